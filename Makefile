@@ -1,0 +1,49 @@
+# Every target makes .venv and installs what it needs by itself.
+PYTHON ?= python3
+BIN := .venv/bin
+SCENARIO := clbench/Fetch-v0
+QUICK := build/quick
+
+.PHONY: leaderboard records test test-slow check wheel-test clean
+
+# The main job: from nothing to a table in minutes, with one seed. The full board takes `make records`.
+leaderboard: .venv/installed
+	@$(BIN)/clbench run $(SCENARIO) joint experience_replay sft frozen --seeds 1 --records $(QUICK)/records
+	@$(BIN)/clbench leaderboard --records $(QUICK)/records
+
+# The committed board: every built-in method, three seeds. Runs that have a record are skipped.
+records: .venv/installed
+	$(BIN)/clbench run $(SCENARIO) joint experience_replay sft from_scratch frozen --seeds 3
+	$(BIN)/clbench leaderboard
+
+test: .venv/installed-dev
+	$(BIN)/pytest -m "not slow"
+
+test-slow: .venv/installed-dev
+	$(BIN)/pytest
+
+check: .venv/installed-dev
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+	$(BIN)/mypy
+
+# The tests against the built wheel, outside the checkout.
+wheel-test: .venv/installed-dev
+	rm -rf build/wheel && mkdir -p build/wheel
+	$(BIN)/python -m build --wheel --outdir build/wheel . >/dev/null
+	$(PYTHON) -m venv build/wheel/venv
+	build/wheel/venv/bin/pip install -q -c constraints.txt "$$(ls build/wheel/*.whl)[dev]"
+	outside=$$(mktemp -d) && cp -r tests pyproject.toml README.md "$$outside" && here=$$PWD && cd "$$outside" \
+		&& $$here/build/wheel/venv/bin/python -m pytest -m "not slow" && rm -rf "$$outside"
+
+clean:
+	rm -rf .venv build dist
+
+.venv/installed: pyproject.toml constraints.txt
+	test -x $(BIN)/python || $(PYTHON) -m venv .venv
+	$(BIN)/pip install -q -c constraints.txt -e .
+	@touch $@
+
+.venv/installed-dev: .venv/installed
+	$(BIN)/pip install -q -c constraints.txt -e ".[dev]"
+	@touch $@

@@ -1,0 +1,173 @@
+"""The commands: `clbench list`, `run`, `leaderboard`, `demonstrations`, `doctor`."""
+
+from __future__ import annotations
+
+import logging
+import os
+import sys
+import time
+from pathlib import Path
+from typing import Annotated
+
+from cyclopts import App, Parameter
+from rich.console import Console
+from rich.logging import RichHandler
+from rich.table import Table
+
+import clbench
+
+RECORDS = Path("leaderboard/records")
+"""Where records lie, seen from the working directory."""
+
+app = App(name="clbench", help=clbench.__doc__, version=clbench.__version__)
+
+# Named, not imported: the core knows its parts by name alone.
+app.command("clbench.leaderboard.cli:show", name="leaderboard")
+app.command("clbench.doctor:doctor", name="doctor")
+
+
+def main() -> None:
+    """Run the command line. A wrong name or value ends with exit code 2 and says the nearest right one."""
+    console = Console(stderr=True)
+    handler = RichHandler(console=console, show_time=False, show_path=False)
+    logging.basicConfig(level=logging.WARNING, format="%(message)s", handlers=[handler])
+    try:
+        app()
+    except (LookupError, ValueError, TypeError) as error:
+        console.print(f"error: {error.args[0] if error.args else error}", style="bold red", highlight=False, markup=False)
+        sys.exit(2)
+    except KeyboardInterrupt:
+        console.print("Stopped. Finished records are kept; the same command goes on from here.", style="bold")
+        sys.exit(130)
+
+
+@app.command(name="list")
+def list_() -> None:
+    """List the scenarios with their tasks, and the methods with the prior data that they use."""
+    from clbench.method import load_method, method_names
+    from clbench.task import load_scenario, scenario_ids
+
+    console = Console()
+    scenarios = Table(title="Scenarios", show_lines=True)
+    for column in ("id", "retained", "target, in order", "held out"):
+        scenarios.add_column(column, no_wrap=column == "id")
+    for id in scenario_ids():
+        scenario = load_scenario(id)
+        groups = (scenario.retained, scenario.target, scenario.held_out)
+        scenarios.add_row(id, *(", ".join(task.name for task in group) for group in groups))
+    console.print(scenarios)
+    methods = Table(title="Methods")
+    for column in ("name", "prior demonstrations", "prior questions", "what it does"):
+        methods.add_column(column, no_wrap=column == "name")
+    for name in method_names():
+        try:
+            method = load_method(name)
+            summary = (method.__doc__ or "").strip().partition("\n")[0]
+            row = (method.uses.demonstrations, method.uses.questions, summary)
+        except Exception as error:  # a plug-in that is broken must not hide the others
+            row = ("?", "?", f"cannot be loaded: {error}")
+        methods.add_row(name, *row)
+    console.print(methods)
+
+
+@app.command
+def run(
+    scenario: str,
+    /,
+    *methods: str,
+    seeds: int = 3,
+    first_seed: int = 0,
+    workers: int | None = None,
+    records: Path = RECORDS,
+    device: str = "cpu",
+    changes: Annotated[dict[str, str] | None, Parameter(name="--set")] = None,
+) -> None:
+    """Run METHODS on SCENARIO, once per seed, and write a record of each run.
+
+    What is missing is made first: demonstrations, then a pretrained policy for each seed. A run that has a
+    record is skipped, so a stopped command goes on where it was.
+
+    Args:
+        scenario: Gymnasium id of the scenario, as clbench/Fetch-v0; module:id imports the module first.
+        methods: Names of installed methods, or module:Class.
+        seeds: How many seeds.
+        first_seed: The first of them.
+        workers: Runs at once, each a process with one thread; all cores if not given.
+        records: Folder of the records.
+        device: Where policies are computed, as cpu or cuda.
+        changes: Hyper-parameters that differ from the methods' own, as --set.name value. Such a run has a
+            record of its own, which the leaderboard does not show.
+    """
+    from clbench.grid import benchmark_jobs, has_record, run_jobs
+    from clbench.method import build_method
+    from clbench.progress import Bars
+    from clbench.run import RunSpec
+    from clbench.task import load_scenario
+
+    console = Console(stderr=True)
+    sys.path.insert(0, os.getcwd())  # a console script lacks it, and module:Class is looked for there
+    workers = (os.cpu_count() or 1) if workers is None else workers
+    for name, value, least in (("--seeds", seeds, 1), ("--first-seed", first_seed, 0), ("--workers", workers, 1)):
+        if value < least:
+            raise ValueError(f"{name} must be at least {least}, not {value}.")
+    if not methods:
+        raise ValueError("Name at least one method; `clbench list` shows them.")
+    load_scenario(scenario)
+    for method in methods:
+        build_method(method, changes or {})
+    specs = [
+        RunSpec(scenario, method, seed, changes or {}, device)
+        for seed in range(first_seed, first_seed + seeds)
+        for method in dict.fromkeys(methods)
+    ]
+    missing = [spec for spec in specs if not has_record(spec, records)]
+    if len(missing) < len(specs):
+        console.print(f"{len(specs) - len(missing)} of {len(specs)} runs have a record already.")
+    if not missing:
+        return
+    begin = time.monotonic()
+    jobs = benchmark_jobs(missing, records)
+    with Bars(sum(job.length for job in jobs), console) as bars:
+        failed = run_jobs(jobs, workers, bars)
+    seconds = time.monotonic() - begin
+    console.print(f"{len(missing)} runs in {seconds / 60:.1f} minutes; records in {records}.", highlight=False)
+    if failed:
+        console.print(f"{len(failed)} failed: {', '.join(failed)}.", style="bold red", highlight=False, markup=False)
+        sys.exit(1)
+
+
+@app.command
+def demonstrations(scenario: str, /, *, workers: int | None = None) -> None:
+    """Collect the expert demonstrations of SCENARIO as Minari datasets, and show a table of them.
+
+    Args:
+        scenario: Gymnasium id of the scenario.
+        workers: Tasks that are collected at once; all cores if not given.
+    """
+    from clbench.demonstrations import dataset_folder, read_dataset
+    from clbench.grid import demonstration_jobs, run_jobs
+    from clbench.progress import Bars
+    from clbench.task import load_scenario
+
+    loaded = load_scenario(scenario)
+    jobs = demonstration_jobs(scenario, [task.name for task in loaded.tasks])
+    with Bars(sum(job.length for job in jobs)) as bars:
+        failed = run_jobs(jobs, workers or os.cpu_count() or 1, bars)
+    if failed:
+        sys.exit(1)
+    table = Table(title=f"Demonstrations of {loaded.id}")
+    for column in ("group", "dataset", "episodes", "disturbed", "success", "mean length", "instruction"):
+        table.add_column(column)
+    for task in loaded.tasks:
+        episodes = read_dataset(dataset_folder(task, loaded.budget))
+        lengths = [len(episode.executed) for episode in episodes]
+        table.add_row(
+            loaded.group(task.name),
+            task.dataset_id,
+            str(len(episodes)),
+            str(sum(bool(episode.disturbed.any()) for episode in episodes)),
+            f"{sum(episode.success for episode in episodes) / len(episodes):.2f}",
+            f"{sum(lengths) / len(lengths):.1f}",
+            task.instructions[0],
+        )
+    Console().print(table)

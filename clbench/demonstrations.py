@@ -1,0 +1,275 @@
+"""Demonstrations: the expert's episodes, kept as Minari datasets, read as batches of action chunks."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from clbench.cache import cached, package_of, source_hash
+from clbench.policy import Batch, PolicyConfig, encode
+from clbench.seeding import derive_seed, numpy_generator
+from clbench.task import Budget, Scenario, Task, resolve
+
+SIMULATORS = ("gymnasium", "gymnasium-robotics", "mujoco", "numpy")
+"""Packages whose version can change a trajectory."""
+
+DISTURBANCE = 0.1
+"""Chance, at each step of a disturbed episode, that a disturbance begins."""
+
+World = gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]
+
+
+@dataclass(frozen=True)
+class Demonstration:
+    """One episode of T steps."""
+
+    state: NDArray[np.float32]
+    """Observations, (T + 1, S)."""
+    executed: NDArray[np.float32]
+    """Actions that were executed, (T, A)."""
+    expert: NDArray[np.float32]
+    """What the expert would do in each state, (T + 1, A)."""
+    disturbed: NDArray[np.bool_]
+    """Where the executed action was not the expert's, (T + 1,); the last is False."""
+    reward: NDArray[np.float64]
+    """Rewards, (T,)."""
+    success: bool
+    """Whether the episode ended in success."""
+
+
+def demonstrate(world: World, task: Task, seed: int, disturb: bool) -> Demonstration:
+    """Run the expert through one episode of `task`.
+
+    Args:
+        world: An environment of the task's world.
+        task: What to do.
+        seed: Of the initial state and of the disturbances.
+        disturb: Whether now and then, about every 10 steps, 3 to 6 random actions replace the expert's, so
+            that the episode shows how to recover.
+    """
+    expert = resolve(task.expert)(task.name)
+    generator = np.random.default_rng([seed, 1])
+    low, high = _action_bounds(world)
+    state, _ = world.reset(seed=seed, options={"task": task.name})
+    states, executed, labels, disturbed, rewards = [state], [], [expert(state)], [], []
+    success, remaining = False, 0
+    for _ in range(task.horizon):
+        if disturb and remaining == 0 and generator.random() < DISTURBANCE:
+            remaining = int(generator.integers(3, 7))
+        action = generator.uniform(low, high).astype(np.float32) if remaining else labels[-1]
+        disturbed.append(remaining > 0)
+        remaining = max(0, remaining - 1)
+        state, reward, terminated, _, _ = world.step(action)
+        states.append(state)
+        executed.append(action)
+        labels.append(expert(state))
+        rewards.append(float(reward))
+        if terminated:
+            success = True
+            break
+    return Demonstration(
+        np.array(states, np.float32),
+        np.array(executed, np.float32),
+        np.clip(np.array(labels, np.float32), low, high),
+        np.array([*disturbed, False]),
+        np.array(rewards),
+        success,
+    )
+
+
+def _action_bounds(world: World) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    assert isinstance(world.action_space, gymnasium.spaces.Box)
+    return world.action_space.low, world.action_space.high
+
+
+def collect(task: Task, budget: Budget, progress: Callable[[float], None] = lambda _: None) -> list[Demonstration]:
+    """Return the successful expert episodes that a budget asks for; failed attempts are repeated.
+
+    Raises:
+        RuntimeError: The expert fails more often than it succeeds.
+    """
+    world: World = resolve(task.world)()
+    kept: list[Demonstration] = []
+    for attempt in range(2 * budget.demonstrations):
+        seed = derive_seed("demonstration", task.dataset_id, attempt)
+        disturb = bool(numpy_generator("disturb", seed).random() < budget.perturbation)
+        episode = demonstrate(world, task, seed, disturb)
+        if episode.success:
+            kept.append(episode)
+            progress(1)
+        if len(kept) == budget.demonstrations:
+            world.close()
+            return kept
+    raise RuntimeError(
+        f"The expert of {task.name!r} succeeded {len(kept)} times in {2 * budget.demonstrations} attempts; "
+        f"{budget.demonstrations} demonstrations are needed. Mend {task.expert} or the success rule."
+    )
+
+
+def dataset_folder(task: Task, budget: Budget, progress: Callable[[float], None] = lambda _: None) -> Path:
+    """Return the folder of the task's Minari dataset, which is collected on first use.
+
+    It lies where Minari keeps its datasets, so that `minari.load_dataset(task.dataset_id)` finds it.
+    """
+    from minari.storage.datasets_root_dir import get_dataset_path
+
+    inputs = {
+        "task": dataclasses.asdict(task),
+        "demonstrations": budget.demonstrations,
+        "perturbation": budget.perturbation,
+        "source": source_hash(__name__, *sorted({package_of(task.world), package_of(task.expert)})),
+        "versions": {package: version(package) for package in SIMULATORS},
+    }
+    folder = get_dataset_path(task.dataset_id)
+    _declare_namespaces(folder, task.dataset_id)
+    return cached(folder, inputs, lambda partial: _write(partial / "data", task, collect(task, budget, progress)))
+
+
+def _declare_namespaces(folder: Path, dataset_id: str) -> None:
+    """Write the namespace files that Minari's own listing looks for."""
+    parts = dataset_id.split("/")[:-1]
+    for depth in range(1, len(parts) + 1):
+        namespace = folder.parents[len(parts) - depth]
+        namespace.mkdir(parents=True, exist_ok=True)
+        path = namespace / "namespace_metadata.json"
+        if not path.exists():
+            path.write_text(json.dumps({"description": "Expert demonstrations of clbench"}), encoding="utf-8")
+
+
+def _write(folder: Path, task: Task, episodes: Sequence[Demonstration]) -> None:
+    """Write episodes as a Minari dataset; actions are the executed ones, the expert's stand in the infos."""
+    from minari.data_collector import EpisodeBuffer
+    from minari.dataset.minari_storage import MinariStorage
+
+    world: World = resolve(task.world)()
+    storage = MinariStorage.new(folder, world.observation_space, world.action_space)
+    world.close()
+    buffers = []
+    for number, episode in enumerate(episodes):
+        last = np.arange(len(episode.executed)) == len(episode.executed) - 1
+        buffers.append(
+            EpisodeBuffer(
+                id=number,
+                observations=list(episode.state),
+                actions=list(episode.executed),
+                rewards=list(episode.reward),
+                terminations=list(last & episode.success),
+                truncations=list(last & (not episode.success)),
+                infos={"expert_action": list(episode.expert), "disturbed": list(episode.disturbed)},
+            )
+        )
+    storage.update_metadata(
+        {
+            "dataset_id": task.dataset_id,
+            "minari_version": version("minari"),
+            "algorithm_name": f"expert {task.expert}",
+            "description": f"{task.instructions[0]} (horizon {task.horizon})",
+        }
+    )
+    storage.update_episodes(buffers)
+
+
+def read_dataset(folder: Path) -> list[Demonstration]:
+    """Return the episodes of the Minari dataset in `folder`."""
+    from minari.dataset.minari_storage import MinariStorage
+
+    storage = MinariStorage.read(folder / "data")
+    return [_demonstration(episode) for episode in storage.get_episodes(range(storage.total_episodes))]
+
+
+def _demonstration(episode: dict[str, Any]) -> Demonstration:
+    return Demonstration(
+        np.asarray(episode["observations"], np.float32),
+        np.asarray(episode["actions"], np.float32),
+        np.asarray(episode["infos"]["expert_action"], np.float32),
+        np.asarray(episode["infos"]["disturbed"], np.bool_),
+        np.asarray(episode["rewards"], np.float64),
+        bool(episode["terminations"][-1]),
+    )
+
+
+@dataclass(frozen=True)
+class Demonstrations:
+    """Demonstrations of one or more tasks as tensors: one row for each of N moments."""
+
+    state: Tensor
+    """Observations, (N, S)."""
+    action: Tensor
+    """The expert's next H actions, (N, H, A)."""
+    valid: Tensor
+    """Which of these count, (N, H): not those after the end, nor those after a disturbance."""
+    words: Tensor
+    """Word ids of the instructions, (tasks, wordings, L)."""
+    rows: Tensor
+    """First row of each task and the number of its rows, (tasks, 2): rows of a task stand together."""
+
+    @classmethod
+    def of_task(cls, task: Task, episodes: Sequence[Demonstration], chunk: int) -> Demonstrations:
+        """Return the episodes of one task, cut into chunks of `chunk` actions."""
+        pieces = [_chunks(episode, chunk) for episode in episodes]
+        state, action, valid = (torch.from_numpy(np.concatenate(column)) for column in zip(*pieces, strict=True))
+        return cls(state, action, valid, encode(task.instructions)[None], torch.tensor([[0, len(state)]]))
+
+    @classmethod
+    def cat(cls, parts: Sequence[Demonstrations]) -> Demonstrations:
+        """Return the tasks of all parts together."""
+        wordings = max(part.words.shape[1] for part in parts)
+        words = [part.words[:, torch.arange(wordings) % part.words.shape[1]] for part in parts]
+        starts = np.cumsum([0, *(len(part.state) for part in parts)])
+        rows = [part.rows + torch.tensor([int(start), 0]) for part, start in zip(parts, starts, strict=False)]
+        state, action, valid = (
+            torch.cat([getattr(part, name) for part in parts]) for name in ("state", "action", "valid")
+        )
+        return cls(state, action, valid, torch.cat(words), torch.cat(rows))
+
+    @property
+    def bytes(self) -> int:
+        """Memory that the data takes."""
+        return sum(value.nbytes for value in vars(self).values())
+
+    def sample(self, count: int, generator: torch.Generator) -> Batch:
+        """Return `count` samples: a task at random, then a moment and a wording of it."""
+        task = torch.randint(len(self.rows), (count,), generator=generator)
+        first, length = self.rows[task].unbind(1)
+        row = first + (torch.rand(count, generator=generator) * length).long()
+        wording = torch.randint(self.words.shape[1], (count,), generator=generator)
+        action = self.action[row]
+        return Batch(
+            self.state[row],
+            self.words[task, wording],
+            action,
+            self.valid[row],
+            torch.rand(count, generator=generator),
+            torch.randn(action.shape, generator=generator),
+        )
+
+
+def _chunks(
+    episode: Demonstration, chunk: int
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
+    """Return states (T, S), chunks (T, chunk, A) and which of their steps count (T, chunk)."""
+    steps = len(episode.executed)
+    index = np.arange(steps)[:, None] + np.arange(chunk)
+    inside = index < steps
+    index = np.minimum(index, steps - 1)
+    # what follows a disturbance answers a state that the chunk's own actions would not have led to
+    earlier = np.cumsum(episode.disturbed[index], axis=1) - episode.disturbed[index]
+    valid = (inside & (earlier == 0)).astype(np.float32)
+    return episode.state[:-1], episode.expert[index], valid
+
+
+def load_demonstrations(task: Task, scenario: Scenario, config: PolicyConfig) -> Demonstrations:
+    """Return the demonstrations of `task`, collected on first use, as chunks that fit a policy."""
+    episodes = read_dataset(dataset_folder(task, scenario.budget))
+    return Demonstrations.of_task(task, episodes, config.chunk)

@@ -1,0 +1,78 @@
+"""The doctor: what is installed, what is missing, and how to get it."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from importlib.metadata import PackageNotFoundError, requires, version
+from pathlib import Path
+
+import torch
+from packaging.requirements import Requirement
+from rich.console import Console
+from rich.table import Table
+
+from clbench.cache import cache_folder
+from clbench.method import method_names
+
+_RENDER = "import mujoco; mujoco.GLContext(8, 8).make_current(); print(mujoco.__version__)"
+
+_DEBIAN_PACKAGES = {"egl": "libegl1 libgl1-mesa-dri", "osmesa": "libosmesa6"}
+"""What makes each headless rendering back end of MuJoCo work on Debian and Ubuntu."""
+
+
+def doctor() -> None:
+    """Show versions, threads, rendering and folders, and say what is missing and how to get it."""
+    console = Console()
+    console.print(_packages())
+    console.print(_machine())
+    if not method_names():
+        console.print("No method is installed: run `pip install -e .` in the checkout.", style="bold red")
+
+
+def _packages() -> Table:
+    table = Table("package", "found", "tried", "", title="Packages")
+    for text in requires("clbench") or []:
+        requirement = Requirement(text)
+        extra = str(requirement.marker).partition("==")[2].strip(" \"'") if requirement.marker else ""
+        try:
+            found = version(requirement.name)
+            fits = requirement.specifier.contains(found, prereleases=True)
+            verdict = "[green]fits[/]" if fits else f"[red]pip install '{requirement.name}{requirement.specifier}'[/]"
+        except PackageNotFoundError:
+            found, verdict = "-", f"pip install 'clbench[{extra}]'" if extra else "[red]pip install clbench[/]"
+        table.add_row(requirement.name, found, str(requirement.specifier), verdict)
+    return table
+
+
+def _machine() -> Table:
+    table = Table(title="Machine", show_header=False)
+    table.add_row("python", sys.version.split()[0])
+    table.add_row("cores", f"{os.cpu_count()} ({torch.get_num_threads()} threads in PyTorch; a run uses one)")
+    table.add_row("cuda", torch.cuda.get_device_name() if torch.cuda.is_available() else "no (none is needed)")
+    for back_end, packages in _DEBIAN_PACKAGES.items():
+        works = _renders(back_end)
+        table.add_row(f"rendering: {back_end}", "works" if works else f"does not work; apt-get install {packages}")
+    chosen = os.environ.get("MUJOCO_GL", "unset; films and pictures need one of the above, scores do not")
+    table.add_row("MUJOCO_GL", chosen)
+    table.add_row("cache", _folder(cache_folder(), "CLBENCH_CACHE"))
+    minari = Path(os.environ.get("MINARI_DATASETS_PATH", "~/.minari/datasets")).expanduser() / "clbench"
+    table.add_row("demonstrations", _folder(minari, "MINARI_DATASETS_PATH"))
+    return table
+
+
+def _renders(back_end: str) -> bool:
+    """Return whether MuJoCo can make a context: tried in a process of its own, since a failure may be fatal."""
+    environment = {**os.environ, "MUJOCO_GL": back_end}
+    try:
+        command = [sys.executable, "-c", _RENDER]
+        result = subprocess.run(command, env=environment, capture_output=True, timeout=60, check=False)
+    except subprocess.TimeoutExpired:
+        return False
+    return result.returncode == 0
+
+
+def _folder(path: Path, variable: str) -> str:
+    size = sum(file.stat().st_size for file in path.rglob("*") if file.is_file()) if path.exists() else 0
+    return f"{path} ({size / 1e6:.1f} MB; {variable} moves it)"

@@ -1,0 +1,214 @@
+"""The grid: many runs, each in its own process with one thread, on all cores."""
+
+from __future__ import annotations
+
+import multiprocessing
+import signal
+import time
+import traceback
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from multiprocessing.connection import Connection, wait
+from multiprocessing.context import SpawnProcess
+from pathlib import Path
+from typing import Any
+
+from clbench.progress import Bars
+from clbench.record import RecordError, read_record
+from clbench.run import RunSpec, execute, run_length
+from clbench.task import load_scenario, resolve
+
+_SEND_SECONDS = 0.2
+
+
+@dataclass(frozen=True)
+class Job:
+    """A piece of work for one process."""
+
+    name: str
+    """What people see."""
+    function: str
+    """Entry point; called with the arguments and `progress`. What it returns, a text, is shown."""
+    arguments: dict[str, Any]
+    """By name."""
+    length: float
+    """In optimiser steps, for the time left."""
+    needs: tuple[str, ...] = ()
+    """Names of the jobs that must have ended well before."""
+
+
+@dataclass
+class _Worker:
+    job: Job
+    process: SpawnProcess
+    connection: Connection
+    started: float = field(default_factory=time.monotonic)
+
+
+def run_jobs(jobs: Sequence[Job], workers: int, bars: Bars) -> dict[str, str]:
+    """Do all jobs, at most `workers` at once, and return what went wrong, by the name of the job.
+
+    A job that fails, or whose process dies, does not stop the others; what needs it is left out. However this
+    function is left, by Ctrl-C too, no process stays behind.
+    """
+    waiting, running = list(jobs), dict[Connection, _Worker]()
+    ended: set[str] = set()
+    failed: dict[str, str] = {}
+    try:
+        while waiting or running:
+            waiting = _drop_hopeless(waiting, failed)
+            for job in _ready(waiting, ended, workers - len(running)):
+                waiting.remove(job)
+                worker = _start(job)
+                running[worker.connection] = worker
+                bars.start(job.name, job.length)
+            for connection in wait(list(running), timeout=1.0):
+                assert isinstance(connection, Connection)
+                worker = running[connection]
+                kind, value = _receive(worker)
+                if kind == "progress":
+                    bars.advance(worker.job.name, value)
+                    continue
+                del running[connection]
+                worker.process.join()
+                if kind == "failed":
+                    failed[worker.job.name] = value
+                else:
+                    ended.add(worker.job.name)
+                seconds = time.monotonic() - worker.started
+                bars.finish(worker.job.name, f"{value} ({seconds:.0f} s)")
+    finally:
+        for worker in running.values():
+            worker.process.terminate()
+            worker.process.join()
+    return failed
+
+
+def _drop_hopeless(waiting: list[Job], failed: dict[str, str]) -> list[Job]:
+    """Return the jobs that can still be done; the others fail with what they needed."""
+    kept = []
+    for job in waiting:
+        missing = [name for name in job.needs if name in failed]
+        if missing:
+            failed[job.name] = f"left out, because {missing[0]} failed"
+        else:
+            kept.append(job)
+    return kept
+
+
+def _ready(waiting: Sequence[Job], ended: set[str], free: int) -> list[Job]:
+    """Return the jobs to start: those whose needs have ended, in their order."""
+    return [job for job in waiting if ended.issuperset(job.needs)][:free]
+
+
+def _start(job: Job) -> _Worker:
+    context = multiprocessing.get_context("spawn")
+    ours, theirs = context.Pipe(duplex=False)
+    process = context.Process(target=_work, args=(theirs, job.function, job.arguments), daemon=True)
+    process.start()
+    theirs.close()  # so that the end of the process is the end of the stream
+    return _Worker(job, process, ours)
+
+
+def _receive(worker: _Worker) -> tuple[str, Any]:
+    try:
+        kind, value = worker.connection.recv()
+    except EOFError:
+        worker.process.join()
+        return "failed", f"its process ended without a result (exit code {worker.process.exitcode})"
+    return kind, value
+
+
+def _work(connection: Connection, function: str, arguments: dict[str, Any]) -> None:
+    """Do one job in this process and send what comes of it."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the parent, which ends its workers
+    owed, sent = 0.0, time.monotonic()
+
+    def progress(amount: float) -> None:
+        nonlocal owed, sent
+        owed += amount
+        if time.monotonic() - sent >= _SEND_SECONDS:
+            connection.send(("progress", owed))
+            owed, sent = 0.0, time.monotonic()
+
+    try:
+        text = resolve(function)(**arguments, progress=progress)
+        connection.send(("progress", owed))
+        connection.send(("done", text))
+    except Exception as error:
+        connection.send(("failed", f"{type(error).__name__}: {error}\n{traceback.format_exc()}"))
+
+
+# ---- the jobs of a benchmark ---------------------------------------------------------------------------------
+
+
+def collect_job(scenario: str, task: str, progress: Callable[[float], None]) -> str:
+    """Collect the demonstrations of a task, unless they are in the cache."""
+    from clbench.demonstrations import dataset_folder, read_dataset
+
+    loaded = load_scenario(scenario)
+    episodes = read_dataset(dataset_folder(loaded.task(task), loaded.budget, progress))
+    return f"{len(episodes)} episodes, {sum(len(episode.executed) for episode in episodes)} steps"
+
+
+def scenes_job(scenario: str, progress: Callable[[float], None]) -> str:
+    """Collect the states that questions are asked about, unless they are in the cache."""
+    from clbench.questions import load_questions
+
+    train, report = load_questions(load_scenario(scenario))
+    return f"{len(train.kinds)} kinds of questions, {len(train.scenes)} states and {len(report.scenes)} for the report"
+
+
+def pretrain_job(scenario: str, seed: int, progress: Callable[[float], None]) -> str:
+    """Pretrain the policy of a seed, unless it is in the cache."""
+    from clbench.training import pretrained_policy
+
+    policy, _ = pretrained_policy(load_scenario(scenario), seed, progress)
+    return f"{sum(parameter.numel() for parameter in policy.parameters()):,} parameters"
+
+
+def run_job(spec: RunSpec, records: str, progress: Callable[[float], None]) -> str:
+    """Do one run and write its record."""
+    record = execute(spec, Path(records), progress)
+    if record.error is not None:
+        raise RuntimeError(f"{record.error['where']}: {record.error['type']}: {record.error['message']}")
+    return "done"
+
+
+def demonstration_jobs(scenario: str, tasks: Sequence[str]) -> list[Job]:
+    """Return the jobs that collect the demonstrations of `tasks`."""
+    length = load_scenario(scenario).budget.demonstrations
+    return [
+        Job(f"demonstrations {task}", "clbench.grid:collect_job", {"scenario": scenario, "task": task}, length)
+        for task in tasks
+    ]
+
+
+def benchmark_jobs(specs: Sequence[RunSpec], records: Path) -> list[Job]:
+    """Return all jobs that the runs `specs` need, of one scenario: demonstrations, pretraining, the runs."""
+    from clbench.training import is_pretrained
+
+    name = specs[0].scenario
+    scenario = load_scenario(name)
+    budget = scenario.budget
+    jobs = demonstration_jobs(name, [task.name for task in scenario.retained + scenario.target])
+    jobs.append(Job("questions", "clbench.grid:scenes_job", {"scenario": name}, budget.question_episodes))
+    data = tuple(job.name for job in jobs)
+    for seed in sorted({spec.seed for spec in specs}):
+        length = 1.0 if is_pretrained(scenario, seed) else 2.0 * budget.pretraining_steps
+        arguments = {"scenario": name, "seed": seed}
+        jobs.append(Job(f"pretraining seed {seed}", "clbench.grid:pretrain_job", arguments, length, data))
+    for spec in specs:
+        arguments = {"spec": spec, "records": str(records)}
+        needs = (f"pretraining seed {spec.seed}",)
+        title = f"{spec.method} seed {spec.seed}"
+        jobs.append(Job(title, "clbench.grid:run_job", arguments, run_length(scenario), needs))
+    return jobs
+
+
+def has_record(spec: RunSpec, records: Path) -> bool:
+    """Return whether the run went through before: a record that failed or cannot be read does not count."""
+    try:
+        return read_record(spec.path(records)).status == "success"
+    except RecordError:
+        return False

@@ -1,0 +1,255 @@
+"""The method: seven seams around a loop that is ours. A method file holds only what differs from fine-tuning."""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import importlib
+from abc import ABC
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from importlib.metadata import EntryPoint, entry_points
+from typing import Any, Generic, Literal, Protocol, TypeVar
+
+import torch
+from torch import Tensor, nn
+
+from clbench.policy import Batch, Policy, QuestionBatch
+from clbench.task import Task
+
+Access = Literal["never", "prepare", "throughout"]
+State = dict[str, Tensor | str | float | int | bool | None]
+Rows = TypeVar("Rows", Batch, QuestionBatch)
+
+
+@dataclass(frozen=True)
+class Uses:
+    """Which prior data a method may touch, and when. The runner hands over nothing else."""
+
+    demonstrations: Access = "never"
+    """Of the retained skills and of the targets learned before."""
+    questions: Access = "never"
+    """The training questions."""
+    reference: bool = False
+    """Whether this is no competitor but a guide: an upper or a lower bound, a baseline of transfer."""
+
+
+class UndeclaredAccessError(RuntimeError):
+    """A method touched prior data that its `uses` does not declare."""
+
+
+class _Samples(Protocol[Rows]):
+    """Data that can be drawn from."""
+
+    def sample(self, count: int, generator: torch.Generator) -> Rows: ...
+
+    @property
+    def bytes(self) -> int: ...
+
+
+class Source(Generic[Rows]):
+    """Data with the random stream that draws from it.
+
+    Args:
+        data: What is drawn from.
+        generator: Of the draws.
+        batch_size: How many samples the budget gives each step.
+        device: Where the samples go.
+    """
+
+    def __init__(
+        self, data: _Samples[Rows], generator: torch.Generator, batch_size: int, device: str = "cpu"
+    ) -> None:
+        self.data = data
+        self.batch_size = batch_size
+        self._generator = generator
+        self._device = device
+
+    def sample(self, count: int) -> Rows:
+        """Return `count` samples."""
+        return self.data.sample(count, self._generator).to(self._device)
+
+
+@dataclass(frozen=True)
+class Prior:
+    """What was learned before: the data that a method's `uses` declares, and nothing else."""
+
+    sources: Mapping[str, Source[Any]]
+    """The declared sources, by the name of the field of `Uses`."""
+
+    @property
+    def demonstrations(self) -> Source[Batch]:
+        """Demonstrations of the retained skills and of the targets learned before."""
+        return self._source("demonstrations")
+
+    @property
+    def questions(self) -> Source[QuestionBatch]:
+        """The training questions."""
+        return self._source("questions")
+
+    def _source(self, name: str) -> Source[Any]:
+        if name not in self.sources:
+            raise UndeclaredAccessError(
+                f"The method touches prior {name} that it does not declare for this seam: "
+                f'set `uses = Uses({name}="prepare")` or "throughout".'
+            )
+        return self.sources[name]
+
+    @property
+    def bytes(self) -> int:
+        """Memory that the declared data takes."""
+        return sum(source.data.bytes for source in self.sources.values())
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One target task of the sequence, as a method meets it."""
+
+    number: int
+    """1 for the first target."""
+    task: Task
+    """What is learned."""
+    seed: int
+    """For the method's own random draws in this stage."""
+
+
+@dataclass(frozen=True)
+class Progress:
+    """How far the adaptation to a target has come."""
+
+    step: int
+    """Optimiser steps done in this stage."""
+    steps: int
+    """Optimiser steps of the whole stage."""
+
+
+class Method(ABC):
+    """A rule for fine-tuning: a dataclass whose fields are its hyper-parameters.
+
+    The constructor only stores; what a method learns is set by the seams. Override what differs from plain
+    fine-tuning, and declare in `uses` which prior data the method touches.
+    """
+
+    uses: Uses = Uses()
+
+    def prepare(self, policy: Policy, prior: Prior) -> None:
+        """Prepare for the sequence, once, before stage 1: anchors, vectors, adapters, frozen copies."""
+
+    def start_task(self, policy: Policy, stage: Stage) -> Iterable[nn.Parameter] | list[dict[str, Any]]:
+        """Return the parameters to train on this target, or optimiser groups of them."""
+        return policy.parameters()
+
+    def batch(self, target: Source[Batch], prior: Prior) -> Any:
+        """Return what to train on at this step; it goes to `loss` as it is."""
+        return target.sample(target.batch_size)
+
+    def loss(self, policy: Policy, batch: Any, progress: Progress) -> Tensor:
+        """Return the scalar to descend."""
+        return policy.action_loss(batch).mean()
+
+    def gradients(self, policy: Policy, loss: Tensor) -> None:
+        """Set the gradients of the trained parameters."""
+        loss.backward()  # type: ignore[no-untyped-call]
+
+    def end_task(self, policy: Policy, stage: Stage) -> None:
+        """Merge or consolidate after a target."""
+
+    def state(self) -> State:
+        """Return what a resumed run needs, tensors and plain values by name; its bytes count as kept."""
+        return {}
+
+    def load_state(self, state: State) -> None:
+        """Take back what `state` returned."""
+        if state:
+            raise NotImplementedError(f"{type(self).__name__} returns a state() but has no load_state().")
+
+    def diagnostics(self) -> dict[str, Any]:
+        """Return what the method tells about itself for the record, as JSON."""
+        return {}
+
+
+def _installed() -> dict[str, EntryPoint]:
+    """Map names to entry points: ours as they are, those of other packages as "package/name"."""
+    found = {}
+    for entry in entry_points(group="clbench.methods"):
+        package = entry.dist.name if entry.dist is not None else "unknown"
+        found[entry.name if package == "clbench" else f"{package}/{entry.name}"] = entry
+    return found
+
+
+def method_names() -> list[str]:
+    """Return the names of the installed methods, sorted; nothing is imported."""
+    return sorted(_installed())
+
+
+def load_method(spec: str) -> type[Method]:
+    """Return the method class that `spec` names: an installed name, or "module:Class".
+
+    Raises:
+        LookupError: Nothing is installed or can be imported under this name; the nearest one is named.
+        TypeError: What is found is no method.
+    """
+    if ":" in spec:
+        cls = _import_method(spec)
+    elif spec in (installed := _installed()):
+        cls = installed[spec].load()
+    else:
+        near = difflib.get_close_matches(spec, installed, n=1)
+        hint = f" Did you mean {near[0]!r}?" if near else ""
+        names = ", ".join(sorted(installed)) or "none; run `pip install -e .` in the checkout"
+        raise LookupError(f"No method is called {spec!r}.{hint} Installed: {names}. Or give module:Class.")
+    if not (isinstance(cls, type) and issubclass(cls, Method)):
+        raise TypeError(f"{spec!r} is not a subclass of clbench.Method.")
+    if not dataclasses.is_dataclass(cls):
+        raise TypeError(f"{spec!r} is not a dataclass: decorate it with @dataclasses.dataclass.")
+    return cls
+
+
+def _import_method(spec: str) -> Any:
+    name, _, attribute = spec.partition(":")
+    try:
+        module = importlib.import_module(name)
+    except ModuleNotFoundError as error:
+        raise LookupError(f"No module {error.name!r} can be imported for the method {spec!r}.") from error
+    if not hasattr(module, attribute):
+        near = difflib.get_close_matches(attribute, dir(module), n=1)
+        hint = f" Did you mean {near[0]!r}?" if near else ""
+        raise LookupError(f"Module {name!r} has no {attribute!r}.{hint}")
+    return getattr(module, attribute)
+
+
+def build_method(spec: str, changes: Mapping[str, Any]) -> Method:
+    """Return the method that `spec` names, with `changes` to its hyper-parameters.
+
+    Args:
+        spec: As for `load_method`.
+        changes: Values by field name; strings, as the command line gives them, become the field's own type.
+
+    Raises:
+        LookupError: The method has no such hyper-parameter; the nearest one is named.
+        ValueError: A value cannot be read as the field's type.
+    """
+    cls = load_method(spec)
+    fields = {field.name: field for field in dataclasses.fields(cls)}  # type: ignore[arg-type]
+    values = {}
+    for name, value in changes.items():
+        if name not in fields:
+            near = difflib.get_close_matches(name, fields, n=1)
+            hint = f" Did you mean {near[0]!r}?" if near else ""
+            raise LookupError(f"{spec} has no hyper-parameter {name!r}.{hint} It has: {', '.join(fields) or 'none'}.")
+        values[name] = _like(fields[name].default, value, name)
+    return cls(**values)
+
+
+def _like(default: Any, value: Any, name: str) -> Any:
+    """Return `value`, a string, as the type of `default`."""
+    if not isinstance(value, str) or isinstance(default, str):
+        return value
+    if isinstance(default, bool):
+        if value.lower() in ("true", "false"):
+            return value.lower() == "true"
+        raise ValueError(f"{name} must be true or false, not {value!r}.")
+    try:
+        return type(default)(value)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{name} must be a {type(default).__name__}, not {value!r}.") from error

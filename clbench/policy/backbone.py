@@ -1,0 +1,84 @@
+"""The backbone: a transformer that reads the observation and the words and answers questions."""
+
+from __future__ import annotations
+
+from typing import cast
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+
+class Attention(nn.Module):
+    """Multi-head attention; its queries read the memory, and themselves where they are part of it."""
+
+    def __init__(self, width: int, heads: int) -> None:
+        super().__init__()
+        self.heads = heads
+        self.query = nn.Linear(width, width)
+        self.key_value = nn.Linear(width, 2 * width)
+        self.out = nn.Linear(width, width)
+
+    def forward(self, tokens: Tensor, memory: Tensor, mask: Tensor) -> Tensor:
+        """Map tokens (B, Q, W), memory (B, P, W) and mask (B, 1, 1, P), True where read, to (B, Q, W)."""
+        batch, length, width = tokens.shape
+        query = self.query(tokens).view(batch, length, self.heads, -1).transpose(1, 2)
+        key, value = self.key_value(memory).view(batch, memory.shape[1], 2, self.heads, -1).unbind(2)
+        mixed = F.scaled_dot_product_attention(query, key.transpose(1, 2), value.transpose(1, 2), attn_mask=mask)
+        return cast(Tensor, self.out(mixed.transpose(1, 2).reshape(batch, length, width)))
+
+
+class Layer(nn.Module):
+    """A pre-norm transformer layer."""
+
+    def __init__(self, width: int, heads: int) -> None:
+        super().__init__()
+        self.attention_norm = nn.LayerNorm(width)
+        self.attention = Attention(width, heads)
+        self.feed_forward = nn.Sequential(
+            nn.LayerNorm(width), nn.Linear(width, 4 * width), nn.ReLU(), nn.Linear(4 * width, width)
+        )
+
+    def forward(self, tokens: Tensor, mask: Tensor, prefix: Tensor | None = None) -> Tensor:
+        """Map tokens (B, Q, W) to (B, Q, W). With a prefix (B, P, W) they also attend to it."""
+        own = self.attention_norm(tokens)
+        memory = own if prefix is None else torch.cat([self.attention_norm(prefix), own], dim=1)
+        tokens = tokens + self.attention(own, memory, mask)
+        return tokens + cast(Tensor, self.feed_forward(tokens))
+
+
+class Backbone(nn.Module):
+    """Reads [observation tokens; a readout token; word tokens], every token attending to every other."""
+
+    observation_tokens = 4
+
+    def __init__(self, state_size: int, vocabulary_size: int, text_length: int, width: int, layers: int, heads: int):
+        super().__init__()
+        self.observation = nn.Linear(state_size, self.observation_tokens * width)
+        self.words = nn.Embedding(vocabulary_size, width)
+        self.readout = nn.Parameter(torch.zeros(1, 1, width))
+        self.position = nn.Parameter(0.02 * torch.randn(1, self.observation_tokens + 1 + text_length, width))
+        self.layers = nn.ModuleList(Layer(width, heads) for _ in range(layers))
+        self.answer = nn.Sequential(nn.LayerNorm(width), nn.Linear(width, vocabulary_size))
+        nn.init.normal_(self.words.weight, std=0.5)
+
+    def mask(self, words: Tensor) -> Tensor:
+        """Return which prefix tokens are read, (B, 1, 1, P): all but the padding of the words (B, L)."""
+        always = torch.ones(len(words), self.observation_tokens + 1, dtype=torch.bool, device=words.device)
+        return torch.cat([always, words != 0], dim=1)[:, None, None, :]
+
+    def forward(self, state: Tensor, words: Tensor) -> list[Tensor]:
+        """Map normalised states (B, S) and words (B, L) to the hidden state (B, P, W) of every layer."""
+        batch = len(state)
+        observation = self.observation(state).view(batch, self.observation_tokens, -1)
+        tokens = torch.cat([observation, self.readout.expand(batch, -1, -1), self.words(words)], dim=1)
+        tokens = tokens + self.position
+        mask, hidden = self.mask(words), []
+        for layer in self.layers:
+            tokens = layer(tokens, mask)
+            hidden.append(tokens)
+        return hidden
+
+    def answer_logits(self, hidden: Tensor) -> Tensor:
+        """Map the last layer's hidden state (B, P, W) to the logits of the answer word (B, V)."""
+        return cast(Tensor, self.answer(hidden[:, self.observation_tokens]))

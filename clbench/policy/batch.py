@@ -1,0 +1,67 @@
+"""Batches: what a loss is computed on, the random draws of the loss included.
+
+A loss is therefore a function of the parameters and the batch alone: the same batch gives the same loss, to
+two policies or twice to one.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Self
+
+import torch
+from torch import Tensor
+
+
+class _Rows:
+    """Dataclass of tensors that share their first dimension."""
+
+    @classmethod
+    def cat(cls, parts: Sequence[Self]) -> Self:
+        """Return the parts as one, in their order."""
+        columns = {
+            field.name: torch.cat([getattr(part, field.name) for part in parts])
+            for field in dataclasses.fields(cls)  # type: ignore[arg-type]
+        }
+        return cls(**columns)
+
+    def to(self, device: torch.device | str) -> Self:
+        """Return the same rows on `device`."""
+        columns = {field.name: getattr(self, field.name).to(device) for field in dataclasses.fields(self)}  # type: ignore[arg-type]
+        return type(self)(**columns)
+
+    def __len__(self) -> int:
+        first = dataclasses.fields(self)[0].name  # type: ignore[arg-type]
+        return len(getattr(self, first))
+
+
+@dataclass(frozen=True)
+class Batch(_Rows):
+    """Demonstrated action chunks, B samples of H actions."""
+
+    state: Tensor
+    """Observations as the world gives them, (B, S)."""
+    words: Tensor
+    """Word ids of the instructions, (B, L)."""
+    action: Tensor
+    """The expert's next actions as the world takes them, (B, H, A)."""
+    valid: Tensor
+    """Which of them count, (B, H): not those after the episode's end or after a disturbance."""
+    draw: Tensor
+    """Uniform draws in [0, 1) for the action head, (B,)."""
+    noise: Tensor
+    """Standard normal draws for the action head, (B, H, A)."""
+
+
+@dataclass(frozen=True)
+class QuestionBatch(_Rows):
+    """Questions with their answers, B samples."""
+
+    state: Tensor
+    """Observations as the world gives them, (B, S)."""
+    words: Tensor
+    """Word ids of the questions, (B, L)."""
+    answer: Tensor
+    """Word id of the right answer, (B,)."""

@@ -1,0 +1,65 @@
+"""Words to ids: one tokenizer over a vocabulary that is fixed before any scenario is known."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Sequence
+from functools import cache
+from importlib.resources import files
+
+import torch
+from tokenizers import Tokenizer, models, normalizers, pre_tokenizers
+
+TEXT_LENGTH = 12
+"""Words that the policy reads at most; shorter texts are padded, so that every forward has one shape."""
+
+PADDING = "[padding]"
+
+
+class UnknownWordError(ValueError):
+    """A text holds a word that is not in the vocabulary."""
+
+
+@cache
+def vocabulary() -> tuple[str, ...]:
+    """Return the words in the order of their ids; id 0 is the padding."""
+    text = files("clbench.policy").joinpath("vocabulary.txt").read_text(encoding="utf-8")
+    return (PADDING, *text.split())
+
+
+@cache
+def _tokenizer() -> Tokenizer:
+    ids = {word: id for id, word in enumerate(vocabulary())}
+    tokenizer = Tokenizer(models.WordLevel(ids, unk_token=PADDING))
+    tokenizer.normalizer = normalizers.Sequence([normalizers.NFKC(), normalizers.Lowercase()])
+    tokenizer.pre_tokenizer = pre_tokenizers.Sequence(
+        [pre_tokenizers.WhitespaceSplit(), pre_tokenizers.Punctuation(behavior="removed")]
+    )
+    tokenizer.enable_padding(length=TEXT_LENGTH, pad_id=0, pad_token=PADDING)
+    return tokenizer
+
+
+def encode(texts: Sequence[str]) -> torch.Tensor:
+    """Return the word ids (len(texts), TEXT_LENGTH), int64, of `texts`. Case and punctuation do not count.
+
+    Raises:
+        UnknownWordError: A word is not in the vocabulary, or there are more than `TEXT_LENGTH` words.
+    """
+    tokenizer = _tokenizer()
+    rows = []
+    for text, encoding in zip(texts, tokenizer.encode_batch(list(texts)), strict=True):
+        words = [text[start:end] for start, end in encoding.offsets if end > start]
+        for word, id in zip(words, encoding.ids, strict=False):
+            if id == 0:
+                near = difflib.get_close_matches(word.lower(), vocabulary(), n=1)
+                hint = f" Did you mean {near[0]!r}?" if near else ""
+                raise UnknownWordError(f"The word {word!r} in {text!r} is not in the vocabulary.{hint}")
+        if not 0 < len(words) <= TEXT_LENGTH:
+            raise UnknownWordError(f"{text!r} has {len(words)} words; the policy reads 1 to {TEXT_LENGTH}.")
+        rows.append(encoding.ids)
+    return torch.tensor(rows, dtype=torch.int64)
+
+
+def word_id(word: str) -> int:
+    """Return the id of a single word of the vocabulary."""
+    return int(encode([word])[0, 0])

@@ -1,0 +1,109 @@
+"""The policy itself: backbone, action head, and the normalisation it was pretrained with."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import cast
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from clbench.policy.backbone import Backbone
+from clbench.policy.batch import Batch, QuestionBatch
+from clbench.policy.flow import FlowHead
+from clbench.policy.language import TEXT_LENGTH, vocabulary
+
+
+@dataclass(frozen=True)
+class PolicyConfig:
+    """Sizes of a policy, and the conventions between it and its world."""
+
+    state_size: int
+    """Length of the world's observation vector."""
+    action_size: int
+    """Length of the world's action vector."""
+    width: int = 96
+    """Channels of every token."""
+    layers: int = 3
+    """Layers of the backbone, and as many of the action head."""
+    heads: int = 4
+    """Attention heads."""
+    chunk: int = 8
+    """Actions that one forward predicts."""
+    executed: int = 4
+    """Actions of a chunk that are executed before the next forward."""
+    euler_steps: int = 5
+    """Integration steps of the flow."""
+    vocabulary_size: int = len(vocabulary())
+    """Words it can read and answer."""
+
+
+class Policy(nn.Module):
+    """A small vision-language-action model: state and words in, action chunks and answers out.
+
+    Args:
+        config: Sizes.
+        seed: Of the initial weights; the global generator is left as it was.
+    """
+
+    state_mean: Tensor
+    state_std: Tensor
+    action_mean: Tensor
+    action_std: Tensor
+
+    def __init__(self, config: PolicyConfig, seed: int = 0) -> None:
+        super().__init__()
+        self.config = config
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(seed)
+            self.backbone = Backbone(
+                config.state_size, config.vocabulary_size, TEXT_LENGTH, config.width, config.layers, config.heads
+            )
+            self.head = FlowHead(
+                config.action_size, config.chunk, config.width, config.layers, config.heads, config.euler_steps
+            )
+        for name, size in (("state", config.state_size), ("action", config.action_size)):
+            self.register_buffer(f"{name}_mean", torch.zeros(size))
+            self.register_buffer(f"{name}_std", torch.ones(size))
+
+    def normalise_like(self, state: Tensor, action: Tensor) -> None:
+        """Set the normalisation to the mean and deviation of states (N, S) and actions (N, A)."""
+        for name, values in (("state", state), ("action", action)):
+            getattr(self, f"{name}_mean").copy_(values.mean(dim=0))
+            # 1e-2 (a centimetre, a hundredth of the action range) keeps what hardly varies from being blown up
+            getattr(self, f"{name}_std").copy_(values.std(dim=0, correction=0).clamp(min=1e-2))
+
+    def hidden_states(self, state: Tensor, words: Tensor) -> list[Tensor]:
+        """Return the hidden state (B, P, W) of every backbone layer for states (B, S) and words (B, L)."""
+        normalised = ((state - self.state_mean) / self.state_std).clamp(-10, 10)
+        return cast(list[Tensor], self.backbone(normalised, words))
+
+    def action_loss(self, batch: Batch, hidden: list[Tensor] | None = None) -> Tensor:
+        """Return the action head's loss of each sample, (B,).
+
+        Args:
+            batch: What to learn.
+            hidden: Hidden states to use instead of `hidden_states(batch.state, batch.words)`: detached ones
+                stop the gradient at the backbone.
+        """
+        hidden = self.hidden_states(batch.state, batch.words) if hidden is None else hidden
+        action = (batch.action - self.action_mean) / self.action_std
+        mask = self.backbone.mask(batch.words)
+        return self.head.loss(action, batch.valid, batch.draw, batch.noise, hidden, mask)
+
+    def answer_logits(self, state: Tensor, words: Tensor) -> Tensor:
+        """Return the logits (B, V) of the word that answers the question `words` about `state`."""
+        return self.backbone.answer_logits(self.hidden_states(state, words)[-1])
+
+    def answer_loss(self, questions: QuestionBatch) -> Tensor:
+        """Return the cross-entropy of each right answer, (B,)."""
+        logits = self.answer_logits(questions.state, questions.words)
+        return F.cross_entropy(logits, questions.answer, reduction="none")
+
+    @torch.inference_mode()
+    def act(self, state: Tensor, words: Tensor, noise: Tensor) -> Tensor:
+        """Return the action chunk (B, H, A) for states (B, S) and words (B, L), from noise (B, H, A)."""
+        hidden = self.hidden_states(state, words)
+        chunk = self.head.sample(noise, hidden, self.backbone.mask(words))
+        return chunk * self.action_std + self.action_mean

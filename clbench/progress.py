@@ -1,0 +1,80 @@
+"""Progress of long work: bars with the time left on a terminal, a line now and then without one."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from types import TracebackType
+from typing import Self
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TaskID, TaskProgressColumn, TextColumn, TimeElapsedColumn
+from rich.progress import TimeRemainingColumn as TimeLeftColumn
+
+LINE_SECONDS = 30.0
+"""How often a line is printed where there is no terminal."""
+
+
+class Bars:
+    """One bar for all work and one for each piece that is under way.
+
+    Args:
+        total: Length of all work, in any unit.
+        console: Where to draw.
+        clock: Seconds; for tests.
+    """
+
+    def __init__(
+        self, total: float, console: Console | None = None, clock: Callable[[], float] = time.monotonic
+    ) -> None:
+        self.console = console or Console(stderr=True)
+        self._clock = clock
+        self._total, self._done = max(total, 1e-9), 0.0
+        self._started = self._last_line = clock()
+        self._bars: dict[str, TaskID] = {}
+        self._progress = Progress(
+            TextColumn("{task.description}"),
+            BarColumn(),
+            TaskProgressColumn(),
+            TimeElapsedColumn(),
+            TextColumn("left"),
+            TimeLeftColumn(),
+            console=self.console,
+            disable=not self.console.is_terminal,
+        )
+        self._all = self._progress.add_task("all", total=self._total)
+
+    def __enter__(self) -> Self:
+        self._progress.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._progress.stop()
+
+    def start(self, name: str, length: float) -> None:
+        """Show a new piece of work."""
+        self._bars[name] = self._progress.add_task(name, total=length)
+
+    def advance(self, name: str, amount: float) -> None:
+        """Show that `amount` of a piece was done."""
+        self._progress.advance(self._bars[name], amount)
+        self._progress.advance(self._all, amount)
+        self._done += amount
+        now = self._clock()
+        if not self.console.is_terminal and now - self._last_line >= LINE_SECONDS:
+            self._last_line = now
+            share = min(1.0, self._done / self._total)
+            left = (now - self._started) * (1 - share) / share
+            names = ", ".join(self._bars)
+            self.console.print(f"{share:4.0%}, about {_minutes(left)} left: {names}", highlight=False, markup=False)
+
+    def finish(self, name: str, text: str) -> None:
+        """Take a piece away and say what came of it."""
+        self._progress.remove_task(self._bars.pop(name))
+        self.console.print(f"{name}: {text}", highlight=False, markup=False)
+
+
+def _minutes(seconds: float) -> str:
+    return f"{int(seconds) // 60}:{int(seconds) % 60:02d}"

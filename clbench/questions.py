@@ -1,0 +1,140 @@
+"""Questions about a scene with one right answer, made from the simulator's state.
+
+They stand for the knowledge of a vision-language model: what a policy knew before it was fine-tuned.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from safetensors.torch import load_file, save_file
+from torch import Tensor
+
+from clbench.cache import cache_folder, cached, hash_of, package_of, source_hash
+from clbench.demonstrations import SIMULATORS, World, demonstrate
+from clbench.policy import QuestionBatch, encode, word_id
+from clbench.seeding import derive_seed, torch_generator
+from clbench.task import Scenario, resolve
+
+
+@dataclass(frozen=True)
+class QuestionKind:
+    """One thing that can be asked about a state, in several wordings."""
+
+    name: str
+    """Name of the kind, as "block_left_of_gripper"."""
+    wordings: tuple[str, ...]
+    """The question in words; each means the same."""
+    answers: tuple[str, ...]
+    """The possible answers, each one word of the vocabulary."""
+    answer: Callable[[NDArray[np.float32]], NDArray[np.int64]]
+    """Maps states (N, S) to the index of the right answer (N,), or -1 where it is too close to tell."""
+
+
+def scenes_folder(scenario: Scenario) -> Path:
+    """Return the folder of the states that questions are asked about; they are collected on first use.
+
+    The states come from disturbed expert episodes of the retained tasks, and are split by episode into
+    `train` and `report`.
+    """
+    inputs = {
+        "scenario": scenario.id,
+        "tasks": [task.name for task in scenario.retained],
+        "episodes": scenario.budget.question_episodes,
+        "source": source_hash(
+            "clbench.demonstrations", __name__, *sorted({package_of(task.world) for task in scenario.retained})
+        ),
+        "versions": {package: version(package) for package in SIMULATORS},
+    }
+    folder = cache_folder() / "scenes" / hash_of(inputs)
+    return cached(folder, inputs, lambda partial: save_file(_scenes(scenario), partial / "scenes.safetensors"))
+
+
+def _scenes(scenario: Scenario) -> dict[str, Tensor]:
+    worlds: dict[str, World] = {}
+    scenes = {}
+    count = scenario.budget.question_episodes
+    for split, episodes in (("train", count), ("report", max(1, count // 4))):
+        states = []
+        for number in range(episodes):
+            task = scenario.retained[number % len(scenario.retained)]
+            if task.world not in worlds:
+                worlds[task.world] = resolve(task.world)()
+            seed = derive_seed("scene", scenario.id, split, number)
+            states.append(demonstrate(worlds[task.world], task, seed, disturb=True).state)
+        scenes[split] = torch.from_numpy(np.concatenate(states))
+    for world in worlds.values():
+        world.close()
+    return scenes
+
+
+class Questions:
+    """Questions about a set of states, drawn so that every kind, and every answer of a kind, is as frequent.
+
+    Args:
+        kinds: What is asked.
+        scenes: States (N, S) to ask about.
+
+    Raises:
+        ValueError: A kind has an answer that no state gives.
+    """
+
+    def __init__(self, kinds: tuple[QuestionKind, ...], scenes: Tensor) -> None:
+        self.kinds = kinds
+        self.scenes = scenes
+        wordings = max(len(kind.wordings) for kind in kinds)
+        self._words = torch.stack(
+            [encode([kind.wordings[i % len(kind.wordings)] for i in range(wordings)]) for kind in kinds]
+        )
+        cells = [self._cells(kind) for kind in kinds]
+        self._answers = torch.tensor([len(kind.answers) for kind in kinds])
+        self._first_cell = self._answers.cumsum(0) - self._answers
+        self._answer_ids = torch.tensor([word_id(answer) for kind in kinds for answer in kind.answers])
+        sizes = torch.tensor([len(rows) for kind_cells in cells for rows in kind_cells])
+        self._cell_sizes, self._cell_starts = sizes, sizes.cumsum(0) - sizes
+        self._rows = torch.cat([rows for kind_cells in cells for rows in kind_cells])
+
+    def _cells(self, kind: QuestionKind) -> list[Tensor]:
+        """Return, for each answer of a kind, the rows of the states that give it."""
+        answers = torch.from_numpy(kind.answer(self.scenes.numpy()))
+        cells = [torch.nonzero(answers == index)[:, 0] for index in range(len(kind.answers))]
+        for answer, rows in zip(kind.answers, cells, strict=True):
+            if not len(rows):
+                raise ValueError(f"No state answers {answer!r} to {kind.name!r}: {kind.wordings[0]!r}.")
+        return cells
+
+    @property
+    def bytes(self) -> int:
+        """Memory that the states and the lists of questions take."""
+        return self.scenes.nbytes + self._rows.nbytes + self._words.nbytes
+
+    def sample(self, count: int, generator: torch.Generator) -> QuestionBatch:
+        """Return `count` questions: a kind at random, then one of its answers, a state and a wording."""
+        return self.ask(torch.randint(len(self.kinds), (count,), generator=generator), generator)
+
+    def ask(self, kind: Tensor, generator: torch.Generator) -> QuestionBatch:
+        """Return one question for each index (count,) of a kind."""
+        draws = torch.rand(3, len(kind), generator=generator)
+        cell = self._first_cell[kind] + (draws[0] * self._answers[kind]).long()
+        row = self._rows[self._cell_starts[cell] + (draws[1] * self._cell_sizes[cell]).long()]
+        wording = (draws[2] * self._words.shape[1]).long()
+        return QuestionBatch(self.scenes[row], self._words[kind, wording], self._answer_ids[cell])
+
+
+def load_questions(scenario: Scenario) -> tuple[Questions, Questions]:
+    """Return the training and the report questions of a scenario."""
+    kinds = resolve(scenario.questions)
+    scenes = load_file(scenes_folder(scenario) / "scenes.safetensors")
+    return Questions(kinds, scenes["train"]), Questions(kinds, scenes["report"])
+
+
+def report_questions(questions: Questions, count: int) -> tuple[Tensor, QuestionBatch]:
+    """Return the kinds (count,) and the questions that every report asks: the same for all methods and seeds."""
+    kind = torch.arange(count) % len(questions.kinds)
+    return kind, questions.ask(kind, torch_generator("report questions"))

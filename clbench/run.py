@@ -1,0 +1,301 @@
+"""One run: scenario x method x seed, from the pretrained policy to a record."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import shutil
+import time
+import traceback
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors.torch import load_file, save_file
+
+from clbench.cache import cache_folder, cached, hash_of, is_cached, package_of, source_hash
+from clbench.demonstrations import Demonstrations, load_demonstrations
+from clbench.evaluation import Episode, Evaluator, answer
+from clbench.fingerprint import fingerprint
+from clbench.method import Access, Method, Prior, Source, Stage, State, build_method
+from clbench.policy import load_policy, save_policy
+from clbench.questions import Questions, load_questions, report_questions
+from clbench.record import Record, read_record, record_path, write_record
+from clbench.seeding import derive_seed, torch_generator
+from clbench.task import Scenario, Task, load_scenario
+from clbench.training import adapt, deterministic, evaluation_steps, pretrained_policy, pretraining_inputs
+
+EPISODE_WEIGHT = 0.3
+"""What an evaluation episode takes, in optimiser steps; for the time left that a progress bar shows."""
+
+
+@dataclass(frozen=True)
+class RunSpec:
+    """What is run."""
+
+    scenario: str
+    """Gymnasium id of the scenario."""
+    method: str
+    """Name of an installed method, or "module:Class"."""
+    seed: int
+    """Of every draw of the run."""
+    changes: Mapping[str, Any] = field(default_factory=dict)
+    """Hyper-parameters that differ from the method's own."""
+    device: str = "cpu"
+    """Where the policy is computed."""
+
+    def path(self, records: Path) -> Path:
+        """Return where the record lies below the folder `records`."""
+        return record_path(records, self.scenario.rpartition(":")[2], self.label, self.seed)
+
+    @property
+    def label(self) -> str:
+        """The method and what was changed of it, as "experience_replay+replay=0.02"."""
+        return "+".join([self.method, *(f"{name}={value}" for name, value in self.changes.items())])
+
+
+def execute(spec: RunSpec, records: Path, progress: Callable[[float], None] = lambda _: None) -> Record:
+    """Run `spec`, or go on where an interrupted run of it stopped, and write its record.
+
+    A run that fails leaves a record of status "failed" that says where.
+
+    Args:
+        spec: What to run.
+        records: Folder of the records.
+        progress: Called with the optimiser steps, or what took as long, that were done since its last call;
+            `run_length` says how many there are.
+    """
+    scenario = load_scenario(spec.scenario)
+    method = build_method(spec.method, spec.changes)
+    with deterministic():
+        record = _Run(spec, scenario, method, progress).go()
+    write_record(record, spec.path(records))
+    return record
+
+
+def run_length(scenario: Scenario) -> float:
+    """Return how long a run takes, in optimiser steps."""
+    budget, stages = scenario.budget, len(scenario.target)
+    reports = (stages + 1) * len(scenario.tasks) + stages * (len(evaluation_steps(budget)) - 1)
+    return stages * budget.adaptation_steps + EPISODE_WEIGHT * reports * budget.report_episodes
+
+
+class _Run:
+    """A run on its way: the policy, the method's data, and the record so far."""
+
+    def __init__(
+        self, spec: RunSpec, scenario: Scenario, method: Method, progress: Callable[[float], None]
+    ) -> None:
+        self.spec, self.scenario, self.method, self.progress = spec, scenario, method, progress
+        self.where = "start"
+        self.evaluator = Evaluator(scenario, spec.seed)
+        self.policy, self.pretrained = pretrained_policy(scenario, spec.seed)
+        self.policy.to(spec.device)
+        self.data = {
+            task.name: load_demonstrations(task, scenario, self.policy.config)
+            for task in scenario.retained + scenario.target
+        }
+        train, report = load_questions(scenario)
+        self.questions: Questions = train
+        self.kinds = report.kinds
+        self.asked = report_questions(report, scenario.budget.report_questions)
+        self.record = self._new_record()
+        self.checkpoints = cache_folder() / "runs" / hash_of(self._inputs(0))
+
+    def go(self) -> Record:
+        """Go through all stages that no checkpoint holds, and return the record."""
+        self.record.timing["started"] = datetime.now(UTC).isoformat(timespec="seconds")
+        begin = time.perf_counter()
+        try:
+            self._go_through()
+        except Exception as error:
+            self.record.status = "failed"
+            self.record.error = {
+                "where": self.where,
+                "type": type(error).__name__,
+                "message": str(error),
+                "traceback": traceback.format_exc(),
+            }
+        finally:
+            self.evaluator.close()
+        self.record.timing["seconds"] = round(time.perf_counter() - begin, 2)
+        self.record.diagnostics = self.method.diagnostics() if self.record.status == "success" else {}
+        shutil.rmtree(self.checkpoints, ignore_errors=True)
+        return self.record
+
+    def _go_through(self) -> None:
+        done = self._resume()
+        if done is None:
+            done = 0
+            self.where = "prepare"
+            self.method.prepare(self.policy, self._prior(0, ("prepare", "throughout")))
+            self._report(0, 0, self.scenario.tasks)
+            self._save(0)
+        for number in range(done + 1, len(self.scenario.target) + 1):
+            self._stage(number)
+            self._save(number)
+        self._count_costs()
+
+    def _stage(self, number: int) -> None:
+        """Adapt to target `number`, evaluating on the way and at the end."""
+        spec, budget, task = self.spec, self.scenario.budget, self.scenario.target[number - 1]
+        stage = Stage(number, task, derive_seed("method", spec.seed, number))
+        points = evaluation_steps(budget)
+        begin, evaluating = time.perf_counter(), 0.0
+
+        def after(step: int) -> None:
+            nonlocal evaluating
+            self.progress(1)
+            if step in points[:-1]:
+                paused = time.perf_counter()
+                self._report(number, step, (task,))
+                evaluating += time.perf_counter() - paused
+
+        self.where = f"stage {number} ({task.name})"
+        target = self._source("target", number, self.data[task.name])
+        prior = self._prior(number, ("throughout",))
+        steps = adapt(self.policy, self.method, stage, target, prior, budget, after)
+        training = time.perf_counter() - begin - evaluating
+        paused = time.perf_counter()
+        self._report(number, budget.adaptation_steps, self.scenario.tasks)
+        evaluating += time.perf_counter() - paused
+        self.record.costs["optimiser_steps"] += steps
+        self.record.timing["stages"].append({"training": round(training, 2), "evaluation": round(evaluating, 2)})
+
+    def _source(self, name: str, number: int, data: Any) -> Source[Any]:
+        """Return data with its own random stream: what one source draws does not move another's draws."""
+        generator = torch_generator(name, self.spec.seed, number)
+        return Source(data, generator, self.scenario.budget.batch_size, self.spec.device)
+
+    def _prior(self, number: int, when: tuple[Access, ...]) -> Prior:
+        """Return the prior data that the method declares for the seams of stage `number`."""
+        sources = {}
+        if self.method.uses.demonstrations in when:
+            before = self.scenario.retained + self.scenario.target[: max(0, number - 1)]
+            demonstrations = Demonstrations.cat([self.data[task.name] for task in before])
+            sources["demonstrations"] = self._source("prior demonstrations", number, demonstrations)
+        if self.method.uses.questions in when:
+            sources["questions"] = self._source("prior questions", number, self.questions)
+        return Prior(sources)
+
+    def _report(self, number: int, step: int, tasks: tuple[Task, ...]) -> None:
+        """Evaluate report episodes, and the questions if it is the end of a stage, into the record."""
+        self.policy.eval()
+        episodes = self.evaluator.evaluate(
+            self.policy, tasks, "report", lambda count: self.progress(EPISODE_WEIGHT * count)
+        )
+        self.policy.train()
+        for episode in episodes:
+            _append(self.record.episodes, _episode_row(number, step, episode))
+        if tasks == self.scenario.tasks:
+            kind, questions = self.asked
+            for name, asked, correct in answer(self.policy, self.kinds, kind, questions):
+                _append(self.record.answers, (number, name, asked, correct))
+
+    def _new_record(self) -> Record:
+        scenario, method = self.scenario, self.method
+        settings = dataclasses.asdict(method)  # type: ignore[call-overload]
+        parameters = sum(parameter.numel() for parameter in self.policy.parameters())
+        return Record(
+            status="success",
+            run={
+                "scenario": scenario.id,
+                "method": self.spec.method,
+                "seed": self.spec.seed,
+                "device": self.spec.device,
+                "settings": settings,
+                "changes": {name: settings[name] for name in self.spec.changes},
+                "uses": dataclasses.asdict(method.uses),
+            },
+            scenario={
+                "id": scenario.id,
+                **{group: [task.name for task in getattr(scenario, group)] for group in ("retained", "target", "held_out")},
+                "budget": dataclasses.asdict(scenario.budget),
+            },
+            costs={"optimiser_steps": 0, "parameters": parameters},
+            fingerprint={**fingerprint(scenario), "pretrained": _hash_of_policy(self.pretrained)},
+            timing={"stages": []},
+        )
+
+    def _count_costs(self) -> None:
+        state = self.method.state()
+        tensors = [value for value in state.values() if isinstance(value, torch.Tensor)]
+        parameters = sum(parameter.numel() for parameter in self.policy.parameters())
+        self.record.costs["parameters_added"] = parameters - self.record.costs["parameters"]
+        kept = self._prior(len(self.scenario.target), ("throughout",)).bytes
+        self.record.costs["bytes_kept"] = kept + sum(tensor.nbytes for tensor in tensors)
+
+    # ---- checkpoints -------------------------------------------------------------------------------------------
+
+    def _inputs(self, number: int) -> dict[str, Any]:
+        """Return all that the state after stage `number` depends on."""
+        suites = {package_of(name) for task in self.scenario.tasks for name in (task.world, task.expert)}
+        return {
+            "run": self.record.run,
+            "stage": number,
+            "pretraining": pretraining_inputs(self.scenario, self.spec.seed),
+            "tasks": [dataclasses.asdict(task) for task in self.scenario.tasks],
+            "source": source_hash("clbench", "clbench.policy", type(self.method).__module__, *sorted(suites)),
+        }
+
+    def _save(self, number: int) -> None:
+        """Write a checkpoint after stage `number`; earlier ones go."""
+
+        def write(folder: Path) -> None:
+            save_policy(self.policy, folder)
+            state = self.method.state()
+            tensors = {name: value for name, value in state.items() if isinstance(value, torch.Tensor)}
+            save_file(tensors, folder / "method.safetensors")
+            values = {name: value for name, value in state.items() if name not in tensors}
+            (folder / "method.json").write_text(json.dumps(values), encoding="utf-8")
+            write_record(self.record, folder / "record.json")
+
+        self.where = f"state() after stage {number}"
+        cached(self.checkpoints / f"stage-{number}", self._inputs(number), write)
+        shutil.rmtree(self.checkpoints / f"stage-{number - 1}", ignore_errors=True)
+
+    def _resume(self) -> int | None:
+        """Go back to the latest checkpoint and return its stage, or None if there is none."""
+        for number in range(len(self.scenario.target), -1, -1):
+            folder = self.checkpoints / f"stage-{number}"
+            if is_cached(folder, self._inputs(number)):
+                self.where = "load_state"
+                self.policy = load_policy(folder).to(self.spec.device)
+                state: State = {**json.loads((folder / "method.json").read_text(encoding="utf-8"))}
+                state.update(load_file(folder / "method.safetensors"))
+                self.method.load_state(state)
+                timing = self.record.timing
+                self.record = read_record(folder / "record.json")
+                self.record.timing.update({**timing, "stages": self.record.timing["stages"], "resumed_after": number})
+                self.progress(number * run_length(self.scenario) / len(self.scenario.target))
+                return number
+        return None
+
+
+def _episode_row(number: int, step: int, episode: Episode) -> tuple[Any, ...]:
+    total_reward = round(episode.total_reward, 4) if abs(episode.total_reward) < float("inf") else None
+    return (
+        number,
+        step,
+        episode.task,
+        episode.split,
+        episode.number,
+        int(episode.success),
+        total_reward,
+        episode.length,
+    )
+
+
+def _append(columns: dict[str, list[Any]], row: tuple[Any, ...]) -> None:
+    for column, value in zip(columns.values(), row, strict=True):
+        column.append(value)
+
+
+def _hash_of_policy(folder: Path) -> str:
+    manifest = json.loads((folder / "clbench.json").read_text(encoding="utf-8"))
+    return str(manifest["files"]["policy.safetensors"][:16])
+
+

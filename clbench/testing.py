@@ -1,0 +1,124 @@
+"""For tests, ours and other people's: a toy scenario on which a whole run takes seconds.
+
+A point on a plane moves left, right, up or down; the words say which way. Import this module to register it
+as `clbench/Toy-v0`, or ask for "clbench.testing:clbench/Toy-v0".
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, ClassVar
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+from gymnasium.envs.registration import register
+from numpy.typing import NDArray
+
+from clbench.questions import QuestionKind
+from clbench.task import Budget, Scenario, Task, unknown
+
+State = NDArray[np.float32]
+Action = NDArray[np.float32]
+
+_DIRECTIONS = {
+    "left": (-1.0, 0.0),
+    "up": (0.0, 1.0),
+    "right": (1.0, 0.0),
+    "down": (0.0, -1.0),
+    "up_left": (-1.0, 1.0),
+}
+
+
+class ToyWorld(gymnasium.Env[State, Action]):
+    """A point with a marker beside it. State: point (2,), marker (2,). Action: velocity (2,).
+
+    A task is done when the point has moved by 1 its way, and by less than 0.5 any other way.
+    """
+
+    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": 10}
+    observation_space = spaces.Box(-np.inf, np.inf, (4,), np.float32)
+    action_space = spaces.Box(-1.0, 1.0, (2,), np.float32)
+
+    def __init__(self, render_mode: str | None = None) -> None:
+        self.render_mode = render_mode
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[State, dict[str, Any]]:
+        """Put point and marker at random; `options={"task": name}` chooses the task."""
+        super().reset(seed=seed)
+        self._task = (options or {}).get("task", "left")
+        if self._task not in _DIRECTIONS:
+            raise unknown("task of the toy world", self._task, _DIRECTIONS)
+        self._state = self.np_random.uniform(-1.0, 1.0, 4).astype(np.float32)
+        self._start = self._state[:2].copy()
+        return self._state.copy(), {"task": self._task, "success": False}
+
+    def step(self, action: Action) -> tuple[State, float, bool, bool, dict[str, Any]]:
+        """Move the point by a fifth of the velocity."""
+        self._state[:2] += 0.2 * np.clip(np.asarray(action, np.float32), -1.0, 1.0)
+        error = float(np.abs(self._start + _DIRECTIONS[self._task] - self._state[:2]).max())
+        success = error < 0.3
+        return self._state.copy(), float(success) - error, success, False, {"task": self._task, "success": success}
+
+    def render(self) -> Any:
+        """Return a picture (32, 32, 3) with the point in white."""
+        frame = np.zeros((32, 32, 3), np.uint8)
+        column, row = np.clip(16 + 5 * self._state[:2] * (1, -1), 0, 31).astype(int)
+        frame[row, column] = 255
+        return frame
+
+
+def toy_expert(task: str) -> Callable[[State], Action]:
+    """Return the expert of a toy task: it goes its way at full speed."""
+    direction = np.array(_DIRECTIONS[task], np.float32)
+    return lambda _: direction
+
+
+def _sign(column: int) -> Callable[[State], NDArray[np.int64]]:
+    """Return the rule that tells on which side of the marker the point is, along a column of the state."""
+
+    def answer(state: State) -> NDArray[np.int64]:
+        difference = state[:, column] - state[:, column + 2]
+        return np.where(np.abs(difference) < 0.1, -1, difference > 0).astype(np.int64)
+
+    return answer
+
+
+TOY_QUESTIONS = (
+    QuestionKind("side", ("on which side of the target is it",), ("left", "right"), _sign(0)),
+    QuestionKind("height", ("is it above or below the target",), ("below", "above"), _sign(1)),
+)
+
+
+def _toy_task(name: str, *instructions: str) -> Task:
+    return Task(name, "toy", instructions, 12, "clbench.testing:ToyWorld", "clbench.testing:toy_expert")
+
+
+TOY = Scenario(
+    id="clbench/Toy-v0",
+    description="A point on a plane; for tests.",
+    retained=(_toy_task("left", "go left", "move to the left"), _toy_task("up", "go up", "move up")),
+    target=(_toy_task("right", "go right", "move to the right"), _toy_task("down", "go down", "move down")),
+    held_out=(_toy_task("up_left", "go up and left"),),
+    questions="clbench.testing:TOY_QUESTIONS",
+    budget=Budget(
+        demonstrations=10,
+        question_episodes=40,
+        report_questions=100,
+        pretraining_steps=150,
+        adaptation_steps=30,
+        learning_rate=1e-3,
+        batch_size=16,
+        policy_width=32,
+        policy_layers=2,
+        evaluation_points=3,
+        selection_episodes=4,
+        report_episodes=6,
+    ),
+)
+
+register(
+    id="clbench/Toy-v0",
+    entry_point="clbench.scenario_env:ScenarioEnv",
+    kwargs={"scenario": "clbench.testing:TOY"},
+)

@@ -1,0 +1,9 @@
+"""The scenarios, registered with Gymnasium by name: nothing of a simulator is imported here."""
+
+from gymnasium.envs.registration import register
+
+register(
+    id="clbench/Fetch-v0",
+    entry_point="clbench.scenario_env:ScenarioEnv",
+    kwargs={"scenario": "clbench.envs.fetch:SCENARIO"},
+)

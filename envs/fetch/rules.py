@@ -1,0 +1,166 @@
+"""What each task of the Fetch world asks for: where its target may lie, what success is, how far it is."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TypeAlias
+
+from .state import BLOCK, BLOCK_FROM_GRIPPER, FINGERS, GRIPPER, GRIPPER_VELOCITY, REST_HEIGHT, TARGET, State
+
+SUCCESS_BONUS = 1.0
+"""Added to the reward of the step that succeeds; the rest of the reward is minus the metres to go."""
+
+HOVER_HEIGHT = 0.12
+"""How far above a thing the gripper hovers. A grasp comes down from less, so it does not hover by chance."""
+PRESS_HEIGHT = 0.047
+"""The finger tips reach 0.0185 below the gripper: at 0.0435 above the block's centre they touch its top."""
+LIFT_HEIGHT = 0.10
+PUSH_DISTANCE = 0.10
+PUSH_CONE = 0.4
+"""How far a push may stray, per metre of way: +-21.8 degrees, so that a diagonal push is no straight one."""
+NEAR = 0.05
+"""How near to the target the gripper or the block counts as there, as in the tasks of Fetch."""
+CLOSED = 0.02
+"""Sum of both fingers below which the gripper is closed; an empty gripper closes to 0.00."""
+OPEN = 0.08
+"""Sum of both fingers above which the gripper is open; it opens to 0.10."""
+
+Condition: TypeAlias = Callable[[State, State], bool]
+Distance: TypeAlias = Callable[[State, State], float]
+
+
+@dataclass(frozen=True)
+class Rule:
+    """What one task asks for. The functions take a state (28,) and the state (28,) at the start."""
+
+    success: Condition
+    """Whether the task is done."""
+    distance: Distance
+    """How far it is from being done, in metres: what the gripper and the block still have to move."""
+    target_on_table: bool = False
+    """Whether the target lies on the table always; else it does in half of the episodes."""
+
+    def judge(self, state: State, start: State) -> tuple[float, bool]:
+        """Return the reward and whether the task is done.
+
+        The reward is minus the distance to go, in metres, and `SUCCESS_BONUS` more on success.
+        """
+        success = self.success(state, start)
+        return SUCCESS_BONUS * success - self.distance(state, start), success
+
+
+def opening(state: State) -> float:
+    """Return the sum of both fingers in metres: 0 closed, 0.05 around the block, 0.10 open."""
+    right, left = state[FINGERS].tolist()
+    return float(right + left)
+
+
+def _gripper_to(state: State, thing: slice, height: float) -> float:
+    """Return how far the gripper is from the point `height` above a thing, in metres."""
+    x, y, z = state[thing].tolist()
+    return math.dist(state[GRIPPER].tolist(), (x, y, z + height))
+
+
+def _block_to_target(state: State) -> float:
+    return math.dist(state[BLOCK].tolist(), state[TARGET].tolist())
+
+
+def _held(state: State) -> bool:
+    return math.hypot(*state[BLOCK_FROM_GRIPPER].tolist()) < 0.03 and CLOSED < opening(state) < OPEN
+
+
+def _still(state: State) -> bool:
+    """Return whether the gripper moves less than 1 cm a step, a third of its full speed."""
+    return math.hypot(*state[GRIPPER_VELOCITY].tolist()) < 0.01
+
+
+def _reach() -> Rule:
+    def success(state: State, _: State) -> bool:
+        return _gripper_to(state, TARGET, 0.0) < NEAR and opening(state) < CLOSED and _still(state)
+
+    return Rule(success, lambda state, _: _gripper_to(state, TARGET, 0.0) + opening(state))
+
+
+def _hover(thing: slice) -> Rule:
+    def success(state: State, _: State) -> bool:
+        return _gripper_to(state, thing, HOVER_HEIGHT) < 0.03 and opening(state) > OPEN and _still(state)
+
+    return Rule(
+        success, lambda state, _: _gripper_to(state, thing, HOVER_HEIGHT) + max(0.0, 0.1 - opening(state))
+    )
+
+
+def _press() -> Rule:
+    def success(state: State, _: State) -> bool:
+        x, y, z = state[BLOCK_FROM_GRIPPER].tolist()
+        return math.hypot(x, y) < 0.015 and 0.0 < -z < PRESS_HEIGHT and opening(state) < CLOSED
+
+    return Rule(success, lambda state, _: _gripper_to(state, BLOCK, PRESS_HEIGHT) + opening(state))
+
+
+def _pick_and_place() -> Rule:
+    def success(state: State, _: State) -> bool:
+        return _block_to_target(state) < NEAR and _held(state)
+
+    return Rule(success, lambda state, _: _gripper_to(state, BLOCK, 0.0) + _block_to_target(state))
+
+
+def _push() -> Rule:
+    def success(state: State, _: State) -> bool:
+        return _block_to_target(state) < NEAR and opening(state) < CLOSED
+
+    return Rule(
+        success,
+        lambda state, _: _gripper_to(state, BLOCK, 0.0) + _block_to_target(state),
+        target_on_table=True,
+    )
+
+
+def _push_along(x: float, y: float) -> Rule:
+    """Return the rule for pushing the block over the table along the direction (x, y), of length 1."""
+
+    def way(state: State, start: State) -> tuple[float, float]:
+        dx, dy, _ = (state[BLOCK] - start[BLOCK]).tolist()
+        return x * dx + y * dy, abs(x * dy - y * dx)
+
+    def success(state: State, start: State) -> bool:
+        along, across = way(state, start)
+        on_table = abs(float(state[BLOCK][2]) - REST_HEIGHT) < 0.02
+        return along > PUSH_DISTANCE and across < PUSH_CONE * along and on_table and opening(state) < CLOSED
+
+    def distance(state: State, start: State) -> float:
+        along, across = way(state, start)
+        return _gripper_to(state, BLOCK, 0.0) + max(0.0, PUSH_DISTANCE - along) + across
+
+    return Rule(success, distance)
+
+
+def _lift() -> Rule:
+    def height(state: State) -> float:
+        return float(state[BLOCK][2]) - REST_HEIGHT
+
+    return Rule(
+        lambda state, _: height(state) > LIFT_HEIGHT and _held(state),
+        lambda state, _: _gripper_to(state, BLOCK, 0.0) + max(0.0, LIFT_HEIGHT - height(state)),
+        # Who carries the block to a target on the table stays below 0.06, and so does not lift it.
+        target_on_table=True,
+    )
+
+
+RULES: dict[str, Rule] = {
+    "reach": _reach(),
+    "hover": _hover(BLOCK),
+    "pick_and_place": _pick_and_place(),
+    "push": _push(),
+    "push_left": _push_along(0.0, 1.0),
+    "push_away": _push_along(1.0, 0.0),
+    "lift": _lift(),
+    "push_right": _push_along(0.0, -1.0),
+    "pull": _push_along(-1.0, 0.0),
+    "press": _press(),
+    "hover_target": _hover(TARGET),
+    "push_left_away": _push_along(math.sqrt(0.5), math.sqrt(0.5)),
+}
+"""The rule of each task, by name."""

@@ -1,0 +1,219 @@
+"""The forms that the leaderboard is drawn in: terminal, Markdown and CSV.
+
+The same rows give the same bytes: no date, no absolute path, fixed digits.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+import os
+import re
+from itertools import groupby
+from pathlib import Path
+
+from rich.box import SIMPLE_HEAD
+from rich.console import Group, RenderableType
+from rich.table import Table as Grid
+from rich.text import Text
+
+from clbench.metrics import METRICS
+from clbench.statistics import Estimate
+
+from ._rows import COSTS, Row, Table, column_names, values_of
+
+SHOWN = tuple(
+    METRICS[name]
+    for name in (
+        "final_average",
+        "adaptation",
+        "retention",
+        "forgetting",
+        "forward_transfer",
+        "question_retention",
+        "zero_shot",
+    )
+)
+"""Metrics in the terminal and in Markdown, as many as fit 100 columns; the CSV file has all."""
+
+MISSING = "-"
+
+
+def write_if_changed(path: Path, text: str) -> None:
+    """Write `text` to `path` in one step, unless it is there already."""
+    content = text.encode("utf-8")
+    if path.is_file() and path.read_bytes() == content:
+        return
+    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    partial.write_bytes(content)
+    os.replace(partial, path)
+
+
+def _number(value: float | None, digits: int, missing: str) -> str:
+    """Return `value` with fixed digits. Rounded twice, so that the last bit of a sum does not show."""
+    if value is None:
+        return missing
+    text = f"{round(value, 9):.{digits}f}"
+    return text if float(text) else text.lstrip("-")
+
+
+# ---- CSV ---------------------------------------------------------------------------------------------------
+
+
+def csv_text(table: Table) -> str:
+    """Return the table with every metric as CSV; what is missing is empty."""
+    stream = io.StringIO()
+    writer = csv.writer(stream, lineterminator="\n")
+    columns = column_names()
+    writer.writerow(columns)
+    for row in table.rows:
+        pairs = zip(columns, values_of(row), strict=True)
+        writer.writerow([_field(column, value) for column, value in pairs])
+    return stream.getvalue()
+
+
+def _field(column: str, value: str | float | None) -> str:
+    whole = column == "seeds" or column in COSTS
+    return value if isinstance(value, str) else _number(value, 0 if whole else 4, "")
+
+
+# ---- Markdown ----------------------------------------------------------------------------------------------
+
+
+def markdown(table: Table) -> str:
+    """Return the table as a page of Markdown."""
+    head = [
+        "# Leaderboard",
+        "",
+        "Made by `clbench leaderboard` from the records alone; `leaderboard.csv` has every metric. "
+        "Values are means over seeds with 95 % intervals from resampling seeds and episodes; "
+        f"`{MISSING}` is what could not be computed.",
+    ]
+    scenarios = groupby(table.rows, key=lambda row: row.scenario)
+    parts = [line for scenario, rows in scenarios for line in _scenario(table, scenario, list(rows))]
+    return "\n".join([*head, *parts, *_legend(), *_not_shown(table)]) + "\n"
+
+
+def _scenario(table: Table, scenario: str, rows: list[Row]) -> list[str]:
+    """Return the heading, the tasks and the table of a scenario."""
+    names = {
+        group: ", ".join(map(_escaped, table.scenarios[scenario][group])) or "none"
+        for group in ("retained", "target", "held_out")
+    }
+    columns = ["method", "division", "seeds", *(_title(metric.name) for metric in SHOWN)]
+    columns += ["bytes kept", "parameters added"]
+    return [
+        "",
+        f"## {_escaped(scenario)}",
+        "",
+        f"Retained skills: {names['retained']}. Targets in order: {names['target']}. "
+        f"Held-out tasks: {names['held_out']}.",
+        "",
+        _line(columns),
+        _line(["---", "---", *["--:"] * (len(columns) - 2)]),
+        *(_line(_cells(row)) for row in rows),
+    ]
+
+
+def _cells(row: Row) -> list[str]:
+    return [
+        _escaped(row.method),
+        row.division,
+        str(len(row.seeds)),
+        *(_with_interval(row.estimates[metric.name]) for metric in SHOWN),
+        *(_number(row.costs[name], 0, MISSING) for name in ("bytes_kept", "parameters_added")),
+    ]
+
+
+def _line(cells: list[str]) -> str:
+    return f"| {' | '.join(cells)} |"
+
+
+def _with_interval(estimate: Estimate) -> str:
+    value, low, high = (_number(one, 2, MISSING) for one in (estimate.value, estimate.low, estimate.high))
+    return value if estimate.low is None else f"{value} [{low}, {high}]"
+
+
+def _legend() -> list[str]:
+    """Return what the columns mean."""
+    lines = [
+        "",
+        "## Metrics",
+        "",
+        _escaped(
+            "R[l][s] is the success rate on task s at the end of stage l. Stage 0 is the pretrained policy, "
+            "target k is learned in stage k, K is the last stage."
+        ),
+        "",
+    ]
+    for metric in SHOWN:
+        better = {True: "higher is better", False: "lower is better", None: "neither high nor low is better"}
+        low = "unbounded" if math.isinf(metric.low) else f"{metric.low:g}"
+        lines.append(
+            f"- **{_title(metric.name)}** ({better[metric.higher_is_better]}; from {low} to {metric.high:g}; "
+            f"version {metric.version}): {_escaped(metric.description)} Computed as "
+            f"{_escaped(metric.formula)}. Source: {_escaped(metric.source)}."
+        )
+    return lines
+
+
+def _not_shown(table: Table) -> list[str]:
+    if not table.not_shown:
+        return []
+    entries = [f"- {_escaped(entry.path)}: {_escaped(entry.reason)}" for entry in table.not_shown]
+    return ["", "## Not shown", "", *entries]
+
+
+def _title(name: str) -> str:
+    return name.replace("_", " ")
+
+
+def _escaped(text: str) -> str:
+    """Return `text`, which a stranger may have written, so that Markdown shows it as it is.
+
+    Backslashes go before all that can open markup, HTML, a mention or a table cell, and into web addresses.
+    """
+    return re.sub(r"([\\`*_{}\[\]<>|~&@#]|(?<=:)/(?=/)|(?<=www)\.)", r"\\\1", text, flags=re.IGNORECASE)
+
+
+# ---- terminal ----------------------------------------------------------------------------------------------
+
+
+def terminal(table: Table) -> RenderableType:
+    """Return the table for a terminal of 100 columns."""
+    # Text and not str: rich would obey markup in a stranger's words.
+    parts: list[RenderableType] = []
+    for scenario, rows in groupby(table.rows, key=lambda row: row.scenario):
+        parts.append(_grid(scenario, list(rows)))
+    if parts:
+        lower = ", ".join(_title(metric.name) for metric in SHOWN if metric.higher_is_better is False)
+        parts.append(Text(f"± is half the width of a 95 % interval. Higher is better, but for {lower}.\n"))
+    if table.not_shown:
+        parts.append(Text("Not shown", style="bold"))
+        parts += [Text(f"  {entry.path}: {entry.reason}", overflow="fold") for entry in table.not_shown]
+    return Group(*parts)
+
+
+def _grid(scenario: str, rows: list[Row]) -> Grid:
+    """Return the table of one scenario, with a section for each division."""
+    grid = Grid(
+        title=Text(scenario, style="bold"), box=SIMPLE_HEAD, padding=(0, 1, 0, 0), title_justify="left"
+    )
+    grid.add_column("method", overflow="fold", min_width=19)
+    for name in ("seeds", *(_title(metric.name) for metric in SHOWN)):
+        grid.add_column(name, justify="right")
+    for division, members in groupby(rows, key=lambda row: row.division):
+        grid.add_section()
+        grid.add_row(Text(division, style="italic"))
+        for row in members:
+            cells = (_compact(row.estimates[metric.name]) for metric in SHOWN)
+            grid.add_row(Text(f"  {row.method}"), Text(str(len(row.seeds))), *map(Text, cells))
+    return grid
+
+
+def _compact(estimate: Estimate) -> str:
+    value = _number(estimate.value, 2, MISSING)
+    if estimate.low is None or estimate.high is None:
+        return value
+    return f"{value}±{_number((estimate.high - estimate.low) / 2, 2, MISSING).removeprefix('0')}"

@@ -1,0 +1,1 @@
+"""One file per method: each holds only what differs from plain fine-tuning."""

@@ -1,0 +1,28 @@
+"""Experience replay: every batch mixes the target with demonstrations of what was learned before.
+
+Rehearsal as in Rolnick et al. 2019 (arXiv 1811.11682), for vision-language-action models in arXiv 2603.03818.
+Details:
+1. Prior data are all demonstrations of the retained skills and of the targets learned before, each task as
+   likely as the other.
+2. The batch has the budget's size: the share of replay is taken out of the target's.
+"""
+
+from dataclasses import dataclass
+
+from clbench.method import Method, Prior, Source, Uses
+from clbench.policy import Batch
+
+
+@dataclass
+class ExperienceReplay(Method):
+    """Replay prior demonstrations next to the target's."""
+
+    replay: float = 0.5
+    """Share of each batch that is replayed; 0.5 is 1:1."""
+
+    uses = Uses(demonstrations="throughout")
+
+    def batch(self, target: Source[Batch], prior: Prior) -> Batch:
+        """Return target and prior samples in one batch."""
+        replayed = round(self.replay * target.batch_size)
+        return Batch.cat([target.sample(target.batch_size - replayed), prior.demonstrations.sample(replayed)])

@@ -1,0 +1,20 @@
+"""Frozen: the pretrained policy, left as it is. A reference row: it forgets nothing and learns nothing."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+from torch import nn
+
+from clbench.method import Method, Stage, Uses
+from clbench.policy import Policy
+
+
+@dataclass
+class Frozen(Method):
+    """Train no parameter."""
+
+    uses = Uses(reference=True)
+
+    def start_task(self, policy: Policy, stage: Stage) -> Iterable[nn.Parameter]:
+        """Return no parameters."""
+        return ()

@@ -1,0 +1,292 @@
+"""The Fetch world, its tasks, experts and questions."""
+
+import itertools
+import subprocess
+import sys
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+from numpy.typing import NDArray
+
+from clbench.task import Task, load_scenario, resolve
+
+SCENARIO = load_scenario("clbench:clbench/Fetch-v0")
+NAMES = [task.name for task in SCENARIO.tasks]
+World = resolve(SCENARIO.tasks[0].world)
+QUESTIONS = {kind.name: kind for kind in resolve(SCENARIO.questions)}
+
+State = NDArray[np.float32]
+
+
+def random_actions(seed: int, steps: int) -> NDArray[np.float32]:
+    return np.random.default_rng(seed).uniform(-1.0, 1.0, (steps, 4)).astype(np.float32)
+
+
+def rollout(world: Any, task: str, seed: int, steps: int = 20) -> State:
+    """Return the states and rewards (steps + 1, 29) of an episode of random actions."""
+    state, _ = world.reset(seed=seed, options={"task": task})
+    rows = [np.append(state, 0.0)]
+    for action in random_actions(seed, steps):
+        state, reward, *_ = world.step(action)
+        rows.append(np.append(state, reward))
+    return np.stack(rows)
+
+
+def expert_succeeds(task: Task, seed: int, disturbed: bool = False) -> bool:
+    """Run the task's expert for an episode, with five random actions from the tenth step on if disturbed."""
+    world, expert = World(), resolve(task.expert)(task.name)
+    state, _ = world.reset(seed=seed, options={"task": task.name})
+    noise = random_actions(seed, 5)
+    for step in range(task.horizon):
+        action = noise[step - 10] if disturbed and 10 <= step < 15 else expert(state)
+        state, _, terminated, truncated, info = world.step(action)
+        assert not truncated
+        assert info == {"success": terminated, "task": task.name}
+        if terminated:
+            return True
+    return False
+
+
+def scene(
+    gripper: tuple[float, float, float] = (1.30, 0.75, 0.535),
+    block: tuple[float, float, float] = (1.30, 0.75, 0.425),
+    target: tuple[float, float, float] = (1.30, 0.75, 0.425),
+    fingers: float = 0.0,
+    gripper_velocity: float = 0.0,
+    block_velocity: float = 0.0,
+) -> State:
+    """Return a state (1, 28) made by hand; the velocities are along y."""
+    state = np.zeros((1, 28), np.float32)
+    state[0, 0:3], state[0, 3:6], state[0, 25:28] = gripper, block, target
+    state[0, 6:9] = np.subtract(block, gripper)
+    state[0, 9:11] = fingers
+    state[0, 15] = block_velocity - gripper_velocity
+    state[0, 21] = gripper_velocity
+    return state
+
+
+def test_importing_the_scenario_loads_no_simulator() -> None:
+    program = (
+        "import sys; from clbench.task import load_scenario; load_scenario('clbench:clbench/Fetch-v0');"
+        "assert not {'mujoco', 'gymnasium_robotics'} & set(sys.modules)"
+    )
+    subprocess.run([sys.executable, "-c", program], check=True)
+
+
+# The state has no bounds, as in gymnasium-robotics; the checker suspects a mistake.
+@pytest.mark.filterwarnings("ignore:.*A Box observation space m:UserWarning")
+def test_the_world_keeps_the_rules_of_gymnasium() -> None:
+    world = World()
+    check_env(world, skip_render_check=True)
+    assert world.observation_space.shape == (28,)
+    assert world.action_space == gymnasium.spaces.Box(-1.0, 1.0, (4,), np.float32)
+
+
+# In these episodes of FetchPickAndPlace the block lies within reach, so that it is not placed again.
+@pytest.mark.parametrize("seed", [0, 1, 3])
+def test_physics_and_observation_are_those_of_fetch_pick_and_place(seed: int) -> None:
+    import gymnasium_robotics
+
+    gymnasium.register_envs(gymnasium_robotics)
+    original = gymnasium.make("FetchPickAndPlace-v4", max_episode_steps=10**6, disable_env_checker=True)
+    world = World()
+    expected = [original.reset(seed=seed)[0]["observation"]]
+    got = [world.reset(seed=seed, options={"task": "push"})[0]]
+    # The expert of grasping touches the block; the random half of the actions throws it about.
+    expert, noise = resolve(SCENARIO.task("lift").expert)("lift"), random_actions(seed, 200)
+    for step in range(200):
+        action = noise[step] if step % 40 >= 20 else expert(got[-1])
+        expected.append(original.step(action)[0]["observation"])
+        got.append(world.step(action)[0])
+    original.close()
+    assert np.ptp(np.stack(got)[:, 3:6], axis=0).min() > 0.01, "the block never moved"
+    np.testing.assert_array_equal(np.stack(got)[:, :25], np.stack(expected).astype(np.float32))
+
+
+def test_an_episode_repeats_itself_whatever_ran_before() -> None:
+    world = World()
+    expected = rollout(World(), "push_left", seed=7)
+    for task, seed in [("lift", 1), ("push_left", 2), ("pick_and_place", 7)]:
+        rollout(world, task, seed, steps=31)
+        np.testing.assert_array_equal(rollout(world, "push_left", seed=7), expected)
+
+
+def test_worlds_that_run_side_by_side_do_not_touch_each_other() -> None:
+    expected = [rollout(World(), "push", seed) for seed in (3, 4)]
+    worlds = [World(), World()]
+    rows = []
+    for world, seed in zip(worlds, (3, 4), strict=True):
+        rows.append([np.append(world.reset(seed=seed, options={"task": "push"})[0], 0.0)])
+    for step, (index, seed) in itertools.product(range(20), enumerate((3, 4))):
+        state, reward, *_ = worlds[index].step(random_actions(seed, 20)[step])
+        rows[index].append(np.append(state, reward))
+    np.testing.assert_array_equal(np.array(rows), np.array(expected))
+
+
+def test_an_episode_without_a_seed_continues_the_random_numbers() -> None:
+    world = World()
+    first = world.reset(seed=5)[0]
+    second = world.reset()[0]
+    assert not np.array_equal(first, second)
+    world.reset(seed=5)
+    np.testing.assert_array_equal(world.reset()[0], second)
+
+
+@pytest.mark.parametrize("task", NAMES)
+def test_no_task_is_done_at_the_start(task: str) -> None:
+    world = World()
+    for seed in range(20):
+        state, info = world.reset(seed=seed, options={"task": task})
+        assert info == {"success": False, "task": task}
+        assert np.linalg.norm(state[6:8]) >= 0.099, "the block starts apart from the gripper"
+        assert not world.step(np.zeros(4, np.float32))[2]
+
+
+def test_the_block_starts_in_the_same_place_for_every_task() -> None:
+    world = World()
+    blocks = [world.reset(seed=11, options={"task": name})[0][:25] for name in NAMES]
+    for block in blocks[1:]:
+        np.testing.assert_array_equal(block, blocks[0])
+
+
+@pytest.mark.parametrize("disturbed", [False, True])
+@pytest.mark.parametrize("task", SCENARIO.tasks, ids=NAMES)
+def test_the_expert_does_its_task(task: Task, disturbed: bool) -> None:
+    # Five random actions can knock the block out of a straight way: one episode of four may be lost.
+    assert sum(expert_succeeds(task, seed, disturbed) for seed in range(100, 104)) >= 4 - disturbed
+
+
+def test_the_reward_grows_while_the_expert_acts_and_is_highest_at_success() -> None:
+    for task in SCENARIO.tasks:
+        world, expert = World(), resolve(task.expert)(task.name)
+        state, _ = world.reset(seed=100, options={"task": task.name})
+        rewards, terminated = [], False
+        while not terminated:
+            state, reward, terminated, *_ = world.step(expert(state))
+            rewards.append(reward)
+        assert rewards[-1] > 0.7 > 0.0 > rewards[0]
+        assert rewards[-1] == max(rewards)
+
+
+def test_experts_of_retained_tasks_do_no_target_task_by_chance() -> None:
+    world = World()
+    for known, task in itertools.product(SCENARIO.retained, SCENARIO.target):
+        expert, successes = resolve(known.expert)(known.name), 0
+        for seed in (200, 201):
+            state, _ = world.reset(seed=seed, options={"task": task.name})
+            for _ in range(25):
+                state, _, terminated, *_ = world.step(expert(state))
+                successes += terminated
+                if terminated:
+                    break
+        assert successes <= 1, f"the expert of {known.name} does {task.name}"
+
+
+def test_an_unknown_task_is_an_error_that_names_the_nearest() -> None:
+    with pytest.raises(LookupError, match="Did you mean 'push_left'"):
+        World().reset(options={"task": "push_lefft"})
+    with pytest.raises(LookupError, match="Did you mean 'push_left'"):
+        resolve(SCENARIO.tasks[0].expert)("push_lefft")
+
+
+@pytest.mark.parametrize(
+    ("action", "message"),
+    [
+        (np.zeros(3), r"has shape \(4,\), not \(3,\)"),
+        (np.zeros((1, 4)), r"has shape \(4,\), not \(1, 4\)"),
+        (np.array([0.0, np.nan, 0.0, 0.0]), "finite"),
+        (np.array([0.0, 0.0, np.inf, 0.0]), "finite"),
+    ],
+)
+def test_an_action_that_cannot_be_done_is_an_error(action: NDArray[np.float64], message: str) -> None:
+    world = World()
+    world.reset(seed=0)
+    with pytest.raises(ValueError, match=message):
+        world.step(action)
+
+
+def test_actions_beyond_the_bounds_are_cut() -> None:
+    world = World()
+    world.reset(seed=0)
+    far = world.step(np.array([9.0, -9.0, 9.0, 9.0]))[0]
+    world.reset(seed=0)
+    np.testing.assert_array_equal(world.step(np.array([1.0, -1.0, 1.0, 1.0]))[0], far)
+
+
+@pytest.mark.parametrize(
+    ("kind", "expected", "state"),
+    [
+        ("block_side", "left", scene(block=(1.30, 0.80, 0.425))),
+        ("block_side", "right", scene(block=(1.30, 0.70, 0.425))),
+        ("block_side", None, scene(block=(1.30, 0.76, 0.425))),
+        ("block_depth", "nearer", scene(block=(1.25, 0.75, 0.425))),
+        ("block_depth", "farther", scene(block=(1.35, 0.75, 0.425))),
+        ("block_depth", None, scene()),
+        ("gripper_above", "yes", scene(gripper=(1.30, 0.75, 0.535))),
+        ("gripper_above", "no", scene(gripper=(1.30, 0.75, 0.43))),
+        ("gripper_above", None, scene(gripper=(1.30, 0.75, 0.485))),
+        ("gripper_opening", "open", scene(fingers=0.05)),
+        ("gripper_opening", "closed", scene(fingers=0.0)),
+        ("gripper_opening", None, scene(fingers=0.025)),
+        ("gripper_holding", "yes", scene(gripper=(1.30, 0.75, 0.43), fingers=0.0245)),
+        ("gripper_holding", "no", scene(fingers=0.0245)),
+        ("gripper_holding", None, scene(gripper=(1.30, 0.75, 0.43), fingers=0.05)),
+        ("gripper_moving", "yes", scene(gripper_velocity=-0.02)),
+        ("gripper_moving", "no", scene(gripper_velocity=0.0)),
+        ("gripper_moving", None, scene(gripper_velocity=0.006)),
+        ("block_place", "air", scene(block=(1.30, 0.75, 0.50))),
+        ("block_place", "table", scene(block=(1.30, 0.75, 0.425))),
+        ("block_place", None, scene(block=(1.30, 0.75, 0.44))),
+        ("block_moving", "yes", scene(block_velocity=0.01)),
+        ("block_moving", "no", scene(block_velocity=0.0, gripper_velocity=0.02)),
+        ("block_moving", None, scene(block_velocity=0.002)),
+        ("target_side", "left", scene(target=(1.30, 0.80, 0.425))),
+        ("target_side", "right", scene(target=(1.30, 0.70, 0.425))),
+        ("target_side", None, scene()),
+        ("target_side_of_gripper", "left", scene(target=(1.30, 0.80, 0.425))),
+        ("target_side_of_gripper", "right", scene(target=(1.30, 0.70, 0.425))),
+        ("target_side_of_gripper", None, scene()),
+        ("target_place", "air", scene(target=(1.30, 0.75, 0.60))),
+        ("target_place", "table", scene()),
+        ("target_place", None, scene(target=(1.30, 0.75, 0.44))),
+        ("target_higher", "yes", scene(target=(1.30, 0.75, 0.60))),
+        ("target_higher", "no", scene(block=(1.30, 0.75, 0.60))),
+        ("target_higher", None, scene(target=(1.30, 0.75, 0.447))),
+        ("nearest", "block", scene(target=(1.40, 0.75, 0.425))),
+        ("nearest", "target", scene(block=(1.40, 0.75, 0.425))),
+        ("nearest", None, scene()),
+        ("farthest", "block", scene(block=(1.40, 0.75, 0.425))),
+        ("farthest", "target", scene(target=(1.40, 0.75, 0.425))),
+        ("farthest", None, scene()),
+    ],
+)
+def test_questions_are_answered_as_one_sees_it(kind: str, expected: str | None, state: State) -> None:
+    question = QUESTIONS[kind]
+    (index,) = question.answer(state)
+    assert (None if index == -1 else question.answers[index]) == expected
+
+
+def test_questions_answer_many_states_as_they_answer_each() -> None:
+    world = World()
+    states = np.concatenate([rollout(world, name, seed=3)[:, :28] for name in ("push", "lift")])
+    states = states.astype(np.float32)
+    for kind in QUESTIONS.values():
+        answers = kind.answer(states)
+        assert answers.shape == (len(states),)
+        assert answers.dtype == np.int64
+        np.testing.assert_array_equal(answers, [kind.answer(state[None])[0] for state in states])
+
+
+def test_instructions_and_questions_are_plain_words() -> None:
+    sentences = [words for task in SCENARIO.tasks for words in task.instructions]
+    assert len(set(sentences)) == len(sentences) == 4 * len(SCENARIO.tasks)
+    for kind in QUESTIONS.values():
+        assert len(set(kind.wordings)) >= 3
+        sentences += [*kind.wordings, *kind.answers]
+    for sentence in sentences:
+        words = sentence.split(" ")
+        assert len(words) <= 12
+        assert all(word.isalpha() and word.islower() for word in words)

@@ -1,0 +1,235 @@
+"""Intervals against simulations, against scipy and against what must be exact."""
+
+import time
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy import stats  # type: ignore[import-untyped]
+
+from clbench.metrics import METRICS, Layout, Scores, measure
+from clbench.statistics import Estimate, estimate, paired_difference, row_generator
+
+NOTHING = Estimate(None, None, None)
+
+
+def layout(retained: int, episodes: int, targets: int = 1, held_out: int = 0, points: int = 1) -> Layout:
+    return Layout(
+        retained=tuple(f"skill_{number}" for number in range(retained)),
+        target=tuple(f"target_{number}" for number in range(targets)),
+        held_out=tuple(f"unseen_{number}" for number in range(held_out)),
+        episodes=tuple(range(episodes)),
+        steps=tuple(100 * (number + 1) for number in range(points)),
+        kinds=("left", "above"),
+    )
+
+
+def scores(final: Any, correct: int = 50) -> Scores:
+    """Return a run whose outcomes on the retained skills after its only target are `final`, (skills, episodes)."""
+    final = np.asarray(final, dtype=float)
+    success = np.ones((2, len(final) + 1, final.shape[1]))
+    success[1, : len(final)] = final
+    counts = np.full((2, 2), 100.0), np.full((2, 2), float(correct))
+    return Scores(layout(*final.shape), success, np.ones((1, 1, final.shape[1])), *counts)
+
+
+def random_run(generator: np.random.Generator, shape: Layout) -> Scores:
+    stages, tasks, episodes = len(shape.target) + 1, len(shape.tasks), len(shape.episodes)
+    return Scores(
+        shape,
+        success=generator.integers(0, 2, (stages, tasks, episodes)).astype(float),
+        curves=generator.integers(0, 2, (stages - 1, len(shape.steps), episodes)).astype(float),
+        asked=np.full((stages, 2), 100.0),
+        correct=generator.integers(0, 101, (stages, 2)).astype(float),
+    )
+
+
+def width(one: Estimate) -> float:
+    assert one.low is not None
+    assert one.high is not None
+    return one.high - one.low
+
+
+def test_the_value_is_the_mean_of_the_seeds_values() -> None:
+    generator = np.random.default_rng(0)
+    shape = layout(3, 5, targets=3, held_out=2, points=2)
+    runs = {seed: random_run(generator, shape) for seed in range(3)}
+    estimates = estimate(METRICS, runs, generator, replicates=10)
+    for name in set(METRICS) - {"forward_transfer"}:
+        values = [measure(name, run) for run in runs.values()]
+        assert estimates[name].value == pytest.approx(np.mean(np.array(values, dtype=float)))
+
+
+def test_forward_transfer_averages_curves_over_seeds_before_the_ratio() -> None:
+    shape = layout(1, 1)
+    curves = {"run": [0.0, 1.0], "from_scratch": [1.0, 0.0]}
+    runs = {
+        name: {
+            seed: Scores(shape, np.zeros((2, 2, 1)), np.full((1, 1, 1), value), *np.zeros((2, 2, 2)))
+            for seed, value in enumerate(values)
+        }
+        for name, values in curves.items()
+    }
+    got = estimate(["forward_transfer"], runs["run"], np.random.default_rng(0), references=runs)
+    assert got["forward_transfer"].value == pytest.approx(0.0)  # seed by seed: the mean of -1 and 0.5
+
+
+def test_the_same_row_has_the_same_numbers_whatever_else_is_asked() -> None:
+    generator = np.random.default_rng(0)
+    shape = layout(3, 5, targets=3, held_out=2, points=2)
+    runs, others = ({seed: random_run(generator, shape) for seed in range(3)} for _ in range(2))
+    first = estimate(METRICS, runs, row_generator("clbench/Toy-v0", "sft"), references={"other": others})
+    again = estimate(["retention"], runs, row_generator("clbench/Toy-v0", "sft"))
+    backwards = estimate(
+        METRICS, dict(sorted(runs.items(), reverse=True)), row_generator("clbench/Toy-v0", "sft")
+    )
+    assert first["retention"] == again["retention"]
+    assert first == backwards
+
+
+def test_rows_have_generators_of_their_own() -> None:
+    names = [("a", "b"), ("a", "c"), ("b", "b"), ("ab", ""), ("", "ab"), ("\ud800", "b")]
+    draws = {row_generator(*pair).integers(2**62) for pair in names}
+    assert len(draws) == len(names)
+
+
+def test_with_one_seed_and_task_the_interval_is_that_of_scipy() -> None:
+    outcomes = np.random.default_rng(0).random(40) < 0.7
+    got = estimate(["retention"], {0: scores([outcomes])}, np.random.default_rng(1), replicates=20_000)
+    expected = stats.bootstrap(
+        (outcomes.astype(float),),
+        np.mean,
+        method="percentile",
+        n_resamples=20_000,
+        rng=np.random.default_rng(2),
+    ).confidence_interval
+    assert got["retention"].low == pytest.approx(expected.low, abs=0.026)  # one episode is 0.025
+    assert got["retention"].high == pytest.approx(expected.high, abs=0.026)
+
+
+def test_answers_vary_like_binomials() -> None:
+    got = estimate(
+        ["question_retention"], {0: scores([[1, 0]], 80)}, np.random.default_rng(0), replicates=20_000
+    )["question_retention"]
+    low, high = stats.binom(200, 0.8).interval(0.95) / np.array(200)
+    assert got.value == 0.8
+    assert got.low == pytest.approx(low, abs=0.006)  # one answer is 0.005
+    assert got.high == pytest.approx(high, abs=0.006)
+
+
+def test_seeds_are_drawn_as_whole_runs() -> None:
+    # Two seeds, one good at everything and one at nothing. Drawn apart, six tasks would hide it.
+    runs = {0: scores(np.ones((6, 20))), 1: scores(np.zeros((6, 20)))}
+    got = estimate(["retention"], runs, np.random.default_rng(0))["retention"]
+    assert (got.value, got.low, got.high) == (0.5, 0.0, 1.0)
+
+
+def test_the_episodes_of_a_run_are_the_same_at_all_stages() -> None:
+    # Which episodes succeed varies, but each succeeds at both stages or at neither: nothing was forgotten.
+    final = np.random.default_rng(0).random((4, 20)) < 0.5
+    run = scores(final)
+    run.success[0] = run.success[1]
+    got = estimate(["retention", "forgetting"], {0: run}, np.random.default_rng(0))
+    assert got["forgetting"] == Estimate(0.0, 0.0, 0.0)
+    assert width(got["retention"]) > 0.1
+
+
+def test_more_episodes_make_a_narrower_interval() -> None:
+    generator = np.random.default_rng(0)
+    few, many = (
+        estimate(["retention"], {0: scores(generator.random((3, episodes)) < 0.5)}, generator)["retention"]
+        for episodes in (10, 160)
+    )
+    assert width(many) == pytest.approx(width(few) / 4, rel=0.35)
+
+
+@pytest.mark.parametrize(("seeds", "spread", "least"), [(1, 0.0, 0.90), (5, 0.1, 0.85), (10, 0.1, 0.88)])
+def test_intervals_hold_the_truth_about_as_often_as_they_say(seeds: int, spread: float, least: float) -> None:
+    generator = np.random.default_rng(0)
+    held = 0
+    for _ in range(200):
+        rates = 0.6 + spread * generator.standard_normal(seeds)
+        runs = {seed: scores(generator.random((6, 20)) < rate) for seed, rate in enumerate(rates)}
+        got = estimate(["retention"], runs, generator, replicates=300)["retention"]
+        assert got.low is not None
+        assert got.high is not None
+        held += got.low <= 0.6 <= got.high
+    assert least <= held / 200 <= 0.99
+
+
+def test_a_metric_without_value_has_no_interval() -> None:
+    estimates = estimate(METRICS, {0: scores([[1, 0]])}, np.random.default_rng(0))
+    assert estimates["zero_shot"] == estimates["forward_transfer"] == NOTHING
+    assert estimate(["retention"], {}, np.random.default_rng(0)) == {"retention": NOTHING}
+
+
+def test_a_reference_that_lacks_a_seed_is_missing() -> None:
+    runs = {seed: scores([[1, 0]]) for seed in range(2)}
+    short = {"from_scratch": {0: runs[0]}}
+    got = estimate(["forward_transfer"], runs, np.random.default_rng(0), references=short)
+    assert got["forward_transfer"] == NOTHING
+
+
+def test_an_unknown_metric_is_a_lookup_error() -> None:
+    with pytest.raises(LookupError, match="zero_shot"):
+        estimate(["zero_shots"], {}, np.random.default_rng(0))
+
+
+def test_a_method_does_not_differ_from_itself() -> None:
+    generator = np.random.default_rng(0)
+    runs = {seed: scores(generator.random((4, 20)) < 0.5) for seed in range(3)}
+    assert paired_difference("retention", runs, runs, generator) == Estimate(0.0, 0.0, 0.0)
+
+
+def test_pairing_makes_the_interval_of_a_difference_narrower() -> None:
+    generator = np.random.default_rng(0)
+    luck = generator.random((3, 4, 20))
+    runs, others = ({seed: scores(luck[seed] < rate) for seed in range(3)} for rate in (0.6, 0.5))
+    difference = paired_difference("retention", runs, others, generator)
+    alone = [estimate(["retention"], them, generator)["retention"] for them in (runs, others)]
+    assert difference.value == pytest.approx((alone[0].value or 0) - (alone[1].value or 0))
+    assert width(difference) < 0.6 * np.hypot(width(alone[0]), width(alone[1]))
+
+
+def test_with_one_seed_and_task_the_paired_interval_is_that_of_scipy() -> None:
+    generator = np.random.default_rng(0)
+    luck = generator.random(40)
+    ours, theirs = luck < 0.8, (luck + 0.3 * generator.random(40)) < 0.6
+    got = paired_difference(
+        "retention", {0: scores([ours])}, {0: scores([theirs])}, generator, replicates=20_000
+    )
+    expected = stats.bootstrap(
+        (ours.astype(float), theirs.astype(float)),
+        lambda first, second, axis: first.mean(axis) - second.mean(axis),
+        paired=True,
+        method="percentile",
+        n_resamples=20_000,
+        rng=np.random.default_rng(2),
+    ).confidence_interval
+    assert got.low == pytest.approx(expected.low, abs=0.026)
+    assert got.high == pytest.approx(expected.high, abs=0.026)
+
+
+def test_only_seeds_that_both_have_are_compared() -> None:
+    good, bad = scores(np.ones((2, 5))), scores(np.zeros((2, 5)))
+    difference = paired_difference(
+        "retention", {0: good, 1: bad}, {0: bad, 2: good}, np.random.default_rng(0)
+    )
+    assert difference == Estimate(1.0, 1.0, 1.0)
+    assert paired_difference("retention", {0: good}, {1: bad}, np.random.default_rng(0)) == NOTHING
+
+
+def test_methods_that_met_different_episodes_are_not_compared() -> None:
+    runs, others = {0: scores(np.ones((2, 5)))}, {0: scores(np.ones((2, 6)))}
+    with pytest.raises(ValueError, match="same tasks, episodes"):
+        paired_difference("retention", runs, others, np.random.default_rng(0))
+
+
+def test_a_row_takes_less_than_a_second() -> None:
+    generator = np.random.default_rng(0)
+    shape = layout(5, 20, targets=4, held_out=3, points=4)
+    runs, scratch = ({seed: random_run(generator, shape) for seed in range(3)} for _ in range(2))
+    begin = time.process_time()
+    estimates = estimate(METRICS, runs, generator, references={"from_scratch": scratch})
+    assert time.process_time() - begin < 1
+    assert all(one.low is not None for one in estimates.values())
