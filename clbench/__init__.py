@@ -6,58 +6,85 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from clbench.evaluation import Episode, Evaluator
-    from clbench.method import Method, Prior, Progress, Source, Stage, Uses, load_method, method_names
-    from clbench.policy import Batch, Policy, PolicyConfig, QuestionBatch
-    from clbench.questions import QuestionKind
-    from clbench.record import Record, read_record
-    from clbench.run import RunSpec, execute
-    from clbench.scenario_env import ScenarioEnv
-    from clbench.task import Budget, Scenario, Task, load_scenario, scenario_ids
+    from clbench.evaluation import Episode as Episode
+    from clbench.evaluation import Evaluator as Evaluator
+    from clbench.method import Method as Method
+    from clbench.method import Prior as Prior
+    from clbench.method import Progress as Progress
+    from clbench.method import Source as Source
+    from clbench.method import Stage as Stage
+    from clbench.method import Uses as Uses
+    from clbench.method import load_method as load_method
+    from clbench.method import method_names as method_names
+    from clbench.policy import Batch as Batch
+    from clbench.policy import Policy as Policy
+    from clbench.policy import PolicyConfig as PolicyConfig
+    from clbench.policy import QuestionBatch as QuestionBatch
+    from clbench.questions import QuestionKind as QuestionKind
+    from clbench.record import Record as Record
+    from clbench.record import read_record as read_record
+    from clbench.run import RunSpec as RunSpec
+    from clbench.run import execute as execute
+    from clbench.scenario_env import ScenarioEnv as ScenarioEnv
+    from clbench.task import Budget as Budget
+    from clbench.task import Scenario as Scenario
+    from clbench.task import Task as Task
+    from clbench.task import load_scenario as load_scenario
+    from clbench.task import scenario_ids as scenario_ids
 
 __version__ = version("clbench")
 
 _HOMES = {
-    "Batch": "policy",
-    "Budget": "task",
-    "Episode": "evaluation",
-    "Evaluator": "evaluation",
-    "Method": "method",
-    "Policy": "policy",
-    "PolicyConfig": "policy",
-    "Prior": "method",
-    "Progress": "method",
-    "QuestionBatch": "policy",
-    "QuestionKind": "questions",
-    "Record": "record",
-    "RunSpec": "run",
-    "Scenario": "task",
-    "ScenarioEnv": "scenario_env",
-    "Source": "method",
-    "Stage": "method",
-    "Task": "task",
-    "Uses": "method",
-    "load_method": "method",
-    "load_scenario": "task",
-    "method_names": "method",
-    "read_record": "record",
-    "execute": "run",
-    "scenario_ids": "task",
+    "evaluation": ("Episode", "Evaluator"),
+    "method": ("Method", "Prior", "Progress", "Source", "Stage", "Uses", "load_method", "method_names"),
+    "policy": ("Batch", "Policy", "PolicyConfig", "QuestionBatch"),
+    "questions": ("QuestionKind",),
+    "record": ("Record", "read_record"),
+    "run": ("RunSpec", "execute"),
+    "scenario_env": ("ScenarioEnv",),
+    "task": ("Budget", "Scenario", "Task", "load_scenario", "scenario_ids"),
 }
-"""The front door: where each public name lives. They are imported when first used, so that
+"""The front door: in which module each public name lives. A name is imported when first used, so that
 `import clbench`, which registers the scenarios, costs no import of PyTorch or MuJoCo."""
 
-__all__ = sorted(_HOMES)  # noqa: PLE0605 - a list, made from the table above
+__all__ = [
+    "Batch",
+    "Budget",
+    "Episode",
+    "Evaluator",
+    "Method",
+    "Policy",
+    "PolicyConfig",
+    "Prior",
+    "Progress",
+    "QuestionBatch",
+    "QuestionKind",
+    "Record",
+    "RunSpec",
+    "Scenario",
+    "ScenarioEnv",
+    "Source",
+    "Stage",
+    "Task",
+    "Uses",
+    "execute",
+    "load_method",
+    "load_scenario",
+    "method_names",
+    "read_record",
+    "scenario_ids",
+]
 
 
 def __getattr__(name: str) -> Any:
-    if name not in _HOMES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(importlib.import_module(f"{__name__}.{_HOMES[name]}"), name)
+    for module, names in _HOMES.items():
+        if name in names:
+            return getattr(importlib.import_module(f"{__name__}.{module}"), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *_HOMES})
+    return sorted({*globals(), *__all__})
 
 
 # A wheel has envs/, methods/ and leaderboard/ inside this directory, a checkout beside it.

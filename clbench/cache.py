@@ -1,4 +1,4 @@
-"""The cache: what takes long is made once, and used again only if it is whole and made from the same inputs."""
+"""The cache: what takes long is made once, and used again if it is whole and made from the same inputs."""
 
 from __future__ import annotations
 
@@ -35,7 +35,8 @@ def source_hash(*modules: str) -> str:
     digest = hashlib.sha256()
     for module in modules:
         spec = importlib.util.find_spec(module)
-        assert spec is not None and spec.origin is not None, module
+        assert spec is not None, module
+        assert spec.origin is not None, module
         origin = Path(spec.origin)
         for path in sorted(origin.parent.iterdir()) if origin.name == "__init__.py" else [origin]:
             if path.is_file():
@@ -105,4 +106,6 @@ def _fault(folder: Path, key: str) -> str | None:
 
 def _file_hashes(folder: Path) -> dict[str, str]:
     paths = sorted(path for path in folder.rglob("*") if path.is_file() and path.name != _MANIFEST)
-    return {path.relative_to(folder).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest() for path in paths}
+    return {
+        path.relative_to(folder).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest() for path in paths
+    }

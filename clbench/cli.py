@@ -34,7 +34,12 @@ def main() -> None:
     try:
         app()
     except (LookupError, ValueError, TypeError) as error:
-        console.print(f"error: {error.args[0] if error.args else error}", style="bold red", highlight=False, markup=False)
+        console.print(
+            f"error: {error.args[0] if error.args else error}",
+            style="bold red",
+            highlight=False,
+            markup=False,
+        )
         sys.exit(2)
     except KeyboardInterrupt:
         console.print("Stopped. Finished records are kept; the same command goes on from here.", style="bold")
@@ -51,10 +56,9 @@ def list_() -> None:
     scenarios = Table(title="Scenarios", show_lines=True)
     for column in ("id", "retained", "target, in order", "held out"):
         scenarios.add_column(column, no_wrap=column == "id")
-    for id in scenario_ids():
-        scenario = load_scenario(id)
+    for scenario in map(load_scenario, scenario_ids()):
         groups = (scenario.retained, scenario.target, scenario.held_out)
-        scenarios.add_row(id, *(", ".join(task.name for task in group) for group in groups))
+        scenarios.add_row(scenario.id, *(", ".join(task.name for task in group) for group in groups))
     console.print(scenarios)
     methods = Table(title="Methods")
     for column in ("name", "prior demonstrations", "prior questions", "what it does"):
@@ -63,7 +67,7 @@ def list_() -> None:
         try:
             method = load_method(name)
             summary = (method.__doc__ or "").strip().partition("\n")[0]
-            row = (method.uses.demonstrations, method.uses.questions, summary)
+            row: tuple[str, str, str] = (method.uses.demonstrations, method.uses.questions, summary)
         except Exception as error:  # a plug-in that is broken must not hide the others
             row = ("?", "?", f"cannot be loaded: {error}")
         methods.add_row(name, *row)
@@ -107,7 +111,11 @@ def run(
     console = Console(stderr=True)
     sys.path.insert(0, os.getcwd())  # a console script lacks it, and module:Class is looked for there
     workers = (os.cpu_count() or 1) if workers is None else workers
-    for name, value, least in (("--seeds", seeds, 1), ("--first-seed", first_seed, 0), ("--workers", workers, 1)):
+    for name, value, least in (
+        ("--seeds", seeds, 1),
+        ("--first-seed", first_seed, 0),
+        ("--workers", workers, 1),
+    ):
         if value < least:
             raise ValueError(f"{name} must be at least {least}, not {value}.")
     if not methods:
@@ -130,9 +138,13 @@ def run(
     with Bars(sum(job.length for job in jobs), console) as bars:
         failed = run_jobs(jobs, workers, bars)
     seconds = time.monotonic() - begin
-    console.print(f"{len(missing)} runs in {seconds / 60:.1f} minutes; records in {records}.", highlight=False)
+    console.print(
+        f"{len(missing)} runs in {seconds / 60:.1f} minutes; records in {records}.", highlight=False
+    )
     if failed:
-        console.print(f"{len(failed)} failed: {', '.join(failed)}.", style="bold red", highlight=False, markup=False)
+        console.print(
+            f"{len(failed)} failed: {', '.join(failed)}.", style="bold red", highlight=False, markup=False
+        )
         sys.exit(1)
 
 

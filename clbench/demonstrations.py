@@ -93,7 +93,9 @@ def _action_bounds(world: World) -> tuple[NDArray[np.float32], NDArray[np.float3
     return world.action_space.low, world.action_space.high
 
 
-def collect(task: Task, budget: Budget, progress: Callable[[float], None] = lambda _: None) -> list[Demonstration]:
+def collect(
+    task: Task, budget: Budget, progress: Callable[[float], None] = lambda _: None
+) -> list[Demonstration]:
     """Return the successful expert episodes that a budget asks for; failed attempts are repeated.
 
     Raises:
@@ -133,7 +135,9 @@ def dataset_folder(task: Task, budget: Budget, progress: Callable[[float], None]
     }
     folder = get_dataset_path(task.dataset_id)
     _declare_namespaces(folder, task.dataset_id)
-    return cached(folder, inputs, lambda partial: _write(partial / "data", task, collect(task, budget, progress)))
+    return cached(
+        folder, inputs, lambda partial: _write(partial / "data", task, collect(task, budget, progress))
+    )
 
 
 def _declare_namespaces(folder: Path, dataset_id: str) -> None:
@@ -218,7 +222,9 @@ class Demonstrations:
     def of_task(cls, task: Task, episodes: Sequence[Demonstration], chunk: int) -> Demonstrations:
         """Return the episodes of one task, cut into chunks of `chunk` actions."""
         pieces = [_chunks(episode, chunk) for episode in episodes]
-        state, action, valid = (torch.from_numpy(np.concatenate(column)) for column in zip(*pieces, strict=True))
+        state, action, valid = (
+            torch.from_numpy(np.concatenate(column)) for column in zip(*pieces, strict=True)
+        )
         return cls(state, action, valid, encode(task.instructions)[None], torch.tensor([[0, len(state)]]))
 
     @classmethod

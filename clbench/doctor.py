@@ -36,12 +36,21 @@ def _packages() -> Table:
     for text in requires("clbench") or []:
         requirement = Requirement(text)
         extra = str(requirement.marker).partition("==")[2].strip(" \"'") if requirement.marker else ""
+        if extra == "dev":
+            continue
         try:
             found = version(requirement.name)
             fits = requirement.specifier.contains(found, prereleases=True)
-            verdict = "[green]fits[/]" if fits else f"[red]pip install '{requirement.name}{requirement.specifier}'[/]"
+            verdict = (
+                "[green]fits[/]"
+                if fits
+                else f"[red]pip install '{requirement.name}{requirement.specifier}'[/]"
+            )
         except PackageNotFoundError:
-            found, verdict = "-", f"pip install 'clbench[{extra}]'" if extra else "[red]pip install clbench[/]"
+            found, verdict = (
+                "-",
+                f"pip install 'clbench[{extra}]'" if extra else "[red]pip install clbench[/]",
+            )
         table.add_row(requirement.name, found, str(requirement.specifier), verdict)
     return table
 
@@ -50,10 +59,14 @@ def _machine() -> Table:
     table = Table(title="Machine", show_header=False)
     table.add_row("python", sys.version.split()[0])
     table.add_row("cores", f"{os.cpu_count()} ({torch.get_num_threads()} threads in PyTorch; a run uses one)")
-    table.add_row("cuda", torch.cuda.get_device_name() if torch.cuda.is_available() else "no (none is needed)")
+    table.add_row(
+        "cuda", torch.cuda.get_device_name() if torch.cuda.is_available() else "no (none is needed)"
+    )
     for back_end, packages in _DEBIAN_PACKAGES.items():
         works = _renders(back_end)
-        table.add_row(f"rendering: {back_end}", "works" if works else f"does not work; apt-get install {packages}")
+        table.add_row(
+            f"rendering: {back_end}", "works" if works else f"does not work; apt-get install {packages}"
+        )
     chosen = os.environ.get("MUJOCO_GL", "unset; films and pictures need one of the above, scores do not")
     table.add_row("MUJOCO_GL", chosen)
     table.add_row("cache", _folder(cache_folder(), "CLBENCH_CACHE"))
@@ -63,7 +76,7 @@ def _machine() -> Table:
 
 
 def _renders(back_end: str) -> bool:
-    """Return whether MuJoCo can make a context: tried in a process of its own, since a failure may be fatal."""
+    """Return whether MuJoCo can make a context; tried in a process of its own, as a failure may kill it."""
     environment = {**os.environ, "MUJOCO_GL": back_end}
     try:
         command = [sys.executable, "-c", _RENDER]

@@ -175,5 +175,6 @@ def answer(
         right.append(word[: LANES - padding] == questions.answer[rows])
     correct = torch.cat(right)
     return [
-        (entry.name, int((kind == index).sum()), int(correct[kind == index].sum())) for index, entry in enumerate(kinds)
+        (entry.name, int((kind == index).sum()), int(correct[kind == index].sum()))
+        for index, entry in enumerate(kinds)
     ]

@@ -64,7 +64,9 @@ def _commit() -> dict[str, Any] | None:
         head = subprocess.run([*git, "rev-parse", "HEAD"], capture_output=True, text=True, check=True)
         # records and the table are what runs make: they do not change what the next run computes
         code = ["clbench", "envs", "methods", "pyproject.toml", "constraints.txt"]
-        changed = subprocess.run([*git, "status", "--porcelain", "--", *code], capture_output=True, text=True, check=True)
+        changed = subprocess.run(
+            [*git, "status", "--porcelain", "--", *code], capture_output=True, text=True, check=True
+        )
     except (OSError, subprocess.CalledProcessError):
         return None
     return {"id": head.stdout.strip(), "dirty": bool(changed.stdout.strip())}

@@ -139,7 +139,7 @@ def _work(connection: Connection, function: str, arguments: dict[str, Any]) -> N
         connection.send(("failed", f"{type(error).__name__}: {error}\n{traceback.format_exc()}"))
 
 
-# ---- the jobs of a benchmark ---------------------------------------------------------------------------------
+# ---- the jobs of a benchmark -----------------------------------------------------------------------
 
 
 def collect_job(scenario: str, task: str, progress: Callable[[float], None]) -> str:
@@ -153,10 +153,14 @@ def collect_job(scenario: str, task: str, progress: Callable[[float], None]) -> 
 
 def scenes_job(scenario: str, progress: Callable[[float], None]) -> str:
     """Collect the states that questions are asked about, unless they are in the cache."""
-    from clbench.questions import load_questions
+    from clbench.questions import load_questions, scenes_folder
 
-    train, report = load_questions(load_scenario(scenario))
-    return f"{len(train.kinds)} kinds of questions, {len(train.scenes)} states and {len(report.scenes)} for the report"
+    loaded = load_scenario(scenario)
+    scenes_folder(loaded, progress)
+    train, report = load_questions(loaded)
+    return (
+        f"{len(train.kinds)} kinds about {len(train.scenes)} states, and {len(report.scenes)} for the report"
+    )
 
 
 def pretrain_job(scenario: str, seed: int, progress: Callable[[float], None]) -> str:
@@ -179,7 +183,9 @@ def demonstration_jobs(scenario: str, tasks: Sequence[str]) -> list[Job]:
     """Return the jobs that collect the demonstrations of `tasks`."""
     length = load_scenario(scenario).budget.demonstrations
     return [
-        Job(f"demonstrations {task}", "clbench.grid:collect_job", {"scenario": scenario, "task": task}, length)
+        Job(
+            f"demonstrations {task}", "clbench.grid:collect_job", {"scenario": scenario, "task": task}, length
+        )
         for task in tasks
     ]
 

@@ -1,11 +1,10 @@
-"""The method: seven seams around a loop that is ours. A method file holds only what differs from fine-tuning."""
+"""The method: seams around a loop that is ours. A method file holds only what differs from fine-tuning."""
 
 from __future__ import annotations
 
 import dataclasses
 import difflib
 import importlib
-from abc import ABC
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from importlib.metadata import EntryPoint, entry_points
@@ -20,6 +19,7 @@ from clbench.task import Task
 Access = Literal["never", "prepare", "throughout"]
 State = dict[str, Tensor | str | float | int | bool | None]
 Rows = TypeVar("Rows", Batch, QuestionBatch)
+Drawn = TypeVar("Drawn", Batch, QuestionBatch, covariant=True)
 
 
 @dataclass(frozen=True)
@@ -38,13 +38,15 @@ class UndeclaredAccessError(RuntimeError):
     """A method touched prior data that its `uses` does not declare."""
 
 
-class _Samples(Protocol[Rows]):
+class Samples(Protocol[Drawn]):
     """Data that can be drawn from."""
 
-    def sample(self, count: int, generator: torch.Generator) -> Rows: ...
+    def sample(self, count: int, generator: torch.Generator) -> Drawn:
+        """Return `count` samples."""
 
     @property
-    def bytes(self) -> int: ...
+    def bytes(self) -> int:
+        """Memory that the data takes."""
 
 
 class Source(Generic[Rows]):
@@ -58,16 +60,17 @@ class Source(Generic[Rows]):
     """
 
     def __init__(
-        self, data: _Samples[Rows], generator: torch.Generator, batch_size: int, device: str = "cpu"
+        self, data: Samples[Rows], generator: torch.Generator, batch_size: int, device: str = "cpu"
     ) -> None:
-        self.data = data
+        self.data: Samples[Rows] = data
         self.batch_size = batch_size
         self._generator = generator
         self._device = device
 
     def sample(self, count: int) -> Rows:
         """Return `count` samples."""
-        return self.data.sample(count, self._generator).to(self._device)
+        rows: Rows = self.data.sample(count, self._generator).to(self._device)
+        return rows
 
 
 @dataclass(frozen=True)
@@ -123,7 +126,7 @@ class Progress:
     """Optimiser steps of the whole stage."""
 
 
-class Method(ABC):
+class Method:
     """A rule for fine-tuning: a dataclass whose fields are its hyper-parameters.
 
     The constructor only stores; what a method learns is set by the seams. Override what differs from plain
@@ -236,7 +239,9 @@ def build_method(spec: str, changes: Mapping[str, Any]) -> Method:
         if name not in fields:
             near = difflib.get_close_matches(name, fields, n=1)
             hint = f" Did you mean {near[0]!r}?" if near else ""
-            raise LookupError(f"{spec} has no hyper-parameter {name!r}.{hint} It has: {', '.join(fields) or 'none'}.")
+            raise LookupError(
+                f"{spec} has no hyper-parameter {name!r}.{hint} It has: {', '.join(fields) or 'none'}."
+            )
         values[name] = _like(fields[name].default, value, name)
     return cls(**values)
 

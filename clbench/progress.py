@@ -68,7 +68,9 @@ class Bars:
             share = min(1.0, self._done / self._total)
             left = (now - self._started) * (1 - share) / share
             names = ", ".join(self._bars)
-            self.console.print(f"{share:4.0%}, about {_minutes(left)} left: {names}", highlight=False, markup=False)
+            self.console.print(
+                f"{share:4.0%}, about {_minutes(left)} left: {names}", highlight=False, markup=False
+            )
 
     def finish(self, name: str, text: str) -> None:
         """Take a piece away and say what came of it."""

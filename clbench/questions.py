@@ -48,12 +48,16 @@ def scenes_folder(scenario: Scenario) -> Path:
         "tasks": [task.name for task in scenario.retained],
         "episodes": scenario.budget.question_episodes,
         "source": source_hash(
-            "clbench.demonstrations", __name__, *sorted({package_of(task.world) for task in scenario.retained})
+            "clbench.demonstrations",
+            __name__,
+            *sorted({package_of(task.world) for task in scenario.retained}),
         ),
         "versions": {package: version(package) for package in SIMULATORS},
     }
     folder = cache_folder() / "scenes" / hash_of(inputs)
-    return cached(folder, inputs, lambda partial: save_file(_scenes(scenario), partial / "scenes.safetensors"))
+    return cached(
+        folder, inputs, lambda partial: save_file(_scenes(scenario), partial / "scenes.safetensors")
+    )
 
 
 def _scenes(scenario: Scenario) -> dict[str, Tensor]:

@@ -163,7 +163,9 @@ class _Run:
         self._report(number, budget.adaptation_steps, self.scenario.tasks)
         evaluating += time.perf_counter() - paused
         self.record.costs["optimiser_steps"] += steps
-        self.record.timing["stages"].append({"training": round(training, 2), "evaluation": round(evaluating, 2)})
+        self.record.timing["stages"].append(
+            {"training": round(training, 2), "evaluation": round(evaluating, 2)}
+        )
 
     def _source(self, name: str, number: int, data: Any) -> Source[Any]:
         """Return data with its own random stream: what one source draws does not move another's draws."""
@@ -212,7 +214,10 @@ class _Run:
             },
             scenario={
                 "id": scenario.id,
-                **{group: [task.name for task in getattr(scenario, group)] for group in ("retained", "target", "held_out")},
+                **{
+                    group: [task.name for task in getattr(scenario, group)]
+                    for group in ("retained", "target", "held_out")
+                },
                 "budget": dataclasses.asdict(scenario.budget),
             },
             costs={"optimiser_steps": 0, "parameters": parameters},
@@ -269,7 +274,9 @@ class _Run:
                 self.method.load_state(state)
                 timing = self.record.timing
                 self.record = read_record(folder / "record.json")
-                self.record.timing.update({**timing, "stages": self.record.timing["stages"], "resumed_after": number})
+                self.record.timing.update(
+                    {**timing, "stages": self.record.timing["stages"], "resumed_after": number}
+                )
                 self.progress(number * run_length(self.scenario) / len(self.scenario.target))
                 return number
         return None
@@ -297,5 +304,3 @@ def _append(columns: dict[str, list[Any]], row: tuple[Any, ...]) -> None:
 def _hash_of_policy(folder: Path) -> str:
     manifest = json.loads((folder / "clbench.json").read_text(encoding="utf-8"))
     return str(manifest["files"]["policy.safetensors"][:16])
-
-

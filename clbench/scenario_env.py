@@ -34,10 +34,10 @@ class ScenarioEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         scenario: The sequence, or its entry point "module:attribute".
         instruction: How the observation gives the instruction.
         episodes_per_stage: Episodes after which `reset()` goes on to the next stage.
-        render_mode: "rgb_array", "human" or None; handed to the worlds.
+        render_mode: "rgb_array" or None; handed to the worlds.
     """
 
-    metadata: dict[str, Any] = {"render_modes": ["rgb_array", "human"], "render_fps": 25}  # noqa: RUF012
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 25}  # noqa: RUF012
 
     def __init__(
         self,
@@ -118,7 +118,9 @@ class ScenarioEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
             self._episode += 1
         self._stage = min(self._episode // self._episodes_per_stage, stages)
         retained = self.scenario.retained
-        self._task = self.scenario.target[self._stage - 1] if self._stage else retained[self._episode % len(retained)]
+        self._task = (
+            self.scenario.target[self._stage - 1] if self._stage else retained[self._episode % len(retained)]
+        )
 
     def _stage_of(self, task: Task) -> int:
         """Return the stage that trains a task; 0 for retained and held-out ones."""

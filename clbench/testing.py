@@ -7,7 +7,7 @@ as `clbench/Toy-v0`, or ask for "clbench.testing:clbench/Toy-v0".
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, ClassVar
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -36,14 +36,16 @@ class ToyWorld(gymnasium.Env[State, Action]):
     A task is done when the point has moved by 1 its way, and by less than 0.5 any other way.
     """
 
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": 10}
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012
     observation_space = spaces.Box(-np.inf, np.inf, (4,), np.float32)
     action_space = spaces.Box(-1.0, 1.0, (2,), np.float32)
 
     def __init__(self, render_mode: str | None = None) -> None:
         self.render_mode = render_mode
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[State, dict[str, Any]]:
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[State, dict[str, Any]]:
         """Put point and marker at random; `options={"task": name}` chooses the task."""
         super().reset(seed=seed)
         self._task = (options or {}).get("task", "left")
@@ -58,7 +60,13 @@ class ToyWorld(gymnasium.Env[State, Action]):
         self._state[:2] += 0.2 * np.clip(np.asarray(action, np.float32), -1.0, 1.0)
         error = float(np.abs(self._start + _DIRECTIONS[self._task] - self._state[:2]).max())
         success = error < 0.3
-        return self._state.copy(), float(success) - error, success, False, {"task": self._task, "success": success}
+        return (
+            self._state.copy(),
+            float(success) - error,
+            success,
+            False,
+            {"task": self._task, "success": success},
+        )
 
     def render(self) -> Any:
         """Return a picture (32, 32, 3) with the point in white."""

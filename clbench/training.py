@@ -75,7 +75,7 @@ def optimise(
     Raises:
         MethodError: The loss is not a finite scalar with a gradient.
     """
-    groups = list(parameters)
+    groups: list[Any] = list(parameters)
     if not groups:
         for step in range(steps):
             after(step + 1)
@@ -100,7 +100,9 @@ def _check_loss(loss: Any, step: int) -> None:
     if not isinstance(loss, Tensor):
         raise MethodError(f"step {step}: loss must be a tensor, not {type(loss).__name__}.")
     if loss.shape != ():
-        raise MethodError(f"step {step}: loss must be a scalar, shape (), not {tuple(loss.shape)}; take its mean.")
+        raise MethodError(
+            f"step {step}: loss must be a scalar, shape (), not {tuple(loss.shape)}; take its mean."
+        )
     if not torch.isfinite(loss):
         raise MethodError(f"step {step}: loss is {loss.item()}, not finite.")
     if not loss.requires_grad:
@@ -167,7 +169,9 @@ def policy_config(scenario: Scenario) -> PolicyConfig:
 
 def _pretrain(scenario: Scenario, seed: int, progress: Callable[[float], None]) -> Policy:
     config, budget = policy_config(scenario), scenario.budget
-    demonstrations = Demonstrations.cat([load_demonstrations(task, scenario, config) for task in scenario.retained])
+    demonstrations = Demonstrations.cat(
+        [load_demonstrations(task, scenario, config) for task in scenario.retained]
+    )
     questions, _ = load_questions(scenario)
     policy = Policy(config, seed=derive_seed("weights", seed))
     policy.normalise_like(demonstrations.state, demonstrations.action[:, 0])
@@ -231,5 +235,3 @@ def evaluation_steps(budget: Budget) -> list[int]:
     """Return after how many optimiser steps of a stage the target is evaluated; the last is its end."""
     points = min(budget.evaluation_points, budget.adaptation_steps)
     return [round((point + 1) * budget.adaptation_steps / points) for point in range(points)]
-
-

@@ -200,7 +200,7 @@ def _grid(scenario: str, rows: list[Row]) -> Grid:
     grid = Grid(
         title=Text(scenario, style="bold"), box=SIMPLE_HEAD, padding=(0, 1, 0, 0), title_justify="left"
     )
-    grid.add_column("method", overflow="fold", min_width=19)
+    grid.add_column("method", overflow="fold", min_width=20)
     for name in ("seeds", *(_title(metric.name) for metric in SHOWN)):
         grid.add_column(name, justify="right")
     for division, members in groupby(rows, key=lambda row: row.division):

@@ -19,7 +19,7 @@ class Joint(Method):
     uses = Uses(demonstrations="throughout", questions="throughout", reference=True)
 
     def batch(self, target: Source[Batch], prior: Prior) -> tuple[Batch, QuestionBatch]:
-        """Return a full batch each of the target and of prior demonstrations, and half a batch of questions."""
+        """Return a full batch of the target, one of prior demonstrations, and half a one of questions."""
         size = target.batch_size
         both = Batch.cat([target.sample(size), prior.demonstrations.sample(size)])
         return both, prior.questions.sample(size // 2)

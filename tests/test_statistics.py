@@ -25,7 +25,7 @@ def layout(retained: int, episodes: int, targets: int = 1, held_out: int = 0, po
 
 
 def scores(final: Any, correct: int = 50) -> Scores:
-    """Return a run whose outcomes on the retained skills after its only target are `final`, (skills, episodes)."""
+    """Return a run whose outcomes on the skills after its only target are `final`, (skills, episodes)."""
     final = np.asarray(final, dtype=float)
     success = np.ones((2, len(final) + 1, final.shape[1]))
     success[1, : len(final)] = final

@@ -24,7 +24,9 @@ class Attention(nn.Module):
         batch, length, width = tokens.shape
         query = self.query(tokens).view(batch, length, self.heads, -1).transpose(1, 2)
         key, value = self.key_value(memory).view(batch, memory.shape[1], 2, self.heads, -1).unbind(2)
-        mixed = F.scaled_dot_product_attention(query, key.transpose(1, 2), value.transpose(1, 2), attn_mask=mask)
+        mixed = F.scaled_dot_product_attention(
+            query, key.transpose(1, 2), value.transpose(1, 2), attn_mask=mask
+        )
         return cast(Tensor, self.out(mixed.transpose(1, 2).reshape(batch, length, width)))
 
 
@@ -52,7 +54,9 @@ class Backbone(nn.Module):
 
     observation_tokens = 4
 
-    def __init__(self, state_size: int, vocabulary_size: int, text_length: int, width: int, layers: int, heads: int):
+    def __init__(
+        self, state_size: int, vocabulary_size: int, text_length: int, width: int, layers: int, heads: int
+    ):
         super().__init__()
         self.observation = nn.Linear(state_size, self.observation_tokens * width)
         self.words = nn.Embedding(vocabulary_size, width)

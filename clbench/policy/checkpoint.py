@@ -20,15 +20,20 @@ class CheckpointError(ValueError):
 def save_policy(policy: Policy, folder: Path) -> None:
     """Write `policy.safetensors` and `policy.json` to `folder`."""
     folder.mkdir(parents=True, exist_ok=True)
-    save_file({name: value.contiguous() for name, value in policy.state_dict().items()}, folder / "policy.safetensors")
-    (folder / "policy.json").write_text(json.dumps(dataclasses.asdict(policy.config), indent=1), encoding="utf-8")
+    save_file(
+        {name: value.contiguous() for name, value in policy.state_dict().items()},
+        folder / "policy.safetensors",
+    )
+    (folder / "policy.json").write_text(
+        json.dumps(dataclasses.asdict(policy.config), indent=1), encoding="utf-8"
+    )
 
 
 def load_policy(folder: Path) -> Policy:
     """Read the policy that `save_policy` wrote to `folder`.
 
     Raises:
-        CheckpointError: A file is missing or torn, or its tensors do not have the shapes that its config says.
+        CheckpointError: A file is missing or torn, or its tensors do not have the shapes that it says.
     """
     try:
         config = PolicyConfig(**json.loads((folder / "policy.json").read_text(encoding="utf-8")))

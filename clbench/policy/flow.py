@@ -21,7 +21,9 @@ class FlowHead(nn.Module):
 
     time_features = 32
 
-    def __init__(self, action_size: int, chunk: int, width: int, layers: int, heads: int, euler_steps: int) -> None:
+    def __init__(
+        self, action_size: int, chunk: int, width: int, layers: int, heads: int, euler_steps: int
+    ) -> None:
         super().__init__()
         self.euler_steps = euler_steps
         self.embed = nn.Linear(action_size, width)
@@ -32,7 +34,9 @@ class FlowHead(nn.Module):
 
     def velocity(self, noisy: Tensor, time: Tensor, hidden: list[Tensor], mask: Tensor) -> Tensor:
         """Return the velocity (B, H, A) at the noisy chunk (B, H, A) and flow time (B,)."""
-        frequency = torch.exp(torch.linspace(0.0, math.log(1000.0), self.time_features // 2, device=noisy.device))
+        frequency = torch.exp(
+            torch.linspace(0.0, math.log(1000.0), self.time_features // 2, device=noisy.device)
+        )
         angle = time[:, None] * frequency
         clock = self.time(torch.cat([angle.sin(), angle.cos()], dim=1))
         tokens = self.embed(noisy) + self.position + clock[:, None]

@@ -29,7 +29,7 @@ def vocabulary() -> tuple[str, ...]:
 
 @cache
 def _tokenizer() -> Tokenizer:
-    ids = {word: id for id, word in enumerate(vocabulary())}
+    ids = {word: number for number, word in enumerate(vocabulary())}
     tokenizer = Tokenizer(models.WordLevel(ids, unk_token=PADDING))
     tokenizer.normalizer = normalizers.Sequence([normalizers.NFKC(), normalizers.Lowercase()])
     tokenizer.pre_tokenizer = pre_tokenizers.Sequence(
@@ -49,8 +49,8 @@ def encode(texts: Sequence[str]) -> torch.Tensor:
     rows = []
     for text, encoding in zip(texts, tokenizer.encode_batch(list(texts)), strict=True):
         words = [text[start:end] for start, end in encoding.offsets if end > start]
-        for word, id in zip(words, encoding.ids, strict=False):
-            if id == 0:
+        for word, number in zip(words, encoding.ids, strict=False):
+            if number == 0:
                 near = difflib.get_close_matches(word.lower(), vocabulary(), n=1)
                 hint = f" Did you mean {near[0]!r}?" if near else ""
                 raise UnknownWordError(f"The word {word!r} in {text!r} is not in the vocabulary.{hint}")

@@ -58,10 +58,20 @@ class Policy(nn.Module):
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
             self.backbone = Backbone(
-                config.state_size, config.vocabulary_size, TEXT_LENGTH, config.width, config.layers, config.heads
+                config.state_size,
+                config.vocabulary_size,
+                TEXT_LENGTH,
+                config.width,
+                config.layers,
+                config.heads,
             )
             self.head = FlowHead(
-                config.action_size, config.chunk, config.width, config.layers, config.heads, config.euler_steps
+                config.action_size,
+                config.chunk,
+                config.width,
+                config.layers,
+                config.heads,
+                config.euler_steps,
             )
         for name, size in (("state", config.state_size), ("action", config.action_size)):
             self.register_buffer(f"{name}_mean", torch.zeros(size))
@@ -75,7 +85,7 @@ class Policy(nn.Module):
             getattr(self, f"{name}_std").copy_(values.std(dim=0, correction=0).clamp(min=1e-2))
 
     def hidden_states(self, state: Tensor, words: Tensor) -> list[Tensor]:
-        """Return the hidden state (B, P, W) of every backbone layer for states (B, S) and words (B, L)."""
+        """Return the hidden state (B, P, W) of every backbone layer, of states (B, S), words (B, L)."""
         normalised = ((state - self.state_mean) / self.state_std).clamp(-10, 10)
         return cast(list[Tensor], self.backbone(normalised, words))
 

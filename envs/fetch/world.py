@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
+import io
 from dataclasses import dataclass
 from typing import Any
 
 import gymnasium
-import mujoco  # type: ignore[import-untyped]
+import mujoco
 import numpy as np
 from gymnasium.envs.mujoco.mujoco_rendering import MujocoRenderer
-from gymnasium_robotics.envs.fetch.fetch_env import DEFAULT_CAMERA_CONFIG
-from gymnasium_robotics.envs.fetch.pick_and_place import MujocoFetchPickAndPlaceEnv
-from gymnasium_robotics.utils.rotations import mat2euler
 from numpy.typing import NDArray
 
 from clbench.task import unknown
@@ -32,6 +31,12 @@ from .state import (
     TARGET,
     State,
 )
+
+# Else each worker prints a notice about Adroit's hand, which is not used here.
+with contextlib.redirect_stderr(io.StringIO()):
+    from gymnasium_robotics.envs.fetch.fetch_env import DEFAULT_CAMERA_CONFIG
+    from gymnasium_robotics.envs.fetch.pick_and_place import MujocoFetchPickAndPlaceEnv
+    from gymnasium_robotics.utils.rotations import mat2euler
 
 REACH_AWAY = 0.09
 """How far in front of the gripper the block may start: else a push away would end beside the table."""

@@ -1,0 +1,364 @@
+"""The leaderboard: the same records give the same bytes, and no file can hide another."""
+
+import importlib
+import itertools
+import json
+import os
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cyclopts
+import numpy as np
+import pandas
+import pytest
+
+from clbench.metrics import METRICS
+from clbench.record import Record, record_path, write_record
+from clbench.task import resolve
+
+MATRIX = [[1.0, 0.8, 0.1, 0.0, 0.2], [0.6, 0.9, 0.9, 0.2, 0.3], [0.5, 0.4, 0.3, 0.8, 0.1]]
+ANSWERS = {(stage, kind): (50, 45 - 10 * stage) for stage in range(3) for kind in ("left", "above")}
+REFERENCE = {"demonstrations": "never", "questions": "never", "reference": True}
+REPLAY = {"demonstrations": "throughout", "questions": "never", "reference": False}
+ASKS = {"demonstrations": "never", "questions": "prepare", "reference": False}
+
+
+def load(records: Path) -> pandas.DataFrame:
+    frame = importlib.import_module("clbench.leaderboard").load(records)
+    assert isinstance(frame, pandas.DataFrame)
+    return frame
+
+
+@pytest.fixture
+def add(make_record: Callable[..., Record], tmp_path: Path) -> Callable[..., Path]:
+    """Return a function that adds a record to the folder and returns its path; `edit` changes it before."""
+
+    def add(
+        method: str = "sft",
+        seed: int = 0,
+        matrix: Any = MATRIX,
+        edit: Callable[[Record], None] | None = None,
+        place: str | None = None,
+        **run: Any,
+    ) -> Path:
+        curves = np.full((2, 3), 0.4)
+        record = make_record(matrix, curves=curves, answers=ANSWERS, method=method, seed=seed, **run)
+        if edit:
+            edit(record)
+        records = tmp_path / "leaderboard" / "records"
+        path = records / place if place else record_path(records, record.run["scenario"], method, seed)
+        write_record(record, path)
+        return path
+
+    return add
+
+
+@pytest.fixture
+def records(add: Callable[..., Path], tmp_path: Path) -> Path:
+    """Return a folder with the records of four methods."""
+    for seed in range(2):
+        add("sft", seed)
+        add("replay", seed, np.clip(np.array(MATRIX) + 0.3, 0, 1), uses=REPLAY)
+        add("asks", seed, uses=ASKS)
+        add("from_scratch", seed, uses=REFERENCE)
+    return tmp_path / "leaderboard" / "records"
+
+
+@pytest.fixture
+def shown(records: Path, capsys: pytest.CaptureFixture[str]) -> Callable[[], tuple[str, str]]:
+    """Return a function that shows the leaderboard and returns what is printed and the Markdown."""
+
+    def shown() -> tuple[str, str]:
+        resolve("clbench.leaderboard.cli:show")(records=records)
+        return capsys.readouterr().out, (records.parent / "LEADERBOARD.md").read_text(encoding="utf-8")
+
+    return shown
+
+
+def flat(text: str) -> str:
+    """Return `text` without the line breaks of the terminal and the backslashes of Markdown."""
+    return " ".join(text.replace("\\", "").split())
+
+
+def test_there_is_one_row_for_each_method_sorted_by_division_and_final_average(
+    records: Path, add: Callable[..., Path]
+) -> None:
+    add("better", 0, np.ones((3, 5)))
+    frame = load(records)
+    assert list(frame.method) == ["better", "sft", "asks", "replay", "from_scratch"]
+    assert list(frame.division) == [
+        "prior-data-free",
+        "prior-data-free",
+        "prior questions",
+        "prior demonstrations",
+        "reference",
+    ]
+    assert list(frame.seeds) == [1, 2, 2, 2, 2]
+
+
+def test_a_row_has_every_metric_with_its_interval_and_the_costs(records: Path) -> None:
+    row = load(records).set_index("method").loc["sft"]
+    assert row.retention == pytest.approx(0.45)
+    assert row.forgetting == pytest.approx(1.6 / 3)
+    assert row.question_retention == pytest.approx(0.5)
+    assert row.steps == 800
+    assert row.parameters == 1000
+    for name in METRICS:
+        assert row[f"{name}_low"] <= row[name] <= row[f"{name}_high"]
+
+
+def test_without_from_scratch_forward_transfer_is_missing(records: Path) -> None:
+    assert load(records).set_index("method").forward_transfer.notna().sum() == 3
+    record_path(records, "clbench/Toy-v0", "from_scratch", 1).unlink()
+    assert load(records).forward_transfer.isna().all()
+
+
+def test_a_row_does_not_depend_on_the_other_rows(records: Path, add: Callable[..., Path]) -> None:
+    before = load(records).set_index("method").loc["sft"]
+    add("another", 0)
+    add("sft", 0, scenario="clbench/Other-v0")
+    frame = load(records)
+    after = frame[frame.scenario == "clbench/Toy-v0"].set_index("method").loc["sft"]
+    assert before.equals(after)
+
+
+def test_showing_twice_changes_no_byte_and_writes_no_file_again(
+    records: Path, shown: Callable[[], tuple[str, str]]
+) -> None:
+    (records / "torn.json").write_text("{", encoding="utf-8")
+    first = shown()
+    files = [records.parent / name for name in ("LEADERBOARD.md", "leaderboard.csv")]
+    stamps = [(path.read_bytes(), path.stat().st_mtime_ns, path.stat().st_ino) for path in files]
+    assert shown() == first
+    assert [(path.read_bytes(), path.stat().st_mtime_ns, path.stat().st_ino) for path in files] == stamps
+    assert sorted(os.listdir(records.parent)) == ["LEADERBOARD.md", "leaderboard.csv", "records"]
+
+
+def test_the_files_do_not_depend_on_where_the_records_lie(
+    records: Path, shown: Callable[[], tuple[str, str]], tmp_path: Path
+) -> None:
+    (records / "folder.json").mkdir()
+    (records / "torn.json").write_text("{", encoding="utf-8")
+    _, here = shown()
+    table = (records.parent / "leaderboard.csv").read_bytes()
+    (tmp_path / "elsewhere").mkdir()
+    moved = records.rename(tmp_path / "elsewhere" / "records")
+    resolve("clbench.leaderboard.cli:show")(records=moved)
+    assert (moved.parent / "LEADERBOARD.md").read_text(encoding="utf-8") == here
+    assert (moved.parent / "leaderboard.csv").read_bytes() == table
+    assert str(tmp_path) not in here
+
+
+def test_the_markdown_has_values_with_intervals_and_says_what_they_are(
+    shown: Callable[[], tuple[str, str]],
+) -> None:
+    _, page = shown()
+    row = next(line for line in page.splitlines() if line.startswith("| sft |"))
+    assert "| prior-data-free | 2 | 0.50 [0." in row
+    assert "**forgetting** (lower is better" in page
+    assert "## clbench/Toy-v0" in page
+    assert "Not shown" not in page
+    assert len({line.count("|") for line in page.splitlines() if line.startswith("|")}) == 1
+
+
+def test_what_is_missing_is_a_dash_in_markdown_and_empty_in_csv(
+    records: Path, shown: Callable[[], tuple[str, str]]
+) -> None:
+    _, page = shown()
+    assert " | - | " in next(line for line in page.splitlines() if line.startswith("| from\\_scratch |"))
+    frame = pandas.read_csv(records.parent / "leaderboard.csv")
+    assert frame.set_index("method").forward_transfer.isna().to_dict() == {
+        "sft": False,
+        "asks": False,
+        "replay": False,
+        "from_scratch": True,
+    }
+
+
+def test_the_csv_file_is_the_data_frame(records: Path, shown: Callable[[], tuple[str, str]]) -> None:
+    shown()
+    written = pandas.read_csv(records.parent / "leaderboard.csv")
+    pandas.testing.assert_frame_equal(written, load(records), check_dtype=False, atol=6e-5, rtol=0)
+
+
+def test_the_terminal_shows_all_rows_in_100_columns(
+    add: Callable[..., Path], shown: Callable[[], tuple[str, str]]
+) -> None:
+    add("experience_replay", 0)
+    printed, _ = shown()
+    assert max(map(len, printed.splitlines())) <= 100
+    for word in ("experience_replay", "from_scratch", "prior demonstrations", "reference", "0.45±."):
+        assert word in printed
+
+
+def set_in(name: str, key: str, value: Any) -> Callable[[Record], None]:
+    return lambda record: getattr(record, name).__setitem__(key, value)
+
+
+def fail(record: Record) -> None:
+    record.status = "failed"
+    record.error = {"where": "loss", "type": "ValueError", "message": "no | [bold]way\n", "traceback": ""}
+
+
+def drop_seed(record: Record) -> None:
+    del record.run["seed"]
+
+
+def cut_answers(record: Record) -> None:
+    record.answers = {name: column[:-1] for name, column in record.answers.items()}
+    record.answers["kind"][-1] = "right"
+
+
+@pytest.mark.parametrize(
+    ("edit", "reason"),
+    [
+        (fail, "the run failed (loss: ValueError: no | [bold]way"),
+        (set_in("run", "changes", {"strength": 2}), "settings were changed: strength"),
+        (set_in("run", "changes", 5), "changes is missing or malformed"),
+        (set_in("run", "method", "[red]x[/red] | `y` | <b>"), "cannot be the name of a method"),
+        (set_in("run", "method", "x\n| best | 1.00 |"), "cannot be the name of a method"),
+        (set_in("run", "method", "\x1b[31mred\u202e\ud800"), "cannot be the name of a method"),
+        (set_in("run", "method", None), "cannot be the name of a method"),
+        (set_in("run", "scenario", "../Toy\n"), "cannot be the id of a scenario"),
+        (set_in("run", "scenario", "clbench/Toy-v9"), "was run"),
+        (set_in("run", "seed", "0"), "cannot be a seed"),
+        (set_in("run", "uses", {}), "uses must say"),
+        (drop_seed, "seed is missing"),
+        (set_in("scenario", "retained", "all"), "retained must be a list"),
+        (
+            set_in("scenario", "budget", {"adaptation_steps": 9, "report_episodes": 20}),
+            "budget (adaptation_steps)",
+        ),
+        (set_in("scenario", "target", ["target_1", "target_0"]), "target differ"),
+        (set_in("fingerprint", "rollouts", {"toy:world": "4567"}), "rollouts of toy:world differ"),
+        (set_in("fingerprint", "rollouts", None), "rollouts of all worlds differ"),
+        (set_in("episodes", "success", [0.5]), "different lengths"),
+        (cut_answers, "kinds differ"),
+        (set_in("run", "settings", {"strength": 2}), "settings are not those of most seeds: strength"),
+    ],
+)
+def test_a_record_that_cannot_be_a_row_is_listed_with_its_reason_and_hides_no_other(
+    edit: Callable[[Record], None],
+    reason: str,
+    records: Path,
+    add: Callable[..., Path],
+    shown: Callable[[], tuple[str, str]],
+) -> None:
+    before = load(records)
+    add("sft", 2, edit=edit, place="stranger/record.json")
+    pandas.testing.assert_frame_equal(load(records), before)
+    for text in shown():
+        assert f"stranger/record.json: {reason}" in flat(text) or reason in flat(text)
+        assert "Not shown" in text
+        assert "\x1b" not in text
+        assert "\n| best" not in text
+
+
+@pytest.mark.parametrize("content", ["", "{", "[]", '{"a": 1}', '{"schema": 99}', "[" * 99_999, "\x00"])
+def test_a_file_that_is_no_record_is_listed_and_hides_no_other(
+    content: str, records: Path, shown: Callable[[], tuple[str, str]]
+) -> None:
+    before = load(records)
+    (records / "a_torn_*file*.json").write_text(content, encoding="utf-8")
+    pandas.testing.assert_frame_equal(load(records), before)
+    printed, page = shown()
+    assert "a_torn_*file*.json: " in printed
+    assert r"a\_torn\_\*file\*.json: " in page
+
+
+def test_a_file_name_with_control_characters_is_shown_without_them(
+    records: Path, shown: Callable[[], tuple[str, str]]
+) -> None:
+    (records / "x\n## y\x1b[31m.json").write_text("{", encoding="utf-8")
+    (records / os.fsdecode(b"\xff.json")).write_text("{", encoding="utf-8")
+    for text in shown():
+        assert "\x1b" not in text
+        assert "\n## y" not in text
+
+
+def test_the_same_run_twice_is_shown_from_its_own_place(
+    records: Path, add: Callable[..., Path], shown: Callable[[], tuple[str, str]]
+) -> None:
+    before = load(records)
+    add("sft", 1, np.ones((3, 5)), place="a/copy.json")
+    pandas.testing.assert_frame_equal(load(records), before)
+    for text in shown():
+        assert "a/copy.json: the same run as Toy-v0/sft/seed-1.json" in flat(text)
+
+
+def test_web_addresses_of_strangers_are_no_links(
+    add: Callable[..., Path], shown: Callable[[], tuple[str, str]]
+) -> None:
+    add("sft", 7, edit=set_in("run", "changes", {"https://x.example www.x.example": 1}))
+    _, page = shown()
+    assert "://" not in page
+    assert "www." not in page
+
+
+def test_any_damage_to_a_record_ends_in_a_row_or_a_reason(
+    make_record: Callable[..., Record], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    records = tmp_path / "records"
+    write_record(make_record([[1.0, 0.0], [0.5, 1.0]], groups=(1, 1, 0), episodes=2), records / "whole.json")
+    whole = json.loads((records / "whole.json").read_text(encoding="utf-8"))
+    damages: tuple[Any, ...] = (None, -1, 1e999, "x", [None], {"x": []}, 10**300)
+    places = [
+        (field, key)
+        for field, values in whole.items()
+        for key in (None, *(values or ()))
+        if field != "schema"
+    ]
+    for number, (damage, (field, key)) in enumerate(itertools.product(damages, places)):
+        damaged = json.loads(json.dumps(whole))
+        damaged["run"]["method"] = f"damaged_{number}"
+        if key is None:
+            damaged[field] = damage
+        else:
+            damaged[field][key] = damage
+        text = json.dumps(damaged).replace("Infinity", "1e999")
+        (records / f"{number}.json").write_text(text, encoding="utf-8")
+    rows = load(records)
+    resolve("clbench.leaderboard.cli:show")(records=records)
+    listed = re.findall(r"^  \d+\.json: ", capsys.readouterr().out, re.MULTILINE)
+    assert "sft" in set(rows.method)
+    assert len(rows) + len(listed) == 1 + len(damages) * len(places)
+
+
+def test_a_folder_without_rows_lists_why(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "records").mkdir()
+    (tmp_path / "records" / "torn.json").write_text("{", encoding="utf-8")
+    resolve("clbench.leaderboard.cli:show")(records=tmp_path / "records")
+    assert "torn.json: cannot be read as JSON" in capsys.readouterr().out
+    assert load(tmp_path / "records").empty
+    assert "retention_low" in load(tmp_path / "records")
+
+
+@pytest.mark.parametrize("exists", [True, False])
+def test_without_records_the_command_says_what_to_run(
+    exists: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "records"
+    if exists:
+        folder.mkdir()
+    with pytest.raises(SystemExit) as exit_info:
+        resolve("clbench.leaderboard.cli:show")(records=folder)
+    assert exit_info.value.code == 2
+    captured = capsys.readouterr()
+    assert not captured.out
+    assert str(folder) in captured.err
+    assert "clbench run clbench/Fetch-v0 sft" in captured.err
+    assert not (tmp_path / "LEADERBOARD.md").exists()
+
+
+def test_loading_a_folder_that_is_not_there_is_an_error(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match="nowhere"):
+        load(tmp_path / "nowhere")
+
+
+def test_the_command_takes_the_folder_as_an_option(records: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    app = cyclopts.App(result_action="return_value")
+    app.command(resolve("clbench.leaderboard.cli:show"), name="leaderboard")
+    app(["leaderboard", "--records", str(records)])
+    assert "from_scratch" in capsys.readouterr().out
