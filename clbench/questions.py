@@ -37,7 +37,7 @@ class QuestionKind:
     """Maps states (N, S) to the index of the right answer (N,), or -1 where it is too close to tell."""
 
 
-def scenes_folder(scenario: Scenario) -> Path:
+def scenes_folder(scenario: Scenario, progress: Callable[[float], None] = lambda _: None) -> Path:
     """Return the folder of the states that questions are asked about; they are collected on first use.
 
     The states come from disturbed expert episodes of the retained tasks, and are split by episode into
@@ -55,12 +55,14 @@ def scenes_folder(scenario: Scenario) -> Path:
         "versions": {package: version(package) for package in SIMULATORS},
     }
     folder = cache_folder() / "scenes" / hash_of(inputs)
-    return cached(
-        folder, inputs, lambda partial: save_file(_scenes(scenario), partial / "scenes.safetensors")
-    )
+
+    def make(partial: Path) -> None:
+        save_file(_scenes(scenario, progress), partial / "scenes.safetensors")
+
+    return cached(folder, inputs, make)
 
 
-def _scenes(scenario: Scenario) -> dict[str, Tensor]:
+def _scenes(scenario: Scenario, progress: Callable[[float], None]) -> dict[str, Tensor]:
     worlds: dict[str, World] = {}
     scenes = {}
     count = scenario.budget.question_episodes
@@ -72,6 +74,7 @@ def _scenes(scenario: Scenario) -> dict[str, Tensor]:
                 worlds[task.world] = resolve(task.world)()
             seed = derive_seed("scene", scenario.id, split, number)
             states.append(demonstrate(worlds[task.world], task, seed, disturb=True).state)
+            progress(1)
         scenes[split] = torch.from_numpy(np.concatenate(states))
     for world in worlds.values():
         world.close()
@@ -139,6 +142,6 @@ def load_questions(scenario: Scenario) -> tuple[Questions, Questions]:
 
 
 def report_questions(questions: Questions, count: int) -> tuple[Tensor, QuestionBatch]:
-    """Return the kinds (count,) and the questions that every report asks: the same for all methods and seeds."""
+    """Return the kinds (count,) and the questions of every report: the same for all methods and seeds."""
     kind = torch.arange(count) % len(questions.kinds)
     return kind, questions.ask(kind, torch_generator("report questions"))

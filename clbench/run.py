@@ -233,7 +233,7 @@ class _Run:
         kept = self._prior(len(self.scenario.target), ("throughout",)).bytes
         self.record.costs["bytes_kept"] = kept + sum(tensor.nbytes for tensor in tensors)
 
-    # ---- checkpoints -------------------------------------------------------------------------------------------
+    # ---- checkpoints -------------------------------------------------------------------------------
 
     def _inputs(self, number: int) -> dict[str, Any]:
         """Return all that the state after stage `number` depends on."""

@@ -145,20 +145,23 @@ def scenario_ids() -> list[str]:
     """Return the Gymnasium ids of all registered scenarios, sorted."""
     import gymnasium
 
-    return sorted(id for id, spec in gymnasium.registry.items() if "scenario" in (spec.kwargs or {}))
+    return sorted(name for name, spec in gymnasium.registry.items() if "scenario" in (spec.kwargs or {}))
 
 
-def load_scenario(id: str) -> Scenario:
-    """Return the scenario registered with Gymnasium as `id`; "module:id" imports `module` first.
+def load_scenario(scenario_id: str) -> Scenario:
+    """Return the scenario registered with Gymnasium under this id; "module:id" imports `module` first.
 
     Raises:
         LookupError: Nothing is registered under this id, or what is registered is no scenario.
     """
     import gymnasium
 
-    module, _, name = id.rpartition(":")
+    module, _, name = scenario_id.rpartition(":")
     if module:
-        importlib.import_module(module)
+        try:
+            importlib.import_module(module)
+        except ModuleNotFoundError as error:
+            raise LookupError(f"No module {error.name!r} can be imported for {scenario_id!r}.") from error
     if name not in gymnasium.registry or "scenario" not in (gymnasium.registry[name].kwargs or {}):
         raise unknown("scenario", name, scenario_ids())
     scenario = resolve(gymnasium.registry[name].kwargs["scenario"])

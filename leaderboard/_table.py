@@ -38,6 +38,7 @@ SHOWN = tuple(
 """Metrics in the terminal and in Markdown, as many as fit 100 columns; the CSV file has all."""
 
 MISSING = "-"
+"""What stands for a value that could not be computed."""
 
 
 def write_if_changed(path: Path, text: str) -> None:
@@ -50,12 +51,12 @@ def write_if_changed(path: Path, text: str) -> None:
     os.replace(partial, path)
 
 
-def _number(value: float | None, digits: int, missing: str) -> str:
-    """Return `value` with fixed digits. Rounded twice, so that the last bit of a sum does not show."""
+def _number(value: float | None, form: str, missing: str = MISSING) -> str:
+    """Return `value` in the format `form`. Rounded twice, so that the last bit of a sum does not show."""
     if value is None:
         return missing
-    text = f"{round(value, 9):.{digits}f}"
-    return text if float(text) else text.lstrip("-")
+    text = format(round(value, 9), form)
+    return text if text.strip("-0.") else text.lstrip("-")
 
 
 # ---- CSV ---------------------------------------------------------------------------------------------------
@@ -75,7 +76,7 @@ def csv_text(table: Table) -> str:
 
 def _field(column: str, value: str | float | None) -> str:
     whole = column == "seeds" or column in COSTS
-    return value if isinstance(value, str) else _number(value, 0 if whole else 4, "")
+    return value if isinstance(value, str) else _number(value, ".0f" if whole else ".4f", "")
 
 
 # ---- Markdown ----------------------------------------------------------------------------------------------
@@ -122,7 +123,7 @@ def _cells(row: Row) -> list[str]:
         row.division,
         str(len(row.seeds)),
         *(_with_interval(row.estimates[metric.name]) for metric in SHOWN),
-        *(_number(row.costs[name], 0, MISSING) for name in ("bytes_kept", "parameters_added")),
+        *(_number(row.costs[name], ",.0f") for name in ("bytes_kept", "parameters_added")),
     ]
 
 
@@ -131,7 +132,7 @@ def _line(cells: list[str]) -> str:
 
 
 def _with_interval(estimate: Estimate) -> str:
-    value, low, high = (_number(one, 2, MISSING) for one in (estimate.value, estimate.low, estimate.high))
+    value, low, high = (_number(one, ".2f") for one in (estimate.value, estimate.low, estimate.high))
     return value if estimate.low is None else f"{value} [{low}, {high}]"
 
 
@@ -197,9 +198,7 @@ def terminal(table: Table) -> RenderableType:
 
 def _grid(scenario: str, rows: list[Row]) -> Grid:
     """Return the table of one scenario, with a section for each division."""
-    grid = Grid(
-        title=Text(scenario, style="bold"), box=SIMPLE_HEAD, padding=(0, 1, 0, 0), title_justify="left"
-    )
+    grid = Grid(title=Text(scenario, style="bold"), box=SIMPLE_HEAD, padding=0, title_justify="left")
     grid.add_column("method", overflow="fold", min_width=20)
     for name in ("seeds", *(_title(metric.name) for metric in SHOWN)):
         grid.add_column(name, justify="right")
@@ -213,7 +212,8 @@ def _grid(scenario: str, rows: list[Row]) -> Grid:
 
 
 def _compact(estimate: Estimate) -> str:
-    value = _number(estimate.value, 2, MISSING)
+    value = _number(estimate.value, ".2f")
     if estimate.low is None or estimate.high is None:
         return value
-    return f"{value}±{_number((estimate.high - estimate.low) / 2, 2, MISSING).removeprefix('0')}"
+    half = _number((estimate.high - estimate.low) / 2, ".2f")
+    return f"{value}±{half.removeprefix('0')}"

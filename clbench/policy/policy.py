@@ -81,7 +81,7 @@ class Policy(nn.Module):
         """Set the normalisation to the mean and deviation of states (N, S) and actions (N, A)."""
         for name, values in (("state", state), ("action", action)):
             getattr(self, f"{name}_mean").copy_(values.mean(dim=0))
-            # 1e-2 (a centimetre, a hundredth of the action range) keeps what hardly varies from being blown up
+            # at least 1e-2, a centimetre or a hundredth of the actions: what hardly varies stays small
             getattr(self, f"{name}_std").copy_(values.std(dim=0, correction=0).clamp(min=1e-2))
 
     def hidden_states(self, state: Tensor, words: Tensor) -> list[Tensor]:
@@ -90,7 +90,7 @@ class Policy(nn.Module):
         return cast(list[Tensor], self.backbone(normalised, words))
 
     def action_loss(self, batch: Batch, hidden: list[Tensor] | None = None) -> Tensor:
-        """Return the action head's loss of each sample, (B,).
+        """Return the head's loss of each sample, (B,).
 
         Args:
             batch: What to learn.
