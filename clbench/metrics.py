@@ -420,7 +420,8 @@ def backward_transfer(rates: Rates) -> Array:
 
 @metric(
     formula="mean over the targets of (A - B) / (1 - B); A is the area under the learning curve divided by "
-    "the stage's steps, B the same for a policy that learns the target from scratch",
+    "the stage's steps, B the same for a policy that learns the target from scratch; the curve starts with "
+    "R[k-1][k], the one from scratch with 0",
     source="Continual World, arXiv 2105.10919 (FT)",
     low=-math.inf,
     units="share of the area that learning from scratch leaves",

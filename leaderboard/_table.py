@@ -21,7 +21,7 @@ from rich.text import Text
 from clbench.metrics import METRICS
 from clbench.statistics import Estimate
 
-from ._rows import COSTS, Row, Table, column_names, values_of
+from ._rows import COSTS, Row, Table, column_names, printable, values_of
 
 SHOWN = tuple(
     METRICS[name]
@@ -88,8 +88,8 @@ def markdown(table: Table) -> str:
         "# Leaderboard",
         "",
         "Made by `clbench leaderboard` from the records alone; `leaderboard.csv` has every metric. "
-        "Values are means over seeds with 95 % intervals from resampling seeds and episodes; "
-        f"`{MISSING}` is what could not be computed.",
+        "Values are means over seeds with 95 % intervals from resampling seeds and episodes, with one seed "
+        f"episodes only. `{MISSING}` stands for what could not be computed.",
     ]
     scenarios = groupby(table.rows, key=lambda row: row.scenario)
     parts = [line for scenario, rows in scenarios for line in _scenario(table, scenario, list(rows))]
@@ -175,7 +175,9 @@ def _escaped(text: str) -> str:
 
     Backslashes go before all that can open markup, HTML, a mention or a table cell, and into web addresses.
     """
-    return re.sub(r"([\\`*_{}\[\]<>|~&@#]|(?<=:)/(?=/)|(?<=www)\.)", r"\\\1", text, flags=re.IGNORECASE)
+    return re.sub(
+        r"([\\`*_{}\[\]<>|~&@#]|(?<=:)/(?=/)|(?<=www)\.)", r"\\\1", printable(text), flags=re.IGNORECASE
+    )
 
 
 # ---- terminal ----------------------------------------------------------------------------------------------
@@ -201,7 +203,8 @@ def _grid(scenario: str, rows: list[Row]) -> Grid:
     grid = Grid(title=Text(scenario, style="bold"), box=SIMPLE_HEAD, padding=0, title_justify="left")
     grid.add_column("method", overflow="fold", min_width=20)
     for name in ("seeds", *(_title(metric.name) for metric in SHOWN)):
-        grid.add_column(name, justify="right")
+        # One word a line: a header must not make its column wider than the numbers.
+        grid.add_column(name.replace(" ", "\n"), justify="right")
     for division, members in groupby(rows, key=lambda row: row.division):
         grid.add_section()
         grid.add_row(Text(division, style="italic"))

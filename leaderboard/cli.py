@@ -12,7 +12,7 @@ from ._rows import read_table
 from ._table import csv_text, markdown, terminal, write_if_changed
 
 WIDTH = 100
-"""Columns where the output is no terminal, as in a file or a log."""
+"""Least width: in a narrower one the last metrics would be cut off, and a long line only wraps."""
 
 
 def show(*, records: Path = Path("leaderboard/records")) -> None:
@@ -27,7 +27,7 @@ def show(*, records: Path = Path("leaderboard/records")) -> None:
         raise SystemExit(2)
     table = read_table(records)
     console = Console()
-    if not console.is_terminal:
+    if console.width < WIDTH:
         console = Console(width=WIDTH)
     console.print(terminal(table))
     folder = Path(os.path.normpath(records / ".."))

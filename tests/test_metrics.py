@@ -149,6 +149,12 @@ def test_what_needs_a_missing_cell_is_none_and_the_rest_is_not(
     assert {name for name, value in values.items() if value is None} == missing
 
 
+def test_a_stage_ends_where_it_was_evaluated_last(scores: Callable[..., Scores]) -> None:
+    run = scores(MATRIX, curves=[[0.4], [0.5]], steps=(10, 25))
+    assert measure("adaptation", run) == pytest.approx(BY_HAND["adaptation"])
+    np.testing.assert_allclose(run.curves.mean(axis=-1), [[0.4, 0.9], [0.5, 0.8]])
+
+
 def test_a_cell_that_lacks_an_episode_is_missing(scores: Callable[..., Scores]) -> None:
     outcomes = np.ones((2, 3, 20))
     outcomes[1, 0, 19] = np.nan

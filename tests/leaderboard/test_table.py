@@ -44,7 +44,9 @@ def add(make_record: Callable[..., Record], tmp_path: Path) -> Callable[..., Pat
         **run: Any,
     ) -> Path:
         curves = np.full((2, 3), 0.4)
-        record = make_record(matrix, curves=curves, answers=ANSWERS, method=method, seed=seed, **run)
+        record = make_record(
+            matrix, curves=curves, answers=ANSWERS, episodes=10, method=method, seed=seed, **run
+        )
         if edit:
             edit(record)
         records = tmp_path / "leaderboard" / "records"
@@ -231,7 +233,7 @@ def cut_answers(record: Record) -> None:
         (drop_seed, "seed is missing"),
         (set_in("scenario", "retained", "all"), "retained must be a list"),
         (
-            set_in("scenario", "budget", {"adaptation_steps": 9, "report_episodes": 20}),
+            set_in("scenario", "budget", {"adaptation_steps": 9, "report_episodes": 10}),
             "budget (adaptation_steps)",
         ),
         (set_in("scenario", "target", ["target_1", "target_0"]), "target differ"),
@@ -291,6 +293,21 @@ def test_the_same_run_twice_is_shown_from_its_own_place(
         assert "a/copy.json: the same run as Toy-v0/sft/seed-1.json" in flat(text)
 
 
+def test_hostile_task_names_stay_on_their_line(
+    add: Callable[..., Path], shown: Callable[[], tuple[str, str]]
+) -> None:
+    def rename(record: Record) -> None:
+        name = "x\n## y <b>\ud800"
+        record.scenario["retained"][0] = name
+        tasks = record.episodes["task"]
+        record.episodes["task"] = [name if task == "skill_0" else task for task in tasks]
+
+    add("sft", 0, scenario="strange/Toy-v0", edit=rename)
+    _, page = shown()
+    assert "## strange/Toy-v0" in page
+    assert r"Retained skills: x\\n\#\# y \<b\>\\ud800, skill\_1." in page
+
+
 def test_web_addresses_of_strangers_are_no_links(
     add: Callable[..., Path], shown: Callable[[], tuple[str, str]]
 ) -> None:
@@ -308,7 +325,11 @@ def test_any_damage_to_a_record_ends_in_a_row_or_a_reason(
     whole = json.loads((records / "whole.json").read_text(encoding="utf-8"))
     damages: tuple[Any, ...] = (None, -1, 1e999, "x", [None], {"x": []}, 10**300)
     parts = {name: values for name, values in whole.items() if name != "schema"}
-    places = [(name, key) for name, values in parts.items() for key in (None, *(values or ()))]
+    places = [
+        (name, key)
+        for name, values in parts.items()
+        for key in (None, *(values if isinstance(values, dict) else ()))
+    ]
     places.remove(("run", "method"))
     for number, (damage, (field, key)) in enumerate(itertools.product(damages, places)):
         damaged = json.loads(json.dumps(whole))

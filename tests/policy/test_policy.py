@@ -1,0 +1,149 @@
+import dataclasses
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from scipy import stats
+
+from clbench.policy import Batch, CheckpointError, Policy, PolicyConfig, QuestionBatch, load_policy, save_policy
+
+CONFIG = PolicyConfig(state_size=5, action_size=3, width=32, layers=2)
+
+
+def _batch(count: int, seed: int = 0) -> Batch:
+    generator = torch.Generator().manual_seed(seed)
+    shape = (count, CONFIG.chunk, CONFIG.action_size)
+    words = torch.randint(1, 200, (count, 12), generator=generator)
+    words[:, 5:] = 0
+    return Batch(
+        torch.randn(count, CONFIG.state_size, generator=generator),
+        words,
+        torch.randn(shape, generator=generator),
+        torch.ones(count, CONFIG.chunk),
+        torch.rand(count, generator=generator),
+        torch.randn(shape, generator=generator),
+    )
+
+
+def test_losses_come_per_sample() -> None:
+    policy, batch = Policy(CONFIG), _batch(7)
+    assert policy.action_loss(batch).shape == (7,)
+    questions = QuestionBatch(batch.state, batch.words, torch.full((7,), 3))
+    assert policy.answer_loss(questions).shape == (7,)
+    assert [hidden.shape for hidden in policy.hidden_states(batch.state, batch.words)] == [(7, 17, 32)] * 2
+
+
+def test_the_same_batch_gives_the_same_loss_and_the_same_seed_the_same_weights() -> None:
+    batch = _batch(4)
+    first, second, other = (Policy(CONFIG, seed=seed).action_loss(batch) for seed in (1, 1, 2))
+    assert first.equal(second)
+    assert not first.equal(other)
+
+
+def test_making_a_policy_leaves_the_global_generator_alone() -> None:
+    before = torch.get_rng_state()
+    Policy(CONFIG, seed=3)
+    assert torch.get_rng_state().equal(before)
+
+
+def test_the_flow_loss_is_the_squared_error_of_the_velocity_at_the_drawn_time() -> None:
+    policy, batch = Policy(CONFIG), _batch(6)
+    loss = policy.action_loss(batch).detach().numpy()
+    # by hand, in NumPy: x_t = t * noise + (1 - t) * action, u = noise - action, t = quantile of Beta(1.5, 1)
+    time = stats.beta(1.5, 1).ppf(batch.draw.numpy()).astype(np.float32)
+    noise, action = batch.noise.numpy(), batch.action.numpy()
+    noisy = time[:, None, None] * noise + (1 - time[:, None, None]) * action
+    hidden = policy.hidden_states(batch.state, batch.words)
+    mask = policy.backbone.mask(batch.words)
+    velocity = policy.head.velocity(torch.from_numpy(noisy), torch.from_numpy(time), hidden, mask)
+    expected = ((velocity.detach().numpy() - (noise - action)) ** 2).mean(axis=(1, 2))
+    np.testing.assert_allclose(loss, expected, rtol=1e-4)
+
+
+def test_steps_that_do_not_count_do_not_change_the_loss() -> None:
+    policy, batch = Policy(CONFIG), _batch(3)
+    valid = batch.valid.clone()
+    valid[:, 4:] = 0
+    loss = policy.action_loss(dataclasses.replace(batch, valid=valid))
+    full = dataclasses.replace(batch, valid=valid, action=batch.action.clone())
+    full.action[:, 4:] += 0.0
+    assert loss.equal(policy.action_loss(full))
+    assert not loss.equal(policy.action_loss(batch))
+
+
+def test_detached_hidden_states_stop_the_gradient_at_the_backbone() -> None:
+    policy, batch = Policy(CONFIG), _batch(3)
+    hidden = [state.detach() for state in policy.hidden_states(batch.state, batch.words)]
+    policy.action_loss(batch, hidden).mean().backward()  # type: ignore[no-untyped-call]
+    assert all(parameter.grad is None for parameter in policy.backbone.parameters())
+    assert all(parameter.grad is not None for parameter in policy.head.parameters())
+
+
+def test_padding_words_do_not_change_what_the_policy_does() -> None:
+    policy, batch = Policy(CONFIG), _batch(16)
+    changed = policy.backbone.words.weight.data.clone()
+    before = policy.act(batch.state, batch.words, batch.noise)
+    changed[0] += 1.0
+    policy.backbone.words.weight.data.copy_(changed)
+    assert policy.act(batch.state, batch.words, batch.noise).equal(before)
+
+
+def test_normalisation_follows_the_data_it_is_given() -> None:
+    policy = Policy(CONFIG)
+    state = torch.randn(100, 5) * torch.tensor([1.0, 2.0, 3.0, 4.0, 0.0]) + 7
+    policy.normalise_like(state, torch.randn(100, 3))
+    np.testing.assert_allclose(policy.state_mean, state.numpy().mean(axis=0), rtol=1e-5)
+    np.testing.assert_allclose(policy.state_std[:4], state.numpy().std(axis=0)[:4], rtol=1e-5)
+    assert policy.state_std[4] == pytest.approx(0.01)  # what does not vary is not blown up
+
+
+def test_a_policy_survives_saving(tmp_path: Path) -> None:
+    policy, batch = Policy(CONFIG, seed=5), _batch(3)
+    policy.normalise_like(batch.state, batch.action[:, 0])
+    save_policy(policy, tmp_path)
+    assert load_policy(tmp_path).action_loss(batch).equal(policy.action_loss(batch))
+
+
+def _cut(folder: Path) -> None:
+    path = folder / "policy.safetensors"
+    path.write_bytes(path.read_bytes()[:-100])
+
+
+def _resize(folder: Path) -> None:
+    config = json.loads((folder / "policy.json").read_text())
+    (folder / "policy.json").write_text(json.dumps({**config, "width": 64}))
+
+
+def _add_field(folder: Path) -> None:
+    config = json.loads((folder / "policy.json").read_text())
+    (folder / "policy.json").write_text(json.dumps({**config, "depth": 64}))
+
+
+def _poison(folder: Path) -> None:
+    policy = load_policy(folder)
+    next(iter(policy.parameters())).data.fill_(float("nan"))
+    save_policy(policy, folder)
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (_cut, "cannot be read as a policy"),
+        (lambda folder: (folder / "policy.json").write_text("{"), "cannot be read as a policy"),
+        (lambda folder: (folder / "policy.safetensors").unlink(), "cannot be read as a policy"),
+        (_add_field, "cannot be read as a policy"),
+        (_resize, "tensors that do not fit the policy: .*position"),
+        (_poison, "not finite"),
+    ],
+)
+def test_a_damaged_checkpoint_is_refused_by_name(
+    tmp_path: Path, damage: Callable[[Path], None], message: str
+) -> None:
+    save_policy(Policy(CONFIG), tmp_path)
+    damage(tmp_path)
+    with pytest.raises(CheckpointError, match=message) as error:
+        load_policy(tmp_path)
+    assert str(tmp_path) in str(error.value)

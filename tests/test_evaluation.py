@@ -1,0 +1,87 @@
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+
+from clbench.evaluation import LANES, Evaluator, answer
+from clbench.policy import Policy
+from clbench.questions import load_questions, report_questions
+from clbench.task import load_scenario
+from clbench.training import deterministic, policy_config, pretrained_policy
+
+TOY = load_scenario("clbench.testing:clbench/Toy-v0")
+FETCH = load_scenario("clbench/Fetch-v0")
+
+
+@pytest.fixture(scope="module")
+def fetch_policy() -> Policy:
+    """A policy for Fetch that was never trained: it waves the arm about."""
+    return Policy(policy_config(FETCH), seed=3).eval()
+
+
+def test_an_outcome_does_not_depend_on_what_else_is_evaluated(fetch_policy: Policy) -> None:
+    scenario = dataclasses.replace(FETCH, budget=dataclasses.replace(FETCH.budget, selection_episodes=8))
+    evaluator = Evaluator(scenario, seed=0)
+    with deterministic():
+        together = evaluator.evaluate(fetch_policy, scenario.tasks)  # 96 episodes: more than lanes
+        alone = Evaluator(scenario, seed=0).evaluate(fetch_policy, [scenario.tasks[5]])
+        again = evaluator.evaluate(fetch_policy, reversed(scenario.tasks))
+    assert len(together) > LANES
+    assert alone == together[40:48]
+    assert again == [episode for start in range(88, -8, -8) for episode in together[start : start + 8]]
+
+
+def test_rows_of_a_forward_do_not_depend_on_their_place_or_their_neighbours(fetch_policy: Policy) -> None:
+    generator = torch.Generator().manual_seed(0)
+    config = fetch_policy.config
+    state = torch.randn(LANES, config.state_size, generator=generator)
+    words = torch.randint(0, 300, (LANES, 12), generator=generator)
+    noise = torch.randn(LANES, config.chunk, config.action_size, generator=generator)
+    order = torch.randperm(LANES, generator=generator)
+    with deterministic():
+        straight = fetch_policy.act(state, words, noise)
+        shuffled = fetch_policy.act(state[order], words[order], noise[order])
+        assert shuffled.equal(straight[order])
+        state[7:], noise[7:] = 0, 0
+        assert fetch_policy.act(state, words, noise)[:7].equal(straight[:7])
+
+
+def test_selection_and_report_episodes_and_seeds_have_different_initial_states(fetch_policy: Policy) -> None:
+    task = FETCH.task("reach")
+    runs = [
+        [episode.total_reward for episode in Evaluator(FETCH, seed).evaluate(fetch_policy, [task], split)]  # type: ignore[arg-type]
+        for seed, split in ((0, "selection"), (0, "report"), (1, "report"))
+    ]
+    assert len(runs[0]) == FETCH.budget.selection_episodes
+    assert len(runs[1]) == FETCH.budget.report_episodes
+    values = [value for run in runs for value in run]
+    assert len(set(values)) == len(values)
+
+
+def test_a_pretrained_toy_policy_does_its_skills_and_not_the_targets() -> None:
+    policy, _ = pretrained_policy(TOY, 0)
+    with deterministic():
+        episodes = Evaluator(TOY, 0).evaluate(policy, TOY.tasks)
+    rates = {task.name: np.mean([e.success for e in episodes if e.task == task.name]) for task in TOY.tasks}
+    assert rates["left"] == rates["up"] == 1.0
+    assert rates["right"] == rates["down"] == 0.0
+
+
+def test_a_policy_that_acts_in_nan_fails_its_episodes_and_stops_nothing(fetch_policy: Policy) -> None:
+    broken = Policy(fetch_policy.config)
+    next(broken.head.parameters()).data.fill_(float("nan"))
+    episodes = Evaluator(FETCH, 0).evaluate(broken, [FETCH.task("lift")])
+    assert not any(episode.success for episode in episodes)
+    assert {episode.length for episode in episodes} == {FETCH.task("lift").horizon}
+
+
+def test_answers_are_counted_by_kind() -> None:
+    policy, _ = pretrained_policy(TOY, 0)
+    _, report = load_questions(TOY)
+    kind, questions = report_questions(report, 90)
+    counts = answer(policy, report.kinds, kind, questions)
+    assert [(name, asked) for name, asked, _ in counts] == [("side", 45), ("height", 45)]
+    assert sum(correct for _, _, correct in counts) > 75
+    swapped = dataclasses.replace(questions, answer=questions.answer.roll(1))
+    assert sum(c for _, _, c in answer(policy, report.kinds, kind, swapped)) < 75

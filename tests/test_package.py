@@ -1,0 +1,43 @@
+"""The package as a whole: its front door, what importing it does, what it brings along."""
+
+import subprocess
+import sys
+
+import clbench
+
+
+def _run(code: str) -> str:
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    return result.stdout.strip()
+
+
+def test_every_public_name_can_be_imported() -> None:
+    assert len(clbench.__all__) == 25
+    for name in clbench.__all__:
+        assert getattr(clbench, name).__name__ == name
+
+
+def test_an_unknown_name_is_an_attribute_error() -> None:
+    assert not hasattr(clbench, "no_such_name")
+
+
+def test_importing_registers_the_scenarios_and_loads_nothing_heavy() -> None:
+    heavy = "{'torch', 'mujoco', 'pandas', 'minari', 'gymnasium_robotics', 'rich'}"
+    code = f"import clbench, gymnasium, sys; gymnasium.spec('clbench/Fetch-v0'); print({heavy} & set(sys.modules))"
+    assert _run(code) == "set()"
+
+
+def test_listing_the_data_of_the_fetch_scenario_loads_no_simulator() -> None:
+    code = "import clbench, sys; clbench.load_scenario('clbench/Fetch-v0'); print('mujoco' in sys.modules)"
+    assert _run(code) == "False"
+
+
+def test_gymnasium_makes_a_scenario_without_an_import_of_clbench() -> None:
+    code = "import gymnasium; print(gymnasium.make('clbench:clbench/Fetch-v0').unwrapped.scenario.id)"
+    assert _run(code) == "clbench/Fetch-v0"
+
+
+def test_nothing_leaks_to_the_top_level() -> None:
+    code = "import clbench.cli, clbench.methods.sft, clbench.envs.fetch, clbench.leaderboard, sys;"
+    code += "print({'envs', 'methods', 'leaderboard'} & set(sys.modules))"
+    assert _run(code) == "set()"

@@ -1,0 +1,226 @@
+"""Runs of the toy: they repeat themselves, resume, and fail with a record that says where."""
+
+import dataclasses
+import json
+import sys
+import types
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from clbench.method import Method, Stage, State, Uses, method_names
+from clbench.policy import Policy
+from clbench.record import read_record
+from clbench.run import RunSpec, execute, run_length
+
+TOY = "clbench.testing:clbench/Toy-v0"
+
+
+def _lasting(path: Path) -> dict[str, Any]:
+    """Return a record without what may differ between equal runs."""
+    record = json.loads(path.read_text())
+    del record["timing"]
+    return dict(record)
+
+
+@dataclasses.dataclass
+class Counting(Method):
+    """A method with a state: it counts its steps and keeps the mean of what it saw."""
+
+    uses = Uses(demonstrations="prepare")
+
+    def prepare(self, policy: Policy, prior: Any) -> None:
+        self.anchor = prior.demonstrations.sample(32).state.mean(dim=0)
+        self.steps = 0
+
+    def gradients(self, policy: Policy, loss: Tensor) -> None:
+        (loss * (1 + self.anchor.abs().sum() + self.steps)).backward()  # type: ignore[no-untyped-call]
+        self.steps += 1
+
+    def state(self) -> State:
+        return {"anchor": self.anchor, "steps": self.steps}
+
+    def load_state(self, state: State) -> None:
+        assert isinstance(state["anchor"], Tensor)
+        assert isinstance(state["steps"], int)
+        self.anchor, self.steps = state["anchor"], state["steps"]
+
+    def diagnostics(self) -> dict[str, Any]:
+        return {"steps": self.steps}
+
+
+@pytest.fixture
+def stranger(monkeypatch: pytest.MonkeyPatch) -> Callable[[type[Method]], str]:
+    """Return a function that makes a class importable and returns its "module:Class"."""
+
+    def offer(cls: type[Method]) -> str:
+        module = types.ModuleType("stranger")
+        module.__dict__[cls.__name__] = cls
+        monkeypatch.setitem(sys.modules, "stranger", module)
+        return f"stranger:{cls.__name__}"
+
+    return offer
+
+
+@pytest.mark.parametrize("method", method_names())
+def test_the_same_run_twice_gives_equal_records(tmp_path: Path, method: str) -> None:
+    paths = []
+    for name in ("first", "second"):
+        spec = RunSpec(TOY, method, seed=1)
+        assert execute(spec, tmp_path / name).status == "success"
+        paths.append(spec.path(tmp_path / name))
+    assert _lasting(paths[0]) == _lasting(paths[1])
+
+
+def test_a_record_holds_every_episode_and_answer_once(tmp_path: Path) -> None:
+    record = execute(RunSpec(TOY, "sft", seed=0), tmp_path)
+    budget = record.scenario["budget"]
+    at_the_ends = 3 * 5 * budget["report_episodes"]
+    on_the_way = 2 * (budget["evaluation_points"] - 1) * budget["report_episodes"]
+    rows = list(zip(*record.episodes.values(), strict=True))
+    assert len(rows) == len({row[:5] for row in rows}) == at_the_ends + on_the_way
+    assert set(record.episodes["split"]) == {"report"}
+    assert sum(record.answers["asked"]) == 3 * budget["report_questions"]
+    assert record.costs["optimiser_steps"] == 2 * budget["adaptation_steps"]
+    assert read_record(tmp_path / "Toy-v0" / "sft" / "seed-0.json") == record
+
+
+def test_all_methods_meet_the_same_initial_states_and_the_same_pretrained_policy(tmp_path: Path) -> None:
+    records = [execute(RunSpec(TOY, method, seed=0), tmp_path) for method in ("sft", "experience_replay")]
+    first, second = (
+        [row for row in zip(*record.episodes.values(), strict=True) if row[0] == 0] for record in records
+    )
+    assert first == second
+    assert records[0].fingerprint == records[1].fingerprint
+
+
+def test_frozen_forgets_nothing_and_costs_nothing(tmp_path: Path) -> None:
+    record = execute(RunSpec(TOY, "frozen", seed=0), tmp_path)
+    rows = list(zip(*record.episodes.values(), strict=True))
+    ends = [{row[2:]: row for row in rows if row[:2] == (stage, 30 * bool(stage))} for stage in range(3)]
+    assert [set(end) for end in ends] == [set(ends[0])] * 3
+    assert (record.costs["optimiser_steps"], record.costs["bytes_kept"]) == (0, 0)
+
+
+def test_progress_adds_up_to_the_length_of_the_run(tmp_path: Path) -> None:
+    from clbench.task import load_scenario
+
+    amounts: list[float] = []
+    execute(RunSpec(TOY, "sft", seed=0), tmp_path, amounts.append)
+    assert sum(amounts) == pytest.approx(run_length(load_scenario(TOY)))
+
+
+class _Killed(BaseException):
+    """What no handler of the run catches, as when its process is killed."""
+
+
+@pytest.mark.parametrize("share", [0.05, 0.3, 0.6, 0.95])
+def test_a_run_killed_anywhere_resumes_to_the_same_record(
+    tmp_path: Path, empty_caches: Path, stranger: Callable[[type[Method]], str], share: float
+) -> None:
+    spec = RunSpec(TOY, stranger(Counting), seed=0)
+    execute(spec, tmp_path / "whole")
+    left = share * 2 * (30 + 0.3 * 6 * 8.5)  # about the length of a run
+
+    def die(amount: float) -> None:
+        nonlocal left
+        left -= amount
+        if left < 0:
+            raise _Killed
+
+    with pytest.raises(_Killed):
+        execute(spec, tmp_path / "killed", die)
+    assert not spec.path(tmp_path / "killed").exists()
+    record = execute(spec, tmp_path / "killed")
+    assert ("resumed_after" in record.timing) == (share > 0.2)
+    assert _lasting(spec.path(tmp_path / "whole")) == _lasting(spec.path(tmp_path / "killed"))
+    assert list((empty_caches / "cache" / "runs").iterdir()) == []
+
+
+def test_what_a_method_keeps_counts_in_bytes(tmp_path: Path, stranger: Callable[[type[Method]], str]) -> None:
+    record = execute(RunSpec(TOY, stranger(Counting), seed=0), tmp_path)
+    assert record.costs["bytes_kept"] == 4 * 4  # the anchor: four float32
+    assert record.diagnostics == {"steps": 60}
+    replay = execute(RunSpec(TOY, "experience_replay", seed=0), tmp_path)
+    assert replay.costs["bytes_kept"] > 10_000
+
+
+def test_changes_are_recorded_and_lie_beside_the_unchanged_run(tmp_path: Path) -> None:
+    record = execute(RunSpec(TOY, "experience_replay", 0, {"replay": "0.25"}), tmp_path)
+    assert record.run["settings"] == record.run["changes"] == {"replay": 0.25}
+    assert [path.name for path in (tmp_path / "Toy-v0").iterdir()] == ["experience_replay+replay=0.25"]
+
+
+@dataclasses.dataclass
+class _Prepares(Method):
+    def prepare(self, policy: Policy, prior: Any) -> None:
+        raise ValueError("no anchor")
+
+
+@dataclasses.dataclass
+class _Diverges(Method):
+    def loss(self, policy: Policy, batch: Any, progress: Any) -> Tensor:
+        loss = policy.action_loss(batch).mean()
+        return loss * float("nan") if progress.step == 7 else loss
+
+
+@dataclasses.dataclass
+class _Shapeless(Method):
+    def loss(self, policy: Policy, batch: Any, progress: Any) -> Tensor:
+        return policy.action_loss(batch)
+
+
+@dataclasses.dataclass
+class _Sneaks(Method):
+    def batch(self, target: Any, prior: Any) -> Any:
+        return prior.demonstrations.sample(4)
+
+
+@dataclasses.dataclass
+class _Peeks(Method):
+    uses = Uses(questions="prepare")
+
+    def batch(self, target: Any, prior: Any) -> Any:
+        return prior.questions.sample(4)
+
+
+@dataclasses.dataclass
+class _Forgetful(Method):
+    def end_task(self, policy: Policy, stage: Stage) -> None:
+        raise RuntimeError(f"cannot merge {stage.task.name}")
+
+
+@pytest.mark.parametrize(
+    ("cls", "where", "message"),
+    [
+        (_Prepares, "prepare", "no anchor"),
+        (_Diverges, "stage 1 (right)", "step 7: loss is nan, not finite."),
+        (_Shapeless, "stage 1 (right)", "loss must be a scalar, shape (), not (16,)"),
+        (_Sneaks, "stage 1 (right)", "touches prior demonstrations that it does not declare"),
+        (_Peeks, "stage 1 (right)", "touches prior questions that it does not declare"),
+        (_Forgetful, "stage 1 (right)", "cannot merge right"),
+    ],
+)
+def test_a_method_that_fails_leaves_a_record_that_says_where(
+    tmp_path: Path, stranger: Callable[[type[Method]], str], cls: type[Method], where: str, message: str
+) -> None:
+    spec = RunSpec(TOY, stranger(cls), seed=0)
+    execute(spec, tmp_path)
+    record = read_record(spec.path(tmp_path))
+    assert record.status == "failed"
+    assert record.error is not None
+    assert record.error["where"] == where
+    assert message in record.error["message"]
+    assert "Traceback" in record.error["traceback"]
+
+
+def test_a_run_leaves_no_global_state_behind(tmp_path: Path) -> None:
+    before = torch.get_rng_state(), torch.get_num_threads(), torch.get_default_dtype()
+    execute(RunSpec(TOY, "sft", seed=0), tmp_path)
+    after = torch.get_rng_state(), torch.get_num_threads(), torch.get_default_dtype()
+    assert before[0].equal(after[0])
+    assert before[1:] == after[1:]

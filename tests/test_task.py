@@ -1,0 +1,52 @@
+import pytest
+
+from clbench.task import load_scenario, resolve, scenario_ids
+
+FETCH = "clbench/Fetch-v0"
+
+
+def test_an_unknown_scenario_is_answered_with_the_nearest() -> None:
+    with pytest.raises(LookupError, match=r"No scenario is called 'clbench/Fecth-v0'. Did you mean 'clbench/Fetch-v0'"):
+        load_scenario("clbench/Fecth-v0")
+
+
+def test_an_environment_that_is_no_scenario_is_refused() -> None:
+    with pytest.raises(LookupError, match="No scenario is called 'CartPole-v1'"):
+        load_scenario("CartPole-v1")
+
+
+def test_a_module_that_cannot_be_imported_is_named() -> None:
+    with pytest.raises(LookupError, match="No module 'no_such_module' can be imported"):
+        load_scenario("no_such_module:x/Y-v0")
+
+
+def test_the_module_before_the_colon_is_imported() -> None:
+    assert load_scenario("clbench.testing:clbench/Toy-v0").id == "clbench/Toy-v0"
+
+
+def test_an_unknown_task_is_answered_with_the_nearest() -> None:
+    with pytest.raises(LookupError, match="No task of clbench/Fetch-v0 is called 'pusch'. Did you mean 'push'"):
+        load_scenario(FETCH).task("pusch")
+
+
+@pytest.mark.parametrize("scenario_id", scenario_ids())
+def test_a_scenario_has_distinct_tasks_whose_entry_points_resolve(scenario_id: str) -> None:
+    scenario = load_scenario(scenario_id)
+    names = [task.name for task in scenario.tasks]
+    assert len(set(names)) == len(names)
+    assert scenario.retained
+    assert scenario.target
+    for task in scenario.tasks:
+        assert callable(resolve(task.world))
+        assert callable(resolve(task.expert)(task.name))
+        assert scenario.task(task.name) is task
+        assert task in getattr(scenario, scenario.group(task.name))
+
+
+def test_the_fetch_scenario_has_the_promised_parts() -> None:
+    scenario = load_scenario(FETCH)
+    assert len(scenario.retained) >= 5
+    assert len(scenario.target) >= 4
+    assert len(scenario.held_out) >= 2
+    assert len(resolve(scenario.questions)) >= 8
+    assert all(len(task.instructions) >= 3 for task in scenario.tasks)
