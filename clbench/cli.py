@@ -19,7 +19,12 @@ import clbench
 RECORDS = Path("leaderboard/records")
 """Where records lie, seen from the working directory."""
 
-app = App(name="clbench", help=clbench.__doc__, version=clbench.__version__)
+app = App(
+    name="clbench",
+    help=clbench.__doc__,
+    version=clbench.__version__,
+    suppress_keyboard_interrupt=False,  # `main` says what is kept
+)
 
 # Named, not imported: the core knows its parts by name alone.
 app.command("clbench.leaderboard.cli:show", name="leaderboard")
@@ -168,18 +173,17 @@ def demonstrations(scenario: str, /, *, workers: int | None = None) -> None:
     if failed:
         sys.exit(1)
     table = Table(title=f"Demonstrations of {loaded.id}")
-    for column in ("group", "dataset", "episodes", "disturbed", "success", "mean length", "instruction"):
-        table.add_column(column)
+    for column in ("dataset", "group", "episodes", "disturbed", "success", "mean length"):
+        table.add_column(column, no_wrap=column == "dataset")
     for task in loaded.tasks:
         episodes = read_dataset(dataset_folder(task, loaded.budget))
         lengths = [len(episode.executed) for episode in episodes]
         table.add_row(
-            loaded.group(task.name),
             task.dataset_id,
+            loaded.group(task.name),
             str(len(episodes)),
             str(sum(bool(episode.disturbed.any()) for episode in episodes)),
             f"{sum(episode.success for episode in episodes) / len(episodes):.2f}",
             f"{sum(lengths) / len(lengths):.1f}",
-            task.instructions[0],
         )
     Console().print(table)

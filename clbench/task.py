@@ -71,7 +71,7 @@ class Budget:
     """Questions asked at the end of each stage."""
     pretraining_steps: int = 2000
     """Optimiser steps on the retained tasks and the training questions."""
-    pretraining_learning_rate: float = 1e-3
+    pretraining_learning_rate: float = 2e-3
     """Peak step size of pretraining."""
     adaptation_steps: int = 400
     """Optimiser steps on each target task."""

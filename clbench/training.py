@@ -13,7 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from clbench.cache import cache_folder, cached, is_cached, package_of, source_hash
+from clbench.cache import cache_folder, cached, hash_of, is_cached, package_of, source_hash
 from clbench.demonstrations import SIMULATORS, Demonstrations, load_demonstrations
 from clbench.method import Method, Prior, Progress, Source, Stage
 from clbench.policy import Batch, Policy, PolicyConfig, load_policy, save_policy
@@ -26,6 +26,17 @@ GRADIENT_NORM = 1.0
 
 BETAS = (0.9, 0.95)
 """Of AdamW, as the three seed papers and openpi have them; weight decay 1e-10 likewise."""
+
+
+AFTER_PRETRAINING = (
+    "adaptation_steps",
+    "learning_rate",
+    "evaluation_points",
+    "selection_episodes",
+    "report_episodes",
+    "report_questions",
+)
+"""Fields of the budget that a pretrained policy does not depend on."""
 
 
 class MethodError(RuntimeError):
@@ -113,10 +124,11 @@ def pretraining_inputs(scenario: Scenario, seed: int) -> dict[str, Any]:
     """Return all that a pretrained policy depends on."""
     suites = {package_of(name) for task in scenario.retained for name in (task.world, task.expert)}
     suites.add(package_of(scenario.questions))
+    budget = dataclasses.asdict(scenario.budget)
     core = ("clbench.policy", "clbench.demonstrations", "clbench.questions", "clbench.seeding", __name__)
     return {
         "retained": [dataclasses.asdict(task) for task in scenario.retained],
-        "budget": dataclasses.asdict(scenario.budget),
+        "budget": {name: value for name, value in budget.items() if name not in AFTER_PRETRAINING},
         "seed": seed,
         "source": source_hash(*core, *sorted(suites)),
         "versions": {package: version(package) for package in (*SIMULATORS, "torch", "tokenizers")},
@@ -125,7 +137,8 @@ def pretraining_inputs(scenario: Scenario, seed: int) -> dict[str, Any]:
 
 def pretrained_folder(scenario: Scenario, seed: int) -> Path:
     """Return where the pretrained policy lies, or will lie."""
-    return cache_folder() / "pretrained" / scenario.id.replace("/", "--") / f"seed-{seed}"
+    name = f"{scenario.id.replace('/', '--')}-seed-{seed}-{hash_of(pretraining_inputs(scenario, seed))}"
+    return cache_folder() / "pretrained" / name
 
 
 def is_pretrained(scenario: Scenario, seed: int) -> bool:

@@ -30,7 +30,8 @@ LONGEST_REASON = 300
 """Characters of a reason that are shown: an error's message may be a page."""
 
 _SCENARIO = re.compile(r"[A-Za-z0-9][\w./:-]{0,99}", re.ASCII)
-_METHOD = re.compile(r"[A-Za-z_][\w.-]{0,99}(:[A-Za-z_][\w.]{0,99})?", re.ASCII)
+_METHOD = re.compile(r"([A-Za-z0-9][\w.-]{0,99}/)?[A-Za-z_][\w.-]{0,99}(:[A-Za-z_][\w.]{0,99})?", re.ASCII)
+"""A built-in name, "package/name" or "module:Class"."""
 
 
 @dataclass(frozen=True)

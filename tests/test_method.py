@@ -1,7 +1,6 @@
 import dataclasses
 import sys
 import types
-from collections.abc import Iterator
 
 import pytest
 import torch
@@ -19,7 +18,7 @@ from clbench.method import (
 
 
 @pytest.fixture
-def module(monkeypatch: pytest.MonkeyPatch) -> Iterator[types.ModuleType]:
+def module(monkeypatch: pytest.MonkeyPatch) -> types.ModuleType:
     """A module of a stranger, as `stranger`."""
     module = types.ModuleType("stranger")
     monkeypatch.setitem(sys.modules, "stranger", module)
@@ -34,7 +33,7 @@ def module(monkeypatch: pytest.MonkeyPatch) -> Iterator[types.ModuleType]:
         pass
 
     module.Acme, module.Plain, module.Number = Acme, Plain, 3  # type: ignore[attr-defined]
-    yield module
+    return module
 
 
 def test_the_built_in_methods_are_found_as_any_submitted_one() -> None:

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy.integrate import trapezoid  # type: ignore[import-untyped]
+from scipy.integrate import trapezoid
 
 from clbench.metrics import METRICS, Scores, load_metric, measure, rates_of
 from clbench.record import Record, RecordError

@@ -23,8 +23,8 @@ def test_an_unknown_name_is_an_attribute_error() -> None:
 
 def test_importing_registers_the_scenarios_and_loads_nothing_heavy() -> None:
     heavy = "{'torch', 'mujoco', 'pandas', 'minari', 'gymnasium_robotics', 'rich'}"
-    code = f"import clbench, gymnasium, sys; gymnasium.spec('clbench/Fetch-v0'); print({heavy} & set(sys.modules))"
-    assert _run(code) == "set()"
+    code = "import clbench, gymnasium, sys; gymnasium.spec('clbench/Fetch-v0');"
+    assert _run(f"{code} print({heavy} & set(sys.modules))") == "set()"
 
 
 def test_listing_the_data_of_the_fetch_scenario_loads_no_simulator() -> None:

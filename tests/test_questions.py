@@ -15,7 +15,9 @@ FETCH = load_scenario("clbench/Fetch-v0")
 def test_every_kind_and_every_answer_of_it_is_as_frequent_and_right() -> None:
     train, _ = load_questions(TOY)
     batch = train.sample(4000, torch.Generator().manual_seed(0))
-    counts = {answer: int((batch.answer == word_id(answer)).sum()) for answer in ("left", "right", "below", "above")}
+    counts = {
+        answer: int((batch.answer == word_id(answer)).sum()) for answer in ("left", "right", "below", "above")
+    }
     assert all(900 < count < 1100 for count in counts.values()), counts
     right = batch.answer == word_id("right")
     left = batch.answer == word_id("left")
@@ -39,7 +41,9 @@ def test_every_report_asks_the_same_questions_as_many_of_each_kind() -> None:
 
 
 def test_an_answer_that_no_state_gives_is_named() -> None:
-    kind = QuestionKind("place", ("where is it",), ("left", "right"), lambda states: np.zeros(len(states), np.int64))
+    kind = QuestionKind(
+        "place", ("where is it",), ("left", "right"), lambda states: np.zeros(len(states), np.int64)
+    )
     with pytest.raises(ValueError, match="No state answers 'right' to 'place': 'where is it'"):
         Questions((kind,), torch.zeros(5, 4))
 

@@ -38,7 +38,7 @@ class Counting(Method):
         self.steps = 0
 
     def gradients(self, policy: Policy, loss: Tensor) -> None:
-        (loss * (1 + self.anchor.abs().sum() + self.steps)).backward()  # type: ignore[no-untyped-call]
+        (loss * (1 + self.anchor.abs().sum() + self.steps)).backward()
         self.steps += 1
 
     def state(self) -> State:

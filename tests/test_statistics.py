@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy import stats  # type: ignore[import-untyped]
+from scipy import stats
 
 from clbench.metrics import METRICS, Layout, Scores, measure
 from clbench.statistics import Estimate, estimate, paired_difference, row_generator

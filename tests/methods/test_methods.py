@@ -1,7 +1,5 @@
 """What each method is for, shown on the toy."""
 
-from pathlib import Path
-
 import pytest
 
 from clbench.metrics import Scores, measure

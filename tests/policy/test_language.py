@@ -7,7 +7,7 @@ from clbench.task import load_scenario, resolve
 def test_words_become_the_ids_of_the_vocabulary_padded_with_zero() -> None:
     ids = encode(["push the block"])
     assert ids.shape == (1, TEXT_LENGTH)
-    assert [vocabulary()[id] for id in ids[0, :3].tolist()] == ["push", "the", "block"]
+    assert [vocabulary()[number] for number in ids[0, :3].tolist()] == ["push", "the", "block"]
     assert not ids[0, 3:].any()
 
 
@@ -16,7 +16,9 @@ def test_case_and_punctuation_do_not_count() -> None:
 
 
 def test_an_unknown_word_is_named_with_the_nearest() -> None:
-    with pytest.raises(UnknownWordError, match=r"The word 'blokc' in 'push the blokc' .* Did you mean 'block'\?"):
+    with pytest.raises(
+        UnknownWordError, match=r"The word 'blokc' in 'push the blokc' .* Did you mean 'block'\?"
+    ):
         encode(["push the block", "push the blokc"])
 
 

@@ -8,7 +8,15 @@ import pytest
 import torch
 from scipy import stats
 
-from clbench.policy import Batch, CheckpointError, Policy, PolicyConfig, QuestionBatch, load_policy, save_policy
+from clbench.policy import (
+    Batch,
+    CheckpointError,
+    Policy,
+    PolicyConfig,
+    QuestionBatch,
+    load_policy,
+    save_policy,
+)
 
 CONFIG = PolicyConfig(state_size=5, action_size=3, width=32, layers=2)
 

@@ -1,0 +1,112 @@
+"""The command line as people type it, in processes of its own."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+TOY = "clbench.testing:clbench/Toy-v0"
+
+
+def _clbench(*arguments: str, folder: Path | None = None) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "clbench", *arguments]
+    return subprocess.run(command, capture_output=True, text=True, cwd=folder, timeout=200, check=False)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (
+            ["run", "clbench/Fecth-v0", "sft"],
+            "No scenario is called 'clbench/Fecth-v0'. Did you mean 'clbench/Fetch-v0'",
+        ),
+        (["run", "clbench/Fetch-v0", "stf"], "No method is called 'stf'. Did you mean 'sft'?"),
+        (["run", "clbench/Fetch-v0"], "Name at least one method"),
+        (
+            ["run", "clbench/Fetch-v0", "sft", "--sedes", "3"],
+            "Unknown option: --sedes. Did you mean --seeds?",
+        ),
+        (["run", "clbench/Fetch-v0", "sft", "--seeds", "0"], "--seeds must be at least 1, not 0"),
+        (["run", "clbench/Fetch-v0", "sft", "--seeds", "many"], "--seeds"),
+        (["run", "clbench/Fetch-v0", "sft", "--workers", "0"], "--workers must be at least 1, not 0"),
+        (["run", "clbench/Fetch-v0", "sft", "--set.rate", "1"], "sft has no hyper-parameter 'rate'"),
+        (
+            ["run", "clbench/Fetch-v0", "experience_replay", "--set.replay", "x"],
+            "replay must be a float, not 'x'",
+        ),
+        (["demonstrations", "clbench/Fetch"], "Did you mean 'clbench/Fetch-v0'"),
+        (["leaderbord"], "leaderbord"),
+    ],
+)
+def test_bad_input_ends_with_exit_code_2_and_the_nearest_right_name(
+    arguments: list[str], message: str, tmp_path: Path
+) -> None:
+    result = _clbench(*arguments, folder=tmp_path)
+    assert result.returncode == 2
+    assert " ".join(message.split()) in " ".join((result.stderr + result.stdout).replace("│", " ").split())
+    assert "Traceback" not in result.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_help_names_every_command() -> None:
+    output = _clbench("--help").stdout
+    assert all(name in output for name in ("list", "run", "leaderboard", "demonstrations", "doctor"))
+
+
+def test_list_shows_scenarios_and_methods() -> None:
+    output = _clbench("list").stdout
+    assert "clbench/Fetch-v0" in output
+    assert "experience_replay" in output
+
+
+def test_doctor_shows_versions_and_rendering() -> None:
+    result = _clbench("doctor")
+    assert result.returncode == 0
+    assert "mujoco" in result.stdout
+    assert "rendering: egl" in result.stdout
+
+
+def test_demonstrations_are_collected_and_shown(empty_caches: Path) -> None:
+    result = _clbench("demonstrations", TOY)
+    assert result.returncode == 0, result.stderr
+    assert "clbench/toy/left-v0" in result.stdout
+    assert "demonstrations left: 10 episodes" in result.stderr
+
+
+METHOD = """
+from dataclasses import dataclass
+from clbench import Method
+
+@dataclass
+class Gentle(Method):
+    strength: float = 0.5
+    def loss(self, policy, batch, progress):
+        return self.strength * policy.action_loss(batch).mean()
+
+@dataclass
+class Broken(Method):
+    def loss(self, policy, batch, progress):
+        raise ValueError("no idea")
+"""
+
+
+def test_a_stranger_runs_a_class_from_the_working_directory_and_sees_it_on_the_board(tmp_path: Path) -> None:
+    (tmp_path / "mine.py").write_text(METHOD)
+    result = _clbench("run", TOY, "mine:Gentle", "mine:Broken", "sft", "--seeds", "1", folder=tmp_path)
+    assert result.returncode == 1  # the broken one; the others went on
+    assert "ValueError: no idea" in result.stderr
+    assert "1 failed: mine:Broken seed 0" in result.stderr
+    records = sorted(path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*.json"))
+    assert records == [
+        f"leaderboard/records/Toy-v0/{name}/seed-0.json" for name in ("mine--Broken", "mine--Gentle", "sft")
+    ]
+    again = _clbench("run", TOY, "mine:Gentle", "sft", "--seeds", "1", folder=tmp_path)
+    assert again.returncode == 0
+    assert "2 of 2 runs have a record already" in again.stderr
+    board = _clbench("leaderboard", folder=tmp_path)
+    assert board.returncode == 0, board.stderr
+    assert "mine:Gentle" in board.stdout
+    text = (tmp_path / "leaderboard" / "LEADERBOARD.md").read_text()
+    assert "mine:Gentle" in text
+    assert "no idea" in text  # why the failed run is not a row

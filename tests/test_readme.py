@@ -1,0 +1,72 @@
+"""The snippets of the README, run as they stand; the commands run on the toy, which takes seconds."""
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+README = Path(__file__).parents[1] / "README.md"
+
+
+def _blocks(language: str) -> list[str]:
+    return re.findall(rf"```{language}\n(.*?)```", README.read_text(encoding="utf-8"), flags=re.DOTALL)
+
+
+def _python(code: str, folder: Path) -> str:
+    command = [sys.executable, "-c", code]
+    return subprocess.run(command, cwd=folder, capture_output=True, text=True, check=True).stdout
+
+
+def _console(block: str, folder: Path) -> str:
+    line = (
+        block.strip()
+        .replace("clbench/Fetch-v0", "clbench.testing:clbench/Toy-v0")
+        .replace("--seeds 3", "--seeds 1")
+    )
+    command = [sys.executable, "-m", *line.split()]
+    return subprocess.run(command, cwd=folder, capture_output=True, text=True, check=True).stdout
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A working directory in which the README's method was saved and run."""
+    folder = tmp_path_factory.mktemp("stranger")
+    (folder / "my_method.py").write_text(_blocks("python")[1])
+    _console(_blocks("console")[0], folder)
+    return folder
+
+
+def test_the_first_snippet_walks_through_the_scenario(tmp_path: Path) -> None:
+    lines = _python(_blocks("python")[0], tmp_path).splitlines()
+    assert lines[0].startswith("0 reach - ")
+    assert lines[1].startswith("(28,)")
+    assert lines[2].startswith("['lift', 'push_right', 'pull', 'press']")
+
+
+def test_the_second_snippet_is_a_method_that_keeps_all_answers(folder: Path) -> None:
+    from clbench import read_record
+
+    answers = read_record(folder / "leaderboard/records/Toy-v0/my_method--HeadOnly/seed-0.json").answers
+    correct = [
+        sum(c for s, c in zip(answers["stage"], answers["correct"], strict=True) if s == k) for k in range(3)
+    ]
+    assert correct[0] == correct[1] == correct[2]
+
+
+def test_the_third_snippet_draws_the_table(folder: Path) -> None:
+    output = _console(_blocks("console")[1], folder)
+    assert "my_method:HeadOnly" in output
+    written = (folder / "leaderboard" / "LEADERBOARD.md").read_bytes()
+    _console(_blocks("console")[1], folder)
+    assert (folder / "leaderboard" / "LEADERBOARD.md").read_bytes() == written
+    assert "HeadOnly" in _python(_blocks("python")[2], folder)
+
+
+def test_every_command_and_file_that_the_readme_names_exists() -> None:
+    text = README.read_text(encoding="utf-8")
+    for path in re.findall(r"\]\(([\w./-]+)\)", text):
+        if os.path.dirname(path) != "leaderboard":  # records and table are not part of an installed package
+            assert (README.parent / path).exists(), path
