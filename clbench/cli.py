@@ -110,7 +110,7 @@ def run(
     from clbench.grid import benchmark_jobs, has_record, run_jobs
     from clbench.method import build_method
     from clbench.progress import Bars
-    from clbench.run import RunSpec
+    from clbench.run import RunSpec, check_device
     from clbench.task import load_scenario
 
     console = Console(stderr=True)
@@ -125,6 +125,7 @@ def run(
             raise ValueError(f"{name} must be at least {least}, not {value}.")
     if not methods:
         raise ValueError("Name at least one method; `clbench list` shows them.")
+    check_device(device)
     load_scenario(scenario)
     for method in methods:
         build_method(method, changes or {})

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import os
 import shutil
 import time
 import traceback
@@ -70,6 +71,9 @@ def execute(spec: RunSpec, records: Path, progress: Callable[[float], None] = la
     """
     scenario = load_scenario(spec.scenario)
     method = build_method(spec.method, spec.changes)
+    if spec.device != "cpu":
+        # without it cuBLAS may choose another kernel each time, and PyTorch refuses to be deterministic
+        os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")
     with deterministic():
         record = _Run(spec, scenario, method, progress).go()
     write_record(record, spec.path(records))
@@ -81,6 +85,19 @@ def run_length(scenario: Scenario) -> float:
     budget, stages = scenario.budget, len(scenario.target)
     reports = (stages + 1) * len(scenario.tasks) + stages * (len(evaluation_steps(budget)) - 1)
     return stages * budget.adaptation_steps + EPISODE_WEIGHT * reports * budget.report_episodes
+
+
+def check_device(device: str) -> None:
+    """Refuse a device that is not here.
+
+    Raises:
+        ValueError: The name is none that PyTorch knows, or this machine has no such device.
+    """
+    try:
+        torch.zeros(1, device=device)
+    except (RuntimeError, AssertionError) as error:
+        reason = str(error).partition("\n")[0]
+        raise ValueError(f"The device {device!r} cannot be used: {reason}") from error
 
 
 class _Run:

@@ -35,6 +35,7 @@ def _clbench(*arguments: str, folder: Path | None = None) -> subprocess.Complete
             ["run", "clbench/Fetch-v0", "experience_replay", "--set.replay", "x"],
             "replay must be a float, not 'x'",
         ),
+        (["run", "clbench/Fetch-v0", "sft", "--device", "gpu"], "The device 'gpu' cannot be used"),
         (["demonstrations", "clbench/Fetch"], "Did you mean 'clbench/Fetch-v0'"),
         (["leaderbord"], "leaderbord"),
     ],

@@ -1,5 +1,8 @@
 """Scenarios as Gymnasium environments, for Gymnasium's own tools and for Stable-Baselines3."""
 
+import os
+import subprocess
+import sys
 import warnings
 from typing import Any
 
@@ -133,8 +136,31 @@ def test_stable_baselines_checks_and_trains_on_numeric_instructions() -> None:
 
     env = gymnasium.make(FETCH, instruction="tokens", episodes_per_stage=10)
     check_env_of_stable_baselines(env)
-    agent = SAC("MultiInputPolicy", env, seed=0, learning_starts=1900, buffer_size=2000, device="cpu")
+    agent = SAC(
+        "MultiInputPolicy", env, seed=0, learning_starts=100, train_freq=8, buffer_size=2000, device="cpu"
+    )
     agent.learn(2000)
     assert agent.num_timesteps == 2000
     action, _ = agent.predict(env.reset()[0])
     assert env.action_space.contains(action)
+
+
+def test_the_scene_renders_without_changing_the_episode() -> None:
+    """In a process of its own: a rendering back end that does not work may kill it."""
+    code = """
+import gymnasium, numpy as np
+env = gymnasium.make("clbench:clbench/Fetch-v0", render_mode="rgb_array")
+twin = gymnasium.make("clbench/Fetch-v0")
+env.reset(seed=0), twin.reset(seed=0)
+for action in np.random.default_rng(0).uniform(-1, 1, (20, 4)).astype(np.float32):
+    state, other = env.step(action)[0]["state"], twin.step(action)[0]["state"]
+    frame = env.render()
+    assert (state == other).all()
+print(frame.shape, frame.std() > 10)
+"""
+    environment = {**os.environ, "MUJOCO_GL": os.environ.get("MUJOCO_GL", "egl")}
+    command = [sys.executable, "-c", code]
+    result = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    if result.returncode and "Assert" not in result.stderr:
+        pytest.skip(f"nothing renders here: {result.stderr.strip().splitlines()[-1:]}")
+    assert result.stdout.strip() == "(480, 480, 3) True", result.stderr
