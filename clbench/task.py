@@ -69,13 +69,13 @@ class Budget:
     """Episodes whose states the training questions ask about; a quarter as many more are for the report."""
     report_questions: int = 1000
     """Questions asked at the end of each stage."""
-    pretraining_steps: int = 2000
+    pretraining_steps: int = 3000
     """Optimiser steps on the retained tasks and the training questions."""
-    pretraining_learning_rate: float = 2e-3
+    pretraining_learning_rate: float = 1.5e-3
     """Peak step size of pretraining."""
-    adaptation_steps: int = 400
+    adaptation_steps: int = 300
     """Optimiser steps on each target task."""
-    learning_rate: float = 5e-4
+    learning_rate: float = 3e-4
     """Peak step size of adaptation."""
     batch_size: int = 64
     """Samples per step."""
