@@ -13,7 +13,7 @@ leaderboard:
 		&& $(BIN)/clbench run $(SCENARIO) joint experience_replay sft frozen --seeds 1 --records $(QUICK)/records \
 		&& $(BIN)/clbench leaderboard --records $(QUICK)/records \
 		&& seconds=$$(($$(date +%s) - start)) \
-		&& echo "From nothing to this table in $$((seconds / 60)) min $$((seconds % 60)) s, installing included."
+		&& echo "This table took $$((seconds / 60)) min $$((seconds % 60)) s, installing included."
 
 # The committed board: every built-in method, three seeds. Runs that have a record are skipped.
 records: .venv/installed

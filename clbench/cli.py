@@ -51,6 +51,11 @@ def main() -> None:
         sys.exit(130)
 
 
+def _at_least(least: int, option: str, value: int | None) -> None:
+    if value is not None and value < least:
+        raise ValueError(f"{option} must be at least {least}, not {value}.")
+
+
 @app.command(name="list")
 def list_() -> None:
     """List the scenarios with their tasks, and the methods with the prior data that they use."""
@@ -115,14 +120,9 @@ def run(
 
     console = Console(stderr=True)
     sys.path.insert(0, os.getcwd())  # a console script lacks it, and module:Class is looked for there
-    workers = (os.cpu_count() or 1) if workers is None else workers
-    for name, value, least in (
-        ("--seeds", seeds, 1),
-        ("--first-seed", first_seed, 0),
-        ("--workers", workers, 1),
-    ):
-        if value < least:
-            raise ValueError(f"{name} must be at least {least}, not {value}.")
+    _at_least(1, "--seeds", seeds)
+    _at_least(0, "--first-seed", first_seed)
+    _at_least(1, "--workers", workers)
     if not methods:
         raise ValueError("Name at least one method; `clbench list` shows them.")
     check_device(device)
@@ -142,7 +142,7 @@ def run(
     begin = time.monotonic()
     jobs = benchmark_jobs(missing, records)
     with Bars(sum(job.length for job in jobs), console) as bars:
-        failed = run_jobs(jobs, workers, bars)
+        failed = run_jobs(jobs, workers or os.cpu_count() or 1, bars)
     seconds = time.monotonic() - begin
     console.print(
         f"{len(missing)} runs in {seconds / 60:.1f} minutes; records in {records}.", highlight=False
@@ -167,6 +167,7 @@ def demonstrations(scenario: str, /, *, workers: int | None = None) -> None:
     from clbench.progress import Bars
     from clbench.task import load_scenario
 
+    _at_least(1, "--workers", workers)
     loaded = load_scenario(scenario)
     jobs = demonstration_jobs(scenario, [task.name for task in loaded.tasks])
     with Bars(sum(job.length for job in jobs)) as bars:

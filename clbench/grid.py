@@ -21,6 +21,10 @@ from clbench.task import load_scenario, resolve
 _SEND_SECONDS = 0.2
 
 
+class JobError(Exception):
+    """A job came to a bad end that its message tells in full."""
+
+
 @dataclass(frozen=True)
 class Job:
     """A piece of work for one process."""
@@ -144,6 +148,8 @@ def _work(connection: Connection, function: str, arguments: dict[str, Any]) -> N
         text = resolve(function)(**arguments, progress=progress)
         connection.send(("progress", owed))
         connection.send(("done", text))
+    except JobError as error:
+        connection.send(("failed", str(error)))
     except Exception as error:
         connection.send(("failed", f"{type(error).__name__}: {error}\n{traceback.format_exc()}"))
 
@@ -184,7 +190,9 @@ def run_job(spec: RunSpec, records: str, progress: Callable[[float], None]) -> s
     """Do one run and write its record."""
     record = execute(spec, Path(records), progress)
     if record.error is not None:
-        raise RuntimeError(f"{record.error['where']}: {record.error['type']}: {record.error['message']}")
+        raise JobError(
+            f"failed in {record.error['where']}: {record.error['type']}: {record.error['message']}"
+        )
     return "done"
 
 
@@ -210,7 +218,7 @@ def benchmark_jobs(specs: Sequence[RunSpec], records: Path) -> list[Job]:
     jobs.append(Job("questions", "clbench.grid:scenes_job", {"scenario": name}, budget.question_episodes))
     data = tuple(job.name for job in jobs)
     for seed in sorted({spec.seed for spec in specs}):
-        length = 1.0 if is_pretrained(scenario, seed) else 2.0 * budget.pretraining_steps
+        length = 0 if is_pretrained(scenario, seed) else budget.pretraining_steps
         arguments = {"scenario": name, "seed": seed}
         jobs.append(Job(f"pretraining seed {seed}", "clbench.grid:pretrain_job", arguments, length, data))
     for spec in specs:

@@ -164,7 +164,7 @@ class Method:
     def load_state(self, state: State) -> None:
         """Take back what `state` returned."""
         if state:
-            raise NotImplementedError(f"{type(self).__name__} returns a state() but has no load_state().")
+            raise TypeError(f"{type(self).__name__} returns a state() but has no load_state().")
 
     def diagnostics(self) -> dict[str, Any]:
         """Return what the method tells about itself for the record, as JSON."""

@@ -139,7 +139,6 @@ class _Run:
         finally:
             self.evaluator.close()
         self.record.timing["seconds"] = round(time.perf_counter() - begin, 2)
-        self.record.diagnostics = self.method.diagnostics() if self.record.status == "success" else {}
         shutil.rmtree(self.checkpoints, ignore_errors=True)
         return self.record
 
@@ -155,6 +154,10 @@ class _Run:
             self._stage(number)
             self._save(number)
         self._count_costs()
+        self.where = "diagnostics()"
+        diagnostics = self.method.diagnostics()
+        json.dumps(diagnostics, allow_nan=False)  # what a record cannot hold is the method's fault, told here
+        self.record.diagnostics = diagnostics
 
     def _stage(self, number: int) -> None:
         """Adapt to target `number`, evaluating on the way and at the end."""

@@ -22,8 +22,8 @@ class ScenarioEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
 
     `reset()` begins the next episode of the walk: `episodes_per_stage` episodes of stage 0, in which the
     retained tasks take turns, then as many of each target task; the last target goes on for ever.
-    `reset(seed=...)` begins the walk anew. `reset(options={"task": name})` chooses a task, and
-    `reset(options={"stage": k})` jumps to a stage; neither is undone by the walk.
+    `reset(seed=...)` begins the walk anew. `reset(options={"stage": k})` goes on from the start of a stage,
+    and `reset(options={"task": name})` chooses any task for one episode.
 
     Observation: a dictionary of `state`, float32 (S,), as the task's world gives it, and `instruction`, text,
     or with `instruction="tokens"` the word ids, int64 (L,), for agents that want numbers.

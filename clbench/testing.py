@@ -114,6 +114,7 @@ TOY = Scenario(
         question_episodes=40,
         report_questions=100,
         pretraining_steps=150,
+        pretraining_learning_rate=2e-3,
         adaptation_steps=30,
         learning_rate=1e-3,
         batch_size=16,

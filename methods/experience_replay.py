@@ -10,7 +10,7 @@ Details:
 from dataclasses import dataclass
 
 from clbench.method import Method, Prior, Source, Uses
-from clbench.policy import Batch
+from clbench.policy import Batch, Policy
 
 
 @dataclass
@@ -21,6 +21,11 @@ class ExperienceReplay(Method):
     """Share of each batch that is replayed; 0.5 is 1:1."""
 
     uses = Uses(demonstrations="throughout")
+
+    def prepare(self, policy: Policy, prior: Prior) -> None:
+        """Check the share."""
+        if not 0 <= self.replay <= 1:
+            raise ValueError(f"replay must be from 0 to 1, not {self.replay}.")
 
     def batch(self, target: Source[Batch], prior: Prior) -> Batch:
         """Return target and prior samples in one batch."""

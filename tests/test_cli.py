@@ -96,7 +96,8 @@ def test_a_stranger_runs_a_class_from_the_working_directory_and_sees_it_on_the_b
     (tmp_path / "mine.py").write_text(METHOD)
     result = _clbench("run", TOY, "mine:Gentle", "mine:Broken", "sft", "--seeds", "1", folder=tmp_path)
     assert result.returncode == 1  # the broken one; the others went on
-    assert "ValueError: no idea" in result.stderr
+    assert "mine:Broken seed 0: failed in stage 1 (right): ValueError: no idea" in result.stderr
+    assert "Traceback" not in result.stderr  # it stands in the record
     assert "1 failed: mine:Broken seed 0" in result.stderr
     records = sorted(path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*.json"))
     assert records == [

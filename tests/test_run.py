@@ -194,6 +194,12 @@ class _Forgetful(Method):
         raise RuntimeError(f"cannot merge {stage.task.name}")
 
 
+@dataclasses.dataclass
+class _Boasts(Method):
+    def diagnostics(self) -> dict[str, Any]:
+        return {"gain": float("inf")}
+
+
 @pytest.mark.parametrize(
     ("cls", "where", "message"),
     [
@@ -202,6 +208,7 @@ class _Forgetful(Method):
         (_Shapeless, "stage 1 (right)", "loss must be a scalar, shape (), not (16,)"),
         (_Sneaks, "stage 1 (right)", "touches prior demonstrations that it does not declare"),
         (_Peeks, "stage 1 (right)", "touches prior questions that it does not declare"),
+        (_Boasts, "diagnostics()", "not JSON compliant"),
         (_Forgetful, "stage 1 (right)", "cannot merge right"),
     ],
 )
@@ -216,6 +223,16 @@ def test_a_method_that_fails_leaves_a_record_that_says_where(
     assert record.error["where"] == where
     assert message in record.error["message"]
     assert "Traceback" in record.error["traceback"]
+
+
+def test_a_hyper_parameter_out_of_range_is_named_before_any_training(tmp_path: Path) -> None:
+    record = execute(RunSpec(TOY, "experience_replay", 0, {"replay": 1.5}), tmp_path)
+    assert record.error is not None
+    assert (record.error["where"], record.error["message"]) == (
+        "prepare",
+        "replay must be from 0 to 1, not 1.5.",
+    )
+    assert not record.episodes["stage"]
 
 
 def test_a_run_leaves_no_global_state_behind(tmp_path: Path) -> None:
