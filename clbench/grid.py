@@ -187,13 +187,17 @@ def pretrain_job(scenario: str, seed: int, progress: Callable[[float], None]) ->
 
 
 def run_job(spec: RunSpec, records: str, progress: Callable[[float], None]) -> str:
-    """Do one run and write its record."""
+    """Do one run, write its record, and return its main scores."""
+    from clbench.metrics import Scores, measure
+
     record = execute(spec, Path(records), progress)
     if record.error is not None:
         raise JobError(
             f"failed in {record.error['where']}: {record.error['type']}: {record.error['message']}"
         )
-    return "done"
+    scores = Scores.from_record(record)
+    values = {name: measure(name, scores) for name in ("adaptation", "retention", "question_retention")}
+    return ", ".join(f"{name} {'-' if value is None else f'{value:.2f}'}" for name, value in values.items())
 
 
 def demonstration_jobs(scenario: str, tasks: Sequence[str]) -> list[Job]:
