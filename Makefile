@@ -35,6 +35,7 @@ check: .venv/installed-dev
 wheel-test: .venv/installed-dev
 	rm -rf build/wheel && mkdir -p build/wheel
 	$(BIN)/python -m build --wheel --outdir build/wheel . >/dev/null
+	$(BIN)/python -m zipfile -l build/wheel/*.whl | grep -v '^File\|^clbench/\|^clbench-[^/]*dist-info/'; test $$? -eq 1
 	$(PYTHON) -m venv build/wheel/venv
 	build/wheel/venv/bin/pip install -q -c constraints.txt "$$(ls build/wheel/*.whl)[dev]"
 	outside=$$(mktemp -d) && cp -r tests pyproject.toml *.md LICENSE "$$outside" && here=$$PWD && cd "$$outside" \

@@ -61,7 +61,7 @@ class Task:
 class Budget:
     """What every method gets: data, steps, a policy of one size, and evaluation episodes."""
 
-    demonstrations: int = 100
+    demonstrations: int = 200
     """Expert episodes per task."""
     perturbation: float = 0.5
     """Share of the demonstrations in which disturbed actions are executed and the expert's are recorded."""
