@@ -26,9 +26,8 @@ def test_sft_learns_the_targets_and_forgets_the_skills(scores: dict[str, Scores]
     assert _value(scores, "sft", "retention") <= 0.2
 
 
-def test_replay_keeps_more_of_the_skills_and_of_the_answers_than_sft(scores: dict[str, Scores]) -> None:
-    for metric, margin in (("retention", 0.2), ("question_retention", 0.1)):
-        assert _value(scores, "experience_replay", metric) > _value(scores, "sft", metric) + margin
+def test_replay_keeps_skills_that_sft_loses(scores: dict[str, Scores]) -> None:
+    assert _value(scores, "experience_replay", "retention") > _value(scores, "sft", "retention") + 0.2
 
 
 def test_joint_keeps_the_answers(scores: dict[str, Scores]) -> None:
