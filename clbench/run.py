@@ -260,6 +260,7 @@ class _Run:
         suites = {package_of(name) for task in self.scenario.tasks for name in (task.world, task.expert)}
         return {
             "run": self.record.run,
+            "scenario": self.record.scenario,
             "stage": number,
             "pretraining": pretraining_inputs(self.scenario, self.spec.seed),
             "tasks": [dataclasses.asdict(task) for task in self.scenario.tasks],
