@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import logging
 import os
+import signal
 import sys
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated
 
@@ -32,23 +35,28 @@ app.command("clbench.doctor:doctor", name="doctor")
 
 
 def main() -> None:
-    """Run the command line. A wrong name or value ends with exit code 2 and says the nearest right one."""
+    """Run the command line."""
     console = Console(stderr=True)
     handler = RichHandler(console=console, show_time=False, show_path=False)
     logging.basicConfig(level=logging.WARNING, format="%(message)s", handlers=[handler])
+    # a scheduler's SIGTERM ends the workers too, as Ctrl-C does
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
     try:
         app()
-    except (LookupError, ValueError, TypeError) as error:
-        console.print(
-            f"error: {error.args[0] if error.args else error}",
-            style="bold red",
-            highlight=False,
-            markup=False,
-        )
-        sys.exit(2)
     except KeyboardInterrupt:
         console.print("Stopped. Finished records are kept; the same command goes on from here.", style="bold")
         sys.exit(130)
+
+
+@contextmanager
+def _input() -> Iterator[None]:
+    """Check input inside: a wrong name or value ends with exit code 2 and says the nearest right one."""
+    try:
+        yield
+    except (LookupError, ValueError, TypeError) as error:
+        console = Console(stderr=True, soft_wrap=True)
+        console.print(f"error: {error.args[0]}", style="bold red", highlight=False, markup=False)
+        sys.exit(2)
 
 
 def _at_least(least: int, option: str, value: int | None) -> None:
@@ -120,15 +128,16 @@ def run(
 
     console = Console(stderr=True)
     sys.path.insert(0, os.getcwd())  # a console script lacks it, and module:Class is looked for there
-    _at_least(1, "--seeds", seeds)
-    _at_least(0, "--first-seed", first_seed)
-    _at_least(1, "--workers", workers)
-    if not methods:
-        raise ValueError("Name at least one method; `clbench list` shows them.")
-    check_device(device)
-    load_scenario(scenario)
-    for method in methods:
-        build_method(method, changes or {})
+    with _input():
+        _at_least(1, "--seeds", seeds)
+        _at_least(0, "--first-seed", first_seed)
+        _at_least(1, "--workers", workers)
+        if not methods:
+            raise ValueError("Name at least one method; `clbench list` shows them.")
+        check_device(device)
+        load_scenario(scenario)
+        for method in methods:
+            build_method(method, changes or {})
     specs = [
         RunSpec(scenario, method, seed, changes or {}, device)
         for seed in range(first_seed, first_seed + seeds)
@@ -167,8 +176,9 @@ def demonstrations(scenario: str, /, *, workers: int | None = None) -> None:
     from clbench.progress import Bars
     from clbench.task import load_scenario
 
-    _at_least(1, "--workers", workers)
-    loaded = load_scenario(scenario)
+    with _input():
+        _at_least(1, "--workers", workers)
+        loaded = load_scenario(scenario)
     jobs = demonstration_jobs(scenario, [task.name for task in loaded.tasks])
     with Bars(sum(job.length for job in jobs)) as bars:
         failed = run_jobs(jobs, workers or os.cpu_count() or 1, bars)

@@ -75,7 +75,7 @@ class Bars:
     def finish(self, name: str, text: str) -> None:
         """Take a piece away and say what came of it."""
         self._progress.remove_task(self._bars.pop(name))
-        self.console.print(f"{name}: {text}", highlight=False, markup=False)
+        self.console.print(f"{name}: {text}", highlight=False, markup=False, soft_wrap=True)
 
 
 def _minutes(seconds: float) -> str:

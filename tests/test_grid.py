@@ -153,7 +153,14 @@ def _is_gone(group: int) -> bool:
     return False
 
 
-def test_ctrl_c_ends_the_command_and_its_workers_and_keeps_finished_records(empty_caches: Path) -> None:
+@pytest.mark.parametrize(
+    ("send", "stop", "code", "said"),
+    [(os.killpg, signal.SIGINT, 130, "Finished records are kept"), (os.kill, signal.SIGTERM, 143, "")],
+    ids=["ctrl-c", "scheduler"],
+)
+def test_stopping_the_command_ends_its_workers_and_keeps_finished_records(
+    empty_caches: Path, send: Callable[[int, int], None], stop: int, code: int, said: str
+) -> None:
     command = [sys.executable, "-m", "clbench", "run", TOY, "frozen", "sft", "joint", "--seeds", "3"]
     command += ["--workers", "1", "--records", str(empty_caches / "records")]
     process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, start_new_session=True)
@@ -161,10 +168,10 @@ def test_ctrl_c_ends_the_command_and_its_workers_and_keeps_finished_records(empt
     deadline = time.monotonic() + 100
     while not first.exists() and time.monotonic() < deadline:
         time.sleep(0.1)
-    os.killpg(process.pid, signal.SIGINT)
+    send(process.pid, stop)
     _, output = process.communicate(timeout=20)
-    assert process.returncode == 130
-    assert "Finished records are kept" in output
+    assert process.returncode == code
+    assert said in output
     assert "Traceback" not in output
     assert _is_gone(process.pid)
     records = _records(empty_caches / "records")
