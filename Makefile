@@ -4,7 +4,7 @@ BIN := .venv/bin
 SCENARIO := clbench/Fetch-v0
 QUICK := build/quick
 
-.PHONY: leaderboard records test test-slow check wheel-test clean
+.PHONY: leaderboard records test check wheel-test clean
 
 # The main job: from nothing to a table in minutes, with one seed. The full board takes `make records`.
 leaderboard:
@@ -21,9 +21,6 @@ records: .venv/installed
 	$(BIN)/clbench leaderboard
 
 test: .venv/installed-dev
-	$(BIN)/pytest -m "not slow"
-
-test-slow: .venv/installed-dev
 	$(BIN)/pytest
 
 check: .venv/installed-dev
@@ -39,13 +36,13 @@ wheel-test: .venv/installed-dev
 	$(PYTHON) -m venv build/wheel/venv
 	build/wheel/venv/bin/pip install -q -c constraints.txt "$$(ls build/wheel/*.whl)[dev]"
 	outside=$$(mktemp -d) && cp -r tests pyproject.toml *.md LICENSE "$$outside" && here=$$PWD && cd "$$outside" \
-		&& $$here/build/wheel/venv/bin/python -m pytest -m "not slow" && rm -rf "$$outside"
+		&& $$here/build/wheel/venv/bin/python -m pytest && rm -rf "$$outside"
 
 clean:
 	rm -rf .venv build dist
 
 .venv/installed: pyproject.toml constraints.txt
-	test -x $(BIN)/python || $(PYTHON) -m venv .venv
+	test -x $(BIN)/pip || $(PYTHON) -m venv .venv
 	$(BIN)/pip install -q -c constraints.txt -e .
 	@touch $@
 

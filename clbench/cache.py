@@ -20,9 +20,9 @@ _MANIFEST = "clbench.json"
 
 def cache_folder() -> Path:
     """Return the folder of the cache: `CLBENCH_CACHE`, or clbench below the user's own cache folder."""
-    if "CLBENCH_CACHE" in os.environ:
+    if os.environ.get("CLBENCH_CACHE"):
         return Path(os.environ["CLBENCH_CACHE"]).expanduser().resolve()
-    return Path(os.environ.get("XDG_CACHE_HOME", "~/.cache")).expanduser() / "clbench"
+    return Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser() / "clbench"
 
 
 def hash_of(values: Any) -> str:
@@ -31,23 +31,33 @@ def hash_of(values: Any) -> str:
 
 
 def source_hash(*modules: str) -> str:
-    """Return the hash of the source of `modules`; a package counts with all its files."""
+    """Return the hash of the source of `modules`; a package counts with all files below it."""
     digest = hashlib.sha256()
     for module in modules:
-        spec = importlib.util.find_spec(module)
-        assert spec is not None, module
-        assert spec.origin is not None, module
-        origin = Path(spec.origin)
-        for path in sorted(origin.parent.iterdir()) if origin.name == "__init__.py" else [origin]:
-            if path.is_file():
+        origin = _origin(module)
+        if origin is None:  # typed in by hand: there is nothing to read
+            digest.update(module.encode())
+            continue
+        for path in sorted(origin.parent.rglob("*")) if origin.name == "__init__.py" else [origin]:
+            if path.is_file() and path.suffix != ".pyc":
                 digest.update(path.read_bytes())
     return digest.hexdigest()[:16]
+
+
+def _origin(module: str) -> Path | None:
+    """Return the file of a module, or None if it has none."""
+    try:
+        spec = importlib.util.find_spec(module)
+    except ValueError:
+        return None
+    return Path(spec.origin) if spec is not None and spec.origin is not None else None
 
 
 def package_of(entry_point: str) -> str:
     """Return the package that "package.module:attribute" lies in, or the module if it stands alone."""
     module = entry_point.partition(":")[0]
-    return module.rpartition(".")[0] or module
+    package = module.rpartition(".")[0]
+    return package if package and _origin(package) is not None else module
 
 
 def cached(folder: Path, inputs: Mapping[str, Any], make: Callable[[Path], None]) -> Path:

@@ -55,7 +55,12 @@ def _input() -> Iterator[None]:
         yield
     except (LookupError, ValueError, TypeError) as error:
         console = Console(stderr=True, soft_wrap=True)
-        console.print(f"error: {error.args[0]}", style="bold red", highlight=False, markup=False)
+        console.print(
+            f"error: {error.args[0] if error.args else error!r}",
+            style="bold red",
+            highlight=False,
+            markup=False,
+        )
         sys.exit(2)
 
 
@@ -120,10 +125,10 @@ def run(
         changes: Hyper-parameters that differ from the methods' own, as --set.name value. Such a run has a
             record of its own, which the leaderboard does not show.
     """
-    from clbench.grid import benchmark_jobs, has_record, run_jobs
+    from clbench.grid import benchmark_jobs, run_jobs
     from clbench.method import build_method
     from clbench.progress import Bars
-    from clbench.run import RunSpec, check_device
+    from clbench.run import RunSpec, check_device, has_record
     from clbench.task import load_scenario
 
     console = Console(stderr=True)
@@ -136,12 +141,12 @@ def run(
             raise ValueError("Name at least one method; `clbench list` shows them.")
         check_device(device)
         load_scenario(scenario)
-        for method in methods:
-            build_method(method, changes or {})
+        built = {method: build_method(method, changes or {}) for method in methods}
+    values = {name: {key: getattr(method, key) for key in changes or {}} for name, method in built.items()}
     specs = [
-        RunSpec(scenario, method, seed, changes or {}, device)
+        RunSpec(scenario, method, seed, values[method], device)
         for seed in range(first_seed, first_seed + seeds)
-        for method in dict.fromkeys(methods)
+        for method in built
     ]
     missing = [spec for spec in specs if not has_record(spec, records)]
     if len(missing) < len(specs):

@@ -130,7 +130,9 @@ def dataset_folder(task: Task, budget: Budget, progress: Callable[[float], None]
         "task": dataclasses.asdict(task),
         "demonstrations": budget.demonstrations,
         "perturbation": budget.perturbation,
-        "source": source_hash(__name__, *sorted({package_of(task.world), package_of(task.expert)})),
+        "source": source_hash(
+            __name__, "clbench.seeding", *sorted({package_of(task.world), package_of(task.expert)})
+        ),
         "versions": {package: version(package) for package in SIMULATORS},
     }
     folder = get_dataset_path(task.dataset_id)

@@ -11,6 +11,7 @@ from pathlib import Path
 import torch
 from packaging.requirements import Requirement
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from clbench.cache import cache_folder
@@ -49,7 +50,7 @@ def _packages() -> Table:
         except PackageNotFoundError:
             found, verdict = (
                 "-",
-                f"pip install 'clbench[{extra}]'" if extra else "[red]pip install clbench[/]",
+                escape(f"pip install 'clbench[{extra}]'") if extra else "[red]pip install clbench[/]",
             )
         table.add_row(requirement.name, found, str(requirement.specifier), verdict)
     return table

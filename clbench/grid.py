@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import multiprocessing
+import os
 import signal
+import sys
 import time
 import traceback
 from collections.abc import Callable, Sequence
@@ -14,7 +16,6 @@ from pathlib import Path
 from typing import Any
 
 from clbench.progress import Bars
-from clbench.record import RecordError, read_record
 from clbench.run import RunSpec, execute, run_length
 from clbench.task import load_scenario, resolve
 
@@ -117,7 +118,9 @@ def _context() -> Any:
 def _start(job: Job) -> _Worker:
     context = _context()
     ours, theirs = context.Pipe(duplex=False)
-    process = context.Process(target=_work, args=(theirs, job.function, job.arguments), daemon=True)
+    process = context.Process(
+        target=_work, args=(theirs, job.function, job.arguments, dict(os.environ)), daemon=True
+    )
     process.start()
     theirs.close()  # so that the end of the process is the end of the stream
     return _Worker(job, process, ours)
@@ -132,8 +135,11 @@ def _receive(worker: _Worker) -> tuple[str, Any]:
     return kind, value
 
 
-def _work(connection: Connection, function: str, arguments: dict[str, Any]) -> None:
+def _work(
+    connection: Connection, function: str, arguments: dict[str, Any], environment: dict[str, str]
+) -> None:
     """Do one job in this process and send what comes of it."""
+    os.environ.update(environment)  # the process that this one was forked from may have an older one
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the parent, which ends its workers
     owed, sent = 0.0, time.monotonic()
 
@@ -141,7 +147,10 @@ def _work(connection: Connection, function: str, arguments: dict[str, Any]) -> N
         nonlocal owed, sent
         owed += amount
         if time.monotonic() - sent >= _SEND_SECONDS:
-            connection.send(("progress", owed))
+            try:
+                connection.send(("progress", owed))
+            except OSError:  # nobody listens any more: stop as if killed, so that the run can be resumed
+                sys.exit(1)
             owed, sent = 0.0, time.monotonic()
 
     try:
@@ -231,11 +240,3 @@ def benchmark_jobs(specs: Sequence[RunSpec], records: Path) -> list[Job]:
         title = f"{spec.method} seed {spec.seed}"
         jobs.append(Job(title, "clbench.grid:run_job", arguments, run_length(scenario), needs))
     return jobs
-
-
-def has_record(spec: RunSpec, records: Path) -> bool:
-    """Return whether the run went through before: a record that failed or cannot be read does not count."""
-    try:
-        return read_record(spec.path(records)).status == "success"
-    except RecordError:
-        return False

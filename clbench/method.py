@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import difflib
 import importlib
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from importlib.metadata import EntryPoint, entry_points
-from typing import Any, Generic, Literal, Protocol, TypeVar
+from types import NoneType, UnionType
+from typing import Any, Generic, Literal, Protocol, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import torch
 from torch import Tensor, nn
@@ -50,7 +52,7 @@ class Samples(Protocol[Drawn]):
 
 
 class Source(Generic[Rows]):
-    """Data with the random stream that draws from it.
+    """Data with the random stream that draws from it, open as long as the seams it was handed to.
 
     Args:
         data: What is drawn from.
@@ -62,15 +64,37 @@ class Source(Generic[Rows]):
     def __init__(
         self, data: Samples[Rows], generator: torch.Generator, batch_size: int, device: str = "cpu"
     ) -> None:
-        self.data: Samples[Rows] = data
         self.batch_size = batch_size
+        self._data: Samples[Rows] | None = data
         self._generator = generator
         self._device = device
 
+    @property
+    def bytes(self) -> int:
+        """Memory that the data takes."""
+        return self._open.bytes
+
     def sample(self, count: int) -> Rows:
-        """Return `count` samples."""
-        rows: Rows = self.data.sample(count, self._generator).to(self._device)
+        """Return `count` samples.
+
+        Raises:
+            UndeclaredAccessError: The seams that it was handed to are over.
+        """
+        rows: Rows = self._open.sample(count, self._generator).to(self._device)
         return rows
+
+    def close(self) -> None:
+        """End the access."""
+        self._data = None
+
+    @property
+    def _open(self) -> Samples[Rows]:
+        if self._data is None:
+            raise UndeclaredAccessError(
+                "The method draws from data after the seams that it was handed to. What it needs later it "
+                'must keep in `state()`, or declare with "throughout" in its `uses`.'
+            )
+        return self._data
 
 
 @dataclass(frozen=True)
@@ -98,10 +122,15 @@ class Prior:
             )
         return self.sources[name]
 
+    def close(self) -> None:
+        """End the access."""
+        for source in self.sources.values():
+            source.close()
+
     @property
     def bytes(self) -> int:
         """Memory that the declared data takes."""
-        return sum(source.data.bytes for source in self.sources.values())
+        return sum(source.bytes for source in self.sources.values())
 
 
 @dataclass(frozen=True)
@@ -114,6 +143,12 @@ class Stage:
     """What is learned."""
     seed: int
     """For the method's own random draws in this stage."""
+    steps: int
+    """Optimiser steps of the budget."""
+    target: Source[Batch]
+    """The task's demonstrations."""
+    prior: Prior
+    """What may be touched of what was learned before."""
 
 
 @dataclass(frozen=True)
@@ -129,7 +164,8 @@ class Progress:
 class Method:
     """A rule for fine-tuning: a dataclass whose fields are its hyper-parameters.
 
-    The constructor only stores; what a method learns is set by the seams. Override what differs from plain
+    The constructor only stores, and `__post_init__` refuses what is out of range; what a method learns is set
+    by the seams. Override what differs from plain
     fine-tuning, and declare in `uses` which prior data the method touches.
     """
 
@@ -158,11 +194,15 @@ class Method:
         """Merge or consolidate after a target."""
 
     def state(self) -> State:
-        """Return what a resumed run needs, tensors and plain values by name; its bytes count as kept."""
+        """Return all that later seams need, tensors and plain values by name; its bytes count as kept.
+
+        Every stage begins with a new object of the method that has this state and nothing else, whether the
+        run was interrupted or not.
+        """
         return {}
 
-    def load_state(self, state: State) -> None:
-        """Take back what `state` returned."""
+    def load_state(self, policy: Policy, state: State) -> None:
+        """Take back what `state` returned, and add to a plain policy what `prepare` added, as adapters."""
         if state:
             raise TypeError(f"{type(self).__name__} returns a state() but has no load_state().")
 
@@ -195,7 +235,7 @@ def load_method(spec: str) -> type[Method]:
     if ":" in spec:
         cls = _import_method(spec)
     elif spec in (installed := _installed()):
-        cls = installed[spec].load()
+        cls = _guarded(spec, installed[spec].load)
     else:
         near = difflib.get_close_matches(spec, installed, n=1)
         hint = f" Did you mean {near[0]!r}?" if near else ""
@@ -208,12 +248,19 @@ def load_method(spec: str) -> type[Method]:
     return cls
 
 
-def _import_method(spec: str) -> Any:
-    name, _, attribute = spec.partition(":")
+def _guarded(spec: str, load: Callable[[], Any]) -> Any:
+    """Return what `load` returns; whatever goes wrong in a stranger's module is told in one line."""
     try:
-        module = importlib.import_module(name)
+        return load()
     except ModuleNotFoundError as error:
         raise LookupError(f"No module {error.name!r} can be imported for the method {spec!r}.") from error
+    except Exception as error:
+        raise LookupError(f"{spec!r} cannot be imported: {type(error).__name__}: {error}") from error
+
+
+def _import_method(spec: str) -> Any:
+    name, _, attribute = spec.partition(":")
+    module = _guarded(spec, lambda: importlib.import_module(name))
     if not hasattr(module, attribute):
         near = difflib.get_close_matches(attribute, dir(module), n=1)
         hint = f" Did you mean {near[0]!r}?" if near else ""
@@ -230,10 +277,11 @@ def build_method(spec: str, changes: Mapping[str, Any]) -> Method:
 
     Raises:
         LookupError: The method has no such hyper-parameter; the nearest one is named.
-        ValueError: A value cannot be read as the field's type.
+        ValueError: A value cannot be read as the field's type, or the method refuses it.
     """
     cls = load_method(spec)
-    fields = {field.name: field for field in dataclasses.fields(cls)}  # type: ignore[arg-type]
+    hints = get_type_hints(cls)
+    fields = [field.name for field in dataclasses.fields(cls)]  # type: ignore[arg-type]
     values = {}
     for name, value in changes.items():
         if name not in fields:
@@ -242,19 +290,25 @@ def build_method(spec: str, changes: Mapping[str, Any]) -> Method:
             raise LookupError(
                 f"{spec} has no hyper-parameter {name!r}.{hint} It has: {', '.join(fields) or 'none'}."
             )
-        values[name] = _like(fields[name].default, value, name)
-    return cls(**values)
-
-
-def _like(default: Any, value: Any, name: str) -> Any:
-    """Return `value`, a string, as the type of `default`."""
-    if not isinstance(value, str) or isinstance(default, str):
-        return value
-    if isinstance(default, bool):
-        if value.lower() in ("true", "false"):
-            return value.lower() == "true"
-        raise ValueError(f"{name} must be true or false, not {value!r}.")
+        values[name] = _read(name, value, hints[name]) if isinstance(value, str) else value
     try:
-        return type(default)(value)
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"{name} must be a {type(default).__name__}, not {value!r}.") from error
+        return cls(**values)
+    except Exception as error:
+        raise ValueError(f"{spec} refuses its hyper-parameters: {error}") from error
+
+
+def _read(name: str, text: str, hint: Any) -> Any:
+    """Return `text` as a value of the type `hint`: str, int, float, bool, or one of these or None."""
+    kinds = get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)
+    if text.lower() == "none" and NoneType in kinds:
+        return None
+    for kind in (bool, int, float, str):
+        if kind not in kinds:
+            continue
+        if kind is bool and text.lower() in ("true", "false"):
+            return text.lower() == "true"
+        if kind is not bool:
+            with contextlib.suppress(ValueError):
+                return kind(text)
+    words = " or ".join(getattr(kind, "__name__", str(kind)).replace("NoneType", "none") for kind in kinds)
+    raise ValueError(f"{name} must be {words.replace('bool', 'true or false')}, not {text!r}.")

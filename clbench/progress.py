@@ -32,6 +32,7 @@ class Bars:
         self._total, self._done = max(total, 1e-9), 0.0
         self._started = self._last_line = clock()
         self._bars: dict[str, TaskID] = {}
+        self._left: dict[str, float] = {}
         self._progress = Progress(
             TextColumn("{task.description}"),
             BarColumn(),
@@ -56,9 +57,11 @@ class Bars:
     def start(self, name: str, length: float) -> None:
         """Show a new piece of work."""
         self._bars[name] = self._progress.add_task(name, total=length)
+        self._left[name] = length
 
     def advance(self, name: str, amount: float) -> None:
         """Show that `amount` of a piece was done."""
+        self._left[name] -= amount
         self._progress.advance(self._bars[name], amount)
         self._progress.advance(self._all, amount)
         self._done += amount
@@ -73,7 +76,9 @@ class Bars:
             )
 
     def finish(self, name: str, text: str) -> None:
-        """Take a piece away and say what came of it."""
+        """Take a piece away, whatever was left of it, and say what came of it."""
+        self.advance(name, self._left[name])
+        del self._left[name]
         self._progress.remove_task(self._bars.pop(name))
         self.console.print(f"{name}: {text}", highlight=False, markup=False, soft_wrap=True)
 

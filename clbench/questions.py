@@ -5,6 +5,7 @@ They stand for the knowledge of a vision-language model: what a policy knew befo
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
 from importlib.metadata import version
@@ -45,12 +46,13 @@ def scenes_folder(scenario: Scenario, progress: Callable[[float], None] = lambda
     """
     inputs = {
         "scenario": scenario.id,
-        "tasks": [task.name for task in scenario.retained],
+        "tasks": [dataclasses.asdict(task) for task in scenario.retained],
         "episodes": scenario.budget.question_episodes,
         "source": source_hash(
             "clbench.demonstrations",
+            "clbench.seeding",
             __name__,
-            *sorted({package_of(task.world) for task in scenario.retained}),
+            *sorted({package_of(name) for task in scenario.retained for name in (task.world, task.expert)}),
         ),
         "versions": {package: version(package) for package in SIMULATORS},
     }

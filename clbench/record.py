@@ -35,8 +35,8 @@ class Record:
     status: Literal["success", "failed"]
     """Whether the run went through."""
     run: dict[str, Any]
-    """What was run: `scenario`, `method`, `seed`, `settings` (all hyper-parameters), `changes` (those that
-    differ from the method's defaults), `uses` (the prior data it may touch)."""
+    """What was run: `scenario`, `method`, `seed`, `device`, `settings` (all hyper-parameters),
+    `changes` (those that differ from the method's defaults), `uses` (the prior data it may touch)."""
     scenario: dict[str, Any]
     """The scenario in full: `retained`, `target` and `held_out` task names in order, and its `budget`."""
     episodes: dict[str, list[Any]] = field(default_factory=lambda: {name: [] for name in EPISODE_COLUMNS})

@@ -23,9 +23,9 @@ from clbench.evaluation import Episode, Evaluator, answer
 from clbench.fingerprint import fingerprint
 from clbench.method import Access, Method, Prior, Source, Stage, State, build_method
 from clbench.policy import load_policy, save_policy
-from clbench.questions import Questions, load_questions, report_questions
-from clbench.record import Record, read_record, record_path, write_record
-from clbench.seeding import derive_seed, torch_generator
+from clbench.questions import load_questions, report_questions
+from clbench.record import Record, RecordError, read_record, record_path, write_record
+from clbench.seeding import derive_seed, seeded, torch_generator
 from clbench.task import Scenario, Task, load_scenario
 from clbench.training import adapt, deterministic, evaluation_steps, pretrained_policy, pretraining_inputs
 
@@ -55,7 +55,7 @@ class RunSpec:
     @property
     def label(self) -> str:
         """The method and what was changed of it, as "experience_replay+replay=0.02"."""
-        return "+".join([self.method, *(f"{name}={value}" for name, value in self.changes.items())])
+        return "+".join([self.method, *(f"{name}={value}" for name, value in sorted(self.changes.items()))])
 
 
 def execute(spec: RunSpec, records: Path, progress: Callable[[float], None] = lambda _: None) -> Record:
@@ -69,15 +69,63 @@ def execute(spec: RunSpec, records: Path, progress: Callable[[float], None] = la
         progress: Called with the optimiser steps, or what took as long, that were done since its last call;
             `run_length` says how many there are.
     """
-    scenario = load_scenario(spec.scenario)
-    method = build_method(spec.method, spec.changes)
     if spec.device != "cpu":
         # without it cuBLAS may choose another kernel each time, and PyTorch refuses to be deterministic
         os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")
     with deterministic():
-        record = _Run(spec, scenario, method, progress).go()
+        run = _Run(spec, records, progress)
+        record = run.go()
     write_record(record, spec.path(records))
+    run.forget()
     return record
+
+
+def has_record(spec: RunSpec, records: Path) -> bool:
+    """Return whether this very run went through before.
+
+    One that failed, that cannot be read, or that is of another budget, device or settings does not count.
+    """
+    try:
+        record = read_record(spec.path(records))
+    except RecordError:
+        return False
+    scenario = load_scenario(spec.scenario)
+    method = build_method(spec.method, spec.changes)
+    wanted = (_describe_run(spec, scenario, method), _describe_scenario(scenario))
+    return record.status == "success" and (record.run, record.scenario) == wanted
+
+
+def _describe_run(spec: RunSpec, scenario: Scenario, method: Method) -> dict[str, Any]:
+    """Return `Record.run`."""
+    values = dataclasses.asdict(method)  # type: ignore[call-overload]
+    settings = {name: _plain(value) for name, value in values.items()}
+    return {
+        "scenario": scenario.id,
+        "method": spec.method,
+        "seed": spec.seed,
+        "device": spec.device,
+        "settings": settings,
+        "changes": {name: settings[name] for name in sorted(spec.changes)},
+        "uses": dataclasses.asdict(method.uses),
+    }
+
+
+def _describe_scenario(scenario: Scenario) -> dict[str, Any]:
+    """Return `Record.scenario`."""
+    groups = ("retained", "target", "held_out")
+    return {
+        "id": scenario.id,
+        **{group: [task.name for task in getattr(scenario, group)] for group in groups},
+        "budget": dataclasses.asdict(scenario.budget),
+    }
+
+
+def _plain(value: Any) -> Any:
+    """Return a value as JSON holds it; what it cannot hold becomes text."""
+    try:
+        return json.loads(json.dumps(value, allow_nan=False))
+    except (TypeError, ValueError):
+        return repr(value)
 
 
 def run_length(scenario: Scenario) -> float:
@@ -101,12 +149,16 @@ def check_device(device: str) -> None:
 
 
 class _Run:
-    """A run on its way: the policy, the method's data, and the record so far."""
+    """A run on its way: the policy, the method's data, and the record so far.
 
-    def __init__(
-        self, spec: RunSpec, scenario: Scenario, method: Method, progress: Callable[[float], None]
-    ) -> None:
-        self.spec, self.scenario, self.method, self.progress = spec, scenario, method, progress
+    Each stage begins with what the last one saved: a policy from its checkpoint and a new object of the
+    method that was given its state. An interrupted run therefore goes on as one that was not.
+    """
+
+    def __init__(self, spec: RunSpec, records: Path, progress: Callable[[float], None]) -> None:
+        self.spec, self.progress = spec, progress
+        self.scenario = scenario = load_scenario(spec.scenario)
+        self.method = build_method(spec.method, spec.changes)
         self.where = "start"
         self.evaluator = Evaluator(scenario, spec.seed)
         self.policy, self.pretrained = pretrained_policy(scenario, spec.seed)
@@ -115,17 +167,18 @@ class _Run:
             task.name: load_demonstrations(task, scenario, self.policy.config)
             for task in scenario.retained + scenario.target
         }
-        train, report = load_questions(scenario)
-        self.questions: Questions = train
+        self.questions, report = load_questions(scenario)
         self.kinds = report.kinds
         self.asked = report_questions(report, scenario.budget.report_questions)
+        self.begin, self.seconds_before = time.perf_counter(), 0.0
         self.record = self._new_record()
-        self.checkpoints = cache_folder() / "runs" / hash_of(self._inputs(0))
+        # two commands may do the same run for different folders at once
+        key = {**self._inputs(0), "records": str(records.resolve())}
+        self.checkpoints = cache_folder() / "runs" / hash_of(key)
 
     def go(self) -> Record:
         """Go through all stages that no checkpoint holds, and return the record."""
         self.record.timing["started"] = datetime.now(UTC).isoformat(timespec="seconds")
-        begin = time.perf_counter()
         try:
             self._go_through()
         except Exception as error:
@@ -138,50 +191,65 @@ class _Run:
             }
         finally:
             self.evaluator.close()
-        self.record.timing["seconds"] = round(time.perf_counter() - begin, 2)
-        shutil.rmtree(self.checkpoints, ignore_errors=True)
+        self._count_seconds()
         return self.record
+
+    def forget(self) -> None:
+        """Remove the checkpoints, once the record is written."""
+        shutil.rmtree(self.checkpoints, ignore_errors=True)
 
     def _go_through(self) -> None:
         done = self._resume()
         if done is None:
             done = 0
-            self.where = "prepare"
-            self.method.prepare(self.policy, self._prior(0, ("prepare", "throughout")))
-            self._report(0, 0, self.scenario.tasks)
+            self._prepare()
             self._save(0)
         for number in range(done + 1, len(self.scenario.target) + 1):
+            self._load(number - 1)
             self._stage(number)
             self._save(number)
+        self._load(len(self.scenario.target))
         self._count_costs()
         self.where = "diagnostics()"
-        diagnostics = self.method.diagnostics()
-        json.dumps(diagnostics, allow_nan=False)  # what a record cannot hold is the method's fault, told here
-        self.record.diagnostics = diagnostics
+        self.record.diagnostics = _checked(self.method.diagnostics())
+
+    def _prepare(self) -> None:
+        """Let the method prepare, and evaluate what there is before any target."""
+        self.where = "prepare"
+        prior = self._prior(0, ("prepare", "throughout"))
+        with seeded("method", self.spec.seed, 0):
+            self.method.prepare(self.policy, prior)
+        prior.close()
+        self._report(0, 0, self.scenario.tasks)
 
     def _stage(self, number: int) -> None:
         """Adapt to target `number`, evaluating on the way and at the end."""
-        spec, budget, task = self.spec, self.scenario.budget, self.scenario.target[number - 1]
-        stage = Stage(number, task, derive_seed("method", spec.seed, number))
+        seed, budget, task = self.spec.seed, self.scenario.budget, self.scenario.target[number - 1]
         points = evaluation_steps(budget)
         begin, evaluating = time.perf_counter(), 0.0
 
-        def after(step: int) -> None:
+        def evaluate(step: int, tasks: tuple[Task, ...]) -> None:
             nonlocal evaluating
+            paused = time.perf_counter()
+            self._report(number, step, tasks)
+            evaluating += time.perf_counter() - paused
+
+        def after(step: int) -> None:
             self.progress(1)
             if step in points[:-1]:
-                paused = time.perf_counter()
-                self._report(number, step, (task,))
-                evaluating += time.perf_counter() - paused
+                evaluate(step, (task,))
 
         self.where = f"stage {number} ({task.name})"
         target = self._source("target", number, self.data[task.name])
         prior = self._prior(number, ("throughout",))
-        steps = adapt(self.policy, self.method, stage, target, prior, budget, after)
+        method_seed = derive_seed("method", seed, number)
+        stage = Stage(number, task, method_seed, budget.adaptation_steps, target, prior)
+        with seeded("method", seed, number):
+            steps = adapt(self.policy, self.method, stage, budget, after)
+        target.close()
+        prior.close()
+        evaluate(budget.adaptation_steps, self.scenario.tasks)
         training = time.perf_counter() - begin - evaluating
-        paused = time.perf_counter()
-        self._report(number, budget.adaptation_steps, self.scenario.tasks)
-        evaluating += time.perf_counter() - paused
         self.record.costs["optimiser_steps"] += steps
         self.record.timing["stages"].append(
             {"training": round(training, 2), "evaluation": round(evaluating, 2)}
@@ -218,32 +286,19 @@ class _Run:
                 _append(self.record.answers, (number, name, asked, correct))
 
     def _new_record(self) -> Record:
-        scenario, method = self.scenario, self.method
-        settings = dataclasses.asdict(method)  # type: ignore[call-overload]
         parameters = sum(parameter.numel() for parameter in self.policy.parameters())
         return Record(
             status="success",
-            run={
-                "scenario": scenario.id,
-                "method": self.spec.method,
-                "seed": self.spec.seed,
-                "device": self.spec.device,
-                "settings": settings,
-                "changes": {name: settings[name] for name in self.spec.changes},
-                "uses": dataclasses.asdict(method.uses),
-            },
-            scenario={
-                "id": scenario.id,
-                **{
-                    group: [task.name for task in getattr(scenario, group)]
-                    for group in ("retained", "target", "held_out")
-                },
-                "budget": dataclasses.asdict(scenario.budget),
-            },
+            run=_describe_run(self.spec, self.scenario, self.method),
+            scenario=_describe_scenario(self.scenario),
             costs={"optimiser_steps": 0, "parameters": parameters},
-            fingerprint={**fingerprint(scenario), "pretrained": _hash_of_policy(self.pretrained)},
+            fingerprint={**fingerprint(self.scenario), "pretrained": _hash_of_policy(self.pretrained)},
             timing={"stages": []},
         )
+
+    def _count_seconds(self) -> None:
+        seconds = self.seconds_before + time.perf_counter() - self.begin
+        self.record.timing["seconds"] = round(seconds, 2)
 
     def _count_costs(self) -> None:
         state = self.method.state()
@@ -258,13 +313,14 @@ class _Run:
     def _inputs(self, number: int) -> dict[str, Any]:
         """Return all that the state after stage `number` depends on."""
         suites = {package_of(name) for task in self.scenario.tasks for name in (task.world, task.expert)}
+        method = package_of(type(self.method).__module__)
         return {
             "run": self.record.run,
             "scenario": self.record.scenario,
             "stage": number,
             "pretraining": pretraining_inputs(self.scenario, self.spec.seed),
             "tasks": [dataclasses.asdict(task) for task in self.scenario.tasks],
-            "source": source_hash("clbench", "clbench.policy", type(self.method).__module__, *sorted(suites)),
+            "source": source_hash("clbench", method, *sorted(suites)),
         }
 
     def _save(self, number: int) -> None:
@@ -274,33 +330,47 @@ class _Run:
             save_policy(self.policy, folder)
             state = self.method.state()
             tensors = {name: value for name, value in state.items() if isinstance(value, torch.Tensor)}
-            save_file(tensors, folder / "method.safetensors")
+            copies = {name: value.detach().clone().contiguous() for name, value in tensors.items()}
+            save_file(copies, folder / "method.safetensors")
             values = {name: value for name, value in state.items() if name not in tensors}
             (folder / "method.json").write_text(json.dumps(values), encoding="utf-8")
             write_record(self.record, folder / "record.json")
 
         self.where = f"state() after stage {number}"
+        self._count_seconds()
         cached(self.checkpoints / f"stage-{number}", self._inputs(number), write)
         shutil.rmtree(self.checkpoints / f"stage-{number - 1}", ignore_errors=True)
 
+    def _load(self, number: int) -> None:
+        """Take the policy and the method as they were after stage `number`."""
+        self.where = f"load_state() after stage {number}"
+        folder = self.checkpoints / f"stage-{number}"
+        state: State = {**json.loads((folder / "method.json").read_text(encoding="utf-8"))}
+        state.update(load_file(folder / "method.safetensors", device=self.spec.device))
+        self.method = build_method(self.spec.method, self.spec.changes)
+        policy = load_policy(folder, lambda policy: self.method.load_state(policy, state))
+        self.policy = policy.to(self.spec.device)
+
     def _resume(self) -> int | None:
-        """Go back to the latest checkpoint and return its stage, or None if there is none."""
+        """Take the record of the latest checkpoint and return its stage, or None if there is none."""
         for number in range(len(self.scenario.target), -1, -1):
             folder = self.checkpoints / f"stage-{number}"
             if is_cached(folder, self._inputs(number)):
-                self.where = "load_state"
-                self.policy = load_policy(folder).to(self.spec.device)
-                state: State = {**json.loads((folder / "method.json").read_text(encoding="utf-8"))}
-                state.update(load_file(folder / "method.safetensors"))
-                self.method.load_state(state)
-                timing = self.record.timing
+                started = self.record.timing["started"]
                 self.record = read_record(folder / "record.json")
-                self.record.timing.update(
-                    {**timing, "stages": self.record.timing["stages"], "resumed_after": number}
-                )
+                self.seconds_before = self.record.timing["seconds"]
+                self.record.timing.update({"started": started, "resumed_after": number})
                 self.progress(number * run_length(self.scenario) / len(self.scenario.target))
                 return number
         return None
+
+
+def _checked(diagnostics: Any) -> dict[str, Any]:
+    """Return a method's diagnostics, if a record can hold them."""
+    if not isinstance(diagnostics, dict):
+        raise TypeError(f"diagnostics() must return a dictionary, not {type(diagnostics).__name__}.")
+    json.dumps(diagnostics, allow_nan=False)
+    return diagnostics
 
 
 def _episode_row(number: int, step: int, episode: Episode) -> tuple[Any, ...]:

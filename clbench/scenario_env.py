@@ -11,7 +11,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from clbench.demonstrations import World
-from clbench.policy import TEXT_LENGTH, encode, vocabulary
+from clbench.policy import TEXT_LENGTH, VOCABULARY_SIZE, encode
 from clbench.task import Scenario, Task, resolve
 
 Observation = dict[str, Any]
@@ -68,7 +68,7 @@ class ScenarioEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
 
     def _instruction_space(self) -> spaces.Space[Any]:
         if self._instruction_format == "tokens":
-            return spaces.Box(0, len(vocabulary()) - 1, (TEXT_LENGTH,), np.int64)
+            return spaces.Box(0, VOCABULARY_SIZE - 1, (TEXT_LENGTH,), np.int64)
         longest = max(len(words) for task in self.scenario.tasks for words in task.instructions)
         return spaces.Text(max_length=longest, charset=string.ascii_lowercase + " ")
 

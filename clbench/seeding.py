@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import hashlib
+import random
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 import numpy as np
 import torch
@@ -22,3 +25,22 @@ def numpy_generator(*parts: str | int) -> np.random.Generator:
 def torch_generator(*parts: str | int) -> torch.Generator:
     """Return the PyTorch generator, on the CPU, of the stream that `parts` name."""
     return torch.Generator().manual_seed(derive_seed(*parts))
+
+
+@contextmanager
+def seeded(*parts: str | int) -> Iterator[None]:
+    """Seed the global generators of Python, NumPy and PyTorch inside, and put them back after.
+
+    Our own code draws from explicit generators; a method, or a library that it uses, may not.
+    """
+    python, numpy_state = random.getstate(), np.random.get_state()  # noqa: NPY002 - to put it back
+    seed = derive_seed(*parts)
+    with torch.random.fork_rng():
+        random.seed(seed)
+        np.random.seed(seed)  # noqa: NPY002
+        torch.manual_seed(seed)
+        try:
+            yield
+        finally:
+            random.setstate(python)
+            np.random.set_state(numpy_state)  # noqa: NPY002

@@ -15,8 +15,8 @@ from torch import Tensor, nn
 
 from clbench.cache import cache_folder, cached, hash_of, is_cached, package_of, source_hash
 from clbench.demonstrations import SIMULATORS, Demonstrations, load_demonstrations
-from clbench.method import Method, Prior, Progress, Source, Stage
-from clbench.policy import Batch, Policy, PolicyConfig, load_policy, save_policy
+from clbench.method import Method, Progress, Stage
+from clbench.policy import Policy, PolicyConfig, load_policy, save_policy
 from clbench.questions import load_questions
 from clbench.seeding import derive_seed, torch_generator
 from clbench.task import Budget, Scenario, resolve
@@ -101,10 +101,17 @@ def optimise(
         _check_loss(loss, step)
         optimiser.zero_grad()
         gradients(loss)
-        nn.utils.clip_grad_norm_(trained, GRADIENT_NORM)
+        _clip(trained, step)
         optimiser.step()
         after(step + 1)
     return steps
+
+
+def _clip(trained: list[nn.Parameter], step: int) -> None:
+    try:
+        nn.utils.clip_grad_norm_(trained, GRADIENT_NORM, error_if_nonfinite=True)
+    except RuntimeError as error:
+        raise MethodError(f"step {step}: a gradient is not finite.") from error
 
 
 def _check_loss(loss: Any, step: int) -> None:
@@ -211,8 +218,6 @@ def adapt(
     policy: Policy,
     method: Method,
     stage: Stage,
-    target: Source[Batch],
-    prior: Prior,
     budget: Budget,
     after: Callable[[int], None] = lambda _: None,
 ) -> int:
@@ -221,26 +226,28 @@ def adapt(
     Args:
         policy: What is trained.
         method: How.
-        stage: Which target.
-        target: Its demonstrations.
-        prior: What the method may touch of what was learned before.
-        budget: Steps and step size.
+        stage: Which target, with the data that the method may touch.
+        budget: Step size.
         after: Called after each step with the number of steps done.
     """
     parameters = method.start_task(policy, stage)
 
     def loss_at(step: int) -> Tensor:
-        return method.loss(policy, method.batch(target, prior), Progress(step, budget.adaptation_steps))
+        batch = method.batch(stage.target, stage.prior)
+        return method.loss(policy, batch, Progress(step, stage.steps))
 
     steps = optimise(
         parameters,
         budget.learning_rate,
-        budget.adaptation_steps,
+        stage.steps,
         loss_at,
         lambda loss: method.gradients(policy, loss),
         after,
     )
     method.end_task(policy, stage)
+    for name, parameter in policy.named_parameters():
+        if not torch.isfinite(parameter).all():
+            raise MethodError(f"The parameter {name} is not finite after {stage.task.name!r}.")
     return steps
 
 

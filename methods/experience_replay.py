@@ -10,7 +10,7 @@ Details:
 from dataclasses import dataclass
 
 from clbench.method import Method, Prior, Source, Uses
-from clbench.policy import Batch, Policy
+from clbench.policy import Batch
 
 
 @dataclass
@@ -22,8 +22,7 @@ class ExperienceReplay(Method):
 
     uses = Uses(demonstrations="throughout")
 
-    def prepare(self, policy: Policy, prior: Prior) -> None:
-        """Check the share."""
+    def __post_init__(self) -> None:
         if not 0 <= self.replay <= 1:
             raise ValueError(f"replay must be from 0 to 1, not {self.replay}.")
 

@@ -33,7 +33,11 @@ def _clbench(*arguments: str, folder: Path | None = None) -> subprocess.Complete
         (["run", "clbench/Fetch-v0", "sft", "--set.rate", "1"], "sft has no hyper-parameter 'rate'"),
         (
             ["run", "clbench/Fetch-v0", "experience_replay", "--set.replay", "x"],
-            "replay must be a float, not 'x'",
+            "replay must be float, not 'x'",
+        ),
+        (
+            ["run", "clbench/Fetch-v0", "experience_replay", "--set.replay", "7"],
+            "replay must be from 0 to 1, not 7.0",
         ),
         (["run", "clbench/Fetch-v0", "sft", "--device", "gpu"], "The device 'gpu' cannot be used"),
         (["demonstrations", "clbench/Fetch"], "Did you mean 'clbench/Fetch-v0'"),

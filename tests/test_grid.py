@@ -14,9 +14,9 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from clbench.grid import Job, benchmark_jobs, has_record, run_jobs
+from clbench.grid import Job, benchmark_jobs, run_jobs
 from clbench.progress import Bars
-from clbench.run import RunSpec
+from clbench.run import RunSpec, has_record
 
 TOY = "clbench.testing:clbench/Toy-v0"
 
@@ -125,21 +125,6 @@ def test_one_worker_and_two_give_equal_records_and_a_stopped_grid_goes_on(
     records = _records(empty_caches / "one")
     assert len(records) == 4
     assert records == _records(empty_caches / "two")
-
-
-def test_a_failed_or_torn_record_is_run_again(tmp_path: Path, make_record: Callable[..., Any]) -> None:
-    from clbench.record import write_record
-
-    spec = RunSpec(TOY, "sft", 0)
-    assert not has_record(spec, tmp_path)
-    record = make_record([[1.0, 0.0], [0.0, 1.0]], groups=(1, 1, 0))
-    write_record(record, spec.path(tmp_path))
-    assert has_record(spec, tmp_path)
-    record.status = "failed"
-    write_record(record, spec.path(tmp_path))
-    assert not has_record(spec, tmp_path)
-    spec.path(tmp_path).write_text("{")
-    assert not has_record(spec, tmp_path)
 
 
 def _is_gone(group: int) -> bool:

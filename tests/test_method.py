@@ -78,7 +78,7 @@ def test_changes_from_the_command_line_take_the_fields_own_types() -> None:
     ("changes", "error", "message"),
     [
         ({"strenght": "1"}, LookupError, r"has no hyper-parameter 'strenght'. Did you mean 'strength'\?"),
-        ({"rounds": "many"}, ValueError, "rounds must be a int, not 'many'"),
+        ({"rounds": "many"}, ValueError, "rounds must be int, not 'many'"),
         ({"gentle": "perhaps"}, ValueError, "gentle must be true or false, not 'perhaps'"),
     ],
 )
@@ -99,5 +99,7 @@ def test_undeclared_prior_data_cannot_be_touched(name: str) -> None:
 def test_declared_prior_data_counts_in_bytes() -> None:
     data = Demonstrations(*(torch.zeros(4, 2) for _ in range(5)))
     prior = Prior({"demonstrations": Source(data, torch.Generator(), 8)})
-    assert prior.demonstrations.data is data
     assert prior.bytes == 5 * 4 * 2 * 4
+    prior.close()
+    with pytest.raises(UndeclaredAccessError, match="after the seams that it was handed to"):
+        prior.demonstrations.sample(1)

@@ -2,11 +2,19 @@
 
 from clbench.policy.batch import Batch, QuestionBatch
 from clbench.policy.checkpoint import CheckpointError, load_policy, save_policy
-from clbench.policy.language import TEXT_LENGTH, UnknownWordError, encode, vocabulary, word_id
+from clbench.policy.language import (
+    TEXT_LENGTH,
+    VOCABULARY_SIZE,
+    UnknownWordError,
+    encode,
+    vocabulary,
+    word_id,
+)
 from clbench.policy.policy import Policy, PolicyConfig
 
 __all__ = [
     "TEXT_LENGTH",
+    "VOCABULARY_SIZE",
     "Batch",
     "CheckpointError",
     "Policy",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 import torch
@@ -29,8 +30,12 @@ def save_policy(policy: Policy, folder: Path) -> None:
     )
 
 
-def load_policy(folder: Path) -> Policy:
+def load_policy(folder: Path, extend: Callable[[Policy], None] = lambda _: None) -> Policy:
     """Read the policy that `save_policy` wrote to `folder`.
+
+    Args:
+        folder: Where it lies.
+        extend: Adds to a plain policy what it had more when it was saved, as adapters.
 
     Raises:
         CheckpointError: A file is missing or torn, or its tensors do not have the shapes that it says.
@@ -41,6 +46,7 @@ def load_policy(folder: Path) -> Policy:
     except (OSError, ValueError, TypeError, SafetensorError) as error:
         raise CheckpointError(f"{folder}: cannot be read as a policy ({error}).") from error
     policy = Policy(config)
+    extend(policy)
     expected = {name: tuple(value.shape) for name, value in policy.state_dict().items()}
     found = {name: tuple(value.shape) for name, value in tensors.items()}
     if expected != found:

@@ -13,6 +13,10 @@ from tokenizers import Tokenizer, models, normalizers, pre_tokenizers
 TEXT_LENGTH = 12
 """Words that the policy reads at most; shorter texts are padded, so that every forward has one shape."""
 
+VOCABULARY_SIZE = 1024
+"""Rows of the embedding and of the answers: more than there are words. A word that a new suite needs is
+appended to the vocabulary's end, and changes neither the shapes nor the initial weights of a policy."""
+
 PADDING = "[padding]"
 
 

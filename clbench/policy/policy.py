@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from clbench.policy.backbone import Backbone
 from clbench.policy.batch import Batch, QuestionBatch
 from clbench.policy.flow import FlowHead
-from clbench.policy.language import TEXT_LENGTH, vocabulary
+from clbench.policy.language import TEXT_LENGTH, VOCABULARY_SIZE
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ class PolicyConfig:
     """Actions of a chunk that are executed before the next forward."""
     euler_steps: int = 5
     """Integration steps of the flow."""
-    vocabulary_size: int = len(vocabulary())
+    vocabulary_size: int = VOCABULARY_SIZE
     """Words it can read and answer."""
 
 

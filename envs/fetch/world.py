@@ -48,6 +48,10 @@ APART = 0.10
 """Least distance from block to gripper, and from target to both: no task is nearly done at the start."""
 
 
+NEARBY = 0.20
+"""Most distance from target to block in the plane: on a longer way a block slips sideways off the fingers."""
+
+
 @dataclass(frozen=True)
 class _Scene:
     """The compiled scene and what is fixed in it. All worlds of a process share it and only read."""
@@ -196,14 +200,15 @@ class FetchWorld(gymnasium.Env[State, NDArray[np.float32]]):
         return block
 
     def _place_target(self, block: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return a place (3,) for the marker: apart from the gripper, and sideways from the block (2,)."""
+        """Return a place (3,) for the marker: apart from the gripper, and beside the block (2,)."""
         gripper = self._scene.gripper
         while True:
             target = gripper + self.np_random.uniform(-SPREAD, SPREAD, size=3)
             target[2] = self._scene.rest_height
             if not self._rule.target_on_table and self.np_random.uniform() < 0.5:
                 target[2] += self.np_random.uniform(*TARGET_HEIGHTS)
-            if min(np.linalg.norm(target - gripper), np.linalg.norm(target[:2] - block)) >= APART:
+            way = float(np.linalg.norm(target[:2] - block))
+            if APART <= way <= NEARBY and np.linalg.norm(target - gripper) >= APART:
                 return target
 
     def _reset_physics(self, block: NDArray[np.float64]) -> None:

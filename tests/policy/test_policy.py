@@ -71,15 +71,21 @@ def test_the_flow_loss_is_the_squared_error_of_the_velocity_at_the_drawn_time() 
     np.testing.assert_allclose(loss, expected, rtol=1e-4)
 
 
-def test_steps_that_do_not_count_do_not_change_the_loss() -> None:
+def test_the_loss_is_the_mean_over_the_steps_that_count() -> None:
+    """What does not count is still read by the other steps, as in a rollout; its own error is left out."""
     policy, batch = Policy(CONFIG), _batch(3)
-    valid = batch.valid.clone()
-    valid[:, 4:] = 0
-    loss = policy.action_loss(dataclasses.replace(batch, valid=valid))
-    full = dataclasses.replace(batch, valid=valid, action=batch.action.clone())
-    full.action[:, 4:] += 0.0
-    assert loss.equal(policy.action_loss(full))
-    assert not loss.equal(policy.action_loss(batch))
+    parts = []
+    for step in range(CONFIG.chunk):
+        valid = torch.zeros(3, CONFIG.chunk)
+        valid[:, step] = 1
+        parts.append(policy.action_loss(dataclasses.replace(batch, valid=valid)))
+    errors = torch.stack(parts).detach().numpy()
+    some = torch.ones(3, CONFIG.chunk)
+    some[0, 2:], some[1, 5:] = 0, 0
+    loss = policy.action_loss(dataclasses.replace(batch, valid=some)).detach().numpy()
+    np.testing.assert_allclose(
+        loss, [errors[:2, 0].mean(), errors[:5, 1].mean(), errors[:, 2].mean()], rtol=1e-4
+    )
 
 
 def test_detached_hidden_states_stop_the_gradient_at_the_backbone() -> None:
