@@ -1,0 +1,57 @@
+"""The committed board: what a scenario must show before any row on it is believed."""
+
+import importlib
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from clbench.metrics import Scores
+from clbench.record import read_record
+
+RECORDS = Path(__file__).parents[2] / "leaderboard" / "records"
+
+pytestmark = pytest.mark.skipif(not RECORDS.exists(), reason="records are not part of an installed package")
+
+
+@pytest.fixture(scope="module")
+def board() -> Any:
+    """The board of Fetch-v0 by method."""
+    table = importlib.import_module("clbench.leaderboard").load(RECORDS)
+    return table[table["scenario"] == "clbench/Fetch-v0"].set_index("method")
+
+
+def test_every_method_has_the_same_seeds_and_the_same_pretrained_policies() -> None:
+    records = [read_record(path) for path in RECORDS.rglob("*.json")]
+    policies = {(record.run["seed"], record.fingerprint["pretrained"]) for record in records}
+    assert len(policies) == len({seed for seed, _ in policies}) >= 3
+    assert not any(record.run["changes"] for record in records)
+    assert not any(record.fingerprint["commit"]["dirty"] for record in records)
+
+
+def test_the_pretrained_policy_has_its_skills_and_answers() -> None:
+    for path in (RECORDS / "Fetch-v0" / "frozen").glob("*.json"):
+        rates = Scores.from_record(read_record(path)).rates()
+        assert rates.retained[0].mean() >= 0.90
+        assert rates.correct[0].sum() / rates.asked[0].sum() >= 0.95
+
+
+def test_plain_fine_tuning_learns_and_forgets(board: Any) -> None:
+    assert board.loc["sft", "adaptation"] >= 0.85
+    assert board.loc["sft", "retention"] <= 0.50
+
+
+def test_replay_keeps_the_skills(board: Any) -> None:
+    assert board.loc["experience_replay", "retention"] >= 0.90
+
+
+def test_joint_training_does_everything() -> None:
+    runs = [Scores.from_record(read_record(path)) for path in (RECORDS / "Fetch-v0" / "joint").glob("*.json")]
+    last = sum(run.success[-1].mean(axis=-1) for run in runs) / len(runs)
+    trained = len(runs[0].layout.retained) + len(runs[0].layout.target)
+    assert last[:trained].min() >= 0.90, dict(zip(runs[0].layout.tasks, last, strict=True))
+
+
+def test_the_frozen_policy_forgets_exactly_nothing_and_does_not_know_the_targets(board: Any) -> None:
+    assert board.loc["frozen", "forgetting"] == 0.0
+    assert board.loc["frozen", "adaptation"] <= 0.25

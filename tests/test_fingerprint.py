@@ -1,0 +1,25 @@
+import subprocess
+import sys
+from importlib.metadata import version
+
+from clbench.fingerprint import fingerprint, rollout_hash
+from clbench.task import load_scenario
+
+TOY = load_scenario("clbench.testing:clbench/Toy-v0")
+FETCH = load_scenario("clbench/Fetch-v0")
+
+
+def test_a_rollout_hash_is_the_same_in_another_process_and_differs_between_tasks() -> None:
+    world = FETCH.task("lift").world
+    code = f"from clbench.fingerprint import rollout_hash; print(rollout_hash({world!r}, 'lift'))"
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert rollout_hash(world, "lift") == result.stdout.strip()
+    assert rollout_hash(world, "lift") != rollout_hash(world, "reach")
+
+
+def test_a_fingerprint_names_versions_hardware_and_every_world() -> None:
+    found = fingerprint(TOY)
+    assert found["versions"]["mujoco"] == version("mujoco")
+    assert found["hardware"]["machine"]
+    assert set(found["rollouts"]) == {"clbench.testing:ToyWorld"}
+    assert found["commit"] is None or len(found["commit"]["id"]) == 40
