@@ -165,7 +165,7 @@ class Method:
     """A rule for fine-tuning: a dataclass whose fields are its hyper-parameters.
 
     The constructor only stores, and `__post_init__` refuses what is out of range; what a method learns is set
-    by the seams. Override what differs from plain fine-tuning, and declare in `uses` which prior data is touched.
+    by the seams. Override what differs from plain fine-tuning, and declare in `uses` the prior data it needs.
     """
 
     uses: Uses = Uses()
