@@ -6,9 +6,11 @@ import multiprocessing
 import os
 import signal
 import sys
+import threading
 import time
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
@@ -64,8 +66,9 @@ def run_jobs(jobs: Sequence[Job], workers: int, bars: Bars) -> dict[str, str]:
             waiting = _drop_hopeless(waiting, failed)
             for job in _ready(waiting, ended, workers - len(running)):
                 waiting.remove(job)
-                worker = _start(job)
-                running[worker.connection] = worker
+                with _undisturbed():
+                    worker = _start(job)
+                    running[worker.connection] = worker
                 bars.start(job.name, job.length)
             for connection in wait(list(running), timeout=1.0):
                 assert isinstance(connection, Connection)
@@ -106,12 +109,37 @@ def _ready(waiting: Sequence[Job], ended: set[str], free: int) -> list[Job]:
     return [job for job in waiting if ended.issuperset(job.needs)][:free]
 
 
+@contextmanager
+def _undisturbed() -> Iterator[None]:
+    """Hold Ctrl-C and SIGTERM back inside: a start that is cut short leaves half a process behind."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    held: list[int] = []
+    stops = (signal.SIGINT, signal.SIGTERM)
+    before = {stop: signal.signal(stop, lambda number, _: held.append(number)) for stop in stops}
+    try:
+        yield
+    finally:
+        for stop, handler in before.items():
+            signal.signal(stop, handler)
+        for number in held[:1]:
+            signal.raise_signal(number)
+
+
 def _context() -> Any:
     """Return how processes are started: from one that has imported all once (50 ms), or anew (2 s)."""
     if "forkserver" not in multiprocessing.get_all_start_methods():
         return multiprocessing.get_context("spawn")
+    from multiprocessing import forkserver  # cannot be imported where there is none
+
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(["clbench.run"])
+    if threading.current_thread() is threading.main_thread():
+        # what it starts ignores Ctrl-C as it does: from the first instruction, not from `_work` on
+        before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+        forkserver.ensure_running()
+        signal.signal(signal.SIGINT, before)
     return context
 
 
