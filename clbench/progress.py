@@ -71,16 +71,18 @@ class Bars:
             share = min(1.0, self._done / self._total)
             left = (now - self._started) * (1 - share) / share
             names = ", ".join(self._bars)
-            self.console.print(
-                f"{share:4.0%}, about {_minutes(left)} left: {names}", highlight=False, markup=False
-            )
+            self._say(f"{share:4.0%}, about {_minutes(left)} left: {names}")
 
     def finish(self, name: str, text: str) -> None:
         """Take a piece away, whatever was left of it, and say what came of it."""
         self.advance(name, self._left[name])
         del self._left[name]
         self._progress.remove_task(self._bars.pop(name))
-        self.console.print(f"{name}: {text}", highlight=False, markup=False, soft_wrap=True)
+        self._say(f"{name}: {text}")
+
+    def _say(self, line: str) -> None:
+        """Print a line as it is: names may look like markup, and a log is not to be wrapped."""
+        self.console.print(line, highlight=False, markup=False, soft_wrap=True)
 
 
 def _minutes(seconds: float) -> str:
