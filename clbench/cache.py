@@ -11,7 +11,10 @@ import shutil
 import uuid
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 LOG = logging.getLogger("clbench")
 
@@ -28,6 +31,15 @@ def cache_folder() -> Path:
 def hash_of(values: Any) -> str:
     """Return a short hash of anything that JSON can hold."""
     return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()[:16]
+
+
+def hash_of_tensors(tensors: Mapping[str, Tensor]) -> str:
+    """Return a short hash of the names and the bits of tensors."""
+    digest = hashlib.sha256()
+    for name, value in sorted(tensors.items()):
+        digest.update(f"{name} {value.dtype} {tuple(value.shape)}".encode())
+        digest.update(value.detach().cpu().contiguous().numpy().tobytes())
+    return digest.hexdigest()[:16]
 
 
 def source_hash(*modules: str) -> str:

@@ -1,7 +1,8 @@
-"""The commands: `clbench list`, `run`, `leaderboard`, `demonstrations`, `doctor`."""
+"""The commands: `clbench list`, `run`, `tune`, `leaderboard`, `demonstrations`, `doctor`."""
 
 from __future__ import annotations
 
+import itertools
 import logging
 import os
 import signal
@@ -10,7 +11,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import App, Parameter
 from rich.console import Console
@@ -19,8 +20,14 @@ from rich.table import Table
 
 import clbench
 
+if TYPE_CHECKING:
+    from clbench.run import RunSpec
+
 RECORDS = Path("leaderboard/records")
 """Where records lie, seen from the working directory."""
+
+TUNING = Path("leaderboard/tuning")
+"""Where the records of tuning runs lie, seen from the working directory."""
 
 app = App(
     name="clbench",
@@ -31,6 +38,8 @@ app = App(
 
 # Named, not imported: the core knows its parts by name alone.
 app.command("clbench.leaderboard.cli:show", name="leaderboard")
+app.command("clbench.leaderboard.cli:claims", name="claims")
+app.command("clbench.leaderboard.cli:method_pages", name="method-pages")
 app.command("clbench.doctor:doctor", name="doctor")
 
 
@@ -102,6 +111,7 @@ def run(
     scenario: str,
     /,
     *methods: str,
+    every: Annotated[bool, Parameter(name="--all", negative="")] = False,
     seeds: int = 3,
     first_seed: int = 0,
     workers: int | None = None,
@@ -117,6 +127,7 @@ def run(
     Args:
         scenario: Gymnasium id of the scenario, as clbench/Fetch-v0; module:id imports the module first.
         methods: Names of installed methods, or module:Class.
+        every: Run all installed methods.
         seeds: How many seeds.
         first_seed: The first of them.
         workers: Runs at once, each a process with one thread; all cores if not given.
@@ -125,34 +136,43 @@ def run(
         changes: Hyper-parameters that differ from the methods' own, as --set.name value. Such a run has a
             record of its own, which the leaderboard does not show.
     """
-    from clbench.grid import benchmark_jobs, run_jobs
-    from clbench.method import build_method
-    from clbench.progress import Bars
-    from clbench.run import RunSpec, check_device, has_record
+    from clbench.method import build_method, method_names
+    from clbench.run import RunSpec, check_device
     from clbench.task import load_scenario
 
-    console = Console(stderr=True)
     sys.path.insert(0, os.getcwd())  # a console script lacks it, and module:Class is looked for there
     with _input():
         _at_least(1, "--seeds", seeds)
         _at_least(0, "--first-seed", first_seed)
         _at_least(1, "--workers", workers)
-        if not methods:
-            raise ValueError("Name at least one method; `clbench list` shows them.")
+        names = dict.fromkeys([*methods, *(method_names() if every else ())])
+        if not names:
+            raise ValueError("Name at least one method, or --all; `clbench list` shows them.")
         check_device(device)
         load_scenario(scenario)
-        built = {method: build_method(method, changes or {}) for method in methods}
+        built = {method: build_method(method, changes or {}) for method in names}
     values = {name: {key: getattr(method, key) for key in changes or {}} for name, method in built.items()}
     specs = [
         RunSpec(scenario, method, seed, values[method], device)
         for seed in range(first_seed, first_seed + seeds)
         for method in built
     ]
+    if not _run_missing(specs, records, workers):
+        sys.exit(1)
+
+
+def _run_missing(specs: list[RunSpec], records: Path, workers: int | None) -> bool:
+    """Do the runs that have no record yet, and return whether none failed."""
+    from clbench.grid import benchmark_jobs, run_jobs
+    from clbench.progress import Bars
+    from clbench.run import has_record
+
+    console = Console(stderr=True)
     missing = [spec for spec in specs if not has_record(spec, records)]
     if len(missing) < len(specs):
         console.print(f"{len(specs) - len(missing)} of {len(specs)} runs have a record already.")
     if not missing:
-        return
+        return True
     begin = time.monotonic()
     jobs = benchmark_jobs(missing, records)
     with Bars(sum(job.length for job in jobs), console) as bars:
@@ -165,7 +185,77 @@ def run(
         console.print(
             f"{len(failed)} failed: {', '.join(failed)}.", style="bold red", highlight=False, markup=False
         )
+    return not failed
+
+
+@app.command
+def tune(
+    scenario: str,
+    method: str,
+    /,
+    *,
+    values: dict[str, str],
+    seed: int = 100,
+    workers: int | None = None,
+    records: Path = TUNING,
+) -> None:
+    """Compare settings of METHOD on SCENARIO, without a look at anything that is reported.
+
+    Every combination of the values is run with a seed that no board reports and on selection episodes, beside
+    plain fine-tuning. Show the table again with the same command; runs that have a record are skipped.
+
+    Args:
+        scenario: Gymnasium id of the scenario.
+        method: Name of an installed method, or module:Class.
+        values: Hyper-parameters and the values to try, as --values.tau_start 0.3,1,3
+        seed: Of pretraining and of every draw; the boards report seeds from 0.
+        workers: Runs at once, each a process with one thread; all cores if not given.
+        records: Folder of these records.
+    """
+    from clbench.method import build_method
+    from clbench.run import RunSpec
+    from clbench.task import load_scenario
+
+    sys.path.insert(0, os.getcwd())
+    with _input():
+        _at_least(0, "--seed", seed)
+        _at_least(1, "--workers", workers)
+        load_scenario(scenario)
+        lists = [[(name, value) for value in text.split(",")] for name, text in values.items()]
+        specs = []
+        for combination in map(dict, itertools.product(*lists)):
+            built = build_method(method, combination)
+            changes = {name: getattr(built, name) for name in combination}
+            specs.append(RunSpec(scenario, method, seed, changes, split="selection"))
+    baseline = RunSpec(scenario, "sft", seed, split="selection")
+    going_well = _run_missing([baseline, *specs], records, workers)
+    Console().print(_tuning_table(baseline, specs, records))
+    if not going_well:
         sys.exit(1)
+
+
+def _tuning_table(baseline: RunSpec, specs: list[RunSpec], records: Path) -> Table:
+    """Return what came of the runs that have a record."""
+    from clbench.metrics import measure
+    from clbench.record import read_record
+    from clbench.run import has_record
+    from clbench.scores import Scores
+
+    names = ("adaptation", "retention", "retention_at_matched_adaptation", "question_retention")
+    table = Table(title=f"{baseline.scenario}, seed {baseline.seed}, selection episodes")
+    table.add_column("settings", no_wrap=True)
+    for name in names:
+        table.add_column(name.replace("_", " "), justify="right")
+    scores = {
+        spec.label: Scores.from_record(read_record(spec.path(records)))
+        for spec in [baseline, *specs]
+        if has_record(spec, records)
+    }
+    reference = scores.get(baseline.label)
+    for label, one in scores.items():
+        row = [measure(name, one, {"sft": reference} if reference else {}) for name in names]
+        table.add_row(label, *("-" if value is None else f"{value:.2f}" for value in row))
+    return table
 
 
 @app.command

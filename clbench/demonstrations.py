@@ -241,6 +241,10 @@ class Demonstrations:
         )
         return cls(state, action, valid, torch.cat(words), torch.cat(rows))
 
+    def __len__(self) -> int:
+        """Return the number of moments."""
+        return len(self.state)
+
     @property
     def bytes(self) -> int:
         """Memory that the data takes."""

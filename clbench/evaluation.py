@@ -20,7 +20,10 @@ from clbench.questions import QuestionKind
 from clbench.seeding import derive_seed, torch_generator
 from clbench.task import Scenario, Split, Task, resolve
 
-LANES = 64
+Trial = tuple[Task, Split, int]
+"""One episode to run: its task, its split and its number."""
+
+LANES = 40
 """Episodes that are stepped together, and rows of every forward."""
 
 
@@ -48,6 +51,7 @@ class _Lane:
 
     worlds: dict[str, World] = field(default_factory=dict)
     task: Task | None = None
+    split: Split = "selection"
     number: int = 0
     words: torch.Tensor = field(default_factory=lambda: torch.zeros(0))
     noise: torch.Tensor = field(default_factory=lambda: torch.zeros(0))
@@ -91,29 +95,42 @@ class Evaluator:
             split: Which episodes. Choose on "selection"; "report" is for scores alone.
             progress: Called with the number of episodes that have ended since its last call.
         """
-        order = [(task, number) for task in tasks for number in range(self.scenario.budget.episodes(split))]
-        queue = list(reversed(order))
-        ended: dict[tuple[str, int], Episode] = {}
+        numbers = range(self.scenario.budget.episodes(split))
+        return self.play(policy, [(task, split, number) for task in tasks for number in numbers], progress)
+
+    def play(
+        self, policy: Policy, trials: Sequence[Trial], progress: Callable[[float], None] = lambda _: None
+    ) -> list[Episode]:
+        """Return the outcome of each of `trials`, in their order; none may be there twice.
+
+        Args:
+            policy: What acts.
+            trials: Which episodes: task, split and number.
+            progress: Called with the number of episodes that have ended since its last call.
+        """
+        queue = list(reversed(trials))
+        ended: dict[tuple[str, Split, int], Episode] = {}
         live: list[_Lane] = []
         idle = list(self._lanes)
         while queue or live:
             while queue and idle:
-                live.append(self._start(idle.pop(), policy, *queue.pop(), split))
+                live.append(self._start(idle.pop(), policy, *queue.pop()))
             chunks = self._act(policy, live)
             for lane, chunk in zip(live.copy(), chunks, strict=True):
-                episode = _execute(lane, chunk, split)
+                episode = _execute(lane, chunk)
                 if episode is not None:
-                    ended[episode.task, episode.number] = episode
+                    ended[episode.task, episode.split, episode.number] = episode
                     live.remove(lane)
                     idle.append(lane)
                     progress(1)
-        return [ended[task.name, number] for task, number in order]
+        return [ended[task.name, split, number] for task, split, number in trials]
 
-    def _start(self, lane: _Lane, policy: Policy, task: Task, number: int, split: Split) -> _Lane:
+    def _start(self, lane: _Lane, policy: Policy, task: Task, split: Split, number: int) -> _Lane:
         if task.world not in lane.worlds:
             lane.worlds[task.world] = resolve(task.world)()
         seed = derive_seed("episode", self.seed, task.name, split, number)
-        lane.task, lane.number, lane.total_reward, lane.length = task, number, 0.0, 0
+        lane.task, lane.split, lane.number = task, split, number
+        lane.total_reward, lane.length = 0.0, 0
         lane.state, _ = lane.worlds[task.world].reset(seed=seed, options={"task": task.name})
         lane.words = encode([task.instructions[number % len(task.instructions)]])[0]
         forwards = -(-task.horizon // policy.config.executed)
@@ -137,7 +154,7 @@ class Evaluator:
         return actions
 
 
-def _execute(lane: _Lane, chunk: NDArray[np.float32], split: Split) -> Episode | None:
+def _execute(lane: _Lane, chunk: NDArray[np.float32]) -> Episode | None:
     """Step a lane through a chunk (executed, A); return the episode if it ends."""
     assert lane.task is not None
     world = lane.worlds[lane.task.world]
@@ -148,7 +165,9 @@ def _execute(lane: _Lane, chunk: NDArray[np.float32], split: Split) -> Episode |
         lane.total_reward += float(reward)
         lane.length += 1
         if terminated or lane.length == lane.task.horizon:
-            return Episode(lane.task.name, split, lane.number, terminated, lane.total_reward, lane.length)
+            return Episode(
+                lane.task.name, lane.split, lane.number, terminated, lane.total_reward, lane.length
+            )
     return None
 
 

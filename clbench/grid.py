@@ -217,7 +217,7 @@ def scenes_job(scenario: str, progress: Callable[[float], None]) -> str:
 
 def pretrain_job(scenario: str, seed: int, progress: Callable[[float], None]) -> str:
     """Pretrain the policy of a seed, unless it is in the cache."""
-    from clbench.training import pretrained_policy
+    from clbench.pretraining import pretrained_policy
 
     policy, _ = pretrained_policy(load_scenario(scenario), seed, progress)
     return f"{sum(parameter.numel() for parameter in policy.parameters()):,} parameters"
@@ -225,7 +225,8 @@ def pretrain_job(scenario: str, seed: int, progress: Callable[[float], None]) ->
 
 def run_job(spec: RunSpec, records: str, progress: Callable[[float], None]) -> str:
     """Do one run, write its record, and return its main scores."""
-    from clbench.metrics import Scores, measure
+    from clbench.metrics import measure
+    from clbench.scores import Scores
 
     record = execute(spec, Path(records), progress)
     if record.error is not None:
@@ -250,7 +251,7 @@ def demonstration_jobs(scenario: str, tasks: Sequence[str]) -> list[Job]:
 
 def benchmark_jobs(specs: Sequence[RunSpec], records: Path) -> list[Job]:
     """Return all jobs that the runs `specs` need, of one scenario: demonstrations, pretraining, the runs."""
-    from clbench.training import is_pretrained
+    from clbench.pretraining import is_pretrained
 
     name = specs[0].scenario
     scenario = load_scenario(name)
@@ -266,5 +267,5 @@ def benchmark_jobs(specs: Sequence[RunSpec], records: Path) -> list[Job]:
         arguments = {"spec": spec, "records": str(records)}
         needs = (f"pretraining seed {spec.seed}",)
         title = f"{spec.method} seed {spec.seed}"
-        jobs.append(Job(title, "clbench.grid:run_job", arguments, run_length(scenario), needs))
+        jobs.append(Job(title, "clbench.grid:run_job", arguments, run_length(scenario, spec.split), needs))
     return jobs

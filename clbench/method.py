@@ -43,6 +43,9 @@ class UndeclaredAccessError(RuntimeError):
 class Samples(Protocol[Drawn]):
     """Data that can be drawn from."""
 
+    def __len__(self) -> int:
+        """Return how many different moments or scenes there are."""
+
     def sample(self, count: int, generator: torch.Generator) -> Drawn:
         """Return `count` samples."""
 
@@ -68,6 +71,9 @@ class Source(Generic[Rows]):
         self._data: Samples[Rows] | None = data
         self._generator = generator
         self._device = device
+
+    def __len__(self) -> int:
+        return len(self._open)
 
     @property
     def bytes(self) -> int:
@@ -169,9 +175,16 @@ class Method:
     """
 
     uses: Uses = Uses()
+    whole_stages: bool = False
+    """Whether the policy is what the method means it to be at the end of a stage only, as one that `end_task`
+    merges: it is then not evaluated on the way."""
 
-    def prepare(self, policy: Policy, prior: Prior) -> None:
-        """Prepare for the sequence, once, before stage 1: anchors, vectors, adapters, frozen copies."""
+    def prepare(self, policy: Policy, prior: Prior) -> int | None:
+        """Prepare for the sequence, once, before stage 1: anchors, vectors, adapters, frozen copies.
+
+        Returns:
+            The optimiser steps that it took, or that what it found in a cache once took; none if None.
+        """
 
     def start_task(self, policy: Policy, stage: Stage) -> Iterable[nn.Parameter] | list[dict[str, Any]]:
         """Return the parameters to train on this target, or optimiser groups of them."""
@@ -188,6 +201,10 @@ class Method:
     def gradients(self, policy: Policy, loss: Tensor) -> None:
         """Set the gradients of the trained parameters."""
         loss.backward()  # type: ignore[no-untyped-call]
+
+    def learning_rate(self, scheduled: float, progress: Progress) -> float:
+        """Return the step size of this step, asked for after `loss` and `gradients`, for each group."""
+        return scheduled
 
     def end_task(self, policy: Policy, stage: Stage) -> None:
         """Merge or consolidate after a target."""
@@ -206,7 +223,7 @@ class Method:
             raise TypeError(f"{type(self).__name__} returns a state() but has no load_state().")
 
     def diagnostics(self) -> dict[str, Any]:
-        """Return what the method tells about itself for the record, as JSON."""
+        """Return what the method tells about the stage that ends, or about `prepare`, as JSON."""
         return {}
 
 

@@ -118,6 +118,10 @@ class Questions:
                 raise ValueError(f"No state answers {answer!r} to {kind.name!r}: {kind.wordings[0]!r}.")
         return cells
 
+    def __len__(self) -> int:
+        """Return the number of states that are asked about."""
+        return len(self.scenes)
+
     @property
     def bytes(self) -> int:
         """Memory that the states and the lists of questions take."""

@@ -1,6 +1,7 @@
 """The record: the one file that a run leaves, written once and never edited.
 
-Every evaluation episode and every answer count is in it; nothing that can be computed from them is.
+Every evaluation episode, every answer count and how far the policy had moved are in it; nothing that can be
+computed from them is.
 """
 
 from __future__ import annotations
@@ -13,15 +14,28 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-SCHEMA = 1
+SCHEMA = 2
 """Version of the file format. A reader refuses what it does not know."""
 
 EPISODE_COLUMNS = ("stage", "step", "task", "split", "episode", "success", "return", "length")
 """`stage` 0 is the pretrained policy, `stage` k the policy while or after it learned target k; `step` counts
-the optimiser steps inside the stage; `episode` numbers the initial state inside its task and split."""
+the optimiser steps inside the stage; `episode` numbers the initial state inside its task and split.
 
-ANSWER_COLUMNS = ("stage", "kind", "asked", "correct")
-"""One row for each stage and kind of question."""
+After each stage come all report episodes of all tasks. At the points before, the retained skills and the
+stage's target have the first `curve_episodes` of these; at every point the target has all selection episodes.
+In a tuning run, whose `Record.run` has the split "selection", selection episodes take the place of all these.
+"""
+
+ANSWER_COLUMNS = ("stage", "step", "kind", "asked", "correct")
+"""One row for each stage, evaluation point and kind of question."""
+
+POLICY_COLUMNS = ("stage", "step", "update_sparsity", "activation_drift")
+"""One row for each stage and evaluation point: how far the policy is from the pretrained one.
+
+`update_sparsity` is the share of its parameters whose relative change is below 1e-3; `activation_drift` the
+squared 2-Wasserstein distance between its hidden states on the questions and those of the pretrained policy,
+mean over layers. Each may be None.
+"""
 
 
 class RecordError(ValueError):
@@ -35,14 +49,19 @@ class Record:
     status: Literal["success", "failed"]
     """Whether the run went through."""
     run: dict[str, Any]
-    """What was run: `scenario`, `method`, `seed`, `device`, `settings` (all hyper-parameters),
-    `changes` (those that differ from the method's defaults), `uses` (the prior data it may touch)."""
+    """What was run: `scenario`, `method`, `seed`, `device`, `split` ("report", or "selection" for a tuning
+    run), `settings` (all hyper-parameters), `changes` (those that differ from the method's defaults), `uses`
+    (the prior data it may touch)."""
     scenario: dict[str, Any]
-    """The scenario in full: `retained`, `target` and `held_out` task names in order, and its `budget`."""
+    """The scenario in full: `retained`, `target` and `held_out` task names in order, `evaluation_steps`
+    (steps of a stage after which it is evaluated, the last one its end), and its `budget`."""
     episodes: dict[str, list[Any]] = field(default_factory=lambda: {name: [] for name in EPISODE_COLUMNS})
     """Evaluation episodes as columns of equal length, see `EPISODE_COLUMNS`."""
     answers: dict[str, list[Any]] = field(default_factory=lambda: {name: [] for name in ANSWER_COLUMNS})
-    """Report questions as columns of equal length, see `ANSWER_COLUMNS`."""
+    """Answers as columns of equal length, see `ANSWER_COLUMNS`: to report questions, in a tuning run to
+    training questions."""
+    policy: dict[str, list[Any]] = field(default_factory=lambda: {name: [] for name in POLICY_COLUMNS})
+    """What has become of the policy as columns of equal length, see `POLICY_COLUMNS`."""
     costs: dict[str, Any] = field(default_factory=dict)
     """`parameters`, `parameters_added`, `optimiser_steps`, `bytes_kept`."""
     diagnostics: dict[str, Any] = field(default_factory=dict)
@@ -94,7 +113,12 @@ def read_record(path: Path) -> Record:
         raise RecordError(f"{path}: cannot be read ({error.strerror}).") from error
     except (ValueError, RecursionError) as error:
         raise RecordError(f"{path}: cannot be read as JSON ({error}).") from error
-    if not isinstance(values, dict) or values.pop("schema", None) != SCHEMA:
+    schema = values.pop("schema", None) if isinstance(values, dict) else None
+    if type(schema) is int and 0 < schema < SCHEMA:
+        raise RecordError(
+            f"{path}: is of the older schema {schema}, not {SCHEMA}: its run must be done again."
+        )
+    if schema != SCHEMA:
         raise RecordError(f"{path}: is no record of schema {SCHEMA}.")
     names = {entry.name for entry in dataclasses.fields(Record)}
     if set(values) != names:
@@ -107,6 +131,7 @@ def read_record(path: Path) -> Record:
             raise RecordError(f"{path}: {name} must be an object with named entries.")
     _check_columns(path, "episodes", record.episodes, EPISODE_COLUMNS)
     _check_columns(path, "answers", record.answers, ANSWER_COLUMNS)
+    _check_columns(path, "policy", record.policy, POLICY_COLUMNS)
     return record
 
 

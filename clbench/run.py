@@ -17,20 +17,27 @@ from typing import Any
 import torch
 from safetensors.torch import load_file, save_file
 
-from clbench.cache import cache_folder, cached, hash_of, is_cached, package_of, source_hash
+from clbench.activations import Gaussian
+from clbench.adaptation import adapt
+from clbench.cache import cache_folder, cached, hash_of, hash_of_tensors, is_cached, package_of, source_hash
 from clbench.demonstrations import Demonstrations, load_demonstrations
-from clbench.evaluation import Episode, Evaluator, answer
+from clbench.evaluation import Episode, Evaluator, Trial, answer
 from clbench.fingerprint import fingerprint
 from clbench.method import Access, Method, Prior, Source, Stage, State, build_method
 from clbench.policy import load_policy, save_policy
+from clbench.pretraining import pretrained_policy, pretraining_inputs
 from clbench.questions import load_questions, report_questions
 from clbench.record import Record, RecordError, read_record, record_path, write_record
 from clbench.seeding import derive_seed, seeded, torch_generator
-from clbench.task import Scenario, Task, load_scenario
-from clbench.training import adapt, deterministic, evaluation_steps, pretrained_policy, pretraining_inputs
+from clbench.task import Scenario, Split, load_scenario
+from clbench.training import deterministic
 
 EPISODE_WEIGHT = 0.3
 """What an evaluation episode takes, in optimiser steps; for the time left that a progress bar shows."""
+
+
+SPARSITY_THRESHOLD = 1e-3
+"""Relative change below which a weight counts as unchanged: ConSFT (arXiv 2605.08879), Eq. 8."""
 
 
 @dataclass(frozen=True)
@@ -47,6 +54,8 @@ class RunSpec:
     """Hyper-parameters that differ from the method's own."""
     device: str = "cpu"
     """Where the policy is computed."""
+    split: Split = "report"
+    """Which episodes it is evaluated on; those of "selection" may be looked at to choose settings."""
 
     def path(self, records: Path) -> Path:
         """Return where the record lies below the folder `records`."""
@@ -104,6 +113,7 @@ def _describe_run(spec: RunSpec, scenario: Scenario, method: Method) -> dict[str
         "method": spec.method,
         "seed": spec.seed,
         "device": spec.device,
+        "split": spec.split,
         "settings": settings,
         "changes": {name: settings[name] for name in sorted(spec.changes)},
         "uses": dataclasses.asdict(method.uses),
@@ -116,6 +126,7 @@ def _describe_scenario(scenario: Scenario) -> dict[str, Any]:
     return {
         "id": scenario.id,
         **{group: [task.name for task in getattr(scenario, group)] for group in groups},
+        "evaluation_steps": list(scenario.budget.evaluation_steps),
         "budget": dataclasses.asdict(scenario.budget),
     }
 
@@ -128,11 +139,17 @@ def _plain(value: Any) -> Any:
         return repr(value)
 
 
-def run_length(scenario: Scenario) -> float:
-    """Return how long a run takes, in optimiser steps."""
-    budget, stages = scenario.budget, len(scenario.target)
-    reports = (stages + 1) * len(scenario.tasks) + stages * (len(evaluation_steps(budget)) - 1)
-    return stages * budget.adaptation_steps + EPISODE_WEIGHT * reports * budget.report_episodes
+def run_length(scenario: Scenario, split: Split = "report") -> float:
+    """Return how long a run that is evaluated on `split` takes, in optimiser steps."""
+    budget, stages, retained = scenario.budget, len(scenario.target), len(scenario.retained)
+    points = len(budget.evaluation_steps)
+    scored = split == "report"
+    ends = (stages + 1) * len(scenario.tasks) * budget.episodes(split)
+    on_the_way = stages * (points - 1) * (retained + 1)
+    on_the_way *= budget.curve_episodes if scored else budget.selection_episodes
+    selection = stages * points * budget.selection_episodes if scored else 0
+    episodes = ends + on_the_way + selection
+    return stages * budget.adaptation_steps + EPISODE_WEIGHT * episodes
 
 
 def check_device(device: str) -> None:
@@ -168,8 +185,10 @@ class _Run:
             for task in scenario.retained + scenario.target
         }
         self.questions, report = load_questions(scenario)
-        self.kinds = report.kinds
-        self.asked = report_questions(report, scenario.budget.report_questions)
+        scored = report if spec.split == "report" else self.questions
+        self.asked = report_questions(scored, scenario.budget.report_questions)
+        self.weights = {name: value.clone() for name, value in self.policy.named_parameters()}
+        self.anchor = self._activations()
         self.begin, self.seconds_before = time.perf_counter(), 0.0
         self.record = self._new_record()
         # two commands may do the same run for different folders at once
@@ -210,34 +229,60 @@ class _Run:
             self._save(number)
         self._load(len(self.scenario.target))
         self._count_costs()
-        self.where = "diagnostics()"
-        self.record.diagnostics = _checked(self.method.diagnostics())
 
     def _prepare(self) -> None:
         """Let the method prepare, and evaluate what there is before any target."""
         self.where = "prepare"
         prior = self._prior(0, ("prepare", "throughout"))
+        begin = time.perf_counter()
         with seeded("method", self.spec.seed, 0):
-            self.method.prepare(self.policy, prior)
+            steps = self.method.prepare(self.policy, prior) or 0
         prior.close()
-        self._report(0, 0, self.scenario.tasks)
+        self.record.timing["preparation"] = round(time.perf_counter() - begin, 2)
+        self.record.costs["preparation_steps"] = steps
+        self.record.costs["optimiser_steps"] += steps
+        self._report_start()
+        self._diagnose(0)
+
+    def _report_start(self) -> None:
+        """Evaluate the policy before any target; the report is kept, as most methods start with the same."""
+        tables = ("episodes", "answers", "policy")
+
+        def write(folder: Path) -> None:
+            self._report(0, 0)
+            values = {name: getattr(self.record, name) for name in tables}
+            (folder / "report.json").write_text(json.dumps(values), encoding="utf-8")
+
+        inputs = {
+            "policy": hash_of_tensors(self.policy.state_dict()),
+            "scenario": self.record.scenario,
+            "spec": [self.spec.seed, self.spec.device, self.spec.split],
+            **self._sources(),
+        }
+        folder = cache_folder() / "reports" / hash_of(inputs)
+        if is_cached(folder, inputs):
+            count = self.scenario.budget.episodes(self.spec.split)
+            self.progress(EPISODE_WEIGHT * len(self.scenario.tasks) * count)
+        cached(folder, inputs, write)
+        for name, value in json.loads((folder / "report.json").read_text(encoding="utf-8")).items():
+            setattr(self.record, name, value)
 
     def _stage(self, number: int) -> None:
         """Adapt to target `number`, evaluating on the way and at the end."""
         seed, budget, task = self.spec.seed, self.scenario.budget, self.scenario.target[number - 1]
-        points = evaluation_steps(budget)
+        points = () if self.method.whole_stages else budget.evaluation_steps[:-1]
         begin, evaluating = time.perf_counter(), 0.0
 
-        def evaluate(step: int, tasks: tuple[Task, ...]) -> None:
+        def evaluate(step: int) -> None:
             nonlocal evaluating
             paused = time.perf_counter()
-            self._report(number, step, tasks)
+            self._report(number, step)
             evaluating += time.perf_counter() - paused
 
         def after(step: int) -> None:
             self.progress(1)
-            if step in points[:-1]:
-                evaluate(step, (task,))
+            if step in points:
+                evaluate(step)
 
         self.where = f"stage {number} ({task.name})"
         target = self._source("target", number, self.data[task.name])
@@ -248,12 +293,20 @@ class _Run:
             steps = adapt(self.policy, self.method, stage, budget, after)
         target.close()
         prior.close()
-        evaluate(budget.adaptation_steps, self.scenario.tasks)
+        evaluate(budget.adaptation_steps)
+        self._diagnose(number)
         training = time.perf_counter() - begin - evaluating
         self.record.costs["optimiser_steps"] += steps
         self.record.timing["stages"].append(
             {"training": round(training, 2), "evaluation": round(evaluating, 2)}
         )
+
+    def _diagnose(self, number: int) -> None:
+        """Keep what the method tells about stage `number`."""
+        self.where = f"diagnostics() after stage {number}"
+        found = _checked(self.method.diagnostics())
+        if found:
+            self.record.diagnostics[str(number)] = found
 
     def _source(self, name: str, number: int, data: Any) -> Source[Any]:
         """Return data with its own random stream: what one source draws does not move another's draws."""
@@ -271,19 +324,56 @@ class _Run:
             sources["questions"] = self._source("prior questions", number, self.questions)
         return Prior(sources)
 
-    def _report(self, number: int, step: int, tasks: tuple[Task, ...]) -> None:
-        """Evaluate report episodes, and the questions if it is the end of a stage, into the record."""
+    def _report(self, number: int, step: int) -> None:
+        """Evaluate the policy after `step` steps of stage `number` into the record.
+
+        At the end of a stage that is everything; on the way only what the stage can show: the skills that it
+        may forget and the target that it learns.
+        """
+        split, budget = self.spec.split, self.scenario.budget
+        at_the_end = step in (0, budget.adaptation_steps)
+        target = self.scenario.target[number - 1 : number] if number else ()
+        tasks = self.scenario.tasks if at_the_end else self.scenario.retained + target
+        count = budget.curve_episodes if split == "report" and not at_the_end else budget.episodes(split)
+        trials: list[Trial] = [(task, split, episode) for task in tasks for episode in range(count)]
+        if split == "report":
+            trials += [(task, "selection", n) for task in target for n in range(budget.selection_episodes)]
+        self._play(number, step, trials)
+        kind, questions = self.asked
+        for name, asked, correct in answer(self.policy, self.questions.kinds, kind, questions):
+            _append(self.record.answers, (number, step, name, asked, correct))
+        drift = float(self._activations().distance(self.anchor).mean())
+        _append(self.record.policy, (number, step, self._update_sparsity(), drift))
+
+    def _play(self, number: int, step: int, trials: list[Trial]) -> None:
         self.policy.eval()
-        episodes = self.evaluator.evaluate(
-            self.policy, tasks, "report", lambda count: self.progress(EPISODE_WEIGHT * count)
+        outcomes = self.evaluator.play(
+            self.policy, trials, lambda count: self.progress(EPISODE_WEIGHT * count)
         )
         self.policy.train()
-        for episode in episodes:
+        for episode in outcomes:
             _append(self.record.episodes, _episode_row(number, step, episode))
-        if tasks == self.scenario.tasks:
-            kind, questions = self.asked
-            for name, asked, correct in answer(self.policy, self.kinds, kind, questions):
-                _append(self.record.answers, (number, name, asked, correct))
+
+    @torch.no_grad()
+    def _activations(self) -> Gaussian:
+        """Return where the hidden states of the scored questions lie."""
+        questions = self.asked[1].to(self.spec.device)
+        hidden = self.policy.hidden_states(questions.state, questions.words)
+        return Gaussian.of(hidden, self.policy.backbone.mask(questions.words))
+
+    def _update_sparsity(self) -> float | None:
+        """Return the share of the pretrained weights that hardly changed, None if there are others now.
+
+        ConSFT (arXiv 2605.08879), Eq. 8: relative change below 1e-3.
+        """
+        now = dict(self.policy.named_parameters())
+        if now.keys() != self.weights.keys():
+            return None
+        unchanged = [
+            (now[name] - before).abs() / (before.abs() + 1e-8) < SPARSITY_THRESHOLD
+            for name, before in self.weights.items()
+        ]
+        return sum(int(part.sum()) for part in unchanged) / sum(part.numel() for part in unchanged)
 
     def _new_record(self) -> Record:
         parameters = sum(parameter.numel() for parameter in self.policy.parameters())
@@ -312,15 +402,21 @@ class _Run:
 
     def _inputs(self, number: int) -> dict[str, Any]:
         """Return all that the state after stage `number` depends on."""
-        suites = {package_of(name) for task in self.scenario.tasks for name in (task.world, task.expert)}
         method = package_of(type(self.method).__module__)
         return {
             "run": self.record.run,
             "scenario": self.record.scenario,
             "stage": number,
+            **self._sources(method),
+        }
+
+    def _sources(self, *modules: str) -> dict[str, Any]:
+        """Return the code and data that any result of a run depends on, `modules` besides."""
+        suites = {package_of(name) for task in self.scenario.tasks for name in (task.world, task.expert)}
+        return {
             "pretraining": pretraining_inputs(self.scenario, self.spec.seed),
             "tasks": [dataclasses.asdict(task) for task in self.scenario.tasks],
-            "source": source_hash("clbench", method, *sorted(suites)),
+            "source": source_hash("clbench", *modules, *sorted(suites)),
         }
 
     def _save(self, number: int) -> None:
@@ -360,7 +456,8 @@ class _Run:
                 self.record = read_record(folder / "record.json")
                 self.seconds_before = self.record.timing["seconds"]
                 self.record.timing.update({"started": started, "resumed_after": number})
-                self.progress(number * run_length(self.scenario) / len(self.scenario.target))
+                length = run_length(self.scenario, self.spec.split)
+                self.progress(number * length / len(self.scenario.target))
                 return number
         return None
 

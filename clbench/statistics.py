@@ -6,11 +6,15 @@ initial states would have met it. Each replicate therefore draws
 1. seeds with replacement, each a whole run from the pretrained policy to the last stage: the tasks of one run
    share a policy and are never drawn apart;
 2. for each run drawn and each task, episodes with replacement. All stages and evaluation points of the run
-   get the same ones, and so do runs of other methods with this seed: they met the same initial states;
+   get the same ones, and so do runs of other methods with this seed: they met the same initial states.
+   Where fewer episodes are run, at the points before the end of a stage, the rate is the mean over those
+   drawn among them;
 3. for each run drawn, stage and kind of question, a binomial number of right answers, since records hold
    counts only.
 
-Tasks are fixed: a scenario is those tasks. Intervals are percentile intervals of 95 %.
+Tasks are fixed: a scenario is those tasks. Fixed too is what was chosen on the selection episodes of a run,
+as the points of `retention_at_matched_adaptation`: these episodes are not drawn again, and the interval says
+nothing of the luck of the choice. Intervals are percentile intervals of 95 %.
 
 What they cannot do: with one seed only episodes vary, so the interval says nothing of other seeds. With few
 seeds it is too narrow when these differ more than episodes do: in simulations of 6 tasks with 20 episodes the
@@ -29,7 +33,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from clbench.metrics import Array, Layout, Metric, Rates, Scores, combine, load_metric, rates_of
+from clbench.metrics import Metric, load_metric
+from clbench.scores import Array, Layout, Rates, Scores, combine, rates_of
 
 Runs = Mapping[int, Scores]
 """Runs of one method on one scenario, by seed."""

@@ -84,15 +84,33 @@ class Budget:
     policy_layers: int = 3
     """Layers of the policy's backbone, and as many of its action head."""
     evaluation_points: int = 4
-    """How often each target is evaluated while it is learned, the end included."""
+    """How often the policy is evaluated while a target is learned, the end included."""
     selection_episodes: int = 10
     """Episodes per task that choices may look at."""
     report_episodes: int = 20
     """Episodes per task that scores are made of, and nothing else."""
+    curve_episodes: int = 5
+    """How many of the report episodes are run at the points before a stage's end."""
+
+    def __post_init__(self) -> None:
+        if self.curve_episodes > self.report_episodes:
+            raise ValueError(
+                f"curve_episodes are the first of the {self.report_episodes} report episodes: "
+                f"{self.curve_episodes} are too many."
+            )
 
     def episodes(self, split: Split) -> int:
         """Return how many episodes per task `split` has."""
         return self.report_episodes if split == "report" else self.selection_episodes
+
+    @property
+    def evaluation_steps(self) -> tuple[int, ...]:
+        """After how many optimiser steps of a stage the policy is evaluated; the last is its end.
+
+        Each point lies at half the steps of the next: a policy learns and forgets most at the beginning.
+        """
+        points = (self.adaptation_steps >> halvings for halvings in range(self.evaluation_points))
+        return tuple(sorted({point for point in points if point}))
 
 
 @dataclass(frozen=True)

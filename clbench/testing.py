@@ -123,6 +123,7 @@ TOY = Scenario(
         evaluation_points=3,
         selection_episodes=4,
         report_episodes=6,
+        curve_episodes=3,
     ),
 )
 

@@ -1,42 +1,20 @@
-"""Training: pretraining and adaptation, the only place that steps an optimiser."""
+"""Training: the only place that steps an optimiser."""
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from importlib.metadata import version
-from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor, nn
-
-from clbench.cache import cache_folder, cached, hash_of, is_cached, package_of, source_hash
-from clbench.demonstrations import SIMULATORS, Demonstrations, load_demonstrations
-from clbench.method import Method, Progress, Stage
-from clbench.policy import Policy, PolicyConfig, load_policy, save_policy
-from clbench.questions import load_questions
-from clbench.seeding import derive_seed, torch_generator
-from clbench.task import Budget, Scenario, resolve
 
 GRADIENT_NORM = 1.0
 """Gradients are clipped at this norm, after the method has set them."""
 
 BETAS = (0.9, 0.95)
 """Of AdamW, as the three seed papers and openpi have them; weight decay 1e-10 likewise."""
-
-
-AFTER_PRETRAINING = (
-    "adaptation_steps",
-    "learning_rate",
-    "evaluation_points",
-    "selection_episodes",
-    "report_episodes",
-    "report_questions",
-)
-"""Fields of the budget that a pretrained policy does not depend on."""
 
 
 class MethodError(RuntimeError):
@@ -70,8 +48,9 @@ def optimise(
     learning_rate: float,
     steps: int,
     loss_at: Callable[[int], Tensor],
-    gradients: Callable[[Tensor], None],
+    gradients: Callable[[Tensor], None] = Tensor.backward,
     after: Callable[[int], None] = lambda _: None,
+    rate: Callable[[float, int], float] = lambda scheduled, _: scheduled,
 ) -> int:
     """Descend a loss with AdamW and return the number of steps done; without parameters none is.
 
@@ -82,9 +61,10 @@ def optimise(
         loss_at: Returns the scalar loss of a step.
         gradients: Sets the gradients from the loss.
         after: Called after each step with the number of steps done.
+        rate: Maps the scheduled step size of a group, and the steps done, to the one that is taken.
 
     Raises:
-        MethodError: The loss is not a finite scalar with a gradient.
+        MethodError: The loss is not a finite scalar with a gradient, or a step size is no positive number.
     """
     groups: list[Any] = list(parameters)
     if not groups:
@@ -95,16 +75,22 @@ def optimise(
     peaks = [group["lr"] for group in optimiser.param_groups]
     trained = [parameter for group in optimiser.param_groups for parameter in group["params"]]
     for step in range(steps):
-        for group, peak in zip(optimiser.param_groups, peaks, strict=True):
-            group["lr"] = peak * learning_rate_factor(step, steps)
         loss = loss_at(step)
         _check_loss(loss, step)
         optimiser.zero_grad()
         gradients(loss)
         _clip(trained, step)
+        for group, peak in zip(optimiser.param_groups, peaks, strict=True):
+            group["lr"] = _checked_rate(rate(peak * learning_rate_factor(step, steps), step), step)
         optimiser.step()
         after(step + 1)
     return steps
+
+
+def _checked_rate(rate: float, step: int) -> float:
+    if not (isinstance(rate, float) and 0.0 <= rate < math.inf):
+        raise MethodError(f"step {step}: the step size must be a number from 0, not {rate!r}.")
+    return rate
 
 
 def _clip(trained: list[nn.Parameter], step: int) -> None:
@@ -125,133 +111,3 @@ def _check_loss(loss: Any, step: int) -> None:
         raise MethodError(f"step {step}: loss is {loss.item()}, not finite.")
     if not loss.requires_grad:
         raise MethodError(f"step {step}: loss has no gradient; was it detached?")
-
-
-def pretraining_inputs(scenario: Scenario, seed: int) -> dict[str, Any]:
-    """Return all that a pretrained policy depends on."""
-    suites = {package_of(name) for task in scenario.retained for name in (task.world, task.expert)}
-    suites.add(package_of(scenario.questions))
-    budget = dataclasses.asdict(scenario.budget)
-    core = ("clbench.policy", "clbench.demonstrations", "clbench.questions", "clbench.seeding", __name__)
-    return {
-        "retained": [dataclasses.asdict(task) for task in scenario.retained],
-        "budget": {name: value for name, value in budget.items() if name not in AFTER_PRETRAINING},
-        "seed": seed,
-        "source": source_hash(*core, *sorted(suites)),
-        "versions": {package: version(package) for package in (*SIMULATORS, "torch", "tokenizers")},
-    }
-
-
-def pretrained_folder(scenario: Scenario, seed: int) -> Path:
-    """Return where the pretrained policy lies, or will lie."""
-    name = f"{scenario.id.replace('/', '--')}-seed-{seed}-{hash_of(pretraining_inputs(scenario, seed))}"
-    return cache_folder() / "pretrained" / name
-
-
-def is_pretrained(scenario: Scenario, seed: int) -> bool:
-    """Return whether the pretrained policy is in the cache."""
-    return is_cached(pretrained_folder(scenario, seed), pretraining_inputs(scenario, seed))
-
-
-def pretrained_policy(
-    scenario: Scenario, seed: int, progress: Callable[[float], None] = lambda _: None
-) -> tuple[Policy, Path]:
-    """Return the policy pretrained on the retained tasks and the questions, and the folder it lies in.
-
-    It is trained on first use, and shared by all methods.
-
-    Args:
-        scenario: What to learn.
-        seed: Of the weights and of every draw.
-        progress: Called with the number of steps done since its last call.
-    """
-    inputs = pretraining_inputs(scenario, seed)
-    folder = cached(
-        pretrained_folder(scenario, seed),
-        inputs,
-        lambda partial: save_policy(_pretrain(scenario, seed, progress), partial),
-    )
-    return load_policy(folder), folder
-
-
-def policy_config(scenario: Scenario) -> PolicyConfig:
-    """Return the sizes of a policy for the scenario's worlds."""
-    world = resolve(scenario.retained[0].world)()
-    config = PolicyConfig(
-        state_size=world.observation_space.shape[0],
-        action_size=world.action_space.shape[0],
-        width=scenario.budget.policy_width,
-        layers=scenario.budget.policy_layers,
-    )
-    world.close()
-    return config
-
-
-def _pretrain(scenario: Scenario, seed: int, progress: Callable[[float], None]) -> Policy:
-    config, budget = policy_config(scenario), scenario.budget
-    demonstrations = Demonstrations.cat(
-        [load_demonstrations(task, scenario, config) for task in scenario.retained]
-    )
-    questions, _ = load_questions(scenario)
-    policy = Policy(config, seed=derive_seed("weights", seed))
-    policy.normalise_like(demonstrations.state, demonstrations.action[:, 0])
-    generator = torch_generator("pretraining", seed)
-
-    def loss_at(step: int) -> Tensor:
-        batch = demonstrations.sample(budget.batch_size, generator)
-        asked = questions.sample(budget.batch_size // 2, generator)
-        return policy.action_loss(batch).mean() + policy.answer_loss(asked).mean()
-
-    with deterministic():
-        optimise(
-            policy.parameters(),
-            budget.pretraining_learning_rate,
-            budget.pretraining_steps,
-            loss_at,
-            Tensor.backward,
-            lambda _: progress(1),
-        )
-    return policy
-
-
-def adapt(
-    policy: Policy,
-    method: Method,
-    stage: Stage,
-    budget: Budget,
-    after: Callable[[int], None] = lambda _: None,
-) -> int:
-    """Let `method` fine-tune the policy on one target, in place, and return the optimiser steps done.
-
-    Args:
-        policy: What is trained.
-        method: How.
-        stage: Which target, with the data that the method may touch.
-        budget: Step size.
-        after: Called after each step with the number of steps done.
-    """
-    parameters = method.start_task(policy, stage)
-
-    def loss_at(step: int) -> Tensor:
-        batch = method.batch(stage.target, stage.prior)
-        return method.loss(policy, batch, Progress(step, stage.steps))
-
-    steps = optimise(
-        parameters,
-        budget.learning_rate,
-        stage.steps,
-        loss_at,
-        lambda loss: method.gradients(policy, loss),
-        after,
-    )
-    method.end_task(policy, stage)
-    for name, parameter in policy.named_parameters():
-        if not torch.isfinite(parameter).all():
-            raise MethodError(f"The parameter {name} is not finite after {stage.task.name!r}.")
-    return steps
-
-
-def evaluation_steps(budget: Budget) -> list[int]:
-    """Return after how many optimiser steps of a stage the target is evaluated; the last is its end."""
-    points = min(budget.evaluation_points, budget.adaptation_steps)
-    return [round((point + 1) * budget.adaptation_steps / points) for point in range(points)]

@@ -11,8 +11,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from clbench.metrics import METRICS, Scores
+from clbench.metrics import METRICS
 from clbench.record import Record, RecordError, read_record, record_path
+from clbench.scores import Scores
 from clbench.statistics import Estimate, Runs, estimate, row_generator
 
 DIVISIONS = ("prior-data-free", "prior questions", "prior demonstrations", "reference")
@@ -143,6 +144,8 @@ def _read_run(records: Path, path: Path) -> _Run:
         raise RecordError(f"run: {seed!r} cannot be a seed.")
     if record.scenario.get("id") != scenario:
         raise RecordError(f"scenario: its id is {record.scenario.get('id')!r}, but {scenario!r} was run.")
+    if run.get("split") == "selection":
+        raise RecordError("it is a tuning run: its episodes may be chosen on.")
     if run["changes"]:
         raise RecordError(f"settings were changed: {', '.join(run['changes'])}.")
     at_home = path == record_path(records, scenario, method, seed)
@@ -270,14 +273,19 @@ def _rows(runs: Iterable[_Run]) -> list[Row]:
     by_scenario: dict[str, dict[str, list[_Run]]] = {}
     for run in runs:
         by_scenario.setdefault(run.scenario, {}).setdefault(run.method, []).append(run)
+    never_itself = {
+        name for metric in METRICS.values() if not metric.compares_itself for name in metric.references
+    }
     rows = []
     for scenario, methods in by_scenario.items():
         scores: dict[str, Runs] = {
             method: {run.seed: run.scores for run in members} for method, members in methods.items()
         }
         for method, members in methods.items():
-            # A reference is not compared with itself.
-            references = {name: theirs for name, theirs in scores.items() if name != method}
+            # A reference is compared with itself only where that means something.
+            references = {
+                name: theirs for name, theirs in scores.items() if name != method or name not in never_itself
+            }
             rows.append(
                 Row(
                     scenario,

@@ -29,13 +29,20 @@ SHOWN = tuple(
         "final_average",
         "adaptation",
         "retention",
+        "retention_at_matched_adaptation",
         "forgetting",
         "forward_transfer",
         "question_retention",
         "zero_shot",
     )
 )
-"""Metrics in the terminal and in Markdown, as many as fit 100 columns; the CSV file has all."""
+"""Metrics in Markdown; the CSV file has all."""
+
+FITTING = tuple(metric for metric in SHOWN if metric.name != "zero_shot")
+"""Metrics in the terminal, as many as fit 100 columns."""
+
+SHORT_TITLES = {"retention_at_matched_adaptation": "matched retention"}
+"""Titles of metrics whose name is too long for the head of a column."""
 
 MISSING = "-"
 """What stands for a value that could not be computed."""
@@ -150,9 +157,9 @@ def _legend() -> list[str]:
     ]
     for metric in SHOWN:
         better = {True: "higher is better", False: "lower is better", None: "neither high nor low is better"}
-        low = "unbounded" if math.isinf(metric.low) else f"{metric.low:g}"
+        low, high = ("unbounded" if math.isinf(end) else f"{end:g}" for end in (metric.low, metric.high))
         lines.append(
-            f"- **{_title(metric.name)}** ({better[metric.higher_is_better]}; from {low} to {metric.high:g}; "
+            f"- **{_title(metric.name)}** ({better[metric.higher_is_better]}; from {low} to {high}; "
             f"version {metric.version}): {_escaped(metric.description)} Computed as "
             f"{_escaped(metric.formula)}. Source: {_escaped(metric.source)}."
         )
@@ -167,7 +174,7 @@ def _not_shown(table: Table) -> list[str]:
 
 
 def _title(name: str) -> str:
-    return name.replace("_", " ")
+    return SHORT_TITLES.get(name, name.replace("_", " "))
 
 
 def _escaped(text: str) -> str:
@@ -190,7 +197,7 @@ def terminal(table: Table) -> RenderableType:
     for scenario, rows in groupby(table.rows, key=lambda row: row.scenario):
         parts.append(_grid(scenario, list(rows)))
     if parts:
-        lower = ", ".join(_title(metric.name) for metric in SHOWN if metric.higher_is_better is False)
+        lower = ", ".join(_title(metric.name) for metric in FITTING if metric.higher_is_better is False)
         parts.append(Text(f"± is half the width of a 95 % interval. Higher is better, but for {lower}.\n"))
     if table.not_shown:
         parts.append(Text("Not shown", style="bold"))
@@ -202,14 +209,14 @@ def _grid(scenario: str, rows: list[Row]) -> Grid:
     """Return the table of one scenario, with a section for each division."""
     grid = Grid(title=Text(scenario, style="bold"), box=SIMPLE_HEAD, padding=0, title_justify="left")
     grid.add_column("method", overflow="fold", min_width=20)
-    for name in ("seeds", *(_title(metric.name) for metric in SHOWN)):
+    for name in ("seeds", *(_title(metric.name) for metric in FITTING)):
         # One word a line: a header must not make its column wider than the numbers.
         grid.add_column(name.replace(" ", "\n"), justify="right")
     for division, members in groupby(rows, key=lambda row: row.division):
         grid.add_section()
         grid.add_row(Text(division, style="italic"))
         for row in members:
-            cells = (_compact(row.estimates[metric.name]) for metric in SHOWN)
+            cells = (_compact(row.estimates[metric.name]) for metric in FITTING)
             grid.add_row(Text(f"  {row.method}"), Text(str(len(row.seeds))), *map(Text, cells))
     return grid
 

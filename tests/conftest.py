@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from clbench.record import ANSWER_COLUMNS, EPISODE_COLUMNS, Record
+from clbench.record import ANSWER_COLUMNS, EPISODE_COLUMNS, POLICY_COLUMNS, Record
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -37,43 +37,60 @@ def _make_record(
     success: Any,
     *,
     curves: Any = None,
+    retained_curves: Any = None,
+    selection: Any = None,
+    sparsity: Any = None,
+    drift: Any = None,
     steps: tuple[int, ...] = (100, 200, 300, 400),
     answers: Mapping[tuple[int, str], tuple[int, int]] | None = None,
     groups: tuple[int, int, int] | None = None,
     episodes: int = 20,
+    curve_episodes: int | None = None,
+    selection_episodes: int = 10,
     **run: Any,
 ) -> Record:
-    """Return a record.
+    """Return a record. Where a value is NaN there is no row, or None in it.
 
     Args:
-        success: Success rates (stages + 1, tasks), or outcomes (stages + 1, tasks, episodes); NaN: no row.
+        success: Success rates (stages + 1, tasks), or outcomes (stages + 1, tasks, episodes).
         curves: The same for the targets on the way, (targets, points before the end); none if None.
+        retained_curves: The same for the retained skills, (targets, points before the end, retained).
+        selection: The same for the targets on selection episodes, (targets, points).
+        sparsity: Update sparsity, (targets, points). No policy was looked at if it and `drift` are None.
+        drift: Activation drift, (targets, points).
         steps: Steps of the evaluation points; the last one ends a stage.
-        answers: Questions asked and answered rightly by stage and kind.
+        answers: Questions asked and answered rightly by stage and kind, at the end of the stage.
         groups: How many tasks are retained, targets and held out; by default one is held out.
         episodes: Episodes per task, where rates are given.
-        run: What differs in `Record.run`, as method="ewc".
+        curve_episodes: Episodes per task on the way, where rates are given; as many as at the end if None.
+        selection_episodes: Selection episodes, where rates are given.
+        run: What differs in `Record.run`, as method="ewc". With split="selection" all episodes are of that.
     """
-    outcomes = _outcomes(success, episodes)
+    outcomes = _outcomes(success, 2, episodes)
     stages, tasks = outcomes.shape[0] - 1, outcomes.shape[1]
     retained, targets, held_out = groups or (tasks - stages - 1, stages, 1)
     assert (targets, retained + targets + held_out) == (stages, tasks)
     counts = {"skill": retained, "target": targets, "unseen": held_out}
     names = [f"{group}_{number}" for group, count in counts.items() for number in range(count)]
-    rows = [
-        (stage, steps[-1] if stage else 0, names[task], "report", episode, int(value), value, 50)
+    uses = {"demonstrations": "never", "questions": "never", "reference": False}
+    names_of_run = {"scenario": "clbench/Toy-v0", "method": "sft", "seed": 0, "split": "report"}
+    run = {**names_of_run, "settings": {}, "changes": {}, "uses": uses, **run}
+    split, on_the_way = run["split"], curve_episodes or outcomes.shape[2]
+    rows: list[tuple[Any, ...]] = [
+        (stage, steps[-1] if stage else 0, names[task], split, episode, int(value), value, 50)
         for (stage, task, episode), value in np.ndenumerate(outcomes)
         if not np.isnan(value)
     ]
-    if curves is not None:
+    for values, which, number in ((curves, split, on_the_way), (selection, "selection", selection_episodes)):
         rows += [
-            (target + 1, steps[point], names[retained + target], "report", episode, int(value), value, 50)
-            for (target, point, episode), value in np.ndenumerate(_outcomes(curves, episodes))
-            if not np.isnan(value)
+            (target + 1, steps[point], names[retained + target], which, episode, int(value), value, 50)
+            for (target, point, episode), value in _each(values, 2, number)
         ]
-    uses = {"demonstrations": "never", "questions": "never", "reference": False}
-    names_of_run = {"scenario": "clbench/Toy-v0", "method": "sft", "seed": 0}
-    run = {**names_of_run, "settings": {}, "changes": {}, "uses": uses, **run}
+    rows += [
+        (target + 1, steps[point], names[task], split, episode, int(value), value, 50)
+        for (target, point, task, episode), value in _each(retained_curves, 3, on_the_way)
+    ]
+    given = answers or {}
     return Record(
         status="success",
         run=run,
@@ -82,10 +99,20 @@ def _make_record(
             "retained": names[:retained],
             "target": names[retained : retained + targets],
             "held_out": names[retained + targets :],
-            "budget": {"adaptation_steps": steps[-1], "report_episodes": outcomes.shape[2]},
+            "evaluation_steps": list(steps),
+            "budget": {
+                "adaptation_steps": steps[-1],
+                "report_episodes": outcomes.shape[2],
+                "curve_episodes": on_the_way,
+                "selection_episodes": selection_episodes,
+            },
         },
         episodes=_columns(EPISODE_COLUMNS, rows),
-        answers=_columns(ANSWER_COLUMNS, [(*key, *value) for key, value in (answers or {}).items()]),
+        answers=_columns(
+            ANSWER_COLUMNS,
+            [(stage, steps[-1] if stage else 0, kind, *value) for (stage, kind), value in given.items()],
+        ),
+        policy=_columns(POLICY_COLUMNS, _policy_rows(sparsity, drift, (stages, len(steps)), steps)),
         costs={
             "optimiser_steps": stages * steps[-1],
             "parameters": 1000,
@@ -96,14 +123,41 @@ def _make_record(
     )
 
 
-def _outcomes(values: Any, episodes: int) -> Any:
-    """Return outcomes (..., episodes) whose mean is the rates: the first episodes are the successes."""
+def _outcomes(values: Any, axes: int, episodes: int) -> Any:
+    """Return outcomes (..., episodes) whose mean is the rates: the first episodes are the successes.
+
+    Values with more than `axes` axes are outcomes already.
+    """
     array = np.asarray(values, dtype=float)
-    if array.ndim == 3:
+    if array.ndim > axes:
         return array
     outcomes = (np.arange(episodes) < np.round(array * episodes)[..., None]).astype(float)
     outcomes[np.isnan(array)] = np.nan
     return outcomes
+
+
+def _each(values: Any, axes: int, episodes: int) -> list[tuple[tuple[int, ...], Any]]:
+    """Return the outcomes that there are with their indices; none if `values` is None."""
+    if values is None:
+        return []
+    outcomes = np.ndenumerate(_outcomes(values, axes, episodes))
+    return [(place, value) for place, value in outcomes if not np.isnan(value)]
+
+
+def _policy_rows(
+    sparsity: Any, drift: Any, shape: tuple[int, int], steps: tuple[int, ...]
+) -> list[tuple[Any, ...]]:
+    """Return the rows of the policy table, that of the pretrained policy included; none without values."""
+    if sparsity is None and drift is None:
+        return []
+    tables = [
+        np.full(shape, np.nan if values is None else values, dtype=float) for values in (sparsity, drift)
+    ]
+    rows: list[tuple[Any, ...]] = [(0, 0, 1.0, 0.0)]
+    for target, point in np.ndindex(shape):
+        both = (float(table[target, point]) for table in tables)
+        rows.append((target + 1, steps[point], *(None if np.isnan(value) else value for value in both)))
+    return rows
 
 
 def _columns(names: tuple[str, ...], rows: list[tuple[Any, ...]]) -> dict[str, list[Any]]:

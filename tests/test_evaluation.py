@@ -6,9 +6,10 @@ import torch
 
 from clbench.evaluation import LANES, Evaluator, answer
 from clbench.policy import Policy
+from clbench.pretraining import policy_config, pretrained_policy
 from clbench.questions import load_questions, report_questions
 from clbench.task import load_scenario
-from clbench.training import deterministic, policy_config, pretrained_policy
+from clbench.training import deterministic
 
 TOY = load_scenario("clbench.testing:clbench/Toy-v0")
 FETCH = load_scenario("clbench/Fetch-v0")

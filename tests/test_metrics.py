@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 from scipy.integrate import trapezoid
 
-from clbench.metrics import METRICS, Scores, load_metric, measure, rates_of
-from clbench.record import Record, RecordError
+from clbench.metrics import METRICS, load_metric, matched_points, measure
+from clbench.record import Record
+from clbench.scores import Scores, rates_of
 
 MakeRecord = Callable[..., Record]
 
@@ -52,6 +53,124 @@ def test_forward_transfer_has_the_value_worked_out_by_hand(scores: Callable[...,
 def test_questions_of_all_kinds_count_together_at_the_end_alone(scores: Callable[..., Scores]) -> None:
     answers = {(0, "left"): (10, 10), (2, "left"): (30, 15), (2, "above"): (10, 9)}
     assert measure("question_retention", scores(MATRIX, answers=answers)) == pytest.approx(24 / 40)
+
+
+# Two stages with three points each: what plain fine-tuning and a gentler method do on the way.
+MATCHED_STEPS = (100, 200, 400)
+PLAIN = {"selection": [[0.4, 0.9, 1.0], [0.0, 0.7, 0.8]], "retained_curves": [[[0.9, 0.7], [0.5, 0.6]]] * 2}
+GENTLE = {
+    "selection": [[0.1, 0.6, 0.9], [0.3, 0.8, 0.9]],
+    "retained_curves": [[[1.0, 1.0], [0.9, 0.9]], [[0.8, 0.9], [0.7, 0.6]]],
+}
+
+
+def test_retention_at_matched_adaptation_has_the_value_worked_out_by_hand(
+    scores: Callable[..., Scores],
+) -> None:
+    sft = scores(MATRIX, steps=MATCHED_STEPS, **PLAIN)
+    run = scores(MATRIX, steps=MATCHED_STEPS, **GENTLE)
+    # The goals are 0.9 x 1.0, reached at the end of its stage, and 0.9 x 0.8, reached in the middle.
+    np.testing.assert_array_equal(matched_points(rates_of([run], {"sft": [sft]})), [[2, 1]])
+    expected = ((0.6 + 0.9) / 2 + (0.7 + 0.6) / 2) / 2
+    assert measure("retention_at_matched_adaptation", run, {"sft": sft}) == pytest.approx(expected)
+
+
+def test_plain_fine_tuning_is_matched_with_its_own_end(scores: Callable[..., Scores]) -> None:
+    sft = scores(MATRIX, steps=MATCHED_STEPS, **PLAIN)
+    # 0.9 of 1.0 after 200 steps, 0.72 of 0.8 not before the end
+    expected = ((0.5 + 0.6) / 2 + (0.5 + 0.4) / 2) / 2
+    assert measure("retention_at_matched_adaptation", sft, {"sft": sft}) == pytest.approx(expected)
+
+
+def test_a_method_that_never_learns_a_target_as_well_has_no_matched_point(
+    scores: Callable[..., Scores],
+) -> None:
+    sft = scores(MATRIX, steps=MATCHED_STEPS, **PLAIN)
+    run = scores(MATRIX, steps=MATCHED_STEPS, **{**GENTLE, "selection": [[0.1, 0.6, 0.8], [0.9, 0.9, 0.9]]})
+    np.testing.assert_array_equal(matched_points(rates_of([run], {"sft": [sft]})), [[np.nan, 0]])
+    assert measure("retention_at_matched_adaptation", run, {"sft": sft}) is None
+
+
+def test_the_matched_point_is_chosen_on_selection_episodes_whatever_the_report_ones_say(
+    scores: Callable[..., Scores],
+) -> None:
+    sft = scores(MATRIX, steps=MATCHED_STEPS, curves=np.ones((2, 2)), **PLAIN)
+    first, last = (
+        scores(MATRIX, steps=MATCHED_STEPS, curves=curves, **GENTLE)
+        for curves in (np.ones((2, 2)), np.zeros((2, 2)))
+    )
+    points = matched_points(rates_of([first, last], {"sft": [sft, sft]}))
+    np.testing.assert_array_equal(points, [[2, 1], [2, 1]])
+
+
+def test_a_rate_that_just_reaches_the_goal_is_matched_whatever_its_last_bit(
+    scores: Callable[..., Scores],
+) -> None:
+    assert 36 / 50 < 0.9 * (40 / 50)
+    sft, run = (
+        scores(
+            [[1.0, 0.0, 0.0], [0.5, 1.0, 0.0]],
+            steps=(100,),
+            selection=[[right / 50]],
+            selection_episodes=50,
+        )
+        for right in (40, 36)
+    )
+    np.testing.assert_array_equal(matched_points(rates_of([run], {"sft": [sft]})), [[0]])
+
+
+@pytest.mark.parametrize(
+    ("method", "point", "points"),
+    [("run", 0, [np.nan, 1]), ("run", 2, [np.nan, 1]), ("sft", 2, [np.nan, 1]), ("sft", 0, [2, 1])],
+)
+def test_a_missing_selection_rate_leaves_no_point_that_could_be_another(
+    method: str, point: int, points: list[float], scores: Callable[..., Scores]
+) -> None:
+    selection = {"sft": np.array(PLAIN["selection"]), "run": np.array(GENTLE["selection"])}
+    selection[method][0, point] = np.nan
+    sft, run = (scores(MATRIX, steps=MATCHED_STEPS, selection=selection[name]) for name in ("sft", "run"))
+    np.testing.assert_array_equal(matched_points(rates_of([run], {"sft": [sft]})), [points])
+
+
+def test_a_missing_success_at_the_matched_point_leaves_no_value_and_elsewhere_does_not_matter(
+    scores: Callable[..., Scores],
+) -> None:
+    sft = scores(MATRIX, steps=MATCHED_STEPS, **PLAIN)
+    values = []
+    for point in (0, 1):
+        retained = np.array(GENTLE["retained_curves"])
+        retained[1, point, 0] = np.nan
+        run = scores(MATRIX, steps=MATCHED_STEPS, **{**GENTLE, "retained_curves": retained})
+        values.append(measure("retention_at_matched_adaptation", run, {"sft": sft}))
+    assert values == [pytest.approx(0.7), None]
+
+
+def test_without_plain_fine_tuning_there_is_no_matched_retention(scores: Callable[..., Scores]) -> None:
+    run = scores(MATRIX, steps=MATCHED_STEPS, **GENTLE)
+    assert measure("retention_at_matched_adaptation", run) is None
+    np.testing.assert_array_equal(matched_points(run.rates()), [np.nan, np.nan])
+
+
+@pytest.mark.parametrize(("name", "table"), [("update_sparsity", "sparsity"), ("activation_drift", "drift")])
+def test_what_has_become_of_the_policy_counts_after_the_last_target(
+    name: str, table: str, scores: Callable[..., Scores]
+) -> None:
+    values = np.array([[0.9, 0.8, 0.7, 0.6], [0.5, 0.4, 0.3, 0.2]])
+    assert measure(name, scores(MATRIX, **{table: values})) == 0.2
+    values[1, 2] = np.nan
+    assert measure(name, scores(MATRIX, **{table: values})) == 0.2
+    values[1, 3] = np.nan
+    assert measure(name, scores(MATRIX, **{table: values})) is None
+
+
+def test_forward_transfer_weighs_uneven_steps_by_their_length(scores: Callable[..., Scores]) -> None:
+    steps = (50, 100, 200, 400)
+    success = [[0.0, 0.0, 0.0], [0.0, 1.0, 0.0]]
+    run = scores(success, curves=[[0.2, 0.4, 0.8]], steps=steps)
+    scratch = scores(success, curves=[[0.0, 0.0, 0.0]], steps=steps)
+    area = (50 * 0.1 + 50 * 0.3 + 100 * 0.6 + 200 * 0.9) / 400
+    expected = (area - 0.25) / (1 - 0.25)
+    assert measure("forward_transfer", run, {"from_scratch": scratch}) == pytest.approx(expected)
 
 
 def test_metrics_agree_with_plain_loops_on_random_matrices(scores: Callable[..., Scores]) -> None:
@@ -149,12 +268,6 @@ def test_what_needs_a_missing_cell_is_none_and_the_rest_is_not(
     assert {name for name, value in values.items() if value is None} == missing
 
 
-def test_a_stage_ends_where_it_was_evaluated_last(scores: Callable[..., Scores]) -> None:
-    run = scores(MATRIX, curves=[[0.4], [0.5]], steps=(10, 25))
-    assert measure("adaptation", run) == pytest.approx(BY_HAND["adaptation"])
-    np.testing.assert_allclose(run.curves.mean(axis=-1), [[0.4, 0.9], [0.5, 0.8]])
-
-
 def test_a_cell_that_lacks_an_episode_is_missing(scores: Callable[..., Scores]) -> None:
     outcomes = np.ones((2, 3, 20))
     outcomes[1, 0, 19] = np.nan
@@ -169,99 +282,6 @@ def test_a_missing_point_of_a_curve_takes_forward_transfer_only(scores: Callable
     run = scores(MATRIX, curves=curves)
     assert measure("forward_transfer", run, {"from_scratch": scratch}) is None
     assert measure("adaptation", run) == pytest.approx(BY_HAND["adaptation"])
-
-
-def test_selection_episodes_count_for_nothing(make_record: MakeRecord) -> None:
-    record = make_record(MATRIX)
-    before = Scores.from_record(record)
-    for column, value in zip(
-        record.episodes.values(), (2, 400, "skill_0", "selection", 20, 1, 1.0, 5), strict=True
-    ):
-        column.append(value)
-    np.testing.assert_array_equal(Scores.from_record(record).success, before.success)
-
-
-def test_the_order_of_rows_does_not_matter(make_record: MakeRecord) -> None:
-    record = make_record(MATRIX, curves=np.full((2, 3), 0.5), answers={(2, "b"): (9, 3), (2, "a"): (5, 4)})
-    scores = Scores.from_record(record)
-    order = np.random.default_rng(0).permutation(len(record.episodes["stage"]))
-    record.episodes = {name: [column[n] for n in order] for name, column in record.episodes.items()}
-    record.answers = {name: column[::-1] for name, column in record.answers.items()}
-    shuffled = Scores.from_record(record)
-    assert shuffled.layout == scores.layout
-    for name in ("success", "curves", "asked", "correct"):
-        np.testing.assert_array_equal(getattr(shuffled, name), getattr(scores, name))
-
-
-def test_the_axes_of_scores_follow_the_scenario(scores: Callable[..., Scores]) -> None:
-    run = scores(MATRIX, curves=[[0.1, 0.2, 0.3], [0.4, 0.5, 0.6]], answers={(1, "left"): (8, 6)})
-    assert run.layout.tasks == ("skill_0", "skill_1", "target_0", "target_1", "unseen_0")
-    assert run.layout.columns("held_out") == slice(4, 5)
-    assert run.layout.steps == (100, 200, 300, 400)
-    np.testing.assert_allclose(run.success.mean(axis=-1), MATRIX)
-    np.testing.assert_allclose(run.curves.mean(axis=-1), [[0.1, 0.2, 0.3, 0.9], [0.4, 0.5, 0.6, 0.8]])
-    np.testing.assert_array_equal(run.asked, [[0], [8], [0]])
-    np.testing.assert_array_equal(run.correct, [[0], [6], [0]])
-
-
-@pytest.mark.parametrize(
-    ("column", "value", "words"),
-    [
-        ("task", "juggle", "juggle"),
-        ("stage", 3, "impossible"),
-        ("stage", -1, "impossible"),
-        ("stage", True, "impossible"),
-        ("step", 10**30, "impossible"),
-        ("step", 1.5, "impossible"),
-        ("episode", None, "impossible"),
-        ("episode", 1, "twice"),
-        ("success", 0.5, "neither true nor false"),
-        ("success", "yes", "neither true nor false"),
-        ("success", [], "neither true nor false"),
-    ],
-)
-def test_an_episode_that_cannot_be_is_refused(
-    column: str, value: Any, words: str, make_record: MakeRecord
-) -> None:
-    record = make_record(MATRIX)
-    record.episodes[column][0] = value
-    with pytest.raises(RecordError, match=words):
-        Scores.from_record(record)
-
-
-@pytest.mark.parametrize(
-    "row",
-    [
-        (2, "left", 5, 6),
-        (2, "left", -1, -2),
-        (3, "left", 5, 5),
-        (2, 7, 5, 5),
-        (2, "left", "5", 5),
-        (0, "left", 10, 1),
-        (2, "left", 10**40, 1),
-    ],
-)
-def test_an_answer_count_that_cannot_be_is_refused(row: tuple[Any, ...], make_record: MakeRecord) -> None:
-    record = make_record(MATRIX, answers={(0, "left"): (10, 9)})
-    for column, value in zip(record.answers.values(), row, strict=True):
-        column.append(value)
-    with pytest.raises(RecordError, match="answers"):
-        Scores.from_record(record)
-
-
-@pytest.mark.parametrize("names", [None, "skill_0", [1], ["target_0"]])
-def test_a_scenario_without_clear_task_names_is_refused(names: Any, make_record: MakeRecord) -> None:
-    record = make_record(MATRIX)
-    record.scenario["retained"] = names
-    with pytest.raises(RecordError, match="scenario"):
-        Scores.from_record(record)
-
-
-def test_a_record_without_report_episodes_is_refused(make_record: MakeRecord) -> None:
-    record = make_record(MATRIX)
-    record.episodes["split"] = ["selection"] * len(record.episodes["split"])
-    with pytest.raises(RecordError, match="no report episode"):
-        Scores.from_record(record)
 
 
 def test_an_unknown_metric_is_a_lookup_error_that_names_the_nearest() -> None:
@@ -289,6 +309,11 @@ def test_every_metric_keeps_to_its_range_and_to_batch_axes(name: str, scores: Ca
             scores(
                 generator.integers(0, 2, size=(4, 6, 2)),
                 curves=generator.integers(0, 2, size=(3, 3, 2)),
+                retained_curves=generator.integers(0, 2, size=(3, 3, 2, 2)),
+                # each target is learned in the end, as the matched point needs
+                selection=np.concatenate([generator.random((3, 3)), np.ones((3, 1))], axis=1),
+                sparsity=generator.random((3, 4)),
+                drift=generator.random((3, 4)),
                 answers={(3, "left"): (10, int(generator.integers(11)))},
             )
             for _ in range(20)
@@ -302,10 +327,3 @@ def test_every_metric_keeps_to_its_range_and_to_batch_axes(name: str, scores: Ca
     assert all(value is not None and metric.low <= value <= metric.high for value in values)
     together = metric.function(rates_of(runs, dict.fromkeys(metric.references, others)))
     np.testing.assert_allclose(together, np.array(values, dtype=float))
-
-
-def test_runs_of_different_layouts_do_not_mix(scores: Callable[..., Scores]) -> None:
-    with pytest.raises(ValueError, match="do not mix"):
-        rates_of([scores(MATRIX), scores(MATRIX, episodes=10)], {})
-    with pytest.raises(ValueError, match="do not mix"):
-        rates_of([scores(MATRIX)], {"from_scratch": [scores(MATRIX, steps=(200,))]})

@@ -15,7 +15,9 @@ from clbench.record import Record, RecordError, read_record, record_path, write_
 @pytest.fixture
 def record(make_record: Callable[..., Record]) -> Record:
     return make_record(
-        [[1.0, 0.0, 0.0], [0.5, 1.0, 0.0]], answers={(0, "left"): (10, 9), (1, "left"): (10, 8)}
+        [[1.0, 0.0, 0.0], [0.5, 1.0, 0.0]],
+        answers={(0, "left"): (10, 9), (1, "left"): (10, 8)},
+        sparsity=[[0.9, 0.8, 0.7, 0.6]],
     )
 
 
@@ -90,11 +92,18 @@ def test_a_torn_record_is_refused_wherever_it_is_torn(record: Record, tmp_path: 
 
 @pytest.mark.parametrize(
     "content",
-    [b"[1, 2]", b"7", b"{}", b'{"schema": 0}', b'{"results": {"success": 1.0}}', b'{"schema": 1}'],
+    [b"[1, 2]", b"7", b"{}", b'{"schema": 0}', b'{"results": {"success": 1.0}}', b'{"schema": 2}'],
 )
 def test_foreign_json_is_refused(content: bytes, tmp_path: Path) -> None:
     (tmp_path / "record.json").write_bytes(content)
     with pytest.raises(RecordError, match="schema"):
+        read_record(tmp_path / "record.json")
+
+
+def test_a_record_of_the_first_schema_is_refused_and_says_what_to_do(record: Record, tmp_path: Path) -> None:
+    write_record(record, tmp_path / "record.json")
+    change(tmp_path / "record.json", schema=1)
+    with pytest.raises(RecordError, match="older schema 1, not 2: its run must be done again"):
         read_record(tmp_path / "record.json")
 
 
@@ -117,7 +126,8 @@ def test_what_is_no_file_is_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("fields", "words"),
     [
-        ({"schema": 2}, "schema 1"),
+        ({"schema": 3}, "no record of schema 2"),
+        ({"schema": True}, "no record of schema 2"),
         ({"score": 0.99}, "score"),
         ({"status": "great"}, "great"),
         ({"run": None}, "run"),
@@ -134,7 +144,7 @@ def test_a_field_that_does_not_fit_the_schema_is_refused_by_name(
         read_record(tmp_path / "record.json")
 
 
-@pytest.mark.parametrize("name", ["episodes", "answers"])
+@pytest.mark.parametrize("name", ["episodes", "answers", "policy"])
 def test_columns_that_do_not_fit_together_are_refused_by_name(
     name: str, record: Record, tmp_path: Path
 ) -> None:

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from clbench.metrics import METRICS, Layout, Scores, measure
+from clbench.metrics import METRICS, measure
+from clbench.scores import Layout, Scores
 from clbench.statistics import Estimate, estimate, paired_difference, row_generator
 
 NOTHING = Estimate(None, None, None)
@@ -19,6 +20,8 @@ def layout(retained: int, episodes: int, targets: int = 1, held_out: int = 0, po
         target=tuple(f"target_{number}" for number in range(targets)),
         held_out=tuple(f"unseen_{number}" for number in range(held_out)),
         episodes=tuple(range(episodes)),
+        curve_episodes=tuple(range((episodes + 1) // 2)),
+        selection_episodes=tuple(range(10)),
         steps=tuple(100 * (number + 1) for number in range(points)),
         kinds=("left", "above"),
     )
@@ -29,18 +32,35 @@ def scores(final: Any, correct: int = 50) -> Scores:
     final = np.asarray(final, dtype=float)
     success = np.ones((2, len(final) + 1, final.shape[1]))
     success[1, : len(final)] = final
-    counts = np.full((2, 2), 100.0), np.full((2, 2), float(correct))
-    return Scores(layout(*final.shape), success, np.ones((1, 1, final.shape[1])), *counts)
+    return whole_run(layout(*final.shape), success, correct=np.full((2, 2), float(correct)))
+
+
+def whole_run(shape: Layout, success: Any, **arrays: Any) -> Scores:
+    """Return a run with the outcomes `success` at the ends; of `arrays` those given, the others missing."""
+    targets, points = len(shape.target), len(shape.steps)
+    counts = np.full((targets + 1, len(shape.kinds)), 100.0)
+    on_the_way = np.full((targets, points - 1, len(shape.tasks), len(shape.curve_episodes)), np.nan)
+    curves = ("selection", "answer_curves", "update_sparsity", "activation_drift")
+    missing = {name: np.full((targets, points), np.nan) for name in curves}
+    given = {"on_the_way": on_the_way, "asked": counts, "correct": counts / 2, **missing, **arrays}
+    return Scores(shape, success, **given)
 
 
 def random_run(generator: np.random.Generator, shape: Layout) -> Scores:
-    stages, tasks, episodes = len(shape.target) + 1, len(shape.tasks), len(shape.episodes)
-    return Scores(
+    """Return a run of coin flips; plain fine-tuning's final success is reached somewhere in each stage."""
+    targets, points, tasks = len(shape.target), len(shape.steps), len(shape.tasks)
+    on_the_way = (targets, points - 1, tasks, len(shape.curve_episodes))
+    selection = generator.random((targets, points))
+    selection[:, -1] = 1.0
+    return whole_run(
         shape,
-        success=generator.integers(0, 2, (stages, tasks, episodes)).astype(float),
-        curves=generator.integers(0, 2, (stages - 1, len(shape.steps), episodes)).astype(float),
-        asked=np.full((stages, 2), 100.0),
-        correct=generator.integers(0, 101, (stages, 2)).astype(float),
+        success=generator.integers(0, 2, (targets + 1, tasks, len(shape.episodes))).astype(float),
+        on_the_way=generator.integers(0, 2, on_the_way).astype(float),
+        selection=selection,
+        correct=generator.integers(0, 101, (targets + 1, 2)).astype(float),
+        answer_curves=generator.random((targets, points)),
+        update_sparsity=generator.random((targets, points)),
+        activation_drift=generator.random((targets, points)),
     )
 
 
@@ -55,7 +75,7 @@ def test_the_value_is_the_mean_of_the_seeds_values() -> None:
     shape = layout(3, 5, targets=3, held_out=2, points=2)
     runs = {seed: random_run(generator, shape) for seed in range(3)}
     estimates = estimate(METRICS, runs, generator, replicates=10)
-    for name in set(METRICS) - {"forward_transfer"}:
+    for name in {name for name, metric in METRICS.items() if not metric.references}:
         values = [measure(name, run) for run in runs.values()]
         assert estimates[name].value == pytest.approx(np.mean(np.array(values, dtype=float)))
 
@@ -65,7 +85,7 @@ def test_forward_transfer_averages_curves_over_seeds_before_the_ratio() -> None:
     curves = {"run": [0.0, 1.0], "from_scratch": [1.0, 0.0]}
     runs = {
         name: {
-            seed: Scores(shape, np.zeros((2, 2, 1)), np.full((1, 1, 1), value), *np.zeros((2, 2, 2)))
+            seed: whole_run(shape, np.array([[[0.0], [0.0]], [[0.0], [value]]]))
             for seed, value in enumerate(values)
         }
         for name, values in curves.items()
@@ -225,6 +245,39 @@ def test_a_difference_can_need_a_reference() -> None:
     assert paired_difference("forward_transfer", runs, others, generator) == NOTHING
 
 
+def test_the_matched_points_of_each_seed_are_its_own() -> None:
+    # The first seed reaches the goal at the first point, the second at the last: there they know all.
+    shape = layout(1, 4, points=2)
+    sft = {seed: random_run(np.random.default_rng(seed), shape) for seed in range(2)}
+    runs = {}
+    for seed, selection in enumerate(([[1.0, 1.0]], [[0.0, 1.0]])):
+        on_the_way = np.full((1, 1, 2, 2), 1.0 - seed)
+        success = np.full((2, 2, 4), float(seed))
+        runs[seed] = whole_run(shape, success, on_the_way=on_the_way, selection=np.array(selection))
+    got = estimate(
+        ["retention_at_matched_adaptation"], runs, np.random.default_rng(0), references={"sft": sft}
+    )
+    assert got["retention_at_matched_adaptation"] == Estimate(1.0, 1.0, 1.0)
+
+
+def test_matched_retention_has_no_value_if_one_seed_has_none() -> None:
+    generator = np.random.default_rng(0)
+    shape = layout(2, 10, targets=2, points=3)
+    sft, runs = ({seed: random_run(generator, shape) for seed in range(3)} for _ in range(2))
+    name = "retention_at_matched_adaptation"
+    whole = estimate([name], runs, generator, references={"sft": sft})[name]
+    assert width(whole) > 0
+    runs[1].selection[1] = 0.5
+    assert estimate([name], runs, generator, references={"sft": sft})[name] == NOTHING
+
+
+def test_matched_retention_of_plain_fine_tuning_differs_from_itself_by_nothing() -> None:
+    generator = np.random.default_rng(0)
+    sft = {seed: random_run(generator, layout(2, 10, targets=2, points=3)) for seed in range(3)}
+    got = paired_difference("retention_at_matched_adaptation", sft, sft, generator, references={"sft": sft})
+    assert got == Estimate(0.0, 0.0, 0.0)
+
+
 def test_only_seeds_that_both_have_are_compared() -> None:
     good, bad = scores(np.ones((2, 5))), scores(np.zeros((2, 5)))
     difference = paired_difference(
@@ -245,6 +298,6 @@ def test_a_row_takes_less_than_a_second() -> None:
     shape = layout(5, 20, targets=4, held_out=3, points=4)
     runs, scratch = ({seed: random_run(generator, shape) for seed in range(3)} for _ in range(2))
     begin = time.process_time()
-    estimates = estimate(METRICS, runs, generator, references={"from_scratch": scratch})
+    estimates = estimate(METRICS, runs, generator, references={"from_scratch": scratch, "sft": scratch})
     assert time.process_time() - begin < 1
     assert all(one.low is not None for one in estimates.values())

@@ -1,6 +1,6 @@
 import pytest
 
-from clbench.task import load_scenario, resolve, scenario_ids
+from clbench.task import Budget, load_scenario, resolve, scenario_ids
 
 FETCH = "clbench/Fetch-v0"
 
@@ -52,3 +52,18 @@ def test_the_fetch_scenario_has_the_promised_parts() -> None:
     assert len(scenario.held_out) >= 2
     assert len(resolve(scenario.questions)) >= 8
     assert all(len(task.instructions) >= 3 for task in scenario.tasks)
+
+
+@pytest.mark.parametrize(
+    ("steps", "points", "expected"),
+    [(300, 4, (37, 75, 150, 300)), (8, 3, (2, 4, 8)), (2, 5, (1, 2)), (7, 1, (7,))],
+)
+def test_evaluation_points_double_and_end_with_the_stage(
+    steps: int, points: int, expected: tuple[int, ...]
+) -> None:
+    assert Budget(adaptation_steps=steps, evaluation_points=points).evaluation_steps == expected
+
+
+def test_a_budget_cannot_have_more_episodes_on_the_way_than_at_the_end() -> None:
+    with pytest.raises(ValueError, match="first of the 5 report episodes: 6 are too many"):
+        Budget(report_episodes=5, curve_episodes=6)

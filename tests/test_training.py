@@ -6,8 +6,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from clbench.task import Budget
-from clbench.training import MethodError, deterministic, evaluation_steps, learning_rate_factor, optimise
+from clbench.training import MethodError, deterministic, learning_rate_factor, optimise
 
 
 def test_the_step_size_warms_up_and_falls_by_a_cosine_to_a_tenth() -> None:
@@ -83,11 +82,21 @@ def test_the_deterministic_block_puts_the_threads_back() -> None:
     assert (torch.get_num_threads(), torch.are_deterministic_algorithms_enabled()) == before
 
 
-@pytest.mark.parametrize(
-    ("steps", "points", "expected"),
-    [(400, 4, [100, 200, 300, 400]), (10, 3, [3, 7, 10]), (2, 5, [1, 2]), (7, 1, [7])],
-)
-def test_evaluation_points_are_even_and_end_with_the_stage(
-    steps: int, points: int, expected: list[int]
-) -> None:
-    assert evaluation_steps(Budget(adaptation_steps=steps, evaluation_points=points)) == expected
+def test_the_step_size_may_be_changed_at_every_step_once_the_gradient_is_known() -> None:
+    weight = nn.Parameter(torch.zeros(1))
+    seen: list[tuple[float, int, bool]] = []
+
+    def rate(scheduled: float, step: int) -> float:
+        seen.append((scheduled, step, weight.grad is not None))
+        return 0.5 * scheduled
+
+    optimise([weight], 0.1, 2, lambda _: (weight - 1).square().sum(), rate=rate)
+    assert seen == [(0.1, 0, True), (pytest.approx(0.1), 1, True)]
+    assert weight.item() == pytest.approx(0.1, rel=1e-2)  # two Adam steps of half of 0.1
+
+
+@pytest.mark.parametrize("rate", [-0.1, float("nan"), float("inf"), "0.1"])
+def test_a_step_size_that_is_none_is_refused(rate: Any) -> None:
+    weight = nn.Parameter(torch.zeros(1))
+    with pytest.raises(MethodError, match="step 0: the step size must be a number from 0"):
+        optimise([weight], 0.1, 1, lambda _: (weight - 1).square().sum(), rate=lambda *_: rate)

@@ -45,6 +45,14 @@ class FlowHead(nn.Module):
             tokens = layer(tokens, mask, prefix)
         return cast(Tensor, self.velocity_out(tokens))
 
+    def predict(
+        self, action: Tensor, draw: Tensor, noise: Tensor, hidden: list[Tensor], mask: Tensor
+    ) -> Tensor:
+        """Return the velocity (B, H, A) at chunks that are noisy by `draw` and `noise`; see `loss`."""
+        time = draw ** (1 / 1.5)  # the inverse of Beta(1.5, 1)'s distribution function t ** 1.5
+        noisy = torch.lerp(action, noise, time[:, None, None])
+        return self.velocity(noisy, time, hidden, mask)
+
     def loss(
         self, action: Tensor, valid: Tensor, draw: Tensor, noise: Tensor, hidden: list[Tensor], mask: Tensor
     ) -> Tensor:
@@ -58,10 +66,8 @@ class FlowHead(nn.Module):
             hidden: Hidden states of the backbone, one (B, P, W) per layer.
             mask: Which prefix tokens are read, (B, 1, 1, P).
         """
-        time = draw ** (1 / 1.5)  # the inverse of Beta(1.5, 1)'s distribution function t ** 1.5
-        noisy = torch.lerp(action, noise, time[:, None, None])
-        error = (self.velocity(noisy, time, hidden, mask) - (noise - action)).square().mean(dim=2)
-        return (error * valid).sum(dim=1) / valid.sum(dim=1)
+        predicted = self.predict(action, draw, noise, hidden, mask)
+        return mean_over_valid((predicted - (noise - action)).square(), valid)
 
     def sample(self, noise: Tensor, hidden: list[Tensor], mask: Tensor) -> Tensor:
         """Return the normalised action chunk (B, H, A) that the noise (B, H, A) flows to."""
@@ -70,3 +76,8 @@ class FlowHead(nn.Module):
             time = torch.full((len(noise),), step / self.euler_steps, device=noise.device)
             chunk = chunk - self.velocity(chunk, time, hidden, mask) / self.euler_steps
         return chunk
+
+
+def mean_over_valid(errors: Tensor, valid: Tensor) -> Tensor:
+    """Return the mean (B,) of errors (B, H, A) over action dimensions and the valid steps (B, H)."""
+    return (errors.mean(dim=2) * valid).sum(dim=1) / valid.sum(dim=1)

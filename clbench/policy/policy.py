@@ -102,6 +102,13 @@ class Policy(nn.Module):
         mask = self.backbone.mask(batch.words)
         return self.head.loss(action, batch.valid, batch.draw, batch.noise, hidden, mask)
 
+    def predict(self, batch: Batch) -> Tensor:
+        """Return what the head predicts for the batch's noisy chunks, (B, H, A): how two policies compare."""
+        hidden = self.hidden_states(batch.state, batch.words)
+        action = (batch.action - self.action_mean) / self.action_std
+        mask = self.backbone.mask(batch.words)
+        return self.head.predict(action, batch.draw, batch.noise, hidden, mask)
+
     def answer_logits(self, state: Tensor, words: Tensor) -> Tensor:
         """Return the logits (B, V) of the word that answers the question `words` about `state`."""
         return self.backbone.answer_logits(self.hidden_states(state, words)[-1])

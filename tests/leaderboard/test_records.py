@@ -6,8 +6,8 @@ from typing import Any
 
 import pytest
 
-from clbench.metrics import Scores
 from clbench.record import read_record
+from clbench.scores import Scores
 
 RECORDS = Path(__file__).parents[2] / "leaderboard" / "records"
 

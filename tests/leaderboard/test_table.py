@@ -20,6 +20,7 @@ from clbench.task import resolve
 
 MATRIX = [[1.0, 0.8, 0.1, 0.0, 0.2], [0.6, 0.9, 0.9, 0.2, 0.3], [0.5, 0.4, 0.3, 0.8, 0.1]]
 ANSWERS = {(stage, kind): (50, 45 - 10 * stage) for stage in range(3) for kind in ("left", "above")}
+SELECTION = [[0.3, 0.6, 0.9, 0.9], [0.1, 0.3, 0.8, 0.8]]
 REFERENCE = {"demonstrations": "never", "questions": "never", "reference": True}
 REPLAY = {"demonstrations": "throughout", "questions": "never", "reference": False}
 ASKS = {"demonstrations": "never", "questions": "prepare", "reference": False}
@@ -43,10 +44,10 @@ def add(make_record: Callable[..., Record], tmp_path: Path) -> Callable[..., Pat
         place: str | None = None,
         **run: Any,
     ) -> Path:
-        curves = np.full((2, 3), 0.4)
-        record = make_record(
-            matrix, curves=curves, answers=ANSWERS, episodes=10, method=method, seed=seed, **run
-        )
+        on_the_way = {"curves": np.full((2, 3), 0.4), "retained_curves": np.full((2, 3, 2), 0.7)}
+        policy = {"sparsity": np.full((2, 4), 0.6), "drift": np.full((2, 4), 3.0)}
+        values = {"selection": SELECTION, "answers": ANSWERS, "episodes": 10, **on_the_way, **policy, **run}
+        record = make_record(matrix, method=method, seed=seed, **values)
         if edit:
             edit(record)
         records = tmp_path / "leaderboard" / "records"
@@ -105,6 +106,9 @@ def test_a_row_has_every_metric_with_its_interval_and_the_costs(records: Path) -
     assert row.retention == pytest.approx(0.45)
     assert row.forgetting == pytest.approx(1.6 / 3)
     assert row.question_retention == pytest.approx(0.5)
+    assert row.retention_at_matched_adaptation == pytest.approx(0.7)
+    assert row.update_sparsity == pytest.approx(0.6)
+    assert row.activation_drift == pytest.approx(3.0)
     assert row.steps == 800
     assert row.parameters == 1000
     for name in METRICS:
@@ -115,6 +119,33 @@ def test_without_from_scratch_forward_transfer_is_missing(records: Path) -> None
     assert load(records).set_index("method").forward_transfer.notna().sum() == 3
     record_path(records, "clbench/Toy-v0", "from_scratch", 1).unlink()
     assert load(records).forward_transfer.isna().all()
+
+
+def test_without_plain_fine_tuning_matched_retention_is_missing(records: Path) -> None:
+    assert load(records).retention_at_matched_adaptation.notna().all()
+    record_path(records, "clbench/Toy-v0", "sft", 1).unlink()
+    rows = load(records).set_index("method")
+    assert rows.retention_at_matched_adaptation.dropna().index.tolist() == ["sft"]
+
+
+def test_a_method_that_does_not_learn_as_well_as_plain_fine_tuning_has_no_matched_retention(
+    records: Path, add: Callable[..., Path], shown: Callable[[], tuple[str, str]]
+) -> None:
+    add("slow", 0, selection=np.array(SELECTION) / 2)
+    assert np.isnan(load(records).set_index("method").retention_at_matched_adaptation["slow"])
+    _, page = shown()
+    assert "**matched retention** (higher is better; from 0 to 1; version 0)" in page
+
+
+def test_a_record_of_the_first_schema_is_listed_and_hides_no_other(
+    records: Path, add: Callable[..., Path], shown: Callable[[], tuple[str, str]]
+) -> None:
+    before = load(records)
+    path = add("old", 0)
+    path.write_text(path.read_text(encoding="utf-8").replace('"schema": 2', '"schema": 1'), encoding="utf-8")
+    pandas.testing.assert_frame_equal(load(records), before)
+    for text in shown():
+        assert "old/seed-0.json: is of the older schema 1" in flat(text)
 
 
 def test_a_row_does_not_depend_on_the_other_rows(records: Path, add: Callable[..., Path]) -> None:
@@ -195,6 +226,7 @@ def test_the_terminal_shows_all_rows_in_100_columns(
         assert word in printed
     row = next(line for line in printed.splitlines() if "experience_replay" in line)
     assert len(row.split()) == 2 + 7  # name, seeds, and seven metrics, none cut off
+    assert "matched" in printed
     assert "…" not in printed
 
 
@@ -216,6 +248,19 @@ def cut_answers(record: Record) -> None:
     record.answers["kind"][-1] = "right"
 
 
+def lose(record: Record, lost: Callable[..., bool]) -> None:
+    rows = [row for row in zip(*record.episodes.values(), strict=True) if not lost(*row)]
+    record.episodes = {name: [row[n] for row in rows] for n, name in enumerate(record.episodes)}
+
+
+def lose_curve_episode(record: Record) -> None:
+    lose(record, lambda stage, step, task, split, episode, *_: 0 < step < 400 and episode == 9)
+
+
+def lose_selection_episode(record: Record) -> None:
+    lose(record, lambda stage, step, task, split, episode, *_: split == "selection" and episode == 9)
+
+
 @pytest.mark.parametrize(
     ("edit", "reason"),
     [
@@ -233,7 +278,7 @@ def cut_answers(record: Record) -> None:
         (drop_seed, "seed is missing"),
         (set_in("scenario", "retained", "all"), "retained must be a list"),
         (
-            set_in("scenario", "budget", {"adaptation_steps": 9, "report_episodes": 10}),
+            lambda record: record.scenario["budget"].update(adaptation_steps=9),
             "budget (adaptation_steps)",
         ),
         (set_in("scenario", "target", ["target_1", "target_0"]), "target differ"),
@@ -241,6 +286,11 @@ def cut_answers(record: Record) -> None:
         (set_in("fingerprint", "rollouts", None), "rollouts of all worlds differ"),
         (set_in("episodes", "success", [0.5]), "different lengths"),
         (cut_answers, "kinds differ"),
+        (lose_curve_episode, "curve_episodes differ"),
+        (lose_selection_episode, "selection_episodes differ"),
+        (set_in("policy", "step", []), "the columns of policy have different lengths"),
+        (set_in("run", "split", "selection"), "it is a tuning run: its episodes may be chosen on."),
+        (set_in("run", "split", "all"), "split must be report or selection"),
         (set_in("run", "settings", {"strength": 2}), "settings are not those of most seeds: strength"),
     ],
 )
@@ -321,7 +371,10 @@ def test_any_damage_to_a_record_ends_in_a_row_or_a_reason(
     make_record: Callable[..., Record], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     records = tmp_path / "records"
-    write_record(make_record([[1.0, 0.0], [0.5, 1.0]], groups=(1, 1, 0), episodes=2), records / "whole.json")
+    whole_record = make_record(
+        [[1.0, 0.0], [0.5, 1.0]], groups=(1, 1, 0), episodes=2, steps=(1, 2), sparsity=[[0.5, 0.4]]
+    )
+    write_record(whole_record, records / "whole.json")
     whole = json.loads((records / "whole.json").read_text(encoding="utf-8"))
     damages: tuple[Any, ...] = (None, -1, 1e999, "x", [None], {"x": []}, 10**300)
     parts = {name: values for name, values in whole.items() if name != "schema"}

@@ -2,8 +2,9 @@
 
 import pytest
 
-from clbench.metrics import Scores, measure
+from clbench.metrics import measure
 from clbench.run import RunSpec, execute
+from clbench.scores import Scores
 
 TOY = "clbench.testing:clbench/Toy-v0"
 METHODS = ("sft", "experience_replay", "joint", "frozen", "from_scratch")

@@ -1,0 +1,130 @@
+"""What an adaptation step of each method costs, as a ratio to plain fine-tuning: `make benchmark`.
+
+Methods take turns in blocks of steps, in a new order each round, so that what else the machine does meets all
+of them alike. A ratio is that of two blocks of one round; reported are the median over rounds and a 95 %
+bootstrap interval of it. The policy, the data and the batches are those of a real run's first target.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import statistics
+import time
+from collections.abc import Mapping
+from copy import deepcopy
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.progress import track
+
+import clbench
+from clbench.adaptation import adapt
+from clbench.demonstrations import Demonstrations, load_demonstrations
+from clbench.fingerprint import fingerprint
+from clbench.method import Prior, Source, Stage, build_method, method_names
+from clbench.policy import Policy
+from clbench.pretraining import pretrained_policy
+from clbench.questions import load_questions
+from clbench.seeding import seeded, torch_generator
+from clbench.task import Scenario, load_scenario
+from clbench.training import deterministic
+
+RESULTS = Path(__file__).parent / "results"
+BASELINE = "sft"
+
+
+class Bench:
+    """One method, prepared, that can be asked for a block of steps.
+
+    Args:
+        name: The method.
+        scenario: Where budget and tasks come from.
+        policy: The pretrained policy; it is copied.
+        data: `target`, `demonstrations` and `questions` to draw from.
+    """
+
+    def __init__(self, name: str, scenario: Scenario, policy: Policy, data: Mapping[str, Any]) -> None:
+        self.scenario, self.policy, self.data = scenario, deepcopy(policy), data
+        self.method = build_method(name, {})
+        with seeded("benchmark", name):
+            self.method.prepare(self.policy, self._prior("prepare"))
+
+    def _source(self, name: str) -> Source[Any]:
+        return Source(self.data[name], torch_generator("benchmark", name), self.scenario.budget.batch_size)
+
+    def _prior(self, when: str) -> Prior:
+        access = dataclasses.asdict(self.method.uses)
+        names = [name for name in ("demonstrations", "questions") if access[name] in (when, "throughout")]
+        return Prior({name: self._source(name) for name in names})
+
+    def seconds(self, steps: int) -> float:
+        """Return what `steps` steps take; the one before them, which makes the optimiser, is not counted."""
+        stage = Stage(
+            1, self.scenario.target[0], 0, steps + 1, self._source("target"), self._prior("throughout")
+        )
+        marks: list[float] = []
+        with seeded("benchmark", "steps"):
+            adapt(
+                self.policy,
+                self.method,
+                stage,
+                self.scenario.budget,
+                lambda _: marks.append(time.perf_counter()),
+            )
+        return marks[-1] - marks[0]
+
+
+def main() -> None:
+    """Measure, print a table and write results/step_time.json."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("--scenario", default="clbench/Fetch-v0")
+    parser.add_argument("--rounds", type=int, default=15)
+    parser.add_argument("--steps", type=int, default=8, help="timed steps in a block")
+    arguments = parser.parse_args()
+    scenario = load_scenario(arguments.scenario)
+    names = [name for name in method_names() if name != "frozen" and "/" not in name]
+    policy, _ = pretrained_policy(scenario, 0)
+    skills = [load_demonstrations(task, scenario, policy.config) for task in scenario.retained]
+    data = {
+        "target": load_demonstrations(scenario.target[0], scenario, policy.config),
+        "demonstrations": Demonstrations.cat(skills),
+        "questions": load_questions(scenario)[0],
+    }
+    generator = np.random.default_rng(0)
+    rounds: list[dict[str, float]] = []
+    with deterministic():
+        benches = {name: Bench(name, scenario, policy, data) for name in names}
+        for number in track(range(arguments.rounds + 1), "rounds"):
+            taken = {}
+            for name in generator.permutation(names):
+                taken[str(name)] = benches[str(name)].seconds(arguments.steps)
+            if number:  # the first round warms up
+                rounds.append(taken)
+    ratios = {name: _ratio([one[name] / one[BASELINE] for one in rounds], generator) for name in names}
+    baseline = statistics.median(one[BASELINE] for one in rounds) / arguments.steps
+    result = {
+        "clbench": clbench.__version__,
+        "hardware": fingerprint(scenario)["hardware"],
+        "baseline_seconds_per_step": round(baseline, 4),
+        "rounds": arguments.rounds,
+        "ratios": ratios,
+    }
+    RESULTS.mkdir(exist_ok=True)
+    (RESULTS / "step_time.json").write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+    for name, ratio in sorted(ratios.items(), key=lambda item: item[1]["median_ratio"]):
+        print(f"{name:24} {ratio['median_ratio']:.2f} [{ratio['low']:.2f}, {ratio['high']:.2f}]")
+
+
+def _ratio(ratios: list[float], generator: np.random.Generator) -> dict[str, float]:
+    """Return the median of the ratios with a bootstrap interval."""
+    drawn = np.median(generator.choice(ratios, size=(2000, len(ratios))), axis=1)
+    low, high = np.percentile(drawn, [2.5, 97.5])
+    values = {"median_ratio": float(np.median(ratios)), "low": float(low), "high": float(high)}
+    return {name: round(value, 3) for name, value in values.items()}
+
+
+if __name__ == "__main__":
+    main()

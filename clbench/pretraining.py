@@ -1,0 +1,117 @@
+"""Pretraining: the policy that every method of a seed starts from, made once and kept in the cache."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from torch import Tensor
+
+from clbench.cache import cache_folder, cached, hash_of, is_cached, package_of, source_hash
+from clbench.demonstrations import SIMULATORS, Demonstrations, load_demonstrations
+from clbench.policy import Policy, PolicyConfig, load_policy, save_policy
+from clbench.questions import load_questions
+from clbench.seeding import derive_seed, torch_generator
+from clbench.task import Scenario, resolve
+from clbench.training import deterministic, optimise
+
+AFTER_PRETRAINING = (
+    "adaptation_steps",
+    "learning_rate",
+    "evaluation_points",
+    "selection_episodes",
+    "report_episodes",
+    "curve_episodes",
+    "report_questions",
+)
+"""Fields of the budget that a pretrained policy does not depend on."""
+
+
+def pretraining_inputs(scenario: Scenario, seed: int) -> dict[str, Any]:
+    """Return all that a pretrained policy depends on."""
+    suites = {package_of(name) for task in scenario.retained for name in (task.world, task.expert)}
+    suites.add(package_of(scenario.questions))
+    budget = dataclasses.asdict(scenario.budget)
+    parts = ("policy", "demonstrations", "questions", "seeding", "training")
+    core = (*(f"clbench.{part}" for part in parts), __name__)
+    return {
+        "retained": [dataclasses.asdict(task) for task in scenario.retained],
+        "budget": {name: value for name, value in budget.items() if name not in AFTER_PRETRAINING},
+        "seed": seed,
+        "source": source_hash(*core, *sorted(suites)),
+        "versions": {package: version(package) for package in (*SIMULATORS, "torch", "tokenizers")},
+    }
+
+
+def pretrained_folder(scenario: Scenario, seed: int) -> Path:
+    """Return where the pretrained policy lies, or will lie."""
+    name = f"{scenario.id.replace('/', '--')}-seed-{seed}-{hash_of(pretraining_inputs(scenario, seed))}"
+    return cache_folder() / "pretrained" / name
+
+
+def is_pretrained(scenario: Scenario, seed: int) -> bool:
+    """Return whether the pretrained policy is in the cache."""
+    return is_cached(pretrained_folder(scenario, seed), pretraining_inputs(scenario, seed))
+
+
+def pretrained_policy(
+    scenario: Scenario, seed: int, progress: Callable[[float], None] = lambda _: None
+) -> tuple[Policy, Path]:
+    """Return the policy pretrained on the retained tasks and the questions, and the folder it lies in.
+
+    It is trained on first use, and shared by all methods.
+
+    Args:
+        scenario: What to learn.
+        seed: Of the weights and of every draw.
+        progress: Called with the number of steps done since its last call.
+    """
+    inputs = pretraining_inputs(scenario, seed)
+    folder = cached(
+        pretrained_folder(scenario, seed),
+        inputs,
+        lambda partial: save_policy(_pretrain(scenario, seed, progress), partial),
+    )
+    return load_policy(folder), folder
+
+
+def policy_config(scenario: Scenario) -> PolicyConfig:
+    """Return the sizes of a policy for the scenario's worlds."""
+    world = resolve(scenario.retained[0].world)()
+    config = PolicyConfig(
+        state_size=world.observation_space.shape[0],
+        action_size=world.action_space.shape[0],
+        width=scenario.budget.policy_width,
+        layers=scenario.budget.policy_layers,
+    )
+    world.close()
+    return config
+
+
+def _pretrain(scenario: Scenario, seed: int, progress: Callable[[float], None]) -> Policy:
+    config, budget = policy_config(scenario), scenario.budget
+    demonstrations = Demonstrations.cat(
+        [load_demonstrations(task, scenario, config) for task in scenario.retained]
+    )
+    questions, _ = load_questions(scenario)
+    policy = Policy(config, seed=derive_seed("weights", seed))
+    policy.normalise_like(demonstrations.state, demonstrations.action[:, 0])
+    generator = torch_generator("pretraining", seed)
+
+    def loss_at(step: int) -> Tensor:
+        batch = demonstrations.sample(budget.batch_size, generator)
+        asked = questions.sample(budget.batch_size // 2, generator)
+        return policy.action_loss(batch).mean() + policy.answer_loss(asked).mean()
+
+    with deterministic():
+        optimise(
+            policy.parameters(),
+            budget.pretraining_learning_rate,
+            budget.pretraining_steps,
+            loss_at,
+            after=lambda _: progress(1),
+        )
+    return policy

@@ -1,0 +1,432 @@
+"""Scores: what a record says as arrays, and the rates that metrics are computed from."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import chain
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clbench.record import Record, RecordError
+from clbench.task import Group
+
+Array = NDArray[np.float64]
+
+MOST = 10**9
+"""More steps, episodes or questions than any run has: a number beyond it is damage."""
+
+FARTHEST = 1e18
+"""A greater activation drift than any policy has whose hidden states are numbers of any use."""
+
+
+@dataclass(frozen=True)
+class Layout:
+    """What the axes of a run's scores stand for. Runs can be put together if their layouts are equal."""
+
+    retained: tuple[str, ...]
+    """Names of the skills that are pretrained and never trained again."""
+    target: tuple[str, ...]
+    """Names of the tasks that are learned, in order."""
+    held_out: tuple[str, ...]
+    """Names of the tasks that are never trained."""
+    episodes: tuple[int, ...]
+    """Numbers of the scored episodes at the end of a stage, rising."""
+    curve_episodes: tuple[int, ...]
+    """Numbers of those that are run at the points before the end too, rising."""
+    selection_episodes: tuple[int, ...]
+    """Numbers of the selection episodes on a stage's target, rising."""
+    steps: tuple[int, ...]
+    """Steps of a stage after which it is evaluated, rising, all above 0; the last one is its end."""
+    kinds: tuple[str, ...]
+    """Kinds of questions, sorted."""
+
+    @property
+    def tasks(self) -> tuple[str, ...]:
+        """The columns of every score table: retained, then target, then held out."""
+        return self.retained + self.target + self.held_out
+
+    def columns(self, group: Group) -> slice:
+        """Return the task columns of `group`."""
+        before = {"retained": (), "target": self.retained, "held_out": self.retained + self.target}[group]
+        return slice(len(before), len(before) + len(getattr(self, group)))
+
+
+@dataclass(frozen=True, eq=False)
+class Scores:
+    """What a record says, as arrays, NaN where missing. The success of an episode is 0 or 1.
+
+    The scored episodes are the report episodes, in a tuning run the selection episodes.
+    """
+
+    layout: Layout
+    """What the axes stand for."""
+    success: Array
+    """Success at the end of each stage, (stages + 1, tasks, episodes)."""
+    on_the_way: Array
+    """Success at the points of each stage before its end, (targets, points - 1, tasks, curve episodes)."""
+    selection: Array
+    """Success rate on target k over the selection episodes at the points of stage k, (targets, points)."""
+    asked: Array
+    """Questions asked at the end of each stage, (stages + 1, kinds)."""
+    correct: Array
+    """Questions answered rightly, (stages + 1, kinds)."""
+    answer_curves: Array
+    """Share of all questions answered rightly at the points of each stage, (targets, points)."""
+    update_sparsity: Array
+    """Share of the parameters that have hardly changed since pretraining, (targets, points)."""
+    activation_drift: Array
+    """Distance of the hidden states from those of the pretrained policy, (targets, points)."""
+
+    @classmethod
+    def from_record(cls, record: Record) -> Scores:
+        """Return the scores in `record`.
+
+        Raises:
+            RecordError: The record contradicts itself: tasks, stages, steps or values that cannot be.
+        """
+        retained, target, held_out = (_names(record, group) for group in ("retained", "target", "held_out"))
+        tasks = retained + target + held_out
+        if len(set(tasks)) != len(tasks):
+            raise RecordError("scenario: a task name occurs twice.")
+        split, steps = _split(record), _steps(record)
+        rows = _episodes(record, tasks, len(target), steps)
+        scored = [row for row in rows if row.split == split]
+        if not scored:
+            raise RecordError(f"episodes: there is no {split} episode.")
+        if split == "selection" and len(scored) < len(rows):
+            raise RecordError("episodes: a tuning run must not have report episodes.")
+        on_the_way = [row for row in scored if row.stage and row.step < steps[-1]]
+        chosen_on = [
+            row
+            for row in rows
+            if row.split == "selection" and row.stage and row.task == target[row.stage - 1]
+        ]
+        kinds, counts = _answers(record, len(target), steps)
+        layout = Layout(
+            retained,
+            target,
+            held_out,
+            episodes=_numbers(scored),
+            # a method that is evaluated at the ends alone has none, and belongs to the others all the same
+            curve_episodes=_numbers(on_the_way) or _curve_episodes(record, split, _numbers(scored)),
+            selection_episodes=_numbers(chosen_on),
+            steps=steps,
+            kinds=kinds,
+        )
+        # one table for all points, with a place for the pretrained policy's; the end is the last point
+        success = np.full((len(target) + 1, len(steps), len(tasks), len(layout.episodes)), np.nan)
+        for row in scored:
+            where = row.stage, _point(row.stage, row.step, steps), tasks.index(row.task)
+            success[where][layout.episodes.index(row.episode)] = row.success
+        on_selection = np.full((len(target), len(steps), len(layout.selection_episodes)), np.nan)
+        for row in chosen_on:
+            where = row.stage - 1, steps.index(row.step), layout.selection_episodes.index(row.episode)
+            on_selection[where] = row.success
+        in_curves = [layout.episodes.index(number) for number in layout.curve_episodes]
+        sparsity, drift = _policy(record, len(target), steps)
+        return cls(
+            layout,
+            success=success[:, -1],
+            on_the_way=success[1:, :-1][..., in_curves],
+            selection=average(on_selection),
+            asked=counts[0, :, -1],
+            correct=counts[1, :, -1],
+            answer_curves=_shares(*counts[:, 1:]),
+            update_sparsity=sparsity,
+            activation_drift=drift,
+        )
+
+    def rates(self, counts: Array | None = None) -> Rates:
+        """Return the success rates with the batch axes of `counts`.
+
+        At the points before the end of a stage fewer episodes are run. There the counts are weights: the
+        rate is the mean over the episodes drawn of those that are run, however many these are. Where none
+        of them was drawn all weigh the same.
+
+        Args:
+            counts: How often each episode is in, the same for all stages and points, (..., tasks, episodes).
+                They add up to the number of episodes. Once each, without batch axes, if None.
+        """
+        layout, number = self.layout, len(self.layout.episodes)
+        if counts is None:
+            counts = np.ones((len(layout.tasks), number))
+        batch = counts.shape[:-2]
+
+        def spread(array: Array) -> Array:
+            return np.broadcast_to(array, batch + array.shape)
+
+        success = np.einsum("lte,...te->...lt", self.success, counts) / number
+        if layout.curve_episodes:
+            weights = counts[..., [layout.episodes.index(episode) for episode in layout.curve_episodes]]
+            weights = np.where(weights.sum(axis=-1, keepdims=True) > 0, weights, 1.0)
+            weights = weights / weights.sum(axis=-1, keepdims=True)
+            on_the_way = np.einsum("kpte,...te->...kpt", self.on_the_way, weights)
+        else:
+            on_the_way = spread(np.full(self.on_the_way.shape[:-1], np.nan))
+        return Rates(
+            layout,
+            success=success,
+            curves=np.concatenate([on_the_way, success[..., 1:, None, :]], axis=-2),
+            selection=spread(self.selection),
+            asked=spread(self.asked),
+            correct=spread(self.correct),
+            answer_curves=spread(self.answer_curves),
+            update_sparsity=spread(self.update_sparsity),
+            activation_drift=spread(self.activation_drift),
+        )
+
+
+def average(values: Array) -> Array:
+    """Return the mean along the last axis, NaN where there is nothing to average."""
+    return values.mean(axis=-1) if values.shape[-1] else np.full(values.shape[:-1], np.nan)
+
+
+# ---- reading a record --------------------------------------------------------------------------------------
+
+
+class _Episode(NamedTuple):
+    stage: int
+    step: int
+    task: str
+    split: str
+    episode: int
+    success: float
+
+
+def _names(record: Record, group: Group) -> tuple[str, ...]:
+    names = record.scenario.get(group)
+    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+        raise RecordError(f"scenario: {group} must be a list of task names.")
+    return tuple(names)
+
+
+def _steps(record: Record) -> tuple[int, ...]:
+    steps = record.scenario.get("evaluation_steps")
+    if (
+        not isinstance(steps, list)
+        or not steps
+        or any(type(step) is not int or not 0 < step <= MOST for step in steps)
+        or steps != sorted(set(steps))
+    ):
+        raise RecordError("scenario: evaluation_steps must be a list of rising whole numbers above 0.")
+    return tuple(steps)
+
+
+def _split(record: Record) -> str:
+    split = record.run.get("split", "report")
+    if split not in ("report", "selection"):
+        raise RecordError(f"run: split must be report or selection, not {split!r}.")
+    return str(split)
+
+
+def _check_when(where: str, stage: Any, step: Any, stages: int, steps: tuple[int, ...]) -> None:
+    """Refuse a stage that is not in the scenario, and a step after which it is not evaluated."""
+    if any(type(value) is not int or not 0 <= value <= MOST for value in (stage, step)) or stage > stages:
+        raise RecordError(f"{where} has an impossible stage or step.")
+    if step not in (steps if stage else (0,)):
+        raise RecordError(f"{where} is of stage {stage}, step {step}, which is no evaluation point.")
+
+
+def _point(stage: int, step: int, steps: tuple[int, ...]) -> int:
+    """Return the evaluation point of `step`; the pretrained policy, which has one, is at its end."""
+    return steps.index(step) if stage else -1
+
+
+def _episodes(record: Record, tasks: tuple[str, ...], stages: int, steps: tuple[int, ...]) -> list[_Episode]:
+    """Return the episodes, each checked."""
+    columns = (record.episodes[name] for name in ("stage", "step", "task", "split", "episode", "success"))
+    rows = []
+    for number, (stage, step, task, split, episode, success) in enumerate(zip(*columns, strict=True)):
+        where = f"episodes: row {number}"
+        _check_when(where, stage, step, stages, steps)
+        if type(episode) is not int or not 0 <= episode <= MOST:
+            raise RecordError(f"{where} has an impossible number of an episode.")
+        if task not in tasks:
+            raise RecordError(f"{where} is of a task that is not in the scenario: {task!r}.")
+        if split not in ("report", "selection"):
+            raise RecordError(f"{where} has the split {split!r}, neither report nor selection.")
+        if success not in (0, 1):
+            raise RecordError(f"{where} has the success {success!r}, neither true nor false.")
+        rows.append(_Episode(stage, step, task, split, episode, float(success)))
+    if len({row[:5] for row in rows}) != len(rows):
+        raise RecordError("episodes: an episode is there twice.")
+    return rows
+
+
+def _curve_episodes(record: Record, split: str, episodes: tuple[int, ...]) -> tuple[int, ...]:
+    """Return which of `episodes` the budget has run on the way."""
+    budget = record.scenario.get("budget")
+    count = budget.get("curve_episodes") if isinstance(budget, dict) else None
+    if type(count) is not int:
+        raise RecordError(f"scenario: curve_episodes of its budget must be a whole number, not {count!r}.")
+    return episodes if split == "selection" else tuple(number for number in episodes if number < count)
+
+
+def _numbers(rows: Iterable[_Episode]) -> tuple[int, ...]:
+    return tuple(sorted({row.episode for row in rows}))
+
+
+def _answers(record: Record, stages: int, steps: tuple[int, ...]) -> tuple[tuple[str, ...], Array]:
+    """Return the kinds of questions, and the counts asked and answered, (2, stages + 1, points, kinds)."""
+    rows = list(zip(*record.answers.values(), strict=True))
+    for number, (stage, step, kind, asked, correct) in enumerate(rows):
+        where = f"answers: row {number}"
+        _check_when(where, stage, step, stages, steps)
+        if any(type(value) is not int for value in (asked, correct)) or not isinstance(kind, str):
+            raise RecordError(f"{where} must hold whole numbers and the name of a kind.")
+        if not 0 <= correct <= asked <= MOST:
+            raise RecordError(f"{where} has impossible numbers.")
+    if len({row[:3] for row in rows}) != len(rows):
+        raise RecordError("answers: a kind is there twice at one evaluation point.")
+    kinds = tuple(sorted({row[2] for row in rows}))
+    counts = np.zeros((2, stages + 1, len(steps), len(kinds)))
+    for stage, step, kind, asked, correct in rows:
+        counts[:, stage, _point(stage, step, steps), kinds.index(kind)] = asked, correct
+    return kinds, counts
+
+
+def _shares(asked: Array, correct: Array) -> Array:
+    """Return the share of right answers (...) of counts (..., kinds), NaN where a kind was not asked."""
+    complete = (asked > 0).all(axis=-1) & (asked.sum(axis=-1) > 0)
+    return np.where(complete, correct.sum(axis=-1) / np.maximum(asked.sum(axis=-1), 1), np.nan)
+
+
+def _policy(record: Record, stages: int, steps: tuple[int, ...]) -> tuple[Array, Array]:
+    """Return the update sparsity and the activation drift at the points of each stage, (targets, points)."""
+    rows = list(zip(*record.policy.values(), strict=True))
+    values = np.full((2, stages + 1, len(steps)), np.nan)
+    for number, (stage, step, *both) in enumerate(rows):
+        where = f"policy: row {number}"
+        _check_when(where, stage, step, stages, steps)
+        for value, name, high in zip(
+            both, ("update_sparsity", "activation_drift"), (1, FARTHEST), strict=True
+        ):
+            if value is not None and not _is_number(value, high):
+                raise RecordError(f"{where} has an impossible {name}.")
+        values[:, stage, _point(stage, step, steps)] = [np.nan if value is None else value for value in both]
+    if len({row[:2] for row in rows}) != len(rows):
+        raise RecordError("policy: an evaluation point is there twice.")
+    return values[0, 1:], values[1, 1:]
+
+
+def _is_number(value: Any, high: float) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and 0 <= value <= high
+
+
+# ---- rates -------------------------------------------------------------------------------------------------
+
+
+_ARRAYS = (
+    "success",
+    "curves",
+    "selection",
+    "asked",
+    "correct",
+    "answer_curves",
+    "update_sparsity",
+    "activation_drift",
+)
+"""Fields of `Rates` that are arrays."""
+
+
+@dataclass(frozen=True, eq=False)
+class Rates:
+    """Success rates, the input of every metric: arrays with any batch axes in front, NaN where missing."""
+
+    layout: Layout
+    """What the axes stand for."""
+    success: Array
+    """Success rate at the end of each stage, (..., stages + 1, tasks)."""
+    curves: Array
+    """Success rate at the points of each stage, (..., targets, points, tasks); the last one is its end."""
+    selection: Array
+    """Success rate on target k over selection episodes at the points of stage k, (..., targets, points)."""
+    asked: Array
+    """Questions asked at the end of each stage, (..., stages + 1, kinds)."""
+    correct: Array
+    """Questions answered rightly, (..., stages + 1, kinds)."""
+    answer_curves: Array
+    """Share of all questions answered rightly at the points of each stage, (..., targets, points)."""
+    update_sparsity: Array
+    """Share of the parameters that have hardly changed since pretraining, (..., targets, points)."""
+    activation_drift: Array
+    """Distance of the hidden states from those of the pretrained policy, (..., targets, points)."""
+    references: Mapping[str, Rates] = field(default_factory=dict)
+    """Rates of reference methods with the same seeds, by the method's name."""
+
+    @property
+    def retained(self) -> Array:
+        """Success rate on the retained skills, (..., stages + 1, retained)."""
+        return self.success[..., self.layout.columns("retained")]
+
+    @property
+    def target(self) -> Array:
+        """Success rate on the targets, (..., stages + 1, targets)."""
+        return self.success[..., self.layout.columns("target")]
+
+    @property
+    def held_out(self) -> Array:
+        """Success rate on the held-out tasks, (..., stages + 1, held out)."""
+        return self.success[..., self.layout.columns("held_out")]
+
+    @property
+    def learned(self) -> Array:
+        """Success rate on target k at the end of stage k, (..., targets)."""
+        return np.diagonal(self.target[..., 1:, :], axis1=-2, axis2=-1)
+
+    @property
+    def learning_curves(self) -> Array:
+        """Success rate on target k at the points of stage k, (..., targets, points)."""
+        curves = self.curves[..., self.layout.columns("target")]
+        return np.swapaxes(np.diagonal(curves, axis1=-3, axis2=-1), -1, -2)
+
+    @property
+    def retained_curves(self) -> Array:
+        """Success rate on the retained skills at each point, (..., targets, points, retained)."""
+        return self.curves[..., self.layout.columns("retained")]
+
+    def each(self, change: Callable[[Array], Array]) -> Rates:
+        """Return rates whose arrays, those of the references included, went through `change`."""
+        changed: dict[str, Any] = {name: change(getattr(self, name)) for name in _ARRAYS}
+        references = {name: rates.each(change) for name, rates in self.references.items()}
+        return replace(self, references=references, **changed)
+
+    def mean_over_runs(self) -> Rates:
+        """Return rates averaged over the last batch axis, that of the runs: (..., runs) becomes (...)."""
+        # counted from the front: behind the batch axes some arrays have two axes and some have three
+        axis = self.success.ndim - 3
+        return self.each(lambda array: np.mean(array, axis=axis))
+
+
+def combine(rates: Sequence[Rates], join: Callable[[Sequence[Array]], Array]) -> Rates:
+    """Return rates whose arrays are those of `rates`, put together by `join`; references stay behind.
+
+    Raises:
+        ValueError: The layouts differ.
+    """
+    _check_same(part.layout for part in rates)
+    joined: dict[str, Any] = {name: join([getattr(part, name) for part in rates]) for name in _ARRAYS}
+    return Rates(rates[0].layout, **joined)
+
+
+def rates_of(runs: Sequence[Scores], references: Mapping[str, Sequence[Scores]]) -> Rates:
+    """Return the success rates of `runs`, with the batch axis (runs,).
+
+    Args:
+        runs: One or more runs.
+        references: Runs of reference methods by name: the same seeds in the same order.
+
+    Raises:
+        ValueError: The layouts differ.
+    """
+    _check_same(run.layout for run in (*runs, *chain.from_iterable(references.values())))
+    rates = combine([run.rates() for run in runs], np.stack)
+    return replace(rates, references={name: rates_of(them, {}) for name, them in references.items()})
+
+
+def _check_same(layouts: Iterable[Layout]) -> None:
+    if len(set(layouts)) != 1:
+        raise ValueError("Runs with different tasks, episodes, evaluation points or questions do not mix.")

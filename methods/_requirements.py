@@ -1,0 +1,55 @@
+"""What a method requires of its hyper-parameters and of a policy, asked for by name before any training."""
+
+import torch
+
+from clbench.policy import TEXT_LENGTH, Batch, Policy
+
+
+def require_hidden_states(policy: Policy, method: str) -> None:
+    """Refuse a policy that does not show its hidden states.
+
+    Raises:
+        TypeError: It has no `hidden_states`.
+    """
+    if not hasattr(policy, "hidden_states"):
+        raise TypeError(
+            f"{method} needs the hidden states of every backbone layer; {type(policy).__name__} has no "
+            "hidden_states(state, words) that returns them."
+        )
+
+
+def require_loss_per_sample(policy: Policy, method: str) -> None:
+    """Refuse a policy whose action loss is not one number per sample; two blank samples tell.
+
+    Raises:
+        TypeError: `action_loss` of two samples has another shape than (2,).
+    """
+    config = policy.config
+    chunks = (2, config.chunk, config.action_size)
+    device = policy.state_mean.device
+    blank = Batch(
+        state=torch.zeros(2, config.state_size),
+        words=torch.ones(2, TEXT_LENGTH, dtype=torch.int64),
+        action=torch.zeros(chunks),
+        valid=torch.ones(chunks[:2]),
+        draw=torch.full((2,), 0.5),
+        noise=torch.zeros(chunks),
+    )
+    with torch.no_grad():
+        shape = tuple(policy.action_loss(blank.to(device)).shape)
+    if shape != (2,):
+        raise TypeError(
+            f"{method} looks at samples one by one: action_loss of {type(policy).__name__} must return one "
+            f"loss per sample, shape (2,) for two; its shape is {shape}."
+        )
+
+
+def in_range(name: str, value: float, low: float, high: float = float("inf")) -> None:
+    """Refuse a hyper-parameter outside its range, ends included.
+
+    Raises:
+        ValueError: `value` is outside, or no number.
+    """
+    if not low <= value <= high:
+        allowed = f"from {low:g}" + (f" to {high:g}" if high < float("inf") else "")
+        raise ValueError(f"{name} must be {allowed}, not {value}.")

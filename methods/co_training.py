@@ -1,0 +1,41 @@
+"""Co-training: plain fine-tuning that goes on answering questions.
+
+What AEGIS (arXiv 2604.16067) calls the costly alternative, and what the capability vector of CapVector (arXiv
+2605.10903) is to replace: the auxiliary objective at every step.
+
+Details:
+1. Half a batch of questions for each batch of demonstrations, as in pretraining.
+"""
+
+from dataclasses import dataclass
+
+from torch import Tensor
+
+from clbench.method import Method, Prior, Progress, Source, Uses
+from clbench.policy import Batch, Policy, QuestionBatch
+
+from ._requirements import in_range
+
+
+@dataclass
+class CoTraining(Method):
+    """Descend the target's action loss and the loss of the questions."""
+
+    auxiliary: float = 1.0
+    """Factor of the answer loss."""
+
+    uses = Uses(questions="throughout")
+
+    def __post_init__(self) -> None:
+        in_range("auxiliary", self.auxiliary, 0.0)
+
+    def batch(self, target: Source[Batch], prior: Prior) -> tuple[Batch, QuestionBatch]:
+        """Return a batch of the target and half a one of questions."""
+        return target.sample(target.batch_size), prior.questions.sample(target.batch_size // 2)
+
+    def loss(self, policy: Policy, batch: tuple[Batch, QuestionBatch], progress: Progress) -> Tensor:
+        """Return the sum of both losses."""
+        demonstrations, questions = batch
+        return (
+            policy.action_loss(demonstrations).mean() + self.auxiliary * policy.answer_loss(questions).mean()
+        )

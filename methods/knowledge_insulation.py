@@ -1,0 +1,45 @@
+"""Knowledge insulation: the head's gradient ends at the backbone, which goes on answering (arXiv 2505.23705).
+
+Details:
+1. The backbone is trained by the questions alone. In the paper it also learns to predict discrete action
+   tokens (FAST), which this policy does not have: what the backbone learns of the new task is nothing here.
+2. Half a batch of questions for each batch of demonstrations, as in pretraining; alpha = 1 weighs the action
+   loss (Eq. 6).
+"""
+
+from dataclasses import dataclass
+
+from torch import Tensor
+
+from clbench.method import Method, Prior, Progress, Source, Uses
+from clbench.policy import Batch, Policy, QuestionBatch
+
+from ._requirements import in_range, require_hidden_states
+
+
+@dataclass
+class KnowledgeInsulation(Method):
+    """Train the head on detached hidden states and the backbone on questions."""
+
+    alpha: float = 1.0
+    """Factor of the action loss."""
+
+    uses = Uses(questions="throughout")
+
+    def __post_init__(self) -> None:
+        in_range("alpha", self.alpha, 0.0)
+
+    def prepare(self, policy: Policy, prior: Prior) -> None:
+        """Refuse a policy without hidden states."""
+        require_hidden_states(policy, "knowledge_insulation")
+
+    def batch(self, target: Source[Batch], prior: Prior) -> tuple[Batch, QuestionBatch]:
+        """Return a batch of the target and half a one of questions."""
+        return target.sample(target.batch_size), prior.questions.sample(target.batch_size // 2)
+
+    def loss(self, policy: Policy, batch: tuple[Batch, QuestionBatch], progress: Progress) -> Tensor:
+        """Return the answer loss, and the action loss whose gradient ends at the head."""
+        demonstrations, questions = batch
+        hidden = policy.hidden_states(demonstrations.state, demonstrations.words)
+        action_loss = policy.action_loss(demonstrations, [states.detach() for states in hidden])
+        return policy.answer_loss(questions).mean() + self.alpha * action_loss.mean()

@@ -1,0 +1,46 @@
+"""L2-SP: weights are pulled back to where they started from (arXiv 1802.01483).
+
+Details:
+1. The penalty (strength / 2) ||theta - theta*||^2 is on all weights; no layer is new here. Its gradient is
+   added in its closed form.
+2. theta* is the pretrained policy for the whole sequence.
+3. `strength` was chosen on selection episodes of seed 100.
+"""
+
+from dataclasses import dataclass
+
+from torch import Tensor
+
+from clbench.method import Method, Prior, State
+from clbench.policy import Policy
+
+from ._requirements import in_range
+from ._weights import copy_of, packed, pull_back, unpacked
+
+
+@dataclass
+class L2SP(Method):
+    """Penalise the distance to the pretrained weights."""
+
+    strength: float = 0.1
+    """Factor of the penalty."""
+
+    def __post_init__(self) -> None:
+        in_range("strength", self.strength, 0.0)
+
+    def prepare(self, policy: Policy, prior: Prior) -> None:
+        """Keep the pretrained weights."""
+        self.anchor = copy_of(policy)
+
+    def gradients(self, policy: Policy, loss: Tensor) -> None:
+        """Set the gradients of the loss and the penalty."""
+        loss.backward()  # type: ignore[no-untyped-call]
+        pull_back(policy, self.anchor, self.strength)
+
+    def state(self) -> State:
+        """Return the pretrained weights."""
+        return {**packed("anchor", self.anchor)}
+
+    def load_state(self, policy: Policy, state: State) -> None:
+        """Take them back."""
+        self.anchor = unpacked("anchor", state)

@@ -1,0 +1,39 @@
+"""Stop-gradient: the action head reads the backbone, and its gradient ends there.
+
+The baseline of AEGIS (arXiv 2604.16067) that keeps the backbone by giving up its training: what answers the
+questions cannot change.
+
+Details:
+1. The hidden states of every layer are detached, keys and values alike.
+2. No weight of the backbone is given to the optimiser: weight decay would move it without a gradient.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from clbench.method import Method, Prior, Progress, Stage
+from clbench.policy import Batch, Policy
+
+from ._requirements import require_hidden_states
+
+
+@dataclass
+class StopGradient(Method):
+    """Train the action head alone, on the hidden states of a backbone that stays as it was."""
+
+    def prepare(self, policy: Policy, prior: Prior) -> None:
+        """Refuse a policy without hidden states."""
+        require_hidden_states(policy, "stop_gradient")
+
+    def start_task(self, policy: Policy, stage: Stage) -> Iterable[nn.Parameter]:
+        """Return the head's parameters."""
+        return policy.head.parameters()
+
+    def loss(self, policy: Policy, batch: Batch, progress: Progress) -> Tensor:
+        """Return the action loss on hidden states that have no graph."""
+        with torch.no_grad():
+            hidden = policy.hidden_states(batch.state, batch.words)
+        return policy.action_loss(batch, hidden).mean()

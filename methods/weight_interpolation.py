@@ -1,0 +1,47 @@
+"""Weight interpolation: after each target the policy goes a part of its way back, in weights.
+
+WiSE-FT (arXiv 2109.01903) for fine-tuned models, RETAIN (arXiv 2512.08333) for vision-language-action models:
+theta = (1 - coefficient) theta_before + coefficient theta_after.
+
+Details:
+1. theta_before is the policy at the start of the target, so that earlier targets are kept as well as skills.
+2. One coefficient for all weights. It was chosen on selection episodes of seed 100.
+3. While a target is learned the policy is not yet what the method makes of it: it is evaluated after the
+   merge only, and has no learning curve.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import torch
+from torch import nn
+
+from clbench.method import Method, Stage
+from clbench.policy import Policy
+
+from ._requirements import in_range
+from ._weights import copy_of
+
+
+@dataclass
+class WeightInterpolation(Method):
+    """Fine-tune, then average with the weights from before."""
+
+    coefficient: float = 0.5
+    """Share of the fine-tuned weights."""
+
+    whole_stages = True
+
+    def __post_init__(self) -> None:
+        in_range("coefficient", self.coefficient, 0.0, 1.0)
+
+    def start_task(self, policy: Policy, stage: Stage) -> Iterable[nn.Parameter]:
+        """Return all parameters, and keep them as they are."""
+        self.before = copy_of(policy)
+        return policy.parameters()
+
+    @torch.no_grad()
+    def end_task(self, policy: Policy, stage: Stage) -> None:
+        """Average the weights."""
+        for name, parameter in policy.named_parameters():
+            parameter.lerp_(self.before[name], 1.0 - self.coefficient)
