@@ -196,6 +196,7 @@ def tune(
     *,
     values: dict[str, str],
     seed: int = 100,
+    targets: int | None = None,
     workers: int | None = None,
     records: Path = TUNING,
 ) -> None:
@@ -209,6 +210,7 @@ def tune(
         method: Name of an installed method, or module:Class.
         values: Hyper-parameters and the values to try, as --values.tau_start 0.3,1,3
         seed: Of pretraining and of every draw; the boards report seeds from 0.
+        targets: How many targets are learned, from the first; all if not given. Fewer are faster.
         workers: Runs at once, each a process with one thread; all cores if not given.
         records: Folder of these records.
     """
@@ -219,6 +221,7 @@ def tune(
     sys.path.insert(0, os.getcwd())
     with _input():
         _at_least(0, "--seed", seed)
+        _at_least(1, "--targets", targets)
         _at_least(1, "--workers", workers)
         load_scenario(scenario)
         lists = [[(name, value) for value in text.split(",")] for name, text in values.items()]
@@ -226,8 +229,8 @@ def tune(
         for combination in map(dict, itertools.product(*lists)):
             built = build_method(method, combination)
             changes = {name: getattr(built, name) for name in combination}
-            specs.append(RunSpec(scenario, method, seed, changes, split="selection"))
-    baseline = RunSpec(scenario, "sft", seed, split="selection")
+            specs.append(RunSpec(scenario, method, seed, changes, split="selection", targets=targets))
+    baseline = RunSpec(scenario, "sft", seed, split="selection", targets=targets)
     going_well = _run_missing([baseline, *specs], records, workers)
     Console().print(_tuning_table(baseline, specs, records))
     if not going_well:

@@ -267,5 +267,5 @@ def benchmark_jobs(specs: Sequence[RunSpec], records: Path) -> list[Job]:
         arguments = {"spec": spec, "records": str(records)}
         needs = (f"pretraining seed {spec.seed}",)
         title = f"{spec.method} seed {spec.seed}"
-        jobs.append(Job(title, "clbench.grid:run_job", arguments, run_length(scenario, spec.split), needs))
+        jobs.append(Job(title, "clbench.grid:run_job", arguments, run_length(spec.load(), spec.split), needs))
     return jobs

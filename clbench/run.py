@@ -56,10 +56,17 @@ class RunSpec:
     """Where the policy is computed."""
     split: Split = "report"
     """Which episodes it is evaluated on; those of "selection" may be looked at to choose settings."""
+    targets: int | None = None
+    """How many targets are learned, from the first; all if None."""
 
     def path(self, records: Path) -> Path:
         """Return where the record lies below the folder `records`."""
         return record_path(records, self.scenario.rpartition(":")[2], self.label, self.seed)
+
+    def load(self) -> Scenario:
+        """Return the scenario, with the targets that are learned."""
+        scenario = load_scenario(self.scenario)
+        return dataclasses.replace(scenario, target=scenario.target[: self.targets])
 
     @property
     def label(self) -> str:
@@ -98,7 +105,7 @@ def has_record(spec: RunSpec, records: Path) -> bool:
         record = read_record(spec.path(records))
     except RecordError:
         return False
-    scenario = load_scenario(spec.scenario)
+    scenario = spec.load()
     method = build_method(spec.method, spec.changes)
     wanted = (_describe_run(spec, scenario, method), _describe_scenario(scenario))
     return record.status == "success" and (record.run, record.scenario) == wanted
@@ -174,7 +181,7 @@ class _Run:
 
     def __init__(self, spec: RunSpec, records: Path, progress: Callable[[float], None]) -> None:
         self.spec, self.progress = spec, progress
-        self.scenario = scenario = load_scenario(spec.scenario)
+        self.scenario = scenario = spec.load()
         self.method = build_method(spec.method, spec.changes)
         self.where = "start"
         self.evaluator = Evaluator(scenario, spec.seed)

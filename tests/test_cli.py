@@ -41,6 +41,14 @@ def _clbench(*arguments: str, folder: Path | None = None) -> subprocess.Complete
         ),
         (["run", "clbench/Fetch-v0", "sft", "--device", "gpu"], "The device 'gpu' cannot be used"),
         (["demonstrations", "clbench/Fetch"], "Did you mean 'clbench/Fetch-v0'"),
+        (
+            ["tune", "clbench/Fetch-v0", "consft", "--values.kapa", "1,2"],
+            "consft has no hyper-parameter 'kapa'. Did you mean 'kappa'?",
+        ),
+        (
+            ["tune", "clbench/Fetch-v0", "consft", "--values.omega_min", "0.1,2"],
+            "omega_min must be from 0 to 1, not 2.0",
+        ),
         (["leaderbord"], "leaderbord"),
     ],
 )
@@ -56,7 +64,8 @@ def test_bad_input_ends_with_exit_code_2_and_the_nearest_right_name(
 
 def test_help_names_every_command() -> None:
     output = _clbench("--help").stdout
-    assert all(name in output for name in ("list", "run", "leaderboard", "demonstrations", "doctor"))
+    commands = ("list", "run", "tune", "leaderboard", "claims", "method-pages", "demonstrations", "doctor")
+    assert all(name in output for name in commands)
 
 
 def test_list_shows_scenarios_and_methods() -> None:
@@ -116,3 +125,16 @@ def test_a_stranger_runs_a_class_from_the_working_directory_and_sees_it_on_the_b
     text = (tmp_path / "leaderboard" / "LEADERBOARD.md").read_text()
     assert "mine:Gentle" in text
     assert "no idea" in text  # why the failed run is not a row
+
+
+def test_tune_compares_settings_without_a_look_at_what_is_reported(tmp_path: Path) -> None:
+    arguments = ("tune", TOY, "low_rate_sft", "--values.speed", "0.2,1", "--seed", "3")
+    result = _clbench(*arguments, folder=tmp_path)
+    assert result.returncode == 0, result.stderr
+    rows = [line.split() for line in result.stdout.splitlines() if "low_rate_sft" in line or " sft" in line]
+    assert [row[1] for row in rows] == ["sft", "low_rate_sft+speed=0.2", "low_rate_sft+speed=1.0"]
+    assert rows[0][3:] == rows[2][3:]  # at full speed it is plain fine-tuning
+    paths = list((tmp_path / "leaderboard" / "tuning").rglob("seed-3.json"))
+    assert len(paths) == 3
+    assert not any('"report"' in path.read_text().partition('"answers"')[0] for path in paths)
+    assert "3 of 3 runs have a record already" in _clbench(*arguments, folder=tmp_path).stderr
