@@ -1,8 +1,31 @@
 """What each method is for, shown on the toy."""
 
-import pytest
+import dataclasses
+import sys
+import types
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any
 
-from clbench.metrics import measure
+import pytest
+from torch import nn
+
+import clbench.testing
+from clbench.method import (
+    Access,
+    Method,
+    Prior,
+    Source,
+    Stage,
+    UndeclaredAccessError,
+    Uses,
+    build_method,
+    load_method,
+    method_names,
+)
+from clbench.metrics import METRICS, measure
+from clbench.policy import Batch, Policy
+from clbench.record import Record
 from clbench.run import RunSpec, execute
 from clbench.scores import Scores
 
@@ -44,3 +67,148 @@ def test_frozen_forgets_exactly_nothing_and_learns_nothing(scores: dict[str, Sco
 def test_from_scratch_knows_nothing_but_the_last_target(scores: dict[str, Scores]) -> None:
     assert _value(scores, "from_scratch", "retention") == 0.0
     assert _value(scores, "from_scratch", "question_retention") < 0.2
+
+
+# ---- every method ------------------------------------------------------------------------------------------
+
+
+FEWER = {"aegis": {"samples": 50}, "ewc": {"samples": 4}, "fast_dvla": {"steps": 3}}
+"""Settings that make the preparation short."""
+
+
+@pytest.fixture
+def short_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Record]:
+    """Return a function that runs a method on the toy with two steps for each target."""
+    budget = dataclasses.replace(
+        clbench.testing.TOY.budget,
+        adaptation_steps=2,
+        evaluation_points=1,
+        selection_episodes=1,
+        report_episodes=2,
+        curve_episodes=1,
+        report_questions=20,
+    )
+    monkeypatch.setattr(clbench.testing, "TOY", dataclasses.replace(clbench.testing.TOY, budget=budget))
+    return lambda method, **changes: execute(RunSpec(TOY, method, 0, changes), tmp_path)
+
+
+@pytest.mark.parametrize("name", method_names())
+def test_a_run_of_every_method_goes_through_and_says_what_it_uses_and_costs(
+    name: str, short_run: Callable[..., Record]
+) -> None:
+    record = short_run(name, **FEWER.get(name, {}))
+    assert record.error is None
+    assert record.status == "success"
+    assert record.run["uses"] == dataclasses.asdict(load_method(name).uses)
+    scores = Scores.from_record(record)
+    values = {
+        metric.name: measure(metric.name, scores) for metric in METRICS.values() if not metric.references
+    }
+    missing = {metric for metric, value in values.items() if value is None}
+    assert missing == ({"update_sparsity"} if record.costs["parameters_added"] else set())
+    assert all(
+        METRICS[metric].low <= value <= METRICS[metric].high for metric, value in values.items() if value
+    )
+    preparing = {"fast_dvla": 2 * 3}.get(name, 0)
+    assert record.costs["preparation_steps"] == preparing
+    assert record.costs["optimiser_steps"] == (0 if name == "frozen" else 2 * 2 + preparing)
+    assert (record.costs["parameters_added"] > 0) == (name == "lora")
+
+
+@pytest.mark.parametrize("declared", ["never", "prepare", "throughout"])
+@pytest.mark.parametrize("kind", ["demonstrations", "questions"])
+def test_prior_data_can_be_touched_in_the_seams_that_are_declared_and_in_no_other(
+    kind: str, declared: Access, short_run: Callable[..., Record], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    touched, refused = set(), set()
+    declaration: dict[str, Any] = {kind: declared}
+
+    def touch(seam: str, prior: Prior) -> None:
+        try:
+            getattr(prior, kind).sample(1)
+            touched.add(seam)
+        except UndeclaredAccessError:
+            refused.add(seam)
+
+    @dataclasses.dataclass
+    class Curious(Method):
+        uses = Uses(**declaration)
+
+        def prepare(self, policy: Policy, prior: Prior) -> None:
+            touch("prepare", prior)
+
+        def start_task(self, policy: Policy, stage: Stage) -> Iterable[nn.Parameter]:
+            touch("start_task", stage.prior)
+            return policy.parameters()
+
+        def batch(self, target: Source[Batch], prior: Prior) -> Batch:
+            touch("batch", prior)
+            return target.sample(4)
+
+        def end_task(self, policy: Policy, stage: Stage) -> None:
+            touch("end_task", stage.prior)
+
+    module = types.ModuleType("stranger")
+    module.__dict__["Curious"] = Curious
+    monkeypatch.setitem(sys.modules, "stranger", module)
+    record = short_run("stranger:Curious")
+    assert record.error is None
+    seams = {"prepare", "start_task", "batch", "end_task"}
+    allowed = {"never": set(), "prepare": {"prepare"}, "throughout": seams}[declared]
+    assert (touched, refused) == (allowed, seams - allowed)
+    never = {"demonstrations": "never", "questions": "never", "reference": False}
+    assert record.run["uses"] == {**never, **declaration}
+    assert (record.costs["bytes_kept"] > 0) == (declared == "throughout")
+
+
+NUMBERS = [
+    (name, field.name)
+    for name in method_names()
+    for field in dataclasses.fields(load_method(name))  # type: ignore[arg-type]
+    if isinstance(field.default, int | float)
+]
+
+
+@pytest.mark.parametrize("value", [-1, float("nan")])
+@pytest.mark.parametrize(("name", "field"), NUMBERS)
+def test_no_hyper_parameter_of_any_method_may_be_negative_or_no_number(
+    name: str, field: str, value: float
+) -> None:
+    with pytest.raises(ValueError, match=rf"{name} refuses .*: {field} must be from .*, not {value}"):
+        build_method(name, {field: value})
+
+
+@pytest.mark.parametrize(
+    ("name", "field", "value", "allowed"),
+    [
+        ("aegis", "direction", "away", "anchor or random, not 'away'"),
+        ("aegis", "samples", 0, "from 1, not 0"),
+        ("buffered_replay", "replay", 1.5, "from 0 to 1, not 1.5"),
+        ("buffered_replay", "share", 1.5, "from 0 to 1, not 1.5"),
+        ("consft", "omega_min", 1.5, "from 0 to 1, not 1.5"),
+        ("consft", "tau_start", 0.0, "from 1e-09, not 0.0"),
+        ("consft", "tau_end", 0.0, "from 1e-09, not 0.0"),
+        ("consft", "kappa", 0.0, "from 1e-09, not 0.0"),
+        ("consft", "decay", 0.0, "from 1e-09, not 0.0"),
+        ("consft", "curvature", 0.0, "from 1e-09, not 0.0"),
+        ("consft", "schedule", 0.0, "from 1e-09, not 0.0"),
+        ("ewc", "samples", 0, "from 1, not 0"),
+        ("experience_replay", "replay", 1.5, "from 0 to 1, not 1.5"),
+        ("fast_dvla", "direction", "none", "capability or random, not 'none'"),
+        ("fast_dvla", "steps", 0, "from 1, not 0"),
+        ("fast_dvla", "step_size", 0.0, "from 1e-12, not 0.0"),
+        ("finch", "kappa", 0.0, "from 1e-09, not 0.0"),
+        ("finch", "momentum", 1.5, "from 0 to 1, not 1.5"),
+        ("lora", "alpha", 0.0, "from 1e-09, not 0.0"),
+        ("lora", "rank", 0, "from 1, not 0"),
+        ("lora", "speed", 0.0, "from 1e-09, not 0.0"),
+        ("lora", "variant", "qlora", "one of lora, dora, rslora, not 'qlora'"),
+        ("low_rate_sft", "speed", 0.0, "from 1e-09, not 0.0"),
+        ("weight_interpolation", "coefficient", 1.5, "from 0 to 1, not 1.5"),
+    ],
+)
+def test_a_hyper_parameter_out_of_range_is_refused_with_its_name_and_range(
+    name: str, field: str, value: Any, allowed: str
+) -> None:
+    with pytest.raises(ValueError, match=f"{name} refuses its hyper-parameters: {field} must be {allowed}"):
+        build_method(name, {field: value})

@@ -1,0 +1,398 @@
+"""Evidence: the runs of a scenario, those with changed settings included, and figures that compare them."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from clbench.metrics import load_metric, matched_points
+from clbench.record import RecordError, read_record, record_path
+from clbench.scores import Array, Rates, Scores, average, rates_of
+from clbench.statistics import REPLICATES, Estimate, _Draw, _estimate, _rates, row_generator
+from clbench.task import Split
+
+from ._rows import (
+    NotShown,
+    Sifted,
+    _differences,
+    _division,
+    _not_shown,
+    _once,
+    _read_run,
+    _Run,
+    _same_layout,
+    _same_scenario,
+    _same_settings,
+    _same_simulator,
+)
+from ._table import _title
+
+SCENARIO = "clbench/Fetch-v0"
+RECORDS = Path("leaderboard/records")
+CONTROLS = Path("leaderboard/controls")
+TUNING = Path("leaderboard/tuning")
+STEP_TIME = Path("benchmarks/results/step_time.json")
+"""Where things lie, seen from the working directory. Pages name these, wherever they were read from."""
+
+LEAST_SEEDS = 2
+"""With one seed an interval says nothing of other seeds: it is shown, but decides nothing."""
+
+NO_ESTIMATE = Estimate(None, None, None)
+
+Of = Mapping[str, Rates]
+"""Rates by label of the method: the same seeds and the same draws of them, batch axes (..., runs)."""
+Quantity = Callable[[Of], Array]
+"""What is measured: rates with batch axes (..., runs) become values (...)."""
+Table = Callable[[Rates], Array]
+"""What a policy is at the points of each stage: rates (...) become values (..., targets, points)."""
+Sift = Callable[[list[_Run]], Sifted]
+"""What tells runs that may be compared from those that may not."""
+
+
+@dataclass(frozen=True)
+class Figure:
+    """One measured number."""
+
+    what: str
+    """What was measured, and of which methods."""
+    methods: tuple[str, ...]
+    """Labels of the methods: the one it is about, then what that is compared with, then references."""
+    estimate: Estimate
+    """The number with its interval."""
+    seeds: tuple[int, ...] = ()
+    """Seeds that it is from; none if it is no matter of seeds."""
+    missing: tuple[str, ...] = ()
+    """Labels that there are no runs of, or "step time"."""
+    note: str = ""
+    """What restricts it."""
+    form: str = ".2f"
+    """How the number is written."""
+
+    @property
+    def value(self) -> float:
+        """The number, NaN if it is missing: no comparison with it is true."""
+        return math.nan if self.estimate.value is None else self.estimate.value
+
+    @property
+    def low(self) -> float:
+        """Lower end of the interval, NaN if there is none that counts."""
+        return self._end(self.estimate.low)
+
+    @property
+    def high(self) -> float:
+        """Upper end of the interval, NaN if there is none that counts."""
+        return self._end(self.estimate.high)
+
+    def _end(self, end: float | None) -> float:
+        return math.nan if end is None or 0 < len(self.seeds) < LEAST_SEEDS else end
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """All runs of one scenario that may be compared, and what each step of a method takes."""
+
+    scenario: str
+    """Gymnasium id."""
+    runs: Mapping[str, Mapping[int, _Run]]
+    """By label of the method, as "lora" and "lora+rank=4", and by seed."""
+    step_times: Mapping[str, Estimate]
+    """Median time of a step divided by that of sft, by method."""
+    not_used: tuple[NotShown, ...]
+    """Records that stand for nothing here."""
+
+    # ---- figures of scores -------------------------------------------------------------------------
+
+    def figure(
+        self, what: str, quantity: Quantity, *methods: str, seeds: Sequence[int] | None = None, **rest: Any
+    ) -> Figure:
+        """Return `quantity` with its interval, from the seeds that all methods have.
+
+        Args:
+            what: Name of the figure.
+            quantity: What is measured.
+            methods: Labels of all methods that it looks at, the one that it is about first.
+            seeds: Those to take of the common ones; all if None.
+            rest: Further fields of the figure.
+        """
+        methods = tuple(dict.fromkeys(methods))
+        missing = tuple(label for label in methods if label not in self.runs)
+        common = self.common_seeds(methods) if seeds is None else tuple(seeds)
+        found = NO_ESTIMATE if missing or not common else self._bootstrapped(what, quantity, methods, common)
+        if not missing and not common:
+            rest.setdefault("note", "no seed that all of them have")
+        elif not missing and found.value is None:
+            rest.setdefault("note", "not measured in these records")
+        elif not missing and len(common) < LEAST_SEEDS:
+            rest.setdefault("note", "one seed: the interval says nothing of others and decides nothing")
+        return Figure(what, methods, found, common, missing, **rest)
+
+    def _bootstrapped(
+        self, what: str, quantity: Quantity, methods: tuple[str, ...], seeds: tuple[int, ...]
+    ) -> Estimate:
+        """Return the quantity over the runs as they are, with its interval over the same as drawn."""
+        scores = self._scores(methods, seeds)
+        first, others = methods[0], {label: scores[label] for label in methods[1:]}
+        generator = row_generator(self.scenario, what)
+        draw = _Draw.make(len(seeds), scores[first][0].layout, generator, REPLICATES)
+        runs = dict(zip(seeds, scores[first], strict=True))
+        exact, drawn = (
+            quantity({first: rates, **rates.references}) for rates in _rates(runs, others, draw, generator)
+        )
+        return _estimate(float(exact), drawn)
+
+    def _scores(self, methods: Iterable[str], seeds: Iterable[int]) -> dict[str, list[Scores]]:
+        return {label: [self.runs[label][seed].scores for seed in seeds] for label in methods}
+
+    def common_seeds(self, methods: Iterable[str]) -> tuple[int, ...]:
+        """Return the seeds that all methods have a run of."""
+        seeds = [set(self.runs.get(label, {})) for label in methods]
+        return tuple(sorted(set.intersection(*seeds))) if seeds else ()
+
+    def rates(self, methods: Iterable[str], seeds: Iterable[int]) -> Of:
+        """Return the rates of the runs as they are, batch axes (runs,)."""
+        return {label: rates_of(runs, {}) for label, runs in self._scores(methods, seeds).items()}
+
+    def metric(self, name: str, method: str, **rest: Any) -> Figure:
+        """Return a metric of one method."""
+        methods = (method, *load_metric(name).references)
+        return self.figure(f"{_title(name)} of {method}", measured(name, method), *methods, **rest)
+
+    def difference(self, name: str, method: str, other: str, **rest: Any) -> Figure:
+        """Return a metric of one method minus that of another."""
+        one, two = measured(name, method), measured(name, other)
+        methods = (method, other, *load_metric(name).references)
+        what = f"{_title(name)}, {method} - {other}"
+        return self.figure(what, lambda of: one(of) - two(of), *methods, **rest)
+
+    def matched_difference(self, name: str, table: Table, method: str, other: str, **rest: Any) -> Figure:
+        """Return the difference of two methods where each has learned the target about as well as sft.
+
+        The mean is over the stages in which both do, for each seed, then over the seeds that have any.
+
+        Args:
+            name: What the table holds.
+            table: What is compared.
+            method: The one that it is about.
+            other: What it is compared with.
+            rest: Further fields of the figure.
+        """
+        methods = tuple(dict.fromkeys((method, other, "sft")))
+
+        def stages(of: Of) -> Array:
+            return at_matched_points(table, of, method) - at_matched_points(table, of, other)
+
+        seeds = self.common_seeds(methods)
+        if seeds:
+            reached = np.asarray(np.isfinite(stages(self.rates(methods, seeds))))
+            if not reached.all():
+                counts = f"{reached.sum()} of {reached.size} stages"
+                rest["note"] = f"over the {counts} in which both learn as well as sft"
+            seeds = tuple(np.array(seeds)[reached.any(axis=-1)].tolist())
+        what = f"{name} at matched adaptation, {method} - {other}"
+        return self.figure(what, lambda of: average(_mean(stages(of))), *methods, seeds=seeds, **rest)
+
+    # ---- figures of costs and diagnostics ----------------------------------------------------------
+
+    def cost(self, name: str, method: str, what: str, form: str = ",.0f") -> Figure:
+        """Return the mean of a cost over seeds."""
+        return self._mean_of(method, what, lambda run: [run.record.costs.get(name)], form)
+
+    def diagnostic(self, name: str, method: str, what: str, form: str = ".2f") -> Figure:
+        """Return the mean of a diagnostic over stages and seeds, with its interval over seeds."""
+
+        def values(run: _Run) -> list[Any]:
+            stages = run.record.diagnostics.values()
+            return [stage[name] for stage in stages if isinstance(stage, dict) and name in stage]
+
+        return self._mean_of(method, what, values, form)
+
+    def share_of_preparation(self, method: str) -> Figure:
+        """Return the share of a run's optimiser steps that its preparation took, mean over seeds."""
+
+        def share(run: _Run) -> Sequence[Any]:
+            steps, taken = (run.record.costs.get(name) for name in ("optimiser_steps", "preparation_steps"))
+            return [taken / steps] if is_number(taken) and is_number(steps) and steps else []
+
+        return self._mean_of(method, f"share of the optimiser steps that prepare {method}", share, ".1%")
+
+    def _mean_of(self, method: str, what: str, values: Callable[[_Run], Sequence[Any]], form: str) -> Figure:
+        runs = self.runs.get(method, {})
+        missing = () if runs else (method,)
+        means = [number_mean(values(run)) for run in runs.values()]
+        if not means or not np.isfinite(means).all():
+            note = "" if missing else "not in these records"
+            return Figure(what, (method,), NO_ESTIMATE, tuple(runs), missing, note, form)
+        drawn = row_generator(self.scenario, what).choice(means, (REPLICATES, len(means))).mean(axis=-1)
+        estimate = _estimate(math.fsum(means) / len(means), drawn)
+        if min(means) == max(means):
+            estimate = Estimate(estimate.value, None, None)
+        return Figure(what, (method,), estimate, tuple(runs), (), "", form)
+
+    def step_time(self, method: str) -> Figure:
+        """Return how much longer a step of the method takes than one of sft."""
+        found = self.step_times.get(method)
+        missing = () if found else ("step time",)
+        what = f"time of a step of {method} divided by sft's"
+        return Figure(what, (method, "sft"), found or NO_ESTIMATE, (), missing)
+
+
+def number_mean(values: Sequence[Any]) -> float:
+    """Return the mean of `values`, NaN if there is none or one is no number that can be."""
+    if not values or not all(is_number(value) for value in values):
+        return math.nan
+    return math.fsum(values) / len(values)
+
+
+def is_number(value: Any) -> bool:
+    """Return whether a stranger's value is a number of any use."""
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e18
+
+
+# ---- quantities --------------------------------------------------------------------------------------------
+
+
+def measured(name: str, method: str) -> Quantity:
+    """Return the quantity that is a metric of `method`, whose references are the methods beside it."""
+    metric = load_metric(name)
+    return lambda of: metric.over_runs(replace(of[method], references=of))
+
+
+def at_matched_points(table: Table, of: Of, method: str) -> Array:
+    """Return the values (..., targets) where each target is first learned about as well as by sft."""
+    rates = replace(of[method], references=of)
+    points = matched_points(rates)
+    chosen = np.nan_to_num(points).astype(np.int64)[..., None]
+    values = np.take_along_axis(table(rates), chosen, axis=-1)[..., 0]
+    return np.where(np.isnan(points), np.nan, values)
+
+
+def _mean(values: Array) -> Array:
+    """Return the mean along the last axis of what is not NaN, NaN where nothing is."""
+    known = np.isfinite(values)
+    counts = known.sum(axis=-1)
+    total = np.where(known, values, 0.0).sum(axis=-1)
+    return np.where(counts > 0, total / np.maximum(counts, 1), np.nan)
+
+
+# ---- reading -----------------------------------------------------------------------------------------------
+
+
+def read_evidence(scenario: str, records: Path, controls: Path, step_time: Path) -> Evidence:
+    """Return what there is; folders and files that are not there hold nothing."""
+    alike = (_same_scenario, _same_simulator, _same_layout, _same_settings)
+    scored, refused = read_runs(records, _read_run, (_once, *alike))
+    changed, refused_controls = read_runs(
+        controls, partial(read_changed, split="report"), (_once, _like(scored), *alike)
+    )
+    runs: dict[str, dict[int, _Run]] = {}
+    for run in (*scored, *changed):
+        if run.scenario == scenario and run.scores.layout.target:
+            runs.setdefault(run.method, {})[run.seed] = run
+    not_used = [("records", entry) for entry in refused] + [("controls", entry) for entry in refused_controls]
+    return Evidence(
+        scenario,
+        {label: dict(sorted(seeds.items())) for label, seeds in sorted(runs.items())},
+        _read_step_times(step_time),
+        tuple(NotShown(f"{name}/{entry.path}", entry.reason) for name, entry in not_used),
+    )
+
+
+def read_runs(folder: Path, read: Callable[[Path, Path], _Run], sifts: Iterable[Sift]) -> Sifted:
+    """Return the runs of the records anywhere below `folder`, sifted, and the files that are none."""
+    runs: list[_Run] = []
+    refused: list[NotShown] = []
+    for path in sorted(folder.rglob("*.json"), key=lambda path: path.relative_to(folder).as_posix()):
+        try:
+            runs.append(read(folder, path))
+        except RecordError as error:
+            name = path.relative_to(folder).as_posix()
+            refused.append(_not_shown(name, str(error).removeprefix(f"{path}: ")))
+    for sift in sifts:
+        runs, others = sift(runs)
+        refused += others
+    return runs, refused
+
+
+def read_changed(folder: Path, path: Path, split: Split) -> _Run:
+    """Return the run of a record that makes no row of the board: of changed settings, or of tuning.
+
+    Its method is the label, as "lora+rank=4".
+
+    Raises:
+        RecordError: It cannot be read, failed, or is of another split.
+    """
+    record = read_record(path)
+    run, error = record.run, record.error or {}
+    if record.status == "failed":
+        what = ": ".join(str(error[key]) for key in ("where", "type", "message") if key in error)
+        raise RecordError(f"the run failed ({what or 'without a word'}).")
+    names = {"scenario": str, "method": str, "seed": int, "settings": dict, "changes": dict, "uses": dict}
+    for name, kind in names.items():
+        if not isinstance(run.get(name), kind):
+            raise RecordError(f"run: {name} is missing or malformed.")
+    if run.get("split") != split:
+        raise RecordError(f"it is of the split {run.get('split')!r}, not {split!r}.")
+    if split == "report" and not run["changes"]:
+        raise RecordError("no setting was changed: its place is among the records of the board.")
+    if record.scenario.get("id") != run["scenario"]:
+        raise RecordError("scenario: its id is not that of the scenario that was run.")
+    label = label_of(run["method"], run["changes"])
+    at_home = path == record_path(folder, run["scenario"], label, run["seed"])
+    name, scores = path.relative_to(folder).as_posix(), Scores.from_record(record)
+    division = _division(run["uses"])
+    return _Run(name, at_home, record, scores, run["scenario"], label, run["seed"], division)
+
+
+def label_of(method: str, changes: Mapping[str, Any]) -> str:
+    """Return the method with what was changed of it, as the folder of its records is called."""
+    return "+".join([method, *(f"{name}={value}" for name, value in sorted(changes.items()))])
+
+
+def _like(scored: Sequence[_Run]) -> Sift:
+    """Return what keeps the runs that were made and evaluated as those of the board were."""
+    examples = {run.scenario: run for run in scored}
+
+    def traits(run: _Run) -> dict[str, Any]:
+        return {
+            **run.record.scenario,
+            "rollouts": run.record.fingerprint.get("rollouts"),
+            **vars(run.scores.layout),
+        }
+
+    def sift(runs: list[_Run]) -> Sifted:
+        kept, refused = [], []
+        for run in runs:
+            example = examples.get(run.scenario, run)
+            fields = _differences(traits(run), traits(example))
+            if fields:
+                reason = f"it cannot be compared with the board: {', '.join(fields)} differ."
+                refused.append(_not_shown(run.path, reason))
+            else:
+                kept.append(run)
+        return kept, refused
+
+    return sift
+
+
+def _read_step_times(path: Path) -> dict[str, Estimate]:
+    """Return the ratios in the file that the speed benchmark leaves, none if it is not there or torn."""
+    try:
+        ratios = json.loads(path.read_text(encoding="utf-8"))["ratios"]
+        found = {
+            method: tuple(entry.get(key) for key in ("median_ratio", "low", "high"))
+            for method, entry in ratios.items()
+        }
+    except (OSError, ValueError, RecursionError, KeyError, TypeError, AttributeError):
+        return {}
+    return {
+        method: Estimate(*(value if is_number(value) else None for value in values))
+        for method, values in found.items()
+        if is_number(values[0])
+    }

@@ -1,0 +1,306 @@
+"""AEGIS: the anchor, and what is left of a gradient that leads away from it."""
+
+from collections.abc import Iterator, Mapping
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from clbench.activations import Gaussian
+from clbench.adaptation import adapt
+from clbench.demonstrations import Demonstrations, collect
+from clbench.method import Prior, Progress, Source, Stage, build_method
+from clbench.policy import Batch, Policy, PolicyConfig, QuestionBatch
+from clbench.questions import Questions
+from clbench.task import Budget, load_scenario, resolve
+from clbench.training import deterministic
+
+TOY = load_scenario("clbench.testing:clbench/Toy-v0")
+CONFIG = PolicyConfig(state_size=4, action_size=2, width=32, layers=4)
+NOW = Progress(0, 100)
+
+
+@pytest.fixture(autouse=True)
+def _one_thread() -> Iterator[None]:
+    with deterministic():
+        yield
+
+
+def _source(seed: int) -> Source[Batch]:
+    task = TOY.task("right")
+    data = Demonstrations.of_task(task, collect(task, TOY.budget), CONFIG.chunk)
+    return Source(data, torch.Generator().manual_seed(seed), 16)
+
+
+def _questions(seed: int) -> Source[QuestionBatch]:
+    scenes = torch.randn(200, 4, generator=torch.Generator().manual_seed(7))
+    return Source(Questions(resolve(TOY.questions), scenes), torch.Generator().manual_seed(seed), 16)
+
+
+def _stage(steps: int) -> Stage:
+    return Stage(1, TOY.task("right"), 0, steps, _source(0), Prior({}))
+
+
+def _moved(config: PolicyConfig = CONFIG, seed: int = 0, **changes: Any) -> tuple[Any, Policy]:
+    """Return a method that has begun a stage, and its policy, which is no longer where the anchor lies."""
+    method, policy = build_method("aegis", {"samples": 64, **changes}), Policy(config, seed=1)
+    method.prepare(policy, Prior({"questions": _questions(0)}))
+    generator = torch.Generator().manual_seed(seed)
+    with torch.no_grad():
+        for weight in policy.parameters():
+            weight.add_(torch.randn(weight.shape, generator=generator), alpha=0.02)
+    method.start_task(policy, _stage(100))
+    return method, policy
+
+
+def _distance(policy: Policy, batch: Batch, anchor: Gaussian) -> Tensor:
+    """Return ||mean - mean*||^2 + ||deviation - deviation*||^2 over channels, its mean over layers."""
+    read = policy.backbone.mask(batch.words)[:, 0, 0]
+    parts = []
+    for layer, states in enumerate(policy.hidden_states(batch.state, batch.words)):
+        rows = states[read]
+        deviation = (rows.var(dim=0, correction=0) + 1e-6).sqrt()
+        away = rows.mean(dim=0) - anchor.mean[layer], deviation - anchor.deviation[layer]
+        parts.append(sum(part.square().sum() for part in away))
+    return torch.stack([torch.as_tensor(part) for part in parts]).mean()
+
+
+def _gradients(policy: Policy, loss: Tensor) -> dict[str, NDArray[np.float64]]:
+    """Return the gradient of `loss` by all weights, by name."""
+    names, weights = zip(*policy.named_parameters(), strict=True)
+    found = torch.autograd.grad(loss, weights, materialize_grads=True)
+    return {name: value.double().numpy() for name, value in zip(names, found, strict=True)}
+
+
+def _block(gradients: Mapping[str, NDArray[np.float64]], layer: int) -> NDArray[np.float64]:
+    """Return the gradient of all weights of one backbone layer as a vector."""
+    start = f"backbone.layers.{layer}."
+    return np.concatenate([value.ravel() for name, value in gradients.items() if name.startswith(start)])
+
+
+def _set(policy: Policy) -> dict[str, NDArray[np.float64]]:
+    """Return the gradients that are set, zeros where there is none."""
+    return {
+        name: (torch.zeros_like(weight) if weight.grad is None else weight.grad).double().numpy()
+        for name, weight in policy.named_parameters()
+    }
+
+
+def test_the_anchor_is_the_gaussian_of_the_questions_that_prepare_draws() -> None:
+    method: Any = build_method("aegis", {"samples": 50})
+    policy, source = Policy(CONFIG), _questions(3)
+    prior = Prior({"questions": source})
+    method.prepare(policy, prior)
+    questions = _questions(3).sample(50)
+    with torch.no_grad():
+        hidden = policy.hidden_states(questions.state, questions.words)
+    expected = Gaussian.of(hidden, policy.backbone.mask(questions.words))
+    assert method.anchor.mean.equal(expected.mean)
+    assert method.anchor.deviation.equal(expected.deviation)
+    assert not method.anchor.mean.requires_grad
+
+
+def test_training_needs_no_question_and_does_not_move_the_anchor() -> None:
+    method: Any = build_method("aegis", {"samples": 50})
+    policy, prior = Policy(CONFIG), Prior({"questions": _questions(3)})
+    method.prepare(policy, prior)
+    prior.close()
+    mean, deviation = method.anchor.mean.clone(), method.anchor.deviation.clone()
+    adapt(policy, method, _stage(5), Budget(learning_rate=1e-3))
+    assert method.anchor.mean.equal(mean)
+    assert method.anchor.deviation.equal(deviation)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_step_sets_the_gradients_of_two_separate_passes_projected_layer_by_layer(seed: int) -> None:
+    method, policy = _moved(seed=seed)
+    batch = _source(seed).sample(16)
+    loss = method.loss(policy, batch, NOW)
+    assert loss.item() == pytest.approx(policy.action_loss(batch).mean().item())
+    method.gradients(policy, loss)
+    found = _set(policy)
+    plain = _gradients(policy, policy.action_loss(batch).mean())
+    away = _gradients(policy, _distance(policy, batch, method.anchor))
+    projected, energy, removed = 0, 0.0, 0.0
+    for layer in range(CONFIG.layers):
+        gradient, against = _block(plain, layer), _block(away, layer)
+        product, norm = float(gradient @ against), float(against @ against)
+        expected = gradient - min(product, 0.0) / norm * against
+        np.testing.assert_allclose(_block(found, layer), expected, rtol=1e-3, atol=1e-5)
+        projected += int(product < 0)
+        energy, removed = energy + float(gradient @ gradient), removed + min(product, 0.0) ** 2 / norm
+    told = method.diagnostics()
+    assert told["layers_projected_mean"] == projected / CONFIG.layers
+    assert told["energy_shed_mean"] == pytest.approx(removed / energy, rel=1e-3)
+    assert told["anchor_distance"] == pytest.approx([_distance(policy, batch, method.anchor).item()] * 11)
+
+
+def test_the_steps_above_project_some_layers_and_leave_others() -> None:
+    shares = []
+    for seed in range(3):
+        method, policy = _moved(seed=seed)
+        method.gradients(policy, method.loss(policy, _source(seed).sample(16), NOW))
+        shares.append(method.diagnostics()["layers_projected_mean"])
+    assert 0.0 < np.mean(shares) < 1.0
+
+
+def test_a_projected_layer_is_orthogonal_to_the_anchor_and_the_others_keep_every_bit() -> None:
+    kinds = set()
+    for seed in range(3):
+        method, policy = _moved(seed=seed)
+        batch = _source(seed).sample(16)
+        policy.action_loss(batch).mean().backward()  # type: ignore[no-untyped-call]
+        plain = _set(policy)
+        policy.zero_grad()
+        method.gradients(policy, method.loss(policy, batch, NOW))
+        found, away = _set(policy), _gradients(policy, _distance(policy, batch, method.anchor))
+        for layer in range(CONFIG.layers):
+            before, after, against = (_block(each, layer) for each in (plain, found, away))
+            kinds.add(bool(before @ against > 0))
+            if before @ against > 0:
+                assert np.array_equal(before, after)
+            else:
+                norms = np.linalg.norm(after) * np.linalg.norm(against)
+                assert abs(after @ against) < 1e-5 * norms < 1e-3 * abs(before @ against)
+    assert kinds == {True, False}
+
+
+def test_what_lies_outside_the_backbones_layers_keeps_the_plain_gradient() -> None:
+    method, policy = _moved()
+    batch = _source(0).sample(16)
+    policy.action_loss(batch).mean().backward()  # type: ignore[no-untyped-call]
+    plain = _set(policy)
+    policy.zero_grad()
+    method.gradients(policy, method.loss(policy, batch, NOW))
+    found = _set(policy)
+    outside = [name for name in plain if not name.startswith("backbone.layers.")]
+    assert {"backbone.words.weight", "backbone.position", "head.embed.weight"} <= set(outside)
+    assert all(np.array_equal(plain[name], found[name]) for name in outside)
+    assert policy.backbone.answer[1].weight.grad is None
+
+
+def _by_hand(
+    gradients: list[list[float]], against: list[list[float]], **changes: Any
+) -> tuple[Any, list[list[float]]]:
+    """Return a method, and what it sets where loss and distance have these gradients, layer by layer."""
+    layers = [nn.Linear(len(values), 1, bias=False) for values in gradients]
+    policy: Any = SimpleNamespace(backbone=SimpleNamespace(layers=layers))
+
+    def linear(slopes: list[list[float]]) -> Tensor:
+        parts = zip(layers, slopes, strict=True)
+        return torch.stack([(layer.weight[0] * torch.tensor(slope)).sum() for layer, slope in parts]).sum()
+
+    method: Any = build_method("aegis", changes)
+    method.start_task(Policy(CONFIG), _stage(1))
+    method.distances.append(linear(against))
+    method.gradients(policy, linear(gradients))
+    return method, [layer.weight.grad[0].tolist() for layer in layers if layer.weight.grad is not None]
+
+
+def test_two_layers_worked_by_hand() -> None:
+    # first: d = (1, 2)(-3, 1) = -1, ||a||^2 = 10: (1, 2) + (-3, 1) / 10; second: d = (2, 1)(1, 1) = 3, kept
+    method, found = _by_hand([[1.0, 2.0], [2.0, 1.0]], [[-3.0, 1.0], [1.0, 1.0]])
+    assert found[0] == pytest.approx([0.7, 2.1])
+    assert found[1] == [2.0, 1.0]
+    told = method.diagnostics()
+    assert told["layers_projected_mean"] == 0.5
+    assert told["energy_shed_mean"] == pytest.approx(0.01)  # 1 / 10 of 5 + 5
+    assert told["energy_shed_highest"] == pytest.approx(0.01)
+
+
+def test_opposite_gradients_leave_nothing_and_orthogonal_or_absent_ones_everything() -> None:
+    method, found = _by_hand([[1.0, 2.0], [2.0, 1.0], [3.0, 4.0]], [[-2.0, -4.0], [1.0, -2.0], [0.0, 0.0]])
+    assert found[0] == pytest.approx([0.0, 0.0])
+    assert found[1:] == [[2.0, 1.0], [3.0, 4.0]]
+    assert method.diagnostics()["layers_projected_mean"] == pytest.approx(1 / 3)
+
+
+def test_the_random_control_has_no_direction_either_where_the_anchor_gives_none() -> None:
+    for _ in range(5):
+        _, found = _by_hand([[1.0, 2.0]], [[0.0, 0.0]], direction="random")
+        assert found == [[1.0, 2.0]]
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_energy_shed_by_one_layer_is_the_squared_cosine(seed: int) -> None:
+    one_layer = PolicyConfig(state_size=4, action_size=2, width=32, layers=1)
+    method, policy = _moved(one_layer, seed=seed)
+    batch = _source(seed).sample(16)
+    method.gradients(policy, method.loss(policy, batch, NOW))
+    gradient = _block(_gradients(policy, policy.action_loss(batch).mean()), 0)
+    against = _block(_gradients(policy, _distance(policy, batch, method.anchor)), 0)
+    cosine = gradient @ against / (np.linalg.norm(gradient) * np.linalg.norm(against))
+    expected = cosine**2 if cosine < 0 else 0.0
+    assert method.diagnostics()["energy_shed_mean"] == pytest.approx(expected, rel=1e-3, abs=1e-9)
+
+
+def test_the_random_control_projects_against_directions_of_the_same_norm() -> None:
+    method, policy = _moved(direction="random")
+    batch = _source(0).sample(16)
+    with torch.random.fork_rng():
+        torch.manual_seed(5)
+        method.gradients(policy, method.loss(policy, batch, NOW))
+        torch.manual_seed(5)
+        drawn = [
+            np.concatenate(
+                [torch.randn_like(weight).double().numpy().ravel() for weight in layer.parameters()]
+            )
+            for layer in policy.backbone.layers
+        ]
+    found, plain = _set(policy), _gradients(policy, policy.action_loss(batch).mean())
+    away, projected = _gradients(policy, _distance(policy, batch, method.anchor)), 0
+    for layer, direction in enumerate(drawn):
+        gradient, norm = _block(plain, layer), np.linalg.norm(_block(away, layer))
+        against = direction * norm / np.linalg.norm(direction)
+        expected = gradient - min(float(gradient @ against), 0.0) / norm**2 * against
+        np.testing.assert_allclose(_block(found, layer), expected, rtol=1e-3, atol=1e-5)
+        projected += int(gradient @ against < 0)
+    assert 0 < projected == method.diagnostics()["layers_projected_mean"] * CONFIG.layers
+
+
+def test_the_anchor_survives_its_state() -> None:
+    method, policy = _moved()
+    other: Any = build_method("aegis", {})
+    other.load_state(policy, method.state())
+    other.start_task(policy, _stage(1))
+    batch, found = _source(0).sample(16), []
+    for each in (method, other):
+        policy.zero_grad()
+        each.gradients(policy, each.loss(policy, batch, NOW))
+        found.append(_set(policy))
+    assert all(np.array_equal(found[0][name], found[1][name]) for name in found[0])
+
+
+def test_the_diagnostics_tell_the_distance_at_eleven_steps_from_the_first_to_the_last() -> None:
+    method, policy = build_method("aegis", {"samples": 50}), Policy(CONFIG)
+    method.prepare(policy, Prior({"questions": _questions(3)}))
+    assert method.diagnostics() == {}
+    adapt(policy, method, _stage(31), Budget(learning_rate=1e-3))
+    told, distances = method.diagnostics(), method.distances  # type: ignore[attr-defined]
+    assert told["anchor_distance"] == [float(distances[step]) for step in range(0, 31, 3)]
+    assert 0.0 <= told["energy_shed_mean"] <= told["energy_shed_highest"] < 1.0
+    adapt(policy, method, _stage(2), Budget(learning_rate=1e-3))
+    again = method.diagnostics()["anchor_distance"]
+    assert len(set(again)) == 2
+    assert not set(again) & {float(distance) for distance in distances}  # of this stage alone
+
+
+@pytest.mark.parametrize(
+    ("spec", "name"),
+    [
+        ("aegis", "AEGIS"),
+        ("stop_gradient", "stop_gradient"),
+        ("knowledge_insulation", "knowledge_insulation"),
+    ],
+)
+def test_a_policy_without_hidden_states_is_refused_by_name(spec: str, name: str) -> None:
+    class Opaque(nn.Module):
+        pass
+
+    policy: Any = Opaque()
+    with pytest.raises(TypeError, match=f"{name} needs the hidden states .*; Opaque has no hidden_states"):
+        build_method(spec, {}).prepare(policy, Prior({"questions": _questions(0)}))

@@ -1,0 +1,256 @@
+"""ConSFT and its control: the weights of the samples, and the gradient that they make."""
+
+import dataclasses
+import math
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from clbench.adaptation import adapt
+from clbench.demonstrations import Demonstrations, collect
+from clbench.method import Prior, Progress, Source, Stage, build_method
+from clbench.policy import Batch, Policy, PolicyConfig
+from clbench.task import Budget, load_scenario
+from clbench.training import MethodError, deterministic, optimise
+
+TOY = load_scenario("clbench.testing:clbench/Toy-v0")
+CONFIG = PolicyConfig(state_size=4, action_size=2, width=32, layers=2)
+UNEVEN = {"kappa": 1.0, "tau_start": 1.0, "omega_min": 0.2}
+"""Settings at which samples of an untrained policy have weights from the floor to above a half."""
+
+# (t/T, omega at LOSSES) with the published constants, worked out by hand to three places
+LOSSES = (0.001, 0.005, 0.01, 0.02, 0.05, 0.1)
+TABLE = (
+    (0.00, (0.001, 0.001, 0.001, 0.001, 0.001, 0.001)),
+    (0.50, (0.001, 0.001, 0.001, 0.001, 0.001, 0.001)),
+    (0.75, (0.011, 0.001, 0.001, 0.001, 0.001, 0.001)),
+    (0.90, (0.149, 0.001, 0.001, 0.001, 0.001, 0.001)),
+    (0.95, (0.385, 0.008, 0.001, 0.001, 0.001, 0.001)),
+    (0.98, (0.683, 0.148, 0.022, 0.001, 0.001, 0.001)),
+    (0.99, (0.826, 0.385, 0.149, 0.022, 0.001, 0.001)),
+    (0.995, (0.909, 0.621, 0.386, 0.149, 0.009, 0.001)),
+    (1.00, (0.995, 0.975, 0.951, 0.905, 0.779, 0.607)),
+)
+
+
+@pytest.fixture(autouse=True)
+def _one_thread() -> Iterator[None]:
+    with deterministic():
+        yield
+
+
+def _source(seed: int) -> Source[Batch]:
+    task = TOY.task("right")
+    data = Demonstrations.of_task(task, collect(task, TOY.budget), CONFIG.chunk)
+    return Source(data, torch.Generator().manual_seed(seed), 16)
+
+
+def _stage(steps: int) -> Stage:
+    return Stage(1, TOY.task("right"), 0, steps, _source(0), Prior({}))
+
+
+def _started(spec: str, **changes: Any) -> Any:
+    """Return a method that has begun its first stage."""
+    method = build_method(spec, changes)
+    method.start_task(Policy(CONFIG), _stage(10))
+    return method
+
+
+def _omega(loss: float, done: float, **changes: float) -> float:
+    """Return the weight of a loss at the share `done` of the schedule, by Eq. 5, 11 and 12 of the paper."""
+    constants = {"tau_start": 0.003, "tau_end": 5.0, "kappa": 25.0, "omega_min": 0.001, **changes}
+    least = math.exp(-0.8)
+    rho = (math.exp(-0.8 * min(done, 1.0) ** 3.5) - least) / (1 - least)
+    tau = constants["tau_end"]
+    if rho > 0:
+        tau = min(constants["tau_start"] / rho, tau)
+    return max(constants["omega_min"], math.exp(-constants["kappa"] * loss / tau))
+
+
+def _flat(gradients: Any) -> Tensor:
+    """Return gradients as one vector, zeros where there is none."""
+    return torch.cat([gradient.flatten() for gradient in gradients])
+
+
+def _gradient(policy: Policy, loss: Tensor) -> Tensor:
+    """Return the gradient of `loss` by all weights, computed by itself."""
+    return _flat(torch.autograd.grad(loss, list(policy.parameters()), materialize_grads=True))
+
+
+def _set_gradient(method: Any, policy: Policy, batch: Batch, progress: Progress) -> Tensor:
+    """Return the gradient that the method's seams set."""
+    policy.zero_grad()
+    method.gradients(policy, method.loss(policy, batch, progress))
+    weights = policy.parameters()
+    return _flat(torch.zeros_like(one) if one.grad is None else one.grad for one in weights)
+
+
+@pytest.mark.parametrize(("done", "omegas"), TABLE)
+def test_published_constants_give_the_weights_of_the_table(done: float, omegas: tuple[float, ...]) -> None:
+    method: Any = build_method("consft", {})
+    weights = method.weights(torch.tensor(LOSSES), Progress(round(2000 * done), 2000))
+    assert weights.tolist() == pytest.approx(omegas, abs=5.1e-4)
+    assert weights.tolist() == pytest.approx([_omega(loss, done) for loss in LOSSES], rel=1e-4)
+
+
+@pytest.mark.parametrize("changes", [{}, {"tau_start": 1.0}, {"kappa": 3.0, "tau_end": 2.0}])
+def test_temperature_follows_the_formula_and_never_falls(changes: dict[str, float]) -> None:
+    method: Any = build_method("consft", changes)
+    found = [method.temperature(Progress(step, 80)) for step in range(81)]
+    # the temperature is told by the weight of one sample: tau = -kappa L / log omega
+    kappa = changes.get("kappa", 25.0)
+    weights = [_omega(1e-4, step / 80, omega_min=0.0, **changes) for step in range(81)]
+    assert found == pytest.approx([-kappa * 1e-4 / math.log(weight) for weight in weights], rel=1e-4)
+    assert found == sorted(found)
+
+
+def test_beyond_the_schedule_the_temperature_stays_at_its_end() -> None:
+    method: Any = build_method("consft", {"schedule": 0.5})
+    assert [method.temperature(Progress(step, 100)) for step in (50, 51, 75, 100)] == [5.0] * 4
+    assert method.temperature(Progress(49, 100)) < 5.0
+    assert method.temperature(Progress(0, 100)) == pytest.approx(0.003)
+
+
+def test_a_perfect_sample_weighs_1_and_a_hopeless_one_the_floor() -> None:
+    method: Any = build_method("consft", {})
+    losses = torch.tensor([0.0, math.inf])
+    for step in (0, 50, 100):
+        assert method.weights(losses, Progress(step, 100)).tolist() == pytest.approx([1.0, 0.001])
+
+
+def test_an_infinite_loss_stops_the_run_although_its_weight_is_the_floor() -> None:
+    policy, batch = Policy(CONFIG), _source(0).sample(2)
+    # at flow time 1 the head reads noise alone: its velocity is finite, the action to be hit is not
+    batch = dataclasses.replace(
+        batch, action=torch.full_like(batch.action, 1e25), draw=torch.ones(2), valid=torch.ones(2, 8)
+    )
+    assert policy.action_loss(batch).tolist() == [math.inf] * 2
+    method = _started("consft")
+    with pytest.raises(MethodError, match="step 0: loss is inf, not finite"):
+        optimise(policy.parameters(), 1e-3, 1, lambda step: method.loss(policy, batch, Progress(step, 1)))
+    assert method.diagnostics()["omega_counts"][0] == [2, 0, 0, 0, 0]
+
+
+@pytest.mark.parametrize("step", [0, 60])
+def test_the_gradient_is_the_mean_of_the_weighted_gradients_of_the_samples(step: int) -> None:
+    policy, batch = Policy(CONFIG), _source(1).sample(8)
+    method = _started("consft", **UNEVEN)
+    found = _set_gradient(method, policy, batch, Progress(step, 100))
+    rows = [Batch(**{name: value[row : row + 1] for name, value in vars(batch).items()}) for row in range(8)]
+    losses = [policy.action_loss(row).sum() for row in rows]
+    omegas = [_omega(loss.item(), step / 100, **UNEVEN) for loss in losses]
+    assert max(omegas) > 1.5 * min(omegas)
+    parts = [omega * _gradient(policy, loss) for omega, loss in zip(omegas, losses, strict=True)]
+    expected = torch.stack(parts).sum(dim=0) / 8
+    torch.testing.assert_close(found, expected, rtol=1e-3, atol=1e-6)
+    # what is usually done with weights, and would cancel most of the method
+    normalised = torch.stack(parts).sum(dim=0) / sum(omegas)
+    assert (found - normalised).norm() > 0.5 * found.norm()
+
+
+def test_no_gradient_flows_through_the_weights() -> None:
+    policy, batch = Policy(CONFIG), _source(1).sample(8)
+    method = _started("consft", **UNEVEN)
+    assert not method.weights(policy.action_loss(batch), Progress(0, 100)).requires_grad
+    found = _set_gradient(method, policy, batch, Progress(0, 100))
+    losses = policy.action_loss(batch)
+    through = _gradient(policy, (torch.exp(-losses).clamp(min=0.2) * losses).mean())
+    assert (found - through).norm() > 0.5 * found.norm()
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_one_sample_disrupts_what_was_known_by_the_square_of_its_weight(seed: int) -> None:
+    """The paper's claim (Eq. 7): g'Fg of the weighted gradient is omega^2 that of the plain one."""
+    policy, batch = Policy(CONFIG, seed=seed), _source(seed).sample(1)
+    method = _started("consft", kappa=1.0, tau_start=1.0)
+    weighted = _set_gradient(method, policy, batch, Progress(0, 100)).double()
+    loss = policy.action_loss(batch).sum()
+    omega = _omega(loss.item(), 0.0, kappa=1.0, tau_start=1.0)
+    plain = _gradient(policy, loss).double()
+    # F = A A' of rank 3, and g'Fg = |A'g|^2
+    generator = torch.Generator().manual_seed(seed)
+    root = torch.randn(len(plain), 3, generator=generator, dtype=torch.float64)
+    risks = [float((root.T @ gradient).square().sum()) for gradient in (weighted, plain)]
+    assert 0.001 < omega < 0.9
+    assert risks[0] == pytest.approx(omega**2 * risks[1], rel=1e-3)
+
+
+def test_the_histogram_counts_each_sample_of_each_step_in_its_part_of_the_stage() -> None:
+    method, policy = build_method("consft", {}), Policy(CONFIG)
+    assert method.diagnostics() == {}
+    adapt(policy, method, _stage(25), Budget(learning_rate=1e-3))
+    told = method.diagnostics()
+    assert told["omega_edges"] == [0.0, 0.01, 0.1, 0.5, 0.9, 1.0]
+    steps = np.bincount([10 * step // 25 for step in range(25)])
+    assert [sum(counts) for counts in told["omega_counts"]] == (16 * steps).tolist()
+    method.start_task(policy, _stage(25))
+    assert not np.any(method.diagnostics()["omega_counts"])  # a new stage counts anew
+
+
+def test_the_histogram_is_that_of_the_weights() -> None:
+    policy, batch = Policy(CONFIG), _source(1).sample(64)
+    method = _started("consft", kappa=2.0, tau_start=1.0)
+    method.loss(policy, batch, Progress(7, 10))
+    omegas = [_omega(loss, 0.7, kappa=2.0, tau_start=1.0) for loss in policy.action_loss(batch).tolist()]
+    told = method.diagnostics()
+    expected = np.histogram(omegas, told["omega_edges"])[0].tolist()
+    assert len([count for count in expected if count]) > 1
+    assert told["omega_counts"][7] == expected
+    assert not np.any(np.delete(told["omega_counts"], 7, axis=0))
+
+
+def test_the_calibrated_variant_changes_only_what_the_authors_tune() -> None:
+    published, calibrated = (
+        dataclasses.asdict(build_method(name, {}))  # type: ignore[call-overload]
+        for name in ("consft", "consft_calibrated")
+    )
+    changed = {name for name in published if published[name] != calibrated[name]}
+    assert changed <= {"tau_start", "schedule"}
+    assert published == {
+        "tau_start": 0.003,
+        "tau_end": 5.0,
+        "kappa": 25.0,
+        "decay": 0.8,
+        "curvature": 3.5,
+        "omega_min": 0.001,
+        "schedule": 1.0,
+    }
+
+
+def test_a_constant_weight_is_the_mean_weight_of_consft_for_every_sample() -> None:
+    losses = Policy(CONFIG).action_loss(_source(2).sample(16))
+    consft: Any = build_method("consft", UNEVEN)
+    constant: Any = build_method("constant_weight", UNEVEN)
+    for step in (0, 60, 99):
+        uneven, even = (method.weights(losses, Progress(step, 100)) for method in (consft, constant))
+        assert uneven.std() > 0.01
+        assert even.tolist() == pytest.approx([float(uneven.mean())] * 16, rel=1e-5)
+
+
+def test_the_gradient_of_a_constant_weight_is_a_multiple_of_that_of_sft() -> None:
+    policy, batch = Policy(CONFIG), _source(2).sample(16)
+    found = _set_gradient(_started("constant_weight", **UNEVEN), policy, batch, Progress(0, 100))
+    losses = policy.action_loss(batch)
+    omega = np.mean([_omega(loss, 0.0, **UNEVEN) for loss in losses.tolist()])
+    torch.testing.assert_close(found, float(omega) * _gradient(policy, losses.mean()), rtol=1e-3, atol=1e-6)
+
+
+class _Reduced(Policy):
+    """A policy that does not tell its samples apart."""
+
+    def action_loss(self, batch: Batch, hidden: list[Tensor] | None = None) -> Tensor:
+        return super().action_loss(batch, hidden).mean()
+
+
+@pytest.mark.parametrize(
+    ("spec", "name"),
+    [("consft", "ConSFT"), ("consft_calibrated", "ConSFTCalibrated"), ("constant_weight", "ConstantWeight")],
+)
+def test_a_policy_without_a_loss_for_each_sample_is_refused_by_name(spec: str, name: str) -> None:
+    with pytest.raises(TypeError, match=rf"{name} .* action_loss of _Reduced must .* its shape is \(\)"):
+        build_method(spec, {}).prepare(_Reduced(CONFIG), Prior({}))
+    build_method(spec, {}).prepare(Policy(CONFIG), Prior({}))

@@ -1,0 +1,331 @@
+"""Methods that differ from fine-tuning by a line or two: rivals and controls."""
+
+import dataclasses
+import math
+from collections.abc import Iterator
+from copy import deepcopy
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from clbench.adaptation import adapt
+from clbench.demonstrations import Demonstrations, collect
+from clbench.method import Method, Prior, Progress, Source, Stage, build_method
+from clbench.policy import Batch, Policy, PolicyConfig, QuestionBatch
+from clbench.questions import Questions
+from clbench.task import Budget, load_scenario, resolve
+from clbench.training import deterministic, learning_rate_factor
+
+TOY = load_scenario("clbench.testing:clbench/Toy-v0")
+CONFIG = PolicyConfig(state_size=4, action_size=2, width=32, layers=2)
+NOW = Progress(0, 100)
+
+
+@pytest.fixture(autouse=True)
+def _one_thread() -> Iterator[None]:
+    with deterministic():
+        yield
+
+
+def _source(task: str, seed: int = 0) -> Source[Batch]:
+    data = Demonstrations.of_task(TOY.task(task), collect(TOY.task(task), TOY.budget), CONFIG.chunk)
+    return Source(data, torch.Generator().manual_seed(seed), 16)
+
+
+def _questions(seed: int = 0) -> Source[QuestionBatch]:
+    scenes = torch.randn(200, 4, generator=torch.Generator().manual_seed(7))
+    return Source(Questions(resolve(TOY.questions), scenes), torch.Generator().manual_seed(seed), 16)
+
+
+def _prior() -> Prior:
+    return Prior({"demonstrations": _source("left"), "questions": _questions()})
+
+
+def _stage(steps: int = 5) -> Stage:
+    return Stage(1, TOY.task("right"), 0, steps, _source("right"), _prior())
+
+
+def _adapt(policy: Policy, method: Method, steps: int = 5) -> None:
+    method.prepare(policy, _prior())
+    adapt(policy, method, _stage(steps), Budget(learning_rate=1e-3))
+
+
+def _weights(policy: Policy) -> dict[str, Tensor]:
+    return {name: weight.detach().clone() for name, weight in policy.named_parameters()}
+
+
+def _gradients(policy: Policy, loss: Tensor) -> dict[str, Tensor]:
+    """Return the gradient of `loss` by all weights, computed by itself."""
+    names, weights = zip(*policy.named_parameters(), strict=True)
+    return dict(zip(names, torch.autograd.grad(loss, weights, materialize_grads=True), strict=True))
+
+
+def _set_by(method: Method, policy: Policy, batch: Any) -> dict[str, Tensor]:
+    """Return the gradients that the method's seams set, zeros where there is none."""
+    policy.zero_grad()
+    method.gradients(policy, method.loss(policy, batch, NOW))
+    return {
+        name: torch.zeros_like(weight) if weight.grad is None else weight.grad
+        for name, weight in policy.named_parameters()
+    }
+
+
+def _check_close(found: dict[str, Tensor], expected: dict[str, Tensor]) -> None:
+    assert found.keys() == expected.keys()
+    for name, value in expected.items():
+        torch.testing.assert_close(found[name], value, rtol=1e-4, atol=1e-6)
+
+
+# ---- LwF ---------------------------------------------------------------------------------------------------
+
+
+def _distilled(policy: Policy, teacher: Policy, batch: Batch) -> float:
+    """Return the mean over samples of the squared difference of the velocities, over what counts of each."""
+    with torch.no_grad():
+        away = (policy.predict(batch) - teacher.predict(batch)).double().numpy() ** 2
+    counts = batch.valid.numpy() > 0
+    return float(np.mean([away[row][counts[row]].mean() for row in range(len(batch))]))
+
+
+def test_lwf_distils_the_policy_that_the_target_began_with() -> None:
+    method, policy = build_method("lwf", {"strength": 0.7}), Policy(CONFIG)
+    method.prepare(policy, Prior({}))
+    method.start_task(policy, _stage())  # of the target before
+    _adapt(policy, build_method("sft", {}))
+    method.start_task(policy, _stage())
+    teacher = deepcopy(policy)
+    _adapt(policy, build_method("sft", {}), steps=10)
+    batch = _source("right", 3).sample(16)
+    distilled = _distilled(policy, teacher, batch)
+    assert distilled > 1e-3
+    loss = method.loss(policy, batch, NOW)
+    expected = policy.action_loss(batch).mean().item() + 0.7 * distilled
+    assert loss.item() == pytest.approx(expected, rel=1e-4)
+
+
+def test_at_the_first_step_of_lwf_there_is_nothing_to_distil() -> None:
+    method, policy, batch = build_method("lwf", {}), Policy(CONFIG), _source("right").sample(16)
+    method.start_task(policy, _stage())
+    plain = policy.action_loss(batch).mean()
+    assert method.loss(policy, batch, NOW).item() == plain.item()
+    _check_close(_set_by(method, policy, batch), _gradients(policy, plain))
+
+
+def test_the_teacher_of_lwf_does_not_learn() -> None:
+    method: Any = build_method("lwf", {})
+    policy = Policy(CONFIG)
+    before = _weights(policy)
+    _adapt(policy, method)
+    assert not policy.head.embed.weight.equal(before["head.embed.weight"])
+    assert all(weight.equal(before[name]) for name, weight in method.teacher.named_parameters())
+
+
+def test_the_gradient_of_lwf_is_that_of_both_terms() -> None:
+    method, policy, batch = build_method("lwf", {"strength": 0.7}), Policy(CONFIG), _source("up").sample(8)
+    method.start_task(policy, _stage())
+    teacher = deepcopy(policy)
+    _adapt(policy, build_method("sft", {}), steps=10)
+    errors = (policy.predict(batch) - teacher.predict(batch).detach()).square().mean(dim=2)
+    parts = [errors[row][batch.valid[row] > 0].mean() for row in range(8)]
+    expected = _gradients(policy, policy.action_loss(batch).mean() + 0.7 * torch.stack(parts).mean())
+    _check_close(_set_by(method, policy, batch), expected)
+
+
+# ---- A-GEM -------------------------------------------------------------------------------------------------
+
+
+def _vector(gradients: dict[str, Tensor]) -> NDArray[np.float64]:
+    return np.concatenate([value.double().numpy().ravel() for value in gradients.values()])
+
+
+def test_a_gem_projects_the_gradient_off_what_raises_the_prior_loss() -> None:
+    policy, method = Policy(CONFIG), build_method("a_gem", {})
+    # at flow time 1 the head reads the noise alone; what it predicts there is too low for one, too high for
+    # the other
+    batch = dataclasses.replace(_source("right").sample(16), draw=torch.ones(16))
+    with torch.no_grad():
+        predicted = batch.noise - policy.predict(batch)
+    target = dataclasses.replace(batch, action=predicted + 0.5 + 0.5 * batch.noise)
+    prior = dataclasses.replace(batch, action=predicted - 0.5)
+    found = _vector(_set_by(method, policy, (target, prior)))
+    gradient = _vector(_gradients(policy, policy.action_loss(target).mean()))
+    against = _vector(_gradients(policy, policy.action_loss(prior).mean()))
+    product = float(gradient @ against)
+    assert product < 0
+    expected = gradient - product / float(against @ against) * against
+    np.testing.assert_allclose(found, expected, rtol=1e-3, atol=1e-5)
+    assert abs(float(found @ against)) < 1e-4 * abs(product)
+    assert np.linalg.norm(found - gradient) > 1e-3 * np.linalg.norm(gradient)
+
+
+def test_a_gem_leaves_every_bit_of_a_gradient_that_does_not_raise_the_prior_loss() -> None:
+    policy, batch = Policy(CONFIG), _source("right").sample(16)
+    found = _set_by(build_method("a_gem", {}), policy, (batch, batch))
+    plain = _set_by(build_method("sft", {}), policy, batch)
+    assert all(value.equal(plain[name]) for name, value in found.items())
+
+
+def test_a_gem_draws_a_full_batch_of_the_target_and_one_of_prior_demonstrations() -> None:
+    target, prior = build_method("a_gem", {}).batch(_source("right"), _prior())
+    assert (len(target), len(prior)) == (16, 16)
+    assert target.state.equal(_source("right").sample(16).state)
+    assert prior.state.equal(_source("left").sample(16).state)
+
+
+# ---- weight interpolation ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("coefficient", [0.0, 0.25, 0.5, 1.0])
+def test_weight_interpolation_goes_its_share_of_the_way(coefficient: float) -> None:
+    method = build_method("weight_interpolation", {"coefficient": coefficient})
+    policy, plain = Policy(CONFIG), Policy(CONFIG)
+    before = _weights(policy)
+    _adapt(policy, method)
+    _adapt(plain, build_method("sft", {}))
+    after = _weights(plain)
+    assert not after["head.embed.weight"].equal(before["head.embed.weight"])
+    for name, weight in _weights(policy).items():
+        expected = (1 - coefficient) * before[name].double() + coefficient * after[name].double()
+        tolerance = 0.0 if coefficient in (0.0, 1.0) else 1e-7
+        torch.testing.assert_close(weight.double(), expected, rtol=0, atol=tolerance)
+    assert method.whole_stages
+
+
+def test_weight_interpolation_goes_back_to_where_the_stage_began() -> None:
+    policy, method = Policy(CONFIG), build_method("weight_interpolation", {"coefficient": 0.0})
+    _adapt(policy, build_method("sft", {}))
+    before = _weights(policy)
+    _adapt(policy, method)
+    assert all(weight.equal(before[name]) for name, weight in policy.named_parameters())
+
+
+# ---- step sizes --------------------------------------------------------------------------------------------
+
+
+def test_the_step_sizes_of_finch_follow_the_average_of_the_losses() -> None:
+    method, policy, source = build_method("finch", {"kappa": 0.9}), Policy(CONFIG), _source("right")
+    method.start_task(policy, _stage())
+    average, found, expected = 0.0, [], []
+    for step in range(20):
+        batch = source.sample(2)
+        loss = method.loss(policy, batch, Progress(step, 20))
+        assert loss.item() == policy.action_loss(batch).mean().item()
+        found.append(method.learning_rate(0.01, Progress(step, 20)))
+        average = 0.9 * average + 0.1 * loss.item() if step else loss.item()
+        expected.append(0.01 * min(1.0, 0.9 / math.sqrt(average + 1e-8)))
+    assert found == pytest.approx(expected, rel=1e-6)
+    assert len({round(rate, 6) for rate in found}) > 5
+
+
+def test_finch_never_exceeds_the_schedule_and_reaches_it_where_the_loss_is_low() -> None:
+    policy, batch = Policy(CONFIG), _source("right").sample(16)
+    rates = []
+    for kappa in (1e-3, 1e-2, 1e3):
+        method = build_method("finch", {"kappa": kappa})
+        method.start_task(policy, _stage())
+        method.loss(policy, batch, NOW)
+        rates.append(method.learning_rate(0.01, NOW))
+    assert rates[0] < rates[1] < rates[2] == 0.01
+
+
+def test_finch_forgets_the_losses_of_the_last_target() -> None:
+    method, policy, rates = build_method("finch", {}), Policy(CONFIG), []
+    for batches in (0, 3):
+        method.start_task(policy, _stage())
+        for seed in range(batches):
+            method.loss(policy, _source("up", seed).sample(2), NOW)
+        method.start_task(policy, _stage())
+        method.loss(policy, _source("right").sample(16), NOW)
+        rates.append(method.learning_rate(0.01, NOW))
+    assert rates[0] == rates[1]
+
+
+@pytest.mark.parametrize(("changes", "share"), [({}, 0.2), ({"speed": 0.5}, 0.5)])
+def test_low_rate_sft_moves_every_weight_by_its_share_of_a_step(
+    changes: dict[str, float], share: float
+) -> None:
+    start = _weights(Policy(CONFIG))
+    moves = []
+    for method in (build_method("sft", {}), build_method("low_rate_sft", changes)):
+        policy = Policy(CONFIG)
+        _adapt(policy, method, steps=1)
+        moves.append({name: weight - start[name] for name, weight in _weights(policy).items()})
+    plain, slow = moves
+    # the first step of Adam is the step size, up or down
+    assert plain["head.embed.weight"].abs().max() == pytest.approx(1e-3, rel=1e-3)
+    for name, move in plain.items():
+        torch.testing.assert_close(slow[name], share * move, rtol=0, atol=1e-6)
+
+
+def test_low_rate_sft_keeps_the_form_of_the_schedule() -> None:
+    method = build_method("low_rate_sft", {})
+    for step in range(0, 100, 9):
+        scheduled = 1e-3 * learning_rate_factor(step, 100)
+        assert method.learning_rate(scheduled, Progress(step, 100)) == pytest.approx(0.2 * scheduled)
+
+
+# ---- what the backbone learns from -------------------------------------------------------------------------
+
+
+def test_stop_gradient_keeps_the_backbone_and_its_answers_to_the_last_bit() -> None:
+    policy, questions = Policy(CONFIG), _questions(3).sample(32)
+    before = _weights(policy)
+    answers = policy.answer_logits(questions.state, questions.words)
+    _adapt(policy, build_method("stop_gradient", {}), steps=10)
+    moved = {name for name, weight in policy.named_parameters() if not weight.equal(before[name])}
+    assert moved == {name for name in before if name.startswith("head.")}
+    assert policy.answer_logits(questions.state, questions.words).equal(answers)
+
+
+def test_stop_gradient_gives_the_optimiser_the_head_alone() -> None:
+    policy = Policy(CONFIG)
+    given: Any = build_method("stop_gradient", {}).start_task(policy, _stage())
+    assert {id(weight) for weight in given} == {id(weight) for weight in policy.head.parameters()}
+
+
+def test_the_head_of_stop_gradient_learns_from_the_plain_action_loss() -> None:
+    policy, batch, method = Policy(CONFIG), _source("right").sample(16), build_method("stop_gradient", {})
+    plain = policy.action_loss(batch).mean()
+    assert method.loss(policy, batch, NOW).item() == pytest.approx(plain.item(), rel=1e-6)
+    gradients = _gradients(policy, plain)
+    found = _set_by(method, policy, batch)
+    head = [name for name in gradients if name.startswith("head.")]
+    _check_close({name: found[name] for name in head}, {name: gradients[name] for name in head})
+    assert not any(value.any() for name, value in found.items() if name not in head)
+
+
+def test_knowledge_insulation_trains_the_backbone_on_questions_and_the_head_on_actions() -> None:
+    policy, method = Policy(CONFIG), build_method("knowledge_insulation", {"alpha": 0.5})
+    batch, questions = _source("right").sample(16), _questions().sample(8)
+    acting = _gradients(policy, 0.5 * policy.action_loss(batch).mean())
+    answering = _gradients(policy, policy.answer_loss(questions).mean())
+    found = _set_by(method, policy, (batch, questions))
+    expected = {
+        name: acting[name] if name.startswith("head.") else value for name, value in answering.items()
+    }
+    _check_close(found, expected)
+    assert acting["backbone.readout"].any()  # what insulation keeps out
+    loss = method.loss(policy, (batch, questions), NOW).item()
+    assert loss == pytest.approx(
+        0.5 * policy.action_loss(batch).mean().item() + policy.answer_loss(questions).mean().item(), rel=1e-5
+    )
+
+
+def test_co_training_descends_the_sum_of_both_losses() -> None:
+    policy, method = Policy(CONFIG), build_method("co_training", {"auxiliary": 0.3})
+    batch, questions = _source("right").sample(16), _questions().sample(8)
+    loss = policy.action_loss(batch).mean() + 0.3 * policy.answer_loss(questions).mean()
+    assert method.loss(policy, (batch, questions), NOW).item() == pytest.approx(loss.item(), rel=1e-6)
+    _check_close(_set_by(method, policy, (batch, questions)), _gradients(policy, loss))
+
+
+@pytest.mark.parametrize("spec", ["co_training", "knowledge_insulation"])
+def test_half_as_many_questions_as_demonstrations_are_asked(spec: str) -> None:
+    batch, questions = build_method(spec, {}).batch(_source("right"), _prior())
+    assert (len(batch), len(questions)) == (16, 8)
+    assert batch.state.equal(_source("right").sample(16).state)
+    assert questions.answer.equal(_questions().sample(8).answer)

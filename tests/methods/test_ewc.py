@@ -1,0 +1,183 @@
+"""EWC and L2-SP: what pulls weights back, where to, and how strongly."""
+
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from clbench.adaptation import adapt
+from clbench.demonstrations import Demonstrations, collect
+from clbench.method import Prior, Progress, Source, Stage, build_method
+from clbench.policy import Batch, Policy, PolicyConfig
+from clbench.task import Budget, load_scenario
+from clbench.training import deterministic
+
+TOY = load_scenario("clbench.testing:clbench/Toy-v0")
+CONFIG = PolicyConfig(state_size=4, action_size=2, width=32, layers=2)
+Weights = dict[str, Tensor]
+
+
+@pytest.fixture(autouse=True)
+def _one_thread() -> Iterator[None]:
+    with deterministic():
+        yield
+
+
+def _source(task: str, seed: int) -> Source[Batch]:
+    data = Demonstrations.of_task(TOY.task(task), collect(TOY.task(task), TOY.budget), CONFIG.chunk)
+    return Source(data, torch.Generator().manual_seed(seed), 16)
+
+
+def _stage(seed: int = 0) -> Stage:
+    return Stage(1, TOY.task("right"), 0, 3, _source("right", seed), Prior({}))
+
+
+def _prepared(spec: str, policy: Policy, **changes: Any) -> Any:
+    method = build_method(spec, changes)
+    method.prepare(policy, Prior({"demonstrations": _source("left", 0)}))
+    return method
+
+
+def _weights(policy: Policy) -> Weights:
+    return {name: weight.detach().clone() for name, weight in policy.named_parameters()}
+
+
+def _moved(policy: Policy) -> None:
+    generator = torch.Generator().manual_seed(0)
+    with torch.no_grad():
+        for weight in policy.parameters():
+            weight.add_(torch.randn(weight.shape, generator=generator), alpha=0.1)
+
+
+def _fisher(policy: Policy, source: Source[Batch], samples: int) -> Weights:
+    """Return the mean squared gradient of the samples' losses, from one graph of all of them."""
+    names, weights = zip(*policy.named_parameters(), strict=True)
+    losses = policy.action_loss(Batch.cat([source.sample(1) for _ in range(samples)]))
+    each = [torch.autograd.grad(loss, weights, retain_graph=True, materialize_grads=True) for loss in losses]
+    return {
+        name: torch.stack([gradients[index] for gradients in each]).square().mean(dim=0)
+        for index, name in enumerate(names)
+    }
+
+
+def _check_close(found: Weights, expected: Weights) -> None:
+    assert found.keys() == expected.keys()
+    for name, value in expected.items():
+        torch.testing.assert_close(found[name], value, rtol=1e-3, atol=1e-6)
+
+
+def _set(method: Any, policy: Policy, batch: Batch) -> list[Tensor | None]:
+    """Return the gradients that the method's seams set."""
+    policy.zero_grad()
+    method.gradients(policy, method.loss(policy, batch, Progress(0, 10)))
+    return [weight.grad for weight in policy.parameters()]
+
+
+def test_importance_is_the_mean_squared_gradient_of_single_samples() -> None:
+    policy = Policy(CONFIG)
+    before = _weights(policy)
+    method = _prepared("ewc", policy, samples=12)
+    _check_close(method.importance, _fisher(policy, _source("left", 0), 12))
+    # not the square of the mean gradient, which is near 0 where training has ended
+    batch = Batch.cat([source.sample(1) for source in [_source("left", 0)] for _ in range(12)])
+    (mean,) = torch.autograd.grad(policy.action_loss(batch).mean(), [policy.head.embed.weight])
+    assert (method.importance["head.embed.weight"] > 1.2 * mean.square()).float().mean() > 0.5
+    assert all(method.anchor[name].equal(weight) for name, weight in before.items())
+    assert all(weight.grad is None for weight in policy.parameters())
+
+
+@pytest.mark.parametrize(
+    ("spec", "changes"), [("ewc", {"samples": 4, "strength": 50.0}), ("l2_sp", {"strength": 0.7})]
+)
+def test_the_pull_is_the_gradient_of_the_penalty(spec: str, changes: dict[str, Any]) -> None:
+    policy, batch = Policy(CONFIG), _source("right", 1).sample(8)
+    method = _prepared(spec, policy, **changes)
+    _moved(policy)
+    found = _set(method, policy, batch)
+    names, weights = zip(*policy.named_parameters(), strict=True)
+    importance = method.importance if spec == "ewc" else dict.fromkeys(names, torch.tensor(1.0))
+    penalty = torch.stack(
+        [
+            (importance[name] * (weight - method.anchor[name]).square()).sum()
+            for name, weight in zip(names, weights, strict=True)
+        ]
+    ).sum()
+    plain = torch.autograd.grad(policy.action_loss(batch).mean(), weights, allow_unused=True)
+    pull = torch.autograd.grad(changes["strength"] / 2 * penalty, weights)
+    for value, before, extra in zip(found, plain, pull, strict=True):
+        if before is None:
+            assert value is None  # what answers questions is not trained: nothing moves it
+        else:
+            assert value is not None
+            torch.testing.assert_close(value, before + extra, rtol=1e-4, atol=1e-6)
+    assert max(float(extra.norm()) for extra in pull) > 0.1
+
+
+@pytest.mark.parametrize(("spec", "changes"), [("ewc", {"samples": 4}), ("l2_sp", {})])
+def test_at_the_anchor_nothing_pulls(spec: str, changes: dict[str, Any]) -> None:
+    policy, batch = Policy(CONFIG), _source("right", 1).sample(8)
+    found = _set(_prepared(spec, policy, **changes), policy, batch)
+    plain = torch.autograd.grad(
+        policy.action_loss(batch).mean(), list(policy.parameters()), allow_unused=True
+    )
+    for value, expected in zip(found, plain, strict=True):
+        assert (value is None) == (expected is None)
+        assert value is None or expected is None or value.equal(expected)
+
+
+def test_after_a_target_its_importance_is_added_and_the_anchor_moves_there() -> None:
+    policy = Policy(CONFIG)
+    method = _prepared("ewc", policy, samples=6)
+    retained = {name: value.clone() for name, value in method.importance.items()}
+    _moved(policy)
+    method.end_task(policy, _stage(5))
+    target = _fisher(policy, _source("right", 5), 6)
+    _check_close(method.importance, {name: value + target[name] for name, value in retained.items()})
+    assert all(method.anchor[name].equal(weight) for name, weight in policy.named_parameters())
+
+
+def test_the_anchor_of_l2_sp_stays_where_pretraining_left_it() -> None:
+    policy = Policy(CONFIG)
+    before = _weights(policy)
+    method = _prepared("l2_sp", policy)
+    adapt(policy, method, _stage(), Budget(learning_rate=1e-3))
+    assert not any(weight.equal(before[name]) for name, weight in policy.head.named_parameters(prefix="head"))
+    assert all(method.anchor[name].equal(weight) for name, weight in before.items())
+
+
+@pytest.mark.parametrize(("spec", "changes"), [("ewc", {"samples": 4}), ("l2_sp", {})])
+def test_anchor_and_importance_survive_the_state(spec: str, changes: dict[str, Any]) -> None:
+    policy, batch = Policy(CONFIG), _source("right", 1).sample(8)
+    method, other = _prepared(spec, policy, **changes), build_method(spec, changes)
+    other.load_state(policy, method.state())
+    _moved(policy)
+    first, second = (_set(each, policy, batch) for each in (method, other))
+    for one, two in zip(first, second, strict=True):
+        assert (one is None) == (two is None)
+        assert one is None or two is None or one.equal(two)
+
+
+def test_a_stronger_penalty_leaves_the_weights_nearer_to_where_they_were() -> None:
+    distances = []
+    for strength in (0.0, 100.0):
+        policy = Policy(CONFIG)
+        before = _weights(policy)
+        stage = Stage(1, TOY.task("right"), 0, 30, _source("right", 0), Prior({}))
+        adapt(policy, _prepared("l2_sp", policy, strength=strength), stage, Budget(learning_rate=1e-3))
+        moved = [(weight - before[name]).square().sum() for name, weight in _weights(policy).items()]
+        distances.append(float(torch.stack(moved).sum()))
+    assert distances[1] < 0.5 * distances[0]
+
+
+class _Reduced(Policy):
+    """A policy that does not tell its samples apart."""
+
+    def action_loss(self, batch: Batch, hidden: list[Tensor] | None = None) -> Tensor:
+        return super().action_loss(batch, hidden).mean()
+
+
+def test_ewc_refuses_a_policy_without_a_loss_for_each_sample_by_name() -> None:
+    with pytest.raises(TypeError, match=r"EWC looks at samples one by one: action_loss of _Reduced"):
+        _prepared("ewc", _Reduced(CONFIG))

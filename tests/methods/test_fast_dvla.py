@@ -1,0 +1,222 @@
+"""FastDVLA: the capability vector, the merge, and the regulariser that keeps it."""
+
+import importlib
+from collections.abc import Iterator
+from copy import deepcopy
+from typing import Any, NoReturn
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from clbench.demonstrations import Demonstrations, collect
+from clbench.method import Prior, Progress, Source, Stage, build_method, load_method
+from clbench.policy import Batch, Policy, PolicyConfig, QuestionBatch
+from clbench.questions import Questions
+from clbench.task import load_scenario, resolve
+from clbench.training import deterministic, optimise
+
+TOY = load_scenario("clbench.testing:clbench/Toy-v0")
+CONFIG = PolicyConfig(state_size=4, action_size=2, width=32, layers=2)
+FEW = {"steps": 6, "step_size": 1e-3}
+
+
+@pytest.fixture(autouse=True)
+def _one_thread() -> Iterator[None]:
+    with deterministic():
+        yield
+
+
+def _source(seed: int) -> Source[Batch]:
+    tasks = TOY.retained
+    parts = [Demonstrations.of_task(task, collect(task, TOY.budget), CONFIG.chunk) for task in tasks]
+    return Source(Demonstrations.cat(parts), torch.Generator().manual_seed(seed), 16)
+
+
+def _questions(seed: int) -> Source[QuestionBatch]:
+    scenes = torch.randn(200, 4, generator=torch.Generator().manual_seed(7))
+    return Source(Questions(resolve(TOY.questions), scenes), torch.Generator().manual_seed(seed), 16)
+
+
+def _prior(seed: int = 0) -> Prior:
+    return Prior({"demonstrations": _source(seed), "questions": _questions(seed)})
+
+
+def _weights(policy: Policy) -> dict[str, Tensor]:
+    return {name: weight.detach().clone() for name, weight in policy.named_parameters()}
+
+
+def _prepared(policy: Policy, **changes: Any) -> Any:
+    """Return a method that has prepared the policy and begun a stage."""
+    method = build_method("fast_dvla", {**FEW, **changes})
+    assert method.prepare(policy, _prior()) == 2 * FEW["steps"]
+    method.start_task(policy, Stage(1, TOY.task("right"), 0, 10, _source(1), Prior({})))
+    return method
+
+
+def _regulariser_gradient(method: Any, policy: Policy) -> dict[str, Tensor]:
+    """Return what the method adds to the gradient of a loss that is flat."""
+    policy.zero_grad()
+    flat = torch.stack([(0.0 * weight).sum() for weight in policy.parameters()]).sum()
+    method.gradients(policy, flat)
+    return {name: weight.grad for name, weight in policy.named_parameters() if weight.grad is not None}
+
+
+def _moved(policy: Policy, seed: int = 0) -> None:
+    generator = torch.Generator().manual_seed(seed)
+    with torch.no_grad():
+        for weight in policy.parameters():
+            weight.add_(torch.randn(weight.shape, generator=generator), alpha=0.01)
+
+
+def _fine_tuned(policy: Policy, auxiliary: bool) -> dict[str, Tensor]:
+    """Return the weights of a copy of the policy after six steps, questions weighing a half if asked."""
+    copy, demonstrations, questions = deepcopy(policy), _source(0), _questions(0)
+
+    def loss_at(_: int) -> Tensor:
+        loss, asked = copy.action_loss(demonstrations.sample(16)).mean(), questions.sample(8)
+        return loss + 0.5 * copy.answer_loss(asked).mean() if auxiliary else loss
+
+    optimise(copy.parameters(), 1e-3, 6, loss_at)
+    return _weights(copy)
+
+
+def test_the_vector_is_the_difference_of_two_fine_tunings_and_alpha_of_it_is_merged() -> None:
+    policy = Policy(CONFIG, seed=3)
+    before = _weights(policy)
+    plain, with_auxiliary = _fine_tuned(policy, False), _fine_tuned(policy, True)
+    method = _prepared(policy, auxiliary=0.5, alpha=0.7)
+    assert method.vector.keys() == before.keys()
+    after = _weights(policy)
+    for name, value in before.items():
+        expected = with_auxiliary[name] - plain[name]
+        assert expected.abs().max() > 0, name
+        torch.testing.assert_close(method.vector[name], expected, rtol=0, atol=1e-7)
+        torch.testing.assert_close(after[name], value + 0.7 * expected, rtol=0, atol=1e-6)
+        assert method.merged[name].equal(after[name])
+
+
+def test_without_an_auxiliary_objective_there_is_no_vector() -> None:
+    method = _prepared(Policy(CONFIG), auxiliary=0.0)
+    assert not any(value.any() for value in method.vector.values())
+
+
+def test_with_alpha_0_the_policy_stays_as_it_was_bit_for_bit() -> None:
+    policy = Policy(CONFIG)
+    before = _weights(policy)
+    method = _prepared(policy, alpha=0.0)
+    assert any(value.any() for value in method.vector.values())
+    assert all(weight.equal(before[name]) for name, weight in policy.named_parameters())
+
+
+def test_the_regularisers_gradient_is_that_of_its_formula() -> None:
+    policy = Policy(CONFIG)
+    method = _prepared(policy, orthogonal=0.3)
+    assert not any(value.any() for value in _regulariser_gradient(method, policy).values())  # sign(0) = 0
+    _moved(policy)
+    found = _regulariser_gradient(method, policy)
+    names, weights = zip(*policy.named_parameters(), strict=True)
+    parts = [
+        (method.vector[name] * (weight - method.merged[name])).abs().sum()
+        for name, weight in zip(names, weights, strict=True)
+    ]
+    expected = torch.autograd.grad(0.3 * torch.stack(parts).sum(), weights)
+    assert found.keys() == set(names)
+    for name, value in zip(names, expected, strict=True):
+        torch.testing.assert_close(found[name], value, rtol=1e-5, atol=1e-9)
+
+
+def test_the_regularisers_gradient_agrees_with_finite_differences() -> None:
+    policy = Policy(CONFIG)
+    method = _prepared(policy, orthogonal=0.3)
+    _moved(policy)
+    found = _regulariser_gradient(method, policy)
+    name = "backbone.layers.1.attention.key_value.weight"
+    vector, merged, weight = (
+        values[name].detach().double().numpy().ravel()
+        for values in (method.vector, method.merged, dict(policy.named_parameters()))
+    )
+
+    def penalty(index: int, shift: float) -> float:
+        shifted = weight.copy()
+        shifted[index] += shift
+        return float(0.3 * np.abs(vector * (shifted - merged)).sum())
+
+    away = np.abs(weight - merged)
+    indices = [index for index in range(len(weight)) if away[index] > 1e-3][:50]
+    slopes = [(penalty(index, 1e-5) - penalty(index, -1e-5)) / 2e-5 for index in indices]
+    assert max(np.abs(slopes)) > 1e-6
+    np.testing.assert_allclose(found[name].numpy().ravel()[indices], slopes, rtol=1e-3, atol=1e-9)
+
+
+def test_the_regulariser_is_added_to_the_gradient_of_the_loss() -> None:
+    policy, batch = Policy(CONFIG), _source(4).sample(8)
+    method = _prepared(policy, orthogonal=0.3)
+    _moved(policy)
+    penalty = _regulariser_gradient(method, policy)
+    policy.zero_grad()
+    method.gradients(policy, method.loss(policy, batch, Progress(0, 10)))
+    names, weights = zip(*policy.named_parameters(), strict=True)
+    plain = torch.autograd.grad(policy.action_loss(batch).mean(), weights, allow_unused=True)
+    for name, weight, value in zip(names, weights, plain, strict=True):
+        if value is None:
+            assert weight.grad is None
+        else:
+            assert weight.grad is not None
+            torch.testing.assert_close(weight.grad, value + penalty[name], rtol=1e-5, atol=1e-7)
+
+
+def test_the_random_control_has_the_norm_of_the_vector_in_each_matrix() -> None:
+    first, second = Policy(CONFIG), Policy(CONFIG)
+    vector, random = (_prepared(first).vector, _prepared(second, direction="random").vector)
+    for name, value in vector.items():
+        assert float(random[name].norm()) == pytest.approx(float(value.norm()), rel=1e-4), name
+    large = [name for name, value in vector.items() if value.numel() > 1000]
+    cosines = [
+        float(torch.cosine_similarity(vector[name].flatten(), random[name].flatten(), dim=0))
+        for name in large
+    ]
+    assert max(np.abs(cosines)) < 0.2
+    for name, weight in second.named_parameters():
+        start = dict(Policy(CONFIG).named_parameters())[name]
+        torch.testing.assert_close(weight, start + 1.1 * random[name], rtol=0, atol=1e-6)
+
+
+@pytest.mark.usefixtures("empty_caches")
+def test_the_vector_is_made_once_and_its_steps_count_every_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    policies = [Policy(CONFIG, seed=5) for _ in range(3)]
+    first = _prepared(policies[0])
+
+    def explode(*_: Any) -> NoReturn:
+        raise AssertionError("the vector is made a second time")
+
+    monkeypatch.setattr(importlib.import_module(load_method("fast_dvla").__module__), "optimise", explode)
+    second = _prepared(policies[1])
+    assert all(second.vector[name].equal(value) for name, value in first.vector.items())
+    # merging and regularising need no other vector; another objective, or another policy, does
+    _prepared(policies[2], alpha=0.5, orthogonal=1.0, direction="random")
+    for policy, changes in ((Policy(CONFIG, seed=5), {"auxiliary": 0.5}), (Policy(CONFIG, seed=6), {})):
+        with pytest.raises(AssertionError, match="made a second time"):
+            _prepared(policy, **changes)
+
+
+def test_other_demonstrations_make_another_vector() -> None:
+    vectors = []
+    for seed in (0, 1):
+        method: Any = build_method("fast_dvla", FEW)
+        method.prepare(Policy(CONFIG), _prior(seed))
+        vectors.append(method.vector)
+    assert not any(vectors[0][name].equal(vectors[1][name]) for name in vectors[0])
+
+
+def test_vector_and_merged_weights_survive_the_state() -> None:
+    policy = Policy(CONFIG)
+    method = _prepared(policy, orthogonal=0.3)
+    other: Any = build_method("fast_dvla", {"orthogonal": 0.3})
+    other.load_state(policy, method.state())
+    other.start_task(policy, Stage(2, TOY.task("down"), 0, 10, _source(1), Prior({})))
+    _moved(policy)
+    first, second = (_regulariser_gradient(each, policy) for each in (method, other))
+    assert first.keys() == second.keys()
+    assert all(value.equal(second[name]) for name, value in first.items())

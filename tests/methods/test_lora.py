@@ -1,0 +1,158 @@
+"""LoRA: the policy under its adapters, and what the adapters add up to."""
+
+import math
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from clbench.adaptation import adapt
+from clbench.demonstrations import Demonstrations, collect
+from clbench.method import Prior, Progress, Source, Stage, build_method
+from clbench.policy import Batch, Policy, PolicyConfig, load_policy, save_policy
+from clbench.task import Budget, load_scenario
+from clbench.training import deterministic
+
+TOY = load_scenario("clbench.testing:clbench/Toy-v0")
+CONFIG = PolicyConfig(state_size=4, action_size=2, width=32, layers=2)
+MAP = "backbone.layers.1.attention.key_value"
+VARIANTS = pytest.mark.parametrize("variant", ["lora", "dora", "rslora"])
+
+
+@pytest.fixture(autouse=True)
+def _one_thread() -> Iterator[None]:
+    with deterministic():
+        yield
+
+
+def _source(seed: int) -> Source[Batch]:
+    task = TOY.task("right")
+    data = Demonstrations.of_task(task, collect(task, TOY.budget), CONFIG.chunk)
+    return Source(data, torch.Generator().manual_seed(seed), 16)
+
+
+def _stage() -> Stage:
+    return Stage(1, TOY.task("right"), 0, 8, _source(0), Prior({}))
+
+
+def _weights(policy: Policy) -> dict[str, Tensor]:
+    """Return the policy's weights under the names that they have without adapters."""
+    return {
+        name.replace(".base_layer", ""): weight.detach().clone() for name, weight in policy.named_parameters()
+    }
+
+
+def _adapters(policy: Policy) -> dict[str, Tensor]:
+    return {name: weight for name, weight in _weights(policy).items() if "lora_" in name}
+
+
+def _adapted(variant: str, **changes: Any) -> tuple[Any, Policy]:
+    """Return a method and the policy after a short stage of it."""
+    method, policy = build_method("lora", {"variant": variant, "rank": 4, **changes}), Policy(CONFIG, seed=1)
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        method.prepare(policy, Prior({}))
+    adapt(policy, method, _stage(), Budget(learning_rate=3e-3))
+    return method, policy
+
+
+@VARIANTS
+def test_adapters_begin_as_no_change_and_sit_on_every_linear_map_of_the_layers(variant: str) -> None:
+    policy, batch = Policy(CONFIG), _source(1).sample(8)
+    before = policy.action_loss(batch).detach()
+    build_method("lora", {"variant": variant}).prepare(policy, Prior({}))
+    torch.testing.assert_close(policy.action_loss(batch).detach(), before, rtol=1e-5, atol=1e-6)
+    found = {name.partition(".lora_")[0] for name in _adapters(policy)}
+    maps = [f"attention.{part}" for part in ("query", "key_value", "out")] + [
+        "feed_forward.1",
+        "feed_forward.3",
+    ]
+    assert found == {
+        f"{part}.layers.{layer}.{name}" for part in ("backbone", "head") for layer in (0, 1) for name in maps
+    }
+    assert sum(value.numel() for value in _adapters(policy).values()) > 0
+
+
+@VARIANTS
+def test_the_weights_under_the_adapters_never_change_and_all_adapters_train(variant: str) -> None:
+    method, policy = build_method("lora", {"variant": variant}), Policy(CONFIG, seed=1)
+    before = _weights(policy)
+    method.prepare(policy, Prior({}))
+    adapters = _adapters(policy)
+    assert all(weight.equal(before[name]) for name, weight in _weights(policy).items() if name in before)
+    steps = adapt(policy, method, _stage(), Budget(learning_rate=3e-3))
+    after = _weights(policy)
+    assert steps == 8
+    assert after.keys() == before.keys() | adapters.keys()
+    assert all(after[name].equal(weight) for name, weight in before.items())
+    assert not any(after[name].equal(weight) for name, weight in adapters.items())
+    trained = {name for name, weight in policy.named_parameters() if weight.requires_grad}
+    assert trained == adapters.keys()
+
+
+@VARIANTS
+def test_merged_adapters_act_as_they_did(variant: str) -> None:
+    from peft.tuners.lora import LoraLayer
+
+    _, policy = _adapted(variant)
+    batch = _source(1).sample(8)
+    start = Policy(CONFIG, seed=1).act(batch.state, batch.words, batch.noise)
+    loss, actions = policy.action_loss(batch).detach(), policy.act(batch.state, batch.words, batch.noise)
+    assert (actions - start).abs().max() > 1e-3
+    layers = [module for module in policy.modules() if isinstance(module, LoraLayer)]
+    assert len(layers) == 20
+    for layer in layers:
+        layer.merge()
+    torch.testing.assert_close(policy.action_loss(batch).detach(), loss, rtol=0, atol=1e-5)
+    torch.testing.assert_close(policy.act(batch.state, batch.words, batch.noise), actions, rtol=0, atol=1e-5)
+
+
+@VARIANTS
+def test_what_an_adapter_adds_is_that_of_the_papers(variant: str) -> None:
+    """W + s B A with s = alpha / rank, or alpha / sqrt(rank); DoRA gives each row of it a learned norm."""
+    _, policy = _adapted(variant, alpha=6.0)
+    weights = {name: weight.double().numpy() for name, weight in _weights(policy).items()}
+    under = weights[f"{MAP}.weight"]
+    down, up = (weights[f"{MAP}.lora_{part}.default.weight"] for part in "AB")
+    assert (down.shape, up.shape) == ((4, 32), (64, 4))
+    expected = under + 6.0 / (math.sqrt(4) if variant == "rslora" else 4) * up @ down
+    if variant == "dora":
+        norms = weights[f"{MAP}.lora_magnitude_vector.default.weight"]
+        expected = norms[:, None] * expected / np.linalg.norm(expected, axis=1, keepdims=True)
+    np.testing.assert_allclose(_map(policy), expected, rtol=1e-4, atol=1e-5)
+    assert np.abs(expected - under).max() > 1e-3
+
+
+def _map(policy: Policy) -> NDArray[np.float64]:
+    """Return the matrix that a linear map with its adapter is, from what it does to unit vectors."""
+    module: Any = policy.get_submodule(MAP)
+    with torch.no_grad():
+        units = module(torch.eye(32)[None])[0] - module(torch.zeros(1, 1, 32))[0]
+    return np.asarray(units.T.double().numpy())
+
+
+@VARIANTS
+def test_an_adapted_policy_survives_saving_and_goes_on_as_it_would_have(variant: str, tmp_path: Path) -> None:
+    method, policy = _adapted(variant)
+    save_policy(policy, tmp_path)
+    other: Any = build_method("lora", {"variant": variant, "rank": 4})
+    loaded = load_policy(tmp_path, lambda plain: other.load_state(plain, method.state()))
+    batch = _source(1).sample(8)
+    assert loaded.action_loss(batch).equal(policy.action_loss(batch))
+    assert loaded.act(batch.state, batch.words, batch.noise).equal(
+        policy.act(batch.state, batch.words, batch.noise)
+    )
+    for each, trained in ((method, policy), (other, loaded)):
+        adapt(trained, each, _stage(), Budget(learning_rate=3e-3))
+    assert _weights(policy).keys() == _weights(loaded).keys()
+    assert all(weight.equal(_weights(loaded)[name]) for name, weight in _weights(policy).items())
+
+
+def test_the_step_size_of_the_adapters_is_a_multiple_of_the_scheduled_one() -> None:
+    method = build_method("lora", {"speed": 2.5})
+    assert method.learning_rate(0.01, Progress(3, 10)) == pytest.approx(0.025)
