@@ -27,7 +27,7 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -91,7 +91,7 @@ def estimate(
     draw = _Draw.make(len(runs), next(iter(runs.values())).layout, generator, replicates)
     needed = _needed(wanted, sorted(runs), references)
     exact, resampled = _rates(runs, needed, draw, generator)
-    return {metric.name: _estimate(_value(metric, exact), metric.over_runs(resampled)) for metric in wanted}
+    return {metric.name: interval(_value(metric, exact), metric.over_runs(resampled)) for metric in wanted}
 
 
 def paired_difference(
@@ -131,10 +131,39 @@ def paired_difference(
     needed = _needed([wanted], seeds, references)
     exact, resampled = _rates({seed: runs[seed] for seed in seeds}, needed, draw, generator)
     other_exact, other_resampled = _rates({seed: others[seed] for seed in seeds}, needed, draw, generator)
-    return _estimate(
+    return interval(
         _value(wanted, exact) - _value(wanted, other_exact),
         wanted.over_runs(resampled) - wanted.over_runs(other_resampled),
     )
+
+
+def bootstrap(
+    quantity: Callable[[Mapping[str, Rates]], Array],
+    runs: Mapping[str, Sequence[Scores]],
+    generator: np.random.Generator,
+    *,
+    replicates: int = REPLICATES,
+) -> Estimate:
+    """Return any quantity of the success rates of several methods, with its interval.
+
+    Args:
+        quantity: Maps the rates of each method, with batch axes (..., runs), to values (...).
+        runs: Runs of each method: the same seeds in the same order. All get the same draws.
+        generator: Source of the draws.
+        replicates: How many draws.
+
+    Raises:
+        ValueError: The runs are of different tasks, episodes, evaluation points or questions.
+    """
+    (first, ours), *others = runs.items()
+    draw = _Draw.make(len(ours), ours[0].layout, generator, replicates)
+    numbered = dict(enumerate(ours))
+    references = {name: list(theirs) for name, theirs in others}
+    exact, drawn = (
+        quantity({first: rates, **rates.references})
+        for rates in _rates(numbered, references, draw, generator)
+    )
+    return interval(float(exact), drawn)
 
 
 @dataclass(frozen=True, eq=False)
@@ -193,7 +222,8 @@ def _value(metric: Metric, rates: Rates) -> float:
     return float(metric.over_runs(rates))
 
 
-def _estimate(value: float, replicates: Array) -> Estimate:
+def interval(value: float, replicates: Array) -> Estimate:
+    """Return a value with the interval that its replicates span."""
     if not math.isfinite(value):
         return Estimate(None, None, None)
     # A metric that has no value in some replicates has no honest interval.

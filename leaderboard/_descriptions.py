@@ -14,7 +14,7 @@ from typing import Any
 
 from clbench.method import Method, load_method, method_names
 
-from ._rows import _division
+from ._rows import division_of
 
 _ITEM = re.compile(r"\d+\. +(.*)")
 
@@ -64,7 +64,7 @@ class Description:
     @property
     def division(self) -> str:
         """What it competes with."""
-        return _division(dataclasses.asdict(self.cls.uses))
+        return division_of(dataclasses.asdict(self.cls.uses))
 
     @property
     def defaults(self) -> dict[str, Any]:

@@ -7,8 +7,8 @@ from collections.abc import Iterable, Sequence
 
 from clbench.statistics import Estimate
 
-from ._evidence import CONTROLS
-from ._table import MISSING, _escaped, _line, _number
+from ._claims.evidence import CONTROLS
+from ._table import MISSING, escaped, number_text, table_line
 
 _ARXIV = re.compile(r"arXiv (\d{4}\.\d{5})")
 
@@ -16,7 +16,7 @@ _ARXIV = re.compile(r"arXiv (\d{4}\.\d{5})")
 def prose(text: str) -> str:
     """Return words of ours for Markdown: code in backticks as it is, links for arXiv identifiers."""
     parts = re.split(r"(`[^`]+`)", text)
-    return "".join(part if part.startswith("`") else linked(_escaped(part)) for part in parts)
+    return "".join(part if part.startswith("`") else linked(escaped(part)) for part in parts)
 
 
 def linked(text: str) -> str:
@@ -32,12 +32,14 @@ def arxiv_ids(text: str) -> list[str]:
 def grid(head: Sequence[str], rows: Iterable[Sequence[str]], numbers: int = 0) -> list[str]:
     """Return the lines of a table whose last `numbers` columns are numbers."""
     under = ["---"] * (len(head) - numbers) + ["--:"] * numbers
-    return [_line(list(head)), _line(under), *(_line(list(row)) for row in rows)]
+    return [table_line(list(head)), table_line(under), *(table_line(list(row)) for row in rows)]
 
 
 def interval(estimate: Estimate, form: str = ".2f") -> str:
     """Return a value with its interval, if it has one."""
-    value, low, high = (_number(one, form, MISSING) for one in (estimate.value, estimate.low, estimate.high))
+    value, low, high = (
+        number_text(one, form, MISSING) for one in (estimate.value, estimate.low, estimate.high)
+    )
     return value if estimate.low is None or estimate.high is None else f"{value} [{low}, {high}]"
 
 

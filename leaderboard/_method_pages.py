@@ -9,12 +9,12 @@ from pathlib import Path
 
 from clbench.metrics import measure
 
-from ._claims import CLAIMS, Finding
+from ._claims.claim import CLAIMS, Finding
+from ._claims.evidence import Evidence, is_number, read_changed, read_runs
 from ._descriptions import Description, of_one_module
-from ._evidence import Evidence, is_number, read_changed, read_runs
 from ._markdown import arxiv_ids, grid, interval, linked, prose, run_command
-from ._rows import DIVISIONS, Row, Table, _once, _Run, printable
-from ._table import MISSING, SHOWN, _escaped, _number, _title
+from ._rows import DIVISIONS, Row, Run, Table, once, printable
+from ._table import MISSING, SHOWN, escaped, number_text, title_of
 
 HEADINGS = (
     "Idea",
@@ -52,13 +52,13 @@ class Sources:
     """What they say to the claims, by id."""
     rows: Mapping[str, Row]
     """Rows of the board by method."""
-    tuning: Sequence[_Run]
+    tuning: Sequence[Run]
     """Runs on selection episodes; their method is a label, as "consft+tau_start=0.1"."""
 
 
 def read_sources(evidence: Evidence, findings: Mapping[str, Finding], board: Table, tuning: Path) -> Sources:
     """Return the sources; a folder that is not there holds no runs."""
-    runs, _ = read_runs(tuning, partial(read_changed, split="selection"), (_once,))
+    runs, _ = read_runs(tuning, partial(read_changed, split="selection"), (once,))
     rows = {row.method: row for row in board.rows if row.scenario == evidence.scenario}
     return Sources(evidence, findings, rows, [run for run in runs if run.scenario == evidence.scenario])
 
@@ -76,7 +76,7 @@ def _contents(methods: Sequence[Description]) -> str:
         members = [method for method in methods if method.division == division]
         if members:
             lines += ["", f"## {division.capitalize()}", ""]
-            lines += [f"- [{_escaped(one.name)}]({one.name}.md): {prose(one.summary)}" for one in members]
+            lines += [f"- [{escaped(one.name)}]({one.name}.md): {prose(one.summary)}" for one in members]
     return "\n".join(lines) + "\n"
 
 
@@ -94,7 +94,7 @@ def _page(method: Description, methods: Sequence[Description], sources: Sources)
         _results(method, methods, sources),
         _commands(method, sources),
     )
-    lines = [f"# {_escaped(method.name)}"]
+    lines = [f"# {escaped(method.name)}"]
     for heading, part in zip(HEADINGS, parts, strict=True):
         lines += ["", f"## {heading}", "", *part]
     return "\n".join(lines) + "\n"
@@ -127,7 +127,7 @@ def _stored(method: Description, sources: Sources) -> list[str]:
     lines += [f"- Handed from stage to stage: {prose(words)}" for words in method.seam("state")[:1]]
     costs = sources.rows[method.name].costs if method.name in sources.rows else {}
     for name, words in (("bytes_kept", "Bytes kept"), ("parameters_added", "Parameters added")):
-        value = _number(costs[name], ",.0f") if name in costs else "no records yet"
+        value = number_text(costs[name], ",.0f") if name in costs else "no records yet"
         lines.append(f"- {words}: {value}.")
     return lines
 
@@ -150,7 +150,7 @@ def _diagnostics(method: Description, sources: Sources) -> list[str]:
     figures = {
         name: sources.evidence.diagnostic(name, method.name, f"{name} of {method.name}") for name in names
     }
-    rows = [(_escaped(name), interval(figure.estimate, ".4g")) for name, figure in figures.items()]
+    rows = [(escaped(name), interval(figure.estimate, ".4g")) for name, figure in figures.items()]
     table = ["", *grid(("mean over stages and seeds", "value"), rows, 1)] if rows else []
     return [*_paragraphs(texts), *table]
 
@@ -175,10 +175,10 @@ def _board(method: Description, sources: Sources) -> list[str]:
         return []
     names = [name for name in dict.fromkeys((method.name, *BESIDE)) if name in sources.rows]
     rows = [sources.rows[name] for name in names]
-    table = [(_title(one.name), *(interval(row.estimates[one.name]) for row in rows)) for one in SHOWN]
+    table = [(title_of(one.name), *(interval(row.estimates[one.name]) for row in rows)) for one in SHOWN]
     table.append(("seeds", *(str(len(row.seeds)) for row in rows)))
-    scenario = _escaped(sources.evidence.scenario)
-    return [f"On {scenario}, with 95 % intervals:", "", *grid(("", *map(_escaped, names)), table, len(names))]
+    scenario = escaped(sources.evidence.scenario)
+    return [f"On {scenario}, with 95 % intervals:", "", *grid(("", *map(escaped, names)), table, len(names))]
 
 
 def _claims(method: Description, sources: Sources) -> list[str]:
@@ -218,15 +218,15 @@ def _tried(method: Description, methods: Sequence[Description], sources: Sources
     return [
         "On selection episodes, with seeds that no board reports; choices were made here and nowhere else.",
         "",
-        *grid(("settings", "seed", "targets", *map(_title, TRIED)), rows, 2 + len(TRIED)),
+        *grid(("settings", "seed", "targets", *map(title_of, TRIED)), rows, 2 + len(TRIED)),
     ]
 
 
-def _has_changes(run: _Run) -> bool:
+def _has_changes(run: Run) -> bool:
     return bool(run.record.run["changes"])
 
 
-def _order(run: _Run) -> list[tuple[str, str, float, str]]:
+def _order(run: Run) -> list[tuple[str, str, float, str]]:
     """Return what settings are sorted by: numbers by size."""
     changes = sorted(run.record.run["changes"].items())
     return [
@@ -235,19 +235,19 @@ def _order(run: _Run) -> list[tuple[str, str, float, str]]:
     ]
 
 
-def _settings(run: _Run, mates: Mapping[str, Description]) -> str:
+def _settings(run: Run, mates: Mapping[str, Description]) -> str:
     """Return the changed settings, and the methods of the module that have just these."""
     changes = ", ".join(f"{name} = {value}" for name, value in sorted(run.record.run["changes"].items()))
     same = [name for name, one in mates.items() if one.defaults == run.record.run["settings"]]
-    return _escaped(changes + (f" ({' and '.join(same)})" if same else ""))
+    return escaped(changes + (f" ({' and '.join(same)})" if same else ""))
 
 
-def _tried_row(settings: str, run: _Run, baseline: _Run | None) -> tuple[str, ...]:
+def _tried_row(settings: str, run: Run, baseline: Run | None) -> tuple[str, ...]:
     comparable = baseline is not None and baseline.scores.layout == run.scores.layout
     references = {"sft": baseline.scores} if comparable and baseline else {}
     values = (measure(name, run.scores, references) for name in TRIED)
     counts = (str(run.seed), str(len(run.scores.layout.target)))
-    return settings, *counts, *(_number(value, ".2f", MISSING) for value in values)
+    return settings, *counts, *(number_text(value, ".2f", MISSING) for value in values)
 
 
 def _commands(method: Description, sources: Sources) -> list[str]:

@@ -76,7 +76,7 @@ class Table:
 
 
 @dataclass(frozen=True, eq=False)
-class _Run:
+class Run:
     """A record that may become part of a row."""
 
     path: str
@@ -97,15 +97,15 @@ def read_table(records: Path) -> Table:
     """
     if not records.is_dir():
         raise FileNotFoundError(f"There is no folder of records at {records}.")
-    runs: list[_Run] = []
+    runs: list[Run] = []
     not_shown: list[NotShown] = []
     for path in sorted(records.rglob("*.json"), key=lambda path: path.relative_to(records).as_posix()):
         try:
-            runs.append(_read_run(records, path))
+            runs.append(read_run(records, path))
         except RecordError as error:
             name = path.relative_to(records).as_posix()
-            not_shown.append(_not_shown(name, str(error).removeprefix(f"{path}: ")))
-    for sift in (_once, _same_scenario, _same_simulator, _same_layout, _same_settings):
+            not_shown.append(no_row(name, str(error).removeprefix(f"{path}: ")))
+    for sift in (once, same_scenario, same_simulator, same_layout, same_settings):
         runs, refused = sift(runs)
         not_shown += refused
     rows = _rows(runs)
@@ -121,7 +121,7 @@ def _rank(row: Row) -> tuple[Hashable, ...]:
     return row.scenario, DIVISIONS.index(row.division), -math.inf if value is None else -value, row.method
 
 
-def _read_run(records: Path, path: Path) -> _Run:
+def read_run(records: Path, path: Path) -> Run:
     """Return the run of the record at `path`.
 
     Raises:
@@ -150,11 +150,11 @@ def _read_run(records: Path, path: Path) -> _Run:
         raise RecordError(f"settings were changed: {', '.join(run['changes'])}.")
     at_home = path == record_path(records, scenario, method, seed)
     name = path.relative_to(records).as_posix()
-    division = _division(run["uses"])
-    return _Run(name, at_home, record, Scores.from_record(record), scenario, method, seed, division)
+    division = division_of(run["uses"])
+    return Run(name, at_home, record, Scores.from_record(record), scenario, method, seed, division)
 
 
-def _division(uses: dict[str, Any]) -> str:
+def division_of(uses: dict[str, Any]) -> str:
     """Return what a method that declares `uses` competes with."""
     kinds = ("demonstrations", "questions")
     if any(not isinstance(uses.get(kind), str) for kind in kinds):
@@ -165,7 +165,7 @@ def _division(uses: dict[str, Any]) -> str:
     return f"prior {used[0]}" if used else "prior-data-free"
 
 
-def _not_shown(path: str, reason: str) -> NotShown:
+def no_row(path: str, reason: str) -> NotShown:
     reason = printable(reason)
     reason = reason if len(reason) <= LONGEST_REASON else f"{reason[:LONGEST_REASON]}…"
     return NotShown(printable(path), reason)
@@ -177,55 +177,55 @@ def printable(text: str) -> str:
     return "".join(visible)
 
 
-Sifted = tuple[list[_Run], list[NotShown]]
+Sifted = tuple[list[Run], list[NotShown]]
 
 
-def _once(runs: list[_Run]) -> Sifted:
+def once(runs: list[Run]) -> Sifted:
     """Keep one record of each run: that at its own path, otherwise the first."""
-    first: dict[Hashable, _Run] = {}
+    first: dict[Hashable, Run] = {}
     for run in sorted(runs, key=lambda run: not run.at_home):
         first.setdefault((run.scenario, run.method, run.seed), run)
     kept = [run for run in runs if run in first.values()]
     others = [(run, first[run.scenario, run.method, run.seed]) for run in runs if run not in kept]
-    return kept, [_not_shown(run.path, f"the same run as {one.path}.") for run, one in others]
+    return kept, [no_row(run.path, f"the same run as {one.path}.") for run, one in others]
 
 
-def _same_scenario(runs: list[_Run]) -> Sifted:
-    def reason(run: _Run, other: _Run) -> str:
-        fields = _differences(run.record.scenario, other.record.scenario)
+def same_scenario(runs: list[Run]) -> Sifted:
+    def reason(run: Run, other: Run) -> str:
+        fields = differences(run.record.scenario, other.record.scenario)
         if fields == ["budget"]:
             ours, theirs = run.record.scenario["budget"], other.record.scenario["budget"]
-            fields = [f"budget ({', '.join(_differences(ours, theirs))})"]
+            fields = [f"budget ({', '.join(differences(ours, theirs))})"]
         return f"its scenario is not that of most records: {', '.join(fields)} differ."
 
     return _most(runs, lambda run: run.scenario, lambda run: _text(run.record.scenario), reason)
 
 
-def _same_simulator(runs: list[_Run]) -> Sifted:
-    def rollouts(run: _Run) -> Any:
+def same_simulator(runs: list[Run]) -> Sifted:
+    def rollouts(run: Run) -> Any:
         return run.record.fingerprint.get("rollouts")
 
-    def reason(run: _Run, other: _Run) -> str:
-        worlds = ", ".join(_differences(rollouts(run), rollouts(other)))
+    def reason(run: Run, other: Run) -> str:
+        worlds = ", ".join(differences(rollouts(run), rollouts(other)))
         return f"its simulator is not that of most records: the rollouts of {worlds or 'all worlds'} differ."
 
     return _most(runs, lambda run: run.scenario, lambda run: _text(rollouts(run)), reason)
 
 
-def _same_layout(runs: list[_Run]) -> Sifted:
-    def reason(run: _Run, other: _Run) -> str:
-        fields = _differences(vars(run.scores.layout), vars(other.scores.layout))
+def same_layout(runs: list[Run]) -> Sifted:
+    def reason(run: Run, other: Run) -> str:
+        fields = differences(vars(run.scores.layout), vars(other.scores.layout))
         return f"it was not evaluated like most records: {', '.join(fields)} differ."
 
     return _most(runs, lambda run: run.scenario, lambda run: run.scores.layout, reason)
 
 
-def _same_settings(runs: list[_Run]) -> Sifted:
-    def reason(run: _Run, other: _Run) -> str:
+def same_settings(runs: list[Run]) -> Sifted:
+    def reason(run: Run, other: Run) -> str:
         fields = [
             name
             for part in ("settings", "uses")
-            for name in _differences(run.record.run[part], other.record.run[part])
+            for name in differences(run.record.run[part], other.record.run[part])
         ]
         return f"its settings are not those of most seeds: {', '.join(fields)} differ."
 
@@ -238,28 +238,28 @@ def _same_settings(runs: list[_Run]) -> Sifted:
 
 
 def _most(
-    runs: list[_Run],
-    group: Callable[[_Run], Hashable],
-    trait: Callable[[_Run], Hashable],
-    reason: Callable[[_Run, _Run], str],
+    runs: list[Run],
+    group: Callable[[Run], Hashable],
+    trait: Callable[[Run], Hashable],
+    reason: Callable[[Run, Run], str],
 ) -> Sifted:
     """Keep the runs that have their group's most frequent trait; of equally frequent ones the first met."""
     counts: dict[Hashable, Counter[Hashable]] = {}
-    example: dict[Hashable, _Run] = {}
+    example: dict[Hashable, Run] = {}
     for run in runs:
         counts.setdefault(group(run), Counter())[trait(run)] += 1
         example.setdefault((group(run), trait(run)), run)
     usual = {key: example[key, counter.most_common(1)[0][0]] for key, counter in counts.items()}
     kept = [run for run in runs if trait(run) == trait(usual[group(run)])]
     others = [run for run in runs if trait(run) != trait(usual[group(run)])]
-    return kept, [_not_shown(run.path, reason(run, usual[group(run)])) for run in others]
+    return kept, [no_row(run.path, reason(run, usual[group(run)])) for run in others]
 
 
 def _text(value: Any) -> str:
     return json.dumps(value, sort_keys=True)
 
 
-def _differences(values: Any, others: Any) -> list[str]:
+def differences(values: Any, others: Any) -> list[str]:
     """Return the names under which two dictionaries differ; none if they are no dictionaries."""
     if not isinstance(values, dict) or not isinstance(others, dict):
         return []
@@ -269,8 +269,8 @@ def _differences(values: Any, others: Any) -> list[str]:
     ]
 
 
-def _rows(runs: Iterable[_Run]) -> list[Row]:
-    by_scenario: dict[str, dict[str, list[_Run]]] = {}
+def _rows(runs: Iterable[Run]) -> list[Row]:
+    by_scenario: dict[str, dict[str, list[Run]]] = {}
     for run in runs:
         by_scenario.setdefault(run.scenario, {}).setdefault(run.method, []).append(run)
     never_itself = {
@@ -301,7 +301,7 @@ def _rows(runs: Iterable[_Run]) -> list[Row]:
     return rows
 
 
-def _mean_cost(runs: list[_Run], name: str) -> float | None:
+def _mean_cost(runs: list[Run], name: str) -> float | None:
     """Return the mean of a cost, None if a run does not say it as a number."""
     values = [run.record.costs.get(name) for run in runs]
     numbers = [value for value in values if isinstance(value, int | float) and abs(value) < 1e18]

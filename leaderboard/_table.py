@@ -58,7 +58,7 @@ def write_if_changed(path: Path, text: str) -> None:
     os.replace(partial, path)
 
 
-def _number(value: float | None, form: str, missing: str = MISSING) -> str:
+def number_text(value: float | None, form: str, missing: str = MISSING) -> str:
     """Return `value` in the format `form`. Rounded twice, so that the last bit of a sum does not show."""
     if value is None:
         return missing
@@ -83,7 +83,7 @@ def csv_text(table: Table) -> str:
 
 def _field(column: str, value: str | float | None) -> str:
     whole = column == "seeds" or column in COSTS
-    return value if isinstance(value, str) else _number(value, ".0f" if whole else ".4f", "")
+    return value if isinstance(value, str) else number_text(value, ".0f" if whole else ".4f", "")
 
 
 # ---- Markdown ----------------------------------------------------------------------------------------------
@@ -106,40 +106,40 @@ def markdown(table: Table) -> str:
 def _scenario(table: Table, scenario: str, rows: list[Row]) -> list[str]:
     """Return the heading, the tasks and the table of a scenario."""
     names = {
-        group: ", ".join(map(_escaped, table.scenarios[scenario][group])) or "none"
+        group: ", ".join(map(escaped, table.scenarios[scenario][group])) or "none"
         for group in ("retained", "target", "held_out")
     }
-    columns = ["method", "division", "seeds", *(_title(metric.name) for metric in SHOWN)]
+    columns = ["method", "division", "seeds", *(title_of(metric.name) for metric in SHOWN)]
     columns += ["bytes kept", "parameters added"]
     return [
         "",
-        f"## {_escaped(scenario)}",
+        f"## {escaped(scenario)}",
         "",
         f"Retained skills: {names['retained']}. Targets in order: {names['target']}. "
         f"Held-out tasks: {names['held_out']}.",
         "",
-        _line(columns),
-        _line(["---", "---", *["--:"] * (len(columns) - 2)]),
-        *(_line(_cells(row)) for row in rows),
+        table_line(columns),
+        table_line(["---", "---", *["--:"] * (len(columns) - 2)]),
+        *(table_line(_cells(row)) for row in rows),
     ]
 
 
 def _cells(row: Row) -> list[str]:
     return [
-        _escaped(row.method),
+        escaped(row.method),
         row.division,
         str(len(row.seeds)),
         *(_with_interval(row.estimates[metric.name]) for metric in SHOWN),
-        *(_number(row.costs[name], ",.0f") for name in ("bytes_kept", "parameters_added")),
+        *(number_text(row.costs[name], ",.0f") for name in ("bytes_kept", "parameters_added")),
     ]
 
 
-def _line(cells: list[str]) -> str:
+def table_line(cells: list[str]) -> str:
     return f"| {' | '.join(cells)} |"
 
 
 def _with_interval(estimate: Estimate) -> str:
-    value, low, high = (_number(one, ".2f") for one in (estimate.value, estimate.low, estimate.high))
+    value, low, high = (number_text(one, ".2f") for one in (estimate.value, estimate.low, estimate.high))
     return value if estimate.low is None else f"{value} [{low}, {high}]"
 
 
@@ -149,7 +149,7 @@ def _legend() -> list[str]:
         "",
         "## Metrics",
         "",
-        _escaped(
+        escaped(
             "R[l][s] is the success rate on task s at the end of stage l. Stage 0 is the pretrained policy, "
             "target k is learned in stage k, K is the last stage."
         ),
@@ -159,9 +159,9 @@ def _legend() -> list[str]:
         better = {True: "higher is better", False: "lower is better", None: "neither high nor low is better"}
         low, high = ("unbounded" if math.isinf(end) else f"{end:g}" for end in (metric.low, metric.high))
         lines.append(
-            f"- **{_title(metric.name)}** ({better[metric.higher_is_better]}; from {low} to {high}; "
-            f"version {metric.version}): {_escaped(metric.description)} Computed as "
-            f"{_escaped(metric.formula)}. Source: {_escaped(metric.source)}."
+            f"- **{title_of(metric.name)}** ({better[metric.higher_is_better]}; from {low} to {high}; "
+            f"version {metric.version}): {escaped(metric.description)} Computed as "
+            f"{escaped(metric.formula)}. Source: {escaped(metric.source)}."
         )
     return lines
 
@@ -169,15 +169,15 @@ def _legend() -> list[str]:
 def _not_shown(table: Table) -> list[str]:
     if not table.not_shown:
         return []
-    entries = [f"- {_escaped(entry.path)}: {_escaped(entry.reason)}" for entry in table.not_shown]
+    entries = [f"- {escaped(entry.path)}: {escaped(entry.reason)}" for entry in table.not_shown]
     return ["", "## Not shown", "", *entries]
 
 
-def _title(name: str) -> str:
+def title_of(name: str) -> str:
     return SHORT_TITLES.get(name, name.replace("_", " "))
 
 
-def _escaped(text: str) -> str:
+def escaped(text: str) -> str:
     """Return `text`, which a stranger may have written, so that Markdown shows it as it is.
 
     Backslashes go before all that can open markup, HTML, a mention or a table cell, and into web addresses.
@@ -197,7 +197,7 @@ def terminal(table: Table) -> RenderableType:
     for scenario, rows in groupby(table.rows, key=lambda row: row.scenario):
         parts.append(_grid(scenario, list(rows)))
     if parts:
-        lower = ", ".join(_title(metric.name) for metric in FITTING if metric.higher_is_better is False)
+        lower = ", ".join(title_of(metric.name) for metric in FITTING if metric.higher_is_better is False)
         parts.append(Text(f"± is half the width of a 95 % interval. Higher is better, but for {lower}.\n"))
     if table.not_shown:
         parts.append(Text("Not shown", style="bold"))
@@ -209,7 +209,7 @@ def _grid(scenario: str, rows: list[Row]) -> Grid:
     """Return the table of one scenario, with a section for each division."""
     grid = Grid(title=Text(scenario, style="bold"), box=SIMPLE_HEAD, padding=0, title_justify="left")
     grid.add_column("method", overflow="fold", min_width=20)
-    for name in ("seeds", *(_title(metric.name) for metric in FITTING)):
+    for name in ("seeds", *(title_of(metric.name) for metric in FITTING)):
         # One word a line: a header must not make its column wider than the numbers.
         grid.add_column(name.replace(" ", "\n"), justify="right")
     for division, members in groupby(rows, key=lambda row: row.division):
@@ -222,8 +222,8 @@ def _grid(scenario: str, rows: list[Row]) -> Grid:
 
 
 def _compact(estimate: Estimate) -> str:
-    value = _number(estimate.value, ".2f")
+    value = number_text(estimate.value, ".2f")
     if estimate.low is None or estimate.high is None:
         return value
-    half = _number((estimate.high - estimate.low) / 2, ".2f")
+    half = number_text((estimate.high - estimate.low) / 2, ".2f")
     return f"{value}±{half.removeprefix('0')}"

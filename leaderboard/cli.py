@@ -8,10 +8,10 @@ from pathlib import Path
 from rich.console import Console
 from rich.text import Text
 
-from . import _claims_page
+from ._claims import page
+from ._claims.evidence import CONTROLS, RECORDS, SCENARIO, STEP_TIME, TUNING, read_evidence
+from ._claims.judges import judge_all
 from ._descriptions import built_in_methods
-from ._evidence import CONTROLS, RECORDS, SCENARIO, STEP_TIME, TUNING, read_evidence
-from ._judges import judge_all
 from ._method_pages import pages, read_sources
 from ._rows import Table, read_table
 from ._table import csv_text, markdown, terminal, write_if_changed
@@ -58,8 +58,8 @@ def claims(
     evidence = read_evidence(scenario, records, controls, step_time)
     findings = judge_all(evidence)
     console = _console()
-    console.print(_claims_page.terminal(findings))
-    _write(console, output, _claims_page.page(evidence, findings))
+    console.print(page.terminal(findings))
+    _write(console, output, page.page(evidence, findings))
 
 
 def method_pages(

@@ -1,5 +1,7 @@
 """What a method requires of its hyper-parameters and of a policy, asked for by name before any training."""
 
+import math
+
 import torch
 
 from clbench.policy import TEXT_LENGTH, Batch, Policy
@@ -50,6 +52,6 @@ def in_range(name: str, value: float, low: float, high: float = float("inf")) ->
     Raises:
         ValueError: `value` is outside, or no number.
     """
-    if not low <= value <= high:
+    if not (low <= value <= high and math.isfinite(value)):
         allowed = f"from {low:g}" + (f" to {high:g}" if high < float("inf") else "")
         raise ValueError(f"{name} must be {allowed}, not {value}.")

@@ -19,7 +19,8 @@ Details:
 6. Projection is before clipping and before Adam, whose step need not be orthogonal any more.
 7. The paper fine-tunes on one data set. In a sequence the anchor stays that of the pretrained policy.
 
-`direction="random"` is the control: the same projection against a random direction of equal norm.
+`direction="random"` is the control: the same projection against a random direction. (It has the norm of the
+anchor's gradient, which the projection does not depend on.)
 """
 
 from collections.abc import Iterable

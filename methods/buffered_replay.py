@@ -34,7 +34,7 @@ class BufferedReplay(Method):
     uses = Uses(demonstrations="prepare")
 
     def __post_init__(self) -> None:
-        in_range("share", self.share, 0.0, 1.0)
+        in_range("share", self.share, 1e-9, 1.0)
         in_range("replay", self.replay, 0.0, 1.0)
 
     def _kept(self, source: Source[Batch]) -> Batch:

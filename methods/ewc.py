@@ -27,7 +27,7 @@ from ._weights import Weights, copy_of, packed, pull_back, unpacked
 class EWC(Method):
     """Penalise moving the weights that earlier skills depend on."""
 
-    strength: float = 1000.0
+    strength: float = 10000.0
     """Factor of the penalty."""
     samples: int = 256
     """Samples that the Fisher information is the mean of."""

@@ -26,7 +26,7 @@ from ._requirements import in_range
 class Finch(Method):
     """Take smaller steps while the loss is high."""
 
-    kappa: float = 0.1
+    kappa: float = 0.3
     """Root of the average loss from which on the steps are as large as scheduled."""
     momentum: float = 0.9
     """Of the exponential moving average of the loss (the paper's value)."""

@@ -9,6 +9,7 @@ Details:
 
 from dataclasses import dataclass
 
+import torch
 from torch import Tensor
 
 from clbench.method import Method, Prior, Progress, Source, Uses
@@ -40,6 +41,7 @@ class KnowledgeInsulation(Method):
     def loss(self, policy: Policy, batch: tuple[Batch, QuestionBatch], progress: Progress) -> Tensor:
         """Return the answer loss, and the action loss whose gradient ends at the head."""
         demonstrations, questions = batch
-        hidden = policy.hidden_states(demonstrations.state, demonstrations.words)
-        action_loss = policy.action_loss(demonstrations, [states.detach() for states in hidden])
+        with torch.no_grad():
+            hidden = policy.hidden_states(demonstrations.state, demonstrations.words)
+        action_loss = policy.action_loss(demonstrations, hidden)
         return policy.answer_loss(questions).mean() + self.alpha * action_loss.mean()

@@ -22,7 +22,7 @@ from ._weights import copy_of, packed, pull_back, unpacked
 class L2SP(Method):
     """Penalise the distance to the pretrained weights."""
 
-    strength: float = 0.1
+    strength: float = 0.3
     """Factor of the penalty."""
 
     def __post_init__(self) -> None:

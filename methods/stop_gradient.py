@@ -5,7 +5,7 @@ questions cannot change.
 
 Details:
 1. The hidden states of every layer are detached, keys and values alike.
-2. No weight of the backbone is given to the optimiser: weight decay would move it without a gradient.
+2. Only the head's weights are given to the optimiser.
 """
 
 from collections.abc import Iterable

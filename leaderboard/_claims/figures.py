@@ -8,7 +8,7 @@ import numpy as np
 
 from clbench.scores import Array, Rates, average
 
-from ._evidence import Evidence, Figure, Of
+from .evidence import Evidence, Figure, Of
 
 
 def retained(rates: Rates) -> Array:

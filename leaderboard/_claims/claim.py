@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-from ._evidence import Evidence, Figure
+from .evidence import Evidence, Figure
 
 Verdict = Literal["holds", "does not hold", "cannot be told"]
 

@@ -9,11 +9,11 @@ from rich.box import SIMPLE_HEAD
 from rich.table import Table as Grid
 from rich.text import Text
 
-from ._claims import CLAIMS, Claim, Finding, Paper
-from ._evidence import LEAST_SEEDS, STEP_TIME, Evidence, Figure
-from ._judges import LATER
-from ._markdown import grid, interval, linked, prose, run_command
-from ._table import MISSING, _escaped
+from .._markdown import grid, interval, linked, prose, run_command
+from .._table import MISSING, escaped
+from .claim import CLAIMS, Claim, Finding, Paper
+from .evidence import LEAST_SEEDS, STEP_TIME, Evidence, Figure
+from .judges import LATER
 
 Findings = Mapping[str, Finding]
 
@@ -51,7 +51,7 @@ def page(evidence: Evidence, findings: Findings) -> str:
 
 
 def _summary(claim: Claim, finding: Finding) -> tuple[str, ...]:
-    here = _number(finding.figures[0]) if finding.figures else MISSING
+    here = number_text(finding.figures[0]) if finding.figures else MISSING
     return (
         f"[{claim.id}](#{claim.id.lower()})",
         prose(claim.words),
@@ -86,10 +86,10 @@ def _section(evidence: Evidence, claim: Claim, finding: Finding) -> list[str]:
 
 def _row(figure: Figure, role: str) -> tuple[str, ...]:
     seeds = ", ".join(map(str, figure.seeds)) or MISSING
-    return role + prose(figure.what), _number(figure), seeds, prose(figure.note)
+    return role + prose(figure.what), number_text(figure), seeds, prose(figure.note)
 
 
-def _number(figure: Figure) -> str:
+def number_text(figure: Figure) -> str:
     return interval(figure.estimate, figure.form)
 
 
@@ -110,7 +110,7 @@ def _missing(evidence: Evidence, finding: Finding) -> list[str]:
 def _not_used(evidence: Evidence) -> list[str]:
     if not evidence.not_used:
         return []
-    entries = [f"- {_escaped(entry.path)}: {_escaped(entry.reason)}" for entry in evidence.not_used]
+    entries = [f"- {escaped(entry.path)}: {escaped(entry.reason)}" for entry in evidence.not_used]
     return ["", "## Records not used", "", *entries]
 
 
@@ -126,7 +126,7 @@ def terminal(findings: Findings) -> Grid:
         table.add_row(
             Text(f"{identifier} "),
             Text(f"{finding.verdict}  "),
-            Text(f"{_number(figure)}  " if figure else MISSING),
+            Text(f"{number_text(figure)}  " if figure else MISSING),
             Text(figure.what if figure else ""),
         )
     return table

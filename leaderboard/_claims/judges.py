@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 
-from ._claims import CLAIMS, Finding, Paper, claim, compared, compared_gains, decided, either
-from ._evidence import Evidence, Figure
-from ._figures import (
+from .claim import CLAIMS, Finding, Paper, claim, compared, compared_gains, decided, either
+from .evidence import Evidence, Figure
+from .figures import (
     answer_curve,
     drift_ratio,
     gain_over_random,

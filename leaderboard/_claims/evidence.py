@@ -15,24 +15,24 @@ import numpy as np
 from clbench.metrics import load_metric, matched_points
 from clbench.record import RecordError, read_record, record_path
 from clbench.scores import Array, Rates, Scores, average, rates_of
-from clbench.statistics import REPLICATES, Estimate, _Draw, _estimate, _rates, row_generator
+from clbench.statistics import REPLICATES, Estimate, bootstrap, interval, row_generator
 from clbench.task import Split
 
-from ._rows import (
+from .._rows import (
     NotShown,
+    Run,
     Sifted,
-    _differences,
-    _division,
-    _not_shown,
-    _once,
-    _read_run,
-    _Run,
-    _same_layout,
-    _same_scenario,
-    _same_settings,
-    _same_simulator,
+    differences,
+    division_of,
+    no_row,
+    once,
+    read_run,
+    same_layout,
+    same_scenario,
+    same_settings,
+    same_simulator,
 )
-from ._table import _title
+from .._table import title_of
 
 SCENARIO = "clbench/Fetch-v0"
 RECORDS = Path("leaderboard/records")
@@ -52,7 +52,7 @@ Quantity = Callable[[Of], Array]
 """What is measured: rates with batch axes (..., runs) become values (...)."""
 Table = Callable[[Rates], Array]
 """What a policy is at the points of each stage: rates (...) become values (..., targets, points)."""
-Sift = Callable[[list[_Run]], Sifted]
+Sift = Callable[[list[Run]], Sifted]
 """What tells runs that may be compared from those that may not."""
 
 
@@ -100,7 +100,7 @@ class Evidence:
 
     scenario: str
     """Gymnasium id."""
-    runs: Mapping[str, Mapping[int, _Run]]
+    runs: Mapping[str, Mapping[int, Run]]
     """By label of the method, as "lora" and "lora+rank=4", and by seed."""
     step_times: Mapping[str, Estimate]
     """Median time of a step divided by that of sft, by method."""
@@ -137,15 +137,7 @@ class Evidence:
         self, what: str, quantity: Quantity, methods: tuple[str, ...], seeds: tuple[int, ...]
     ) -> Estimate:
         """Return the quantity over the runs as they are, with its interval over the same as drawn."""
-        scores = self._scores(methods, seeds)
-        first, others = methods[0], {label: scores[label] for label in methods[1:]}
-        generator = row_generator(self.scenario, what)
-        draw = _Draw.make(len(seeds), scores[first][0].layout, generator, REPLICATES)
-        runs = dict(zip(seeds, scores[first], strict=True))
-        exact, drawn = (
-            quantity({first: rates, **rates.references}) for rates in _rates(runs, others, draw, generator)
-        )
-        return _estimate(float(exact), drawn)
+        return bootstrap(quantity, self._scores(methods, seeds), row_generator(self.scenario, what))
 
     def _scores(self, methods: Iterable[str], seeds: Iterable[int]) -> dict[str, list[Scores]]:
         return {label: [self.runs[label][seed].scores for seed in seeds] for label in methods}
@@ -162,13 +154,13 @@ class Evidence:
     def metric(self, name: str, method: str, **rest: Any) -> Figure:
         """Return a metric of one method."""
         methods = (method, *load_metric(name).references)
-        return self.figure(f"{_title(name)} of {method}", measured(name, method), *methods, **rest)
+        return self.figure(f"{title_of(name)} of {method}", measured(name, method), *methods, **rest)
 
     def difference(self, name: str, method: str, other: str, **rest: Any) -> Figure:
         """Return a metric of one method minus that of another."""
         one, two = measured(name, method), measured(name, other)
         methods = (method, other, *load_metric(name).references)
-        what = f"{_title(name)}, {method} - {other}"
+        what = f"{title_of(name)}, {method} - {other}"
         return self.figure(what, lambda of: one(of) - two(of), *methods, **rest)
 
     def matched_difference(self, name: str, table: Table, method: str, other: str, **rest: Any) -> Figure:
@@ -207,7 +199,7 @@ class Evidence:
     def diagnostic(self, name: str, method: str, what: str, form: str = ".2f") -> Figure:
         """Return the mean of a diagnostic over stages and seeds, with its interval over seeds."""
 
-        def values(run: _Run) -> list[Any]:
+        def values(run: Run) -> list[Any]:
             stages = run.record.diagnostics.values()
             return [stage[name] for stage in stages if isinstance(stage, dict) and name in stage]
 
@@ -216,13 +208,13 @@ class Evidence:
     def share_of_preparation(self, method: str) -> Figure:
         """Return the share of a run's optimiser steps that its preparation took, mean over seeds."""
 
-        def share(run: _Run) -> Sequence[Any]:
+        def share(run: Run) -> Sequence[Any]:
             steps, taken = (run.record.costs.get(name) for name in ("optimiser_steps", "preparation_steps"))
             return [taken / steps] if is_number(taken) and is_number(steps) and steps else []
 
         return self._mean_of(method, f"share of the optimiser steps that prepare {method}", share, ".1%")
 
-    def _mean_of(self, method: str, what: str, values: Callable[[_Run], Sequence[Any]], form: str) -> Figure:
+    def _mean_of(self, method: str, what: str, values: Callable[[Run], Sequence[Any]], form: str) -> Figure:
         runs = self.runs.get(method, {})
         missing = () if runs else (method,)
         means = [number_mean(values(run)) for run in runs.values()]
@@ -230,7 +222,7 @@ class Evidence:
             note = "" if missing else "not in these records"
             return Figure(what, (method,), NO_ESTIMATE, tuple(runs), missing, note, form)
         drawn = row_generator(self.scenario, what).choice(means, (REPLICATES, len(means))).mean(axis=-1)
-        estimate = _estimate(math.fsum(means) / len(means), drawn)
+        estimate = interval(math.fsum(means) / len(means), drawn)
         if min(means) == max(means):
             estimate = Estimate(estimate.value, None, None)
         return Figure(what, (method,), estimate, tuple(runs), (), "", form)
@@ -286,12 +278,12 @@ def _mean(values: Array) -> Array:
 
 def read_evidence(scenario: str, records: Path, controls: Path, step_time: Path) -> Evidence:
     """Return what there is; folders and files that are not there hold nothing."""
-    alike = (_same_scenario, _same_simulator, _same_layout, _same_settings)
-    scored, refused = read_runs(records, _read_run, (_once, *alike))
+    alike = (same_scenario, same_simulator, same_layout, same_settings)
+    scored, refused = read_runs(records, read_run, (once, *alike))
     changed, refused_controls = read_runs(
-        controls, partial(read_changed, split="report"), (_once, _like(scored), *alike)
+        controls, partial(read_changed, split="report"), (once, _like(scored), *alike)
     )
-    runs: dict[str, dict[int, _Run]] = {}
+    runs: dict[str, dict[int, Run]] = {}
     for run in (*scored, *changed):
         if run.scenario == scenario and run.scores.layout.target:
             runs.setdefault(run.method, {})[run.seed] = run
@@ -304,23 +296,23 @@ def read_evidence(scenario: str, records: Path, controls: Path, step_time: Path)
     )
 
 
-def read_runs(folder: Path, read: Callable[[Path, Path], _Run], sifts: Iterable[Sift]) -> Sifted:
+def read_runs(folder: Path, read: Callable[[Path, Path], Run], sifts: Iterable[Sift]) -> Sifted:
     """Return the runs of the records anywhere below `folder`, sifted, and the files that are none."""
-    runs: list[_Run] = []
+    runs: list[Run] = []
     refused: list[NotShown] = []
     for path in sorted(folder.rglob("*.json"), key=lambda path: path.relative_to(folder).as_posix()):
         try:
             runs.append(read(folder, path))
         except RecordError as error:
             name = path.relative_to(folder).as_posix()
-            refused.append(_not_shown(name, str(error).removeprefix(f"{path}: ")))
+            refused.append(no_row(name, str(error).removeprefix(f"{path}: ")))
     for sift in sifts:
         runs, others = sift(runs)
         refused += others
     return runs, refused
 
 
-def read_changed(folder: Path, path: Path, split: Split) -> _Run:
+def read_changed(folder: Path, path: Path, split: Split) -> Run:
     """Return the run of a record that makes no row of the board: of changed settings, or of tuning.
 
     Its method is the label, as "lora+rank=4".
@@ -346,8 +338,8 @@ def read_changed(folder: Path, path: Path, split: Split) -> _Run:
     label = label_of(run["method"], run["changes"])
     at_home = path == record_path(folder, run["scenario"], label, run["seed"])
     name, scores = path.relative_to(folder).as_posix(), Scores.from_record(record)
-    division = _division(run["uses"])
-    return _Run(name, at_home, record, scores, run["scenario"], label, run["seed"], division)
+    division = division_of(run["uses"])
+    return Run(name, at_home, record, scores, run["scenario"], label, run["seed"], division)
 
 
 def label_of(method: str, changes: Mapping[str, Any]) -> str:
@@ -355,25 +347,25 @@ def label_of(method: str, changes: Mapping[str, Any]) -> str:
     return "+".join([method, *(f"{name}={value}" for name, value in sorted(changes.items()))])
 
 
-def _like(scored: Sequence[_Run]) -> Sift:
+def _like(scored: Sequence[Run]) -> Sift:
     """Return what keeps the runs that were made and evaluated as those of the board were."""
     examples = {run.scenario: run for run in scored}
 
-    def traits(run: _Run) -> dict[str, Any]:
+    def traits(run: Run) -> dict[str, Any]:
         return {
             **run.record.scenario,
             "rollouts": run.record.fingerprint.get("rollouts"),
             **vars(run.scores.layout),
         }
 
-    def sift(runs: list[_Run]) -> Sifted:
+    def sift(runs: list[Run]) -> Sifted:
         kept, refused = [], []
         for run in runs:
             example = examples.get(run.scenario, run)
-            fields = _differences(traits(run), traits(example))
+            fields = differences(traits(run), traits(example))
             if fields:
                 reason = f"it cannot be compared with the board: {', '.join(fields)} differ."
-                refused.append(_not_shown(run.path, reason))
+                refused.append(no_row(run.path, reason))
             else:
                 kept.append(run)
         return kept, refused
