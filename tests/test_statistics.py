@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from clbench.metrics import METRICS, measure
+from clbench.metrics import METRICS, load_metric, measure
 from clbench.scores import Layout, Scores
-from clbench.statistics import Estimate, estimate, paired_difference, row_generator
+from clbench.statistics import Estimate, bootstrap, estimate, paired_difference, row_generator
 
 NOTHING = Estimate(None, None, None)
 
@@ -301,3 +301,16 @@ def test_a_row_takes_less_than_a_second() -> None:
     estimates = estimate(METRICS, runs, generator, references={"from_scratch": scratch, "sft": scratch})
     assert time.process_time() - begin < 1
     assert all(one.low is not None for one in estimates.values())
+
+
+def test_a_bootstrap_of_any_quantity_gives_a_difference_of_metrics_its_interval() -> None:
+    generator, shape = np.random.default_rng(5), layout(3, 8, targets=2, points=3)
+    ours, theirs = ([random_run(generator, shape) for _ in range(3)] for _ in range(2))
+    retention = load_metric("retention").over_runs
+    got = bootstrap(
+        lambda rates: retention(rates["ours"]) - retention(rates["theirs"]),
+        {"ours": ours, "theirs": theirs},
+        np.random.default_rng(1),
+    )
+    runs, others = dict(enumerate(ours)), dict(enumerate(theirs))
+    assert got == paired_difference("retention", runs, others, np.random.default_rng(1))

@@ -1,11 +1,13 @@
 """The committed board: what a scenario must show before any row on it is believed."""
 
+import dataclasses
 import importlib
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from clbench.method import load_method, method_names
 from clbench.record import read_record
 from clbench.scores import Scores
 
@@ -55,3 +57,27 @@ def test_joint_training_does_everything() -> None:
 def test_the_frozen_policy_forgets_exactly_nothing_and_does_not_know_the_targets(board: Any) -> None:
     assert board.loc["frozen", "forgetting"] == 0.0
     assert board.loc["frozen", "adaptation"] <= 0.25
+
+
+def test_every_built_in_method_has_a_row_of_three_seeds(board: Any) -> None:
+    assert set(board.index) == {name for name in method_names() if "/" not in name}
+    assert (board["seeds"] == 3).all()
+
+
+def test_stop_gradient_keeps_every_answer(board: Any) -> None:
+    before = board.loc["frozen", "question_retention"]
+    assert abs(board.loc["stop_gradient", "question_retention"] - before) <= 0.01
+
+
+def test_what_a_row_may_touch_is_what_its_class_declares() -> None:
+    for path in (RECORDS / "Fetch-v0").rglob("*.json"):
+        run = read_record(path).run
+        assert run["uses"] == dataclasses.asdict(load_method(run["method"]).uses), path
+
+
+def test_aegis_sheds_little_energy_at_every_stage() -> None:
+    for path in (RECORDS / "Fetch-v0" / "aegis").glob("*.json"):
+        for stage in ("1", "2", "3", "4"):
+            told = read_record(path).diagnostics[stage]
+            assert 0 < told["energy_shed_mean"] <= told["energy_shed_highest"] < 1
+            assert 0 < told["layers_projected_mean"] <= 1
