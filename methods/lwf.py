@@ -27,7 +27,7 @@ from ._requirements import in_range
 class LwF(Method):
     """Distil the policy's own earlier velocities on the target's data."""
 
-    strength: float = 1.0
+    strength: float = 0.1
     """Factor of the distillation loss."""
 
     def __post_init__(self) -> None:
