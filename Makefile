@@ -46,7 +46,9 @@ check: .venv/installed-dev
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 
-# The tests against the built wheel, outside the checkout.
+# What a wheel may do otherwise than the checkout, against a built one outside of it: its files, the parts that are
+# found by name, the commands.
+WHEEL_TESTS := tests/test_package.py tests/test_cli.py tests/test_readme.py tests/methods/test_methods.py tests/leaderboard
 wheel-test: .venv/installed-dev
 	rm -rf build/wheel && mkdir -p build/wheel
 	$(BIN)/python -m build --wheel --outdir build/wheel . >/dev/null
@@ -54,7 +56,7 @@ wheel-test: .venv/installed-dev
 	$(PYTHON) -m venv build/wheel/venv
 	build/wheel/venv/bin/pip install -q -c constraints.txt "$$(ls build/wheel/*.whl)[dev]"
 	outside=$$(mktemp -d) && cp -r tests pyproject.toml *.md LICENSE "$$outside" && here=$$PWD && cd "$$outside" \
-		&& $$here/build/wheel/venv/bin/python -m pytest && rm -rf "$$outside"
+		&& $$here/build/wheel/venv/bin/python -m pytest $(WHEEL_TESTS) && rm -rf "$$outside"
 
 clean:
 	rm -rf .venv build dist

@@ -266,6 +266,6 @@ def benchmark_jobs(specs: Sequence[RunSpec], records: Path) -> list[Job]:
     for spec in specs:
         arguments = {"spec": spec, "records": str(records)}
         needs = (f"pretraining seed {spec.seed}",)
-        title = f"{spec.method} seed {spec.seed}"
+        title = f"{spec.label} seed {spec.seed}"
         jobs.append(Job(title, "clbench.grid:run_job", arguments, run_length(spec.load(), spec.split), needs))
     return jobs

@@ -90,7 +90,7 @@ def stranger(monkeypatch: pytest.MonkeyPatch) -> Callable[[type[Method]], str]:
     return offer
 
 
-@pytest.mark.parametrize("method", ["aegis", "buffered_replay", "fast_dvla", "lora", "sft"])
+@pytest.mark.parametrize("method", ["aegis", "buffered_replay", "fast_dvla", "lora"])
 def test_the_same_run_twice_gives_equal_records(tmp_path: Path, method: str) -> None:
     paths = []
     for name in ("first", "second"):

@@ -73,9 +73,9 @@ def sft_degrades(evidence: Evidence) -> Finding:
 )
 def keeps_20_points_more(evidence: Evidence) -> Finding:
     """Keeps pretrained skills more than 20 points better than plain fine-tuning."""
-    published, calibrated, smaller, constant, finch = (
-        matched_retention(evidence, method, "sft")
-        for method in ("consft", "consft_calibrated", "low_rate_sft", "constant_weight", "finch")
+    arms = ("consft", "consft_calibrated", "low_rate_sft", "constant_weight", "shuffled_weights", "finch")
+    published, calibrated, smaller, constant, shuffled, finch = (
+        matched_retention(evidence, method, "sft") for method in arms
     )
     verdict, sentences = either(
         (published, calibrated),
@@ -86,11 +86,12 @@ def keeps_20_points_more(evidence: Evidence) -> Finding:
     return Finding(
         verdict,
         (published, calibrated),
-        (smaller, constant, finch),
+        (smaller, constant, shuffled, finch),
         (
             *sentences,
             compared_gains(smaller, best, does_as_well="the gain is that of a smaller step size"),
             compared_gains(constant, published, does_as_well="the gain is not from weighing samples"),
+            compared_gains(shuffled, published, does_as_well="it does not matter which samples weigh little"),
             compared_gains(finch, best, does_as_well="a step size that follows the loss is enough"),
         ),
     )

@@ -221,7 +221,8 @@ def test_the_terminal_shows_all_rows_in_100_columns(
 ) -> None:
     add("experience_replay", 0)
     printed, _ = shown()
-    assert max(map(len, printed.splitlines())) <= 100
+    table, _, _ = printed.partition("Written: ")  # the paths below it are as long as they are
+    assert max(map(len, table.splitlines())) <= 100
     for word in ("experience_replay", "from_scratch", "prior demonstrations", "reference", "0.45±."):
         assert word in printed
     row = next(line for line in printed.splitlines() if "experience_replay" in line)

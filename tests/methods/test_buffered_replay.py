@@ -57,7 +57,7 @@ def _ways(batch: Batch) -> set[tuple[float, ...]]:
     return {tuple(action) for action in batch.action[:, 0].tolist()}
 
 
-@pytest.mark.parametrize("share", [0.0, 0.02, 0.1, 1.0])
+@pytest.mark.parametrize("share", [0.001, 0.02, 0.1, 1.0])
 def test_the_buffer_holds_its_share_of_the_prior_demonstrations_at_least_one(share: float) -> None:
     method, _ = _prepared(share=share)
     assert len(method.buffer) == max(1, round(share * len(_source("left", "up"))))

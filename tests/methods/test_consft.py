@@ -14,6 +14,7 @@ from clbench.adaptation import adapt
 from clbench.demonstrations import Demonstrations, collect
 from clbench.method import Prior, Progress, Source, Stage, build_method
 from clbench.policy import Batch, Policy, PolicyConfig
+from clbench.seeding import seeded
 from clbench.task import Budget, load_scenario
 from clbench.training import MethodError, deterministic, optimise
 
@@ -237,6 +238,17 @@ def test_the_gradient_of_a_constant_weight_is_a_multiple_of_that_of_sft() -> Non
     losses = policy.action_loss(batch)
     omega = np.mean([_omega(loss, 0.0, **UNEVEN) for loss in losses.tolist()])
     torch.testing.assert_close(found, float(omega) * _gradient(policy, losses.mean()), rtol=1e-3, atol=1e-6)
+
+
+def test_shuffled_weights_are_those_of_consft_in_another_order() -> None:
+    losses = Policy(CONFIG).action_loss(_source(2).sample(64))
+    consft: Any = build_method("consft", UNEVEN)
+    shuffled: Any = build_method("shuffled_weights", UNEVEN)
+    with seeded("shuffle"):
+        theirs = shuffled.weights(losses, Progress(0, 100))
+    ours = consft.weights(losses, Progress(0, 100))
+    assert theirs.tolist() != ours.tolist()
+    assert theirs.sort().values.tolist() == ours.sort().values.tolist()
 
 
 class _Reduced(Policy):

@@ -184,7 +184,7 @@ def test_no_hyper_parameter_of_any_method_may_be_negative_or_no_number(
         ("aegis", "direction", "away", "anchor or random, not 'away'"),
         ("aegis", "samples", 0, "from 1, not 0"),
         ("buffered_replay", "replay", 1.5, "from 0 to 1, not 1.5"),
-        ("buffered_replay", "share", 1.5, "from 0 to 1, not 1.5"),
+        ("buffered_replay", "share", 1.5, "from 1e-09 to 1, not 1.5"),
         ("consft", "omega_min", 1.5, "from 0 to 1, not 1.5"),
         ("consft", "tau_start", 0.0, "from 1e-09, not 0.0"),
         ("consft", "tau_end", 0.0, "from 1e-09, not 0.0"),
