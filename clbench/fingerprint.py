@@ -15,7 +15,17 @@ import numpy as np
 
 from clbench.task import Scenario, resolve
 
-PACKAGES = ("clbench", "gymnasium", "gymnasium-robotics", "minari", "mujoco", "numpy", "tokenizers", "torch")
+PACKAGES = (
+    "clbench",
+    "gymnasium",
+    "gymnasium-robotics",
+    "minari",
+    "mujoco",
+    "numpy",
+    "peft",
+    "tokenizers",
+    "torch",
+)
 
 _ROLLOUT_STEPS = 50
 
