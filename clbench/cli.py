@@ -1,4 +1,4 @@
-"""The commands: `clbench list`, `run`, `tune`, `leaderboard`, `demonstrations`, `doctor`."""
+"""The commands: `clbench list`, `run`, `tune`, `metrics`, `leaderboard`, `demonstrations`, `doctor`."""
 
 from __future__ import annotations
 
@@ -259,6 +259,32 @@ def _tuning_table(baseline: RunSpec, specs: list[RunSpec], records: Path) -> Tab
         row = [measure(name, one, {"sft": reference} if reference else {}) for name in names]
         table.add_row(label, *("-" if value is None else f"{value:.2f}" for value in row))
     return table
+
+
+@app.command
+def metrics(name: str | None = None, /, *, markdown: Path | None = None) -> None:
+    """Show the metrics, or all about the one called NAME.
+
+    Args:
+        name: Name of a metric, as forgetting.
+        markdown: Write the page of all metrics to this file, as docs/metrics.md, and show nothing.
+    """
+    from clbench import metric_pages
+    from clbench.metrics import load_metric
+
+    console = Console()
+    with _input():
+        if name and markdown:
+            raise ValueError("The page has all metrics: give a name or --markdown, not both.")
+        metric = load_metric(name) if name else None
+    if markdown:
+        markdown.parent.mkdir(parents=True, exist_ok=True)
+        markdown.write_text(metric_pages.page(), encoding="utf-8", newline="\n")
+    elif metric:
+        console.print(metric_pages.text(metric), end="", soft_wrap=True, highlight=False, markup=False)
+    else:
+        width = max(console.width, metric_pages.WIDTH)
+        Console(width=width).print(metric_pages.table())
 
 
 @app.command

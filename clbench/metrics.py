@@ -1,6 +1,7 @@
 """Metrics: named, versioned functions from the success rates of runs to one number.
 
 A new metric is one function with the decorator `metric`; intervals, tables and tests find it by themselves.
+Here are the registry and the metrics of the leaderboard; what else was published is in `clbench.definitions`.
 
 In the formulas R[l][s] is the success rate on task s at the end of stage l, stage 0 is the pretrained policy,
 target k is learned in stage k, and K is the last stage.
@@ -45,6 +46,8 @@ class Metric:
     """None if it says nothing of better or worse."""
     units: str
     """What is counted."""
+    missing: str
+    """When it has no value, in one sentence."""
     references: tuple[str, ...]
     """Methods without whose records, of the same seeds, it has no value."""
     compares_itself: bool
@@ -71,6 +74,7 @@ def metric(
     *,
     formula: str,
     source: str,
+    missing: str,
     low: float = 0.0,
     high: float = 1.0,
     higher_is_better: bool | None = True,
@@ -96,6 +100,7 @@ def metric(
             high=high,
             higher_is_better=higher_is_better,
             units=units,
+            missing=missing,
             references=references,
             compares_itself=compares_itself,
             pooled=pooled,
@@ -133,19 +138,28 @@ def measure(name: str, scores: Scores, references: Mapping[str, Scores] | None =
 @metric(
     formula="mean of R[K][s] over the retained skills and the targets",
     source="GEM, arXiv 1706.08840 (ACC)",
+    missing="A success after the last target on a retained skill or a target is missing.",
 )
 def final_average(rates: Rates) -> Array:
     """Success after the last target on everything that was ever trained."""
     return average(np.concatenate([rates.retained[..., -1, :], rates.target[..., -1, :]], axis=-1))
 
 
-@metric(formula="mean of R[k][k] over the targets k", source="the diagonal of the matrix of arXiv 1706.08840")
+@metric(
+    formula="mean of R[k][k] over the targets k",
+    source="the diagonal of the matrix of arXiv 1706.08840",
+    missing="The success on a target right after it was learned is missing.",
+)
 def adaptation(rates: Rates) -> Array:
     """Success on each target right after it was learned."""
     return average(rates.learned)
 
 
-@metric(formula="mean of R[K][s] over the retained skills s", source="clbench")
+@metric(
+    formula="mean of R[K][s] over the retained skills s",
+    source="clbench",
+    missing="The success on a retained skill after the last target is missing.",
+)
 def retention(rates: Rates) -> Array:
     """Success on the retained skills after the last target."""
     return average(rates.retained[..., -1, :])
@@ -158,6 +172,8 @@ def retention(rates: Rates) -> Array:
     source="the protocol of ConSFT, arXiv 2605.08879, Sec. 5.1: comparison at comparable target success",
     references=("sft",),
     compares_itself=True,
+    missing="A target is never learned as well as by sft, a rate up to that point is missing, "
+    "or there is no sft.",
 )
 def retention_at_matched_adaptation(rates: Rates) -> Array:
     """Success on the retained skills at the point where the target is learned about as well as by sft.
@@ -204,6 +220,7 @@ def matched_points(rates: Rates) -> Array:
     source="Chaudhry et al. 2018, arXiv 1801.10112; the retained skills counted in",
     low=-1.0,
     higher_is_better=False,
+    missing="A success that it needs is missing, or nothing is known before the last stage.",
 )
 def forgetting(rates: Rates) -> Array:
     """Drop from the best success before the last stage to the success after it.
@@ -225,6 +242,7 @@ def forgetting(rates: Rates) -> Array:
     formula="mean of R[K][k] - R[k][k] over all targets k but the last",
     source="GEM, arXiv 1706.08840 (BWT)",
     low=-1.0,
+    missing="There are fewer than two targets, or a success on an earlier one is missing.",
 )
 def backward_transfer(rates: Rates) -> Array:
     """Change of the success on earlier targets by learning the later ones."""
@@ -240,6 +258,7 @@ def backward_transfer(rates: Rates) -> Array:
     units="share of the area that learning from scratch leaves",
     references=("from_scratch",),
     pooled=True,
+    missing="A point of a learning curve is missing, or there is no from_scratch of the same seeds.",
 )
 def forward_transfer(rates: Rates) -> Array:
     """How much faster targets are learned than from scratch.
@@ -272,6 +291,7 @@ def _area(steps: tuple[int, ...], curves: Array, starts: Array) -> Array:
     formula="right answers divided by questions, of all kinds together, at the end of stage K",
     source="clbench",
     units="share of right answers",
+    missing="No question was asked after the last target.",
 )
 def question_retention(rates: Rates) -> Array:
     """Share of the questions about the scene that are answered rightly after the last target."""
@@ -279,7 +299,11 @@ def question_retention(rates: Rates) -> Array:
     return np.where(asked > 0, correct / np.maximum(asked, 1), np.nan)
 
 
-@metric(formula="mean of R[K][s] over the held-out tasks s", source="arXiv 2603.11653 (ZS)")
+@metric(
+    formula="mean of R[K][s] over the held-out tasks s",
+    source="arXiv 2603.11653 (ZS)",
+    missing="There are no held-out tasks, or the success on one after the last target is missing.",
+)
 def zero_shot(rates: Rates) -> Array:
     """Success after the last target on tasks that were never trained."""
     return average(rates.held_out[..., -1, :])
@@ -291,6 +315,7 @@ def zero_shot(rates: Rates) -> Array:
     source="ConSFT, arXiv 2605.08879, Eq. 8",
     higher_is_better=None,
     units="share of parameters",
+    missing="It was not measured after the last target, as where a method changes the set of the parameters.",
 )
 def update_sparsity(rates: Rates) -> Array:
     """Share of the parameters that are after the last target nearly what they were after pretraining."""
@@ -304,6 +329,7 @@ def update_sparsity(rates: Rates) -> Array:
     high=math.inf,
     higher_is_better=False,
     units="squared distance",
+    missing="It was not measured after the last target.",
 )
 def activation_drift(rates: Rates) -> Array:
     """How far the hidden states have moved after the last target from where pretraining left them."""
@@ -313,3 +339,7 @@ def activation_drift(rates: Rates) -> Array:
 def _at_the_end(values: Array) -> Array:
     """Return the last of values (..., targets, points), NaN without targets."""
     return values[..., -1, -1] if values.shape[-2] else np.full(values.shape[:-2], np.nan)
+
+
+# Whoever knows this registry knows all of it; they import it, so that this stands at the end.
+import clbench.definitions  # noqa: E402, F401

@@ -49,6 +49,7 @@ def _clbench(*arguments: str, folder: Path | None = None) -> subprocess.Complete
             ["tune", "clbench/Fetch-v0", "consft", "--values.omega_min", "0.1,2"],
             "omega_min must be from 0 to 1, not 2.0",
         ),
+        (["metrics", "forgeting"], "No metric is called 'forgeting'. Did you mean 'forgetting'?"),
         (["leaderbord"], "leaderbord"),
     ],
 )
@@ -64,7 +65,17 @@ def test_bad_input_ends_with_exit_code_2_and_the_nearest_right_name(
 
 def test_help_names_every_command() -> None:
     output = _clbench("--help").stdout
-    commands = ("list", "run", "tune", "leaderboard", "claims", "method-pages", "demonstrations", "doctor")
+    commands = (
+        "list",
+        "run",
+        "tune",
+        "metrics",
+        "leaderboard",
+        "claims",
+        "method-pages",
+        "demonstrations",
+        "doctor",
+    )
     assert all(name in output for name in commands)
 
 
@@ -72,6 +83,12 @@ def test_list_shows_scenarios_and_methods() -> None:
     output = _clbench("list").stdout
     assert "clbench/Fetch-v0" in output
     assert "experience_replay" in output
+
+
+def test_metrics_shows_all_and_everything_about_one() -> None:
+    assert "positive_backward_transfer_diaz_rodriguez" in _clbench("metrics").stdout
+    output = _clbench("metrics", "worst_case_accuracy").stdout
+    assert "Formula: R[K][K] / K + (1 - 1 / K) minimum_accuracy\n" in output
 
 
 def test_doctor_shows_versions_and_rendering() -> None:

@@ -104,7 +104,8 @@ def test_a_run_of_every_method_goes_through_and_says_what_it_uses_and_costs(
     values = {
         metric.name: measure(metric.name, scores) for metric in METRICS.values() if not metric.references
     }
-    missing = {metric for metric, value in values.items() if value is None}
+    # a share of the highest success has no value where there is none
+    missing = {metric for metric, value in values.items() if value is None and not metric.endswith("_cora")}
     assert missing == ({"update_sparsity"} if record.costs["parameters_added"] else set())
     assert all(
         METRICS[metric].low <= value <= METRICS[metric].high for metric, value in values.items() if value
