@@ -217,7 +217,7 @@ def _grid(scenario: str, rows: list[Row]) -> Grid:
         grid.add_row(Text(division, style="italic"))
         for row in members:
             cells = (_compact(row.estimates[metric.name]) for metric in FITTING)
-            grid.add_row(Text(f"  {row.method}"), Text(str(len(row.seeds))), *map(Text, cells))
+            grid.add_row(Text(row.method), Text(str(len(row.seeds))), *map(Text, cells))
     return grid
 
 
