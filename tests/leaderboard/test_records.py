@@ -2,6 +2,7 @@
 
 import dataclasses
 import importlib
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -85,3 +86,21 @@ def test_aegis_sheds_little_energy_at_every_stage() -> None:
             told = read_record(path).diagnostics[stage]
             assert 0 < told["energy_shed_mean"] <= told["energy_shed_highest"] < 1
             assert 0 < told["layers_projected_mean"] <= 1
+
+
+def test_the_committed_pages_are_those_of_the_committed_records(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    checkout = RECORDS.parents[1]
+    cli = importlib.import_module("clbench.leaderboard.cli")
+    monkeypatch.chdir(checkout)
+    cli.claims(output=tmp_path / "claims.md")
+    cli.method_pages(output=tmp_path / "methods")
+    for made in sorted(tmp_path.rglob("*.md")):
+        page = made.relative_to(tmp_path)
+        assert made.read_text() == (checkout / "docs" / page).read_text(), f"{page}: run `make docs`"
+    shutil.copytree(RECORDS, tmp_path / "board" / "records")
+    cli.show(records=tmp_path / "board" / "records")
+    for name in ("LEADERBOARD.md", "leaderboard.csv"):
+        made = tmp_path / "board" / name
+        assert made.read_text() == (RECORDS.parent / name).read_text(), f"{name}: run `clbench leaderboard`"
