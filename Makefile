@@ -55,7 +55,7 @@ wheel-test: .venv/installed-dev
 	$(BIN)/python -m zipfile -l build/wheel/*.whl | grep -v '^File\|^clbench/\|^clbench-[^/]*dist-info/'; test $$? -eq 1
 	$(PYTHON) -m venv build/wheel/venv
 	build/wheel/venv/bin/pip install -q -c constraints.txt "$$(ls build/wheel/*.whl)[dev]"
-	outside=$$(mktemp -d) && cp -r tests pyproject.toml *.md LICENSE "$$outside" && here=$$PWD && cd "$$outside" \
+	outside=$$(mktemp -d) && cp -r tests docs pyproject.toml *.md LICENSE "$$outside" && here=$$PWD && cd "$$outside" \
 		&& $$here/build/wheel/venv/bin/python -m pytest $(WHEEL_TESTS) && rm -rf "$$outside"
 
 clean:
