@@ -19,15 +19,10 @@ from rich.logging import RichHandler
 from rich.table import Table
 
 import clbench
+from clbench.record import RECORDS, TUNING
 
 if TYPE_CHECKING:
     from clbench.run import RunSpec
-
-RECORDS = Path("leaderboard/records")
-"""Where records lie, seen from the working directory."""
-
-TUNING = Path("leaderboard/tuning")
-"""Where the records of tuning runs lie, seen from the working directory."""
 
 app = App(
     name="clbench",

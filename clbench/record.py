@@ -9,13 +9,19 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
 SCHEMA = 2
 """Version of the file format. A reader refuses what it does not know."""
+
+RECORDS = Path("leaderboard/records")
+"""Where the records of the board lie, seen from the working directory."""
+
+TUNING = Path("leaderboard/tuning")
+"""Where the records of tuning runs lie, seen from the working directory."""
 
 EPISODE_COLUMNS = ("stage", "step", "task", "split", "episode", "success", "return", "length")
 """`stage` 0 is the pretrained policy, `stage` k the policy while or after it learned target k; `step` counts
@@ -73,6 +79,11 @@ class Record:
     """Dates and seconds: all that may differ between two equal runs."""
     error: dict[str, str] | None = None
     """For a failed run: `where` (the seam and stage), `type`, `message`, `traceback`."""
+
+
+def label_of(method: str, changes: Mapping[str, Any]) -> str:
+    """Return the method with what was changed of it, as "experience_replay+replay=0.02"."""
+    return "+".join([method, *(f"{name}={value}" for name, value in sorted(changes.items()))])
 
 
 def record_path(records: Path, scenario: str, method: str, seed: int) -> Path:

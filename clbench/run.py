@@ -27,7 +27,7 @@ from clbench.method import Access, Method, Prior, Source, Stage, State, build_me
 from clbench.policy import load_policy, save_policy
 from clbench.pretraining import pretrained_policy, pretraining_inputs
 from clbench.questions import load_questions, report_questions
-from clbench.record import Record, RecordError, read_record, record_path, write_record
+from clbench.record import Record, RecordError, label_of, read_record, record_path, write_record
 from clbench.seeding import derive_seed, seeded, torch_generator
 from clbench.task import Scenario, Split, load_scenario
 from clbench.training import deterministic
@@ -71,7 +71,7 @@ class RunSpec:
     @property
     def label(self) -> str:
         """The method and what was changed of it, as "experience_replay+replay=0.02"."""
-        return "+".join([self.method, *(f"{name}={value}" for name, value in sorted(self.changes.items()))])
+        return label_of(self.method, self.changes)
 
 
 def execute(spec: RunSpec, records: Path, progress: Callable[[float], None] = lambda _: None) -> Record:

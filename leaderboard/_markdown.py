@@ -5,10 +5,8 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Sequence
 
-from clbench.statistics import Estimate
-
 from ._claims.evidence import CONTROLS
-from ._table import MISSING, escaped, number_text, table_line
+from ._table import escaped, table_line
 
 _ARXIV = re.compile(r"arXiv (\d{4}\.\d{5})")
 
@@ -33,14 +31,6 @@ def grid(head: Sequence[str], rows: Iterable[Sequence[str]], numbers: int = 0) -
     """Return the lines of a table whose last `numbers` columns are numbers."""
     under = ["---"] * (len(head) - numbers) + ["--:"] * numbers
     return [table_line(list(head)), table_line(under), *(table_line(list(row)) for row in rows)]
-
-
-def interval(estimate: Estimate, form: str = ".2f") -> str:
-    """Return a value with its interval, if it has one."""
-    value, low, high = (
-        number_text(one, form, MISSING) for one in (estimate.value, estimate.low, estimate.high)
-    )
-    return value if estimate.low is None or estimate.high is None else f"{value} [{low}, {high}]"
 
 
 def run_command(scenario: str, *labels: str) -> str:

@@ -12,9 +12,9 @@ from clbench.metrics import measure
 from ._claims.claim import CLAIMS, Finding
 from ._claims.evidence import Evidence, is_number, read_changed, read_runs
 from ._descriptions import Description, of_one_module
-from ._markdown import arxiv_ids, grid, interval, linked, prose, run_command
+from ._markdown import arxiv_ids, grid, linked, prose, run_command
 from ._rows import DIVISIONS, Row, Run, Table, once, printable
-from ._table import MISSING, SHOWN, escaped, number_text, title_of
+from ._table import MISSING, SHOWN, escaped, interval, number_text, title_of
 
 HEADINGS = (
     "Idea",

@@ -129,7 +129,7 @@ def _cells(row: Row) -> list[str]:
         escaped(row.method),
         row.division,
         str(len(row.seeds)),
-        *(_with_interval(row.estimates[metric.name]) for metric in SHOWN),
+        *(interval(row.estimates[metric.name]) for metric in SHOWN),
         *(number_text(row.costs[name], ",.0f") for name in ("bytes_kept", "parameters_added")),
     ]
 
@@ -138,8 +138,9 @@ def table_line(cells: list[str]) -> str:
     return f"| {' | '.join(cells)} |"
 
 
-def _with_interval(estimate: Estimate) -> str:
-    value, low, high = (number_text(one, ".2f") for one in (estimate.value, estimate.low, estimate.high))
+def interval(estimate: Estimate, form: str = ".2f") -> str:
+    """Return a value with its interval, if it has one."""
+    value, low, high = (number_text(one, form) for one in (estimate.value, estimate.low, estimate.high))
     return value if estimate.low is None else f"{value} [{low}, {high}]"
 
 

@@ -8,8 +8,10 @@ from pathlib import Path
 from rich.console import Console
 from rich.text import Text
 
+from clbench.record import RECORDS, TUNING
+
 from ._claims import page
-from ._claims.evidence import CONTROLS, RECORDS, SCENARIO, STEP_TIME, TUNING, read_evidence
+from ._claims.evidence import CONTROLS, SCENARIO, STEP_TIME, read_evidence
 from ._claims.judges import judge_all
 from ._descriptions import built_in_methods
 from ._method_pages import pages, read_sources

@@ -1,4 +1,4 @@
-"""One-sided projection of gradients: A-GEM's rule for one block of parameters."""
+"""Directions of blocks of parameters: A-GEM's one-sided projection, and a random one for controls."""
 
 from collections.abc import Sequence
 
@@ -27,3 +27,10 @@ def project_out(gradient: Sequence[Tensor], against: Sequence[Tensor]) -> float:
     for one, other in zip(gradient, against, strict=True):
         one.sub_(other, alpha=product / norm)
     return product * product / norm
+
+
+def random_like(block: Sequence[Tensor]) -> list[Tensor]:
+    """Return a random direction with the norm of the block."""
+    drawn = [torch.randn_like(one) for one in block]
+    scale = (inner(block, block) / inner(drawn, drawn)) ** 0.5
+    return [one * scale for one in drawn]

@@ -34,7 +34,7 @@ from clbench.activations import Gaussian
 from clbench.method import Method, Prior, Progress, Stage, State, Uses
 from clbench.policy import Batch, Policy
 
-from ._projection import inner, project_out
+from ._projection import inner, project_out, random_like
 from ._requirements import in_range, require_hidden_states
 
 
@@ -89,7 +89,7 @@ class Aegis(Method):
         for block in blocks:
             against = [next(away) for _ in block]
             if self.direction == "random":
-                against = _random_like(against)
+                against = random_like(against)
             gradient = [weight.grad for weight in block if weight.grad is not None]
             energy += inner(gradient, gradient)
             part = project_out(gradient, against)
@@ -125,10 +125,3 @@ class Aegis(Method):
             "layers_projected_mean": sum(self.projected) / len(self.projected),
             "anchor_distance": [float(self.distances[step]) for step in steps],
         }
-
-
-def _random_like(block: list[Tensor]) -> list[Tensor]:
-    """Return a random direction with the norm of the block."""
-    drawn = [torch.randn_like(one) for one in block]
-    scale = (inner(block, block) / inner(drawn, drawn)) ** 0.5
-    return [one * scale for one in drawn]

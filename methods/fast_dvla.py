@@ -37,6 +37,7 @@ from clbench.method import Method, Prior, Stage, State, Uses
 from clbench.policy import Batch, Policy, QuestionBatch
 from clbench.training import optimise
 
+from ._projection import random_like
 from ._requirements import in_range
 from ._weights import Weights, copy_of, packed, unpacked
 
@@ -79,7 +80,7 @@ class FastDVLA(Method):
         ]
         self.vector = self._cached_vector(policy, drawn)
         if self.direction == "random":
-            self.vector = {name: _random_like(value) for name, value in self.vector.items()}
+            self.vector = {name: random_like([value])[0] for name, value in self.vector.items()}
         with torch.no_grad():
             for name, parameter in policy.named_parameters():
                 parameter.add_(self.vector[name], alpha=self.alpha)
@@ -145,10 +146,3 @@ def _fine_tuned(policy: Policy, drawn: Drawn, auxiliary: float, step_size: float
 
     optimise(copy.parameters(), step_size, len(drawn), loss_at)
     return copy_of(copy)
-
-
-def _random_like(value: Tensor) -> Tensor:
-    """Return a random tensor with the norm of `value`."""
-    drawn = torch.randn_like(value)
-    scaled: Tensor = drawn * (value.norm() / drawn.norm())
-    return scaled

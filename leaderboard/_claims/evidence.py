@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from clbench.metrics import load_metric, matched_points
-from clbench.record import RecordError, read_record, record_path
+from clbench.record import RecordError, label_of, read_record, record_path
 from clbench.scores import Array, Rates, Scores, average, rates_of
 from clbench.statistics import REPLICATES, Estimate, bootstrap, interval, row_generator
 from clbench.task import Split
@@ -35,9 +35,7 @@ from .._rows import (
 from .._table import title_of
 
 SCENARIO = "clbench/Fetch-v0"
-RECORDS = Path("leaderboard/records")
 CONTROLS = Path("leaderboard/controls")
-TUNING = Path("leaderboard/tuning")
 STEP_TIME = Path("benchmarks/results/step_time.json")
 """Where things lie, seen from the working directory. Pages name these, wherever they were read from."""
 
@@ -340,11 +338,6 @@ def read_changed(folder: Path, path: Path, split: Split) -> Run:
     name, scores = path.relative_to(folder).as_posix(), Scores.from_record(record)
     division = division_of(run["uses"])
     return Run(name, at_home, record, scores, run["scenario"], label, run["seed"], division)
-
-
-def label_of(method: str, changes: Mapping[str, Any]) -> str:
-    """Return the method with what was changed of it, as the folder of its records is called."""
-    return "+".join([method, *(f"{name}={value}" for name, value in sorted(changes.items()))])
 
 
 def _like(scored: Sequence[Run]) -> Sift:

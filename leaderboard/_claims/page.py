@@ -9,8 +9,8 @@ from rich.box import SIMPLE_HEAD
 from rich.table import Table as Grid
 from rich.text import Text
 
-from .._markdown import grid, interval, linked, prose, run_command
-from .._table import MISSING, escaped
+from .._markdown import grid, linked, prose, run_command
+from .._table import MISSING, escaped, interval
 from .claim import CLAIMS, Claim, Finding, Paper
 from .evidence import LEAST_SEEDS, STEP_TIME, Evidence, Figure
 from .judges import LATER
