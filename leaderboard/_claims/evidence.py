@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -13,30 +12,26 @@ from typing import Any
 import numpy as np
 
 from clbench.metrics import load_metric, matched_points
-from clbench.record import RecordError, label_of, read_record, record_path
 from clbench.scores import Array, Rates, Scores, average, rates_of
-from clbench.statistics import REPLICATES, Estimate, bootstrap, interval, row_generator
-from clbench.task import Split
+from clbench.statistics import Estimate, bootstrap, interval, row_generator
 
-from .._rows import (
+from .._costs import read_step_times
+from .._runs import (
+    ALIKE,
     NotShown,
     Run,
+    Sift,
     Sifted,
     differences,
-    division_of,
+    is_number,
     no_row,
-    once,
     read_run,
-    same_layout,
-    same_scenario,
-    same_settings,
-    same_simulator,
+    read_runs,
 )
 from .._table import title_of
 
 SCENARIO = "clbench/Fetch-v0"
 CONTROLS = Path("leaderboard/controls")
-STEP_TIME = Path("benchmarks/results/step_time.json")
 """Where things lie, seen from the working directory. Pages name these, wherever they were read from."""
 
 LEAST_SEEDS = 2
@@ -50,8 +45,6 @@ Quantity = Callable[[Of], Array]
 """What is measured: rates with batch axes (..., runs) become values (...)."""
 Table = Callable[[Rates], Array]
 """What a policy is at the points of each stage: rates (...) become values (..., targets, points)."""
-Sift = Callable[[list[Run]], Sifted]
-"""What tells runs that may be compared from those that may not."""
 
 
 @dataclass(frozen=True)
@@ -108,7 +101,13 @@ class Evidence:
     # ---- figures of scores -------------------------------------------------------------------------
 
     def figure(
-        self, what: str, quantity: Quantity, *methods: str, seeds: Sequence[int] | None = None, **rest: Any
+        self,
+        what: str,
+        quantity: Quantity,
+        *methods: str,
+        seeds: Sequence[int] | None = None,
+        span: tuple[float, float] = (-math.inf, math.inf),
+        **rest: Any,
     ) -> Figure:
         """Return `quantity` with its interval, from the seeds that all methods have.
 
@@ -117,12 +116,16 @@ class Evidence:
             quantity: What is measured.
             methods: Labels of all methods that it looks at, the one that it is about first.
             seeds: Those to take of the common ones; all if None.
+            span: Least and greatest possible value.
             rest: Further fields of the figure.
         """
         methods = tuple(dict.fromkeys(methods))
         missing = tuple(label for label in methods if label not in self.runs)
         common = self.common_seeds(methods) if seeds is None else tuple(seeds)
-        found = NO_ESTIMATE if missing or not common else self._bootstrapped(what, quantity, methods, common)
+        found = NO_ESTIMATE
+        if common and not missing:
+            generator = row_generator(self.scenario, what)
+            found = bootstrap(quantity, self._scores(methods, common), generator, span=span)
         if not missing and not common:
             rest.setdefault("note", "no seed that all of them have")
         elif not missing and found.value is None:
@@ -130,12 +133,6 @@ class Evidence:
         elif not missing and len(common) < LEAST_SEEDS:
             rest.setdefault("note", "one seed: the interval says nothing of others and decides nothing")
         return Figure(what, methods, found, common, missing, **rest)
-
-    def _bootstrapped(
-        self, what: str, quantity: Quantity, methods: tuple[str, ...], seeds: tuple[int, ...]
-    ) -> Estimate:
-        """Return the quantity over the runs as they are, with its interval over the same as drawn."""
-        return bootstrap(quantity, self._scores(methods, seeds), row_generator(self.scenario, what))
 
     def _scores(self, methods: Iterable[str], seeds: Iterable[int]) -> dict[str, list[Scores]]:
         return {label: [self.runs[label][seed].scores for seed in seeds] for label in methods}
@@ -151,15 +148,17 @@ class Evidence:
 
     def metric(self, name: str, method: str, **rest: Any) -> Figure:
         """Return a metric of one method."""
-        methods = (method, *load_metric(name).references)
-        return self.figure(f"{title_of(name)} of {method}", measured(name, method), *methods, **rest)
+        metric = load_metric(name)
+        what, span = f"{title_of(name)} of {method}", (metric.low, metric.high)
+        return self.figure(what, measured(name, method), method, *metric.references, span=span, **rest)
 
     def difference(self, name: str, method: str, other: str, **rest: Any) -> Figure:
         """Return a metric of one method minus that of another."""
         one, two = measured(name, method), measured(name, other)
-        methods = (method, other, *load_metric(name).references)
+        metric = load_metric(name)
+        methods, reach = (method, other, *metric.references), metric.high - metric.low
         what = f"{title_of(name)}, {method} - {other}"
-        return self.figure(what, lambda of: one(of) - two(of), *methods, **rest)
+        return self.figure(what, lambda of: one(of) - two(of), *methods, span=(-reach, reach), **rest)
 
     def matched_difference(self, name: str, table: Table, method: str, other: str, **rest: Any) -> Figure:
         """Return the difference of two methods where each has learned the target about as well as sft.
@@ -219,10 +218,8 @@ class Evidence:
         if not means or not np.isfinite(means).all():
             note = "" if missing else "not in these records"
             return Figure(what, (method,), NO_ESTIMATE, tuple(runs), missing, note, form)
-        drawn = row_generator(self.scenario, what).choice(means, (REPLICATES, len(means))).mean(axis=-1)
-        estimate = interval(math.fsum(means) / len(means), drawn)
-        if min(means) == max(means):
-            estimate = Estimate(estimate.value, None, None)
+        without_one = [number_mean(means[:place] + means[place + 1 :]) for place in range(len(means))]
+        estimate = interval(number_mean(means), np.array(without_one if len(means) > 1 else []))
         return Figure(what, (method,), estimate, tuple(runs), (), "", form)
 
     def step_time(self, method: str) -> Figure:
@@ -238,11 +235,6 @@ def number_mean(values: Sequence[Any]) -> float:
     if not values or not all(is_number(value) for value in values):
         return math.nan
     return math.fsum(values) / len(values)
-
-
-def is_number(value: Any) -> bool:
-    """Return whether a stranger's value is a number of any use."""
-    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e18
 
 
 # ---- quantities --------------------------------------------------------------------------------------------
@@ -276,11 +268,8 @@ def _mean(values: Array) -> Array:
 
 def read_evidence(scenario: str, records: Path, controls: Path, step_time: Path) -> Evidence:
     """Return what there is; folders and files that are not there hold nothing."""
-    alike = (same_scenario, same_simulator, same_layout, same_settings)
-    scored, refused = read_runs(records, read_run, (once, *alike))
-    changed, refused_controls = read_runs(
-        controls, partial(read_changed, split="report"), (once, _like(scored), *alike)
-    )
+    scored, refused = read_runs(records, read_run, ALIKE)
+    changed, refused_controls = read_runs(controls, partial(read_run, changed=True), (_like(scored), *ALIKE))
     runs: dict[str, dict[int, Run]] = {}
     for run in (*scored, *changed):
         if run.scenario == scenario and run.scores.layout.target:
@@ -289,55 +278,9 @@ def read_evidence(scenario: str, records: Path, controls: Path, step_time: Path)
     return Evidence(
         scenario,
         {label: dict(sorted(seeds.items())) for label, seeds in sorted(runs.items())},
-        _read_step_times(step_time),
+        read_step_times(step_time),
         tuple(NotShown(f"{name}/{entry.path}", entry.reason) for name, entry in not_used),
     )
-
-
-def read_runs(folder: Path, read: Callable[[Path, Path], Run], sifts: Iterable[Sift]) -> Sifted:
-    """Return the runs of the records anywhere below `folder`, sifted, and the files that are none."""
-    runs: list[Run] = []
-    refused: list[NotShown] = []
-    for path in sorted(folder.rglob("*.json"), key=lambda path: path.relative_to(folder).as_posix()):
-        try:
-            runs.append(read(folder, path))
-        except RecordError as error:
-            name = path.relative_to(folder).as_posix()
-            refused.append(no_row(name, str(error).removeprefix(f"{path}: ")))
-    for sift in sifts:
-        runs, others = sift(runs)
-        refused += others
-    return runs, refused
-
-
-def read_changed(folder: Path, path: Path, split: Split) -> Run:
-    """Return the run of a record that makes no row of the board: of changed settings, or of tuning.
-
-    Its method is the label, as "lora+rank=4".
-
-    Raises:
-        RecordError: It cannot be read, failed, or is of another split.
-    """
-    record = read_record(path)
-    run, error = record.run, record.error or {}
-    if record.status == "failed":
-        what = ": ".join(str(error[key]) for key in ("where", "type", "message") if key in error)
-        raise RecordError(f"the run failed ({what or 'without a word'}).")
-    names = {"scenario": str, "method": str, "seed": int, "settings": dict, "changes": dict, "uses": dict}
-    for name, kind in names.items():
-        if not isinstance(run.get(name), kind):
-            raise RecordError(f"run: {name} is missing or malformed.")
-    if run.get("split") != split:
-        raise RecordError(f"it is of the split {run.get('split')!r}, not {split!r}.")
-    if split == "report" and not run["changes"]:
-        raise RecordError("no setting was changed: its place is among the records of the board.")
-    if record.scenario.get("id") != run["scenario"]:
-        raise RecordError("scenario: its id is not that of the scenario that was run.")
-    label = label_of(run["method"], run["changes"])
-    at_home = path == record_path(folder, run["scenario"], label, run["seed"])
-    name, scores = path.relative_to(folder).as_posix(), Scores.from_record(record)
-    division = division_of(run["uses"])
-    return Run(name, at_home, record, scores, run["scenario"], label, run["seed"], division)
 
 
 def _like(scored: Sequence[Run]) -> Sift:
@@ -364,20 +307,3 @@ def _like(scored: Sequence[Run]) -> Sift:
         return kept, refused
 
     return sift
-
-
-def _read_step_times(path: Path) -> dict[str, Estimate]:
-    """Return the ratios in the file that the speed benchmark leaves, none if it is not there or torn."""
-    try:
-        ratios = json.loads(path.read_text(encoding="utf-8"))["ratios"]
-        found = {
-            method: tuple(entry.get(key) for key in ("median_ratio", "low", "high"))
-            for method, entry in ratios.items()
-        }
-    except (OSError, ValueError, RecursionError, KeyError, TypeError, AttributeError):
-        return {}
-    return {
-        method: Estimate(*(value if is_number(value) else None for value in values))
-        for method, values in found.items()
-        if is_number(values[0])
-    }

@@ -9,10 +9,11 @@ from rich.box import SIMPLE_HEAD
 from rich.table import Table as Grid
 from rich.text import Text
 
+from .._costs import STEP_TIME
 from .._markdown import grid, linked, prose, run_command
 from .._table import MISSING, escaped, interval
 from .claim import CLAIMS, Claim, Finding, Paper
-from .evidence import LEAST_SEEDS, STEP_TIME, Evidence, Figure
+from .evidence import LEAST_SEEDS, Evidence, Figure
 from .judges import LATER
 
 Findings = Mapping[str, Finding]
@@ -29,7 +30,7 @@ def page(evidence: Evidence, findings: Findings) -> str:
         prose(
             f"What the records of {evidence.scenario} say to the claims of the papers. Made by `clbench "
             "claims` from records alone, each verdict by a rule that was in the code before the records. "
-            "Numbers are means over seeds with 95 % intervals from resampling seeds and episodes; "
+            "Numbers are means over seeds with 95 % intervals over seeds (docs/statistics.md); "
             "differences and ratios are paired by seed and episode. Where a rule asks for an interval, it "
             f"needs {LEAST_SEEDS} seeds. Matched adaptation: each method is looked at where it first reaches "
             "90 % of what sft reaches on the target. A control does what the method does, but for the one "

@@ -164,7 +164,7 @@ CASES: list[tuple[str, str, Given]] = [
             "buffered_replay": {},
         },
     ),
-    ("C4", "holds", {"sft": {"sparsity": 0.3}, "consft": {"sparsity": (0.4, 0.5, 0.6)}}),
+    ("C4", "holds", {"sft": {"sparsity": 0.3}, "consft": {"sparsity": (0.45, 0.5, 0.55)}}),
     ("C4", "does not hold", {"sft": {"sparsity": 0.3}, "consft": {"sparsity": 0.3}}),
     ("C4", "cannot be told", {"sft": {"sparsity": 0.5}, "consft": {"sparsity": (0.4, 0.5, 0.6)}}),
     ("C4", "cannot be told", {"sft": {"sparsity": 0.3, "seeds": 1}, "consft": {"sparsity": 0.9, "seeds": 1}}),

@@ -189,12 +189,12 @@ def test_the_claims_on_a_method_are_linked_with_their_verdicts(bench: Bench) -> 
 
 
 def test_scalar_diagnostics_are_averaged_over_stages_and_seeds(bench: Bench) -> None:
-    for seed, shed in enumerate((0.01, 0.03)):
+    for seed, shed in enumerate((0.019, 0.02, 0.021)):
         stages = {str(stage): {"energy_shed_mean": shed, "anchor_distance": [1.0]} for stage in (1, 2)}
         bench.add("aegis", seed=seed, diagnostics={"0": "none", **stages})
     told = part(bench.pages()["aegis"], "Diagnostics")
     assert told.startswith("What was projected")
-    assert "| energy_shed_mean | 0.02 [0.01, 0.03] |" in told
+    assert "| energy_shed_mean | 0.02 [0.01752, 0.02248] |" in told
     assert "| anchor_distance" not in told
 
 
