@@ -9,10 +9,15 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
+import uuid
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
+
+from clbench.names import check_label, check_plain, check_scenario_id, folder_name
+from clbench.strict_json import StrictJSONError, quoted, read_json
+from clbench.task import unknown
 
 SCHEMA = 2
 """Version of the file format. A reader refuses what it does not know."""
@@ -42,6 +47,34 @@ POLICY_COLUMNS = ("stage", "step", "update_sparsity", "activation_drift")
 squared 2-Wasserstein distance between its hidden states on the questions and those of the pretrained policy,
 mean over layers. Each may be None.
 """
+
+MOST_ROWS = 200_000
+"""Rows of a table. A record of Fetch-v0 has 1,780 episodes."""
+
+_Fields = Mapping[str, type | None]
+"""Types of the values that must be there by name; None for any."""
+
+_RUN: _Fields = {
+    "scenario": str,
+    "method": str,
+    "seed": int,
+    "device": str,
+    "split": str,
+    "settings": dict,
+    "changes": dict,
+    "uses": dict,
+}
+_SCENARIO: _Fields = {
+    "id": str,
+    "retained": list,
+    "target": list,
+    "held_out": list,
+    "evaluation_steps": list,
+    "budget": dict,
+}
+_ERROR: _Fields = dict.fromkeys(("where", "type", "message", "traceback"), str)
+
+_WORDS = {str: "a text", int: "a whole number", list: "a list", dict: "an object with named entries"}
 
 
 class RecordError(ValueError):
@@ -86,22 +119,49 @@ def label_of(method: str, changes: Mapping[str, Any]) -> str:
     return "+".join([method, *(f"{name}={value}" for name, value in sorted(changes.items()))])
 
 
-def record_path(records: Path, scenario: str, method: str, seed: int) -> Path:
-    """Return where the record of a run lies below the folder `records`."""
-    folder = [
-        part.replace("/", "--").replace(":", "--") for part in (scenario.removeprefix("clbench/"), method)
-    ]
-    return records.joinpath(*folder, f"seed-{seed}.json")
+def record_name(scenario: str, label: str, seed: int) -> Path:
+    """Return where the record of a run lies, seen from the folder of records; no other run has this place.
+
+    Args:
+        scenario: Gymnasium id.
+        label: The method and what was changed of it, see `label_of`.
+        seed: Of the run.
+
+    Raises:
+        ValueError: A name is refused.
+    """
+    check_scenario_id(scenario)
+    check_label(label)
+    return Path(folder_name(scenario), folder_name(label), f"seed-{seed}.json")
+
+
+def record_path(records: Path, scenario: str, label: str, seed: int) -> Path:
+    """Return where the record of a run lies below the folder `records`, see `record_name`.
+
+    Raises:
+        ValueError: A name is refused, or a symbolic link leads out of the folder.
+    """
+    path = records / record_name(scenario, label, seed)
+    if not path.parent.resolve().is_relative_to(records.resolve()):
+        raise ValueError(f"{path.parent}: a symbolic link leads out of {records}.")
+    return path
 
 
 def write_record(record: Record, path: Path) -> None:
-    """Write `record` to `path` in one step: a reader sees the whole file or none."""
+    """Write `record` to `path` in one step: a reader sees the whole file or none.
+
+    A symbolic link that is there is replaced, and what it leads to is left alone.
+    """
     values = {"schema": SCHEMA, **dataclasses.asdict(record)}
     text = "{\n" + ",\n".join(f"{json.dumps(key)}: {_dump(value)}" for key, value in values.items()) + "\n}\n"
     path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
-    partial.write_text(text, encoding="utf-8")
-    os.replace(partial, path)
+    partial = path.with_name(f".{path.name}.{uuid.uuid4().hex}.partial")
+    try:
+        with open(partial, "x", encoding="utf-8") as file:
+            file.write(text)
+        os.replace(partial, path)
+    finally:
+        partial.unlink(missing_ok=True)
 
 
 def _dump(value: Any) -> str:
@@ -113,47 +173,85 @@ def _dump(value: Any) -> str:
 
 
 def read_record(path: Path) -> Record:
-    """Read the record at `path`.
+    """Read the record at `path`, which a stranger may have written.
+
+    What its values mean is not looked at: that they can be together is checked by `Scores.from_record`.
 
     Raises:
-        RecordError: The file is torn, foreign, of another schema, or its columns do not fit together.
+        RecordError: It is not a regular file of JSON within the limits, is of another schema, has a field too
+            many or too few, or its columns do not fit together.
     """
     try:
-        values = json.loads(path.read_text(encoding="utf-8"), parse_constant=_no_number)
-    except OSError as error:
-        raise RecordError(f"{path}: cannot be read ({error.strerror}).") from error
-    except (ValueError, RecursionError) as error:
-        raise RecordError(f"{path}: cannot be read as JSON ({error}).") from error
+        return _record(read_json(path))
+    except (StrictJSONError, RecordError) as error:
+        raise RecordError(f"{path}: {error}") from error
+
+
+def _record(values: Any) -> Record:
     schema = values.pop("schema", None) if isinstance(values, dict) else None
     if type(schema) is int and 0 < schema < SCHEMA:
-        raise RecordError(
-            f"{path}: is of the older schema {schema}, not {SCHEMA}: its run must be done again."
-        )
-    if schema != SCHEMA:
-        raise RecordError(f"{path}: is no record of schema {SCHEMA}.")
-    names = {entry.name for entry in dataclasses.fields(Record)}
-    if set(values) != names:
-        raise RecordError(f"{path}: fields differ from schema {SCHEMA}: {sorted(set(values) ^ names)}.")
+        raise RecordError(f"is of the older schema {schema}, not {SCHEMA}: its run must be done again.")
+    if type(schema) is not int or schema != SCHEMA:
+        raise RecordError(f"is no record of schema {SCHEMA}.")
+    names = [entry.name for entry in dataclasses.fields(Record)]
+    _check_fields(f"a record of schema {SCHEMA}", values, dict.fromkeys(names))
     record = Record(**values)
     if record.status not in ("success", "failed"):
-        raise RecordError(f"{path}: status must be success or failed, not {record.status!r}.")
-    for name in ("run", "scenario", "costs", "diagnostics", "fingerprint", "timing", "error"):
-        if not isinstance(values[name], dict) and not (name == "error" and values[name] is None):
-            raise RecordError(f"{path}: {name} must be an object with named entries.")
-    _check_columns(path, "episodes", record.episodes, EPISODE_COLUMNS)
-    _check_columns(path, "answers", record.answers, ANSWER_COLUMNS)
-    _check_columns(path, "policy", record.policy, POLICY_COLUMNS)
+        raise RecordError(f"status must be success or failed, not {quoted(str(record.status))}.")
+    _check_fields("run", record.run, _RUN)
+    _check_fields("scenario", record.scenario, _SCENARIO)
+    for name in ("costs", "diagnostics", "fingerprint", "timing"):
+        _check_type(name, values[name], dict)
+    if record.status == "failed":
+        _check_fields("error", record.error, _ERROR)
+    elif record.error is not None:
+        raise RecordError("error must be null: the run went through.")
+    _check_columns("episodes", record.episodes, EPISODE_COLUMNS)
+    _check_columns("answers", record.answers, ANSWER_COLUMNS)
+    _check_columns("policy", record.policy, POLICY_COLUMNS)
+    groups = (record.scenario[group] for group in ("retained", "target", "held_out"))
+    _check_names("task", (name for group in groups for name in group))
+    _check_names("kind of question", set(record.answers["kind"]))
     return record
 
 
-def _no_number(name: str) -> Any:
-    """Refuse NaN and infinities, which Python reads although JSON has none."""
-    raise ValueError(f"{name} is no number")
+def _check_fields(where: str, values: Any, fields: _Fields) -> None:
+    """Refuse what is not an object with exactly these entries."""
+    _check_type(where, values, dict)
+    missing = [name for name in fields if name not in values]
+    if missing:
+        raise RecordError(f"{where}: {', '.join(missing)} is missing.")
+    for name in values:
+        if name not in fields:
+            raise RecordError(str(unknown(f"field of {where}", name, fields)))
+    for name, kind in fields.items():
+        if kind is not None:
+            _check_type(f"{where}: {name}", values[name], kind)
 
 
-def _check_columns(path: Path, name: str, table: Any, columns: Iterable[str]) -> None:
+def _check_type(where: str, value: Any, kind: type) -> None:
+    # not isinstance: True would pass for a whole number
+    if type(value) is not kind:
+        raise RecordError(f"{where} must be {_WORDS[kind]}, not {json.dumps(value)[:60]}.")
+
+
+def _check_columns(name: str, table: Any, columns: Iterable[str]) -> None:
     if not isinstance(table, dict) or tuple(table) != tuple(columns):
-        raise RecordError(f"{path}: {name} must have the columns {', '.join(columns)}.")
+        raise RecordError(f"{name} must have the columns {', '.join(columns)}.")
     lengths = {len(column) if isinstance(column, list) else -1 for column in table.values()}
     if len(lengths) != 1 or -1 in lengths:
-        raise RecordError(f"{path}: the columns of {name} have different lengths.")
+        raise RecordError(f"the columns of {name} have different lengths.")
+    if max(lengths) > MOST_ROWS:
+        raise RecordError(f"{name} has {max(lengths):,} rows, more than {MOST_ROWS:,}.")
+    for column, values in table.items():
+        if {list, dict} & set(map(type, values)):
+            raise RecordError(f"{name}: {column} must not hold lists or objects.")
+
+
+def _check_names(kind: str, names: Iterable[Any]) -> None:
+    for name in names:
+        _check_type(f"the name of a {kind}", name, str)
+        try:
+            check_plain(kind, name)
+        except ValueError as error:
+            raise RecordError(str(error)) from error

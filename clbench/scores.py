@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import chain
@@ -10,13 +11,20 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from clbench.record import Record, RecordError
+from clbench.record import EPISODE_COLUMNS, Record, RecordError
 from clbench.task import Group
 
 Array = NDArray[np.float64]
 
 MOST = 10**9
 """More steps, episodes or questions than any run has: a number beyond it is damage."""
+
+MOST_POINTS = 100
+"""Evaluation points of a stage."""
+
+MOST_CELLS = 20_000
+"""Cells of a table of rates, such as stages x points x tasks: 2,000 replicates of it take 320 MB. Fetch-v0
+has 240, a sequence of 40 targets among 50 tasks 8,200."""
 
 FARTHEST = 1e18
 """A greater activation drift than any policy has whose hidden states are numbers of any use."""
@@ -105,6 +113,9 @@ class Scores:
             if row.split == "selection" and row.stage and row.task == target[row.stage - 1]
         ]
         kinds, counts = _answers(record, len(target), steps)
+        # few rows may ask for more memory than there is
+        _check_cells("stages x points x tasks", len(target) + 1, len(steps), len(tasks))
+        _check_cells("tasks x episodes", len(tasks), len(_numbers(rows)))
         layout = Layout(
             retained,
             target,
@@ -118,14 +129,15 @@ class Scores:
         )
         # one table for all points, with a place for the pretrained policy's; the end is the last point
         success = np.full((len(target) + 1, len(steps), len(tasks), len(layout.episodes)), np.nan)
+        of_task, of_episode = _places(tasks), _places(layout.episodes)
         for row in scored:
-            where = row.stage, _point(row.stage, row.step, steps), tasks.index(row.task)
-            success[where][layout.episodes.index(row.episode)] = row.success
+            where = row.stage, _point(row.stage, row.step, steps), of_task[row.task], of_episode[row.episode]
+            success[where] = row.success
         on_selection = np.full((len(target), len(steps), len(layout.selection_episodes)), np.nan)
+        of_selection = _places(layout.selection_episodes)
         for row in chosen_on:
-            where = row.stage - 1, steps.index(row.step), layout.selection_episodes.index(row.episode)
-            on_selection[where] = row.success
-        in_curves = [layout.episodes.index(number) for number in layout.curve_episodes]
+            on_selection[row.stage - 1, steps.index(row.step), of_selection[row.episode]] = row.success
+        in_curves = [of_episode[number] for number in layout.curve_episodes]
         sparsity, drift = _policy(record, len(target), steps)
         return cls(
             layout,
@@ -160,7 +172,7 @@ class Scores:
 
         success = np.einsum("lte,...te->...lt", self.success, counts) / number
         if layout.curve_episodes:
-            weights = counts[..., [layout.episodes.index(episode) for episode in layout.curve_episodes]]
+            weights = counts[..., np.searchsorted(layout.episodes, layout.curve_episodes)]
             weights = np.where(weights.sum(axis=-1, keepdims=True) > 0, weights, 1.0)
             weights = weights / weights.sum(axis=-1, keepdims=True)
             on_the_way = np.einsum("kpte,...te->...kpt", self.on_the_way, weights)
@@ -212,7 +224,20 @@ def _steps(record: Record) -> tuple[int, ...]:
         or steps != sorted(set(steps))
     ):
         raise RecordError("scenario: evaluation_steps must be a list of rising whole numbers above 0.")
+    if len(steps) > MOST_POINTS:
+        raise RecordError(f"scenario: {len(steps):,} evaluation_steps; {MOST_POINTS} are the most.")
     return tuple(steps)
+
+
+def _places(names: Sequence[Any]) -> dict[Any, int]:
+    return {name: place for place, name in enumerate(names)}
+
+
+def _check_cells(what: str, *sizes: int) -> None:
+    """Refuse a table that is too large to be resampled."""
+    if math.prod(sizes) > MOST_CELLS:
+        text = " x ".join(f"{size:,}" for size in sizes)
+        raise RecordError(f"it is too large to be shown: {what} are {text}, and {MOST_CELLS:,} are the most.")
 
 
 def _split(record: Record) -> str:
@@ -237,19 +262,24 @@ def _point(stage: int, step: int, steps: tuple[int, ...]) -> int:
 
 def _episodes(record: Record, tasks: tuple[str, ...], stages: int, steps: tuple[int, ...]) -> list[_Episode]:
     """Return the episodes, each checked."""
-    columns = (record.episodes[name] for name in ("stage", "step", "task", "split", "episode", "success"))
-    rows = []
-    for number, (stage, step, task, split, episode, success) in enumerate(zip(*columns, strict=True)):
+    rows, known = [], set(tasks)
+    columns = (record.episodes[name] for name in EPISODE_COLUMNS)
+    for number, values in enumerate(zip(*columns, strict=True)):
+        stage, step, task, split, episode, success, total_reward, length = values
         where = f"episodes: row {number}"
         _check_when(where, stage, step, stages, steps)
         if type(episode) is not int or not 0 <= episode <= MOST:
             raise RecordError(f"{where} has an impossible number of an episode.")
-        if task not in tasks:
+        if not isinstance(task, str) or task not in known:
             raise RecordError(f"{where} is of a task that is not in the scenario: {task!r}.")
         if split not in ("report", "selection"):
             raise RecordError(f"{where} has the split {split!r}, neither report nor selection.")
         if success not in (0, 1):
             raise RecordError(f"{where} has the success {success!r}, neither true nor false.")
+        if total_reward is not None and not _is_number(total_reward, FARTHEST, -FARTHEST):
+            raise RecordError(f"{where} has an impossible return.")
+        if type(length) is not int or not 0 <= length <= MOST:
+            raise RecordError(f"{where} has an impossible length.")
         rows.append(_Episode(stage, step, task, split, episode, float(success)))
     if len({row[:5] for row in rows}) != len(rows):
         raise RecordError("episodes: an episode is there twice.")
@@ -282,6 +312,7 @@ def _answers(record: Record, stages: int, steps: tuple[int, ...]) -> tuple[tuple
     if len({row[:3] for row in rows}) != len(rows):
         raise RecordError("answers: a kind is there twice at one evaluation point.")
     kinds = tuple(sorted({row[2] for row in rows}))
+    _check_cells("stages x points x kinds of questions", stages + 1, len(steps), len(kinds))
     counts = np.zeros((2, stages + 1, len(steps), len(kinds)))
     for stage, step, kind, asked, correct in rows:
         counts[:, stage, _point(stage, step, steps), kinds.index(kind)] = asked, correct
@@ -312,8 +343,8 @@ def _policy(record: Record, stages: int, steps: tuple[int, ...]) -> tuple[Array,
     return values[0, 1:], values[1, 1:]
 
 
-def _is_number(value: Any, high: float) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and 0 <= value <= high
+def _is_number(value: Any, high: float, low: float = 0) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and low <= value <= high
 
 
 # ---- rates -------------------------------------------------------------------------------------------------

@@ -16,10 +16,11 @@ __all__ = ["load"]
 def load(records: Path | str = Path("leaderboard/records")) -> pandas.DataFrame:
     """Return the leaderboard as a table, one row for each scenario and method, sorted as it is shown.
 
-    The columns are `scenario`, `method`, `division`, `seeds` (how many); for every metric its value and the
-    ends of its 95 % interval, as `retention`, `retention_low`, `retention_high`; then `steps`, `bytes_kept`,
-    `parameters` and `parameters_added`, each a mean over seeds. What is missing is NaN. `clbench leaderboard`
-    lists the records that make no row, and why.
+    The columns are `scenario`, `method`, `division`, `rank` (the place in the division, shared by what cannot
+    be told apart), `tier`, `seeds` (how many); for every metric its value and the ends of its 95 % interval,
+    as `retention`, `retention_low`, `retention_high`; then `relative_cost` (training time, sft's is 1),
+    `steps`, `bytes_kept`, `parameters` and `parameters_added`, each a mean over seeds. What is missing is
+    NaN. `clbench leaderboard` lists the records that make no row, and why.
 
     Args:
         records: Folder of the records.
@@ -31,5 +32,5 @@ def load(records: Path | str = Path("leaderboard/records")) -> pandas.DataFrame:
 
     rows = [values_of(row) for row in read_table(Path(records)).rows]
     frame = pandas.DataFrame(rows, columns=column_names(), dtype=object)
-    kinds = {"scenario": "str", "method": "str", "division": "str", "seeds": "int64"}
+    kinds = {"scenario": "str", "method": "str", "division": "str", "tier": "str", "seeds": "int64"}
     return frame.astype({name: kinds.get(name, "float64") for name in column_names()})

@@ -14,7 +14,7 @@ from typing import Any
 
 from clbench.method import Method, load_method, method_names
 
-from ._rows import division_of
+from ._runs import division_of
 
 _ITEM = re.compile(r"\d+\. +(.*)")
 

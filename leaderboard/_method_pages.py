@@ -10,10 +10,11 @@ from pathlib import Path
 from clbench.metrics import measure
 
 from ._claims.claim import CLAIMS, Finding
-from ._claims.evidence import Evidence, is_number, read_changed, read_runs
+from ._claims.evidence import Evidence
 from ._descriptions import Description, of_one_module
 from ._markdown import arxiv_ids, grid, linked, prose, run_command
-from ._rows import DIVISIONS, Row, Run, Table, once, printable
+from ._rows import Row, Table
+from ._runs import DIVISIONS, Run, is_number, printable, read_run, read_runs
 from ._table import MISSING, SHOWN, escaped, interval, number_text, title_of
 
 HEADINGS = (
@@ -58,7 +59,7 @@ class Sources:
 
 def read_sources(evidence: Evidence, findings: Mapping[str, Finding], board: Table, tuning: Path) -> Sources:
     """Return the sources; a folder that is not there holds no runs."""
-    runs, _ = read_runs(tuning, partial(read_changed, split="selection"), (once,))
+    runs, _ = read_runs(tuning, partial(read_run, split="selection", changed=None), ())
     rows = {row.method: row for row in board.rows if row.scenario == evidence.scenario}
     return Sources(evidence, findings, rows, [run for run in runs if run.scenario == evidence.scenario])
 

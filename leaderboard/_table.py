@@ -10,6 +10,7 @@ import io
 import math
 import os
 import re
+from collections.abc import Sequence
 from itertools import groupby
 from pathlib import Path
 
@@ -21,7 +22,11 @@ from rich.text import Text
 from clbench.metrics import METRICS
 from clbench.statistics import Estimate
 
-from ._rows import COSTS, Row, Table, column_names, printable, values_of
+from ._costs import COSTS
+from ._overall import OverallRow, overall
+from ._rows import Row, Table, column_names, values_of
+from ._runs import printable
+from ._tiers import TIERS
 
 SHOWN = tuple(
     METRICS[name]
@@ -38,11 +43,17 @@ SHOWN = tuple(
 )
 """Metrics in Markdown; the CSV file has all."""
 
-FITTING = tuple(metric for metric in SHOWN if metric.name != "zero_shot")
-"""Metrics in the terminal, as many as fit 100 columns."""
+FITTING = tuple(metric for metric in SHOWN if metric.name not in ("forward_transfer", "zero_shot"))
+"""Metrics in the terminal, as many as fit 108 columns."""
 
 SHORT_TITLES = {"retention_at_matched_adaptation": "matched retention"}
 """Titles of metrics whose name is too long for the head of a column."""
+
+LEGEND = (
+    "Rows of a division that cannot be told apart share a rank. ± is half the width of a 95 % interval. "
+    "Higher is better, but for {lower}. Cost: training time, sft's is 1. Tier: {tiers}.\n"
+)
+"""What a reader of the terminal must know."""
 
 MISSING = "-"
 """What stands for a value that could not be computed."""
@@ -82,7 +93,7 @@ def csv_text(table: Table) -> str:
 
 
 def _field(column: str, value: str | float | None) -> str:
-    whole = column == "seeds" or column in COSTS
+    whole = column in ("rank", "seeds", *COSTS)
     return value if isinstance(value, str) else number_text(value, ".0f" if whole else ".4f", "")
 
 
@@ -95,12 +106,37 @@ def markdown(table: Table) -> str:
         "# Leaderboard",
         "",
         "Made by `clbench leaderboard` from the records alone; `leaderboard.csv` has every metric. "
-        "Values are means over seeds with 95 % intervals from resampling seeds and episodes, with one seed "
-        f"episodes only. `{MISSING}` stands for what could not be computed.",
+        "Values are means over seeds with 95 % intervals over seeds, with one seed over episodes. Rows of a "
+        "division that cannot be told apart share a rank: docs/statistics.md. "
+        f"`{MISSING}` stands for what could not be computed.",
     ]
     scenarios = groupby(table.rows, key=lambda row: row.scenario)
     parts = [line for scenario, rows in scenarios for line in _scenario(table, scenario, list(rows))]
-    return "\n".join([*head, *parts, *_legend(), *_not_shown(table)]) + "\n"
+    return "\n".join([*head, *_overall(table), *parts, *_legend(), *_not_shown(table)]) + "\n"
+
+
+def _overall(table: Table) -> list[str]:
+    """Return the table over scenarios, nothing if there is only one."""
+    rows = overall(table.rows)
+    if not rows:
+        return []
+    head = ["method", "division", "ranks", *(title_of(metric.name) for metric in SHOWN)]
+    names = ", ".join(escaped(name) for name in sorted(table.scenarios))
+    return [
+        "",
+        "## All scenarios",
+        "",
+        f"Means over {names} of the methods that have a row in each; ranks in this order.",
+        "",
+        table_line(head),
+        table_line(["---", "---", *["--:"] * (len(head) - 2)]),
+        *(table_line([escaped(row.method), row.division, *_overall_cells(row)]) for row in rows),
+    ]
+
+
+def _overall_cells(row: OverallRow) -> list[str]:
+    ranks = ", ".join(number_text(rank, ".0f") for rank in row.ranks)
+    return [ranks, *(interval(row.estimates[metric.name]) for metric in SHOWN)]
 
 
 def _scenario(table: Table, scenario: str, rows: list[Row]) -> list[str]:
@@ -109,8 +145,8 @@ def _scenario(table: Table, scenario: str, rows: list[Row]) -> list[str]:
         group: ", ".join(map(escaped, table.scenarios[scenario][group])) or "none"
         for group in ("retained", "target", "held_out")
     }
-    columns = ["method", "division", "seeds", *(title_of(metric.name) for metric in SHOWN)]
-    columns += ["bytes kept", "parameters added"]
+    columns = ["rank", "method", "division", "tier", "seeds", *(title_of(metric.name) for metric in SHOWN)]
+    columns += ["relative cost", "bytes kept", "parameters added"]
     return [
         "",
         f"## {escaped(scenario)}",
@@ -119,17 +155,20 @@ def _scenario(table: Table, scenario: str, rows: list[Row]) -> list[str]:
         f"Held-out tasks: {names['held_out']}.",
         "",
         table_line(columns),
-        table_line(["---", "---", *["--:"] * (len(columns) - 2)]),
+        table_line(["--:", "---", "---", "---", *["--:"] * (len(columns) - 4)]),
         *(table_line(_cells(row)) for row in rows),
     ]
 
 
 def _cells(row: Row) -> list[str]:
     return [
+        number_text(row.rank, ".0f"),
         escaped(row.method),
         row.division,
+        row.tier,
         str(len(row.seeds)),
         *(interval(row.estimates[metric.name]) for metric in SHOWN),
+        number_text(row.costs["relative_cost"], ".2f"),
         *(number_text(row.costs[name], ",.0f") for name in ("bytes_kept", "parameters_added")),
     ]
 
@@ -192,14 +231,17 @@ def escaped(text: str) -> str:
 
 
 def terminal(table: Table) -> RenderableType:
-    """Return the table for a terminal of 100 columns."""
+    """Return the table for a terminal of 108 columns."""
     # Text and not str: rich would obey markup in a stranger's words.
     parts: list[RenderableType] = []
     for scenario, rows in groupby(table.rows, key=lambda row: row.scenario):
         parts.append(_grid(scenario, list(rows)))
+    if overall(table.rows):
+        parts.append(_overall_grid(overall(table.rows)))
     if parts:
         lower = ", ".join(title_of(metric.name) for metric in FITTING if metric.higher_is_better is False)
-        parts.append(Text(f"± is half the width of a 95 % interval. Higher is better, but for {lower}.\n"))
+        tiers = ", ".join(f"{number} {tier}" for number, tier in enumerate(TIERS))
+        parts.append(Text(LEGEND.format(lower=lower, tiers=tiers)))
     if table.not_shown:
         parts.append(Text("Not shown", style="bold"))
         parts += [Text(f"  {entry.path}: {entry.reason}", overflow="fold") for entry in table.not_shown]
@@ -209,17 +251,44 @@ def terminal(table: Table) -> RenderableType:
 def _grid(scenario: str, rows: list[Row]) -> Grid:
     """Return the table of one scenario, with a section for each division."""
     grid = Grid(title=Text(scenario, style="bold"), box=SIMPLE_HEAD, padding=0, title_justify="left")
+    grid.add_column("", justify="right", min_width=2)
     grid.add_column("method", overflow="fold", min_width=20)
-    for name in ("seeds", *(title_of(metric.name) for metric in FITTING)):
+    for name in ("seeds", *(title_of(metric.name) for metric in FITTING), "cost", "bytes kept", "tier"):
         # One word a line: a header must not make its column wider than the numbers.
+        grid.add_column(name.replace(" ", "\n"), justify="right")
+    for division, members in groupby(rows, key=lambda row: row.division):
+        grid.add_section()
+        grid.add_row("", Text(division, style="italic"))
+        for row in members:
+            cells = [number_text(row.rank, ".0f", ""), row.method, str(len(row.seeds))]
+            cells += [_compact(row.estimates[metric.name]) for metric in FITTING]
+            cells += [number_text(row.costs["relative_cost"], ".1f"), _size(row.costs["bytes_kept"])]
+            grid.add_row(*map(Text, cells), str(TIERS.index(row.tier)))
+    return grid
+
+
+def _overall_grid(rows: Sequence[OverallRow]) -> Grid:
+    """Return the table over scenarios, with a section for each division."""
+    grid = Grid(title=Text("All scenarios", style="bold"), box=SIMPLE_HEAD, padding=0, title_justify="left")
+    grid.add_column("method", overflow="fold", min_width=20)
+    for name in ("ranks", *(title_of(metric.name) for metric in FITTING)):
         grid.add_column(name.replace(" ", "\n"), justify="right")
     for division, members in groupby(rows, key=lambda row: row.division):
         grid.add_section()
         grid.add_row(Text(division, style="italic"))
         for row in members:
-            cells = (_compact(row.estimates[metric.name]) for metric in FITTING)
-            grid.add_row(Text(row.method), Text(str(len(row.seeds))), *map(Text, cells))
+            ranks = ",".join(number_text(rank, ".0f") for rank in row.ranks)
+            cells = [_compact(row.estimates[metric.name]) for metric in FITTING]
+            grid.add_row(*map(Text, [row.method, ranks, *cells]))
     return grid
+
+
+def _size(count: float | None) -> str:
+    """Return a number of bytes in at most five characters."""
+    if count is None or count < 1000:
+        return number_text(count, ".0f")
+    unit = min(int(math.log10(count)) // 3, 4)
+    return f"{count / 1000**unit:.3g}{'kMGT'[unit - 1]}"
 
 
 def _compact(estimate: Estimate) -> str:
