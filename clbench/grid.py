@@ -9,7 +9,7 @@ import sys
 import threading
 import time
 import traceback
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from multiprocessing.connection import Connection, wait
@@ -17,11 +17,14 @@ from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any
 
+from clbench.limits import Limits, end
 from clbench.progress import Bars
 from clbench.run import RunSpec, execute, run_length
 from clbench.task import load_scenario, resolve
+from clbench.training import MethodError
 
 _SEND_SECONDS = 0.2
+_LOOK_SECONDS = 0.5
 
 
 class JobError(Exception):
@@ -42,6 +45,8 @@ class Job:
     """In optimiser steps, for the time left."""
     needs: tuple[str, ...] = ()
     """Names of the jobs that must have ended well before."""
+    limits: Limits | None = None
+    """What its process may take; anything if None."""
 
 
 @dataclass
@@ -50,6 +55,9 @@ class _Worker:
     process: BaseProcess
     connection: Connection
     started: float = field(default_factory=time.monotonic)
+    looked: float = field(default_factory=time.monotonic)
+    broken: str | None = None
+    """Why its process was ended, if it was beyond a limit."""
 
 
 def run_jobs(jobs: Sequence[Job], workers: int, bars: Bars) -> dict[str, str]:
@@ -70,6 +78,7 @@ def run_jobs(jobs: Sequence[Job], workers: int, bars: Bars) -> dict[str, str]:
                     worker = _start(job)
                     running[worker.connection] = worker
                 bars.start(job.name, job.length)
+            _hold_to_limits(running.values())
             for connection in wait(list(running), timeout=1.0):
                 assert isinstance(connection, Connection)
                 worker = running[connection]
@@ -90,6 +99,19 @@ def run_jobs(jobs: Sequence[Job], workers: int, bars: Bars) -> dict[str, str]:
             worker.process.terminate()
             worker.process.join()
     return failed
+
+
+def _hold_to_limits(workers: Iterable[_Worker]) -> None:
+    """End the processes that are beyond their limits."""
+    for worker in workers:
+        limits, now = worker.job.limits, time.monotonic()
+        if limits is None or worker.broken or now - worker.looked < _LOOK_SECONDS:
+            continue
+        worker.looked = now
+        assert worker.process.pid is not None
+        worker.broken = limits.exceeded(worker.process.pid, now - worker.started)
+        if worker.broken:
+            end(worker.process.pid)
 
 
 def _drop_hopeless(waiting: list[Job], failed: dict[str, str]) -> list[Job]:
@@ -159,6 +181,8 @@ def _receive(worker: _Worker) -> tuple[str, Any]:
         kind, value = worker.connection.recv()
     except EOFError:
         worker.process.join()
+        if worker.broken:
+            return "failed", f"stopped, because {worker.broken}"
         return "failed", f"its process ended without a result (exit code {worker.process.exitcode})"
     return kind, value
 
@@ -223,12 +247,18 @@ def pretrain_job(scenario: str, seed: int, progress: Callable[[float], None]) ->
     return f"{sum(parameter.numel() for parameter in policy.parameters()):,} parameters"
 
 
-def run_job(spec: RunSpec, records: str, progress: Callable[[float], None]) -> str:
+def run_job(
+    spec: RunSpec,
+    records: Path,
+    progress: Callable[[float], None],
+    checkpoints: Path | None = None,
+    tensorboard: Path | None = None,
+) -> str:
     """Do one run, write its record, and return its main scores."""
     from clbench.metrics import measure
     from clbench.scores import Scores
 
-    record = execute(spec, Path(records), progress)
+    record = execute(spec, records, progress, checkpoints=checkpoints, tensorboard=tensorboard)
     if record.error is not None:
         raise JobError(
             f"failed in {record.error['where']}: {record.error['type']}: {record.error['message']}"
@@ -236,6 +266,20 @@ def run_job(spec: RunSpec, records: str, progress: Callable[[float], None]) -> s
     scores = Scores.from_record(record)
     values = {name: measure(name, scores) for name in ("adaptation", "retention", "question_retention")}
     return ", ".join(f"{name} {'-' if value is None else f'{value:.2f}'}" for name, value in values.items())
+
+
+def stages_job(spec: RunSpec, checkpoints: Path | None, progress: Callable[[float], None]) -> str:
+    """Make the policies of all stages of a run again, and keep them below `checkpoints`, if any."""
+    from clbench.stages import keep_stages, make_stages
+
+    try:
+        if checkpoints is None:
+            make_stages(spec, progress)
+        else:
+            keep_stages(spec, checkpoints, progress)
+    except MethodError as error:
+        raise JobError(str(error)) from error
+    return "policies of all stages"
 
 
 def demonstration_jobs(scenario: str, tasks: Sequence[str]) -> list[Job]:
@@ -249,10 +293,55 @@ def demonstration_jobs(scenario: str, tasks: Sequence[str]) -> list[Job]:
     ]
 
 
-def benchmark_jobs(specs: Sequence[RunSpec], records: Path) -> list[Job]:
-    """Return all jobs that the runs `specs` need, of one scenario: demonstrations, pretraining, the runs."""
+def benchmark_jobs(
+    specs: Sequence[RunSpec],
+    records: Path,
+    limits: Limits | None = None,
+    *,
+    checkpoints: Path | None = None,
+    tensorboard: Path | None = None,
+) -> list[Job]:
+    """Return all jobs that the runs `specs` need, of one scenario: demonstrations, pretraining, the runs.
+
+    Args:
+        specs: What is run.
+        records: Folder of the records.
+        limits: What the process of a run may take.
+        checkpoints: Folder below which the policies of all stages are kept; none is if None.
+        tensorboard: Folder below which the runs are logged for TensorBoard; they are not if None.
+    """
+    folders = {"records": records, "checkpoints": checkpoints, "tensorboard": tensorboard}
+    jobs = _preparing_jobs(specs)
+    for spec in specs:
+        title, needs = f"{spec.label} seed {spec.seed}", (f"pretraining seed {spec.seed}",)
+        length = run_length(spec.load(), spec.split)
+        jobs.append(Job(title, "clbench.grid:run_job", {"spec": spec, **folders}, length, needs, limits))
+    return jobs
+
+
+def stages_jobs(specs: Sequence[RunSpec], checkpoints: Path | None) -> list[Job]:
+    """Return all jobs that make the policies of all stages of runs, of one scenario, without a record.
+
+    Args:
+        specs: The runs.
+        checkpoints: Folder below which the policies are kept; they stay in the cache alone if None.
+    """
+    jobs = _preparing_jobs(specs)
+    for spec in specs:
+        title, needs = f"stages of {spec.label} seed {spec.seed}", (f"pretraining seed {spec.seed}",)
+        scenario = spec.load()
+        length = len(scenario.target) * scenario.budget.adaptation_steps
+        arguments = {"spec": spec, "checkpoints": checkpoints}
+        jobs.append(Job(title, "clbench.grid:stages_job", arguments, length, needs))
+    return jobs
+
+
+def _preparing_jobs(specs: Sequence[RunSpec]) -> list[Job]:
+    """Return the jobs that make what runs begin with: demonstrations, questions, a policy for each seed."""
     from clbench.pretraining import is_pretrained
 
+    if not specs:
+        return []
     name = specs[0].scenario
     scenario = load_scenario(name)
     budget = scenario.budget
@@ -263,9 +352,4 @@ def benchmark_jobs(specs: Sequence[RunSpec], records: Path) -> list[Job]:
         length = 0 if is_pretrained(scenario, seed) else budget.pretraining_steps
         arguments = {"scenario": name, "seed": seed}
         jobs.append(Job(f"pretraining seed {seed}", "clbench.grid:pretrain_job", arguments, length, data))
-    for spec in specs:
-        arguments = {"spec": spec, "records": str(records)}
-        needs = (f"pretraining seed {spec.seed}",)
-        title = f"{spec.label} seed {spec.seed}"
-        jobs.append(Job(title, "clbench.grid:run_job", arguments, run_length(spec.load(), spec.split), needs))
     return jobs

@@ -6,15 +6,17 @@ import contextlib
 import dataclasses
 import difflib
 import importlib
+import re
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
-from importlib.metadata import EntryPoint, entry_points
 from types import NoneType, UnionType
 from typing import Any, Generic, Literal, Protocol, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import torch
 from torch import Tensor, nn
 
+from clbench.cache import package_of, source_hash
+from clbench.names import installed_methods
 from clbench.policy import Batch, Policy, QuestionBatch
 from clbench.task import Task
 
@@ -34,6 +36,44 @@ class Uses:
     """The training questions."""
     reference: bool = False
     """Whether this is no competitor but a guide: an upper or a lower bound, a baseline of transfer."""
+
+
+_TEXTS = {
+    "authors": (r"(?=\S).{1,200}", "printable text of at most 200 characters"),
+    "link": (
+        r"https?://[A-Za-z0-9][A-Za-z0-9.-]*(:\d{1,5})?(/[A-Za-z0-9._~:/?#@!$&()*+,;=%-]{0,300})?",
+        "a web address that begins with http:// or https://",
+    ),
+    "licence": (r"[A-Za-z0-9][A-Za-z0-9 .()+-]{0,99}", 'an SPDX expression, as "MIT" or "Apache-2.0"'),
+    "version": (r"[A-Za-z0-9][A-Za-z0-9.+!_-]{0,49}", 'a version, as "1.0"'),
+}
+"""What the texts of `Metadata` must match, and the same in words."""
+
+
+@dataclass(frozen=True)
+class Metadata:
+    """Who made a method, and on what terms; None is not said.
+
+    Raises:
+        ValueError: A text is not of its kind: all of them are shown on a page that strangers read.
+    """
+
+    authors: str | None = None
+    """Names of who made it."""
+    link: str | None = None
+    """Of the paper, or of the code."""
+    licence: str | None = None
+    """Of the code, as an SPDX expression."""
+    version: str | None = None
+    """Of the code."""
+
+    def __post_init__(self) -> None:
+        for name, (pattern, words) in _TEXTS.items():
+            text = getattr(self, name)
+            if text is None:
+                continue
+            if not (isinstance(text, str) and text.isprintable() and re.fullmatch(pattern, text)):
+                raise ValueError(f"{name} in the metadata must be {words}, not {text!r}.")
 
 
 class UndeclaredAccessError(RuntimeError):
@@ -175,6 +215,7 @@ class Method:
     """
 
     uses: Uses = Uses()
+    metadata: Metadata = Metadata()
     whole_stages: bool = False
     """Whether the policy is what the method means it to be at the end of a stage only, as one that `end_task`
     merges: it is then not evaluated on the way."""
@@ -227,18 +268,9 @@ class Method:
         return {}
 
 
-def _installed() -> dict[str, EntryPoint]:
-    """Map names to entry points: ours as they are, those of other packages as "package/name"."""
-    found = {}
-    for entry in entry_points(group="clbench.methods"):
-        package = entry.dist.name if entry.dist is not None else "unknown"
-        found[entry.name if package == "clbench" else f"{package}/{entry.name}"] = entry
-    return found
-
-
 def method_names() -> list[str]:
     """Return the names of the installed methods, sorted; nothing is imported."""
-    return sorted(_installed())
+    return sorted(installed_methods())
 
 
 def load_method(spec: str) -> type[Method]:
@@ -250,7 +282,7 @@ def load_method(spec: str) -> type[Method]:
     """
     if ":" in spec:
         cls = _import_method(spec)
-    elif spec in (installed := _installed()):
+    elif spec in (installed := installed_methods()):
         cls = _guarded(spec, installed[spec].load)
     else:
         near = difflib.get_close_matches(spec, installed, n=1)
@@ -262,6 +294,11 @@ def load_method(spec: str) -> type[Method]:
     if not dataclasses.is_dataclass(cls):
         raise TypeError(f"{spec!r} is not a dataclass: decorate it with @dataclasses.dataclass.")
     return cls
+
+
+def describe_method(cls: type[Method]) -> dict[str, Any]:
+    """Return a method's metadata, and as `source` the hash of the package or the module that it lies in."""
+    return {**dataclasses.asdict(cls.metadata), "source": source_hash(package_of(cls.__module__))}
 
 
 def _guarded(spec: str, load: Callable[[], Any]) -> Any:

@@ -69,9 +69,9 @@ class Bars:
         if not self.console.is_terminal and now - self._last_line >= LINE_SECONDS:
             self._last_line = now
             share = min(1.0, self._done / self._total)
-            left = (now - self._started) * (1 - share) / share
-            names = ", ".join(self._bars)
-            self._say(f"{share:4.0%}, about {_minutes(left)} left: {names}")
+            # before anything is done nobody knows how long the rest takes
+            left = f", about {_minutes((now - self._started) * (1 - share) / share)} left" if share else ""
+            self._say(f"{share:4.0%}{left}: {', '.join(self._bars)}")
 
     def finish(self, name: str, text: str) -> None:
         """Take a piece away, whatever was left of it, and say what came of it."""

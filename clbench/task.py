@@ -9,6 +9,8 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Literal
 
+from clbench.limits import Limits
+
 Group = Literal["retained", "target", "held_out"]
 Split = Literal["selection", "report"]
 
@@ -131,6 +133,8 @@ class Scenario:
     """Entry point of a tuple of `QuestionKind`: what can be asked about a state."""
     budget: Budget = Budget()
     """What every method gets."""
+    limits: Limits = Limits()
+    """What the process of a submitted run may take."""
 
     @cached_property
     def tasks(self) -> tuple[Task, ...]:

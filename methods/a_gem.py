@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from clbench.method import Method, Prior, Progress, Source, Uses
+from clbench.method import Metadata, Method, Prior, Progress, Source, Uses
 from clbench.policy import Batch, Policy
 
 from ._projection import project_out
@@ -25,6 +25,7 @@ class AGEM(Method):
     """Project the gradient off what raises the loss on prior demonstrations."""
 
     uses = Uses(demonstrations="throughout")
+    metadata = Metadata(link="https://arxiv.org/abs/1812.00420")
 
     def batch(self, target: Source[Batch], prior: Prior) -> tuple[Batch, Batch]:
         """Return a batch of the target and one of prior demonstrations."""

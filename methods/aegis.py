@@ -31,7 +31,7 @@ import torch
 from torch import Tensor, nn
 
 from clbench.activations import Gaussian
-from clbench.method import Method, Prior, Progress, Stage, State, Uses
+from clbench.method import Metadata, Method, Prior, Progress, Stage, State, Uses
 from clbench.policy import Batch, Policy
 
 from ._projection import inner, project_out, random_like
@@ -48,6 +48,7 @@ class Aegis(Method):
     """What is projected against: "anchor", or "random" for the control."""
 
     uses = Uses(questions="prepare")
+    metadata = Metadata(link="https://arxiv.org/abs/2604.16067")
 
     def __post_init__(self) -> None:
         in_range("samples", self.samples, 1)

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from clbench.method import Method, Prior, Source, Stage, State, Uses
+from clbench.method import Metadata, Method, Prior, Source, Stage, State, Uses
 from clbench.policy import Batch, Policy
 
 from ._requirements import in_range
@@ -32,6 +32,7 @@ class BufferedReplay(Method):
     """Share of each batch that is replayed."""
 
     uses = Uses(demonstrations="prepare")
+    metadata = Metadata(link="https://arxiv.org/abs/2603.03818")
 
     def __post_init__(self) -> None:
         in_range("share", self.share, 1e-9, 1.0)

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
-from clbench.method import Method, Prior, Progress, Source, Uses
+from clbench.method import Metadata, Method, Prior, Progress, Source, Uses
 from clbench.policy import Batch, Policy, QuestionBatch
 
 from ._requirements import in_range
@@ -25,6 +25,7 @@ class CoTraining(Method):
     """Factor of the answer loss."""
 
     uses = Uses(questions="throughout")
+    metadata = Metadata(link="https://arxiv.org/abs/2604.16067")
 
     def __post_init__(self) -> None:
         in_range("auxiliary", self.auxiliary, 0.0)

@@ -26,7 +26,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from clbench.method import Method, Prior, Progress, Stage
+from clbench.method import Metadata, Method, Prior, Progress, Stage
 from clbench.policy import Batch, Policy
 
 from ._requirements import in_range, require_loss_per_sample
@@ -55,6 +55,8 @@ class ConSFT(Method):
     """Least weight (Table 5)."""
     schedule: float = 1.0
     """Length T of the schedule, as a share of the stage's steps."""
+
+    metadata = Metadata(link="https://arxiv.org/abs/2605.08879")
 
     def __post_init__(self) -> None:
         for name in ("tau_start", "tau_end", "kappa", "decay", "curvature", "schedule"):

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from clbench.method import Method, Prior, Source, Stage, State, Uses
+from clbench.method import Metadata, Method, Prior, Source, Stage, State, Uses
 from clbench.policy import Batch, Policy
 
 from ._requirements import in_range, require_loss_per_sample
@@ -33,6 +33,7 @@ class EWC(Method):
     """Samples that the Fisher information is the mean of."""
 
     uses = Uses(demonstrations="prepare")
+    metadata = Metadata(link="https://arxiv.org/abs/1612.00796")
 
     def __post_init__(self) -> None:
         in_range("strength", self.strength, 0.0)

@@ -9,7 +9,7 @@ Details:
 
 from dataclasses import dataclass
 
-from clbench.method import Method, Prior, Source, Uses
+from clbench.method import Metadata, Method, Prior, Source, Uses
 from clbench.policy import Batch
 
 
@@ -21,6 +21,7 @@ class ExperienceReplay(Method):
     """Share of each batch that is replayed; 0.5 is 1:1."""
 
     uses = Uses(demonstrations="throughout")
+    metadata = Metadata(link="https://arxiv.org/abs/1811.11682")
 
     def __post_init__(self) -> None:
         if not 0 <= self.replay <= 1:

@@ -33,7 +33,7 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
 from clbench.cache import cache_folder, cached, hash_of, hash_of_tensors, source_hash
-from clbench.method import Method, Prior, Stage, State, Uses
+from clbench.method import Metadata, Method, Prior, Stage, State, Uses
 from clbench.policy import Batch, Policy, QuestionBatch
 from clbench.training import optimise
 
@@ -62,6 +62,7 @@ class FastDVLA(Method):
     """What is merged: "capability", or "random" for the control."""
 
     uses = Uses(demonstrations="prepare", questions="prepare")
+    metadata = Metadata(link="https://arxiv.org/abs/2603.25661")
 
     def __post_init__(self) -> None:
         for name in ("alpha", "orthogonal", "auxiliary"):

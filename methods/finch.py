@@ -16,7 +16,7 @@ from dataclasses import dataclass
 
 from torch import Tensor, nn
 
-from clbench.method import Method, Progress, Stage
+from clbench.method import Metadata, Method, Progress, Stage
 from clbench.policy import Batch, Policy
 
 from ._requirements import in_range
@@ -30,6 +30,8 @@ class Finch(Method):
     """Root of the average loss from which on the steps are as large as scheduled."""
     momentum: float = 0.9
     """Of the exponential moving average of the loss (the paper's value)."""
+
+    metadata = Metadata(link="https://arxiv.org/abs/2605.20005")
 
     def __post_init__(self) -> None:
         in_range("kappa", self.kappa, 1e-9)

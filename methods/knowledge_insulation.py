@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from clbench.method import Method, Prior, Progress, Source, Uses
+from clbench.method import Metadata, Method, Prior, Progress, Source, Uses
 from clbench.policy import Batch, Policy, QuestionBatch
 
 from ._requirements import in_range, require_hidden_states
@@ -26,6 +26,7 @@ class KnowledgeInsulation(Method):
     """Factor of the action loss."""
 
     uses = Uses(questions="throughout")
+    metadata = Metadata(link="https://arxiv.org/abs/2505.23705")
 
     def __post_init__(self) -> None:
         in_range("alpha", self.alpha, 0.0)

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
-from clbench.method import Method, Prior, State
+from clbench.method import Metadata, Method, Prior, State
 from clbench.policy import Policy
 
 from ._requirements import in_range
@@ -24,6 +24,8 @@ class L2SP(Method):
 
     strength: float = 0.3
     """Factor of the penalty."""
+
+    metadata = Metadata(link="https://arxiv.org/abs/1802.01483")
 
     def __post_init__(self) -> None:
         in_range("strength", self.strength, 0.0)

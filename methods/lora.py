@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 from torch import nn
 
-from clbench.method import Method, Prior, Progress, Stage, State
+from clbench.method import Metadata, Method, Prior, Progress, Stage, State
 from clbench.policy import Policy
 
 from ._requirements import in_range
@@ -35,6 +35,8 @@ class LoRA(Method):
     """One of lora, dora and rslora."""
     speed: float = 3.0
     """Factor of the step size."""
+
+    metadata = Metadata(link="https://arxiv.org/abs/2106.09685")
 
     def __post_init__(self) -> None:
         in_range("rank", self.rank, 1)

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from clbench.method import Method, Progress, Stage
+from clbench.method import Metadata, Method, Progress, Stage
 from clbench.policy import Batch, Policy
 from clbench.policy.flow import mean_over_valid
 
@@ -29,6 +29,8 @@ class LwF(Method):
 
     strength: float = 0.1
     """Factor of the distillation loss."""
+
+    metadata = Metadata(link="https://arxiv.org/abs/1606.09282")
 
     def __post_init__(self) -> None:
         in_range("strength", self.strength, 0.0)

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from clbench.method import Method, Prior, Progress, Stage
+from clbench.method import Metadata, Method, Prior, Progress, Stage
 from clbench.policy import Batch, Policy
 
 from ._requirements import require_hidden_states
@@ -23,6 +23,8 @@ from ._requirements import require_hidden_states
 @dataclass
 class StopGradient(Method):
     """Train the action head alone, on the hidden states of a backbone that stays as it was."""
+
+    metadata = Metadata(link="https://arxiv.org/abs/2604.16067")
 
     def prepare(self, policy: Policy, prior: Prior) -> None:
         """Refuse a policy without hidden states."""

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import torch
 from torch import nn
 
-from clbench.method import Method, Stage
+from clbench.method import Metadata, Method, Stage
 from clbench.policy import Policy
 
 from ._requirements import in_range
@@ -31,6 +31,7 @@ class WeightInterpolation(Method):
     """Share of the fine-tuned weights."""
 
     whole_stages = True
+    metadata = Metadata(link="https://arxiv.org/abs/2109.01903")
 
     def __post_init__(self) -> None:
         in_range("coefficient", self.coefficient, 0.0, 1.0)

@@ -22,6 +22,16 @@ def test_without_a_terminal_a_line_is_printed_now_and_then() -> None:
     assert lines[5] == "pretraining [seed 0]: done"
 
 
+def test_before_anything_is_done_no_time_left_is_made_up() -> None:
+    now = 0.0
+    file = io.StringIO()
+    with Bars(100, Console(file=file, width=100), clock=lambda: now) as bars:
+        bars.start("a", 100)
+        now += 2 * LINE_SECONDS
+        bars.advance("a", 0)
+    assert file.getvalue() == "  0%: a\n"
+
+
 def test_on_a_terminal_there_are_bars_with_the_time_left() -> None:
     file = io.StringIO()
     with Bars(100, Console(file=file, width=100, force_terminal=True)) as bars:

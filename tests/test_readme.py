@@ -57,6 +57,23 @@ def test_the_second_snippet_is_a_method_that_keeps_all_answers(folder: Path) -> 
     assert len(set(correct.values())) == 1
 
 
+def test_three_commands_lead_from_nothing_to_a_row_on_the_board(tmp_path: Path) -> None:
+    (block,) = _blocks("shell")
+    new, check, submit = block.strip().splitlines()
+    (toy,) = re.findall(
+        r"`(--scenario clbench\.testing[^`]*)`", README.read_text(encoding="utf-8").replace("\n", " ")
+    )
+    command = [sys.executable, "-m"]
+    subprocess.run([*command, *new.split()], cwd=tmp_path, check=True, capture_output=True)
+    plain = ["-p", "no:cacheprovider", "-p", "no:xdist"]
+    subprocess.run([*command, *check.split(), *plain], cwd=tmp_path, check=True, capture_output=True)
+    words = [*submit.split(), *toy.split()]
+    told = subprocess.run([*command, *words], cwd=tmp_path, check=True, capture_output=True, text=True).stdout
+    assert "Rank 1 of 1 in the division prior-data-free." in told
+    assert (tmp_path / "try/records/FetchToy-v0/gentle_tuning--GentleTuning/seed-0.json").is_file()
+    assert "gentle" in (tmp_path / "try/LEADERBOARD.md").read_text(encoding="utf-8")
+
+
 def test_the_third_snippet_draws_the_table(folder: Path) -> None:
     output = _console(_blocks("console")[1], folder)
     assert "my_method:HeadOnly" in output

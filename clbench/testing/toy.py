@@ -1,8 +1,4 @@
-"""For tests, ours and other people's: a toy scenario on which a whole run takes seconds.
-
-A point on a plane moves left, right, up or down; the words say which way. Import this module to register it
-as `clbench/Toy-v0`, or ask for "clbench.testing:clbench/Toy-v0".
-"""
+"""The toy: a point on a plane moves left, right, up or down; the words say which way. A run takes seconds."""
 
 from __future__ import annotations
 

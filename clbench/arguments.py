@@ -1,0 +1,35 @@
+"""What all commands do with what people type: a wrong name or value ends in one line with the right one."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from rich.console import Console
+
+
+@contextmanager
+def checked_input() -> Iterator[None]:
+    """Check input inside: a wrong name or value ends with exit code 2 and says the nearest right one."""
+    try:
+        yield
+    except (LookupError, ValueError, TypeError) as error:
+        console = Console(stderr=True, soft_wrap=True)
+        console.print(
+            f"error: {error.args[0] if error.args else error!r}",
+            style="bold red",
+            highlight=False,
+            markup=False,
+        )
+        sys.exit(2)
+
+
+def at_least(least: int, option: str, value: int | None) -> None:
+    """Refuse the value of an option that is too small.
+
+    Raises:
+        ValueError: It is.
+    """
+    if value is not None and value < least:
+        raise ValueError(f"{option} must be at least {least}, not {value}.")

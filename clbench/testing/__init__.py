@@ -1,0 +1,19 @@
+"""For tests, ours and other people's: a toy scenario on which a whole run takes seconds, and the contract.
+
+Import this package to register the toy as `clbench/Toy-v0`, or ask for "clbench.testing:clbench/Toy-v0".
+"""
+
+from clbench.testing.contract import Check, check_method, method_checks
+from clbench.testing.error import ContractError
+from clbench.testing.toy import TOY, TOY_QUESTIONS, ToyWorld, toy_expert
+
+__all__ = [
+    "TOY",
+    "TOY_QUESTIONS",
+    "Check",
+    "ContractError",
+    "ToyWorld",
+    "check_method",
+    "method_checks",
+    "toy_expert",
+]

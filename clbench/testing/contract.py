@@ -1,0 +1,392 @@
+"""The public contract of a method, checked on the toy in seconds; `docs/contract.md` has it in words.
+
+    def test_my_method() -> None:
+        check_method(MyMethod)
+
+or, for a test of each clause,
+
+    @pytest.mark.parametrize("check", method_checks(MyMethod), ids=str)
+    def test_my_method(check: Check) -> None:
+        check()
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import functools
+import inspect
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, get_args
+
+from torch import Tensor
+
+from clbench.evaluation import Evaluator
+from clbench.learner import repeatable
+from clbench.method import Access, Metadata, Method, Uses
+from clbench.policy import Policy
+from clbench.seeding import seeded
+from clbench.testing.error import ContractError
+from clbench.testing.leaks import GENERATORS, same, watched
+from clbench.testing.toy import TOY
+from clbench.testing.toy_run import SEAMS, ToyRun, toy_learner
+
+TARGETS, STEPS = 2, 2
+"""Length of the runs in which only what happens matters, and not what is learned."""
+
+LEARNING_STEPS = 40
+"""Optimiser steps in which the toy's first target is to be learned."""
+
+LEAST_GAIN = 1.0
+"""By how much the mean return must rise in them. Plain fine-tuning gains 16, from -17.6 to -1.3; the built-in
+method that moves least, `finch`, gains 2.1."""
+
+PRIOR = ("demonstrations", "questions")
+"""Kinds of prior data, by the fields of `Uses`."""
+
+_KINDS = {"uses": Uses, "metadata": Metadata, "whole_stages": bool}
+"""What a class declares besides its hyper-parameters."""
+
+
+def check_method(cls: type[Method], **settings: Any) -> None:
+    """Check on the toy that a method keeps the public contract.
+
+    Args:
+        cls: The method's class.
+        settings: Hyper-parameters that differ from its defaults, to shorten a long preparation.
+
+    Raises:
+        ContractError: It breaks a clause; the message says what was expected, what was found, where to look.
+    """
+    for check in method_checks(cls, **settings):
+        check()
+
+
+def method_checks(cls: type[Method], **settings: Any) -> list[Check]:
+    """Return the clauses of the contract one by one, for `pytest.mark.parametrize(..., ids=str)`.
+
+    They share what they try: together they take no longer than `check_method`.
+
+    Args:
+        cls: The method's class.
+        settings: As for `check_method`.
+    """
+    subject = Subject(cls, settings)
+    return [Check(clause, subject) for clause in CLAUSES]
+
+
+@dataclass(frozen=True, eq=False)
+class Check:
+    """One clause of the contract for one method, to be called."""
+
+    clause: Callable[[Subject], None]
+    """One of `CLAUSES`."""
+    subject: Subject
+    """The method."""
+
+    def __call__(self) -> None:
+        """Raise `ContractError` if the method breaks the clause."""
+        self.clause(self.subject)
+
+    def __str__(self) -> str:
+        return self.clause.__name__
+
+
+class Subject:
+    """A method with the runs of it that several clauses look at.
+
+    Args:
+        cls: The method's class.
+        settings: Hyper-parameters that differ from its defaults.
+    """
+
+    def __init__(self, cls: type[Method], settings: Mapping[str, Any]) -> None:
+        self.cls, self.settings = cls, settings
+
+    def build(self) -> Method:
+        """Return a new object of the method."""
+        return self.cls(**self.settings)
+
+    @cached_property
+    def first(self) -> ToyRun:
+        """A run that goes from stage to stage as a run does."""
+        return ToyRun(self.build, TARGETS, STEPS)
+
+    @cached_property
+    def second(self) -> ToyRun:
+        """The same once more; what the method imports on first use is there now."""
+        _ = self.first
+        return ToyRun(self.build, TARGETS, STEPS)
+
+    @cached_property
+    def kept(self) -> ToyRun:
+        """The same with one object of the method for all stages."""
+        return ToyRun(self.build, TARGETS, STEPS, resumed=False)
+
+    @cached_property
+    def longer(self) -> ToyRun:
+        """A run that is long enough to learn the first target, with another seed."""
+        return ToyRun(self.build, 1, LEARNING_STEPS, seed=1)
+
+
+# ---- the clauses -------------------------------------------------------------------------------------------
+
+
+def declaration(subject: Subject) -> None:
+    """A documented dataclass of its own, whose seams are those of the loop."""
+    cls = subject.cls
+    if not (isinstance(cls, type) and issubclass(cls, Method)):
+        raise _breach(declaration, "a subclass of clbench.Method", repr(cls), "the class")
+    if "__dataclass_fields__" not in vars(cls):
+        found = f"{cls.__name__} is not decorated"
+        raise _breach(declaration, "a dataclass: @dataclasses.dataclass above the class", found, "the class")
+    if not cls.__doc__ or cls.__doc__.startswith(f"{cls.__name__}("):  # that is dataclass's own
+        expected = "a docstring of the class that says in its first line what the method does"
+        raise _breach(declaration, expected, "none", "the class")
+    _check_declared(cls)
+    _check_signatures(cls)
+
+
+def _check_declared(cls: type[Method]) -> None:
+    """Check what the class says of itself besides its hyper-parameters."""
+    fields = {field.name for field in dataclasses.fields(cls)}  # type: ignore[arg-type]
+    for name, kind in _KINDS.items():
+        value = getattr(cls, name)
+        if not isinstance(value, kind):
+            raise _breach(declaration, f"{name} to be a {kind.__name__}", repr(value), name)
+        if name in fields:
+            expected = f"`{name} = ...` without an annotation, which would make it a hyper-parameter"
+            raise _breach(declaration, expected, f"{name} is a field of the dataclass", name)
+    for name in PRIOR:
+        access = getattr(cls.uses, name)
+        if access not in get_args(Access):
+            expected = f"uses.{name} to be one of {', '.join(get_args(Access))}"
+            raise _breach(declaration, expected, repr(access), "uses")
+
+
+def _check_signatures(cls: type[Method]) -> None:
+    """Check that the loop can call every seam, and that none is misspelt."""
+    for name, value in vars(cls).items():
+        if callable(value) and name not in SEAMS and not name.startswith("_"):
+            near = difflib.get_close_matches(name, SEAMS, n=1, cutoff=0.85)
+            if near:
+                expected = f"seams that the loop calls; did you mean {near[0]}()? Helpers begin with _"
+                raise _breach(declaration, expected, f"{name}() is never called", f"{name}()")
+    for seam in SEAMS:
+        given, taken = (inspect.signature(getattr(one, seam)) for one in (Method, cls))
+        try:
+            taken.bind(*given.parameters)
+        except TypeError as error:
+            expected = f"{seam}({', '.join(given.parameters)})"
+            found = f"{seam}({', '.join(taken.parameters)})"
+            raise _breach(declaration, expected, found, f"{seam}()") from error
+
+
+def constructor(subject: Subject) -> None:
+    """A constructor that stores its hyper-parameters as they are given, and does nothing else."""
+    leaks: list[str] = []
+    with seeded("constructor"), watched(leaks, generators=True):
+        _check_fields(subject.cls)
+        _check_stored(subject.cls)
+    if leaks:
+        raise _misbuilt("nothing to be done but storing", "; ".join(leaks))
+
+
+def _check_fields(cls: type[Method]) -> None:
+    """Check that the fields are hyper-parameters, and all that an object of the defaults has."""
+    fields = dataclasses.fields(cls)  # type: ignore[arg-type]
+    for field in fields:
+        if not field.init:
+            expected = "every field to be a hyper-parameter; what is learned is set by the seams"
+            raise _misbuilt(expected, f"{field.name} has init=False")
+        if field.default is field.default_factory is dataclasses.MISSING:
+            raise _misbuilt("a default for every hyper-parameter", f"{field.name} has none")
+    try:
+        method = cls()
+    except Exception as error:
+        words = f"{type(error).__name__}: {error}"
+        raise _misbuilt("an object of the defaults to be made", words) from error
+    more = sorted(vars(method).keys() - {field.name for field in fields})
+    if more:
+        expected = "only hyper-parameters to be stored; what is learned is set by the seams"
+        raise _misbuilt(expected, f"it sets {', '.join(more)}")
+    for field in fields:
+        value = getattr(method, field.name)
+        if not _is_plain(value):
+            expected = "numbers, truth values, text, None, or lists of them as hyper-parameters"
+            raise _misbuilt(expected, f"{field.name} is a {type(value).__name__}")
+    if method != cls():
+        expected = "equal objects from equal arguments, as a dataclass has them"
+        raise _misbuilt(expected, "two objects of the defaults differ")
+
+
+def _check_stored(cls: type[Method]) -> None:
+    """Check that values are kept: the defaults, and others unless they are refused."""
+    expected = "hyper-parameters to be kept as they are given, or refused with a ValueError"
+    method = cls()
+    for field in dataclasses.fields(cls):  # type: ignore[arg-type]
+        name = field.name
+        default = getattr(method, name) if field.default is dataclasses.MISSING else field.default
+        given = [default]
+        if type(default) in (bool, int, float):
+            given.append(not default if type(default) is bool else type(default)(default / 2 + 1))
+        for value in given:
+            try:
+                kept = getattr(cls(**{name: value}), name)
+            except ValueError:
+                continue
+            except Exception as error:
+                words = f"{name}={value!r} raises {type(error).__name__}: {error}"
+                raise _misbuilt(expected, words) from error
+            if kept != value:
+                raise _misbuilt(expected, f"{name}={value!r} becomes {kept!r}")
+
+
+def _misbuilt(expected: str, found: str) -> ContractError:
+    return _breach(constructor, expected, found, "the fields, __init__ and __post_init__")
+
+
+def sound_seams(subject: Subject) -> None:
+    """Seams that return what the loop can go on with, and at most a batch of the target in a step."""
+    size, drawn = TOY.budget.batch_size, subject.first.target_rows
+    if drawn > size:
+        expected = (
+            f"at most target.batch_size = {size} samples of the target in a step: the budget of all methods"
+        )
+        raise _breach(sound_seams, expected, f"{drawn} samples", "batch()")
+
+
+def declared_data(subject: Subject) -> None:
+    """Prior data that `uses` declares, and all of it: divisions are made of these declarations."""
+    for name in PRIOR:
+        access: Access = getattr(subject.cls.uses, name)
+        if access == "never" or _drawn_as(access, subject.first.seams_that_draw(name)):
+            continue
+        seams = subject.longer.seams_that_draw(name)  # it may draw at few steps
+        if not _drawn_as(access, seams):
+            expected = f"prior {name} to be drawn when `uses` declares it, {access!r}"
+            found = "in prepare() alone; declare 'prepare'" if seams else "never; leave them out of `uses`"
+            raise _breach(declared_data, expected, f"they are drawn {found}", "uses")
+
+
+def _drawn_as(access: Access, seams: set[str]) -> bool:
+    """Return whether data that are drawn in `seams` are declared as they should be."""
+    return bool(seams if access == "prepare" else seams - {"prepare"})
+
+
+def same_numbers(subject: Subject) -> None:
+    """Two runs with one seed that are equal, bit for bit."""
+    difference = _difference(subject.first, subject.second)
+    if difference:
+        raise _breach(
+            same_numbers,
+            "two runs with one seed to be equal: draw from the sources, from the global generators, which "
+            "are seeded for each seam, or from a generator that is seeded with stage.seed",
+            difference,
+            "every seam that draws, measures time, or iterates over a set",
+        )
+
+
+def state(subject: Subject) -> None:
+    """State that survives: an object that is given it goes on as the one that returned it."""
+    difference = _difference(subject.second, subject.kept)
+    if difference:
+        raise _breach(
+            state,
+            "state() to return all that later stages need, and load_state() to take it back",
+            f"a run with a new object for each stage differs from one that keeps the old: {difference}",
+            "state() and load_state()",
+        )
+
+
+def global_state(subject: Subject) -> None:
+    """Nothing that is left behind: settings of the process stay as they were, files are written nowhere."""
+    for seam, leak in subject.second.leaks:
+        expected = "the process to be left as it was, and files to be written in clbench's cache alone"
+        raise _breach(global_state, expected, f"after {seam}() {leak}", f"{seam}()")
+
+
+def seeding(subject: Subject) -> None:
+    """Random generators that are left to the run: with another seed it draws otherwise."""
+    first, other = subject.first.generators, subject.longer.generators
+    for seam in [seam for seam in first if seam in other]:
+        for name in GENERATORS:
+            if same(first[seam][name], other[seam][name]):
+                expected = "the global generators to be as the run's seed left them: draw, but do not seed"
+                found = f"after {seam}() {name} stands alike in runs of two seeds"
+                raise _breach(seeding, expected, found, f"{seam}()")
+
+
+def learning(subject: Subject) -> None:
+    """A target that is learned: guides excepted, the policy acts better than one that was left alone."""
+    if subject.cls.uses.reference:
+        return
+    before, after = _frozen_return(), _mean_return(subject.longer.learner.policy)
+    if not after - before >= LEAST_GAIN:
+        raise _breach(
+            learning,
+            f"a mean return of {before + LEAST_GAIN:.1f} or more on the toy's first target after "
+            f"{LEARNING_STEPS} steps; only a guide, `uses = Uses(reference=True)`, may learn nothing",
+            f"{after:.1f}, with {before:.1f} before",
+            "start_task(), loss(), gradients() and learning_rate()",
+        )
+
+
+CLAUSES = (
+    declaration,
+    constructor,
+    sound_seams,
+    declared_data,
+    same_numbers,
+    global_state,
+    state,
+    seeding,
+    learning,
+)
+"""The contract, in the order in which it is checked."""
+
+
+def _breach(clause: Callable[[Subject], None], expected: str, found: str, look: str) -> ContractError:
+    return ContractError(clause.__name__.replace("_", " "), expected, found, look)
+
+
+def _is_plain(value: Any) -> bool:
+    """Return whether a record can hold the value."""
+    try:
+        json.dumps(value, allow_nan=False)
+    except (TypeError, ValueError):
+        return False
+    return True
+
+
+def _difference(one: ToyRun, other: ToyRun) -> str | None:
+    """Return in words the first outcome that differs, or None."""
+    for stage, name in {**one.outcomes, **other.outcomes}:
+        values = [run.outcomes.get((stage, name)) for run in (one, other)]
+        if same(*values):
+            continue
+        words = f"{name} differs in {stage}"
+        first, second = values
+        if isinstance(first, Tensor) and isinstance(second, Tensor) and first.shape == second.shape:
+            words += f" by up to {float((first - second).abs().max()):.2g}"
+        return words
+    return None
+
+
+@functools.cache
+def _frozen_return() -> float:
+    return _mean_return(toy_learner().policy)
+
+
+def _mean_return(policy: Policy) -> float:
+    """Return the mean return of the policy on the toy's first target, over its selection episodes."""
+    evaluator = Evaluator(TOY, 0)
+    policy.eval()
+    with repeatable("cpu"):
+        episodes = evaluator.evaluate(policy, TOY.target[:1])
+    policy.train()
+    evaluator.close()
+    return sum(episode.total_reward for episode in episodes) / len(episodes)

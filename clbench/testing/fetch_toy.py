@@ -1,0 +1,48 @@
+"""A Fetch scenario of a minute: real worlds, experts and runs, and a budget that teaches next to nothing.
+
+It walks the whole way from a class to a row; its scores mean nothing. Ask for it as
+"clbench.testing.fetch_toy:clbench/FetchToy-v0".
+"""
+
+import dataclasses
+
+from gymnasium.envs.registration import register
+
+from clbench.task import Budget, Task, load_scenario
+
+_FETCH = load_scenario("clbench/Fetch-v0")
+
+
+def _apart(tasks: tuple[Task, ...]) -> tuple[Task, ...]:
+    """Return the tasks as those of another suite: their few demonstrations must not replace the full ones."""
+    return tuple(dataclasses.replace(task, suite="fetch-toy") for task in tasks)
+
+
+FETCH_TOY = dataclasses.replace(
+    _FETCH,
+    id="clbench/FetchToy-v0",
+    description="Fetch with one target and a budget of seconds; for tests and for a first try.",
+    retained=_apart(_FETCH.retained),
+    target=_apart(_FETCH.target[:1]),
+    held_out=_apart(_FETCH.held_out[:1]),
+    budget=Budget(
+        demonstrations=4,
+        question_episodes=36,
+        report_questions=60,
+        pretraining_steps=40,
+        adaptation_steps=16,
+        batch_size=16,
+        policy_width=32,
+        policy_layers=2,
+        evaluation_points=2,
+        selection_episodes=2,
+        report_episodes=3,
+        curve_episodes=2,
+    ),
+)
+
+register(
+    id=FETCH_TOY.id,
+    entry_point="clbench.scenario_env:ScenarioEnv",
+    kwargs={"scenario": "clbench.testing.fetch_toy:FETCH_TOY"},
+)

@@ -1,0 +1,298 @@
+"""A run of a method on the toy, without evaluation and with an eye on every seam."""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+import functools
+import itertools
+import json
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from torch import Tensor, nn
+
+from clbench.learner import Learner, repeatable
+from clbench.method import Method, Prior, Source, Stage, UndeclaredAccessError
+from clbench.policy import CheckpointError
+from clbench.seeding import seeded
+from clbench.testing.error import ContractError
+from clbench.testing.leaks import GENERATORS, read, watched
+from clbench.testing.toy import TOY
+from clbench.training import MethodError
+
+SEAMS = (
+    "prepare",
+    "start_task",
+    "batch",
+    "loss",
+    "gradients",
+    "learning_rate",
+    "end_task",
+    "state",
+    "load_state",
+    "diagnostics",
+)
+"""Of `Method`."""
+
+IN_A_STEP = ("batch", "loss", "gradients", "learning_rate")
+"""Seams of one optimiser step, in their order."""
+
+UNSEEDED = ("state", "diagnostics")
+"""Seams that may not draw at random."""
+
+SOUND = {
+    "start_task": "an iterable of the policy's parameters, or of optimiser groups of them",
+    "loss": "a finite scalar tensor that has a gradient",
+    "gradients": "finite gradients of the trained parameters",
+    "learning_rate": "a finite float from 0",
+    "end_task": "a policy of finite weights",
+}
+"""What the loop needs of a seam, in words."""
+
+_numbers = itertools.count()
+
+
+@functools.cache
+def toy_learner() -> Learner:
+    """Return a learner of the toy that is not to be used itself: to read its data takes a second."""
+    return Learner(TOY, Method, 0, "cpu")
+
+
+class ToyRun:
+    """What a method does on the toy, where it learns as it would in a run.
+
+    Args:
+        build: Returns a new object of the method.
+        targets: How many targets are learned.
+        steps: Optimiser steps on each.
+        seed: Of every draw.
+        resumed: Whether each stage begins with a new object that is given the state of the last one, as in a
+            run, or goes on with the old object.
+
+    Raises:
+        ContractError: A seam does what the loop cannot go on with.
+    """
+
+    def __init__(
+        self, build: Callable[[], Method], targets: int, steps: int, seed: int = 0, resumed: bool = True
+    ) -> None:
+        self.draws: set[tuple[str, str]] = set()
+        """Where samples were drawn: the source, and the seam."""
+        self.target_rows = 0
+        """Most samples of the target that were drawn in one step."""
+        self.leaks: dict[tuple[str, str], None] = {}
+        """What each seam left changed behind it."""
+        self.outcomes: dict[tuple[str, str], Any] = {}
+        """All that came of it, by stage and name: weights, state, diagnostics."""
+        self.generators: dict[str, dict[str, Any]] = {}
+        """The global random generators after the first call of each seam for which a run seeds them."""
+        self._build, self._seam, self._running, self._step_rows = build, "prepare", False, 0
+        learner = copy.copy(toy_learner())
+        budget = dataclasses.replace(TOY.budget, adaptation_steps=steps)
+        learner.scenario = dataclasses.replace(TOY, target=TOY.target[:targets], budget=budget)
+        learner.policy, learner.seed = copy.deepcopy(learner.policy), seed
+        learner.new_method = self._watched_method
+        self.learner = learner
+        # no two begin with the same global generators: what depends on them differs
+        with repeatable("cpu"), seeded("toy run", next(_numbers)), tempfile.TemporaryDirectory() as folder:
+            learner.method = self._watched_method()
+            self._go(Path(folder), resumed)
+
+    def _go(self, folder: Path, resumed: bool) -> None:
+        for number in range(len(self.learner.scenario.target) + 1):
+            with self._named_faults():
+                if number:
+                    self.learner.learn(number, lambda _: None)
+                else:
+                    self.outcomes["prepare", "steps"] = self.learner.prepare()
+                stage = self.learner.where
+                self._keep(stage, "diagnostics", self.learner.method.diagnostics())
+                self.learner.save(folder, number)
+                for name, value in self.learner.policy.state_dict().items():
+                    self._keep(stage, name, value)
+                if resumed:
+                    self.learner.load(folder, number)
+
+    def seams_that_draw(self, source: str) -> set[str]:
+        """Return the seams in which samples of a source are drawn."""
+        return {seam for one, seam in self.draws if one == source}
+
+    def _keep(self, stage: str, name: str, value: Any) -> None:
+        value = value.detach().clone() if isinstance(value, Tensor) else copy.deepcopy(value)
+        self.outcomes[stage, name] = value
+
+    @contextmanager
+    def _named_faults(self) -> Iterator[None]:
+        """Turn what goes wrong inside, but in no seam, into a fault of the last seam."""
+        try:
+            yield
+        except CheckpointError as error:
+            raise ContractError(
+                "state",
+                "load_state() to add to a plain policy what prepare() added",
+                str(error).partition(": ")[2],
+                "load_state()",
+            ) from error
+        except ContractError:
+            raise
+        except Exception as error:
+            found = str(error) if isinstance(error, MethodError) else f"{type(error).__name__}: {error}"
+            expected = SOUND.get(self._seam, f"{self._seam}() to go through")
+            raise ContractError("sound seams", expected, found, f"{self._seam}()") from error
+
+    # ---- the seams ---------------------------------------------------------------------------------
+
+    def _watched_method(self) -> Method:
+        method = self._build()
+        self.uses = method.uses
+        for seam in SEAMS:
+            # an attribute of the object goes before the seam of its class, also where the class is frozen
+            object.__setattr__(method, seam, functools.partial(self._call, seam, getattr(method, seam)))
+        return method
+
+    def _call(self, seam: str, function: Callable[..., Any], *arguments: Any, **named: Any) -> Any:
+        if self._running:  # the method calls a seam of its own
+            return function(*arguments, **named)
+        self._seam, self._running = seam, True
+        self._step_rows = 0 if seam == "batch" else self._step_rows
+        leaks: list[str] = []
+        try:
+            with watched(leaks, generators=seam in UNSEEDED):
+                result = function(*map(self._counted, arguments), **named)
+        except Exception as error:
+            raise self._fault(seam, error) from error
+        finally:
+            self._running = False
+            self.leaks.update(dict.fromkeys((seam, leak) for leak in leaks))
+        if seam not in (*UNSEEDED, "load_state"):
+            self.generators.setdefault(seam, read(GENERATORS))
+        check = getattr(self, f"_checked_{seam}", None)
+        return check(result) if check else result
+
+    def _fault(self, seam: str, error: Exception) -> ContractError:
+        """Return the breach that an error in a seam is."""
+        clause, expected, found = "sound seams", f"{seam}() to go through", f"{type(error).__name__}: {error}"
+        if isinstance(error, UndeclaredAccessError):
+            clause, found = "declared data", str(error)
+            expected = f"{seam}() to draw from what it is handed, and of prior data from what `uses` declares"
+        elif isinstance(error, AttributeError) and error.obj is self.learner.method and seam != "prepare":
+            clause, found = "state", f"{seam}() finds no attribute {error.name!r}"
+            expected = "every stage to begin with a new object that has what load_state() sets, and no more"
+        elif seam in ("state", "load_state"):
+            clause = "state"
+        return ContractError(clause, expected, found, f"{seam}()")
+
+    def _checked_prepare(self, steps: Any) -> Any:
+        if steps is not None and not (type(steps) is int and steps >= 0):
+            raise _unsound("prepare", "the optimiser steps that it took, or None", repr(steps))
+        return steps
+
+    def _checked_start_task(self, parameters: Any) -> list[Any]:
+        try:
+            groups = list(parameters)
+        except TypeError as error:
+            raise _unsound("start_task", SOUND["start_task"], type(parameters).__name__) from error
+        members = [group["params"] if isinstance(group, dict) else [group] for group in groups]
+        self._trained = list(itertools.chain.from_iterable(members))
+        if not self._trained and not self.uses.reference:
+            expected = "parameters to train; only a guide, `uses = Uses(reference=True)`, may train none"
+            raise _unsound("start_task", expected, "none")
+        for one in self._trained:
+            if not isinstance(one, nn.Parameter):
+                raise _unsound("start_task", SOUND["start_task"], f"a {type(one).__name__} among them")
+            if not one.requires_grad:
+                raise _unsound("start_task", "parameters that require a gradient", "one that does not")
+        return groups
+
+    def _checked_gradients(self, result: Any) -> Any:
+        if all(parameter.grad is None for parameter in self._trained):
+            found = "no parameter that start_task() returned has a gradient"
+            raise ContractError("sound seams", SOUND["gradients"], found, "gradients()")
+        return result
+
+    def _checked_state(self, state: Any) -> Any:
+        if not isinstance(state, dict):
+            raise _bad_state("a dictionary", f"a {type(state).__name__}")
+        for name, value in state.items():
+            if not isinstance(name, str):
+                raise _bad_state("names that are text", repr(name))
+            if not (value is None or isinstance(value, Tensor | str | float | int)):
+                raise _bad_state("tensors and plain values", f"a {type(value).__name__}, {name!r}")
+            self._keep(self.learner.where, f"state {name!r}", value)
+        return state
+
+    def _checked_diagnostics(self, diagnostics: Any) -> Any:
+        try:
+            text = json.dumps(diagnostics, allow_nan=False)
+        except (TypeError, ValueError) as error:
+            raise _unsound("diagnostics", "what JSON can hold", str(error)) from error
+        if not isinstance(diagnostics, dict):
+            raise _unsound("diagnostics", "a dictionary", text)
+        return diagnostics
+
+    # ---- what the method is handed -----------------------------------------------------------------
+
+    def _counted(self, argument: Any) -> Any:
+        """Return an argument of a seam, its sources counted."""
+        if isinstance(argument, Stage):
+            counted = {"target": self._counted(argument.target), "prior": self._counted(argument.prior)}
+            return dataclasses.replace(argument, **counted)
+        if isinstance(argument, Prior):
+            return Prior(
+                {name: CountedSource(one, self._counter(name)) for name, one in argument.sources.items()}
+            )
+        if isinstance(argument, Source):
+            return CountedSource(argument, self._counter("target"))
+        return argument
+
+    def _counter(self, source: str) -> Callable[[int], None]:
+        def count(samples: int) -> None:
+            self.draws.add((source, self._seam))
+            if source == "target" and self._seam in IN_A_STEP:
+                self._step_rows += samples
+                self.target_rows = max(self.target_rows, self._step_rows)
+
+        return count
+
+
+class CountedSource(Source[Any]):
+    """A source that tells how many samples are drawn from it.
+
+    Args:
+        source: Where they come from.
+        drew: Called with their number.
+    """
+
+    def __init__(self, source: Source[Any], drew: Callable[[int], None]) -> None:
+        self.batch_size = source.batch_size
+        self._source, self._drew = source, drew
+
+    def __len__(self) -> int:
+        return len(self._source)
+
+    @property
+    def bytes(self) -> int:
+        """Memory that the data takes."""
+        return self._source.bytes
+
+    def sample(self, count: int) -> Any:
+        """Return `count` samples."""
+        rows = self._source.sample(count)
+        self._drew(count)
+        return rows
+
+    def close(self) -> None:
+        """End the access."""
+        self._source.close()
+
+
+def _unsound(seam: str, expected: str, found: str) -> ContractError:
+    return ContractError("sound seams", f"{seam}() to return {expected}", found, f"{seam}()")
+
+
+def _bad_state(expected: str, found: str) -> ContractError:
+    return ContractError("state", f"state() to return {expected}", found, "state()")

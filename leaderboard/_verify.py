@@ -1,0 +1,328 @@
+"""Verification: a record is read again, replayed from its policies, or made a second time.
+
+Each check says what it found. What a record names is imported only if it is installed or the verifier names
+it himself. What was found goes into a file beside the record, with who found it; the record is never touched.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import tempfile
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+
+from clbench.evaluation import Evaluator, Trial, answer
+from clbench.fingerprint import fingerprint
+from clbench.grid import Job, JobError, run_jobs
+from clbench.learner import repeatable
+from clbench.method import method_names
+from clbench.metrics import measure
+from clbench.policy import Policy
+from clbench.progress import Bars
+from clbench.questions import load_questions, report_questions
+from clbench.record import Record, RecordError
+from clbench.run import RunSpec, episode_row, execute, pretrained_hash, run_length
+from clbench.stages import has_stages, stage_policies
+from clbench.task import Scenario, load_scenario
+
+from ._runs import Run, differences, read_run
+from ._table import write_if_changed
+from ._tiers import TIERS, tier_of, verification_path
+
+Row = tuple[Any, ...]
+"""One line of a table of a record."""
+
+SHOWN = 3
+"""Differences that a check tells in full."""
+
+PARTS = ("run", "scenario", "episodes", "answers", "policy", "costs", "diagnostics")
+"""What two records of one run have in common to the last bit."""
+
+
+@dataclass(frozen=True)
+class Check:
+    """One thing that was looked at."""
+
+    name: str
+    """What was looked at."""
+    found: str
+    """What was found, in words."""
+    passed: bool
+    """Whether it is as it should be."""
+
+
+@dataclass(frozen=True)
+class Request:
+    """What a verifier asks for."""
+
+    tier: str
+    """The highest of `TIERS` to try."""
+    episodes: int
+    """How many episodes are replayed; all that can be if there are fewer."""
+    seed: int
+    """Of the choice of these episodes. Whoever made the record must not know it."""
+    method: str | None
+    """The method's "module:Class", for one that is not installed: a record's own word is not imported."""
+    scenario: str | None
+    """Where the scenario is registered, as "module:id"; None if importing clbench registers it."""
+    checkpoints: Path | None
+    """Folder of kept policies; they are made again if None."""
+
+
+def verify(
+    path: Path, records: Path, request: Request, progress: Callable[[float], None] = lambda _: None
+) -> list[Check]:
+    """Look at the record at `path`, write the tier that it reaches beside it, and return what was looked at.
+
+    What an earlier verification wrote goes; a check that fails ends this one.
+
+    Args:
+        path: The record.
+        records: Folder of the records.
+        request: What is asked for.
+        progress: Called with the optimiser steps, or what took as long, done since its last call.
+    """
+    verification_path(path).unlink(missing_ok=True)
+    try:
+        run = read_run(records, path, changed=None)
+    except RecordError as error:
+        return [Check("record", str(error), False)]
+    checks: list[Check] = []
+    looks = {"recomputed": _recompute, "replayed": _replay, "retrained": _retrain}
+    for tier in TIERS[1 : TIERS.index(request.tier) + 1]:
+        checks += looks[tier](run, request, progress)
+        if not all(check.passed for check in checks):
+            break
+        _write(path, run, tier, request, checks)
+    return checks
+
+
+def _spec(run: Run, request: Request) -> RunSpec:
+    """Return what to run to get a record again."""
+    values = run.record.run
+    return RunSpec(
+        request.scenario or values["scenario"],
+        values["method"],
+        values["seed"],
+        values["changes"],
+        values["device"],
+    )
+
+
+def _write(path: Path, run: Run, tier: str, request: Request, checks: Sequence[Check]) -> None:
+    """Write the file that says what a record was found to be, and by whom."""
+    values = {
+        "tier": tier,
+        "record": hashlib.sha256(path.read_bytes()).hexdigest(),
+        "seed": request.seed,
+        "checks": [asdict(check) for check in checks],
+        "verifier": fingerprint(load_scenario(request.scenario or run.scenario)),
+    }
+    write_if_changed(verification_path(path), json.dumps(values, indent=1) + "\n")
+
+
+# ---- recomputed --------------------------------------------------------------------------------------------
+
+
+def _recompute(run: Run, request: Request, _: Callable[[float], None]) -> list[Check]:
+    """Check that a record agrees with itself, and is of this very scenario."""
+    values = {name: measure(name, run.scores) for name in ("final_average", "adaptation", "retention")}
+    told = ", ".join(f"{name} {'-' if value is None else f'{value:.3f}'}" for name, value in values.items())
+    checks = [Check("metrics from its episodes", told, values["final_average"] is not None)]
+    try:
+        scenario = load_scenario(request.scenario or run.scenario)
+        described = _spec(run, request).describe() if _may_import(run, request) else None
+    except (LookupError, ValueError, TypeError) as error:
+        return [*checks, Check("what was run", str(error.args[0]), False)]
+    checks.append(_check_horizons(run.record, scenario))
+    if described is None:
+        told = f"{run.record.run['method']} is not installed: its settings were not compared with its class"
+        checks.append(Check("what was run", told, True))
+    else:
+        ours = dict(zip(("run", "scenario"), described, strict=True))
+        theirs = {"run": run.record.run, "scenario": run.record.scenario}
+        wrong = [f"{part}.{name}" for part in ours for name in differences(theirs[part], ours[part])]
+        told = (
+            f"{', '.join(wrong)} differ from what is installed"
+            if wrong
+            else "as its class and the scenario say"
+        )
+        checks.append(Check("what was run", told, not wrong))
+    worlds = differences(run.record.fingerprint.get("rollouts"), fingerprint(scenario)["rollouts"])
+    same = run.record.fingerprint.get("rollouts") == fingerprint(scenario)["rollouts"]
+    told = (
+        "moves as here"
+        if same
+        else f"the rollouts of {', '.join(worlds) or 'all worlds'} differ from those here"
+    )
+    return [*checks, Check("simulator", told, same)]
+
+
+def _may_import(run: Run, request: Request) -> bool:
+    """Return whether the method of a record may be imported: it is installed, or the verifier named it."""
+    return run.record.run["method"] in (*method_names(), request.method)
+
+
+def _check_horizons(record: Record, scenario: Scenario) -> Check:
+    """Check that episodes end as episodes do: with success, or at the horizon of their task."""
+    horizons = {task.name: task.horizon for task in scenario.tasks}
+    wrong = [
+        f"{task} {split} episode {number} of stage {stage}"
+        for stage, _, task, split, number, success, _, length in _rows(record.episodes)
+        if not (length == horizons.get(task) or (success and 0 < length < horizons.get(task, 0)))
+    ]
+    if not wrong:
+        return Check(
+            "ends of episodes", f"all {len(record.episodes['task'])} as the task's horizon allows", True
+        )
+    return Check("ends of episodes", f"failed before the horizon, or beyond it: {_some(wrong)}", False)
+
+
+# ---- replayed ----------------------------------------------------------------------------------------------
+
+
+def _replay(run: Run, request: Request, progress: Callable[[float], None]) -> list[Check]:
+    """Run episodes of a record again from the policies of its stages, and ask the questions again."""
+    if not _may_import(run, request):
+        told = f"{run.method} is not installed: name it with --method to import and run its code"
+        return [Check("policies", told, False)]
+    spec = _spec(run, request)
+    kept = request.checkpoints is not None and has_stages(spec, request.checkpoints)
+    if not kept:
+        pretrained = pretrained_hash(spec)
+        if pretrained != run.record.fingerprint.get("pretrained"):
+            told = (
+                "pretraining does not give the same policy here as where the record was made, as on another "
+                "processor: ask for the policies of its stages (--checkpoints)"
+            )
+            return [Check("policies", told, False)]
+    with repeatable(spec.device):
+        policies = stage_policies(spec, request.checkpoints, progress)
+        episodes = _replay_episodes(run, request, spec, policies)
+        answers = _replay_answers(run, spec, policies)
+    origin = "those kept by the run" if kept else "made again"
+    return [Check("policies", origin, True), episodes, answers]
+
+
+def _replay_episodes(run: Run, request: Request, spec: RunSpec, policies: Sequence[Policy]) -> Check:
+    scenario = spec.load()
+    end = scenario.budget.adaptation_steps
+    at_ends = [row for row in _rows(run.record.episodes) if row[1] in (0, end) and row[3] == "report"]
+    generator = np.random.default_rng(request.seed)
+    chosen = generator.permutation(len(at_ends))[: request.episodes]
+    rows = [at_ends[index] for index in sorted(chosen)]
+    again: list[Row] = []
+    evaluator = Evaluator(scenario, spec.seed)
+    for stage, policy in enumerate(policies):
+        trials: list[Trial] = [(scenario.task(row[2]), row[3], row[4]) for row in rows if row[0] == stage]
+        policy.eval()
+        step = end if stage else 0
+        again += [episode_row(stage, step, episode) for episode in evaluator.play(policy, trials)]
+    evaluator.close()
+    wrong = [
+        f"{theirs[2]} episode {theirs[4]} of stage {theirs[0]} has {_told(theirs)}, not {_told(ours)}"
+        for theirs, ours in zip(rows, again, strict=True)
+        if theirs != ours
+    ]
+    if wrong:
+        return Check("episodes", f"{len(wrong)} of {len(rows)} ended otherwise: {_some(wrong)}", False)
+    return Check("episodes", f"{len(rows)} of {len(at_ends)} run again, all ended as recorded", True)
+
+
+def _told(row: Row) -> str:
+    success, total_reward, length = row[5:]
+    return f"{'success' if success else 'failure'} after {length} steps, return {total_reward}"
+
+
+def _replay_answers(run: Run, spec: RunSpec, policies: Sequence[Policy]) -> Check:
+    scenario = spec.load()
+    _, questions = load_questions(scenario)
+    kind, asked = report_questions(questions, scenario.budget.report_questions)
+    end = scenario.budget.adaptation_steps
+    again = [
+        (stage, end if stage else 0, *counts)
+        for stage, policy in enumerate(policies)
+        for counts in answer(policy, questions.kinds, kind, asked)
+    ]
+    theirs = {row for row in _rows(run.record.answers) if row[1] in (0, end)}
+    wrong = [f"{row[2]} after stage {row[0]}" for row in sorted(theirs.symmetric_difference(again))]
+    if wrong:
+        return Check("answers", f"other counts of right answers: {_some(list(dict.fromkeys(wrong)))}", False)
+    return Check("answers", f"asked again after all {len(policies) - 1} stages, counts as recorded", True)
+
+
+# ---- retrained ---------------------------------------------------------------------------------------------
+
+
+def _retrain(run: Run, request: Request, progress: Callable[[float], None]) -> list[Check]:
+    """Do the whole run again, and compare the records."""
+    spec = _spec(run, request)
+    with tempfile.TemporaryDirectory() as folder:
+        again = execute(spec, Path(folder), progress)
+    wrong = [
+        part
+        if not (names := differences(getattr(run.record, part), getattr(again, part)))
+        else f"{part} ({', '.join(names)})"
+        for part in PARTS
+        if getattr(run.record, part) != getattr(again, part)
+    ]
+    if again.error is not None:
+        return [Check("whole run", f"it failed: {again.error['type']}: {again.error['message']}", False)]
+    if wrong:
+        return [Check("whole run", f"done again, {', '.join(wrong)} came out otherwise", False)]
+    return [Check("whole run", f"done again, equal in {', '.join(PARTS)}", True)]
+
+
+def _rows(columns: dict[str, list[Any]]) -> list[Row]:
+    return list(zip(*columns.values(), strict=True))
+
+
+def _some(wrong: Sequence[str]) -> str:
+    more = f", and {len(wrong) - SHOWN} more" if len(wrong) > SHOWN else ""
+    return f"{'; '.join(wrong[:SHOWN])}{more}"
+
+
+# ---- the job -----------------------------------------------------------------------------------------------
+
+
+def run_verifications(paths: Sequence[Path], records: Path, request: Request, workers: int | None) -> bool:
+    """Verify records, each in a process of its own, and return whether all of them passed."""
+    console = Console()
+    jobs = [_job(path, records, request) for path in paths]
+    with Bars(sum(job.length for job in jobs), console) as bars:
+        failed = run_jobs(jobs, workers or os.cpu_count() or 1, bars)
+    return not failed
+
+
+def _job(path: Path, records: Path, request: Request) -> Job:
+    """Return the job that verifies a record; how long it takes is known if it can be read."""
+    length = 1.0
+    try:
+        spec = _spec(read_run(records, path, changed=None), request)
+        scenario = spec.load()
+        if request.tier in TIERS[2:]:
+            length += len(scenario.target) * scenario.budget.adaptation_steps
+        if request.tier == "retrained":
+            length += run_length(scenario)
+    except (RecordError, LookupError):
+        pass  # the job itself says what is wrong
+    arguments = {"path": str(path), "records": str(records), "request": request}
+    return Job(str(path), "clbench.leaderboard._verify:verify_job", arguments, length)
+
+
+def verify_job(path: str, records: str, request: Request, progress: Callable[[float], None]) -> str:
+    """Verify a record, and return its tier with what was found."""
+    checks = verify(Path(path), Path(records), request, progress)
+    text = "\n".join(f"  {'ok ' if check.passed else 'NOT'} {check.name}: {check.found}" for check in checks)
+    progress(1.0)
+    tier = tier_of(Path(path))
+    if not all(check.passed for check in checks):
+        raise JobError(f"{tier}\n{text}")
+    return f"{tier}\n{text}"
