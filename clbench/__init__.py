@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from clbench.evaluation import Episode as Episode
     from clbench.evaluation import Evaluator as Evaluator
+    from clbench.method import Metadata as Metadata
     from clbench.method import Method as Method
     from clbench.method import Prior as Prior
     from clbench.method import Progress as Progress
@@ -36,7 +37,17 @@ __version__ = version("clbench")
 
 _HOMES = {
     "evaluation": ("Episode", "Evaluator"),
-    "method": ("Method", "Prior", "Progress", "Source", "Stage", "Uses", "load_method", "method_names"),
+    "method": (
+        "Metadata",
+        "Method",
+        "Prior",
+        "Progress",
+        "Source",
+        "Stage",
+        "Uses",
+        "load_method",
+        "method_names",
+    ),
     "policy": ("Batch", "Policy", "PolicyConfig", "QuestionBatch"),
     "questions": ("QuestionKind",),
     "record": ("Record", "read_record"),
@@ -52,6 +63,7 @@ __all__ = [
     "Budget",
     "Episode",
     "Evaluator",
+    "Metadata",
     "Method",
     "Policy",
     "PolicyConfig",

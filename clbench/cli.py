@@ -1,4 +1,4 @@
-"""The commands: `clbench list`, `run`, `tune`, `metrics`, `leaderboard`, `demonstrations`, `doctor`."""
+"""The commands: `clbench list`, `run`, `tune`, `film`, `metrics`, `leaderboard`, `demonstrations`, `doctor`."""
 
 from __future__ import annotations
 
@@ -8,8 +8,6 @@ import os
 import signal
 import sys
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -19,6 +17,7 @@ from rich.logging import RichHandler
 from rich.table import Table
 
 import clbench
+from clbench.arguments import at_least, checked_input
 from clbench.record import RECORDS, TUNING
 
 if TYPE_CHECKING:
@@ -33,6 +32,8 @@ app = App(
 
 # Named, not imported: the core knows its parts by name alone.
 app.command("clbench.leaderboard.cli:show", name="leaderboard")
+app.command("clbench.leaderboard.cli:submit", name="submit")
+app.command("clbench.leaderboard.cli:verify", name="verify")
 app.command("clbench.leaderboard.cli:claims", name="claims")
 app.command("clbench.leaderboard.cli:method_pages", name="method-pages")
 app.command("clbench.doctor:doctor", name="doctor")
@@ -50,27 +51,6 @@ def main() -> None:
     except KeyboardInterrupt:
         console.print("Stopped. Finished records are kept; the same command goes on from here.", style="bold")
         sys.exit(130)
-
-
-@contextmanager
-def _input() -> Iterator[None]:
-    """Check input inside: a wrong name or value ends with exit code 2 and says the nearest right one."""
-    try:
-        yield
-    except (LookupError, ValueError, TypeError) as error:
-        console = Console(stderr=True, soft_wrap=True)
-        console.print(
-            f"error: {error.args[0] if error.args else error!r}",
-            style="bold red",
-            highlight=False,
-            markup=False,
-        )
-        sys.exit(2)
-
-
-def _at_least(least: int, option: str, value: int | None) -> None:
-    if value is not None and value < least:
-        raise ValueError(f"{option} must be at least {least}, not {value}.")
 
 
 @app.command(name="list")
@@ -102,6 +82,24 @@ def list_() -> None:
 
 
 @app.command
+def new_method(name: str, /, *, folder: Path = Path()) -> None:
+    """Write NAME.py, a commented template of a method, and test_NAME.py.
+
+    Args:
+        name: Of the module; that of the class is made from it.
+        folder: Where to; nothing in it is overwritten.
+    """
+    from clbench.new_method import class_name, write_method
+
+    with checked_input():
+        module, test = write_method(name, folder)
+    lines = [f"Wrote {module} and {test}. Make the method yours, then:"]
+    lines += [f"  cd {folder}"] if folder != Path() else []
+    lines += [f"  python -m pytest {test.name}", f"  clbench submit {name}:{class_name(name)}"]
+    Console().print("\n".join(lines), highlight=False, markup=False, soft_wrap=True)
+
+
+@app.command
 def run(
     scenario: str,
     /,
@@ -113,6 +111,8 @@ def run(
     records: Path = RECORDS,
     device: str = "cpu",
     changes: Annotated[dict[str, str] | None, Parameter(name="--set")] = None,
+    checkpoints: Path | None = None,
+    tensorboard: Path | None = None,
 ) -> None:
     """Run METHODS on SCENARIO, once per seed, and write a record of each run.
 
@@ -130,21 +130,28 @@ def run(
         device: Where policies are computed, as cpu or cuda.
         changes: Hyper-parameters that differ from the methods' own, as --set.name value. Such a run has a
             record of its own, which the leaderboard does not show.
+        checkpoints: Keep the policies of all stages below this folder. Those of runs that have a record are
+            made again.
+        tensorboard: Log the runs for TensorBoard below this folder, while they are under way.
     """
+    from clbench.live import require_tensorboard
     from clbench.method import build_method, method_names
     from clbench.run import RunSpec, check_device
+    from clbench.statistics import expected_precision
     from clbench.task import load_scenario
 
     sys.path.insert(0, os.getcwd())  # a console script lacks it, and module:Class is looked for there
-    with _input():
-        _at_least(1, "--seeds", seeds)
-        _at_least(0, "--first-seed", first_seed)
-        _at_least(1, "--workers", workers)
+    with checked_input():
+        at_least(1, "--seeds", seeds)
+        at_least(0, "--first-seed", first_seed)
+        at_least(1, "--workers", workers)
         names = dict.fromkeys([*methods, *(method_names() if every else ())])
         if not names:
             raise ValueError("Name at least one method, or --all; `clbench list` shows them.")
         check_device(device)
-        load_scenario(scenario)
+        if tensorboard:
+            require_tensorboard()
+        loaded = load_scenario(scenario)
         built = {method: build_method(method, changes or {}) for method in names}
     values = {name: {key: getattr(method, key) for key in changes or {}} for name, method in built.items()}
     specs = [
@@ -152,30 +159,42 @@ def run(
         for seed in range(first_seed, first_seed + seeds)
         for method in built
     ]
-    if not _run_missing(specs, records, workers):
+    Console(stderr=True).print(expected_precision(loaded, seeds), highlight=False)
+    if not _run_missing(specs, records, workers, checkpoints, tensorboard):
         sys.exit(1)
 
 
-def _run_missing(specs: list[RunSpec], records: Path, workers: int | None) -> bool:
-    """Do the runs that have no record yet, and return whether none failed."""
-    from clbench.grid import benchmark_jobs, run_jobs
+def _run_missing(
+    specs: list[RunSpec],
+    records: Path,
+    workers: int | None,
+    checkpoints: Path | None = None,
+    tensorboard: Path | None = None,
+) -> bool:
+    """Do the runs that have no record yet, keep what policies are to be kept; return whether none failed."""
+    from clbench.grid import benchmark_jobs, run_jobs, stages_jobs
     from clbench.progress import Bars
     from clbench.run import has_record
+    from clbench.stages import has_stages
 
     console = Console(stderr=True)
-    missing = [spec for spec in specs if not has_record(spec, records)]
+    with checked_input():
+        missing = [spec for spec in specs if not has_record(spec, records)]
     if len(missing) < len(specs):
         console.print(f"{len(specs) - len(missing)} of {len(specs)} runs have a record already.")
-    if not missing:
+    recorded = [spec for spec in specs if spec not in missing]
+    bare = [spec for spec in recorded if checkpoints and not has_stages(spec, checkpoints)]
+    if not missing and not bare:
         return True
     begin = time.monotonic()
-    jobs = benchmark_jobs(missing, records)
+    runs = benchmark_jobs(missing, records, checkpoints=checkpoints, tensorboard=tensorboard)
+    # what both need is made once
+    jobs = list({job.name: job for job in (*runs, *stages_jobs(bare, checkpoints))}.values())
     with Bars(sum(job.length for job in jobs), console) as bars:
         failed = run_jobs(jobs, workers or os.cpu_count() or 1, bars)
     seconds = time.monotonic() - begin
-    console.print(
-        f"{len(missing)} runs in {seconds / 60:.1f} minutes; records in {records}.", highlight=False
-    )
+    done = f"{len(missing)} runs" + (f" and the policies of {len(bare)}" if bare else "")
+    console.print(f"{done} in {seconds / 60:.1f} minutes; records in {records}.", highlight=False)
     if failed:
         console.print(
             f"{len(failed)} failed: {', '.join(failed)}.", style="bold red", highlight=False, markup=False
@@ -214,10 +233,10 @@ def tune(
     from clbench.task import load_scenario
 
     sys.path.insert(0, os.getcwd())
-    with _input():
-        _at_least(0, "--seed", seed)
-        _at_least(1, "--targets", targets)
-        _at_least(1, "--workers", workers)
+    with checked_input():
+        at_least(0, "--seed", seed)
+        at_least(1, "--targets", targets)
+        at_least(1, "--workers", workers)
         load_scenario(scenario)
         lists = [[(name, value) for value in text.split(",")] for name, text in values.items()]
         specs = []
@@ -257,6 +276,103 @@ def _tuning_table(baseline: RunSpec, specs: list[RunSpec], records: Path) -> Tab
 
 
 @app.command
+def film(
+    scenario: str,
+    method: str,
+    /,
+    *,
+    seed: int = 0,
+    tasks: str | None = None,
+    stages: str | None = None,
+    episode: int = 0,
+    output: Path | None = None,
+    size: int = 200,
+    fps: int | None = None,
+    checkpoints: Path | None = None,
+    device: str = "cpu",
+    changes: Annotated[dict[str, str] | None, Parameter(name="--set")] = None,
+) -> None:
+    """Film METHOD on SCENARIO: the pretrained policy beside that of each stage, in the same initial states.
+
+    The policies are those that `clbench run` kept, or are made again without evaluation.
+
+    Args:
+        scenario: Gymnasium id of the scenario.
+        method: Name of an installed method, or module:Class.
+        seed: Of the run.
+        tasks: Names of tasks, as push,lift; every retained skill and target if not given.
+        stages: Numbers of stages, as 0,4; all if not given. 0 is before any target.
+        episode: Which selection episode; those of the report are not filmed.
+        output: A .gif or .mp4 file; if not given, a .gif below films/.
+        size: Width of each picture in pixels.
+        fps: Steps shown in a second; as in the simulated world if not given.
+        checkpoints: Folder below which `clbench run` kept policies.
+        device: Where the policies were computed, and are.
+        changes: Hyper-parameters that differ from the method's own, as --set.name value.
+    """
+    from clbench.film import FASTEST, FILMS, check_format, film_run, steps_per_second
+    from clbench.method import build_method
+    from clbench.progress import Bars
+    from clbench.rendering import choose_back_end
+    from clbench.run import RunSpec, check_device
+    from clbench.stages import load_stages
+    from clbench.task import load_scenario
+
+    sys.path.insert(0, os.getcwd())
+    with checked_input():
+        at_least(0, "--seed", seed)
+        at_least(96, "--size", size)
+        if fps is not None and not 1 <= fps <= FASTEST:
+            raise ValueError(f"--fps must be from 1 to {FASTEST}, not {fps}.")
+        check_device(device)
+        loaded = load_scenario(scenario)
+        built = build_method(method, changes or {})
+        spec = RunSpec(scenario, method, seed, {name: getattr(built, name) for name in changes or {}}, device)
+        shown = [loaded.task(name) for name in tasks.split(",")] if tasks else loaded.retained + loaded.target
+        numbers = _numbers("--stages", stages, len(loaded.target))
+        (episode,) = _numbers("--episode", str(episode), loaded.budget.selection_episodes - 1)
+        path = output or spec.path(FILMS).with_suffix(".gif")
+        check_format(path)
+        choose_back_end(task.world for task in shown)
+    console = Console(stderr=True)
+    policies = load_stages(spec, _stages_folder(spec, checkpoints, console))
+    with Bars(len(shown) * len(numbers), console) as bars:
+        bars.start("film", len(shown) * len(numbers))
+        chosen = {number: policies[number] for number in numbers}
+        made = film_run(spec, chosen, shown, episode, size, lambda takes: bars.advance("film", takes))
+        made.save(path, fps or steps_per_second(shown[0]))
+        width, height = made.size
+        bars.finish("film", f"{path} ({width} x {height} pixels, {path.stat().st_size / 1e6:.1f} MB)")
+
+
+def _numbers(option: str, text: str | None, last: int) -> list[int]:
+    """Return the numbers from 0 to `last` that an option names; all if it was not given."""
+    if text is None:
+        return list(range(last + 1))
+    words = text.split(",")
+    if not all(word.isdecimal() and int(word) <= last for word in words):
+        raise ValueError(f"{option} has numbers from 0 to {last}, not {text}.")
+    return [int(word) for word in words]
+
+
+def _stages_folder(spec: RunSpec, checkpoints: Path | None, console: Console) -> Path:
+    """Return where the policies of all stages of a run lie; what is missing is made first."""
+    from clbench.grid import run_jobs, stages_jobs
+    from clbench.progress import Bars
+    from clbench.stages import find_stages, make_stages
+
+    found = find_stages(spec, checkpoints)
+    if found is not None:
+        return found
+    jobs = stages_jobs([spec], None)
+    with Bars(sum(job.length for job in jobs), console) as bars:
+        failed = run_jobs(jobs, os.cpu_count() or 1, bars)
+    if failed:
+        sys.exit(1)
+    return make_stages(spec)
+
+
+@app.command
 def metrics(name: str | None = None, /, *, markdown: Path | None = None) -> None:
     """Show the metrics, or all about the one called NAME.
 
@@ -268,7 +384,7 @@ def metrics(name: str | None = None, /, *, markdown: Path | None = None) -> None
     from clbench.metrics import load_metric
 
     console = Console()
-    with _input():
+    with checked_input():
         if name and markdown:
             raise ValueError("The page has all metrics: give a name or --markdown, not both.")
         metric = load_metric(name) if name else None
@@ -295,8 +411,8 @@ def demonstrations(scenario: str, /, *, workers: int | None = None) -> None:
     from clbench.progress import Bars
     from clbench.task import load_scenario
 
-    with _input():
-        _at_least(1, "--workers", workers)
+    with checked_input():
+        at_least(1, "--workers", workers)
         loaded = load_scenario(scenario)
     jobs = demonstration_jobs(scenario, [task.name for task in loaded.tasks])
     with Bars(sum(job.length for job in jobs)) as bars:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import subprocess
 import sys
 from importlib.metadata import PackageNotFoundError, requires, version
 from pathlib import Path
@@ -16,11 +15,7 @@ from rich.table import Table
 
 from clbench.cache import cache_folder
 from clbench.method import method_names
-
-_RENDER = "import mujoco; mujoco.GLContext(8, 8).make_current(); print(mujoco.__version__)"
-
-_DEBIAN_PACKAGES = {"egl": "libegl1 libgl1-mesa-dri", "osmesa": "libosmesa6"}
-"""What makes each headless rendering back end of MuJoCo work on Debian and Ubuntu."""
+from clbench.rendering import DEBIAN_PACKAGES, rendering_fault
 
 
 def doctor() -> None:
@@ -63,28 +58,27 @@ def _machine() -> Table:
     table.add_row(
         "cuda", torch.cuda.get_device_name() if torch.cuda.is_available() else "no (none is needed)"
     )
-    for back_end, packages in _DEBIAN_PACKAGES.items():
-        works = _renders(back_end)
-        table.add_row(
-            f"rendering: {back_end}", "works" if works else f"does not work; apt-get install {packages}"
-        )
-    chosen = os.environ.get("MUJOCO_GL", "unset; films and pictures need one of the above, scores do not")
-    table.add_row("MUJOCO_GL", chosen)
+    faults = {back_end: rendering_fault(back_end) for back_end in DEBIAN_PACKAGES}
+    for back_end, fault in faults.items():
+        missing = f"does not work; apt-get install {DEBIAN_PACKAGES[back_end]}"
+        table.add_row(f"rendering: {back_end}", "works" if fault is None else missing)
+    table.add_row("films", _films(faults))
     table.add_row("cache", _folder(cache_folder(), "CLBENCH_CACHE"))
     minari = Path(os.environ.get("MINARI_DATASETS_PATH", "~/.minari/datasets")).expanduser() / "clbench"
     table.add_row("demonstrations", _folder(minari, "MINARI_DATASETS_PATH"))
     return table
 
 
-def _renders(back_end: str) -> bool:
-    """Return whether MuJoCo can make a context; tried in a process of its own, as a failure may kill it."""
-    environment = {**os.environ, "MUJOCO_GL": back_end}
-    try:
-        command = [sys.executable, "-c", _RENDER]
-        result = subprocess.run(command, env=environment, capture_output=True, timeout=60, check=False)
-    except subprocess.TimeoutExpired:
-        return False
-    return result.returncode == 0
+def _films(faults: dict[str, str | None]) -> str:
+    """Return which back end draws films, if one does."""
+    chosen = os.environ.get("MUJOCO_GL")
+    if chosen:
+        works = rendering_fault(chosen) is None
+        return f"{'drawn with' if works else 'cannot be drawn with'} {chosen}, as MUJOCO_GL says"
+    working = [back_end for back_end, fault in faults.items() if fault is None]
+    if working:
+        return f"drawn with {working[0]}; MUJOCO_GL chooses another"
+    return "cannot be drawn until one of the above works; scores need none"
 
 
 def _folder(path: Path, variable: str) -> str:

@@ -23,6 +23,9 @@ from clbench.task import Scenario, Split, Task, resolve
 Trial = tuple[Task, Split, int]
 """One episode to run: its task, its split and its number."""
 
+Watch = Callable[[Trial, NDArray[np.float32]], None]
+"""Called with a trial and an action (A,) that is taken in it."""
+
 LANES = 40
 """Episodes that are stepped together, and rows of every forward."""
 
@@ -99,7 +102,11 @@ class Evaluator:
         return self.play(policy, [(task, split, number) for task in tasks for number in numbers], progress)
 
     def play(
-        self, policy: Policy, trials: Sequence[Trial], progress: Callable[[float], None] = lambda _: None
+        self,
+        policy: Policy,
+        trials: Sequence[Trial],
+        progress: Callable[[float], None] = lambda _: None,
+        watch: Watch = lambda _, __: None,
     ) -> list[Episode]:
         """Return the outcome of each of `trials`, in their order; none may be there twice.
 
@@ -107,6 +114,7 @@ class Evaluator:
             policy: What acts.
             trials: Which episodes: task, split and number.
             progress: Called with the number of episodes that have ended since its last call.
+            watch: Called with every action: the plain world, reset as `start_of` says, repeats the episode.
         """
         queue = list(reversed(trials))
         ended: dict[tuple[str, Split, int], Episode] = {}
@@ -117,7 +125,7 @@ class Evaluator:
                 live.append(self._start(idle.pop(), policy, *queue.pop()))
             chunks = self._act(policy, live)
             for lane, chunk in zip(live.copy(), chunks, strict=True):
-                episode = _execute(lane, chunk)
+                episode = _execute(lane, chunk, watch)
                 if episode is not None:
                     ended[episode.task, episode.split, episode.number] = episode
                     live.remove(lane)
@@ -128,11 +136,11 @@ class Evaluator:
     def _start(self, lane: _Lane, policy: Policy, task: Task, split: Split, number: int) -> _Lane:
         if task.world not in lane.worlds:
             lane.worlds[task.world] = resolve(task.world)()
-        seed = derive_seed("episode", self.seed, task.name, split, number)
+        seed, instruction = start_of((task, split, number), self.seed)
         lane.task, lane.split, lane.number = task, split, number
         lane.total_reward, lane.length = 0.0, 0
         lane.state, _ = lane.worlds[task.world].reset(seed=seed, options={"task": task.name})
-        lane.words = encode([task.instructions[number % len(task.instructions)]])[0]
+        lane.words = encode([instruction])[0]
         forwards = -(-task.horizon // policy.config.executed)
         shape = (forwards, policy.config.chunk, policy.config.action_size)
         lane.noise = torch.randn(shape, generator=torch_generator("noise", seed))
@@ -154,13 +162,21 @@ class Evaluator:
         return actions
 
 
-def _execute(lane: _Lane, chunk: NDArray[np.float32]) -> Episode | None:
+def start_of(trial: Trial, seed: int) -> tuple[int, str]:
+    """Return what a trial starts with in a run of `seed`: the seed of its initial state, its instruction."""
+    task, split, number = trial
+    instruction = task.instructions[number % len(task.instructions)]
+    return derive_seed("episode", seed, task.name, split, number), instruction
+
+
+def _execute(lane: _Lane, chunk: NDArray[np.float32], watch: Watch) -> Episode | None:
     """Step a lane through a chunk (executed, A); return the episode if it ends."""
     assert lane.task is not None
     world = lane.worlds[lane.task.world]
     for action in chunk:
         # a diverged policy acts in NaN: it stands still and fails rather than stop the run
         action = np.clip(np.nan_to_num(action), -1.0, 1.0)
+        watch((lane.task, lane.split, lane.number), action)
         lane.state, reward, terminated, _, _ = world.step(action)
         lane.total_reward += float(reward)
         lane.length += 1

@@ -1,0 +1,144 @@
+"""The learner: the policy and the method of a run on their way from stage to stage, without evaluation."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors.torch import load_file, save_file
+
+from clbench.adaptation import Step, adapt
+from clbench.cache import package_of, source_hash
+from clbench.demonstrations import Demonstrations, load_demonstrations
+from clbench.method import Access, Method, Prior, Source, Stage, State
+from clbench.policy import Policy, load_policy, save_policy
+from clbench.pretraining import pretrained_policy, pretraining_inputs
+from clbench.questions import load_questions
+from clbench.seeding import derive_seed, seeded, torch_generator
+from clbench.task import Scenario
+from clbench.training import deterministic
+
+STAGE_FILES = ("policy.safetensors", "policy.json", "method.safetensors", "method.json")
+"""What a stage leaves: the policy, and the state of the method that the next stage begins with."""
+
+
+class Learner:
+    """The policy and the method of a run, and the data that they learn from.
+
+    Each stage begins with what the last one saved: a policy from its checkpoint and a new object of the
+    method that was given its state. Whoever stopped after a stage therefore goes on as one who did not.
+
+    Args:
+        scenario: With the targets that are learned.
+        new_method: Returns a new object of the method.
+        seed: Of the run.
+        device: Where the policy is computed.
+    """
+
+    def __init__(self, scenario: Scenario, new_method: Callable[[], Method], seed: int, device: str) -> None:
+        self.scenario, self.seed, self.device = scenario, seed, device
+        self.new_method = new_method
+        self.method = new_method()
+        self.where = "start"
+        """The seam, or the stage, that is under way."""
+        self.policy, _ = pretrained_policy(scenario, seed)
+        self.policy.to(device)
+        self.data = {
+            task.name: load_demonstrations(task, scenario, self.policy.config)
+            for task in scenario.retained + scenario.target
+        }
+        self.questions, self.report_questions = load_questions(scenario)
+
+    def prepare(self) -> int:
+        """Let the method prepare for the sequence, and return the optimiser steps that it took."""
+        self.where = "prepare"
+        prior = self.prior(0, ("prepare", "throughout"))
+        with seeded("method", self.seed, 0):
+            steps = self.method.prepare(self.policy, prior) or 0
+        prior.close()
+        return steps
+
+    def learn(self, number: int, after: Callable[[Step], None]) -> int:
+        """Adapt to target `number`, from 1, and return the optimiser steps done.
+
+        Args:
+            number: Which target.
+            after: Called after each step.
+        """
+        budget, task = self.scenario.budget, self.scenario.target[number - 1]
+        self.where = f"stage {number} ({task.name})"
+        target = self._source("target", number, self.data[task.name])
+        prior = self.prior(number, ("throughout",))
+        method_seed = derive_seed("method", self.seed, number)
+        stage = Stage(number, task, method_seed, budget.adaptation_steps, target, prior)
+        with seeded("method", self.seed, number):
+            steps = adapt(self.policy, self.method, stage, budget, after)
+        target.close()
+        prior.close()
+        return steps
+
+    def prior(self, number: int, when: tuple[Access, ...]) -> Prior:
+        """Return the prior data that the method declares for the seams of stage `number`."""
+        sources = {}
+        if self.method.uses.demonstrations in when:
+            before = self.scenario.retained + self.scenario.target[: max(0, number - 1)]
+            demonstrations = Demonstrations.cat([self.data[task.name] for task in before])
+            sources["demonstrations"] = self._source("prior demonstrations", number, demonstrations)
+        if self.method.uses.questions in when:
+            sources["questions"] = self._source("prior questions", number, self.questions)
+        return Prior(sources)
+
+    def _source(self, name: str, number: int, data: Any) -> Source[Any]:
+        """Return data with its own random stream: what one source draws does not move another's draws."""
+        generator = torch_generator(name, self.seed, number)
+        return Source(data, generator, self.scenario.budget.batch_size, self.device)
+
+    def save(self, folder: Path, number: int) -> None:
+        """Write what stage `number` leaves, `STAGE_FILES`, to `folder`."""
+        self.where = f"state() after stage {number}"
+        save_policy(self.policy, folder)
+        state = self.method.state()
+        tensors = {name: value for name, value in state.items() if isinstance(value, torch.Tensor)}
+        copies = {name: value.detach().clone().contiguous() for name, value in tensors.items()}
+        save_file(copies, folder / "method.safetensors")
+        values = {name: value for name, value in state.items() if name not in tensors}
+        (folder / "method.json").write_text(json.dumps(values), encoding="utf-8")
+
+    def load(self, folder: Path, number: int) -> None:
+        """Take the policy and the method as stage `number` left them in `folder`."""
+        self.where = f"load_state() after stage {number}"
+        self.method = self.new_method()
+        self.policy = load_stage(folder, self.method, self.device)
+
+
+def load_stage(folder: Path, method: Method, device: str) -> Policy:
+    """Return the policy that a stage left in `folder`, and give `method` the state that it left there."""
+    state: State = {**json.loads((folder / "method.json").read_text(encoding="utf-8"))}
+    state.update(load_file(folder / "method.safetensors", device=device))
+    return load_policy(folder, lambda policy: method.load_state(policy, state)).to(device)
+
+
+def sources(scenario: Scenario, seed: int, *modules: str) -> dict[str, Any]:
+    """Return the code and data that any result of a run depends on, `modules` besides, as JSON."""
+    suites = {package_of(name) for task in scenario.tasks for name in (task.world, task.expert)}
+    return {
+        "pretraining": pretraining_inputs(scenario, seed),
+        "tasks": [dataclasses.asdict(task) for task in scenario.tasks],
+        "source": source_hash("clbench", *modules, *sorted(suites)),
+    }
+
+
+@contextmanager
+def repeatable(device: str) -> Iterator[None]:
+    """Make computations on `device` repeat themselves bit for bit inside."""
+    if device != "cpu":
+        # without it cuBLAS may choose another kernel each time, and PyTorch refuses to be deterministic
+        os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")
+    with deterministic():
+        yield
