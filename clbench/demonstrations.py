@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from clbench.cache import cached, package_of, source_hash
+from clbench.leaks import check_demonstrations
 from clbench.policy import Batch, PolicyConfig, encode
 from clbench.seeding import derive_seed, numpy_generator
 from clbench.task import Budget, Scenario, Task, resolve
@@ -283,5 +284,6 @@ def _chunks(
 
 def load_demonstrations(task: Task, scenario: Scenario, config: PolicyConfig) -> Demonstrations:
     """Return the demonstrations of `task`, collected on first use, as chunks that fit a policy."""
+    check_demonstrations(task.name)
     episodes = read_dataset(dataset_folder(task, scenario.budget))
     return Demonstrations.of_task(task, episodes, config.chunk)

@@ -15,6 +15,7 @@ import torch
 from numpy.typing import NDArray
 
 from clbench.demonstrations import World
+from clbench.leaks import check_episodes
 from clbench.policy import Policy, QuestionBatch, encode
 from clbench.questions import QuestionKind
 from clbench.seeding import derive_seed, torch_generator
@@ -116,6 +117,7 @@ class Evaluator:
             progress: Called with the number of episodes that have ended since its last call.
             watch: Called with every action: the plain world, reset as `start_of` says, repeats the episode.
         """
+        check_episodes((task.name, split) for task, split, _ in trials)
         queue = list(reversed(trials))
         ended: dict[tuple[str, Split, int], Episode] = {}
         live: list[_Lane] = []

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import json
 import os
@@ -16,6 +17,7 @@ from safetensors.torch import load_file, save_file
 from clbench.adaptation import Step, adapt
 from clbench.cache import package_of, source_hash
 from clbench.demonstrations import Demonstrations, load_demonstrations
+from clbench.leaks import check_policy, outside, seams
 from clbench.method import Access, Method, Prior, Source, Stage, State
 from clbench.policy import Policy, load_policy, save_policy
 from clbench.pretraining import pretrained_policy, pretraining_inputs
@@ -47,8 +49,8 @@ class Learner:
         self.method = new_method()
         self.where = "start"
         """The seam, or the stage, that is under way."""
-        self.policy, _ = pretrained_policy(scenario, seed)
-        self.policy.to(device)
+        self.pretrained, _ = pretrained_policy(scenario, seed)
+        self.policy = copy.deepcopy(self.pretrained).to(device)
         self.data = {
             task.name: load_demonstrations(task, scenario, self.policy.config)
             for task in scenario.retained + scenario.target
@@ -59,9 +61,10 @@ class Learner:
         """Let the method prepare for the sequence, and return the optimiser steps that it took."""
         self.where = "prepare"
         prior = self.prior(0, ("prepare", "throughout"))
-        with seeded("method", self.seed, 0):
+        with seeded("method", self.seed, 0), seams(self._known(0)):
             steps = self.method.prepare(self.policy, prior) or 0
         prior.close()
+        check_policy(self.policy, self.pretrained)
         return steps
 
     def learn(self, number: int, after: Callable[[Step], None]) -> int:
@@ -77,11 +80,21 @@ class Learner:
         prior = self.prior(number, ("throughout",))
         method_seed = derive_seed("method", self.seed, number)
         stage = Stage(number, task, method_seed, budget.adaptation_steps, target, prior)
-        with seeded("method", self.seed, number):
-            steps = adapt(self.policy, self.method, stage, budget, after)
+
+        def report(step: Step) -> None:
+            with outside():
+                after(step)
+
+        with seeded("method", self.seed, number), seams(self._known(number)):
+            steps = adapt(self.policy, self.method, stage, budget, report)
         target.close()
         prior.close()
+        check_policy(self.policy, self.pretrained)
         return steps
+
+    def _known(self, number: int) -> list[str]:
+        """Return the names of the tasks that the seams of stage `number` may know."""
+        return [task.name for task in self.scenario.retained + self.scenario.target[:number]]
 
     def prior(self, number: int, when: tuple[Access, ...]) -> Prior:
         """Return the prior data that the method declares for the seams of stage `number`."""
@@ -114,7 +127,8 @@ class Learner:
         """Take the policy and the method as stage `number` left them in `folder`."""
         self.where = f"load_state() after stage {number}"
         self.method = self.new_method()
-        self.policy = load_stage(folder, self.method, self.device)
+        with seeded("method", self.seed, number):  # adapters are drawn before they are filled
+            self.policy = load_stage(folder, self.method, self.device)
 
 
 def load_stage(folder: Path, method: Method, device: str) -> Policy:

@@ -19,6 +19,7 @@ from torch import Tensor
 
 from clbench.cache import cache_folder, cached, hash_of, package_of, source_hash
 from clbench.demonstrations import SIMULATORS, World, demonstrate
+from clbench.leaks import check_questions
 from clbench.policy import QuestionBatch, encode, word_id
 from clbench.seeding import derive_seed, torch_generator
 from clbench.task import Scenario, resolve
@@ -142,6 +143,7 @@ class Questions:
 
 def load_questions(scenario: Scenario) -> tuple[Questions, Questions]:
     """Return the training and the report questions of a scenario."""
+    check_questions()
     kinds = resolve(scenario.questions)
     scenes = load_file(scenes_folder(scenario) / "scenes.safetensors")
     return Questions(kinds, scenes["train"]), Questions(kinds, scenes["report"])

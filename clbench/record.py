@@ -72,6 +72,8 @@ _SCENARIO: _Fields = {
     "evaluation_steps": list,
     "budget": dict,
 }
+_COSTS = ("optimiser_steps", "parameters", "preparation_steps", "parameters_added", "bytes_kept")
+"""A run that failed need not have all."""
 _ERROR: _Fields = dict.fromkeys(("where", "type", "message", "traceback"), str)
 
 _WORDS = {str: "a text", int: "a whole number", list: "a list", dict: "an object with named entries"}
@@ -102,12 +104,13 @@ class Record:
     policy: dict[str, list[Any]] = field(default_factory=lambda: {name: [] for name in POLICY_COLUMNS})
     """What has become of the policy as columns of equal length, see `POLICY_COLUMNS`."""
     costs: dict[str, Any] = field(default_factory=dict)
-    """`parameters`, `parameters_added`, `optimiser_steps`, `bytes_kept`."""
+    """`parameters`, `parameters_added`, `optimiser_steps`, those of them that are `preparation_steps`, and
+    `bytes_kept`: whole numbers."""
     diagnostics: dict[str, Any] = field(default_factory=dict)
     """What the method tells about itself."""
     fingerprint: dict[str, Any] = field(default_factory=dict)
-    """Commit of `clbench`, package versions, hardware, `rollouts` (a hash for each world), hash of the
-    pretrained policy."""
+    """Commit of `clbench`, package versions, hardware, `rollouts` (a hash for each world), `method` (who made
+    it, its version and the hash of its source), hash of the pretrained policy."""
     timing: dict[str, Any] = field(default_factory=dict)
     """Dates and seconds: all that may differ between two equal runs."""
     error: dict[str, str] | None = None
@@ -202,6 +205,7 @@ def _record(values: Any) -> Record:
     _check_fields("scenario", record.scenario, _SCENARIO)
     for name in ("costs", "diagnostics", "fingerprint", "timing"):
         _check_type(name, values[name], dict)
+    _check_costs(record.costs)
     if record.status == "failed":
         _check_fields("error", record.error, _ERROR)
     elif record.error is not None:
@@ -227,6 +231,16 @@ def _check_fields(where: str, values: Any, fields: _Fields) -> None:
     for name, kind in fields.items():
         if kind is not None:
             _check_type(f"{where}: {name}", values[name], kind)
+
+
+def _check_costs(costs: Mapping[str, Any]) -> None:
+    for name, value in costs.items():
+        if name not in _COSTS:
+            raise RecordError(str(unknown("field of costs", name, _COSTS)))
+        _check_type(f"costs: {name}", value, int)
+        # a method may leave parameters out, but nothing else is less than nothing
+        if value < 0 and name != "parameters_added":
+            raise RecordError(f"costs: {name} must not be below 0.")
 
 
 def _check_type(where: str, value: Any, kind: type) -> None:

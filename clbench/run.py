@@ -22,7 +22,7 @@ from clbench.evaluation import Episode, Evaluator, Trial, answer
 from clbench.fingerprint import fingerprint
 from clbench.learner import Learner, repeatable, sources
 from clbench.live import Log, require_tensorboard
-from clbench.method import Method, build_method
+from clbench.method import Method, build_method, describe_method
 from clbench.pretraining import pretrained_policy
 from clbench.questions import report_questions
 from clbench.record import Record, RecordError, label_of, read_record, record_path, write_record
@@ -402,7 +402,11 @@ class _Run:
             run=run,
             scenario=scenario,
             costs={"optimiser_steps": 0, "parameters": parameters},
-            fingerprint={**fingerprint(self.scenario), "pretrained": pretrained_hash(self.spec)},
+            fingerprint={
+                **fingerprint(self.scenario),
+                "method": describe_method(type(self.learner.method)),
+                "pretrained": pretrained_hash(self.spec),
+            },
             timing={"stages": []},
         )
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 import importlib
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, Literal
 
@@ -133,7 +133,7 @@ class Scenario:
     """Entry point of a tuple of `QuestionKind`: what can be asked about a state."""
     budget: Budget = Budget()
     """What every method gets."""
-    limits: Limits = Limits()
+    limits: Limits = field(default_factory=Limits)
     """What the process of a submitted run may take."""
 
     @cached_property

@@ -126,6 +126,8 @@ def test_all_methods_meet_the_same_initial_states_and_the_same_pretrained_policy
         [row for row in zip(*record.episodes.values(), strict=True) if row[0] == 0] for record in records
     )
     assert first == second
+    ours, theirs = (record.fingerprint.pop("method") for record in records)
+    assert (ours["link"], theirs["link"]) == (None, "https://arxiv.org/abs/1811.11682")
     assert records[0].fingerprint == records[1].fingerprint
 
 

@@ -519,7 +519,7 @@ FAULTS: list[tuple[Any, str, str, str]] = [
     (Sneaks, "declared data", "what `uses` declares", "prior demonstrations that it does not declare"),
     (Lingers, "declared data", "what `uses` declares", "does not declare for this seam"),
     (Hoards, "declared data", "to draw from what it is handed", "after the seams that it was handed to"),
-    (Modest, "declared data", "prior questions to be drawn", "they are drawn never; leave them out"),
+    (Modest, "declared data", "prior questions to be drawn", "they are never drawn; leave them out"),
     (Early, "declared data", "prior demonstrations to be drawn", "in prepare() alone; declare 'prepare'"),
     (Timed, "same numbers", "two runs with one seed to be equal", "differs in stage 1 (right) by up to"),
     (Remembers, "same numbers", "two runs with one seed to be equal", "diagnostics differs in prepare"),

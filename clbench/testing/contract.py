@@ -267,9 +267,12 @@ def declared_data(subject: Subject) -> None:
             continue
         seams = subject.longer.seams_that_draw(name)  # it may draw at few steps
         if not _drawn_as(access, seams):
-            expected = f"prior {name} to be drawn when `uses` declares it, {access!r}"
-            found = "in prepare() alone; declare 'prepare'" if seams else "never; leave them out of `uses`"
-            raise _breach(declared_data, expected, f"they are drawn {found}", "uses")
+            expected = f"prior {name} to be drawn as `uses` declares, {access!r}"
+            alone, never = (
+                "drawn in prepare() alone; declare 'prepare'",
+                "never drawn; leave them out of `uses`",
+            )
+            raise _breach(declared_data, expected, f"they are {alone if seams else never}", "uses")
 
 
 def _drawn_as(access: Access, seams: set[str]) -> bool:

@@ -175,16 +175,18 @@ class ToyRun:
 
     def _fault(self, seam: str, error: Exception) -> ContractError:
         """Return the breach that an error in a seam is."""
-        clause, expected, found = "sound seams", f"{seam}() to go through", f"{type(error).__name__}: {error}"
+        clause, look = "sound seams", f"{seam}()"
+        expected, found = f"{seam}() to go through", f"{type(error).__name__}: {error}"
         if isinstance(error, UndeclaredAccessError):
             clause, found = "declared data", str(error)
             expected = f"{seam}() to draw from what it is handed, and of prior data from what `uses` declares"
         elif isinstance(error, AttributeError) and error.obj is self.learner.method and seam != "prepare":
-            clause, found = "state", f"{seam}() finds no attribute {error.name!r}"
+            clause, look = "state", "state() and load_state()"
+            found = f"{seam}() finds no attribute {error.name!r}"
             expected = "every stage to begin with a new object that has what load_state() sets, and no more"
         elif seam in ("state", "load_state"):
             clause = "state"
-        return ContractError(clause, expected, found, f"{seam}()")
+        return ContractError(clause, expected, found, look)
 
     def _checked_prepare(self, steps: Any) -> Any:
         if steps is not None and not (type(steps) is int and steps >= 0):

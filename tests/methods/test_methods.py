@@ -1,6 +1,7 @@
 """What each method is for, shown on the toy."""
 
 import dataclasses
+import re
 import sys
 import types
 from collections.abc import Callable, Iterable
@@ -28,6 +29,7 @@ from clbench.policy import Batch, Policy
 from clbench.record import Record
 from clbench.run import RunSpec, execute
 from clbench.scores import Scores
+from clbench.testing import check_method
 
 TOY = "clbench.testing:clbench/Toy-v0"
 METHODS = ("sft", "experience_replay", "joint", "frozen", "from_scratch")
@@ -72,8 +74,25 @@ def test_from_scratch_knows_nothing_but_the_last_target(scores: dict[str, Scores
 # ---- every method ------------------------------------------------------------------------------------------
 
 
-FEWER = {"aegis": {"samples": 50}, "ewc": {"samples": 4}, "fast_dvla": {"steps": 3}}
+FEWER: dict[str, dict[str, Any]] = {
+    "aegis": {"samples": 50},
+    "ewc": {"samples": 4},
+    "fast_dvla": {"steps": 3},
+}
 """Settings that make the preparation short."""
+
+
+@pytest.mark.parametrize("name", method_names())
+def test_every_method_keeps_the_contract(name: str) -> None:
+    check_method(load_method(name), **FEWER.get(name, {}))
+
+
+@pytest.mark.parametrize("name", method_names())
+def test_the_link_of_a_method_is_the_first_paper_that_its_module_names(name: str) -> None:
+    cls = load_method(name)
+    papers = re.findall(r"arXiv\s(\d{4}\.\d{5})", sys.modules[cls.__module__].__doc__ or "")
+    mine = papers and not cls.uses.reference
+    assert cls.metadata.link == (f"https://arxiv.org/abs/{papers[0]}" if mine else None)
 
 
 @pytest.fixture
@@ -92,13 +111,21 @@ def short_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., 
     return lambda method, **changes: execute(RunSpec(TOY, method, 0, changes), tmp_path)
 
 
-@pytest.mark.parametrize("name", method_names())
-def test_a_run_of_every_method_goes_through_and_says_what_it_uses_and_costs(
-    name: str, short_run: Callable[..., Record]
+@pytest.mark.parametrize(
+    ("name", "preparing", "adapting"),
+    [
+        ("fast_dvla", 2 * 3, 2),
+        ("frozen", 0, 0),
+        ("joint", 0, 2),
+        ("lora", 0, 2),
+        ("weight_interpolation", 0, 2),
+    ],
+)
+def test_a_run_says_what_it_uses_and_costs_and_has_every_metric(
+    name: str, preparing: int, adapting: int, short_run: Callable[..., Record]
 ) -> None:
     record = short_run(name, **FEWER.get(name, {}))
     assert record.error is None
-    assert record.status == "success"
     assert record.run["uses"] == dataclasses.asdict(load_method(name).uses)
     scores = Scores.from_record(record)
     values = {
@@ -110,9 +137,8 @@ def test_a_run_of_every_method_goes_through_and_says_what_it_uses_and_costs(
     assert all(
         METRICS[metric].low <= value <= METRICS[metric].high for metric, value in values.items() if value
     )
-    preparing = {"fast_dvla": 2 * 3}.get(name, 0)
     assert record.costs["preparation_steps"] == preparing
-    assert record.costs["optimiser_steps"] == (0 if name == "frozen" else 2 * 2 + preparing)
+    assert record.costs["optimiser_steps"] == 2 * adapting + preparing
     assert (record.costs["parameters_added"] > 0) == (name == "lora")
 
 
