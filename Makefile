@@ -4,7 +4,7 @@ BIN := .venv/bin
 SCENARIO := clbench/Fetch-v0
 QUICK := build/quick
 
-.PHONY: leaderboard records controls docs benchmark test check wheel-test clean
+.PHONY: leaderboard records controls docs benchmark test test-slow check wheel-test clean
 
 # The main job: from nothing to a table in minutes, with one seed. The full board takes `make records`.
 leaderboard:
@@ -41,6 +41,10 @@ benchmark: .venv/installed
 test: .venv/installed-dev
 	$(BIN)/pytest
 
+# What takes minutes and finds little that `make test` does not: more of the same random input.
+test-slow: .venv/installed-dev
+	$(BIN)/pytest -m slow
+
 check: .venv/installed-dev
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
@@ -48,7 +52,8 @@ check: .venv/installed-dev
 
 # What a wheel may do otherwise than the checkout, against a built one outside of it: its files, the parts that are
 # found by name, the commands.
-WHEEL_TESTS := tests/test_package.py tests/test_cli.py tests/test_readme.py tests/methods/test_methods.py tests/leaderboard
+WHEEL_TESTS := tests/test_package.py tests/test_cli.py tests/test_readme.py tests/test_new_method.py \
+	tests/test_submission.py tests/methods/test_methods.py tests/leaderboard
 wheel-test: .venv/installed-dev
 	rm -rf build/wheel && mkdir -p build/wheel
 	$(BIN)/python -m build --wheel --outdir build/wheel . >/dev/null

@@ -7,8 +7,9 @@ the bytes that it saw: the tier of a record that was changed afterwards is lost.
 from __future__ import annotations
 
 import hashlib
-import json
 from pathlib import Path
+
+from clbench.strict_json import read_json
 
 TIERS = ("self-reported", "recomputed", "replayed", "retrained")
 """What was done to believe a record: nothing; its metrics were computed again from its episodes; some of its
@@ -23,9 +24,9 @@ def verification_path(record: Path) -> Path:
 def tier_of(record: Path) -> str:
     """Return the tier of the record at `record`, "self-reported" if no verification holds for its bytes."""
     try:
-        values = json.loads(verification_path(record).read_text(encoding="utf-8"))
+        values = read_json(verification_path(record))
         if values["record"] == hashlib.sha256(record.read_bytes()).hexdigest() and values["tier"] in TIERS:
             return str(values["tier"])
-    except (OSError, ValueError, RecursionError, KeyError, TypeError):
+    except (OSError, ValueError, KeyError, TypeError):
         pass
     return TIERS[0]

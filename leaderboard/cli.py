@@ -1,29 +1,44 @@
-"""The commands `clbench leaderboard`, `clbench claims` and `clbench method-pages`."""
+"""The commands `clbench leaderboard`, `clbench submit`, `clbench claims` and `clbench method-pages`."""
 
 from __future__ import annotations
 
 import os
+import secrets
+import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 from rich.console import Console
 from rich.text import Text
 
-from clbench.record import RECORDS, TUNING
+from clbench.arguments import at_least, checked_input
+from clbench.method import build_method
+from clbench.record import RECORDS, TUNING, record_path
+from clbench.run import RunSpec
+from clbench.task import load_scenario, unknown
 
+from . import _page
 from ._claims import page
-from ._claims.evidence import CONTROLS, SCENARIO, STEP_TIME, read_evidence
+from ._claims.evidence import CONTROLS, SCENARIO, read_evidence
 from ._claims.judges import judge_all
+from ._costs import STEP_TIME
 from ._descriptions import built_in_methods
 from ._method_pages import pages, read_sources
 from ._rows import Table, read_table
+from ._submit import placement, run_submission
 from ._table import csv_text, markdown, terminal, write_if_changed
+from ._tiers import TIERS
+from ._verify import Request, run_verifications
 
-WIDTH = 100
+WIDTH = 108
 """Least width: in a narrower one the last metrics would be cut off, and a long line only wraps."""
 
 
 def show(*, records: Path = RECORDS) -> None:
-    """Show the leaderboard, and write it as LEADERBOARD.md and leaderboard.csv beside the records.
+    """Show the leaderboard, and write it beside the records.
+
+    As LEADERBOARD.md, as leaderboard.csv with every metric, and as index.html, a page for a browser that has
+    all that is behind the numbers and needs no network; pareto.svg and pareto-dark.svg are pictures of it.
 
     Args:
         records: Folder of the records.
@@ -35,9 +50,99 @@ def show(*, records: Path = RECORDS) -> None:
     table = read_table(records)
     console = _console()
     console.print(terminal(table))
-    folder = Path(os.path.normpath(records / ".."))
-    for name, text in (("LEADERBOARD.md", markdown(table)), ("leaderboard.csv", csv_text(table))):
-        _write(console, folder / name, text)
+    _write_table(console, table, records)
+
+
+def submit(
+    method: str,
+    /,
+    *,
+    scenario: str = SCENARIO,
+    seeds: int = 3,
+    first_seed: int = 0,
+    workers: int | None = None,
+    records: Path = RECORDS,
+) -> None:
+    """Check METHOD, run it, and put it on the board: its row, its rank and, if it is not shown, why.
+
+    The check takes seconds on a toy scenario and says what to mend. Each run is a process of its own, which
+    is stopped when it goes beyond the scenario's limits of time, memory and written bytes; a run that has a
+    record is skipped. Submitting runs the method's code as you: read it first if it is not yours.
+
+    Args:
+        method: module:Class, or the name of an installed method.
+        scenario: Gymnasium id of the scenario, as clbench/Fetch-v0; module:id imports the module first.
+        seeds: How many seeds.
+        first_seed: The first of them.
+        workers: Runs at once, each a process with one thread; all cores if not given.
+        records: Folder of the records.
+    """
+    sys.path.insert(0, os.getcwd())  # a console script lacks it, and module:Class is looked for there
+    with checked_input():
+        at_least(1, "--seeds", seeds)
+        at_least(0, "--first-seed", first_seed)
+        at_least(1, "--workers", workers)
+        name = load_scenario(scenario).id
+        build_method(method, {})
+    specs = [RunSpec(scenario, method, seed) for seed in range(first_seed, first_seed + seeds)]
+    went_well = run_submission(specs, records, workers)
+    if records.is_dir():
+        table, console = read_table(records), _console()
+        _write_table(console, table, records)
+        console.print(Text("\n".join(placement(table, name, method, records))), soft_wrap=True)
+    if not went_well:
+        raise SystemExit(1)
+
+
+def verify(
+    *paths: Path,
+    tier: str = "replayed",
+    episodes: int = 40,
+    seed: int | None = None,
+    method: str | None = None,
+    scenario: str | None = None,
+    checkpoints: Path | None = None,
+    workers: int | None = None,
+    records: Path = RECORDS,
+) -> None:
+    """Check the records at PATHS, and write the tier that each reaches beside it.
+
+    recomputed: the record is whole, is what its method and scenario say, and its metrics follow from its
+    episodes. replayed: report episodes, drawn at random, and all questions come out the same with the
+    policies of its stages. retrained: the whole run does. Each tier includes those before it.
+
+    Args:
+        paths: Records, or folders of them.
+        tier: How far to go: recomputed, replayed or retrained.
+        episodes: How many episodes are replayed.
+        seed: Of the choice of these; by chance if not given. Whoever made the record must not know it.
+        method: The method's module:Class, if it is not installed: it is imported, and its code runs as you.
+        scenario: Where the scenario is registered, as module:id, if clbench does not register it.
+        checkpoints: Folder of policies that `clbench run --checkpoints` kept; made again if not given.
+        workers: Verifications at once, each a process with one thread; all cores if not given.
+        records: Folder of the records.
+    """
+    sys.path.insert(0, os.getcwd())  # a console script lacks it, and module:Class is looked for there
+    with checked_input():
+        at_least(1, "--episodes", episodes)
+        at_least(1, "--workers", workers)
+        if tier not in TIERS[1:]:
+            raise unknown("tier", tier, TIERS[1:])
+        found = _found(paths, records)
+    seed = secrets.randbits(48) if seed is None else seed
+    request = Request(tier, episodes, seed, method, scenario, checkpoints)
+    if not run_verifications(found, records, request, workers):
+        raise SystemExit(1)
+
+
+def _found(paths: Sequence[Path], records: Path) -> list[Path]:
+    """Return the records at `paths`, those in folders too."""
+    found = [one for path in paths for one in (sorted(path.rglob("*.json")) if path.is_dir() else [path])]
+    absent = [path for path in found if not path.is_file()]
+    if absent or not found:
+        what = f"There is no record at {absent[0]}." if absent else "There is no record to verify."
+        raise ValueError(f"{what} Give paths, as {record_path(records, SCENARIO, 'sft', 0)}.")
+    return found
 
 
 def claims(
@@ -91,6 +196,19 @@ def method_pages(
     for name, text in texts.items():
         write_if_changed(output / name, text)
     _console().print(Text(f"Written: {len(texts)} pages in {output}"), soft_wrap=True)
+
+
+def _write_table(console: Console, table: Table, records: Path) -> None:
+    """Write every form of the table beside the records."""
+    folder = Path(os.path.normpath(records / ".."))
+    texts = {
+        "LEADERBOARD.md": markdown(table),
+        "leaderboard.csv": csv_text(table),
+        "index.html": _page.page(table),
+        **_page.pictures(table),
+    }
+    for name, text in texts.items():
+        _write(console, folder / name, text)
 
 
 def _console() -> Console:

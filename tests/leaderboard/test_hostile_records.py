@@ -121,6 +121,9 @@ FIELDS = [
     ("schema", "2", "is no record of schema 2"),
     ("score", 0.99, "No field of a record of schema 2 is called 'score'"),
     ("costs", ABSENT, "a record of schema 2: costs is missing"),
+    ("costs.bytes_kept", -1, "costs: bytes_kept must not be below 0"),
+    ("costs.optimiser_steps", "few", "costs: optimiser_steps must be a whole number"),
+    ("costs.parametres", 1, "No field of costs is called 'parametres'. Did you mean 'parameters'?"),
     ("status", "great", "status must be success or failed, not 'great'"),
     ("error", {"where": "loss"}, "error must be null"),
     ("run", [], "run must be an object with named entries"),
@@ -365,6 +368,17 @@ def test_all_that_is_refused_together_changes_no_number_of_the_table(
     assert sorted(os.listdir(board.parent)) == sorted({*written_before, "elsewhere.json"})
     assert "<script>" not in page
     assert "\x1b" not in page + capsys.readouterr().out
+
+
+@pytest.mark.parametrize("damage", [linked, piped, replaced_by_folder, written(b"{"), inflated])
+def test_a_verification_that_is_none_is_not_waited_for(damage: Callable[[Path], Any], board: Path) -> None:
+    before, _ = shown(board)
+    path = (board / MINE).with_suffix(".verified")
+    path.write_text("{}", encoding="utf-8")
+    damage(path)
+    after, refused = shown(board)
+    assert list(after) == list(before)
+    assert not refused
 
 
 def test_a_linked_folder_is_listed_and_not_followed(board: Path, tmp_path: Path) -> None:

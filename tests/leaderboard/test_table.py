@@ -168,7 +168,8 @@ def test_showing_twice_changes_no_byte_and_writes_no_file_again(
     stamps = [(path.read_bytes(), path.stat().st_mtime_ns, path.stat().st_ino) for path in files]
     assert shown() == first
     assert [(path.read_bytes(), path.stat().st_mtime_ns, path.stat().st_ino) for path in files] == stamps
-    assert sorted(os.listdir(records.parent)) == ["LEADERBOARD.md", "leaderboard.csv", "records"]
+    made = ["LEADERBOARD.md", "index.html", "leaderboard.csv", "pareto-dark.svg", "pareto.svg"]
+    assert sorted(os.listdir(records.parent)) == [*made, "records"]
 
 
 def test_the_files_do_not_depend_on_where_the_records_lie(

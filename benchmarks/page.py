@@ -1,0 +1,148 @@
+"""How large the page is and how long it takes to make, from made records: `python benchmarks/page.py`.
+
+The records have the shape of those of Fetch-v0; a method is two numbers, how well it learns, what it keeps.
+Asked for are less than 3 MB and 20 s with 15 methods, 5 seeds and 4 scenarios.
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+import time
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from clbench.record import ANSWER_COLUMNS, EPISODE_COLUMNS, POLICY_COLUMNS, Record, record_path, write_record
+from clbench.task import resolve
+
+GROUPS = {
+    "retained": ["reach", "hover", "pick_and_place", "push", "push_left", "push_away"],
+    "target": ["lift", "push_right", "pull", "press"],
+    "held_out": ["hover_target", "push_left_away"],
+}
+STEPS = (37, 75, 150, 300)
+EPISODES, ON_THE_WAY, SELECTION, KINDS, ASKED = 20, 5, 10, 14, 72
+REFERENCES = ("sft", "joint", "from_scratch", "frozen")
+"""Methods that others are compared with."""
+
+
+def main() -> None:
+    """Make the records, then the page, and print what that took."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    for name, count in (("methods", 15), ("seeds", 5), ("scenarios", 4)):
+        parser.add_argument(f"--{name}", type=int, default=count)
+    parser.add_argument("--output", type=Path, help="where to keep the page")
+    arguments = parser.parse_args()
+    read_table = resolve("clbench.leaderboard._rows:read_table")
+    page, pictures = (resolve(f"clbench.leaderboard._page:{name}") for name in ("page", "pictures"))
+    with tempfile.TemporaryDirectory() as folder:
+        records = Path(folder) / "leaderboard" / "records"
+        make_records(records, arguments.methods, arguments.seeds, arguments.scenarios)
+        begin = time.monotonic(), time.process_time()
+        table = read_table(records)
+        read = time.monotonic(), time.process_time()
+        text = page(table)
+        pictures(table)
+        end = time.monotonic(), time.process_time()
+    if arguments.output:
+        arguments.output.write_text(text, encoding="utf-8")
+    print(f"{len(table.rows)} rows, {len(text.encode()) / 1e6:.2f} MB")
+    for what, first, last in (("table", begin, read), ("page and pictures", read, end), ("all", begin, end)):
+        wall, processor = (late - early for early, late in zip(first, last, strict=True))
+        print(f"{what}: {wall:.1f} s, of the processor {processor:.1f} s")
+
+
+def make_records(folder: Path, methods: int, seeds: int, scenarios: int) -> None:
+    """Write the records of `methods` methods on each of `scenarios` scenarios with each of `seeds` seeds."""
+    names = [*REFERENCES, *(f"method_{number}" for number in range(methods))][:methods]
+    for scenario, (number, method), seed in product(range(scenarios), enumerate(names), range(seeds)):
+        generator = np.random.default_rng([scenario, number, seed])
+        learns, keeps = np.random.default_rng([scenario, number]).random(2)
+        record = made_record(f"clbench/Made{scenario}-v0", method, seed, 0.5 + learns / 2, keeps, generator)
+        write_record(record, record_path(folder, record.run["scenario"], method, seed))
+
+
+def made_record(
+    scenario: str, method: str, seed: int, learns: float, keeps: float, generator: np.random.Generator
+) -> Record:
+    """Return the record of a run in which each stage leaves the share `keeps` of what was known."""
+    access = "throughout" if method == "joint" else "never"
+    policy = generator.random((len(GROUPS["target"]) * len(STEPS), 2))
+    points = list(product(range(1, len(GROUPS["target"]) + 1), STEPS))
+    return Record(
+        status="success",
+        run={
+            "scenario": scenario,
+            "method": method,
+            "seed": seed,
+            "device": "cpu",
+            "split": "report",
+            "settings": {},
+            "changes": {},
+            "uses": {"demonstrations": access, "questions": access, "reference": method in REFERENCES[1:]},
+        },
+        scenario={"id": scenario, **GROUPS, "evaluation_steps": list(STEPS), "budget": {"curve_episodes": 5}},
+        episodes=_columns(EPISODE_COLUMNS, _episodes(learns, keeps, generator)),
+        answers=_columns(
+            ANSWER_COLUMNS,
+            [
+                (stage, step, f"kind_{kind}", ASKED, int(generator.binomial(ASKED, 0.95)))
+                for (stage, step), kind in product([(0, 0), *points], range(KINDS))
+            ],
+        ),
+        policy=_columns(
+            POLICY_COLUMNS,
+            [
+                (0, 0, 1.0, 0.0),
+                *((*point, *map(float, row)) for point, row in zip(points, policy, strict=True)),
+            ],
+        ),
+        costs={"optimiser_steps": 1200, "parameters": 673700, "parameters_added": 0, "bytes_kept": 2304},
+        diagnostics={
+            str(stage): {
+                **{f"share_{number}": float(generator.random()) for number in range(3)},
+                "distance": [float(one) for one in 50 * generator.random(11)],
+            }
+            for stage in range(1, 5)
+        },
+        fingerprint={
+            "versions": {f"package-{number}": f"{number}.4.2" for number in range(8)},
+            "python": "3.11.7",
+            "commit": {"id": "0123456789" * 4, "dirty": False},
+            "hardware": {"machine": "x86_64", "system": "Linux", "processor": "a slow one"},
+            "rollouts": {"world": "65ffb3394577ffdd"},
+        },
+    )
+
+
+def _episodes(learns: float, keeps: float, generator: np.random.Generator) -> list[tuple[Any, ...]]:
+    tasks = [name for names in GROUPS.values() for name in names]
+    known = np.array([0.97] * 6 + [0.05] * 4 + [0.2] * 2)
+    rows: list[tuple[Any, ...]] = []
+
+    def evaluate(stage: int, step: int, names: list[str], split: str, count: int) -> None:
+        for task, episode in product(names, range(count)):
+            success = int(generator.random() < known[tasks.index(task)])
+            rows.append((stage, step, task, split, episode, success, float(success), 50))
+
+    evaluate(0, 0, tasks, "report", EPISODES)
+    for stage, target in enumerate(GROUPS["target"], 1):
+        for step in STEPS:
+            known *= keeps ** (1 / len(STEPS))
+            known[tasks.index(target)] = learns * min(1.0, step / STEPS[1])
+            evaluate(stage, step, [target], "selection", SELECTION)
+            if step < STEPS[-1]:
+                evaluate(stage, step, [*GROUPS["retained"], target], "report", ON_THE_WAY)
+        evaluate(stage, STEPS[-1], tasks, "report", EPISODES)
+    return rows
+
+
+def _columns(names: tuple[str, ...], rows: list[tuple[Any, ...]]) -> dict[str, list[Any]]:
+    return {name: list(column) for name, column in zip(names, zip(*rows, strict=True), strict=True)}
+
+
+if __name__ == "__main__":
+    main()
