@@ -1,4 +1,4 @@
-"""The commands: `clbench list`, `run`, `tune`, `film`, `metrics`, `leaderboard`, `demonstrations`, `doctor`."""
+"""The commands: `clbench list`, `run`, `tune`, `film`, `metrics`, `demonstrations`; the parts add theirs."""
 
 from __future__ import annotations
 

@@ -1,5 +1,6 @@
 """Fixtures that several test files share."""
 
+import dataclasses
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -7,7 +8,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+from clbench.method import Uses, load_method
+from clbench.names import built_in_methods
 from clbench.record import ANSWER_COLUMNS, EPISODE_COLUMNS, POLICY_COLUMNS, Record
+
+collect_ignore = ["submission"]
+"""A package of its own, which test_submission.py installs and tests."""
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -27,7 +33,7 @@ def empty_caches(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def make_record() -> Callable[..., Record]:
     """Return a function that makes a record out of matrices, as a run would have left it."""
     return _make_record
@@ -65,6 +71,7 @@ def _make_record(
         curve_episodes: Episodes per task on the way, where rates are given; as many as at the end if None.
         selection_episodes: Selection episodes, where rates are given.
         run: What differs in `Record.run`, as method="ewc". With split="selection" all episodes are of that.
+            A built-in method uses what it declares.
     """
     outcomes = _outcomes(success, 2, episodes)
     stages, tasks = outcomes.shape[0] - 1, outcomes.shape[1]
@@ -72,9 +79,10 @@ def _make_record(
     assert (targets, retained + targets + held_out) == (stages, tasks)
     counts = {"skill": retained, "target": targets, "unseen": held_out}
     names = [f"{group}_{number}" for group, count in counts.items() for number in range(count)]
-    uses = {"demonstrations": "never", "questions": "never", "reference": False}
-    names_of_run = {"scenario": "clbench/Toy-v0", "method": "sft", "seed": 0, "split": "report"}
-    run = {**names_of_run, "settings": {}, "changes": {}, "uses": uses, **run}
+    method = run.get("method", "sft")
+    uses = dataclasses.asdict(load_method(method).uses if method in built_in_methods() else Uses())
+    names_of_run = {"scenario": "clbench/Toy-v0", "method": method, "seed": 0, "device": "cpu"}
+    run = {**names_of_run, "split": "report", "settings": {}, "changes": {}, "uses": uses, **run}
     split, on_the_way = run["split"], curve_episodes or outcomes.shape[2]
     rows: list[tuple[Any, ...]] = [
         (stage, steps[-1] if stage else 0, names[task], split, episode, int(value), value, 50)

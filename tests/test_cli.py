@@ -69,6 +69,7 @@ def test_help_names_every_command() -> None:
         "list",
         "run",
         "tune",
+        "film",
         "metrics",
         "leaderboard",
         "claims",
@@ -131,7 +132,7 @@ def test_a_stranger_runs_a_class_from_the_working_directory_and_sees_it_on_the_b
     assert "1 failed: mine:Broken seed 0" in result.stderr
     records = sorted(path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*.json"))
     assert records == [
-        f"leaderboard/records/Toy-v0/{name}/seed-0.json" for name in ("mine--Broken", "mine--Gentle", "sft")
+        f"leaderboard/records/Toy-v0/{name}/seed-0.json" for name in ("mine.Broken", "mine.Gentle", "sft")
     ]
     again = _clbench("run", TOY, "mine:Gentle", "sft", "--seeds", "1", folder=tmp_path)
     assert again.returncode == 0

@@ -1,17 +1,20 @@
 import dataclasses
 import sys
 import types
+from pathlib import Path
 
 import pytest
 import torch
 
 from clbench.demonstrations import Demonstrations
 from clbench.method import (
+    Metadata,
     Method,
     Prior,
     Source,
     UndeclaredAccessError,
     build_method,
+    describe_method,
     load_method,
     method_names,
 )
@@ -103,3 +106,63 @@ def test_declared_prior_data_counts_in_bytes() -> None:
     prior.close()
     with pytest.raises(UndeclaredAccessError, match="after the seams that it was handed to"):
         prior.demonstrations.sample(1)
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        {},
+        {
+            "authors": "Ada Lovelace, Élie Cartan",
+            "licence": "Apache-2.0 WITH LLVM-exception",
+            "version": "1.0rc1",
+        },
+        {"link": "https://arxiv.org/abs/2605.08879"},
+        {"link": "http://example.org:8080/a/b?c=d&e=%20#f"},
+    ],
+)
+def test_metadata_may_be_left_out_or_be_of_its_kind(values: dict[str, str]) -> None:
+    assert {name: value for name, value in vars(Metadata(**values)).items() if value} == values
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("authors", ""),
+        ("authors", " "),
+        ("authors", "A" * 201),
+        ("authors", "Ada\nLovelace"),
+        ("authors", "Ada\u202eLovelace"),
+        ("authors", 3),
+        ("link", "javascript:alert(1)"),
+        ("link", "ftp://example.org"),
+        ("link", "https://"),
+        ("link", "https://user@example.org"),
+        ("link", "https://example.org/a b"),
+        ("link", 'https://example.org/"onclick'),
+        ("link", "https://example.org/" + "a" * 400),
+        ("licence", "MIT; drop"),
+        ("licence", ""),
+        ("version", "1 0"),
+        ("version", "v" * 51),
+    ],
+)
+def test_metadata_of_another_kind_are_refused_by_name(name: str, value: object) -> None:
+    with pytest.raises(ValueError, match=f"{name} in the metadata must be "):
+        Metadata(**{name: value})  # type: ignore[arg-type]
+
+
+def test_a_method_is_described_with_the_hash_of_its_code(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert describe_method(load_method("consft"))["link"] == "https://arxiv.org/abs/2605.08879"
+    text = "import dataclasses, clbench\n@dataclasses.dataclass\nclass Mine(clbench.Method): ...\n"
+    monkeypatch.syspath_prepend(tmp_path)
+    hashes = []
+    for ending in ("", "# changed\n"):
+        (tmp_path / "described.py").write_text(text + ending)
+        found = describe_method(load_method("described:Mine"))
+        assert {**found, "source": ""} == {**vars(Metadata()), "source": ""}
+        hashes.append(found["source"])
+    del sys.modules["described"]
+    assert len(set(hashes)) == 2

@@ -55,11 +55,47 @@ def test_every_run_has_a_path_of_its_own_below_the_folder(tmp_path: Path) -> Non
         ("clbench/Toy-v0", "sft", 1),
         ("clbench/Toy-v1", "sft", 0),
         ("clbench/Toy-v0", "theirs:SFT", 0),
+        ("clbench/Toy-v0", "theirs/SFT", 0),
+        ("clbench/Toy-v0", "theirs:SFT+strength=2", 0),
         ("theirs/Toy-v0", "sft", 0),
     ]
     paths = {record_path(tmp_path, *run) for run in runs}
     assert len(paths) == len(runs)
     assert all(path.parent.parent.parent == tmp_path for path in paths)
+
+
+@pytest.mark.parametrize(
+    ("scenario", "label"),
+    [
+        ("../Toy-v0", "sft"),
+        ("clbench/Toy-v0", ".."),
+        ("clbench/Toy-v0", "sft+x=../../.."),
+        ("/Toy-v0", "sft"),
+    ],
+)
+def test_no_name_leads_out_of_the_folder(scenario: str, label: str, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="cannot be the"):
+        record_path(tmp_path, scenario, label, 0)
+
+
+def test_no_link_leads_out_of_the_folder(tmp_path: Path) -> None:
+    records = tmp_path / "records"
+    records.mkdir()
+    (records / "Toy-v0").symlink_to(tmp_path)
+    with pytest.raises(ValueError, match="a symbolic link leads out of"):
+        record_path(records, "clbench/Toy-v0", "sft", 0)
+    (tmp_path / "link").symlink_to(records)  # the folder itself may be one
+    assert record_path(tmp_path / "link", "theirs/Toy-v0", "sft", 0).parents[2] == tmp_path / "link"
+
+
+def test_a_link_in_the_place_of_a_record_is_replaced_and_not_followed(record: Record, tmp_path: Path) -> None:
+    (tmp_path / "precious").write_text("mine", encoding="utf-8")
+    (tmp_path / "record.json").symlink_to(tmp_path / "precious")
+    with pytest.raises(RecordError, match="is a symbolic link"):
+        read_record(tmp_path / "record.json")
+    write_record(record, tmp_path / "record.json")
+    assert (tmp_path / "precious").read_text(encoding="utf-8") == "mine"
+    assert read_record(tmp_path / "record.json") == record
 
 
 def test_writing_leaves_nothing_but_the_record(record: Record, tmp_path: Path) -> None:
@@ -133,6 +169,12 @@ def test_what_is_no_file_is_refused(tmp_path: Path) -> None:
         ({"run": None}, "run"),
         ({"costs": [1]}, "costs"),
         ({"error": "yes"}, "error"),
+        ({"status": "failed"}, "error must be an object"),
+        ({"run": {}}, "run: scenario, method, seed, device, split, settings, changes, uses is missing"),
+        (
+            {"scenario": {"id": "x"}},
+            "scenario: retained, target, held_out, evaluation_steps, budget is missing",
+        ),
     ],
 )
 def test_a_field_that_does_not_fit_the_schema_is_refused_by_name(

@@ -4,14 +4,20 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any
 
 import torch
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
+from torch import Tensor
 
 from clbench.policy.policy import Policy, PolicyConfig
+from clbench.strict_json import read_json
+
+LARGEST = 65_536
+"""Of every size in a `PolicyConfig`."""
 
 
 class CheckpointError(ValueError):
@@ -38,17 +44,20 @@ def load_policy(folder: Path, extend: Callable[[Policy], None] = lambda _: None)
         extend: Adds to a plain policy what it had more when it was saved, as adapters.
 
     Raises:
-        CheckpointError: A file is missing or torn, or its tensors do not have the shapes that it says.
+        CheckpointError: A file is missing or torn, sizes cannot be, or the tensors do not have the names,
+            shapes and types that a policy of these sizes has, or hold what is not finite.
     """
     try:
-        config = PolicyConfig(**json.loads((folder / "policy.json").read_text(encoding="utf-8")))
+        config = PolicyConfig(**read_json(folder / "policy.json"))
         tensors = load_file(folder / "policy.safetensors")
     except (OSError, ValueError, TypeError, SafetensorError) as error:
         raise CheckpointError(f"{folder}: cannot be read as a policy ({error}).") from error
+    fault = _fault(config, tensors)
+    if fault:
+        raise CheckpointError(f"{folder}: {fault}.")
     policy = Policy(config)
     extend(policy)
-    expected = {name: tuple(value.shape) for name, value in policy.state_dict().items()}
-    found = {name: tuple(value.shape) for name, value in tensors.items()}
+    expected, found = _kinds(policy.state_dict()), _kinds(tensors)
     if expected != found:
         wrong = sorted(name for name in expected | found if expected.get(name) != found.get(name))
         raise CheckpointError(f"{folder}: tensors that do not fit the policy: {', '.join(wrong)}.")
@@ -56,3 +65,25 @@ def load_policy(folder: Path, extend: Callable[[Policy], None] = lambda _: None)
         raise CheckpointError(f"{folder}: holds values that are not finite.")
     policy.load_state_dict(tensors)
     return policy
+
+
+def _kinds(tensors: Mapping[str, Tensor]) -> dict[str, tuple[Any, ...]]:
+    return {name: (tuple(value.shape), value.dtype) for name, value in tensors.items()}
+
+
+def _fault(config: PolicyConfig, tensors: Mapping[str, Tensor]) -> str | None:
+    """Return why a policy of these sizes must not be built, or None: it may be larger than the memory is."""
+    for name, size in dataclasses.asdict(config).items():
+        if type(size) is not int or not 0 < size <= LARGEST:
+            return f"{name} must be a whole number from 1 to {LARGEST:,}, not {size!r}"
+    if config.width % config.heads:
+        return f"width {config.width} cannot be shared among {config.heads} heads"
+    if config.layers > len(tensors):
+        return f"{config.layers:,} layers cannot have {len(tensors):,} tensors"
+    held = sum(value.numel() for value in tensors.values())
+    # one square matrix of each layer, one vector of each number, word and action: a tenth of a policy
+    rows = config.layers * config.width + config.state_size + config.vocabulary_size
+    least = config.width * (rows + config.action_size + config.chunk)
+    if least > held:
+        return f"a policy of its sizes has at least {least:,} numbers, but the file has {held:,}"
+    return None

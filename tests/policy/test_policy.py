@@ -2,11 +2,14 @@ import dataclasses
 import json
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from safetensors.torch import load, save_file
 from scipy import stats
+from torch import Tensor
 
 from clbench.policy import (
     Batch,
@@ -126,14 +129,29 @@ def _cut(folder: Path) -> None:
     path.write_bytes(path.read_bytes()[:-100])
 
 
-def _resize(folder: Path) -> None:
-    config = json.loads((folder / "policy.json").read_text())
-    (folder / "policy.json").write_text(json.dumps({**config, "width": 64}))
+def _set(**sizes: Any) -> Callable[[Path], None]:
+    """Return what writes other sizes beside the tensors."""
+
+    def damage(folder: Path) -> None:
+        config = json.loads((folder / "policy.json").read_text())
+        (folder / "policy.json").write_text(json.dumps({**config, **sizes}))
+
+    return damage
 
 
-def _add_field(folder: Path) -> None:
-    config = json.loads((folder / "policy.json").read_text())
-    (folder / "policy.json").write_text(json.dumps({**config, "depth": 64}))
+def _edit(change: Callable[[dict[str, Tensor]], Any]) -> Callable[[Path], None]:
+    """Return what writes other tensors."""
+
+    def damage(folder: Path) -> None:
+        tensors = load((folder / "policy.safetensors").read_bytes())
+        change(tensors)
+        save_file(tensors, folder / "policy.safetensors")
+
+    return damage
+
+
+def _pickle(folder: Path) -> None:
+    torch.save(Policy(CONFIG).state_dict(), folder / "policy.safetensors")
 
 
 def _poison(folder: Path) -> None:
@@ -148,8 +166,18 @@ def _poison(folder: Path) -> None:
         (_cut, "cannot be read as a policy"),
         (lambda folder: (folder / "policy.json").write_text("{"), "cannot be read as a policy"),
         (lambda folder: (folder / "policy.safetensors").unlink(), "cannot be read as a policy"),
-        (_add_field, "cannot be read as a policy"),
-        (_resize, "tensors that do not fit the policy: .*position"),
+        (lambda folder: (folder / "policy.json").write_text("[1]"), "cannot be read as a policy"),
+        (_pickle, "cannot be read as a policy"),
+        (_set(depth=64), "cannot be read as a policy"),
+        (_set(width=36), "tensors that do not fit the policy: .*position"),
+        (_set(width="32"), "width must be a whole number from 1 to 65,536, not '32'"),
+        (_set(layers=10**12), "layers must be a whole number from 1 to 65,536"),
+        (_set(heads=5), "width 32 cannot be shared among 5 heads"),
+        (_set(width=1, heads=1, layers=65_536), "65,536 layers cannot have"),
+        (_set(width=65_536), "a policy of its sizes has at least .* numbers, but the file has"),
+        (_edit(lambda them: them.pop("state_std")), "tensors that do not fit the policy: state_std"),
+        (_edit(lambda them: them.update(more=torch.zeros(1))), "do not fit the policy: more"),
+        (_edit(lambda them: them.update(state_std=them["state_std"].half())), "do not fit .*: state_std"),
         (_poison, "not finite"),
     ],
 )
