@@ -115,13 +115,19 @@ def estimate(
     if not runs:
         return {metric.name: Estimate(None, None, None) for metric in wanted}
     seeds = sorted(runs)
-    methods, needed = [[runs[seed] for seed in seeds]], needed_references(wanted, seeds, references)
-    samples = _Samples(methods, needed, generator, replicates)
+    methods = [[runs[seed] for seed in seeds]]
+    # Metrics with the same references share their draws; most have none, and draws of episodes cost most.
+    samples = {
+        names: _Samples(methods, needed_references([one], seeds, references), generator, replicates)
+        for names, one in {one.references: one for one in wanted}.items()
+    }
 
     def over_runs(metric: Metric) -> _Quantity:
         return lambda rates: metric.over_runs(rates[0])
 
-    return {one.name: samples.estimate(over_runs(one), Span(one.low, one.high)) for one in wanted}
+    return {
+        one.name: samples[one.references].estimate(over_runs(one), Span(one.low, one.high)) for one in wanted
+    }
 
 
 def paired_difference(
