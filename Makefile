@@ -4,7 +4,7 @@ BIN := .venv/bin
 SCENARIO := clbench/Fetch-v0
 QUICK := build/quick
 
-.PHONY: leaderboard records controls docs benchmark test check wheel-test clean
+.PHONY: leaderboard records controls docs benchmark test slow-test check wheel-test clean
 
 # The main job: from nothing to a table in minutes, with one seed. The full board takes `make records`.
 leaderboard:
@@ -40,6 +40,10 @@ benchmark: .venv/installed
 
 test: .venv/installed-dev
 	$(BIN)/pytest
+
+# What takes minutes: ten thousand steps of every task against gymnasium-robotics.
+slow-test: .venv/installed-dev
+	$(BIN)/pytest -m slow --dist=load
 
 check: .venv/installed-dev
 	$(BIN)/ruff format --check .

@@ -41,6 +41,9 @@ APART = 0.10
 NEARBY = 0.20
 """Most distance from target to block in the plane: on a longer way a block slips sideways off the fingers."""
 
+HAND_TURN = np.array([1.0, 0.0, 1.0, 0.0])
+"""What gymnasium-robotics adds to the hand's quaternion for its goal, which keeps the hand pointing down."""
+
 Vectors = NDArray[np.float64]
 
 
@@ -68,7 +71,7 @@ class FetchVectorWorld:
 
     An action (4,) in [-1, 1] moves the gripper by up to 5 cm along x, y and z, of which the arm makes about
     3 cm a step, and opens (+1) or closes (-1) the fingers. The reward is that of `Rule.judge`. An episode
-    ends with success only; whoever uses the world counts its steps. It is a `clbench.vector_world.VectorWorld`.
+    ends with success only; whoever uses the world counts its steps. It is a `clbench.world.VectorWorld`.
 
     Args:
         lanes: Places for episodes. A lane takes its memory when it is first reset.
@@ -138,7 +141,7 @@ class FetchVectorWorld:
         return states, np.array(rewards), np.array(successes)
 
     def picture_data(self, lane: int) -> mujoco.MjData:
-        """Return the physics of a lane with the target marker at its place, to draw it; it is not for change."""
+        """Return the physics of a lane, with the target marker at its place, to draw it and no more."""
         data = self._lane(lane).data
         # The place of a site is an output of the physics: the next step computes it again and never reads it.
         data.site_xpos[self._scene.target_site] = self._lane(lane).target
@@ -189,7 +192,7 @@ class FetchVectorWorld:
     def _act(self, lanes: Sequence[int], actions: NDArray[np.float32]) -> None:
         """Set the hands' goals and the fingers' controls, in the arithmetic of gymnasium-robotics."""
         hands = self._gather(lanes, "hand") + actions[:, :3] * np.float32(0.05)
-        quaternions = self._gather(lanes, "hand_quaternion") + (1.0, 0.0, 1.0, 0.0)
+        quaternions = self._gather(lanes, "hand_quaternion") + HAND_TURN
         fingers = self._gather(lanes, "qpos")[:, self._scene.actuators_qpos] + actions[:, 3:].astype(float)
         for row, number in enumerate(lanes):
             lane = self._lane(number)
@@ -225,7 +228,7 @@ class FetchVectorWorld:
         return np.concatenate([getattr(self._lane(number), name) for number in lanes]).reshape(len(lanes), -1)
 
     def _observe(self, lanes: Sequence[int]) -> State:
-        """Return the states (N, 28), computed as gymnasium-robotics does, in double precision, then rounded."""
+        """Return the states (N, 28): gymnasium-robotics' arithmetic in double precision, then rounded."""
         scene, seconds = self._scene, self._scene.step_seconds
         gripper, block = self._gather(lanes, "gripper"), self._gather(lanes, "block")
         qvel = self._gather(lanes, "qvel")
