@@ -138,12 +138,15 @@ class Lanes:
         for world in self._worlds.values():
             world.close()
         self._worlds.clear()
+        self._home = [None] * self._count
 
     def _empty(self, lanes: Sequence[int]) -> States:
-        home = self._home[lanes[0]]
-        if home is None:
-            raise gymnasium.error.ResetNeeded(f"Lane {lanes[0]} has no episode: reset it.")
-        return np.empty((len(lanes), *home.single_observation_space.shape), np.float32)
+        """Return memory for the states of `lanes`, all of which have an episode."""
+        homes = [self._home[lane] for lane in lanes]
+        if None in homes:
+            raise gymnasium.error.ResetNeeded(f"Lane {lanes[homes.index(None)]} has no episode: reset it.")
+        assert homes[0] is not None
+        return np.empty((len(lanes), *homes[0].single_observation_space.shape), np.float32)
 
     def _by_world(self, lanes: Sequence[int]) -> Iterator[tuple[VectorWorld, list[int]]]:
         """Return each world with the rows of `lanes` that are in it."""
