@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from typing import Any
 
 import gymnasium
 import mujoco
@@ -54,6 +55,7 @@ class _Lane:
     """
 
     def __init__(self, scene: Scene) -> None:
+        self.scene = scene
         self.data = data = mujoco.MjData(scene.model)
         self.qpos, self.qvel = data.qpos, data.qvel
         self.gripper, self.block = data.site_xpos[scene.gripper_site], data.site_xpos[scene.block_site]
@@ -64,6 +66,13 @@ class _Lane:
         self.rule: Rule = next(iter(RULES.values()))
         self.target = np.zeros(3)
         self.start = np.zeros(SIZE, np.float32)
+
+    def __deepcopy__(self, _: dict[int, Any]) -> _Lane:
+        """Return a lane whose views are of its own physics."""
+        lane = _Lane(self.scene)
+        mujoco.mj_copyData(lane.data, self.scene.model, self.data)
+        lane.rule, lane.target, lane.start = self.rule, self.target, self.start
+        return lane
 
 
 class FetchVectorWorld:
