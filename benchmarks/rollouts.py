@@ -10,7 +10,9 @@ environment besides; the physics alone is as many threads that do nothing but `m
 from __future__ import annotations
 
 import argparse
+import contextlib
 import functools
+import io
 import json
 import os
 import statistics
@@ -95,7 +97,8 @@ def _make(env_id: str, options: dict[str, Any]) -> gymnasium.Env[Any, Any]:
 
 
 def _register_peers() -> None:
-    import gymnasium_robotics
+    with contextlib.redirect_stderr(io.StringIO()):  # else each process prints a notice about Adroit's hand
+        import gymnasium_robotics
 
     gymnasium.register_envs(gymnasium_robotics)
 
