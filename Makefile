@@ -4,7 +4,7 @@ BIN := .venv/bin
 SCENARIO := clbench/Fetch-v0
 QUICK := build/quick
 
-.PHONY: leaderboard records controls docs benchmark test slow-test check wheel-test clean
+.PHONY: leaderboard records controls docs benchmark test test-slow check wheel-test clean
 
 # The main job: from nothing to a table in minutes, with one seed. The full board takes `make records`.
 leaderboard:
@@ -42,9 +42,9 @@ benchmark: .venv/installed
 test: .venv/installed-dev
 	$(BIN)/pytest
 
-# What takes minutes: ten thousand steps of every task against gymnasium-robotics.
-slow-test: .venv/installed-dev
-	$(BIN)/pytest -m slow --dist=load
+# What takes minutes and finds little that `make test` does not: more of the same random input.
+test-slow: .venv/installed-dev
+	$(BIN)/pytest -m slow
 
 check: .venv/installed-dev
 	$(BIN)/ruff format --check .
