@@ -37,6 +37,7 @@ docs: .venv/installed
 # Speed, as ratios: benchmarks/results/.
 benchmark: .venv/installed
 	$(BIN)/python benchmarks/step_time.py
+	$(BIN)/python benchmarks/rollouts.py
 
 test: .venv/installed-dev
 	$(BIN)/pytest

@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from ratios import median_ratio
 from rich.progress import track
 
 import clbench
@@ -103,7 +104,7 @@ def main() -> None:
                 taken[str(name)] = benches[str(name)].seconds(arguments.steps)
             if number:  # the first round warms up
                 rounds.append(taken)
-    ratios = {name: _ratio([one[name] / one[BASELINE] for one in rounds], generator) for name in names}
+    ratios = {name: median_ratio([one[name] / one[BASELINE] for one in rounds], generator) for name in names}
     baseline = statistics.median(one[BASELINE] for one in rounds) / arguments.steps
     result = {
         "clbench": clbench.__version__,
@@ -116,14 +117,6 @@ def main() -> None:
     (RESULTS / "step_time.json").write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
     for name, ratio in sorted(ratios.items(), key=lambda item: item[1]["median_ratio"]):
         print(f"{name:24} {ratio['median_ratio']:.2f} [{ratio['low']:.2f}, {ratio['high']:.2f}]")
-
-
-def _ratio(ratios: list[float], generator: np.random.Generator) -> dict[str, float]:
-    """Return the median of the ratios with a bootstrap interval."""
-    drawn = np.median(generator.choice(ratios, size=(2000, len(ratios))), axis=1)
-    low, high = np.percentile(drawn, [2.5, 97.5])
-    values = {"median_ratio": float(np.median(ratios)), "low": float(low), "high": float(high)}
-    return {name: round(value, 3) for name, value in values.items()}
 
 
 if __name__ == "__main__":

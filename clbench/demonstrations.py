@@ -21,14 +21,13 @@ from clbench.leaks import check_demonstrations
 from clbench.policy import Batch, PolicyConfig, encode
 from clbench.seeding import derive_seed, numpy_generator
 from clbench.task import Budget, Scenario, Task, resolve
+from clbench.world import World
 
 SIMULATORS = ("gymnasium", "gymnasium-robotics", "mujoco", "numpy")
 """Packages whose version can change a trajectory."""
 
 DISTURBANCE = 0.1
 """Chance, at each step of a disturbed episode, that a disturbance begins."""
-
-World = gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]
 
 
 @dataclass(frozen=True)

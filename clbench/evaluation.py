@@ -8,18 +8,18 @@ another number of rows.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from clbench.demonstrations import World
 from clbench.leaks import check_episodes
 from clbench.policy import Policy, QuestionBatch, encode
 from clbench.questions import QuestionKind
 from clbench.seeding import derive_seed, torch_generator
-from clbench.task import Scenario, Split, Task, resolve
+from clbench.task import Scenario, Split, Task
+from clbench.world import Lanes
 
 Trial = tuple[Task, Split, int]
 """One episode to run: its task, its split and its number."""
@@ -53,15 +53,27 @@ class Episode:
 class _Lane:
     """One episode on its way."""
 
-    worlds: dict[str, World] = field(default_factory=dict)
-    task: Task | None = None
-    split: Split = "selection"
-    number: int = 0
-    words: torch.Tensor = field(default_factory=lambda: torch.zeros(0))
-    noise: torch.Tensor = field(default_factory=lambda: torch.zeros(0))
-    state: NDArray[np.float32] = field(default_factory=lambda: np.zeros(0, np.float32))
+    number: int
+    """Which of the lanes it runs in."""
+    trial: Trial
+    words: torch.Tensor
+    noise: torch.Tensor
+    """Draws for every forward of the episode, (forwards, H, A)."""
+    state: NDArray[np.float32]
     total_reward: float = 0.0
     length: int = 0
+    success: bool = False
+
+    @property
+    def ended(self) -> bool:
+        """Whether the episode is over."""
+        return self.success or self.length == self.trial[0].horizon
+
+    @property
+    def episode(self) -> Episode:
+        """What came of it."""
+        task, split, number = self.trial
+        return Episode(task.name, split, number, self.success, self.total_reward, self.length)
 
 
 class Evaluator:
@@ -70,19 +82,17 @@ class Evaluator:
     Args:
         scenario: Where the tasks come from.
         seed: Of the run: it chooses the initial states, the same for all methods.
+        threads: Threads that may step the worlds; no outcome depends on it.
     """
 
-    def __init__(self, scenario: Scenario, seed: int) -> None:
+    def __init__(self, scenario: Scenario, seed: int, threads: int = 1) -> None:
         self.scenario = scenario
         self.seed = seed
-        self._lanes = [_Lane() for _ in range(LANES)]
+        self._lanes = Lanes(LANES, threads)
 
     def close(self) -> None:
         """Close all worlds."""
-        for lane in self._lanes:
-            for world in lane.worlds.values():
-                world.close()
-            lane.worlds.clear()
+        self._lanes.close()
 
     def evaluate(
         self,
@@ -121,32 +131,34 @@ class Evaluator:
         queue = list(reversed(trials))
         ended: dict[tuple[str, Split, int], Episode] = {}
         live: list[_Lane] = []
-        idle = list(self._lanes)
+        idle = list(range(LANES))
         while queue or live:
-            while queue and idle:
-                live.append(self._start(idle.pop(), policy, *queue.pop()))
-            chunks = self._act(policy, live)
-            for lane, chunk in zip(live.copy(), chunks, strict=True):
-                episode = _execute(lane, chunk, watch)
-                if episode is not None:
-                    ended[episode.task, episode.split, episode.number] = episode
-                    live.remove(lane)
-                    idle.append(lane)
-                    progress(1)
+            starting = [(idle.pop(), queue.pop()) for _ in range(min(len(idle), len(queue)))]
+            live += self._start(policy, starting)
+            self._execute(live, self._act(policy, live), watch)
+            for lane in [lane for lane in live if lane.ended]:
+                episode = lane.episode
+                ended[episode.task, episode.split, episode.number] = episode
+                live.remove(lane)
+                idle.append(lane.number)
+                progress(1)
         return [ended[task.name, split, number] for task, split, number in trials]
 
-    def _start(self, lane: _Lane, policy: Policy, task: Task, split: Split, number: int) -> _Lane:
-        if task.world not in lane.worlds:
-            lane.worlds[task.world] = resolve(task.world)()
-        seed, instruction = start_of((task, split, number), self.seed)
-        lane.task, lane.split, lane.number = task, split, number
-        lane.total_reward, lane.length = 0.0, 0
-        lane.state, _ = lane.worlds[task.world].reset(seed=seed, options={"task": task.name})
-        lane.words = encode([instruction])[0]
-        forwards = -(-task.horizon // policy.config.executed)
-        shape = (forwards, policy.config.chunk, policy.config.action_size)
-        lane.noise = torch.randn(shape, generator=torch_generator("noise", seed))
-        return lane
+    def _start(self, policy: Policy, starting: Sequence[tuple[int, Trial]]) -> list[_Lane]:
+        """Begin each trial in the lane that stands beside it."""
+        if not starting:
+            return []
+        tasks = [task for _, (task, _, _) in starting]
+        starts = [start_of(trial, self.seed) for _, trial in starting]
+        states = self._lanes.reset([lane for lane, _ in starting], [seed for seed, _ in starts], tasks)
+        lanes = []
+        for (lane, trial), (seed, instruction), state in zip(starting, starts, states, strict=True):
+            words = encode([instruction])[0]
+            forwards = -(-trial[0].horizon // policy.config.executed)
+            shape = (forwards, policy.config.chunk, policy.config.action_size)
+            noise = torch.randn(shape, generator=torch_generator("noise", seed))
+            lanes.append(_Lane(lane, trial, words, noise, state))
+        return lanes
 
     def _act(self, policy: Policy, live: Sequence[_Lane]) -> NDArray[np.float32]:
         """Return the actions to execute, (len(live), executed, A)."""
@@ -161,7 +173,23 @@ class Evaluator:
         device = policy.state_mean.device
         chunks = policy.act(state.to(device), words.to(device), noise.to(device))
         actions: NDArray[np.float32] = chunks[: len(live), : config.executed].cpu().numpy()
-        return actions
+        # a diverged policy acts in NaN: it stands still and fails rather than stop the run
+        return np.nan_to_num(actions).clip(-1.0, 1.0)
+
+    def _execute(self, live: Sequence[_Lane], chunks: NDArray[np.float32], watch: Watch) -> None:
+        """Step the lanes through their chunks (len(live), executed, A), each until its episode ends."""
+        for step in range(chunks.shape[1]):
+            rows = [row for row, lane in enumerate(live) if not lane.ended]
+            if not rows:
+                return
+            for row in rows:
+                watch(live[row].trial, chunks[row, step])
+            outcomes = self._lanes.step([live[row].number for row in rows], chunks[rows, step])
+            for row, state, reward, success in zip(rows, *outcomes, strict=True):
+                lane = live[row]
+                lane.state, lane.length = state, lane.length + 1
+                lane.total_reward += float(reward)
+                lane.success = bool(success)
 
 
 def start_of(trial: Trial, seed: int) -> tuple[int, str]:
@@ -169,24 +197,6 @@ def start_of(trial: Trial, seed: int) -> tuple[int, str]:
     task, split, number = trial
     instruction = task.instructions[number % len(task.instructions)]
     return derive_seed("episode", seed, task.name, split, number), instruction
-
-
-def _execute(lane: _Lane, chunk: NDArray[np.float32], watch: Watch) -> Episode | None:
-    """Step a lane through a chunk (executed, A); return the episode if it ends."""
-    assert lane.task is not None
-    world = lane.worlds[lane.task.world]
-    for action in chunk:
-        # a diverged policy acts in NaN: it stands still and fails rather than stop the run
-        action = np.clip(np.nan_to_num(action), -1.0, 1.0)
-        watch((lane.task, lane.split, lane.number), action)
-        lane.state, reward, terminated, _, _ = world.step(action)
-        lane.total_reward += float(reward)
-        lane.length += 1
-        if terminated or lane.length == lane.task.horizon:
-            return Episode(
-                lane.task.name, lane.split, lane.number, terminated, lane.total_reward, lane.length
-            )
-    return None
 
 
 @torch.inference_mode()

@@ -18,13 +18,13 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageColor, ImageDraw, ImageFont
 
-from clbench.demonstrations import World
 from clbench.evaluation import Episode, Evaluator, Trial, start_of
 from clbench.extras import require
 from clbench.policy import Policy
 from clbench.run import RunSpec
 from clbench.task import Scenario, Task, resolve
 from clbench.training import deterministic
+from clbench.world import World
 
 FORMATS = (".gif", ".mp4")
 

@@ -18,11 +18,12 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from clbench.cache import cache_folder, cached, hash_of, package_of, source_hash
-from clbench.demonstrations import SIMULATORS, World, demonstrate
+from clbench.demonstrations import SIMULATORS, demonstrate
 from clbench.leaks import check_questions
 from clbench.policy import QuestionBatch, encode, word_id
 from clbench.seeding import derive_seed, torch_generator
 from clbench.task import Scenario, resolve
+from clbench.world import World
 
 
 @dataclass(frozen=True)

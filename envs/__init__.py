@@ -5,5 +5,6 @@ from gymnasium.envs.registration import register
 register(
     id="clbench/Fetch-v0",
     entry_point="clbench.scenario_env:ScenarioEnv",
+    vector_entry_point="clbench.scenario_vector_env:ScenarioVectorEnv",
     kwargs={"scenario": "clbench.envs.fetch:SCENARIO"},
 )

@@ -4,11 +4,12 @@ import numpy as np
 import pytest
 import torch
 
-from clbench.evaluation import LANES, Evaluator, answer
-from clbench.policy import Policy
+from clbench.evaluation import LANES, Episode, Evaluator, Trial, answer
+from clbench.policy import Policy, encode
 from clbench.pretraining import policy_config, pretrained_policy
 from clbench.questions import load_questions, report_questions
-from clbench.task import load_scenario
+from clbench.seeding import derive_seed, torch_generator
+from clbench.task import Task, load_scenario, resolve
 from clbench.training import deterministic
 
 TOY = load_scenario("clbench.testing:clbench/Toy-v0")
@@ -31,6 +32,41 @@ def test_an_outcome_does_not_depend_on_what_else_is_evaluated(fetch_policy: Poli
     assert len(together) > LANES
     assert alone == together[40:48]
     assert again == [episode for start in range(88, -8, -8) for episode in together[start : start + 8]]
+
+
+def _played_alone(policy: Policy, task: Task, number: int, seed: int) -> Episode:
+    """Run one selection episode in the plain world, with nothing else in the forward."""
+    config, world = policy.config, resolve(task.world)()
+    start = derive_seed("episode", seed, task.name, "selection", number)
+    state, _ = world.reset(seed=start, options={"task": task.name})
+    words = torch.ones(LANES, 12, dtype=torch.int64)
+    words[0] = encode([task.instructions[number % len(task.instructions)]])[0]
+    forwards = -(-task.horizon // config.executed)
+    draws = torch.randn(forwards, config.chunk, config.action_size, generator=torch_generator("noise", start))
+    states, noise = torch.zeros(LANES, config.state_size), torch.zeros(LANES, *draws.shape[1:])
+    total_reward = 0.0
+    for step in range(task.horizon):
+        if step % config.executed == 0:
+            states[0], noise[0] = torch.from_numpy(state), draws[step // config.executed]
+            chunk = policy.act(states, words, noise)[0].clamp(-1.0, 1.0).numpy()
+        state, reward, success, _, _ = world.step(chunk[step % config.executed])
+        total_reward += reward
+        if success:
+            break
+    return Episode(task.name, "selection", number, success, total_reward, step + 1)
+
+
+def test_an_outcome_is_bit_for_bit_that_of_the_plain_world(fetch_policy: Policy) -> None:
+    trained, _ = pretrained_policy(TOY, 0)
+    cases = [(FETCH, fetch_policy, ["push", "pull"]), (TOY, trained, ["left", "right", "up_left"])]
+    for scenario, policy, names in cases:
+        trials: list[Trial] = [
+            (scenario.task(name), "selection", number) for name in names for number in (0, 3)
+        ]
+        with deterministic():
+            alone = [_played_alone(policy, task, number, seed=4) for task, _, number in trials]
+            for threads in (1, 2):
+                assert Evaluator(scenario, seed=4, threads=threads).play(policy, trials) == alone
 
 
 def test_rows_of_a_forward_do_not_depend_on_their_place_or_their_neighbours(fetch_policy: Policy) -> None:

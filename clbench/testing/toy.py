@@ -126,5 +126,6 @@ TOY = Scenario(
 register(
     id="clbench/Toy-v0",
     entry_point="clbench.scenario_env:ScenarioEnv",
+    vector_entry_point="clbench.scenario_vector_env:ScenarioVectorEnv",
     kwargs={"scenario": "clbench.testing:TOY"},
 )

@@ -1,5 +1,6 @@
 """The Fetch world, its tasks, experts and questions."""
 
+import copy
 import itertools
 import subprocess
 import sys
@@ -124,6 +125,17 @@ def test_worlds_that_run_side_by_side_do_not_touch_each_other() -> None:
         state, reward, *_ = worlds[index].step(random_actions(seed, 20)[step])
         rows[index].append(np.append(state, reward))
     np.testing.assert_array_equal(np.array(rows), np.array(expected))
+
+
+def test_a_copy_of_a_world_goes_on_as_the_world_does_and_leaves_it_alone() -> None:
+    world, expected = World(), rollout(World(), "lift", seed=2)
+    world.reset(seed=2, options={"task": "lift"})
+    actions = random_actions(2, 20)
+    for action in actions[:10]:
+        world.step(action)
+    for one in (copy.deepcopy(world), world):
+        rows = [np.append(*one.step(action)[:2]) for action in actions[10:]]
+        np.testing.assert_array_equal(rows, expected[11:])
 
 
 def test_an_episode_without_a_seed_continues_the_random_numbers() -> None:

@@ -1,0 +1,146 @@
+"""Many environments of a scenario side by side: what `gymnasium.make_vec` makes."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+from gymnasium.utils.seeding import np_random
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+from numpy.typing import NDArray
+
+from clbench.scenario_env import Observation
+from clbench.task import Scenario, resolve
+from clbench.walk import InstructionFormat, Start, Walk
+from clbench.world import Lanes
+
+Flags = NDArray[np.bool_]
+Outcome = tuple[Observation, NDArray[np.float64], Flags, Flags, dict[str, Any]]
+
+
+class ScenarioVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]]):
+    """As many `ScenarioEnv` as asked for, each on its own walk, stepped together by the suite's vector world.
+
+    It does bit for bit what a `gymnasium.vector.SyncVectorEnv` of them does: an environment whose episode has
+    ended begins the next one at the next step, which takes no notice of its action.
+
+    Args:
+        scenario: The sequence, or its entry point "module:attribute".
+        num_envs: How many environments.
+        instruction: How the observations give the instruction, "text" or "tokens".
+        episodes_per_stage: Episodes after which an environment goes on to the next stage.
+        threads: Threads that step the worlds, by default one for each core. Results do not depend on it.
+    """
+
+    metadata: dict[str, Any] = {"render_modes": [], "autoreset_mode": AutoresetMode.NEXT_STEP}  # noqa: RUF012
+
+    def __init__(
+        self,
+        scenario: Scenario | str,
+        num_envs: int = 1,
+        instruction: InstructionFormat = "text",
+        episodes_per_stage: int = 100,
+        threads: int | None = None,
+    ) -> None:
+        self.scenario: Scenario = resolve(scenario) if isinstance(scenario, str) else scenario
+        self.num_envs = num_envs
+        self._walks = [Walk(self.scenario, episodes_per_stage, instruction) for _ in range(num_envs)]
+        self._generators: list[np.random.Generator] = [np_random()[0] for _ in range(num_envs)]
+        self._lanes = Lanes(num_envs, threads or os.cpu_count() or 1)
+        world = self._lanes.world(self.scenario.retained[0])
+        self.single_action_space = world.single_action_space
+        self.single_observation_space = spaces.Dict(
+            {"state": world.single_observation_space, "instruction": self._walks[0].instruction_space}
+        )
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self._starts: list[Start] = []
+        self._states = np.zeros((num_envs, *world.single_observation_space.shape), np.float32)
+        self._steps_left = np.zeros(num_envs, np.int64)
+        self._ended = np.zeros(num_envs, np.bool_)
+
+    def reset(
+        self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observation, dict[str, Any]]:
+        """Begin an episode in every environment.
+
+        Args:
+            seed: A number, from which on the environments' seeds count up, or a seed or None for each.
+            options: As `ScenarioEnv` takes them, for all.
+
+        Raises:
+            LookupError: The scenario has no such task.
+            ValueError: It has no such stage, an option is unknown, or there are more or fewer seeds.
+        """
+        seeds = self._seeds(seed)
+        for number, own in enumerate(seeds):
+            if own is not None:
+                self._generators[number], _ = np_random(own)
+                self._walks[number].begin()
+        walks = zip(self._walks, self._generators, strict=True)
+        self._starts = [walk.next(generator, options or {}) for walk, generator in walks]
+        self._begin(range(self.num_envs))
+        self._ended = np.zeros(self.num_envs, np.bool_)
+        return self._observation(), self._info(self._ended)
+
+    def _seeds(self, seed: int | Sequence[int | None] | None) -> Sequence[int | None]:
+        if seed is None:
+            return [None] * self.num_envs
+        if isinstance(seed, int):
+            return range(seed, seed + self.num_envs)
+        if len(seed) != self.num_envs:
+            raise ValueError(f"{self.num_envs} environments need as many seeds, not {len(seed)}.")
+        return seed
+
+    def step(self, actions: NDArray[np.float32]) -> Outcome:
+        """Take one step in every environment; where the last one ended an episode, begin the next instead.
+
+        Raises:
+            ResetNeeded: There was no `reset` yet.
+        """
+        if not self._starts:
+            raise gymnasium.error.ResetNeeded(f"{self.scenario.id} has no episodes yet: call reset().")
+        rewards, terminated = np.zeros(self.num_envs), np.zeros(self.num_envs, np.bool_)
+        beginning, going = np.flatnonzero(self._ended).tolist(), np.flatnonzero(~self._ended).tolist()
+        if going:
+            outcomes = self._lanes.step(going, np.asarray(actions)[going])
+            self._states[going], rewards[going], terminated[going] = outcomes
+            self._steps_left[going] -= 1
+        if beginning:
+            for number in beginning:
+                self._starts[number] = self._walks[number].next(self._generators[number], {})
+            self._begin(beginning)
+        truncated = ~terminated & (self._steps_left <= 0)
+        self._ended = terminated | truncated
+        return self._observation(), rewards, terminated, truncated, self._info(terminated)
+
+    def close_extras(self) -> None:
+        """Close the worlds."""
+        self._lanes.close()
+
+    def _begin(self, numbers: Sequence[int]) -> None:
+        """Put the environments `numbers` at their starts."""
+        starts = [self._starts[number] for number in numbers]
+        tasks = [start.task for start in starts]
+        self._states[numbers] = self._lanes.reset(numbers, [start.seed for start in starts], tasks)
+        self._steps_left[numbers] = [task.horizon for task in tasks]
+
+    def _observation(self) -> Observation:
+        instructions = [start.observed_instruction for start in self._starts]
+        observed = tuple(instructions) if isinstance(instructions[0], str) else np.stack(instructions)
+        return {"state": self._states.copy(), "instruction": observed}
+
+    def _info(self, successes: Flags) -> dict[str, Any]:
+        """Return the infos as Gymnasium's vector environments do: a column of each, and where it is known."""
+        rows = [start.info(bool(success)) for start, success in zip(self._starts, successes, strict=True)]
+        info: dict[str, Any] = {}
+        for name, value in rows[0].items():
+            kind = object if isinstance(value, str) else type(value)
+            info[name] = np.array([row[name] for row in rows], dtype=kind)
+            info[f"_{name}"] = np.ones(self.num_envs, np.bool_)
+        return info

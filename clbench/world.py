@@ -1,0 +1,156 @@
+"""Worlds: one episode in a Gymnasium environment, or many side by side in the lanes of a vector world."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from typing import Protocol, TypeAlias
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from clbench.task import Task, resolve
+
+World = gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]
+
+States: TypeAlias = NDArray[np.float32]
+"""States of N lanes, (N, S)."""
+Outcomes: TypeAlias = tuple[States, NDArray[np.float64], NDArray[np.bool_]]
+"""What a step led to in N lanes: states (N, S), rewards (N,), and which episodes succeeded (N,)."""
+
+
+class VectorWorld(Protocol):
+    """Many episodes of one world side by side, each in a lane.
+
+    A suite has its own where stepping many episodes together is faster than one after the other: the
+    attribute `vector_world` of its world makes it, from the number of lanes and of threads. Each episode is
+    bit for bit that of the plain world, whatever the other lanes do. Who uses it resets a lane before
+    stepping it, counts the steps, and lets a lane rest once its episode has succeeded.
+    """
+
+    single_observation_space: spaces.Box
+    """Of the state in one lane."""
+    single_action_space: spaces.Box
+
+    def reset(self, lanes: Sequence[int], seeds: Sequence[int], tasks: Sequence[str]) -> States:
+        """Start an episode of a task in each of `lanes`, and return the states."""
+        ...
+
+    def step(self, lanes: Sequence[int], actions: NDArray[np.float32]) -> Outcomes:
+        """Move each of `lanes`, none twice, by its row of actions (N, A)."""
+        ...
+
+    def close(self) -> None:
+        """Free what it holds."""
+        ...
+
+
+class PlainVectorWorld:
+    """The vector world of a suite that has no own: a plain world in each lane, one stepped after the other.
+
+    Args:
+        make: Makes a world.
+        lanes: Places for episodes; a world is made when its lane is first reset.
+    """
+
+    def __init__(self, make: Callable[[], World], lanes: int) -> None:
+        first = make()
+        assert isinstance(first.observation_space, spaces.Box)
+        assert isinstance(first.action_space, spaces.Box)
+        self.single_observation_space, self.single_action_space = first.observation_space, first.action_space
+        self._make = make
+        self._worlds: list[World | None] = [first, *[None] * (lanes - 1)]
+
+    def reset(self, lanes: Sequence[int], seeds: Sequence[int], tasks: Sequence[str]) -> States:
+        """Start an episode of a task in each of `lanes`, and return the states."""
+        states = []
+        for lane, seed, task in zip(lanes, seeds, tasks, strict=True):
+            world = self._worlds[lane] or self._make()
+            self._worlds[lane] = world
+            states.append(world.reset(seed=seed, options={"task": task})[0])
+        return np.stack(states)
+
+    def step(self, lanes: Sequence[int], actions: NDArray[np.float32]) -> Outcomes:
+        """Move each of `lanes`, none twice, by its row of actions (N, A)."""
+        outcomes = []
+        for lane, action in zip(lanes, actions, strict=True):
+            world = self._worlds[lane]
+            if world is None:
+                raise gymnasium.error.ResetNeeded(f"Lane {lane} has no episode: reset it.")
+            outcomes.append(world.step(action)[:3])
+        states, rewards, successes = zip(*outcomes, strict=True)
+        return np.stack(states), np.array(rewards, np.float64), np.array(successes, np.bool_)
+
+    def close(self) -> None:
+        """Close all worlds."""
+        for world in self._worlds:
+            if world is not None:
+                world.close()
+
+
+def vector_world(entry_point: str, lanes: int, threads: int = 1) -> VectorWorld:
+    """Return a vector world of the world that `entry_point` names: the suite's own if it has one."""
+    world = resolve(entry_point)
+    own: Callable[[int, int], VectorWorld] | None = getattr(world, "vector_world", None)
+    return PlainVectorWorld(world, lanes) if own is None else own(lanes, threads)
+
+
+class Lanes:
+    """Places for episodes of any tasks: each runs in the vector world of its task.
+
+    Args:
+        count: How many; they are numbered from 0.
+        threads: Threads that a suite's own vector world may use.
+    """
+
+    def __init__(self, count: int, threads: int = 1) -> None:
+        self._count, self._threads = count, threads
+        self._worlds: dict[str, VectorWorld] = {}
+        self._home: list[VectorWorld | None] = [None] * count
+
+    def world(self, task: Task) -> VectorWorld:
+        """Return the vector world of a task; it is made when first needed."""
+        if task.world not in self._worlds:
+            self._worlds[task.world] = vector_world(task.world, self._count, self._threads)
+        return self._worlds[task.world]
+
+    def reset(self, lanes: Sequence[int], seeds: Sequence[int], tasks: Sequence[Task]) -> States:
+        """Start an episode of a task in each of `lanes`, and return the states (N, S)."""
+        for lane, task in zip(lanes, tasks, strict=True):
+            self._home[lane] = self.world(task)
+        states = self._empty(lanes)
+        for world, rows in self._by_world(lanes):
+            names = [tasks[row].name for row in rows]
+            states[rows] = world.reset([lanes[row] for row in rows], [seeds[row] for row in rows], names)
+        return states
+
+    def step(self, lanes: Sequence[int], actions: NDArray[np.float32]) -> Outcomes:
+        """Move each of `lanes`, none twice, by its row of actions (N, A)."""
+        states, rewards, successes = self._empty(lanes), np.empty(len(lanes)), np.empty(len(lanes), np.bool_)
+        for world, rows in self._by_world(lanes):
+            outcomes = world.step([lanes[row] for row in rows], actions[rows])
+            states[rows], rewards[rows], successes[rows] = outcomes
+        return states, rewards, successes
+
+    def close(self) -> None:
+        """Close all worlds."""
+        for world in self._worlds.values():
+            world.close()
+        self._worlds.clear()
+        self._home = [None] * self._count
+
+    def _empty(self, lanes: Sequence[int]) -> States:
+        """Return memory for the states of `lanes`, all of which have an episode."""
+        homes = [self._home[lane] for lane in lanes]
+        if None in homes:
+            raise gymnasium.error.ResetNeeded(f"Lane {lanes[homes.index(None)]} has no episode: reset it.")
+        assert homes[0] is not None
+        return np.empty((len(lanes), *homes[0].single_observation_space.shape), np.float32)
+
+    def _by_world(self, lanes: Sequence[int]) -> Iterator[tuple[VectorWorld, list[int]]]:
+        """Return each world with the rows of `lanes` that are in it."""
+        for world in self._worlds.values():
+            rows = [row for row, lane in enumerate(lanes) if self._home[lane] is world]
+            if rows:
+                yield world, rows

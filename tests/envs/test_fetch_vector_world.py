@@ -1,0 +1,143 @@
+"""The vector world of Fetch, against the plain world and against gymnasium-robotics, bit for bit."""
+
+import itertools
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from clbench.task import load_scenario, resolve
+from clbench.world import VectorWorld, vector_world
+
+SCENARIO = load_scenario("clbench:clbench/Fetch-v0")
+NAMES = [task.name for task in SCENARIO.tasks]
+PlainWorld = resolve(SCENARIO.tasks[0].world)
+LONGEST = 80
+"""Steps after which an episode is begun anew if it has not ended: more than the horizon."""
+
+State = NDArray[np.float32]
+
+
+def fetch(lanes: int, threads: int = 1) -> VectorWorld:
+    return vector_world(SCENARIO.tasks[0].world, lanes, threads)
+
+
+class Peer:
+    """One episode of gymnasium-robotics and one of our plain world, step by step."""
+
+    def __init__(self, original: Any) -> None:
+        self.plain, self.original = PlainWorld(), original
+        self.follows = False
+
+    def reset(self, seed: int, task: str) -> State:
+        state, _ = self.plain.reset(seed=seed, options={"task": task})
+        observation = self.original.reset(seed=seed)[0]["observation"].astype(np.float32)
+        # Where the block lies out of our reach, ours is placed again: of these episodes it knows nothing.
+        self.follows = bool((observation == state[:25]).all())
+        return state  # type: ignore[no-any-return]
+
+    def step(self, action: NDArray[np.float32]) -> tuple[State, float, bool]:
+        state, reward, success, _, _ = self.plain.step(action)
+        if self.follows:
+            observation = self.original.step(action)[0]["observation"].astype(np.float32)
+            np.testing.assert_array_equal(observation, state[:25])
+        return state, reward, success
+
+
+def compare(task: str, steps: int, threads: int, lanes: int = 8) -> tuple[int, int]:
+    """Compare `steps` steps of a task; return how many gymnasium-robotics followed, and the successes.
+
+    Expert and random actions take turns; an episode is begun anew after success, or at a random age.
+    """
+    import gymnasium_robotics
+
+    gymnasium.register_envs(gymnasium_robotics)
+    originals = [
+        gymnasium.make("FetchPickAndPlace-v4", max_episode_steps=10**6, disable_env_checker=True)
+        for _ in range(lanes)
+    ]
+    world, peers = fetch(lanes, threads), [Peer(original) for original in originals]
+    generator = np.random.default_rng([7, NAMES.index(task)])
+    expert = resolve(SCENARIO.task(task).expert)(task)
+    states = np.zeros((lanes, 28), np.float32)
+    left, numbers = np.zeros(lanes, np.int64), list(range(lanes))
+    followed = successes = 0
+    for step in range(-(-steps // lanes)):
+        beginning = [lane for lane in numbers if left[lane] <= 0]
+        seeds = generator.integers(2**31, size=len(beginning)).tolist()
+        if beginning:
+            states[beginning] = world.reset(beginning, seeds, [task] * len(beginning))
+            left[beginning] = generator.integers(20, LONGEST, size=len(beginning))
+        for lane, seed in zip(beginning, seeds, strict=True):
+            np.testing.assert_array_equal(peers[lane].reset(seed, task), states[lane])
+        actions = generator.uniform(-1.2, 1.2, (lanes, 4)).astype(np.float32)
+        for lane in numbers:
+            if (step // 12 + lane) % 3:
+                actions[lane] = expert(states[lane])
+        states, rewards, ended = world.step(numbers, actions)
+        for lane, peer in enumerate(peers):
+            state, reward, success = peer.step(actions[lane])
+            np.testing.assert_array_equal(state, states[lane])
+            assert (reward, success) == (rewards[lane], ended[lane])
+        followed += sum(peer.follows for peer in peers)
+        successes += int(ended.sum())
+        left = np.where(ended, 0, left - 1)
+    for original in originals:
+        original.close()
+    world.close()
+    return followed, successes
+
+
+@pytest.mark.parametrize("task", ["lift", "push_left"])
+def test_it_is_the_plain_world_and_gymnasium_robotics_bit_for_bit(task: str) -> None:
+    followed, successes = compare(task, steps=400, threads=2)
+    assert followed > 200
+    assert successes > 2
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("task", NAMES)
+def test_it_is_so_over_ten_thousand_steps_of_each_task(task: str) -> None:
+    followed, successes = compare(task, steps=10_000, threads=2)
+    assert followed > 5_000
+    assert successes > 50
+
+
+def test_lanes_step_in_any_order_and_number_without_a_trace_in_the_others() -> None:
+    world, plain = fetch(lanes=5, threads=3), [PlainWorld() for _ in range(5)]
+    states = world.reset([4, 2, 0], [4, 2, 0], ["push", "lift", "reach"])
+    for row, lane in enumerate([4, 2, 0]):
+        task = ["push", "lift", "reach"][row]
+        np.testing.assert_array_equal(plain[lane].reset(seed=lane, options={"task": task})[0], states[row])
+    actions = np.random.default_rng(0).uniform(-1, 1, (30, 5, 4)).astype(np.float32)
+    for step, moving in zip(range(30), itertools.cycle([[4, 2, 0], [0], [2, 4], [0, 4]])):
+        states, rewards, _ = world.step(moving, actions[step, moving])
+        for row, lane in enumerate(moving):
+            state, reward, *_ = plain[lane].step(actions[step, lane])
+            assert states[row].tobytes() == state.tobytes()
+            assert rewards[row] == reward
+        if step == 15:
+            world.reset([1, 3], [9, 9], ["pull", "press"])
+    world.close()
+
+
+def test_an_action_that_cannot_be_done_is_an_error_that_names_it() -> None:
+    world = fetch(lanes=2)
+    world.reset([0, 1], [0, 1], ["reach", "reach"])
+    actions = np.zeros((2, 4), np.float32)
+    actions[1, 2] = np.nan
+    with pytest.raises(ValueError, match=r"is finite, not \[0.0, 0.0, nan, 0.0\]"):
+        world.step([0, 1], actions)
+    with pytest.raises(ValueError, match=r"has shape \(4,\), not \(3,\)"):
+        world.step([0, 1], np.zeros((2, 3), np.float32))
+
+
+def test_a_lane_without_an_episode_and_an_unknown_task_are_named() -> None:
+    world = fetch(lanes=2)
+    world.reset([0], [0], ["reach"])
+    with pytest.raises(gymnasium.error.ResetNeeded, match="Lane 1 of the Fetch world has no episode"):
+        world.step([0, 1], np.zeros((2, 4), np.float32))
+    with pytest.raises(LookupError, match="Did you mean 'push_left'"):
+        world.reset([1], [0], ["push_lefft"])
