@@ -49,7 +49,7 @@ def test_the_first_snippet_walks_through_the_scenario(tmp_path: Path) -> None:
 def test_the_second_snippet_is_a_method_that_keeps_all_answers(folder: Path) -> None:
     from clbench import read_record
 
-    answers = read_record(folder / "leaderboard/records/Toy-v0/my_method--HeadOnly/seed-0.json").answers
+    answers = read_record(folder / "leaderboard/records/Toy-v0/my_method.HeadOnly/seed-0.json").answers
     correct: dict[tuple[int, int], int] = {}
     for stage, step, right in zip(answers["stage"], answers["step"], answers["correct"], strict=True):
         correct[stage, step] = correct.get((stage, step), 0) + right
@@ -70,7 +70,7 @@ def test_three_commands_lead_from_nothing_to_a_row_on_the_board(tmp_path: Path) 
     words = [*submit.split(), *toy.split()]
     told = subprocess.run([*command, *words], cwd=tmp_path, check=True, capture_output=True, text=True).stdout
     assert "Rank 1 of 1 in the division prior-data-free." in told
-    assert (tmp_path / "try/records/FetchToy-v0/gentle_tuning--GentleTuning/seed-0.json").is_file()
+    assert (tmp_path / "try/records/FetchToy-v0/gentle_tuning.GentleTuning/seed-0.json").is_file()
     assert "gentle" in (tmp_path / "try/LEADERBOARD.md").read_text(encoding="utf-8")
 
 

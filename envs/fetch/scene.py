@@ -13,9 +13,11 @@ from numpy.typing import NDArray
 
 # Else each worker prints a notice about Adroit's hand, which is not used here.
 with contextlib.redirect_stderr(io.StringIO()):
-    from gymnasium_robotics.envs.fetch.fetch_env import DEFAULT_CAMERA_CONFIG as CAMERA
     from gymnasium_robotics.envs.fetch.pick_and_place import MujocoFetchPickAndPlaceEnv
     from gymnasium_robotics.utils.rotations import mat2euler
+
+CAMERA = {"distance": 1.2, "azimuth": 60.0, "elevation": -25.0, "lookat": np.array([1.3, 0.75, 0.56])}
+"""From the robot's right, behind it: left is left, away goes right, and small pictures show the block."""
 
 __all__ = ["CAMERA", "Scene", "mat2euler", "scene"]
 
@@ -54,6 +56,8 @@ def scene() -> Scene:
     def site(name: str) -> int:
         return int(model.site(name).id)
 
+    # green beams, 2 m long, that only show where the hand is to go
+    model.geom_rgba[model.body_mocapid[model.geom_bodyid] >= 0, 3] = 0.0
     fingers = [model.joint(f"robot0:{side}_gripper_finger_joint") for side in ("r", "l")]
     return Scene(
         model=model,

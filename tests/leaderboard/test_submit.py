@@ -57,7 +57,7 @@ def test_a_sound_class_gets_a_row_a_rank_and_its_ties(
     printed = capsys.readouterr()
     assert "the method keeps the contract" in printed.err
     assert "Rank 1 of 1 in the division prior-data-free." in printed.out
-    assert "Metrics that compare with from_scratch, sft need records of it" in printed.out
+    assert "Metrics that compare with sft need records of it" in printed.out
     path = record_path(Path("board/records"), "clbench/Toy-v0", "submitted:Mine", 0)
     record = read_record(path)
     assert record.status == "success"
