@@ -109,7 +109,7 @@ NAMES = [
     ("run.scenario", "clbench/../../Toy-v0", "cannot be the id of a scenario"),
     ("run.scenario", "clbench/Toy-v0\n## Toy", "cannot be the id of a scenario"),
     ("run.scenario", "clbench/fetch-v0", "can be taken for the scenario 'clbench/Fetch-v0'"),
-    ("run.scenario", "c1bench/Toy-v0", "can be taken for a scenario of clbench"),
+    ("run.scenario", "c1bench/Unknown-v0", "can be taken for a scenario of clbench"),
     ("run.scenario", "theirs/Toy-v0", "its id is 'clbench/Toy-v0', but 'theirs/Toy-v0' was run"),
     ("scenario.retained.0", "<script>", "'<script>' cannot be the name of a task"),
     ("answers.kind.0", "../left", "'../left' cannot be the name of a kind of question"),
