@@ -172,8 +172,7 @@ def _run_missing(
     tensorboard: Path | None = None,
 ) -> bool:
     """Do the runs that have no record yet, keep what policies are to be kept; return whether none failed."""
-    from clbench.grid import benchmark_jobs, run_jobs, stages_jobs
-    from clbench.progress import Bars
+    from clbench.grid import benchmark_jobs, run_with_bars, stages_jobs
     from clbench.run import has_record
     from clbench.stages import has_stages
 
@@ -190,8 +189,7 @@ def _run_missing(
     runs = benchmark_jobs(missing, records, checkpoints=checkpoints, tensorboard=tensorboard)
     # what both need is made once
     jobs = list({job.name: job for job in (*runs, *stages_jobs(bare, checkpoints))}.values())
-    with Bars(sum(job.length for job in jobs), console) as bars:
-        failed = run_jobs(jobs, workers or os.cpu_count() or 1, bars)
+    failed = run_with_bars(jobs, workers, console)
     seconds = time.monotonic() - begin
     done = f"{len(missing)} runs" + (f" and the policies of {len(bare)}" if bare else "")
     console.print(f"{done} in {seconds / 60:.1f} minutes; records in {records}.", highlight=False)
@@ -357,17 +355,13 @@ def _numbers(option: str, text: str | None, last: int) -> list[int]:
 
 def _stages_folder(spec: RunSpec, checkpoints: Path | None, console: Console) -> Path:
     """Return where the policies of all stages of a run lie; what is missing is made first."""
-    from clbench.grid import run_jobs, stages_jobs
-    from clbench.progress import Bars
+    from clbench.grid import run_with_bars, stages_jobs
     from clbench.stages import find_stages, make_stages
 
     found = find_stages(spec, checkpoints)
     if found is not None:
         return found
-    jobs = stages_jobs([spec], None)
-    with Bars(sum(job.length for job in jobs), console) as bars:
-        failed = run_jobs(jobs, os.cpu_count() or 1, bars)
-    if failed:
+    if run_with_bars(stages_jobs([spec], None), None, console):
         sys.exit(1)
     return make_stages(spec)
 
@@ -407,17 +401,14 @@ def demonstrations(scenario: str, /, *, workers: int | None = None) -> None:
         workers: Tasks that are collected at once; all cores if not given.
     """
     from clbench.demonstrations import dataset_folder, read_dataset
-    from clbench.grid import demonstration_jobs, run_jobs
-    from clbench.progress import Bars
+    from clbench.grid import demonstration_jobs, run_with_bars
     from clbench.task import load_scenario
 
     with checked_input():
         at_least(1, "--workers", workers)
         loaded = load_scenario(scenario)
     jobs = demonstration_jobs(scenario, [task.name for task in loaded.tasks])
-    with Bars(sum(job.length for job in jobs)) as bars:
-        failed = run_jobs(jobs, workers or os.cpu_count() or 1, bars)
-    if failed:
+    if run_with_bars(jobs, workers):
         sys.exit(1)
     table = Table(title=f"Demonstrations of {loaded.id}")
     for column in ("dataset", "group", "episodes", "disturbed", "success", "mean length"):

@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
-import os
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from rich.console import Console
 
-from clbench.grid import Job, JobError, benchmark_jobs, run_jobs
+from clbench.grid import Job, JobError, benchmark_jobs, run_with_bars
 from clbench.method import load_method
 from clbench.metrics import METRICS
-from clbench.progress import Bars
 from clbench.record import label_of, record_path
 from clbench.run import RunSpec, has_record
 from clbench.task import load_scenario
@@ -48,8 +46,7 @@ def run_submission(specs: Sequence[RunSpec], records: Path, workers: int | None)
     runs = benchmark_jobs(missing, records, limits)
     jobs = [check, *(dataclasses.replace(job, needs=(*job.needs, check.name)) for job in runs)]
     begin = time.monotonic()
-    with Bars(sum(job.length for job in jobs), console) as bars:
-        failed = run_jobs(jobs, workers or os.cpu_count() or 1, bars)
+    failed = run_with_bars(jobs, workers, console)
     seconds = time.monotonic() - begin
     console.print(
         f"{len(missing)} runs in {seconds / 60:.1f} minutes; records in {records}.", highlight=False

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
@@ -20,12 +19,11 @@ from rich.console import Console
 
 from clbench.evaluation import Evaluator, Trial, answer
 from clbench.fingerprint import fingerprint
-from clbench.grid import Job, JobError, run_jobs
+from clbench.grid import Job, JobError, run_with_bars
 from clbench.learner import repeatable
 from clbench.method import method_names
 from clbench.metrics import measure
 from clbench.policy import Policy
-from clbench.progress import Bars
 from clbench.questions import load_questions, report_questions
 from clbench.record import Record, RecordError
 from clbench.run import RunSpec, episode_row, execute, pretrained_hash, run_length
@@ -294,11 +292,8 @@ def _some(wrong: Sequence[str]) -> str:
 
 def run_verifications(paths: Sequence[Path], records: Path, request: Request, workers: int | None) -> bool:
     """Verify records, each in a process of its own, and return whether all of them passed."""
-    console = Console()
     jobs = [_job(path, records, request) for path in paths]
-    with Bars(sum(job.length for job in jobs), console) as bars:
-        failed = run_jobs(jobs, workers or os.cpu_count() or 1, bars)
-    return not failed
+    return not run_with_bars(jobs, workers, Console())
 
 
 def _job(path: Path, records: Path, request: Request) -> Job:
