@@ -49,8 +49,9 @@ class Learner:
         self.method = new_method()
         self.where = "start"
         """The seam, or the stage, that is under way."""
-        self.pretrained, _ = pretrained_policy(scenario, seed)
-        self.policy = copy.deepcopy(self.pretrained).to(device)
+        pretrained, self.pretrained_folder = pretrained_policy(scenario, seed)
+        self.pretrained = pretrained.to(device)
+        self.policy = copy.deepcopy(self.pretrained)
         self.data = {
             task.name: load_demonstrations(task, scenario, self.policy.config)
             for task in scenario.retained + scenario.target

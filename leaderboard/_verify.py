@@ -24,6 +24,7 @@ from clbench.learner import repeatable
 from clbench.method import method_names
 from clbench.metrics import measure
 from clbench.policy import Policy
+from clbench.pretraining import pretrained_policy
 from clbench.questions import load_questions, report_questions
 from clbench.record import Record, RecordError
 from clbench.run import RunSpec, episode_row, execute, pretrained_hash, run_length
@@ -194,8 +195,8 @@ def _replay(run: Run, request: Request, progress: Callable[[float], None]) -> li
     spec = _spec(run, request)
     kept = request.checkpoints is not None and has_stages(spec, request.checkpoints)
     if not kept:
-        pretrained = pretrained_hash(spec)
-        if pretrained != run.record.fingerprint.get("pretrained"):
+        _, folder = pretrained_policy(spec.load(), spec.seed)
+        if pretrained_hash(folder) != run.record.fingerprint.get("pretrained"):
             told = (
                 "pretraining does not give the same policy here as where the record was made, as on another "
                 "processor: ask for the policies of its stages (--checkpoints)"
