@@ -236,8 +236,9 @@ def terminal(table: Table) -> RenderableType:
     parts: list[RenderableType] = []
     for scenario, rows in groupby(table.rows, key=lambda row: row.scenario):
         parts.append(_grid(scenario, list(rows)))
-    if overall(table.rows):
-        parts.append(_overall_grid(overall(table.rows)))
+    over_scenarios = overall(table.rows)
+    if over_scenarios:
+        parts.append(_overall_grid(over_scenarios))
     if parts:
         lower = ", ".join(title_of(metric.name) for metric in FITTING if metric.higher_is_better is False)
         tiers = ", ".join(f"{number} {tier}" for number, tier in enumerate(TIERS))
