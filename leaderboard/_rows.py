@@ -51,7 +51,7 @@ class Row:
     @property
     def scores(self) -> Runs:
         """Scores of its runs by seed."""
-        return {run.seed: run.scores for run in self.runs}
+        return _scores(self.runs)
 
 
 @dataclass(frozen=True)
