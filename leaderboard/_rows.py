@@ -138,6 +138,12 @@ def _scores(runs: Iterable[Run]) -> Runs:
     return {run.seed: run.scores for run in runs}
 
 
+def rank_mates(row: Row, rows: Iterable[Row]) -> tuple[int, list[str]]:
+    """Return how many of `rows` are in the division of `row`, and the methods that share its rank there."""
+    division = [other for other in rows if other.division == row.division]
+    return len(division), [other.method for other in division if other.rank == row.rank and other is not row]
+
+
 def column_names() -> list[str]:
     """Return the columns of the CSV file and of the data frame."""
     ends = ("", "_low", "_high")

@@ -17,7 +17,7 @@ from clbench.run import RunSpec, has_record
 from clbench.task import load_scenario
 from clbench.testing import ContractError, check_method
 
-from ._rows import Row, Table
+from ._rows import Row, Table, rank_mates
 from ._table import FITTING, interval, title_of
 
 CHECK_STEPS = 100.0
@@ -80,14 +80,13 @@ def placement(table: Table, scenario: str, method: str, records: Path) -> list[s
 
 
 def _row_lines(row: Row, rows: Sequence[Row]) -> list[str]:
-    division = [other for other in rows if other.division == row.division]
     lines = [f"{row.method} on {row.scenario}, {len(row.seeds)} seeds, {row.tier}"]
     if row.rank is None:
         lines.append("It does not compete." if row.division == "reference" else "It has no final average.")
     else:
-        tied = [other.method for other in division if other.rank == row.rank and other is not row]
+        count, tied = rank_mates(row, rows)
         shared = f", which it shares with {', '.join(tied)}: they cannot be told apart" if tied else ""
-        lines.append(f"Rank {row.rank} of {len(division)} in the division {row.division}{shared}.")
+        lines.append(f"Rank {row.rank} of {count} in the division {row.division}{shared}.")
     lines += [f"  {title_of(metric.name)}: {interval(row.estimates[metric.name])}" for metric in FITTING]
     needed = {name for metric in FITTING for name in METRICS[metric.name].references}
     absent = sorted(needed - {other.method for other in rows})

@@ -18,7 +18,7 @@ from clbench.statistics import Estimate, row_generator
 
 from .._descriptions import Description, describe
 from .._markdown import arxiv_ids
-from .._rows import Row, Table
+from .._rows import Row, Table, rank_mates
 from .._runs import DIVISIONS, printable
 from .._table import SHOWN, interval, number_text, title_of
 from .charts import finite, rounded
@@ -306,13 +306,11 @@ def _bytes(value: float) -> str:
 
 def _rank(row: Row, rows: Sequence[Row]) -> tuple[str, str]:
     """Return the rank of a row as it is shown, and in words."""
-    mates = [other for other in rows if other.division == row.division]
     if row.rank is None:
-        return MISSING, "no rank: a reference does not compete" if row.division == DIVISIONS[
-            -1
-        ] else "no rank"
-    same = [other.method for other in mates if other.rank == row.rank and other is not row]
-    place = f"rank {row.rank} of {len(mates)}"
+        reference = row.division == DIVISIONS[-1]
+        return MISSING, "no rank: a reference does not compete" if reference else "no rank"
+    count, same = rank_mates(row, rows)
+    place = f"rank {row.rank} of {count}"
     if not same:
         return str(row.rank), place
     shown = ", ".join(same[:NAMED]) + (f" and {len(same) - NAMED} more" if len(same) > NAMED else "")
