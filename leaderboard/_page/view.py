@@ -14,7 +14,7 @@ from clbench.method import load_method
 from clbench.metrics import METRICS, Metric
 from clbench.names import built_in_methods
 from clbench.scores import rates_of
-from clbench.statistics import Estimate, row_generator
+from clbench.statistics import Estimate, needed_references, row_generator
 
 from .._descriptions import Description, describe
 from .._markdown import arxiv_ids
@@ -326,13 +326,8 @@ def _metric(metric: Metric, one: Estimate, seeds: Sequence[float | None]) -> Met
 
 def _of_seeds(row: Row, rows: Sequence[Row]) -> dict[str, list[float | None]]:
     """Return the value of every metric for each seed, None where the row has none either."""
-    needed = {name for metric in METRICS.values() for name in metric.references}
-    scores = {other.method: other.scores for other in rows if other.method in needed}
-    references = {
-        name: [runs[seed] for seed in row.seeds]
-        for name, runs in scores.items()
-        if set(row.seeds) <= set(runs)
-    }
+    scores = {other.method: other.scores for other in rows}
+    references = needed_references(METRICS.values(), row.seeds, scores)
     rates = rates_of([run.scores for run in row.runs], references)
     found: dict[str, list[float | None]] = {}
     for metric in METRICS.values():
