@@ -20,7 +20,7 @@ from .._descriptions import Description, describe
 from .._markdown import arxiv_ids
 from .._rows import Row, Table, rank_mates
 from .._runs import DIVISIONS, printable
-from .._table import SHOWN, interval, number_text, title_of
+from .._table import SHOWN, interval, number_text, scaled, title_of
 from .charts import finite, rounded
 from .curves import estimated, retained_curve, target_curves
 from .definitions import Family, families
@@ -292,16 +292,10 @@ def _costs(row: Row) -> tuple[Number, Number]:
     if relative is not None:
         cost = Number(number_text(relative, ".2f") + "\N{MULTIPLICATION SIGN}", number_text(relative, ".6f"))
     if kept is not None:
-        size = Number(_bytes(kept), number_text(kept, ".0f"), f"{number_text(kept, ',.0f')} bytes")
+        digits, unit = scaled(kept)
+        text = f"{digits} {unit}B" if unit else digits
+        size = Number(text, number_text(kept, ".0f"), f"{number_text(kept, ',.0f')} bytes")
     return cost, size
-
-
-def _bytes(value: float) -> str:
-    """Return a number of bytes in three digits."""
-    for power, unit in ((1e12, "TB"), (1e9, "GB"), (1e6, "MB"), (1e3, "kB")):
-        if value >= power:
-            return f"{float(f'{value / power:.3g}'):g} {unit}"
-    return number_text(value, ".0f")
 
 
 def _rank(row: Row, rows: Sequence[Row]) -> tuple[str, str]:

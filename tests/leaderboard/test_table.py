@@ -234,6 +234,28 @@ def test_the_terminal_shows_all_rows_in_108_columns(
     assert "…" not in printed
 
 
+@pytest.mark.parametrize(
+    ("count", "text"),
+    [
+        (0, "0"),
+        (999, "999"),
+        (999.7, "1k"),
+        (1234, "1.23k"),
+        (999_900, "1M"),
+        (45_678_901, "45.7M"),
+        (3e15, "3000T"),
+    ],
+)
+def test_bytes_have_three_digits_and_go_on_to_the_next_unit(
+    count: float, text: str, add: Callable[..., Path], shown: Callable[[], tuple[str, str]]
+) -> None:
+    assert "".join(resolve("clbench.leaderboard._table:scaled")(count)) == text
+    for seed in range(2):
+        add("keeps", seed, edit=lambda record: record.costs.update(bytes_kept=count))
+    (row,) = (line for line in shown()[0].splitlines() if line.split()[1:2] == ["keeps"])
+    assert row.split()[-2] == text
+
+
 def test_the_relative_cost_is_that_of_all_steps_with_the_time_of_one(
     records: Path, add: Callable[..., Path]
 ) -> None:
