@@ -4,7 +4,6 @@ import dataclasses
 import logging
 import random
 import sys
-import types
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -17,9 +16,8 @@ from torch import Tensor
 from clbench.cli import run
 from clbench.method import Method, Stage, State
 from clbench.policy import Policy
-from clbench.run import RunSpec, execute, run_length
+from clbench.run import RunSpec, execute
 from clbench.stages import find_stages, has_stages, keep_stages, stage_policies
-from clbench.task import load_scenario
 from clbench.training import MethodError
 
 TOY = "clbench.testing:clbench/Toy-v0"
@@ -56,19 +54,6 @@ class Stumbling(Method):
 
     def end_task(self, policy: Policy, stage: Stage) -> None:
         raise RuntimeError(f"cannot merge {stage.task.name}")
-
-
-@pytest.fixture
-def stranger(monkeypatch: pytest.MonkeyPatch) -> Callable[[type[Method]], str]:
-    """Return a function that makes a class importable and returns its "module:Class"."""
-
-    def offer(cls: type[Method]) -> str:
-        module = types.ModuleType("stranger")
-        module.__dict__[cls.__name__] = cls
-        monkeypatch.setitem(sys.modules, "stranger", module)
-        return f"stranger:{cls.__name__}"
-
-    return offer
 
 
 @pytest.fixture(scope="module")
@@ -126,21 +111,11 @@ def test_a_method_that_draws_from_global_generators_makes_the_same_policies_agai
     _assert_equal(stage_policies(spec, tmp_path), stage_policies(spec))
 
 
-def test_a_run_that_was_killed_keeps_all_stages_in_the_end(tmp_path: Path) -> None:
-    class Killed(BaseException):
-        """What no handler of the run catches, as when its process is killed."""
-
-    left = 0.75 * run_length(load_scenario(TOY))
-
-    def die(amount: float) -> None:
-        nonlocal left
-        left -= amount
-        if left < 0:
-            raise Killed
-
+def test_a_run_that_was_killed_keeps_all_stages_in_the_end(
+    tmp_path: Path, execute_and_kill: Callable[..., None]
+) -> None:
     spec = RunSpec(TOY, "sft", seed=0)
-    with pytest.raises(Killed):
-        execute(spec, tmp_path, die, checkpoints=tmp_path)
+    execute_and_kill(spec, tmp_path, 0.75, checkpoints=tmp_path)
     assert not has_stages(spec, tmp_path)
     assert execute(spec, tmp_path, checkpoints=tmp_path).timing["resumed_after"] == 1
     _assert_equal(stage_policies(spec, tmp_path), stage_policies(spec))
