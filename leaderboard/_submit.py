@@ -9,6 +9,7 @@ from pathlib import Path
 
 from rich.console import Console
 
+from clbench.arguments import checked_input
 from clbench.grid import Job, JobError, benchmark_jobs, run_with_bars
 from clbench.method import load_method
 from clbench.metrics import METRICS
@@ -30,7 +31,8 @@ def run_submission(specs: Sequence[RunSpec], records: Path, workers: int | None)
     Each run has a process of its own, which is ended if it goes beyond the scenario's limits.
     """
     console = Console(stderr=True)
-    missing = [spec for spec in specs if not has_record(spec, records)]
+    with checked_input():
+        missing = [spec for spec in specs if not has_record(spec, records)]
     if not missing:
         console.print("All runs have a record already.")
         return True
