@@ -3,6 +3,7 @@
 import dataclasses
 import logging
 import random
+import shutil
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -15,9 +16,9 @@ from torch import Tensor
 
 from clbench.cli import run
 from clbench.method import Method, Stage, State
-from clbench.policy import Policy
+from clbench.policy import CheckpointError, Policy
 from clbench.run import RunSpec, execute
-from clbench.stages import find_stages, has_stages, keep_stages, stage_policies
+from clbench.stages import find_stages, has_stages, keep_stages, load_stages, stage_policies
 from clbench.training import MethodError
 
 TOY = "clbench.testing:clbench/Toy-v0"
@@ -152,6 +153,41 @@ def test_a_torn_policy_is_not_taken_and_the_log_says_so(
     with caplog.at_level(logging.WARNING, "clbench"):
         assert find_stages(SPEC, tmp_path) == find_stages(SPEC)
     assert "does not hold the policies of all stages of lora, seed 0" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ('{"scale": 1, "scale": 2}', "the name 'scale' is there twice"),
+        (f'{{"scale": {"[" * 99}{"]" * 99}}}', "scale: nested more than 16 deep"),
+        ('{"scale": NaN}', "NaN is no number"),
+        ("[1]", "cannot be read as the state of a method"),
+    ],
+)
+def test_a_state_that_a_stranger_wrote_is_read_within_limits_and_refused_by_name(
+    kept: Path, tmp_path: Path, text: str, reason: str
+) -> None:
+    folder = shutil.copytree(kept / "Toy-v0" / "lora" / "seed-0", tmp_path / "stages")
+    (folder / "stage-1" / "method.json").write_text(text)
+    with pytest.raises(CheckpointError, match=reason) as refused:
+        load_stages(SPEC, folder)
+    assert str(folder / "stage-1") in str(refused.value)
+
+
+@dataclasses.dataclass
+class Boundless(Method):
+    """A method whose state no file can hold."""
+
+    def state(self) -> State:
+        return {"best": float("inf")}
+
+
+def test_a_state_that_could_not_be_read_again_is_refused_when_it_is_kept(
+    stranger: Callable[[type[Method]], str],
+) -> None:
+    message = r"failed in state\(\) after stage 0: .*best: a number that is not finite"
+    with pytest.raises(MethodError, match=message):
+        stage_policies(RunSpec(TOY, stranger(Boundless), seed=0))
 
 
 def test_a_method_that_fails_says_where(stranger: Callable[[type[Method]], str]) -> None:
