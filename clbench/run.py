@@ -161,6 +161,12 @@ def run_length(scenario: Scenario, split: Split = "report") -> float:
     return stages * budget.adaptation_steps + EPISODE_WEIGHT * episodes
 
 
+def read_changes(method: str, changes: Mapping[str, Any]) -> dict[str, Any]:
+    """Return changed hyper-parameters as the method holds them: the text "0.5" may be a number."""
+    built = build_method(method, changes)
+    return {name: getattr(built, name) for name in changes}
+
+
 def check_device(device: str) -> None:
     """Refuse a device that is not here.
 

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from clbench import cli
+from clbench.commands.runs import run as run_command
 from clbench.comparison import (
     UNKNOWN_DEVIATION,
     interquartile_mean,
@@ -349,7 +349,7 @@ def test_the_command_line_says_before_a_run_how_wide_the_intervals_will_be(
     record = replace(make_record(np.ones((3, 5))), run=run_section, scenario=scenario_section)
     write_record(record, spec.path(tmp_path))
     monkeypatch.setattr(sys, "path", [*sys.path])  # the command adds the working directory
-    cli.run(scenario, "sft", seeds=1, records=tmp_path)
+    run_command(scenario, "sft", seeds=1, records=tmp_path)
     said = " ".join(capsys.readouterr().err.split())
     assert said == f"{expected_precision(TOY, 1)} 1 of 1 runs have a record already."
 

@@ -91,7 +91,7 @@ def test_a_run_that_goes_on_has_no_point_twice(
 def test_a_missing_package_is_named_before_any_work(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from clbench.cli import run
+    from clbench.commands.runs import run
 
     monkeypatch.setattr("clbench.extras.find_spec", lambda name: None)
     monkeypatch.setattr(sys, "path", sys.path.copy())  # the command adds to it

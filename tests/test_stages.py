@@ -14,7 +14,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from clbench.cli import run
+from clbench.commands.runs import run
 from clbench.method import Method, Stage, State
 from clbench.policy import CheckpointError, Policy
 from clbench.run import RunSpec, execute
