@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -23,6 +24,11 @@ def checked_input() -> Iterator[None]:
             markup=False,
         )
         sys.exit(2)
+
+
+def look_here() -> None:
+    """Look for modules, as those of module:Class, in the working directory too: a console script does not."""
+    sys.path.insert(0, os.getcwd())
 
 
 def at_least(least: int, option: str, value: int | None) -> None:

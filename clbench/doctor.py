@@ -73,8 +73,8 @@ def _films(faults: dict[str, str | None]) -> str:
     """Return which back end draws films, if one does."""
     chosen = os.environ.get("MUJOCO_GL")
     if chosen:
-        works = rendering_fault(chosen) is None
-        return f"{'drawn with' if works else 'cannot be drawn with'} {chosen}, as MUJOCO_GL says"
+        fault = faults[chosen] if chosen in faults else rendering_fault(chosen)
+        return f"{'drawn with' if fault is None else 'cannot be drawn with'} {chosen}, as MUJOCO_GL says"
     working = [back_end for back_end, fault in faults.items() if fault is None]
     if working:
         return f"drawn with {working[0]}; MUJOCO_GL chooses another"

@@ -17,6 +17,8 @@ from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any
 
+from rich.console import Console
+
 from clbench.limits import Limits, end
 from clbench.progress import Bars
 from clbench.run import RunSpec, execute, run_length
@@ -99,6 +101,12 @@ def run_jobs(jobs: Sequence[Job], workers: int, bars: Bars) -> dict[str, str]:
             worker.process.terminate()
             worker.process.join()
     return failed
+
+
+def run_with_bars(jobs: Sequence[Job], workers: int | None, console: Console | None = None) -> dict[str, str]:
+    """Do all jobs as `run_jobs` does, with a bar for each, on all cores if `workers` is None."""
+    with Bars(sum(job.length for job in jobs), console) as bars:
+        return run_jobs(jobs, workers or os.cpu_count() or 1, bars)
 
 
 def _hold_to_limits(workers: Iterable[_Worker]) -> None:

@@ -96,7 +96,7 @@ def check_policy(policy: Policy, pretrained: Policy) -> None:
 
     Args:
         policy: As a seam left it.
-        pretrained: As pretraining left it, on the retained skills alone.
+        pretrained: As pretraining left it, on the retained skills alone; on the same device.
 
     Raises:
         LeakError: Its normalisation, its vocabulary or another of its sizes has changed.
@@ -104,7 +104,7 @@ def check_policy(policy: Policy, pretrained: Policy) -> None:
     if policy.config != pretrained.config:
         raise LeakError("The method changes the vocabulary or a size of the policy: all stages share them.")
     for name in NORMALISATION:
-        if not torch.equal(getattr(policy, name).cpu(), getattr(pretrained, name).cpu()):
+        if not torch.equal(getattr(policy, name), getattr(pretrained, name)):
             raise LeakError(
                 f"The method changes {name}: the normalisation comes from the retained skills alone."
             )

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 
 from clbench.adaptation import Step, adapt
@@ -19,10 +20,11 @@ from clbench.cache import package_of, source_hash
 from clbench.demonstrations import Demonstrations, load_demonstrations
 from clbench.leaks import check_policy, outside, seams
 from clbench.method import Access, Method, Prior, Source, Stage, State
-from clbench.policy import Policy, load_policy, save_policy
+from clbench.policy import CheckpointError, Policy, load_policy, save_policy
 from clbench.pretraining import pretrained_policy, pretraining_inputs
 from clbench.questions import load_questions
 from clbench.seeding import derive_seed, seeded, torch_generator
+from clbench.strict_json import check_json, read_json
 from clbench.task import Scenario
 from clbench.training import deterministic
 
@@ -49,8 +51,9 @@ class Learner:
         self.method = new_method()
         self.where = "start"
         """The seam, or the stage, that is under way."""
-        self.pretrained, _ = pretrained_policy(scenario, seed)
-        self.policy = copy.deepcopy(self.pretrained).to(device)
+        pretrained, self.pretrained_folder = pretrained_policy(scenario, seed)
+        self.pretrained = pretrained.to(device)
+        self.policy = copy.deepcopy(self.pretrained)
         self.data = {
             task.name: load_demonstrations(task, scenario, self.policy.config)
             for task in scenario.retained + scenario.target
@@ -121,7 +124,9 @@ class Learner:
         copies = {name: value.detach().clone().contiguous() for name, value in tensors.items()}
         save_file(copies, folder / "method.safetensors")
         values = {name: value for name, value in state.items() if name not in tensors}
-        (folder / "method.json").write_text(json.dumps(values), encoding="utf-8")
+        text = json.dumps(values)
+        check_json(json.loads(text))  # what would be refused when it is read is refused here, by its name
+        (folder / "method.json").write_text(text, encoding="utf-8")
 
     def load(self, folder: Path, number: int) -> None:
         """Take the policy and the method as stage `number` left them in `folder`."""
@@ -132,9 +137,16 @@ class Learner:
 
 
 def load_stage(folder: Path, method: Method, device: str) -> Policy:
-    """Return the policy that a stage left in `folder`, and give `method` the state that it left there."""
-    state: State = {**json.loads((folder / "method.json").read_text(encoding="utf-8"))}
-    state.update(load_file(folder / "method.safetensors", device=device))
+    """Return the policy that a stage left in `folder`, and give `method` the state that it left there.
+
+    Raises:
+        CheckpointError: A file is missing or torn, or is not what a stage leaves.
+    """
+    try:
+        state: State = {**read_json(folder / "method.json")}
+        state.update(load_file(folder / "method.safetensors", device=device))
+    except (OSError, ValueError, TypeError, SafetensorError) as error:
+        raise CheckpointError(f"{folder}: cannot be read as the state of a method ({error}).") from error
     return load_policy(folder, lambda policy: method.load_state(policy, state)).to(device)
 
 

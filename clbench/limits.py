@@ -9,8 +9,6 @@ from __future__ import annotations
 import contextlib
 from dataclasses import dataclass
 
-import psutil
-
 
 @dataclass(frozen=True)
 class Limits:
@@ -42,6 +40,8 @@ class Limits:
 
 def usage(process: int) -> tuple[int, int]:
     """Return the resident and the written bytes of a process and of those it started that still live."""
+    import psutil
+
     memory = written = 0
     with contextlib.suppress(psutil.NoSuchProcess):
         parent = psutil.Process(process)
@@ -54,6 +54,8 @@ def usage(process: int) -> tuple[int, int]:
 
 def end(process: int) -> None:
     """Kill a process and those it started."""
+    import psutil
+
     with contextlib.suppress(psutil.NoSuchProcess):
         parent = psutil.Process(process)
         for one in (*parent.children(recursive=True), parent):

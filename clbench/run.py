@@ -23,7 +23,6 @@ from clbench.fingerprint import fingerprint
 from clbench.learner import Learner, repeatable, sources
 from clbench.live import Log, require_tensorboard
 from clbench.method import Method, build_method, describe_method
-from clbench.pretraining import pretrained_policy
 from clbench.questions import report_questions
 from clbench.record import Record, RecordError, label_of, read_record, record_path, write_record
 from clbench.stages import drop_stages, has_stages, keep_stage
@@ -162,6 +161,12 @@ def run_length(scenario: Scenario, split: Split = "report") -> float:
     return stages * budget.adaptation_steps + EPISODE_WEIGHT * episodes
 
 
+def read_changes(method: str, changes: Mapping[str, Any]) -> dict[str, Any]:
+    """Return changed hyper-parameters as the method holds them: the text "0.5" may be a number."""
+    built = build_method(method, changes)
+    return {name: getattr(built, name) for name in changes}
+
+
 def check_device(device: str) -> None:
     """Refuse a device that is not here.
 
@@ -175,9 +180,8 @@ def check_device(device: str) -> None:
         raise ValueError(f"The device {device!r} cannot be used: {reason}") from error
 
 
-def pretrained_hash(spec: RunSpec) -> str:
-    """Return the hash of the pretrained policy that a run begins with; it is trained on first use."""
-    _, folder = pretrained_policy(spec.load(), spec.seed)
+def pretrained_hash(folder: Path) -> str:
+    """Return the hash of the pretrained policy that lies in `folder`, as a record names it."""
     manifest = json.loads((folder / "clbench.json").read_text(encoding="utf-8"))
     return str(manifest["files"]["policy.safetensors"][:16])
 
@@ -221,7 +225,6 @@ class _Run:
         training, report = self.learner.questions, self.learner.report_questions
         scored = report if spec.split == "report" else training
         self.asked = report_questions(scored, scenario.budget.report_questions)
-        self.weights = {name: value.clone() for name, value in self.learner.policy.named_parameters()}
         self.anchor = self._activations()
         self.begin, self.seconds_before = time.perf_counter(), 0.0
         self.record = self._new_record()
@@ -380,17 +383,19 @@ class _Run:
         hidden = self.learner.policy.hidden_states(questions.state, questions.words)
         return Gaussian.of(hidden, self.learner.policy.backbone.mask(questions.words))
 
+    @torch.no_grad()
     def _update_sparsity(self) -> float | None:
         """Return the share of the pretrained weights that hardly changed, None if there are others now.
 
         ConSFT (arXiv 2605.08879), Eq. 8: relative change below 1e-3.
         """
+        before = dict(self.learner.pretrained.named_parameters())
         now = dict(self.learner.policy.named_parameters())
-        if now.keys() != self.weights.keys():
+        if now.keys() != before.keys():
             return None
         unchanged = [
-            (now[name] - before).abs() / (before.abs() + 1e-8) < SPARSITY_THRESHOLD
-            for name, before in self.weights.items()
+            (now[name] - value).abs() / (value.abs() + 1e-8) < SPARSITY_THRESHOLD
+            for name, value in before.items()
         ]
         return sum(int(part.sum()) for part in unchanged) / sum(part.numel() for part in unchanged)
 
@@ -405,7 +410,7 @@ class _Run:
             fingerprint={
                 **fingerprint(self.scenario),
                 "method": describe_method(type(self.learner.method)),
-                "pretrained": pretrained_hash(self.spec),
+                "pretrained": pretrained_hash(self.learner.pretrained_folder),
             },
             timing={"stages": []},
         )

@@ -56,13 +56,25 @@ def find_stages(spec: RunSpec, checkpoints: Path | None = None) -> Path | None:
         checkpoints: Folder below which policies were kept. If these are not there, which is said in the log,
             those in the cache are looked for.
     """
-    if checkpoints is not None:
-        if has_stages(spec, checkpoints):
-            return _kept(spec, checkpoints)
-        missing = "%s does not hold the policies of all stages of %s, seed %d: those made again are taken."
-        LOG.warning(missing, checkpoints, spec.label, spec.seed)
+    kept = kept_stages(spec, checkpoints)
+    if kept is not None:
+        return kept
     made = _made(spec)
     return made if _are_whole(spec, made) else None
+
+
+def kept_stages(spec: RunSpec, checkpoints: Path | None) -> Path | None:
+    """Return the folder below `checkpoints` in which a run kept the policies of all stages, or None.
+
+    Where there are checkpoints without them, the log says so.
+    """
+    if checkpoints is None:
+        return None
+    if has_stages(spec, checkpoints):
+        return _kept(spec, checkpoints)
+    missing = "%s does not hold the policies of all stages of %s, seed %d."
+    LOG.warning(missing, checkpoints, spec.label, spec.seed)
+    return None
 
 
 def make_stages(spec: RunSpec, progress: Callable[[float], None] = lambda _: None) -> Path:

@@ -235,6 +235,21 @@ def needed_references(
     return {name: [runs[seed] for seed in seeds] for name, runs in found.items() if set(seeds) <= set(runs)}
 
 
+def draw_episodes(shape: tuple[int, ...], episodes: int, generator: np.random.Generator) -> Array:
+    """Return how often each episode is drawn, with replacement, in each cell of `shape`: (*shape, episodes).
+
+    Args:
+        shape: Of the cells.
+        episodes: How many there are, and are drawn for a cell.
+        generator: Source of the draws.
+    """
+    drawn = generator.integers(episodes, size=(math.prod(shape), episodes))
+    # Counted in one call: the episodes of each cell get numbers of their own.
+    drawn += np.arange(len(drawn))[:, None] * episodes
+    counts = np.bincount(drawn.ravel(), minlength=drawn.size)
+    return counts.reshape(*shape, episodes).astype(np.float64)
+
+
 # ---- rates of the runs, as they are and as they might have been --------------------------------------------
 
 _Quantity = Callable[[Sequence[Rates]], Array]
@@ -286,11 +301,8 @@ class _Samples:
     def other_episodes(self) -> list[Rates]:
         """The runs with episodes and answers drawn anew, (replicates, runs)."""
         layout = self.methods[0][0].layout
-        shape = (self.replicates, len(self.methods[0]), len(layout.tasks), len(layout.episodes))
-        episodes = self.generator.integers(shape[-1], size=(math.prod(shape[:-1]), shape[-1]))
-        # Counted in one call: the episodes of each cell get numbers of their own.
-        episodes += np.arange(len(episodes))[:, None] * shape[-1]
-        counts = np.bincount(episodes.ravel(), minlength=episodes.size).reshape(shape).astype(np.float64)
+        shape = (self.replicates, len(self.methods[0]), len(layout.tasks))
+        counts = draw_episodes(shape, len(layout.episodes), self.generator)
         methods = [self._drawn(runs, counts) for runs in self.methods]
         references = {name: self._drawn(runs, counts) for name, runs in self.references.items()}
         return [replace(rates, references=references) for rates in methods]

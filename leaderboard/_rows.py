@@ -51,7 +51,7 @@ class Row:
     @property
     def scores(self) -> Runs:
         """Scores of its runs by seed."""
-        return {run.seed: run.scores for run in self.runs}
+        return _scores(self.runs)
 
 
 @dataclass(frozen=True)
@@ -136,6 +136,12 @@ def _estimates(method: str, by_method: Mapping[str, list[Run]]) -> dict[str, Est
 
 def _scores(runs: Iterable[Run]) -> Runs:
     return {run.seed: run.scores for run in runs}
+
+
+def rank_mates(row: Row, rows: Iterable[Row]) -> tuple[int, list[str]]:
+    """Return how many of `rows` are in the division of `row`, and the methods that share its rank there."""
+    division = [other for other in rows if other.division == row.division]
+    return len(division), [other.method for other in division if other.rank == row.rank and other is not row]
 
 
 def column_names() -> list[str]:

@@ -3,23 +3,22 @@
 from __future__ import annotations
 
 import dataclasses
-import os
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from rich.console import Console
 
-from clbench.grid import Job, JobError, benchmark_jobs, run_jobs
+from clbench.arguments import checked_input
+from clbench.grid import Job, JobError, benchmark_jobs, run_with_bars
 from clbench.method import load_method
 from clbench.metrics import METRICS
-from clbench.progress import Bars
 from clbench.record import label_of, record_path
 from clbench.run import RunSpec, has_record
 from clbench.task import load_scenario
 from clbench.testing import ContractError, check_method
 
-from ._rows import Row, Table
+from ._rows import Row, Table, rank_mates
 from ._table import FITTING, interval, title_of
 
 CHECK_STEPS = 100.0
@@ -32,7 +31,8 @@ def run_submission(specs: Sequence[RunSpec], records: Path, workers: int | None)
     Each run has a process of its own, which is ended if it goes beyond the scenario's limits.
     """
     console = Console(stderr=True)
-    missing = [spec for spec in specs if not has_record(spec, records)]
+    with checked_input():
+        missing = [spec for spec in specs if not has_record(spec, records)]
     if not missing:
         console.print("All runs have a record already.")
         return True
@@ -48,8 +48,7 @@ def run_submission(specs: Sequence[RunSpec], records: Path, workers: int | None)
     runs = benchmark_jobs(missing, records, limits)
     jobs = [check, *(dataclasses.replace(job, needs=(*job.needs, check.name)) for job in runs)]
     begin = time.monotonic()
-    with Bars(sum(job.length for job in jobs), console) as bars:
-        failed = run_jobs(jobs, workers or os.cpu_count() or 1, bars)
+    failed = run_with_bars(jobs, workers, console)
     seconds = time.monotonic() - begin
     console.print(
         f"{len(missing)} runs in {seconds / 60:.1f} minutes; records in {records}.", highlight=False
@@ -83,14 +82,13 @@ def placement(table: Table, scenario: str, method: str, records: Path) -> list[s
 
 
 def _row_lines(row: Row, rows: Sequence[Row]) -> list[str]:
-    division = [other for other in rows if other.division == row.division]
     lines = [f"{row.method} on {row.scenario}, {len(row.seeds)} seeds, {row.tier}"]
     if row.rank is None:
         lines.append("It does not compete." if row.division == "reference" else "It has no final average.")
     else:
-        tied = [other.method for other in division if other.rank == row.rank and other is not row]
+        count, tied = rank_mates(row, rows)
         shared = f", which it shares with {', '.join(tied)}: they cannot be told apart" if tied else ""
-        lines.append(f"Rank {row.rank} of {len(division)} in the division {row.division}{shared}.")
+        lines.append(f"Rank {row.rank} of {count} in the division {row.division}{shared}.")
     lines += [f"  {title_of(metric.name)}: {interval(row.estimates[metric.name])}" for metric in FITTING]
     needed = {name for metric in FITTING for name in METRICS[metric.name].references}
     absent = sorted(needed - {other.method for other in rows})

@@ -77,6 +77,15 @@ def number_text(value: float | None, form: str, missing: str = MISSING) -> str:
     return text if text.strip("-0.") else text.lstrip("-")
 
 
+def scaled(count: float) -> tuple[str, str]:
+    """Return a number in three digits and the prefix of its unit: 1234.0 is ("1.23", "k")."""
+    units = ("", "k", "M", "G", "T")
+    digits = [float(f"{count / 1000**power:.3g}") for power in range(len(units))]
+    # asked of the rounded number: 999.9 k is 1 M
+    power = next((power for power, value in enumerate(digits) if value < 1000), len(units) - 1)
+    return f"{digits[power]:g}" if power else number_text(count, ".0f"), units[power]
+
+
 # ---- CSV ---------------------------------------------------------------------------------------------------
 
 
@@ -236,8 +245,9 @@ def terminal(table: Table) -> RenderableType:
     parts: list[RenderableType] = []
     for scenario, rows in groupby(table.rows, key=lambda row: row.scenario):
         parts.append(_grid(scenario, list(rows)))
-    if overall(table.rows):
-        parts.append(_overall_grid(overall(table.rows)))
+    over_scenarios = overall(table.rows)
+    if over_scenarios:
+        parts.append(_overall_grid(over_scenarios))
     if parts:
         lower = ", ".join(title_of(metric.name) for metric in FITTING if metric.higher_is_better is False)
         tiers = ", ".join(f"{number} {tier}" for number, tier in enumerate(TIERS))
@@ -262,7 +272,9 @@ def _grid(scenario: str, rows: list[Row]) -> Grid:
         for row in members:
             cells = [number_text(row.rank, ".0f", ""), row.method, str(len(row.seeds))]
             cells += [_compact(row.estimates[metric.name]) for metric in FITTING]
-            cells += [number_text(row.costs["relative_cost"], ".1f"), _size(row.costs["bytes_kept"])]
+            kept = row.costs["bytes_kept"]
+            size = MISSING if kept is None else "".join(scaled(kept))
+            cells += [number_text(row.costs["relative_cost"], ".1f"), size]
             grid.add_row(*map(Text, cells), str(TIERS.index(row.tier)))
     return grid
 
@@ -281,14 +293,6 @@ def _overall_grid(rows: Sequence[OverallRow]) -> Grid:
             cells = [_compact(row.estimates[metric.name]) for metric in FITTING]
             grid.add_row(*map(Text, [row.method, ranks, *cells]))
     return grid
-
-
-def _size(count: float | None) -> str:
-    """Return a number of bytes in at most five characters."""
-    if count is None or count < 1000:
-        return number_text(count, ".0f")
-    unit = min(int(math.log10(count)) // 3, 4)
-    return f"{count / 1000**unit:.3g}{'kMGT'[unit - 1]}"
 
 
 def _compact(estimate: Estimate) -> str:

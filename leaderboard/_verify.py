@@ -8,10 +8,10 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -20,17 +20,17 @@ from rich.console import Console
 
 from clbench.evaluation import Evaluator, Trial, answer
 from clbench.fingerprint import fingerprint
-from clbench.grid import Job, JobError, run_jobs
+from clbench.grid import Job, JobError, run_with_bars
 from clbench.learner import repeatable
 from clbench.method import method_names
 from clbench.metrics import measure
 from clbench.policy import Policy
-from clbench.progress import Bars
+from clbench.pretraining import pretrained_policy
 from clbench.questions import load_questions, report_questions
 from clbench.record import Record, RecordError
 from clbench.run import RunSpec, episode_row, execute, pretrained_hash, run_length
-from clbench.stages import has_stages, stage_policies
-from clbench.task import Scenario, load_scenario
+from clbench.stages import kept_stages, load_stages, stage_policies
+from clbench.task import Scenario
 
 from ._runs import Run, differences, read_run
 from ._table import write_if_changed
@@ -76,6 +76,41 @@ class Request:
     """Folder of kept policies; they are made again if None."""
 
 
+@dataclass(frozen=True)
+class _Subject:
+    """A record that is verified, and what its checks need more than once."""
+
+    run: Run
+    request: Request
+
+    @property
+    def spec(self) -> RunSpec:
+        """What to run to get the record again."""
+        values = self.run.record.run
+        return RunSpec(
+            self.request.scenario or values["scenario"],
+            values["method"],
+            values["seed"],
+            values["changes"],
+            values["device"],
+        )
+
+    @property
+    def may_import(self) -> bool:
+        """Whether its method may be imported: it is installed, or the verifier named it."""
+        return self.run.record.run["method"] in (*method_names(), self.request.method)
+
+    @cached_property
+    def scenario(self) -> Scenario:
+        """That of the verifier."""
+        return self.spec.load()
+
+    @cached_property
+    def here(self) -> dict[str, Any]:
+        """The fingerprint of this machine; it plays a rollout of every world."""
+        return fingerprint(self.scenario)
+
+
 def verify(
     path: Path, records: Path, request: Request, progress: Callable[[float], None] = lambda _: None
 ) -> list[Check]:
@@ -94,36 +129,25 @@ def verify(
         run = read_run(records, path, changed=None)
     except RecordError as error:
         return [Check("record", str(error), False)]
+    subject = _Subject(run, request)
     checks: list[Check] = []
     looks = {"recomputed": _recompute, "replayed": _replay, "retrained": _retrain}
     for tier in TIERS[1 : TIERS.index(request.tier) + 1]:
-        checks += looks[tier](run, request, progress)
+        checks += looks[tier](subject, progress)
         if not all(check.passed for check in checks):
             break
-        _write(path, run, tier, request, checks)
+        _write(path, subject, tier, checks)
     return checks
 
 
-def _spec(run: Run, request: Request) -> RunSpec:
-    """Return what to run to get a record again."""
-    values = run.record.run
-    return RunSpec(
-        request.scenario or values["scenario"],
-        values["method"],
-        values["seed"],
-        values["changes"],
-        values["device"],
-    )
-
-
-def _write(path: Path, run: Run, tier: str, request: Request, checks: Sequence[Check]) -> None:
+def _write(path: Path, subject: _Subject, tier: str, checks: Sequence[Check]) -> None:
     """Write the file that says what a record was found to be, and by whom."""
     values = {
         "tier": tier,
         "record": hashlib.sha256(path.read_bytes()).hexdigest(),
-        "seed": request.seed,
+        "seed": subject.request.seed,
         "checks": [asdict(check) for check in checks],
-        "verifier": fingerprint(load_scenario(request.scenario or run.scenario)),
+        "verifier": subject.here,
     }
     write_if_changed(verification_path(path), json.dumps(values, indent=1) + "\n")
 
@@ -131,14 +155,15 @@ def _write(path: Path, run: Run, tier: str, request: Request, checks: Sequence[C
 # ---- recomputed --------------------------------------------------------------------------------------------
 
 
-def _recompute(run: Run, request: Request, _: Callable[[float], None]) -> list[Check]:
+def _recompute(subject: _Subject, _: Callable[[float], None]) -> list[Check]:
     """Check that a record agrees with itself, and is of this very scenario."""
+    run = subject.run
     values = {name: measure(name, run.scores) for name in ("final_average", "adaptation", "retention")}
     told = ", ".join(f"{name} {'-' if value is None else f'{value:.3f}'}" for name, value in values.items())
     checks = [Check("metrics from its episodes", told, values["final_average"] is not None)]
     try:
-        scenario = load_scenario(request.scenario or run.scenario)
-        described = _spec(run, request).describe() if _may_import(run, request) else None
+        scenario = subject.scenario
+        described = subject.spec.describe() if subject.may_import else None
     except (LookupError, ValueError, TypeError) as error:
         return [*checks, Check("what was run", str(error.args[0]), False)]
     checks.append(_check_horizons(run.record, scenario))
@@ -155,19 +180,10 @@ def _recompute(run: Run, request: Request, _: Callable[[float], None]) -> list[C
             else "as its class and the scenario say"
         )
         checks.append(Check("what was run", told, not wrong))
-    worlds = differences(run.record.fingerprint.get("rollouts"), fingerprint(scenario)["rollouts"])
-    same = run.record.fingerprint.get("rollouts") == fingerprint(scenario)["rollouts"]
-    told = (
-        "moves as here"
-        if same
-        else f"the rollouts of {', '.join(worlds) or 'all worlds'} differ from those here"
-    )
-    return [*checks, Check("simulator", told, same)]
-
-
-def _may_import(run: Run, request: Request) -> bool:
-    """Return whether the method of a record may be imported: it is installed, or the verifier named it."""
-    return run.record.run["method"] in (*method_names(), request.method)
+    theirs, ours = run.record.fingerprint.get("rollouts"), subject.here["rollouts"]
+    worlds = ", ".join(differences(theirs, ours)) or "all worlds"
+    told = "moves as here" if theirs == ours else f"the rollouts of {worlds} differ from those here"
+    return [*checks, Check("simulator", told, theirs == ours)]
 
 
 def _check_horizons(record: Record, scenario: Scenario) -> Check:
@@ -188,38 +204,38 @@ def _check_horizons(record: Record, scenario: Scenario) -> Check:
 # ---- replayed ----------------------------------------------------------------------------------------------
 
 
-def _replay(run: Run, request: Request, progress: Callable[[float], None]) -> list[Check]:
+def _replay(subject: _Subject, progress: Callable[[float], None]) -> list[Check]:
     """Run episodes of a record again from the policies of its stages, and ask the questions again."""
-    if not _may_import(run, request):
+    run, spec = subject.run, subject.spec
+    if not subject.may_import:
         told = f"{run.method} is not installed: name it with --method to import and run its code"
         return [Check("policies", told, False)]
-    spec = _spec(run, request)
-    kept = request.checkpoints is not None and has_stages(spec, request.checkpoints)
-    if not kept:
-        pretrained = pretrained_hash(spec)
-        if pretrained != run.record.fingerprint.get("pretrained"):
+    kept = kept_stages(spec, subject.request.checkpoints)
+    if kept is None:
+        _, folder = pretrained_policy(subject.scenario, spec.seed)
+        if pretrained_hash(folder) != run.record.fingerprint.get("pretrained"):
             told = (
                 "pretraining does not give the same policy here as where the record was made, as on another "
                 "processor: ask for the policies of its stages (--checkpoints)"
             )
             return [Check("policies", told, False)]
     with repeatable(spec.device):
-        policies = stage_policies(spec, request.checkpoints, progress)
-        episodes = _replay_episodes(run, request, spec, policies)
-        answers = _replay_answers(run, spec, policies)
+        policies = load_stages(spec, kept) if kept else stage_policies(spec, progress=progress)
+        episodes = _replay_episodes(subject, policies)
+        answers = _replay_answers(subject, policies)
     origin = "those kept by the run" if kept else "made again"
     return [Check("policies", origin, True), episodes, answers]
 
 
-def _replay_episodes(run: Run, request: Request, spec: RunSpec, policies: Sequence[Policy]) -> Check:
-    scenario = spec.load()
+def _replay_episodes(subject: _Subject, policies: Sequence[Policy]) -> Check:
+    scenario, request = subject.scenario, subject.request
     end = scenario.budget.adaptation_steps
-    at_ends = [row for row in _rows(run.record.episodes) if row[1] in (0, end) and row[3] == "report"]
+    at_ends = [row for row in _rows(subject.run.record.episodes) if row[1] in (0, end) and row[3] == "report"]
     generator = np.random.default_rng(request.seed)
     chosen = generator.permutation(len(at_ends))[: request.episodes]
     rows = [at_ends[index] for index in sorted(chosen)]
     again: list[Row] = []
-    evaluator = Evaluator(scenario, spec.seed)
+    evaluator = Evaluator(scenario, subject.spec.seed)
     for stage, policy in enumerate(policies):
         trials: list[Trial] = [(scenario.task(row[2]), row[3], row[4]) for row in rows if row[0] == stage]
         policy.eval()
@@ -241,8 +257,8 @@ def _told(row: Row) -> str:
     return f"{'success' if success else 'failure'} after {length} steps, return {total_reward}"
 
 
-def _replay_answers(run: Run, spec: RunSpec, policies: Sequence[Policy]) -> Check:
-    scenario = spec.load()
+def _replay_answers(subject: _Subject, policies: Sequence[Policy]) -> Check:
+    scenario = subject.scenario
     _, questions = load_questions(scenario)
     kind, asked = report_questions(questions, scenario.budget.report_questions)
     end = scenario.budget.adaptation_steps
@@ -251,7 +267,7 @@ def _replay_answers(run: Run, spec: RunSpec, policies: Sequence[Policy]) -> Chec
         for stage, policy in enumerate(policies)
         for counts in answer(policy, questions.kinds, kind, asked)
     ]
-    theirs = {row for row in _rows(run.record.answers) if row[1] in (0, end)}
+    theirs = {row for row in _rows(subject.run.record.answers) if row[1] in (0, end)}
     wrong = [f"{row[2]} after stage {row[0]}" for row in sorted(theirs.symmetric_difference(again))]
     if wrong:
         return Check("answers", f"other counts of right answers: {_some(list(dict.fromkeys(wrong)))}", False)
@@ -261,18 +277,16 @@ def _replay_answers(run: Run, spec: RunSpec, policies: Sequence[Policy]) -> Chec
 # ---- retrained ---------------------------------------------------------------------------------------------
 
 
-def _retrain(run: Run, request: Request, progress: Callable[[float], None]) -> list[Check]:
+def _retrain(subject: _Subject, progress: Callable[[float], None]) -> list[Check]:
     """Do the whole run again, and compare the records."""
-    spec = _spec(run, request)
     with tempfile.TemporaryDirectory() as folder:
-        again = execute(spec, Path(folder), progress)
-    wrong = [
-        part
-        if not (names := differences(getattr(run.record, part), getattr(again, part)))
-        else f"{part} ({', '.join(names)})"
-        for part in PARTS
-        if getattr(run.record, part) != getattr(again, part)
-    ]
+        again = execute(subject.spec, Path(folder), progress)
+    wrong = []
+    for part in PARTS:
+        theirs, ours = getattr(subject.run.record, part), getattr(again, part)
+        if theirs != ours:
+            names = ", ".join(differences(theirs, ours))
+            wrong.append(f"{part} ({names})" if names else part)
     if again.error is not None:
         return [Check("whole run", f"it failed: {again.error['type']}: {again.error['message']}", False)]
     if wrong:
@@ -294,19 +308,15 @@ def _some(wrong: Sequence[str]) -> str:
 
 def run_verifications(paths: Sequence[Path], records: Path, request: Request, workers: int | None) -> bool:
     """Verify records, each in a process of its own, and return whether all of them passed."""
-    console = Console()
     jobs = [_job(path, records, request) for path in paths]
-    with Bars(sum(job.length for job in jobs), console) as bars:
-        failed = run_jobs(jobs, workers or os.cpu_count() or 1, bars)
-    return not failed
+    return not run_with_bars(jobs, workers, Console())
 
 
 def _job(path: Path, records: Path, request: Request) -> Job:
     """Return the job that verifies a record; how long it takes is known if it can be read."""
     length = 1.0
     try:
-        spec = _spec(read_run(records, path, changed=None), request)
-        scenario = spec.load()
+        scenario = _Subject(read_run(records, path, changed=None), request).scenario
         if request.tier in TIERS[2:]:
             length += len(scenario.target) * scenario.budget.adaptation_steps
         if request.tier == "retrained":

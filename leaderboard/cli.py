@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import os
 import secrets
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 
 from rich.console import Console
 from rich.text import Text
 
-from clbench.arguments import at_least, checked_input
+from clbench.arguments import at_least, checked_input, look_here
 from clbench.method import build_method
 from clbench.record import RECORDS, TUNING, record_path
 from clbench.run import RunSpec
@@ -77,7 +76,7 @@ def submit(
         workers: Runs at once, each a process with one thread; all cores if not given.
         records: Folder of the records.
     """
-    sys.path.insert(0, os.getcwd())  # a console script lacks it, and module:Class is looked for there
+    look_here()
     with checked_input():
         at_least(1, "--seeds", seeds)
         at_least(0, "--first-seed", first_seed)
@@ -122,7 +121,7 @@ def verify(
         workers: Verifications at once, each a process with one thread; all cores if not given.
         records: Folder of the records.
     """
-    sys.path.insert(0, os.getcwd())  # a console script lacks it, and module:Class is looked for there
+    look_here()
     with checked_input():
         at_least(1, "--episodes", episodes)
         at_least(1, "--workers", workers)

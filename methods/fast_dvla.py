@@ -38,6 +38,7 @@ from clbench.policy import Batch, Policy, QuestionBatch
 from clbench.training import optimise
 
 from ._projection import random_like
+from ._questions import with_questions
 from ._requirements import in_range
 from ._weights import Weights, copy_of, packed, unpacked
 
@@ -74,11 +75,7 @@ class FastDVLA(Method):
 
     def prepare(self, policy: Policy, prior: Prior) -> int:
         """Make the capability vector, or take it from the cache, and merge it."""
-        half = prior.questions.batch_size // 2
-        drawn = [
-            (prior.demonstrations.sample(prior.demonstrations.batch_size), prior.questions.sample(half))
-            for _ in range(self.steps)
-        ]
+        drawn = [with_questions(prior.demonstrations, prior.questions) for _ in range(self.steps)]
         self.vector = self._cached_vector(policy, drawn)
         if self.direction == "random":
             self.vector = {name: random_like([value])[0] for name, value in self.vector.items()}

@@ -15,6 +15,7 @@ from torch import Tensor
 from clbench.method import Metadata, Method, Prior, Progress, Source, Uses
 from clbench.policy import Batch, Policy, QuestionBatch
 
+from ._questions import with_questions
 from ._requirements import in_range, require_hidden_states
 
 
@@ -37,7 +38,7 @@ class KnowledgeInsulation(Method):
 
     def batch(self, target: Source[Batch], prior: Prior) -> tuple[Batch, QuestionBatch]:
         """Return a batch of the target and half a one of questions."""
-        return target.sample(target.batch_size), prior.questions.sample(target.batch_size // 2)
+        return with_questions(target, prior.questions)
 
     def loss(self, policy: Policy, batch: tuple[Batch, QuestionBatch], progress: Progress) -> Tensor:
         """Return the answer loss, and the action loss whose gradient ends at the head."""

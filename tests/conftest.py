@@ -1,6 +1,8 @@
 """Fixtures that several test files share."""
 
 import dataclasses
+import sys
+import types
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -8,9 +10,18 @@ from typing import Any
 import numpy as np
 import pytest
 
-from clbench.method import Uses, load_method
+from clbench.method import Method, Uses, load_method
 from clbench.names import built_in_methods
-from clbench.record import ANSWER_COLUMNS, EPISODE_COLUMNS, POLICY_COLUMNS, Record
+from clbench.record import (
+    ANSWER_COLUMNS,
+    EPISODE_COLUMNS,
+    POLICY_COLUMNS,
+    Record,
+    record_path,
+    write_record,
+)
+from clbench.run import RunSpec, execute, run_length
+from clbench.training import deterministic
 
 collect_ignore = ["submission"]
 """A package of its own, which test_submission.py installs and tests."""
@@ -31,6 +42,80 @@ def empty_caches(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setenv("CLBENCH_CACHE", str(tmp_path / "cache"))
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
     return tmp_path
+
+
+@pytest.fixture
+def one_thread() -> Iterator[None]:
+    """Compute as a run does: with one thread, so that numbers repeat themselves."""
+    with deterministic():
+        yield
+
+
+@pytest.fixture
+def stranger(monkeypatch: pytest.MonkeyPatch) -> Callable[[type[Method]], str]:
+    """Return a function that makes a class importable and returns its "module:Class"."""
+
+    def offer(cls: type[Method]) -> str:
+        module = types.ModuleType("stranger")
+        module.__dict__[cls.__name__] = cls
+        monkeypatch.setitem(sys.modules, "stranger", module)
+        return f"stranger:{cls.__name__}"
+
+    return offer
+
+
+class _Killed(BaseException):
+    """What no handler of the run catches, as when its process is killed."""
+
+
+@pytest.fixture
+def execute_and_kill() -> Callable[..., None]:
+    """Return a function that does a run as `execute` does, and kills it after a share of its length."""
+
+    def execute_and_kill(spec: RunSpec, records: Path, share: float, **folders: Path) -> None:
+        left = share * run_length(spec.load())
+
+        def die(amount: float) -> None:
+            nonlocal left
+            left -= amount
+            if left < 0:
+                raise _Killed
+
+        with pytest.raises(_Killed):
+            execute(spec, records, die, **folders)
+
+    return execute_and_kill
+
+
+@pytest.fixture(scope="session")
+def matrix() -> Any:
+    """Return the success rates (stages, tasks) of a method that learns and forgets."""
+    return np.array([[1.0, 0.8, 0.1, 0.0, 0.2], [0.6, 0.9, 0.9, 0.2, 0.3], [0.5, 0.4, 0.3, 0.8, 0.1]])
+
+
+@pytest.fixture
+def add(make_record: Callable[..., Record], matrix: Any, tmp_path: Path) -> Callable[..., Path]:
+    """Return a function that adds a record to leaderboard/records and returns its path."""
+
+    def add(
+        method: str = "sft",
+        seed: int = 0,
+        matrix: Any = matrix,
+        edit: Callable[[Record], None] | None = None,
+        place: str | None = None,
+        **run: Any,
+    ) -> Path:
+        """Add a record, which `edit` changes before, at its own place or at another one."""
+        on_the_way = {"curves": np.full((2, 3), 0.4), "retained_curves": np.full((2, 3, 2), 0.7)}
+        record = make_record(matrix, method=method, seed=seed, **{"episodes": 10, **on_the_way, **run})
+        if edit:
+            edit(record)
+        records = tmp_path / "leaderboard" / "records"
+        path = records / place if place else record_path(records, record.run["scenario"], method, seed)
+        write_record(record, path)
+        return path
+
+    return add
 
 
 @pytest.fixture(scope="session")

@@ -1,5 +1,6 @@
 """Comparisons against SciPy, plain loops and scores worked by hand; tie groups against simulated boards."""
 
+import ast
 import importlib.util
 import itertools
 import json
@@ -16,7 +17,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from clbench import cli
+from clbench.commands.runs import run as run_command
 from clbench.comparison import (
     UNKNOWN_DEVIATION,
     interquartile_mean,
@@ -324,9 +325,15 @@ def test_the_page_has_the_figures_of_the_simulations(coverage: ModuleType, resul
 def test_the_examples_of_the_page_give_what_it_says() -> None:
     page = (ROOT / "docs" / "statistics.md").read_text(encoding="utf-8")
     examples = re.findall(r"^((?:half_width|episodes_needed)\(.*\))  # (None|[\d.]+)", page, re.MULTILINE)
+    functions: dict[str, Callable[..., float | None]]
+    functions = {"half_width": half_width, "episodes_needed": episodes_needed}
     assert len(examples) == 4
-    for call, result in examples:
-        got = eval(call, {"half_width": half_width, "episodes_needed": episodes_needed})
+    for example, result in examples:
+        call = ast.parse(example, mode="eval").body
+        assert isinstance(call, ast.Call)
+        values = [ast.literal_eval(value) for value in call.args]
+        named = {str(part.arg): ast.literal_eval(part.value) for part in call.keywords}
+        got = functions[ast.unparse(call.func)](*values, **named)
         assert (f"{got:.2f}" if isinstance(got, float) else str(got)) == result
 
 
@@ -342,7 +349,7 @@ def test_the_command_line_says_before_a_run_how_wide_the_intervals_will_be(
     record = replace(make_record(np.ones((3, 5))), run=run_section, scenario=scenario_section)
     write_record(record, spec.path(tmp_path))
     monkeypatch.setattr(sys, "path", [*sys.path])  # the command adds the working directory
-    cli.run(scenario, "sft", seeds=1, records=tmp_path)
+    run_command(scenario, "sft", seeds=1, records=tmp_path)
     said = " ".join(capsys.readouterr().err.split())
     assert said == f"{expected_precision(TOY, 1)} 1 of 1 runs have a record already."
 

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from PIL import Image, ImageDraw
 
-from clbench.cli import film
+from clbench.commands.film import film
 from clbench.evaluation import Episode, Trial
 from clbench.film import FAILURE, SUCCESS, Film, Take, film_run, shoot
 from clbench.record import Record

@@ -2,13 +2,13 @@
 
 import dataclasses
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from clbench.run import RunSpec, execute, run_length
-from clbench.task import load_scenario
+from clbench.run import RunSpec, execute
 
 TOY = "clbench.testing:clbench/Toy-v0"
 SPEC = RunSpec(TOY, "aegis", seed=0)
@@ -77,20 +77,10 @@ def test_a_log_shows_what_the_record_holds(logged: tuple[Any, Path]) -> None:
     assert "diagnostics/anchor_distance" not in points  # a list, no number
 
 
-def test_a_run_that_goes_on_has_no_point_twice(logged: tuple[Any, Path], tmp_path: Path) -> None:
-    class Killed(BaseException):
-        """What no handler of the run catches, as when its process is killed."""
-
-    left = 0.75 * run_length(load_scenario(TOY))
-
-    def die(amount: float) -> None:
-        nonlocal left
-        left -= amount
-        if left < 0:
-            raise Killed
-
-    with pytest.raises(Killed):
-        execute(SPEC, tmp_path, die, tensorboard=tmp_path)
+def test_a_run_that_goes_on_has_no_point_twice(
+    logged: tuple[Any, Path], tmp_path: Path, execute_and_kill: Callable[..., None]
+) -> None:
+    execute_and_kill(SPEC, tmp_path, 0.75, tensorboard=tmp_path)
     folder = tmp_path / "Toy-v0" / "aegis" / "seed-0"
     last = _points(folder)["training/loss"][-1][0]
     assert last > 60
@@ -101,7 +91,7 @@ def test_a_run_that_goes_on_has_no_point_twice(logged: tuple[Any, Path], tmp_pat
 def test_a_missing_package_is_named_before_any_work(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from clbench.cli import run
+    from clbench.commands.runs import run
 
     monkeypatch.setattr("clbench.extras.find_spec", lambda name: None)
     monkeypatch.setattr(sys, "path", sys.path.copy())  # the command adds to it

@@ -3,8 +3,6 @@
 import dataclasses
 import json
 import random
-import sys
-import types
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, ClassVar
@@ -77,19 +75,6 @@ class Adapting(Method):
         return policy.action_loss(batch).mean() * (1 + noise) + (scale * torch.rand(3)).sum()
 
 
-@pytest.fixture
-def stranger(monkeypatch: pytest.MonkeyPatch) -> Callable[[type[Method]], str]:
-    """Return a function that makes a class importable and returns its "module:Class"."""
-
-    def offer(cls: type[Method]) -> str:
-        module = types.ModuleType("stranger")
-        module.__dict__[cls.__name__] = cls
-        monkeypatch.setitem(sys.modules, "stranger", module)
-        return f"stranger:{cls.__name__}"
-
-    return offer
-
-
 @pytest.mark.parametrize("method", ["aegis", "buffered_replay", "fast_dvla", "lora"])
 def test_the_same_run_twice_gives_equal_records(tmp_path: Path, method: str) -> None:
     paths = []
@@ -148,31 +133,19 @@ def test_progress_adds_up_to_the_length_of_the_run(tmp_path: Path) -> None:
     assert sum(amounts) == pytest.approx(run_length(load_scenario(TOY)))
 
 
-class _Killed(BaseException):
-    """What no handler of the run catches, as when its process is killed."""
-
-
 @pytest.mark.parametrize("cls", [Counting, Adapting])
 @pytest.mark.parametrize("share", [0.05, 0.45, 0.95])
 def test_a_run_killed_anywhere_resumes_to_the_same_record(
     tmp_path: Path,
     empty_caches: Path,
     stranger: Callable[[type[Method]], str],
+    execute_and_kill: Callable[..., None],
     cls: type[Method],
     share: float,
 ) -> None:
     spec = RunSpec(TOY, stranger(cls), seed=0)
     execute(spec, tmp_path / "whole")
-    left = share * run_length(load_scenario(TOY))
-
-    def die(amount: float) -> None:
-        nonlocal left
-        left -= amount
-        if left < 0:
-            raise _Killed
-
-    with pytest.raises(_Killed):
-        execute(spec, tmp_path / "killed", die)
+    execute_and_kill(spec, tmp_path / "killed", share)
     assert not spec.path(tmp_path / "killed").exists()
     record = execute(spec, tmp_path / "killed")
     assert ("resumed_after" in record.timing) == (share > 0.2)

@@ -3,8 +3,8 @@
 import dataclasses
 import logging
 import random
+import shutil
 import sys
-import types
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -14,12 +14,11 @@ import pytest
 import torch
 from torch import Tensor
 
-from clbench.cli import run
+from clbench.commands.runs import run
 from clbench.method import Method, Stage, State
-from clbench.policy import Policy
-from clbench.run import RunSpec, execute, run_length
-from clbench.stages import find_stages, has_stages, keep_stages, stage_policies
-from clbench.task import load_scenario
+from clbench.policy import CheckpointError, Policy
+from clbench.run import RunSpec, execute
+from clbench.stages import find_stages, has_stages, keep_stages, load_stages, stage_policies
 from clbench.training import MethodError
 
 TOY = "clbench.testing:clbench/Toy-v0"
@@ -56,19 +55,6 @@ class Stumbling(Method):
 
     def end_task(self, policy: Policy, stage: Stage) -> None:
         raise RuntimeError(f"cannot merge {stage.task.name}")
-
-
-@pytest.fixture
-def stranger(monkeypatch: pytest.MonkeyPatch) -> Callable[[type[Method]], str]:
-    """Return a function that makes a class importable and returns its "module:Class"."""
-
-    def offer(cls: type[Method]) -> str:
-        module = types.ModuleType("stranger")
-        module.__dict__[cls.__name__] = cls
-        monkeypatch.setitem(sys.modules, "stranger", module)
-        return f"stranger:{cls.__name__}"
-
-    return offer
 
 
 @pytest.fixture(scope="module")
@@ -126,21 +112,11 @@ def test_a_method_that_draws_from_global_generators_makes_the_same_policies_agai
     _assert_equal(stage_policies(spec, tmp_path), stage_policies(spec))
 
 
-def test_a_run_that_was_killed_keeps_all_stages_in_the_end(tmp_path: Path) -> None:
-    class Killed(BaseException):
-        """What no handler of the run catches, as when its process is killed."""
-
-    left = 0.75 * run_length(load_scenario(TOY))
-
-    def die(amount: float) -> None:
-        nonlocal left
-        left -= amount
-        if left < 0:
-            raise Killed
-
+def test_a_run_that_was_killed_keeps_all_stages_in_the_end(
+    tmp_path: Path, execute_and_kill: Callable[..., None]
+) -> None:
     spec = RunSpec(TOY, "sft", seed=0)
-    with pytest.raises(Killed):
-        execute(spec, tmp_path, die, checkpoints=tmp_path)
+    execute_and_kill(spec, tmp_path, 0.75, checkpoints=tmp_path)
     assert not has_stages(spec, tmp_path)
     assert execute(spec, tmp_path, checkpoints=tmp_path).timing["resumed_after"] == 1
     _assert_equal(stage_policies(spec, tmp_path), stage_policies(spec))
@@ -177,6 +153,41 @@ def test_a_torn_policy_is_not_taken_and_the_log_says_so(
     with caplog.at_level(logging.WARNING, "clbench"):
         assert find_stages(SPEC, tmp_path) == find_stages(SPEC)
     assert "does not hold the policies of all stages of lora, seed 0" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ('{"scale": 1, "scale": 2}', "the name 'scale' is there twice"),
+        (f'{{"scale": {"[" * 99}{"]" * 99}}}', "scale: nested more than 16 deep"),
+        ('{"scale": NaN}', "NaN is no number"),
+        ("[1]", "cannot be read as the state of a method"),
+    ],
+)
+def test_a_state_that_a_stranger_wrote_is_read_within_limits_and_refused_by_name(
+    kept: Path, tmp_path: Path, text: str, reason: str
+) -> None:
+    folder = shutil.copytree(kept / "Toy-v0" / "lora" / "seed-0", tmp_path / "stages")
+    (folder / "stage-1" / "method.json").write_text(text)
+    with pytest.raises(CheckpointError, match=reason) as refused:
+        load_stages(SPEC, folder)
+    assert str(folder / "stage-1") in str(refused.value)
+
+
+@dataclasses.dataclass
+class Boundless(Method):
+    """A method whose state no file can hold."""
+
+    def state(self) -> State:
+        return {"best": float("inf")}
+
+
+def test_a_state_that_could_not_be_read_again_is_refused_when_it_is_kept(
+    stranger: Callable[[type[Method]], str],
+) -> None:
+    message = r"failed in state\(\) after stage 0: .*best: a number that is not finite"
+    with pytest.raises(MethodError, match=message):
+        stage_policies(RunSpec(TOY, stranger(Boundless), seed=0))
 
 
 def test_a_method_that_fails_says_where(stranger: Callable[[type[Method]], str]) -> None:

@@ -30,7 +30,7 @@ from clbench.method import Access, Metadata, Method, Uses
 from clbench.policy import Policy
 from clbench.seeding import seeded
 from clbench.testing.error import ContractError
-from clbench.testing.leaks import GENERATORS, same, watched
+from clbench.testing.global_state import GENERATORS, same, watched
 from clbench.testing.toy import TOY
 from clbench.testing.toy_run import SEAMS, ToyRun, toy_learner
 
@@ -187,12 +187,12 @@ def _check_signatures(cls: type[Method]) -> None:
 
 def constructor(subject: Subject) -> None:
     """A constructor that stores its hyper-parameters as they are given, and does nothing else."""
-    leaks: list[str] = []
-    with seeded("constructor"), watched(leaks, generators=True):
+    changes: list[str] = []
+    with seeded("constructor"), watched(changes, generators=True):
         _check_fields(subject.cls)
         _check_stored(subject.cls)
-    if leaks:
-        raise _misbuilt("nothing to be done but storing", "; ".join(leaks))
+    if changes:
+        raise _misbuilt("nothing to be done but storing", "; ".join(changes))
 
 
 def _check_fields(cls: type[Method]) -> None:
@@ -307,9 +307,9 @@ def state(subject: Subject) -> None:
 
 def global_state(subject: Subject) -> None:
     """Nothing that is left behind: settings of the process stay as they were, files are written nowhere."""
-    for seam, leak in subject.second.leaks:
+    for seam, change in subject.second.changes:
         expected = "the process to be left as it was, and files to be written in clbench's cache alone"
-        raise _breach(global_state, expected, f"after {seam}() {leak}", f"{seam}()")
+        raise _breach(global_state, expected, f"after {seam}() {change}", f"{seam}()")
 
 
 def seeding(subject: Subject) -> None:

@@ -20,7 +20,7 @@ from clbench.method import Method, Prior, Source, Stage, UndeclaredAccessError
 from clbench.policy import CheckpointError
 from clbench.seeding import seeded
 from clbench.testing.error import ContractError
-from clbench.testing.leaks import GENERATORS, read, watched
+from clbench.testing.global_state import GENERATORS, read, watched
 from clbench.testing.toy import TOY
 from clbench.training import MethodError
 
@@ -84,7 +84,7 @@ class ToyRun:
         """Where samples were drawn: the source, and the seam."""
         self.target_rows = 0
         """Most samples of the target that were drawn in one step."""
-        self.leaks: dict[tuple[str, str], None] = {}
+        self.changes: dict[tuple[str, str], None] = {}
         """What each seam left changed behind it."""
         self.outcomes: dict[tuple[str, str], Any] = {}
         """All that came of it, by stage and name: weights, state, diagnostics."""
@@ -159,15 +159,15 @@ class ToyRun:
             return function(*arguments, **named)
         self._seam, self._running = seam, True
         self._step_rows = 0 if seam == "batch" else self._step_rows
-        leaks: list[str] = []
+        changes: list[str] = []
         try:
-            with watched(leaks, generators=seam in UNSEEDED):
+            with watched(changes, generators=seam in UNSEEDED):
                 result = function(*map(self._counted, arguments), **named)
         except Exception as error:
             raise self._fault(seam, error) from error
         finally:
             self._running = False
-            self.leaks.update(dict.fromkeys((seam, leak) for leak in leaks))
+            self.changes.update(dict.fromkeys((seam, change) for change in changes))
         if seam not in (*UNSEEDED, "load_state"):
             self.generators.setdefault(seam, read(GENERATORS))
         check = getattr(self, f"_checked_{seam}", None)

@@ -8,7 +8,7 @@ from functools import cache
 import numpy as np
 
 from clbench.scores import Array, Rates, Scores, average
-from clbench.statistics import Estimate, interval
+from clbench.statistics import Estimate, draw_episodes, interval
 
 REPLICATES = 300
 """Draws behind an interval of episodes: with 2000 its ends move by less than a line is wide."""
@@ -42,15 +42,8 @@ def estimated(
     @cache
     def with_other_episodes() -> list[Rates]:
         layout = runs[0].layout
-        tasks, episodes = len(layout.tasks), len(layout.episodes)
-        rates = []
-        for run in runs:
-            drawn = generator.integers(episodes, size=(REPLICATES * tasks, episodes))
-            # Counted in one call: the episodes of each cell get numbers of their own.
-            drawn += np.arange(len(drawn))[:, None] * episodes
-            counts = np.bincount(drawn.ravel(), minlength=drawn.size).astype(np.float64)
-            rates.append(run.rates(counts.reshape(REPLICATES, tasks, episodes)))
-        return rates
+        shape, episodes = (REPLICATES, len(layout.tasks)), len(layout.episodes)
+        return [run.rates(draw_episodes(shape, episodes, generator)) for run in runs]
 
     found = {}
     for name, curve in curves.items():

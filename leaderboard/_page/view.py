@@ -14,13 +14,13 @@ from clbench.method import load_method
 from clbench.metrics import METRICS, Metric
 from clbench.names import built_in_methods
 from clbench.scores import rates_of
-from clbench.statistics import Estimate, row_generator
+from clbench.statistics import Estimate, needed_references, row_generator
 
 from .._descriptions import Description, describe
 from .._markdown import arxiv_ids
-from .._rows import Row, Table
+from .._rows import Row, Table, rank_mates
 from .._runs import DIVISIONS, printable
-from .._table import SHOWN, interval, number_text, title_of
+from .._table import SHOWN, interval, number_text, scaled, title_of
 from .charts import finite, rounded
 from .curves import estimated, retained_curve, target_curves
 from .definitions import Family, families
@@ -292,27 +292,19 @@ def _costs(row: Row) -> tuple[Number, Number]:
     if relative is not None:
         cost = Number(number_text(relative, ".2f") + "\N{MULTIPLICATION SIGN}", number_text(relative, ".6f"))
     if kept is not None:
-        size = Number(_bytes(kept), number_text(kept, ".0f"), f"{number_text(kept, ',.0f')} bytes")
+        digits, unit = scaled(kept)
+        text = f"{digits} {unit}B" if unit else digits
+        size = Number(text, number_text(kept, ".0f"), f"{number_text(kept, ',.0f')} bytes")
     return cost, size
-
-
-def _bytes(value: float) -> str:
-    """Return a number of bytes in three digits."""
-    for power, unit in ((1e12, "TB"), (1e9, "GB"), (1e6, "MB"), (1e3, "kB")):
-        if value >= power:
-            return f"{float(f'{value / power:.3g}'):g} {unit}"
-    return number_text(value, ".0f")
 
 
 def _rank(row: Row, rows: Sequence[Row]) -> tuple[str, str]:
     """Return the rank of a row as it is shown, and in words."""
-    mates = [other for other in rows if other.division == row.division]
     if row.rank is None:
-        return MISSING, "no rank: a reference does not compete" if row.division == DIVISIONS[
-            -1
-        ] else "no rank"
-    same = [other.method for other in mates if other.rank == row.rank and other is not row]
-    place = f"rank {row.rank} of {len(mates)}"
+        reference = row.division == DIVISIONS[-1]
+        return MISSING, "no rank: a reference does not compete" if reference else "no rank"
+    count, same = rank_mates(row, rows)
+    place = f"rank {row.rank} of {count}"
     if not same:
         return str(row.rank), place
     shown = ", ".join(same[:NAMED]) + (f" and {len(same) - NAMED} more" if len(same) > NAMED else "")
@@ -328,13 +320,8 @@ def _metric(metric: Metric, one: Estimate, seeds: Sequence[float | None]) -> Met
 
 def _of_seeds(row: Row, rows: Sequence[Row]) -> dict[str, list[float | None]]:
     """Return the value of every metric for each seed, None where the row has none either."""
-    needed = {name for metric in METRICS.values() for name in metric.references}
-    scores = {other.method: other.scores for other in rows if other.method in needed}
-    references = {
-        name: [runs[seed] for seed in row.seeds]
-        for name, runs in scores.items()
-        if set(row.seeds) <= set(runs)
-    }
+    scores = {other.method: other.scores for other in rows}
+    references = needed_references(METRICS.values(), row.seeds, scores)
     rates = rates_of([run.scores for run in row.runs], references)
     found: dict[str, list[float | None]] = {}
     for metric in METRICS.values():

@@ -21,39 +21,16 @@ page = resolve("clbench.leaderboard._page:page")
 pictures = resolve("clbench.leaderboard._page:pictures")
 read_table = resolve("clbench.leaderboard._rows:read_table")
 
-MATRIX = [[1.0, 0.8, 0.1, 0.0, 0.2], [0.6, 0.9, 0.9, 0.2, 0.3], [0.5, 0.4, 0.3, 0.8, 0.1]]
 HOSTILE = "</script><img src=x onerror=alert(1)>'\"&{{ 1 }}"
 ADDRESS = re.compile(r"https?://[^\s\"'<>`)]+")
 
 
 @pytest.fixture
-def add(make_record: Callable[..., Record], tmp_path: Path) -> Callable[..., Path]:
-    """Return a function that adds a record to the folder and returns its path; `edit` changes it before."""
-
-    def add(
-        method: str = "sft",
-        seed: int = 0,
-        matrix: Any = MATRIX,
-        edit: Callable[[Record], None] | None = None,
-        **run: Any,
-    ) -> Path:
-        on_the_way = {"curves": np.full((2, 3), 0.4), "retained_curves": np.full((2, 3, 2), 0.7)}
-        record = make_record(matrix, method=method, seed=seed, **{"episodes": 10, **on_the_way, **run})
-        if edit:
-            edit(record)
-        path = record_path(tmp_path / "leaderboard" / "records", record.run["scenario"], method, seed)
-        write_record(record, path)
-        return path
-
-    return add
-
-
-@pytest.fixture
-def records(add: Callable[..., Path], tmp_path: Path) -> Path:
+def records(add: Callable[..., Path], matrix: Any, tmp_path: Path) -> Path:
     """Return a folder with the records of two methods."""
     for seed in range(2):
         add("sft", seed)
-        add("better", seed, np.clip(np.array(MATRIX) + 0.3, 0, 1))
+        add("better", seed, np.clip(matrix + 0.3, 0, 1))
     return tmp_path / "leaderboard" / "records"
 
 

@@ -24,6 +24,9 @@ register(id=hurried.id, entry_point="clbench.scenario_env:ScenarioEnv", kwargs=k
 class Mine(clbench.Method):
     '''Plain fine-tuning, under another name.'''
 
+class Größe(Mine):
+    '''Its name is not one of a row.'''
+
 @dataclasses.dataclass
 class Broken(clbench.Method):
     '''Its loss is not a scalar.'''
@@ -99,6 +102,7 @@ def test_a_method_that_goes_beyond_the_limits_of_its_scenario_is_stopped(
     [
         ("submitted:Mind", {}, "Did you mean 'Mine'?"),
         ("submited:Mine", {}, "No module 'submited' can be imported"),
+        ("submitted:Größe", {}, "'submitted:Größe' cannot be the name of a method"),
         ("submitted:Mine", {"seeds": 0}, "--seeds must be at least 1"),
         ("submitted:Mine", {"scenario": "clbench/Fetsch-v0"}, "Did you mean 'clbench/Fetch-v0'?"),
     ],

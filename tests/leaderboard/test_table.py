@@ -1,5 +1,6 @@
 """The leaderboard: the same records give the same bytes, and no file can hide another."""
 
+import functools
 import importlib
 import itertools
 import json
@@ -18,7 +19,6 @@ from clbench.metrics import METRICS
 from clbench.record import Record, record_path, write_record
 from clbench.task import resolve
 
-MATRIX = [[1.0, 0.8, 0.1, 0.0, 0.2], [0.6, 0.9, 0.9, 0.2, 0.3], [0.5, 0.4, 0.3, 0.8, 0.1]]
 ANSWERS = {(stage, kind): (50, 45 - 10 * stage) for stage in range(3) for kind in ("left", "above")}
 SELECTION = [[0.3, 0.6, 0.9, 0.9], [0.1, 0.3, 0.8, 0.8]]
 REFERENCE = {"demonstrations": "never", "questions": "never", "reference": True}
@@ -33,37 +33,18 @@ def load(records: Path) -> pandas.DataFrame:
 
 
 @pytest.fixture
-def add(make_record: Callable[..., Record], tmp_path: Path) -> Callable[..., Path]:
-    """Return a function that adds a record to the folder and returns its path; `edit` changes it before."""
-
-    def add(
-        method: str = "sft",
-        seed: int = 0,
-        matrix: Any = MATRIX,
-        edit: Callable[[Record], None] | None = None,
-        place: str | None = None,
-        **run: Any,
-    ) -> Path:
-        on_the_way = {"curves": np.full((2, 3), 0.4), "retained_curves": np.full((2, 3, 2), 0.7)}
-        policy = {"sparsity": np.full((2, 4), 0.6), "drift": np.full((2, 4), 3.0)}
-        values = {"selection": SELECTION, "answers": ANSWERS, "episodes": 10, **on_the_way, **policy, **run}
-        record = make_record(matrix, method=method, seed=seed, **values)
-        if edit:
-            edit(record)
-        records = tmp_path / "leaderboard" / "records"
-        path = records / place if place else record_path(records, record.run["scenario"], method, seed)
-        write_record(record, path)
-        return path
-
-    return add
+def add(add: Callable[..., Path]) -> Callable[..., Path]:
+    """Return the function that adds a record, for one with values for every metric."""
+    policy = {"sparsity": np.full((2, 4), 0.6), "drift": np.full((2, 4), 3.0)}
+    return functools.partial(add, selection=SELECTION, answers=ANSWERS, **policy)
 
 
 @pytest.fixture
-def records(add: Callable[..., Path], tmp_path: Path) -> Path:
+def records(add: Callable[..., Path], matrix: Any, tmp_path: Path) -> Path:
     """Return a folder with the records of four methods."""
     for seed in range(2):
         add("sft", seed)
-        add("replay", seed, np.clip(np.array(MATRIX) + 0.3, 0, 1), uses=REPLAY)
+        add("replay", seed, np.clip(matrix + 0.3, 0, 1), uses=REPLAY)
         add("asks", seed, uses=ASKS)
         add("from_scratch", seed, uses=REFERENCE)
     return tmp_path / "leaderboard" / "records"
@@ -232,6 +213,21 @@ def test_the_terminal_shows_all_rows_in_108_columns(
     assert len(row.split()) == 3 + 6 + 3  # rank, name, seeds; six metrics; cost, bytes and tier: none cut off
     assert "matched" in printed
     assert "…" not in printed
+
+
+def test_bytes_have_three_digits_and_go_on_to_the_next_unit(
+    records: Path, add: Callable[..., Path], shown: Callable[[], tuple[str, str]]
+) -> None:
+    counts = {0: "0", 999: "999", 1234: "1.23k", 999_900: "1M", 45_678_901: "45.7M", 3 * 10**15: "3000T"}
+    for count in counts:
+        add(f"keeps_{count}", 0, edit=lambda record, count=count: record.costs.update(bytes_kept=count))
+    printed = [line.split() for line in shown()[0].splitlines()]
+    page = (records.parent / "index.html").read_text(encoding="utf-8")
+    for count, text in counts.items():
+        (size,) = (line[-2] for line in printed if f"keeps_{count}" in line)
+        assert size == text
+        unit = f" {text[-1]}B" if text[-1].isalpha() else ""
+        assert f'<span title="{count:,} bytes">{text.rstrip("kMGT")}{unit}</span>' in page
 
 
 def test_the_relative_cost_is_that_of_all_steps_with_the_time_of_one(

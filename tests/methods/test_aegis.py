@@ -1,6 +1,7 @@
 """AEGIS: the anchor, and what is left of a gradient that leads away from it."""
 
-from collections.abc import Iterator, Mapping
+import dataclasses
+from collections.abc import Mapping
 from types import SimpleNamespace
 from typing import Any
 
@@ -12,43 +13,25 @@ from torch import Tensor, nn
 
 from clbench.activations import Gaussian
 from clbench.adaptation import adapt
-from clbench.demonstrations import Demonstrations, collect
-from clbench.method import Prior, Progress, Source, Stage, build_method
-from clbench.policy import Batch, Policy, PolicyConfig, QuestionBatch
-from clbench.questions import Questions
-from clbench.task import Budget, load_scenario, resolve
-from clbench.training import deterministic
+from clbench.method import Prior, Progress, Stage, build_method
+from clbench.policy import Batch, Policy, PolicyConfig
+from clbench.task import Budget
+from clbench.testing import TOY
+from clbench.testing.small import SMALL, toy_questions, toy_source
 
-TOY = load_scenario("clbench.testing:clbench/Toy-v0")
-CONFIG = PolicyConfig(state_size=4, action_size=2, width=32, layers=4)
+pytestmark = pytest.mark.usefixtures("one_thread")
+CONFIG = dataclasses.replace(SMALL, layers=4)
 NOW = Progress(0, 100)
 
 
-@pytest.fixture(autouse=True)
-def _one_thread() -> Iterator[None]:
-    with deterministic():
-        yield
-
-
-def _source(seed: int) -> Source[Batch]:
-    task = TOY.task("right")
-    data = Demonstrations.of_task(task, collect(task, TOY.budget), CONFIG.chunk)
-    return Source(data, torch.Generator().manual_seed(seed), 16)
-
-
-def _questions(seed: int) -> Source[QuestionBatch]:
-    scenes = torch.randn(200, 4, generator=torch.Generator().manual_seed(7))
-    return Source(Questions(resolve(TOY.questions), scenes), torch.Generator().manual_seed(seed), 16)
-
-
 def _stage(steps: int) -> Stage:
-    return Stage(1, TOY.task("right"), 0, steps, _source(0), Prior({}))
+    return Stage(1, TOY.task("right"), 0, steps, toy_source("right"), Prior({}))
 
 
 def _moved(config: PolicyConfig = CONFIG, seed: int = 0, **changes: Any) -> tuple[Any, Policy]:
     """Return a method that has begun a stage, and its policy, which is no longer where the anchor lies."""
     method, policy = build_method("aegis", {"samples": 64, **changes}), Policy(config, seed=1)
-    method.prepare(policy, Prior({"questions": _questions(0)}))
+    method.prepare(policy, Prior({"questions": toy_questions()}))
     generator = torch.Generator().manual_seed(seed)
     with torch.no_grad():
         for weight in policy.parameters():
@@ -92,10 +75,10 @@ def _set(policy: Policy) -> dict[str, NDArray[np.float64]]:
 
 def test_the_anchor_is_the_gaussian_of_the_questions_that_prepare_draws() -> None:
     method: Any = build_method("aegis", {"samples": 50})
-    policy, source = Policy(CONFIG), _questions(3)
+    policy, source = Policy(CONFIG), toy_questions(3)
     prior = Prior({"questions": source})
     method.prepare(policy, prior)
-    questions = _questions(3).sample(50)
+    questions = toy_questions(3).sample(50)
     with torch.no_grad():
         hidden = policy.hidden_states(questions.state, questions.words)
     expected = Gaussian.of(hidden, policy.backbone.mask(questions.words))
@@ -106,7 +89,7 @@ def test_the_anchor_is_the_gaussian_of_the_questions_that_prepare_draws() -> Non
 
 def test_training_needs_no_question_and_does_not_move_the_anchor() -> None:
     method: Any = build_method("aegis", {"samples": 50})
-    policy, prior = Policy(CONFIG), Prior({"questions": _questions(3)})
+    policy, prior = Policy(CONFIG), Prior({"questions": toy_questions(3)})
     method.prepare(policy, prior)
     prior.close()
     mean, deviation = method.anchor.mean.clone(), method.anchor.deviation.clone()
@@ -118,7 +101,7 @@ def test_training_needs_no_question_and_does_not_move_the_anchor() -> None:
 @pytest.mark.parametrize("seed", range(3))
 def test_a_step_sets_the_gradients_of_two_separate_passes_projected_layer_by_layer(seed: int) -> None:
     method, policy = _moved(seed=seed)
-    batch = _source(seed).sample(16)
+    batch = toy_source("right", seed=seed).sample(16)
     loss = method.loss(policy, batch, NOW)
     assert loss.item() == pytest.approx(policy.action_loss(batch).mean().item())
     method.gradients(policy, loss)
@@ -143,7 +126,7 @@ def test_the_steps_above_project_some_layers_and_leave_others() -> None:
     shares = []
     for seed in range(3):
         method, policy = _moved(seed=seed)
-        method.gradients(policy, method.loss(policy, _source(seed).sample(16), NOW))
+        method.gradients(policy, method.loss(policy, toy_source("right", seed=seed).sample(16), NOW))
         shares.append(method.diagnostics()["layers_projected_mean"])
     assert 0.0 < np.mean(shares) < 1.0
 
@@ -152,7 +135,7 @@ def test_a_projected_layer_is_orthogonal_to_the_anchor_and_the_others_keep_every
     kinds = set()
     for seed in range(3):
         method, policy = _moved(seed=seed)
-        batch = _source(seed).sample(16)
+        batch = toy_source("right", seed=seed).sample(16)
         policy.action_loss(batch).mean().backward()  # type: ignore[no-untyped-call]
         plain = _set(policy)
         policy.zero_grad()
@@ -171,7 +154,7 @@ def test_a_projected_layer_is_orthogonal_to_the_anchor_and_the_others_keep_every
 
 def test_what_lies_outside_the_backbones_layers_keeps_the_plain_gradient() -> None:
     method, policy = _moved()
-    batch = _source(0).sample(16)
+    batch = toy_source("right").sample(16)
     policy.action_loss(batch).mean().backward()  # type: ignore[no-untyped-call]
     plain = _set(policy)
     policy.zero_grad()
@@ -229,7 +212,7 @@ def test_the_random_control_has_no_direction_either_where_the_anchor_gives_none(
 def test_the_energy_shed_by_one_layer_is_the_squared_cosine(seed: int) -> None:
     one_layer = PolicyConfig(state_size=4, action_size=2, width=32, layers=1)
     method, policy = _moved(one_layer, seed=seed)
-    batch = _source(seed).sample(16)
+    batch = toy_source("right", seed=seed).sample(16)
     method.gradients(policy, method.loss(policy, batch, NOW))
     gradient = _block(_gradients(policy, policy.action_loss(batch).mean()), 0)
     against = _block(_gradients(policy, _distance(policy, batch, method.anchor)), 0)
@@ -240,7 +223,7 @@ def test_the_energy_shed_by_one_layer_is_the_squared_cosine(seed: int) -> None:
 
 def test_the_random_control_projects_against_directions_of_the_same_norm() -> None:
     method, policy = _moved(direction="random")
-    batch = _source(0).sample(16)
+    batch = toy_source("right").sample(16)
     with torch.random.fork_rng():
         torch.manual_seed(5)
         method.gradients(policy, method.loss(policy, batch, NOW))
@@ -267,7 +250,7 @@ def test_the_anchor_survives_its_state() -> None:
     other: Any = build_method("aegis", {})
     other.load_state(policy, method.state())
     other.start_task(policy, _stage(1))
-    batch, found = _source(0).sample(16), []
+    batch, found = toy_source("right").sample(16), []
     for each in (method, other):
         policy.zero_grad()
         each.gradients(policy, each.loss(policy, batch, NOW))
@@ -277,7 +260,7 @@ def test_the_anchor_survives_its_state() -> None:
 
 def test_the_diagnostics_tell_the_distance_at_eleven_steps_from_the_first_to_the_last() -> None:
     method, policy = build_method("aegis", {"samples": 50}), Policy(CONFIG)
-    method.prepare(policy, Prior({"questions": _questions(3)}))
+    method.prepare(policy, Prior({"questions": toy_questions(3)}))
     assert method.diagnostics() == {}
     adapt(policy, method, _stage(31), Budget(learning_rate=1e-3))
     told, distances = method.diagnostics(), method.distances  # type: ignore[attr-defined]
@@ -303,4 +286,4 @@ def test_a_policy_without_hidden_states_is_refused_by_name(spec: str, name: str)
 
     policy: Any = Opaque()
     with pytest.raises(TypeError, match=f"{name} needs the hidden states .*; Opaque has no hidden_states"):
-        build_method(spec, {}).prepare(policy, Prior({"questions": _questions(0)}))
+        build_method(spec, {}).prepare(policy, Prior({"questions": toy_questions()}))

@@ -1,49 +1,32 @@
 """Buffered replay: what is kept, what is replayed of it, and what that costs."""
 
-from collections.abc import Iterator
 from typing import Any
 
 import pytest
 import torch
 from torch import Tensor
 
-from clbench.demonstrations import Demonstrations, collect
-from clbench.method import Prior, Source, Stage, build_method
-from clbench.policy import Batch, Policy, PolicyConfig
-from clbench.task import load_scenario
-from clbench.training import deterministic
+from clbench.method import Prior, Stage, build_method
+from clbench.policy import Batch, Policy
+from clbench.testing import TOY
+from clbench.testing.small import SMALL, toy_source
 
-TOY = load_scenario("clbench.testing:clbench/Toy-v0")
-CONFIG = PolicyConfig(state_size=4, action_size=2, width=32, layers=2)
-
-
-@pytest.fixture(autouse=True)
-def _one_thread() -> Iterator[None]:
-    with deterministic():
-        yield
-
-
-def _source(*tasks: str, seed: int = 0) -> Source[Batch]:
-    parts = [
-        Demonstrations.of_task(TOY.task(task), collect(TOY.task(task), TOY.budget), CONFIG.chunk)
-        for task in tasks
-    ]
-    return Source(Demonstrations.cat(parts), torch.Generator().manual_seed(seed), 16)
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 def _prepared(**changes: Any) -> tuple[Any, Prior]:
     """Return a method that has filled its buffer, and the prior data, closed as in a run."""
     method = build_method("buffered_replay", changes)
-    prior = Prior({"demonstrations": _source("left", "up")})
+    prior = Prior({"demonstrations": toy_source("left", "up")})
     with torch.random.fork_rng():
         torch.manual_seed(0)
-        method.prepare(Policy(CONFIG), prior)
+        method.prepare(Policy(SMALL), prior)
     prior.close()
     return method, prior
 
 
 def _stage(seed: int = 0) -> Stage:
-    return Stage(1, TOY.task("right"), 0, 10, _source("right", seed=seed), Prior({}))
+    return Stage(1, TOY.task("right"), 0, 10, toy_source("right", seed=seed), Prior({}))
 
 
 def _moments(batch: Batch) -> list[tuple[float, ...]]:
@@ -60,7 +43,7 @@ def _ways(batch: Batch) -> set[tuple[float, ...]]:
 @pytest.mark.parametrize("share", [0.001, 0.02, 0.1, 1.0])
 def test_the_buffer_holds_its_share_of_the_prior_demonstrations_at_least_one(share: float) -> None:
     method, _ = _prepared(share=share)
-    assert len(method.buffer) == max(1, round(share * len(_source("left", "up"))))
+    assert len(method.buffer) == max(1, round(share * len(toy_source("left", "up"))))
 
 
 def test_both_skills_are_kept() -> None:
@@ -77,7 +60,7 @@ def test_what_is_kept_counts_in_bytes() -> None:
 
 def test_half_of_each_batch_comes_from_the_buffer_alone_and_half_from_the_target() -> None:
     method, prior = _prepared(share=0.1)
-    kept, target = set(_moments(method.buffer)), _source("right")
+    kept, target = set(_moments(method.buffer)), toy_source("right")
     replayed = set()
     for _ in range(10):
         batch = method.batch(target, prior)
@@ -93,13 +76,13 @@ def test_half_of_each_batch_comes_from_the_buffer_alone_and_half_from_the_target
 def test_the_share_of_replay_is_taken_out_of_the_batch(replay: float, count: int) -> None:
     method, prior = _prepared(replay=replay, share=0.1)
     kept = set(_moments(method.buffer))
-    found = [moment in kept for moment in _moments(method.batch(_source("right"), prior))]
+    found = [moment in kept for moment in _moments(method.batch(toy_source("right"), prior))]
     assert found == [False] * (16 - count) + [True] * count
 
 
 def test_flow_time_and_noise_of_what_is_replayed_are_drawn_anew() -> None:
     method, prior = _prepared(share=0.02)
-    first, second = (method.batch(_source("right"), prior) for _ in range(2))
+    first, second = (method.batch(toy_source("right"), prior) for _ in range(2))
     draws = torch.cat([first.draw[8:], second.draw[8:], method.buffer.draw])
     assert len(set(draws.tolist())) == len(draws)
     noise = torch.cat([first.noise[8:], second.noise[8:], method.buffer.noise])
@@ -108,20 +91,20 @@ def test_flow_time_and_noise_of_what_is_replayed_are_drawn_anew() -> None:
 
 def test_after_a_target_the_same_share_of_it_is_added() -> None:
     method, prior = _prepared(share=0.1)
-    before, count = _moments(method.buffer), round(0.1 * len(_source("right")))
-    method.end_task(Policy(CONFIG), _stage(seed=3))
-    assert _moments(method.buffer) == before + _moments(_source("right", seed=3).sample(count))
+    before, count = _moments(method.buffer), round(0.1 * len(toy_source("right")))
+    method.end_task(Policy(SMALL), _stage(seed=3))
+    assert _moments(method.buffer) == before + _moments(toy_source("right", seed=3).sample(count))
     replayed = set()
     for _ in range(20):
-        replayed |= set(_moments(method.batch(_source("down"), prior))[8:])
+        replayed |= set(_moments(method.batch(toy_source("down"), prior))[8:])
     assert replayed == set(_moments(method.buffer))
 
 
 def test_the_buffer_survives_its_state() -> None:
     method, _ = _prepared(share=0.1)
-    method.end_task(Policy(CONFIG), _stage())
+    method.end_task(Policy(SMALL), _stage())
     other: Any = build_method("buffered_replay", {"share": 0.1})
-    other.load_state(Policy(CONFIG), method.state())
+    other.load_state(Policy(SMALL), method.state())
     for name, value in vars(method.buffer).items():
         again = getattr(other.buffer, name)
         assert isinstance(again, Tensor)

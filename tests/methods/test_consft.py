@@ -2,7 +2,6 @@
 
 import dataclasses
 import math
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -11,15 +10,15 @@ import torch
 from torch import Tensor
 
 from clbench.adaptation import adapt
-from clbench.demonstrations import Demonstrations, collect
-from clbench.method import Prior, Progress, Source, Stage, build_method
-from clbench.policy import Batch, Policy, PolicyConfig
+from clbench.method import Prior, Progress, Stage, build_method
+from clbench.policy import Batch, Policy
 from clbench.seeding import seeded
-from clbench.task import Budget, load_scenario
-from clbench.training import MethodError, deterministic, optimise
+from clbench.task import Budget
+from clbench.testing import TOY
+from clbench.testing.small import SMALL, toy_source
+from clbench.training import MethodError, optimise
 
-TOY = load_scenario("clbench.testing:clbench/Toy-v0")
-CONFIG = PolicyConfig(state_size=4, action_size=2, width=32, layers=2)
+pytestmark = pytest.mark.usefixtures("one_thread")
 UNEVEN = {"kappa": 1.0, "tau_start": 1.0, "omega_min": 0.2}
 """Settings at which samples of an untrained policy have weights from the floor to above a half."""
 
@@ -38,26 +37,14 @@ TABLE = (
 )
 
 
-@pytest.fixture(autouse=True)
-def _one_thread() -> Iterator[None]:
-    with deterministic():
-        yield
-
-
-def _source(seed: int) -> Source[Batch]:
-    task = TOY.task("right")
-    data = Demonstrations.of_task(task, collect(task, TOY.budget), CONFIG.chunk)
-    return Source(data, torch.Generator().manual_seed(seed), 16)
-
-
 def _stage(steps: int) -> Stage:
-    return Stage(1, TOY.task("right"), 0, steps, _source(0), Prior({}))
+    return Stage(1, TOY.task("right"), 0, steps, toy_source("right"), Prior({}))
 
 
 def _started(spec: str, **changes: Any) -> Any:
     """Return a method that has begun its first stage."""
     method = build_method(spec, changes)
-    method.start_task(Policy(CONFIG), _stage(10))
+    method.start_task(Policy(SMALL), _stage(10))
     return method
 
 
@@ -124,7 +111,7 @@ def test_a_perfect_sample_weighs_1_and_a_hopeless_one_the_floor() -> None:
 
 
 def test_an_infinite_loss_stops_the_run_although_its_weight_is_the_floor() -> None:
-    policy, batch = Policy(CONFIG), _source(0).sample(2)
+    policy, batch = Policy(SMALL), toy_source("right").sample(2)
     # at flow time 1 the head reads noise alone: its velocity is finite, the action to be hit is not
     batch = dataclasses.replace(
         batch, action=torch.full_like(batch.action, 1e25), draw=torch.ones(2), valid=torch.ones(2, 8)
@@ -138,7 +125,7 @@ def test_an_infinite_loss_stops_the_run_although_its_weight_is_the_floor() -> No
 
 @pytest.mark.parametrize("step", [0, 60])
 def test_the_gradient_is_the_mean_of_the_weighted_gradients_of_the_samples(step: int) -> None:
-    policy, batch = Policy(CONFIG), _source(1).sample(8)
+    policy, batch = Policy(SMALL), toy_source("right", seed=1).sample(8)
     method = _started("consft", **UNEVEN)
     found = _set_gradient(method, policy, batch, Progress(step, 100))
     rows = [Batch(**{name: value[row : row + 1] for name, value in vars(batch).items()}) for row in range(8)]
@@ -154,7 +141,7 @@ def test_the_gradient_is_the_mean_of_the_weighted_gradients_of_the_samples(step:
 
 
 def test_no_gradient_flows_through_the_weights() -> None:
-    policy, batch = Policy(CONFIG), _source(1).sample(8)
+    policy, batch = Policy(SMALL), toy_source("right", seed=1).sample(8)
     method = _started("consft", **UNEVEN)
     assert not method.weights(policy.action_loss(batch), Progress(0, 100)).requires_grad
     found = _set_gradient(method, policy, batch, Progress(0, 100))
@@ -166,7 +153,7 @@ def test_no_gradient_flows_through_the_weights() -> None:
 @pytest.mark.parametrize("seed", range(3))
 def test_one_sample_disrupts_what_was_known_by_the_square_of_its_weight(seed: int) -> None:
     """The paper's claim (Eq. 7): g'Fg of the weighted gradient is omega^2 that of the plain one."""
-    policy, batch = Policy(CONFIG, seed=seed), _source(seed).sample(1)
+    policy, batch = Policy(SMALL, seed=seed), toy_source("right", seed=seed).sample(1)
     method = _started("consft", kappa=1.0, tau_start=1.0)
     weighted = _set_gradient(method, policy, batch, Progress(0, 100)).double()
     loss = policy.action_loss(batch).sum()
@@ -181,7 +168,7 @@ def test_one_sample_disrupts_what_was_known_by_the_square_of_its_weight(seed: in
 
 
 def test_the_histogram_counts_each_sample_of_each_step_in_its_part_of_the_stage() -> None:
-    method, policy = build_method("consft", {}), Policy(CONFIG)
+    method, policy = build_method("consft", {}), Policy(SMALL)
     assert method.diagnostics() == {}
     adapt(policy, method, _stage(25), Budget(learning_rate=1e-3))
     told = method.diagnostics()
@@ -193,7 +180,7 @@ def test_the_histogram_counts_each_sample_of_each_step_in_its_part_of_the_stage(
 
 
 def test_the_histogram_is_that_of_the_weights() -> None:
-    policy, batch = Policy(CONFIG), _source(1).sample(64)
+    policy, batch = Policy(SMALL), toy_source("right", seed=1).sample(64)
     method = _started("consft", kappa=2.0, tau_start=1.0)
     method.loss(policy, batch, Progress(7, 10))
     omegas = [_omega(loss, 0.7, kappa=2.0, tau_start=1.0) for loss in policy.action_loss(batch).tolist()]
@@ -223,7 +210,7 @@ def test_the_calibrated_variant_changes_only_what_the_authors_tune() -> None:
 
 
 def test_a_constant_weight_is_the_mean_weight_of_consft_for_every_sample() -> None:
-    losses = Policy(CONFIG).action_loss(_source(2).sample(16))
+    losses = Policy(SMALL).action_loss(toy_source("right", seed=2).sample(16))
     consft: Any = build_method("consft", UNEVEN)
     constant: Any = build_method("constant_weight", UNEVEN)
     for step in (0, 60, 99):
@@ -233,7 +220,7 @@ def test_a_constant_weight_is_the_mean_weight_of_consft_for_every_sample() -> No
 
 
 def test_the_gradient_of_a_constant_weight_is_a_multiple_of_that_of_sft() -> None:
-    policy, batch = Policy(CONFIG), _source(2).sample(16)
+    policy, batch = Policy(SMALL), toy_source("right", seed=2).sample(16)
     found = _set_gradient(_started("constant_weight", **UNEVEN), policy, batch, Progress(0, 100))
     losses = policy.action_loss(batch)
     omega = np.mean([_omega(loss, 0.0, **UNEVEN) for loss in losses.tolist()])
@@ -241,7 +228,7 @@ def test_the_gradient_of_a_constant_weight_is_a_multiple_of_that_of_sft() -> Non
 
 
 def test_shuffled_weights_are_those_of_consft_in_another_order() -> None:
-    losses = Policy(CONFIG).action_loss(_source(2).sample(64))
+    losses = Policy(SMALL).action_loss(toy_source("right", seed=2).sample(64))
     consft: Any = build_method("consft", UNEVEN)
     shuffled: Any = build_method("shuffled_weights", UNEVEN)
     with seeded("shuffle"):
@@ -264,5 +251,5 @@ class _Reduced(Policy):
 )
 def test_a_policy_without_a_loss_for_each_sample_is_refused_by_name(spec: str, name: str) -> None:
     with pytest.raises(TypeError, match=rf"{name} .* action_loss of _Reduced must .* its shape is \(\)"):
-        build_method(spec, {}).prepare(_Reduced(CONFIG), Prior({}))
-    build_method(spec, {}).prepare(Policy(CONFIG), Prior({}))
+        build_method(spec, {}).prepare(_Reduced(SMALL), Prior({}))
+    build_method(spec, {}).prepare(Policy(SMALL), Prior({}))

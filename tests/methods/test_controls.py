@@ -2,7 +2,6 @@
 
 import dataclasses
 import math
-from collections.abc import Iterator
 from copy import deepcopy
 from typing import Any
 
@@ -13,40 +12,23 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from clbench.adaptation import adapt
-from clbench.demonstrations import Demonstrations, collect
-from clbench.method import Method, Prior, Progress, Source, Stage, build_method
-from clbench.policy import Batch, Policy, PolicyConfig, QuestionBatch
-from clbench.questions import Questions
-from clbench.task import Budget, load_scenario, resolve
-from clbench.training import deterministic, learning_rate_factor
+from clbench.method import Method, Prior, Progress, Stage, build_method
+from clbench.policy import Batch, Policy
+from clbench.task import Budget
+from clbench.testing import TOY
+from clbench.testing.small import SMALL, toy_questions, toy_source
+from clbench.training import learning_rate_factor
 
-TOY = load_scenario("clbench.testing:clbench/Toy-v0")
-CONFIG = PolicyConfig(state_size=4, action_size=2, width=32, layers=2)
+pytestmark = pytest.mark.usefixtures("one_thread")
 NOW = Progress(0, 100)
 
 
-@pytest.fixture(autouse=True)
-def _one_thread() -> Iterator[None]:
-    with deterministic():
-        yield
-
-
-def _source(task: str, seed: int = 0) -> Source[Batch]:
-    data = Demonstrations.of_task(TOY.task(task), collect(TOY.task(task), TOY.budget), CONFIG.chunk)
-    return Source(data, torch.Generator().manual_seed(seed), 16)
-
-
-def _questions(seed: int = 0) -> Source[QuestionBatch]:
-    scenes = torch.randn(200, 4, generator=torch.Generator().manual_seed(7))
-    return Source(Questions(resolve(TOY.questions), scenes), torch.Generator().manual_seed(seed), 16)
-
-
 def _prior() -> Prior:
-    return Prior({"demonstrations": _source("left"), "questions": _questions()})
+    return Prior({"demonstrations": toy_source("left"), "questions": toy_questions()})
 
 
 def _stage(steps: int = 5) -> Stage:
-    return Stage(1, TOY.task("right"), 0, steps, _source("right"), _prior())
+    return Stage(1, TOY.task("right"), 0, steps, toy_source("right"), _prior())
 
 
 def _adapt(policy: Policy, method: Method, steps: int = 5) -> None:
@@ -92,14 +74,14 @@ def _distilled(policy: Policy, teacher: Policy, batch: Batch) -> float:
 
 
 def test_lwf_distils_the_policy_that_the_target_began_with() -> None:
-    method, policy = build_method("lwf", {"strength": 0.7}), Policy(CONFIG)
+    method, policy = build_method("lwf", {"strength": 0.7}), Policy(SMALL)
     method.prepare(policy, Prior({}))
     method.start_task(policy, _stage())  # of the target before
     _adapt(policy, build_method("sft", {}))
     method.start_task(policy, _stage())
     teacher = deepcopy(policy)
     _adapt(policy, build_method("sft", {}), steps=10)
-    batch = _source("right", 3).sample(16)
+    batch = toy_source("right", seed=3).sample(16)
     distilled = _distilled(policy, teacher, batch)
     assert distilled > 1e-3
     loss = method.loss(policy, batch, NOW)
@@ -108,7 +90,7 @@ def test_lwf_distils_the_policy_that_the_target_began_with() -> None:
 
 
 def test_at_the_first_step_of_lwf_there_is_nothing_to_distil() -> None:
-    method, policy, batch = build_method("lwf", {}), Policy(CONFIG), _source("right").sample(16)
+    method, policy, batch = build_method("lwf", {}), Policy(SMALL), toy_source("right").sample(16)
     method.start_task(policy, _stage())
     plain = policy.action_loss(batch).mean()
     assert method.loss(policy, batch, NOW).item() == plain.item()
@@ -117,7 +99,7 @@ def test_at_the_first_step_of_lwf_there_is_nothing_to_distil() -> None:
 
 def test_the_teacher_of_lwf_does_not_learn() -> None:
     method: Any = build_method("lwf", {})
-    policy = Policy(CONFIG)
+    policy = Policy(SMALL)
     before = _weights(policy)
     _adapt(policy, method)
     assert not policy.head.embed.weight.equal(before["head.embed.weight"])
@@ -125,7 +107,7 @@ def test_the_teacher_of_lwf_does_not_learn() -> None:
 
 
 def test_the_gradient_of_lwf_is_that_of_both_terms() -> None:
-    method, policy, batch = build_method("lwf", {"strength": 0.7}), Policy(CONFIG), _source("up").sample(8)
+    method, policy, batch = build_method("lwf", {"strength": 0.7}), Policy(SMALL), toy_source("up").sample(8)
     method.start_task(policy, _stage())
     teacher = deepcopy(policy)
     _adapt(policy, build_method("sft", {}), steps=10)
@@ -143,10 +125,10 @@ def _vector(gradients: dict[str, Tensor]) -> NDArray[np.float64]:
 
 
 def test_a_gem_projects_the_gradient_off_what_raises_the_prior_loss() -> None:
-    policy, method = Policy(CONFIG), build_method("a_gem", {})
+    policy, method = Policy(SMALL), build_method("a_gem", {})
     # at flow time 1 the head reads the noise alone; what it predicts there is too low for one, too high for
     # the other
-    batch = dataclasses.replace(_source("right").sample(16), draw=torch.ones(16))
+    batch = dataclasses.replace(toy_source("right").sample(16), draw=torch.ones(16))
     with torch.no_grad():
         predicted = batch.noise - policy.predict(batch)
     target = dataclasses.replace(batch, action=predicted + 0.5 + 0.5 * batch.noise)
@@ -163,17 +145,17 @@ def test_a_gem_projects_the_gradient_off_what_raises_the_prior_loss() -> None:
 
 
 def test_a_gem_leaves_every_bit_of_a_gradient_that_does_not_raise_the_prior_loss() -> None:
-    policy, batch = Policy(CONFIG), _source("right").sample(16)
+    policy, batch = Policy(SMALL), toy_source("right").sample(16)
     found = _set_by(build_method("a_gem", {}), policy, (batch, batch))
     plain = _set_by(build_method("sft", {}), policy, batch)
     assert all(value.equal(plain[name]) for name, value in found.items())
 
 
 def test_a_gem_draws_a_full_batch_of_the_target_and_one_of_prior_demonstrations() -> None:
-    target, prior = build_method("a_gem", {}).batch(_source("right"), _prior())
+    target, prior = build_method("a_gem", {}).batch(toy_source("right"), _prior())
     assert (len(target), len(prior)) == (16, 16)
-    assert target.state.equal(_source("right").sample(16).state)
-    assert prior.state.equal(_source("left").sample(16).state)
+    assert target.state.equal(toy_source("right").sample(16).state)
+    assert prior.state.equal(toy_source("left").sample(16).state)
 
 
 # ---- weight interpolation ----------------------------------------------------------------------------------
@@ -182,7 +164,7 @@ def test_a_gem_draws_a_full_batch_of_the_target_and_one_of_prior_demonstrations(
 @pytest.mark.parametrize("coefficient", [0.0, 0.25, 0.5, 1.0])
 def test_weight_interpolation_goes_its_share_of_the_way(coefficient: float) -> None:
     method = build_method("weight_interpolation", {"coefficient": coefficient})
-    policy, plain = Policy(CONFIG), Policy(CONFIG)
+    policy, plain = Policy(SMALL), Policy(SMALL)
     before = _weights(policy)
     _adapt(policy, method)
     _adapt(plain, build_method("sft", {}))
@@ -196,7 +178,7 @@ def test_weight_interpolation_goes_its_share_of_the_way(coefficient: float) -> N
 
 
 def test_weight_interpolation_goes_back_to_where_the_stage_began() -> None:
-    policy, method = Policy(CONFIG), build_method("weight_interpolation", {"coefficient": 0.0})
+    policy, method = Policy(SMALL), build_method("weight_interpolation", {"coefficient": 0.0})
     _adapt(policy, build_method("sft", {}))
     before = _weights(policy)
     _adapt(policy, method)
@@ -207,7 +189,7 @@ def test_weight_interpolation_goes_back_to_where_the_stage_began() -> None:
 
 
 def test_the_step_sizes_of_finch_follow_the_average_of_the_losses() -> None:
-    method, policy, source = build_method("finch", {"kappa": 0.9}), Policy(CONFIG), _source("right")
+    method, policy, source = build_method("finch", {"kappa": 0.9}), Policy(SMALL), toy_source("right")
     method.start_task(policy, _stage())
     average, found, expected = 0.0, [], []
     for step in range(20):
@@ -222,7 +204,7 @@ def test_the_step_sizes_of_finch_follow_the_average_of_the_losses() -> None:
 
 
 def test_finch_never_exceeds_the_schedule_and_reaches_it_where_the_loss_is_low() -> None:
-    policy, batch = Policy(CONFIG), _source("right").sample(16)
+    policy, batch = Policy(SMALL), toy_source("right").sample(16)
     rates = []
     for kappa in (1e-3, 1e-2, 1e3):
         method = build_method("finch", {"kappa": kappa})
@@ -233,13 +215,13 @@ def test_finch_never_exceeds_the_schedule_and_reaches_it_where_the_loss_is_low()
 
 
 def test_finch_forgets_the_losses_of_the_last_target() -> None:
-    method, policy, rates = build_method("finch", {}), Policy(CONFIG), []
+    method, policy, rates = build_method("finch", {}), Policy(SMALL), []
     for batches in (0, 3):
         method.start_task(policy, _stage())
         for seed in range(batches):
-            method.loss(policy, _source("up", seed).sample(2), NOW)
+            method.loss(policy, toy_source("up", seed=seed).sample(2), NOW)
         method.start_task(policy, _stage())
-        method.loss(policy, _source("right").sample(16), NOW)
+        method.loss(policy, toy_source("right").sample(16), NOW)
         rates.append(method.learning_rate(0.01, NOW))
     assert rates[0] == rates[1]
 
@@ -248,10 +230,10 @@ def test_finch_forgets_the_losses_of_the_last_target() -> None:
 def test_low_rate_sft_moves_every_weight_by_its_share_of_a_step(
     changes: dict[str, float], share: float
 ) -> None:
-    start = _weights(Policy(CONFIG))
+    start = _weights(Policy(SMALL))
     moves = []
     for method in (build_method("sft", {}), build_method("low_rate_sft", changes)):
-        policy = Policy(CONFIG)
+        policy = Policy(SMALL)
         _adapt(policy, method, steps=1)
         moves.append({name: weight - start[name] for name, weight in _weights(policy).items()})
     plain, slow = moves
@@ -272,7 +254,7 @@ def test_low_rate_sft_keeps_the_form_of_the_schedule() -> None:
 
 
 def test_stop_gradient_keeps_the_backbone_and_its_answers_to_the_last_bit() -> None:
-    policy, questions = Policy(CONFIG), _questions(3).sample(32)
+    policy, questions = Policy(SMALL), toy_questions(3).sample(32)
     before = _weights(policy)
     answers = policy.answer_logits(questions.state, questions.words)
     _adapt(policy, build_method("stop_gradient", {}), steps=10)
@@ -282,13 +264,13 @@ def test_stop_gradient_keeps_the_backbone_and_its_answers_to_the_last_bit() -> N
 
 
 def test_stop_gradient_gives_the_optimiser_the_head_alone() -> None:
-    policy = Policy(CONFIG)
+    policy = Policy(SMALL)
     given: Any = build_method("stop_gradient", {}).start_task(policy, _stage())
     assert {id(weight) for weight in given} == {id(weight) for weight in policy.head.parameters()}
 
 
 def test_the_head_of_stop_gradient_learns_from_the_plain_action_loss() -> None:
-    policy, batch, method = Policy(CONFIG), _source("right").sample(16), build_method("stop_gradient", {})
+    policy, batch, method = Policy(SMALL), toy_source("right").sample(16), build_method("stop_gradient", {})
     plain = policy.action_loss(batch).mean()
     assert method.loss(policy, batch, NOW).item() == pytest.approx(plain.item(), rel=1e-6)
     gradients = _gradients(policy, plain)
@@ -299,8 +281,8 @@ def test_the_head_of_stop_gradient_learns_from_the_plain_action_loss() -> None:
 
 
 def test_knowledge_insulation_trains_the_backbone_on_questions_and_the_head_on_actions() -> None:
-    policy, method = Policy(CONFIG), build_method("knowledge_insulation", {"alpha": 0.5})
-    batch, questions = _source("right").sample(16), _questions().sample(8)
+    policy, method = Policy(SMALL), build_method("knowledge_insulation", {"alpha": 0.5})
+    batch, questions = toy_source("right").sample(16), toy_questions().sample(8)
     acting = _gradients(policy, 0.5 * policy.action_loss(batch).mean())
     answering = _gradients(policy, policy.answer_loss(questions).mean())
     found = _set_by(method, policy, (batch, questions))
@@ -316,8 +298,8 @@ def test_knowledge_insulation_trains_the_backbone_on_questions_and_the_head_on_a
 
 
 def test_co_training_descends_the_sum_of_both_losses() -> None:
-    policy, method = Policy(CONFIG), build_method("co_training", {"auxiliary": 0.3})
-    batch, questions = _source("right").sample(16), _questions().sample(8)
+    policy, method = Policy(SMALL), build_method("co_training", {"auxiliary": 0.3})
+    batch, questions = toy_source("right").sample(16), toy_questions().sample(8)
     loss = policy.action_loss(batch).mean() + 0.3 * policy.answer_loss(questions).mean()
     assert method.loss(policy, (batch, questions), NOW).item() == pytest.approx(loss.item(), rel=1e-6)
     _check_close(_set_by(method, policy, (batch, questions)), _gradients(policy, loss))
@@ -325,7 +307,7 @@ def test_co_training_descends_the_sum_of_both_losses() -> None:
 
 @pytest.mark.parametrize("spec", ["co_training", "knowledge_insulation"])
 def test_half_as_many_questions_as_demonstrations_are_asked(spec: str) -> None:
-    batch, questions = build_method(spec, {}).batch(_source("right"), _prior())
+    batch, questions = build_method(spec, {}).batch(toy_source("right"), _prior())
     assert (len(batch), len(questions)) == (16, 8)
-    assert batch.state.equal(_source("right").sample(16).state)
-    assert questions.answer.equal(_questions().sample(8).answer)
+    assert batch.state.equal(toy_source("right").sample(16).state)
+    assert questions.answer.equal(toy_questions().sample(8).answer)

@@ -1,6 +1,5 @@
 """EWC and L2-SP: what pulls weights back, where to, and how strongly."""
 
-from collections.abc import Iterator
 from typing import Any
 
 import pytest
@@ -8,35 +7,23 @@ import torch
 from torch import Tensor
 
 from clbench.adaptation import adapt
-from clbench.demonstrations import Demonstrations, collect
 from clbench.method import Prior, Progress, Source, Stage, build_method
-from clbench.policy import Batch, Policy, PolicyConfig
-from clbench.task import Budget, load_scenario
-from clbench.training import deterministic
+from clbench.policy import Batch, Policy
+from clbench.task import Budget
+from clbench.testing import TOY
+from clbench.testing.small import SMALL, toy_source
 
-TOY = load_scenario("clbench.testing:clbench/Toy-v0")
-CONFIG = PolicyConfig(state_size=4, action_size=2, width=32, layers=2)
+pytestmark = pytest.mark.usefixtures("one_thread")
 Weights = dict[str, Tensor]
 
 
-@pytest.fixture(autouse=True)
-def _one_thread() -> Iterator[None]:
-    with deterministic():
-        yield
-
-
-def _source(task: str, seed: int) -> Source[Batch]:
-    data = Demonstrations.of_task(TOY.task(task), collect(TOY.task(task), TOY.budget), CONFIG.chunk)
-    return Source(data, torch.Generator().manual_seed(seed), 16)
-
-
 def _stage(seed: int = 0) -> Stage:
-    return Stage(1, TOY.task("right"), 0, 3, _source("right", seed), Prior({}))
+    return Stage(1, TOY.task("right"), 0, 3, toy_source("right", seed=seed), Prior({}))
 
 
 def _prepared(spec: str, policy: Policy, **changes: Any) -> Any:
     method = build_method(spec, changes)
-    method.prepare(policy, Prior({"demonstrations": _source("left", 0)}))
+    method.prepare(policy, Prior({"demonstrations": toy_source("left")}))
     return method
 
 
@@ -76,12 +63,12 @@ def _set(method: Any, policy: Policy, batch: Batch) -> list[Tensor | None]:
 
 
 def test_importance_is_the_mean_squared_gradient_of_single_samples() -> None:
-    policy = Policy(CONFIG)
+    policy = Policy(SMALL)
     before = _weights(policy)
     method = _prepared("ewc", policy, samples=12)
-    _check_close(method.importance, _fisher(policy, _source("left", 0), 12))
+    _check_close(method.importance, _fisher(policy, toy_source("left"), 12))
     # not the square of the mean gradient, which is near 0 where training has ended
-    batch = Batch.cat([source.sample(1) for source in [_source("left", 0)] for _ in range(12)])
+    batch = Batch.cat([source.sample(1) for source in [toy_source("left")] for _ in range(12)])
     (mean,) = torch.autograd.grad(policy.action_loss(batch).mean(), [policy.head.embed.weight])
     assert (method.importance["head.embed.weight"] > 1.2 * mean.square()).float().mean() > 0.5
     assert all(method.anchor[name].equal(weight) for name, weight in before.items())
@@ -92,7 +79,7 @@ def test_importance_is_the_mean_squared_gradient_of_single_samples() -> None:
     ("spec", "changes"), [("ewc", {"samples": 4, "strength": 50.0}), ("l2_sp", {"strength": 0.7})]
 )
 def test_the_pull_is_the_gradient_of_the_penalty(spec: str, changes: dict[str, Any]) -> None:
-    policy, batch = Policy(CONFIG), _source("right", 1).sample(8)
+    policy, batch = Policy(SMALL), toy_source("right", seed=1).sample(8)
     method = _prepared(spec, policy, **changes)
     _moved(policy)
     found = _set(method, policy, batch)
@@ -117,7 +104,7 @@ def test_the_pull_is_the_gradient_of_the_penalty(spec: str, changes: dict[str, A
 
 @pytest.mark.parametrize(("spec", "changes"), [("ewc", {"samples": 4}), ("l2_sp", {})])
 def test_at_the_anchor_nothing_pulls(spec: str, changes: dict[str, Any]) -> None:
-    policy, batch = Policy(CONFIG), _source("right", 1).sample(8)
+    policy, batch = Policy(SMALL), toy_source("right", seed=1).sample(8)
     found = _set(_prepared(spec, policy, **changes), policy, batch)
     plain = torch.autograd.grad(
         policy.action_loss(batch).mean(), list(policy.parameters()), allow_unused=True
@@ -128,18 +115,18 @@ def test_at_the_anchor_nothing_pulls(spec: str, changes: dict[str, Any]) -> None
 
 
 def test_after_a_target_its_importance_is_added_and_the_anchor_moves_there() -> None:
-    policy = Policy(CONFIG)
+    policy = Policy(SMALL)
     method = _prepared("ewc", policy, samples=6)
     retained = {name: value.clone() for name, value in method.importance.items()}
     _moved(policy)
     method.end_task(policy, _stage(5))
-    target = _fisher(policy, _source("right", 5), 6)
+    target = _fisher(policy, toy_source("right", seed=5), 6)
     _check_close(method.importance, {name: value + target[name] for name, value in retained.items()})
     assert all(method.anchor[name].equal(weight) for name, weight in policy.named_parameters())
 
 
 def test_the_anchor_of_l2_sp_stays_where_pretraining_left_it() -> None:
-    policy = Policy(CONFIG)
+    policy = Policy(SMALL)
     before = _weights(policy)
     method = _prepared("l2_sp", policy)
     adapt(policy, method, _stage(), Budget(learning_rate=1e-3))
@@ -149,7 +136,7 @@ def test_the_anchor_of_l2_sp_stays_where_pretraining_left_it() -> None:
 
 @pytest.mark.parametrize(("spec", "changes"), [("ewc", {"samples": 4}), ("l2_sp", {})])
 def test_anchor_and_importance_survive_the_state(spec: str, changes: dict[str, Any]) -> None:
-    policy, batch = Policy(CONFIG), _source("right", 1).sample(8)
+    policy, batch = Policy(SMALL), toy_source("right", seed=1).sample(8)
     method, other = _prepared(spec, policy, **changes), build_method(spec, changes)
     other.load_state(policy, method.state())
     _moved(policy)
@@ -162,9 +149,9 @@ def test_anchor_and_importance_survive_the_state(spec: str, changes: dict[str, A
 def test_a_stronger_penalty_leaves_the_weights_nearer_to_where_they_were() -> None:
     distances = []
     for strength in (0.0, 100.0):
-        policy = Policy(CONFIG)
+        policy = Policy(SMALL)
         before = _weights(policy)
-        stage = Stage(1, TOY.task("right"), 0, 30, _source("right", 0), Prior({}))
+        stage = Stage(1, TOY.task("right"), 0, 30, toy_source("right"), Prior({}))
         adapt(policy, _prepared("l2_sp", policy, strength=strength), stage, Budget(learning_rate=1e-3))
         moved = [(weight - before[name]).square().sum() for name, weight in _weights(policy).items()]
         distances.append(float(torch.stack(moved).sum()))
@@ -180,4 +167,4 @@ class _Reduced(Policy):
 
 def test_ewc_refuses_a_policy_without_a_loss_for_each_sample_by_name() -> None:
     with pytest.raises(TypeError, match=r"EWC looks at samples one by one: action_loss of _Reduced"):
-        _prepared("ewc", _Reduced(CONFIG))
+        _prepared("ewc", _Reduced(SMALL))

@@ -1,7 +1,6 @@
 """FastDVLA: the capability vector, the merge, and the regulariser that keeps it."""
 
 import importlib
-from collections.abc import Iterator
 from copy import deepcopy
 from typing import Any, NoReturn
 
@@ -10,37 +9,18 @@ import pytest
 import torch
 from torch import Tensor
 
-from clbench.demonstrations import Demonstrations, collect
-from clbench.method import Prior, Progress, Source, Stage, build_method, load_method
-from clbench.policy import Batch, Policy, PolicyConfig, QuestionBatch
-from clbench.questions import Questions
-from clbench.task import load_scenario, resolve
-from clbench.training import deterministic, optimise
+from clbench.method import Prior, Progress, Stage, build_method, load_method
+from clbench.policy import Policy
+from clbench.testing import TOY
+from clbench.testing.small import SMALL, toy_questions, toy_source
+from clbench.training import optimise
 
-TOY = load_scenario("clbench.testing:clbench/Toy-v0")
-CONFIG = PolicyConfig(state_size=4, action_size=2, width=32, layers=2)
+pytestmark = pytest.mark.usefixtures("one_thread")
 FEW = {"steps": 6, "step_size": 1e-3}
 
 
-@pytest.fixture(autouse=True)
-def _one_thread() -> Iterator[None]:
-    with deterministic():
-        yield
-
-
-def _source(seed: int) -> Source[Batch]:
-    tasks = TOY.retained
-    parts = [Demonstrations.of_task(task, collect(task, TOY.budget), CONFIG.chunk) for task in tasks]
-    return Source(Demonstrations.cat(parts), torch.Generator().manual_seed(seed), 16)
-
-
-def _questions(seed: int) -> Source[QuestionBatch]:
-    scenes = torch.randn(200, 4, generator=torch.Generator().manual_seed(7))
-    return Source(Questions(resolve(TOY.questions), scenes), torch.Generator().manual_seed(seed), 16)
-
-
 def _prior(seed: int = 0) -> Prior:
-    return Prior({"demonstrations": _source(seed), "questions": _questions(seed)})
+    return Prior({"demonstrations": toy_source("left", "up", seed=seed), "questions": toy_questions(seed)})
 
 
 def _weights(policy: Policy) -> dict[str, Tensor]:
@@ -51,7 +31,7 @@ def _prepared(policy: Policy, **changes: Any) -> Any:
     """Return a method that has prepared the policy and begun a stage."""
     method = build_method("fast_dvla", {**FEW, **changes})
     assert method.prepare(policy, _prior()) == 2 * FEW["steps"]
-    method.start_task(policy, Stage(1, TOY.task("right"), 0, 10, _source(1), Prior({})))
+    method.start_task(policy, Stage(1, TOY.task("right"), 0, 10, toy_source("left", "up", seed=1), Prior({})))
     return method
 
 
@@ -72,7 +52,7 @@ def _moved(policy: Policy, seed: int = 0) -> None:
 
 def _fine_tuned(policy: Policy, auxiliary: bool) -> dict[str, Tensor]:
     """Return the weights of a copy of the policy after six steps, questions weighing a half if asked."""
-    copy, demonstrations, questions = deepcopy(policy), _source(0), _questions(0)
+    copy, demonstrations, questions = deepcopy(policy), toy_source("left", "up"), toy_questions()
 
     def loss_at(_: int) -> Tensor:
         loss, asked = copy.action_loss(demonstrations.sample(16)).mean(), questions.sample(8)
@@ -83,7 +63,7 @@ def _fine_tuned(policy: Policy, auxiliary: bool) -> dict[str, Tensor]:
 
 
 def test_the_vector_is_the_difference_of_two_fine_tunings_and_alpha_of_it_is_merged() -> None:
-    policy = Policy(CONFIG, seed=3)
+    policy = Policy(SMALL, seed=3)
     before = _weights(policy)
     plain, with_auxiliary = _fine_tuned(policy, False), _fine_tuned(policy, True)
     method = _prepared(policy, auxiliary=0.5, alpha=0.7)
@@ -98,12 +78,12 @@ def test_the_vector_is_the_difference_of_two_fine_tunings_and_alpha_of_it_is_mer
 
 
 def test_without_an_auxiliary_objective_there_is_no_vector() -> None:
-    method = _prepared(Policy(CONFIG), auxiliary=0.0)
+    method = _prepared(Policy(SMALL), auxiliary=0.0)
     assert not any(value.any() for value in method.vector.values())
 
 
 def test_with_alpha_0_the_policy_stays_as_it_was_bit_for_bit() -> None:
-    policy = Policy(CONFIG)
+    policy = Policy(SMALL)
     before = _weights(policy)
     method = _prepared(policy, alpha=0.0)
     assert any(value.any() for value in method.vector.values())
@@ -111,7 +91,7 @@ def test_with_alpha_0_the_policy_stays_as_it_was_bit_for_bit() -> None:
 
 
 def test_the_regularisers_gradient_is_that_of_its_formula() -> None:
-    policy = Policy(CONFIG)
+    policy = Policy(SMALL)
     method = _prepared(policy, orthogonal=0.3)
     assert not any(value.any() for value in _regulariser_gradient(method, policy).values())  # sign(0) = 0
     _moved(policy)
@@ -128,7 +108,7 @@ def test_the_regularisers_gradient_is_that_of_its_formula() -> None:
 
 
 def test_the_regularisers_gradient_agrees_with_finite_differences() -> None:
-    policy = Policy(CONFIG)
+    policy = Policy(SMALL)
     method = _prepared(policy, orthogonal=0.3)
     _moved(policy)
     found = _regulariser_gradient(method, policy)
@@ -151,7 +131,7 @@ def test_the_regularisers_gradient_agrees_with_finite_differences() -> None:
 
 
 def test_the_regulariser_is_added_to_the_gradient_of_the_loss() -> None:
-    policy, batch = Policy(CONFIG), _source(4).sample(8)
+    policy, batch = Policy(SMALL), toy_source("left", "up", seed=4).sample(8)
     method = _prepared(policy, orthogonal=0.3)
     _moved(policy)
     penalty = _regulariser_gradient(method, policy)
@@ -168,7 +148,7 @@ def test_the_regulariser_is_added_to_the_gradient_of_the_loss() -> None:
 
 
 def test_the_random_control_has_the_norm_of_the_vector_in_each_matrix() -> None:
-    first, second = Policy(CONFIG), Policy(CONFIG)
+    first, second = Policy(SMALL), Policy(SMALL)
     vector, random = (_prepared(first).vector, _prepared(second, direction="random").vector)
     for name, value in vector.items():
         assert float(random[name].norm()) == pytest.approx(float(value.norm()), rel=1e-4), name
@@ -179,13 +159,13 @@ def test_the_random_control_has_the_norm_of_the_vector_in_each_matrix() -> None:
     ]
     assert max(np.abs(cosines)) < 0.2
     for name, weight in second.named_parameters():
-        start = dict(Policy(CONFIG).named_parameters())[name]
+        start = dict(Policy(SMALL).named_parameters())[name]
         torch.testing.assert_close(weight, start + 1.1 * random[name], rtol=0, atol=1e-6)
 
 
 @pytest.mark.usefixtures("empty_caches")
 def test_the_vector_is_made_once_and_its_steps_count_every_time(monkeypatch: pytest.MonkeyPatch) -> None:
-    policies = [Policy(CONFIG, seed=5) for _ in range(3)]
+    policies = [Policy(SMALL, seed=5) for _ in range(3)]
     first = _prepared(policies[0])
 
     def explode(*_: Any) -> NoReturn:
@@ -196,7 +176,7 @@ def test_the_vector_is_made_once_and_its_steps_count_every_time(monkeypatch: pyt
     assert all(second.vector[name].equal(value) for name, value in first.vector.items())
     # merging and regularising need no other vector; another objective, or another policy, does
     _prepared(policies[2], alpha=0.5, orthogonal=1.0, direction="random")
-    for policy, changes in ((Policy(CONFIG, seed=5), {"auxiliary": 0.5}), (Policy(CONFIG, seed=6), {})):
+    for policy, changes in ((Policy(SMALL, seed=5), {"auxiliary": 0.5}), (Policy(SMALL, seed=6), {})):
         with pytest.raises(AssertionError, match="made a second time"):
             _prepared(policy, **changes)
 
@@ -205,17 +185,17 @@ def test_other_demonstrations_make_another_vector() -> None:
     vectors = []
     for seed in (0, 1):
         method: Any = build_method("fast_dvla", FEW)
-        method.prepare(Policy(CONFIG), _prior(seed))
+        method.prepare(Policy(SMALL), _prior(seed))
         vectors.append(method.vector)
     assert not any(vectors[0][name].equal(vectors[1][name]) for name in vectors[0])
 
 
 def test_vector_and_merged_weights_survive_the_state() -> None:
-    policy = Policy(CONFIG)
+    policy = Policy(SMALL)
     method = _prepared(policy, orthogonal=0.3)
     other: Any = build_method("fast_dvla", {"orthogonal": 0.3})
     other.load_state(policy, method.state())
-    other.start_task(policy, Stage(2, TOY.task("down"), 0, 10, _source(1), Prior({})))
+    other.start_task(policy, Stage(2, TOY.task("down"), 0, 10, toy_source("left", "up", seed=1), Prior({})))
     _moved(policy)
     first, second = (_regulariser_gradient(each, policy) for each in (method, other))
     assert first.keys() == second.keys()

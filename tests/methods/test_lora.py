@@ -1,7 +1,6 @@
 """LoRA: the policy under its adapters, and what the adapters add up to."""
 
 import math
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -12,32 +11,19 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from clbench.adaptation import adapt
-from clbench.demonstrations import Demonstrations, collect
-from clbench.method import Prior, Progress, Source, Stage, build_method
-from clbench.policy import Batch, Policy, PolicyConfig, load_policy, save_policy
-from clbench.task import Budget, load_scenario
-from clbench.training import deterministic
+from clbench.method import Prior, Progress, Stage, build_method
+from clbench.policy import Policy, load_policy, save_policy
+from clbench.task import Budget
+from clbench.testing import TOY
+from clbench.testing.small import SMALL, toy_source
 
-TOY = load_scenario("clbench.testing:clbench/Toy-v0")
-CONFIG = PolicyConfig(state_size=4, action_size=2, width=32, layers=2)
+pytestmark = pytest.mark.usefixtures("one_thread")
 MAP = "backbone.layers.1.attention.key_value"
 VARIANTS = pytest.mark.parametrize("variant", ["lora", "dora", "rslora"])
 
 
-@pytest.fixture(autouse=True)
-def _one_thread() -> Iterator[None]:
-    with deterministic():
-        yield
-
-
-def _source(seed: int) -> Source[Batch]:
-    task = TOY.task("right")
-    data = Demonstrations.of_task(task, collect(task, TOY.budget), CONFIG.chunk)
-    return Source(data, torch.Generator().manual_seed(seed), 16)
-
-
 def _stage() -> Stage:
-    return Stage(1, TOY.task("right"), 0, 8, _source(0), Prior({}))
+    return Stage(1, TOY.task("right"), 0, 8, toy_source("right"), Prior({}))
 
 
 def _weights(policy: Policy) -> dict[str, Tensor]:
@@ -53,7 +39,7 @@ def _adapters(policy: Policy) -> dict[str, Tensor]:
 
 def _adapted(variant: str, **changes: Any) -> tuple[Any, Policy]:
     """Return a method and the policy after a short stage of it."""
-    method, policy = build_method("lora", {"variant": variant, "rank": 4, **changes}), Policy(CONFIG, seed=1)
+    method, policy = build_method("lora", {"variant": variant, "rank": 4, **changes}), Policy(SMALL, seed=1)
     with torch.random.fork_rng():
         torch.manual_seed(0)
         method.prepare(policy, Prior({}))
@@ -63,7 +49,7 @@ def _adapted(variant: str, **changes: Any) -> tuple[Any, Policy]:
 
 @VARIANTS
 def test_adapters_begin_as_no_change_and_sit_on_every_linear_map_of_the_layers(variant: str) -> None:
-    policy, batch = Policy(CONFIG), _source(1).sample(8)
+    policy, batch = Policy(SMALL), toy_source("right", seed=1).sample(8)
     before = policy.action_loss(batch).detach()
     build_method("lora", {"variant": variant}).prepare(policy, Prior({}))
     torch.testing.assert_close(policy.action_loss(batch).detach(), before, rtol=1e-5, atol=1e-6)
@@ -80,7 +66,7 @@ def test_adapters_begin_as_no_change_and_sit_on_every_linear_map_of_the_layers(v
 
 @VARIANTS
 def test_the_weights_under_the_adapters_never_change_and_all_adapters_train(variant: str) -> None:
-    method, policy = build_method("lora", {"variant": variant}), Policy(CONFIG, seed=1)
+    method, policy = build_method("lora", {"variant": variant}), Policy(SMALL, seed=1)
     before = _weights(policy)
     method.prepare(policy, Prior({}))
     adapters = _adapters(policy)
@@ -100,8 +86,8 @@ def test_merged_adapters_act_as_they_did(variant: str) -> None:
     from peft.tuners.lora import LoraLayer
 
     _, policy = _adapted(variant)
-    batch = _source(1).sample(8)
-    start = Policy(CONFIG, seed=1).act(batch.state, batch.words, batch.noise)
+    batch = toy_source("right", seed=1).sample(8)
+    start = Policy(SMALL, seed=1).act(batch.state, batch.words, batch.noise)
     loss, actions = policy.action_loss(batch).detach(), policy.act(batch.state, batch.words, batch.noise)
     assert (actions - start).abs().max() > 1e-3
     layers = [module for module in policy.modules() if isinstance(module, LoraLayer)]
@@ -142,7 +128,7 @@ def test_an_adapted_policy_survives_saving_and_goes_on_as_it_would_have(variant:
     save_policy(policy, tmp_path)
     other: Any = build_method("lora", {"variant": variant, "rank": 4})
     loaded = load_policy(tmp_path, lambda plain: other.load_state(plain, method.state()))
-    batch = _source(1).sample(8)
+    batch = toy_source("right", seed=1).sample(8)
     assert loaded.action_loss(batch).equal(policy.action_loss(batch))
     assert loaded.act(batch.state, batch.words, batch.noise).equal(
         policy.act(batch.state, batch.words, batch.noise)

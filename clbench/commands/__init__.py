@@ -1,0 +1,1 @@
+"""Commands that are longer than a screen; `clbench.cli` names them."""

@@ -1,0 +1,176 @@
+"""The commands `clbench run` and `clbench tune`."""
+
+from __future__ import annotations
+
+import itertools
+import sys
+import time
+from pathlib import Path
+from typing import Annotated
+
+from cyclopts import Parameter
+from rich.console import Console
+from rich.table import Table
+
+from clbench.arguments import at_least, checked_input, look_here
+from clbench.grid import benchmark_jobs, run_with_bars, stages_jobs
+from clbench.live import require_tensorboard
+from clbench.method import method_names
+from clbench.metrics import measure
+from clbench.record import RECORDS, TUNING, read_record
+from clbench.run import RunSpec, check_device, has_record, read_changes
+from clbench.scores import Scores
+from clbench.stages import has_stages
+from clbench.statistics import expected_precision
+from clbench.task import load_scenario
+
+
+def run(
+    scenario: str,
+    /,
+    *methods: str,
+    every: Annotated[bool, Parameter(name="--all", negative="")] = False,
+    seeds: int = 3,
+    first_seed: int = 0,
+    workers: int | None = None,
+    records: Path = RECORDS,
+    device: str = "cpu",
+    changes: Annotated[dict[str, str] | None, Parameter(name="--set")] = None,
+    checkpoints: Path | None = None,
+    tensorboard: Path | None = None,
+) -> None:
+    """Run METHODS on SCENARIO, once per seed, and write a record of each run.
+
+    What is missing is made first: demonstrations, then a pretrained policy for each seed. A run that has a
+    record is skipped, so a stopped command goes on where it was.
+
+    Args:
+        scenario: Gymnasium id of the scenario, as clbench/Fetch-v0; module:id imports the module first.
+        methods: Names of installed methods, or module:Class.
+        every: Run all installed methods.
+        seeds: How many seeds.
+        first_seed: The first of them.
+        workers: Runs at once, each a process with one thread; all cores if not given.
+        records: Folder of the records.
+        device: Where policies are computed, as cpu or cuda.
+        changes: Hyper-parameters that differ from the methods' own, as --set.name value. Such a run has a
+            record of its own, which the leaderboard does not show.
+        checkpoints: Keep the policies of all stages below this folder. Those of runs that have a record are
+            made again.
+        tensorboard: Log the runs for TensorBoard below this folder, while they are under way.
+    """
+    look_here()
+    with checked_input():
+        at_least(1, "--seeds", seeds)
+        at_least(0, "--first-seed", first_seed)
+        at_least(1, "--workers", workers)
+        names = dict.fromkeys([*methods, *(method_names() if every else ())])
+        if not names:
+            raise ValueError("Name at least one method, or --all; `clbench list` shows them.")
+        check_device(device)
+        if tensorboard:
+            require_tensorboard()
+        loaded = load_scenario(scenario)
+        values = {method: read_changes(method, changes or {}) for method in names}
+    specs = [
+        RunSpec(scenario, method, seed, values[method], device)
+        for seed in range(first_seed, first_seed + seeds)
+        for method in names
+    ]
+    Console(stderr=True).print(expected_precision(loaded, seeds), highlight=False)
+    if not _run_missing(specs, records, workers, checkpoints, tensorboard):
+        sys.exit(1)
+
+
+def _run_missing(
+    specs: list[RunSpec],
+    records: Path,
+    workers: int | None,
+    checkpoints: Path | None = None,
+    tensorboard: Path | None = None,
+) -> bool:
+    """Do the runs that have no record yet, keep what policies are to be kept; return whether none failed."""
+    console = Console(stderr=True)
+    with checked_input():
+        missing = [spec for spec in specs if not has_record(spec, records)]
+    if len(missing) < len(specs):
+        console.print(f"{len(specs) - len(missing)} of {len(specs)} runs have a record already.")
+    recorded = [spec for spec in specs if spec not in missing]
+    bare = [spec for spec in recorded if checkpoints and not has_stages(spec, checkpoints)]
+    if not missing and not bare:
+        return True
+    begin = time.monotonic()
+    runs = benchmark_jobs(missing, records, checkpoints=checkpoints, tensorboard=tensorboard)
+    # what both need is made once
+    jobs = list({job.name: job for job in (*runs, *stages_jobs(bare, checkpoints))}.values())
+    failed = run_with_bars(jobs, workers, console)
+    seconds = time.monotonic() - begin
+    done = f"{len(missing)} runs" + (f" and the policies of {len(bare)}" if bare else "")
+    console.print(f"{done} in {seconds / 60:.1f} minutes; records in {records}.", highlight=False)
+    if failed:
+        console.print(
+            f"{len(failed)} failed: {', '.join(failed)}.", style="bold red", highlight=False, markup=False
+        )
+    return not failed
+
+
+def tune(
+    scenario: str,
+    method: str,
+    /,
+    *,
+    values: dict[str, str],
+    seed: int = 100,
+    targets: int | None = None,
+    workers: int | None = None,
+    records: Path = TUNING,
+) -> None:
+    """Compare settings of METHOD on SCENARIO, without a look at anything that is reported.
+
+    Every combination of the values is run with a seed that no board reports and on selection episodes, beside
+    plain fine-tuning. Show the table again with the same command; runs that have a record are skipped.
+
+    Args:
+        scenario: Gymnasium id of the scenario.
+        method: Name of an installed method, or module:Class.
+        values: Hyper-parameters and the values to try, as --values.tau_start 0.3,1,3
+        seed: Of pretraining and of every draw; the boards report seeds from 0.
+        targets: How many targets are learned, from the first; all if not given. Fewer are faster.
+        workers: Runs at once, each a process with one thread; all cores if not given.
+        records: Folder of these records.
+    """
+    look_here()
+    with checked_input():
+        at_least(0, "--seed", seed)
+        at_least(1, "--targets", targets)
+        at_least(1, "--workers", workers)
+        load_scenario(scenario)
+        lists = [[(name, value) for value in text.split(",")] for name, text in values.items()]
+        specs = []
+        for combination in map(dict, itertools.product(*lists)):
+            changes = read_changes(method, combination)
+            specs.append(RunSpec(scenario, method, seed, changes, split="selection", targets=targets))
+    baseline = RunSpec(scenario, "sft", seed, split="selection", targets=targets)
+    going_well = _run_missing([baseline, *specs], records, workers)
+    Console().print(_tuning_table(baseline, specs, records))
+    if not going_well:
+        sys.exit(1)
+
+
+def _tuning_table(baseline: RunSpec, specs: list[RunSpec], records: Path) -> Table:
+    """Return what came of the runs that have a record."""
+    names = ("adaptation", "retention", "retention_at_matched_adaptation", "question_retention")
+    table = Table(title=f"{baseline.scenario}, seed {baseline.seed}, selection episodes")
+    table.add_column("settings", no_wrap=True)
+    for name in names:
+        table.add_column(name.replace("_", " "), justify="right")
+    scores = {
+        spec.label: Scores.from_record(read_record(spec.path(records)))
+        for spec in [baseline, *specs]
+        if has_record(spec, records)
+    }
+    reference = scores.get(baseline.label)
+    for label, one in scores.items():
+        row = [measure(name, one, {"sft": reference} if reference else {}) for name in names]
+        table.add_row(label, *("-" if value is None else f"{value:.2f}" for value in row))
+    return table

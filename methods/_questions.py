@@ -1,0 +1,12 @@
+"""Questions beside demonstrations, as much of each as in pretraining."""
+
+from clbench.method import Source
+from clbench.policy import Batch, QuestionBatch
+
+
+def with_questions(
+    demonstrations: Source[Batch], questions: Source[QuestionBatch]
+) -> tuple[Batch, QuestionBatch]:
+    """Return a batch of demonstrations and half a one of questions."""
+    size = demonstrations.batch_size
+    return demonstrations.sample(size), questions.sample(size // 2)
