@@ -53,8 +53,8 @@ check: .venv/installed-dev
 
 # What a wheel may do otherwise than the checkout, against a built one outside of it: its files, the parts that are
 # found by name, the commands.
-WHEEL_TESTS := tests/test_package.py tests/test_cli.py tests/test_new_method.py tests/test_submission.py \
-	tests/leaderboard/test_hostile_records.py tests/leaderboard/test_claims.py
+WHEEL_TESTS := tests/test_package.py tests/test_cli.py tests/test_readme.py tests/test_new_method.py \
+	tests/test_submission.py tests/methods/test_methods.py tests/leaderboard
 wheel-test: .venv/installed-dev
 	rm -rf build/wheel && mkdir -p build/wheel
 	$(BIN)/python -m build --wheel --outdir build/wheel . >/dev/null
