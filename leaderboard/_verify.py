@@ -180,10 +180,10 @@ def _recompute(subject: _Subject, _: Callable[[float], None]) -> list[Check]:
             else "as its class and the scenario say"
         )
         checks.append(Check("what was run", told, not wrong))
-    theirs, ours = run.record.fingerprint.get("rollouts"), subject.here["rollouts"]
-    worlds = ", ".join(differences(theirs, ours)) or "all worlds"
-    told = "moves as here" if theirs == ours else f"the rollouts of {worlds} differ from those here"
-    return [*checks, Check("simulator", told, theirs == ours)]
+    recorded, found = run.record.fingerprint.get("rollouts"), subject.here["rollouts"]
+    worlds = ", ".join(differences(recorded, found)) or "all worlds"
+    told = "moves as here" if recorded == found else f"the rollouts of {worlds} differ from those here"
+    return [*checks, Check("simulator", told, recorded == found)]
 
 
 def _check_horizons(record: Record, scenario: Scenario) -> Check:
