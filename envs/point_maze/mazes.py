@@ -2,7 +2,7 @@
 
 All have a hub in the middle with a passage to each side. They differ in how the corners are reached: in the
 red maze by way of the upper and the lower room, in the blue one by way of the left and the right room; in the
-green one the upper corners as in the blue maze, the lower ones as in the red. So the same room lies at the same
+green one the upper corners as in the blue maze, the lower ones as in the red. So a room lies at the same
 place in every maze, but the way to it begins in another direction.
 """
 

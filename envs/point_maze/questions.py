@@ -74,7 +74,8 @@ def _part(states: State) -> Answers:
 
 
 def _colour(states: State) -> Answers:
-    return states[:, COLOUR].argmax(axis=1)
+    colour: Answers = states[:, COLOUR].argmax(axis=1)
+    return colour
 
 
 def _moving(states: State) -> Answers:
