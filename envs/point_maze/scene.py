@@ -7,12 +7,8 @@ import importlib.util
 from pathlib import Path
 
 import mujoco
-import numpy as np
 
 from .mazes import MAZES, SIZE, Cell, centre
-
-CAMERA = {"distance": 9.2, "azimuth": 90.0, "elevation": -90.0, "lookat": np.zeros(3)}
-"""From above: left is left, up is up, and the whole maze is in the picture."""
 
 TARGET = "target"
 """Site that marks the goal in pictures."""
@@ -55,6 +51,13 @@ def scene(colour: str) -> mujoco.MjModel:
     model.geom("ground").rgba = (*FLOOR, 1.0)
     model.site("particle_site").rgba = (*BALL, 1.0)
     return model
+
+
+def camera() -> mujoco.MjvCamera:
+    """Return a camera above the maze: left is left, up is up, and all of it is in the picture."""
+    above = mujoco.MjvCamera()
+    above.distance, above.azimuth, above.elevation = 9.2, 90.0, -90.0
+    return above
 
 
 def _point_file() -> Path:

@@ -30,12 +30,17 @@ SUCCESS_BONUS = 1.0
 
 
 class _Lane:
-    """The physics of one episode in one maze."""
+    """The physics of one episode after the other in one maze."""
 
-    def __init__(self, goal: Goal, place: Place) -> None:
+    def __init__(self, goal: Goal) -> None:
         self.goal = goal
         self.model = scene(goal.maze.colour)
         self.data = mujoco.MjData(self.model)
+
+    def begin(self, goal: Goal, place: Place) -> None:
+        """Put the ball at rest at a place, and forget all that was before."""
+        self.goal = goal
+        mujoco.mj_resetData(self.model, self.data)
         self.data.qpos[:] = place
         mujoco.mj_forward(self.model, self.data)
 
@@ -73,7 +78,7 @@ class PointMazeVectorWorld:
     ends with success only; whoever uses the world counts its steps. It is a `clbench.world.VectorWorld`.
 
     Args:
-        lanes: Places for episodes. A lane takes its memory when it is first reset.
+        lanes: Places for episodes. A lane takes its memory when it is reset into another maze than before.
         threads: Not used: the steps of a ball are too short to share out.
     """
 
@@ -91,8 +96,10 @@ class PointMazeVectorWorld:
             LookupError: No task has this name; the nearest one is named.
         """
         for number, seed, task in zip(lanes, seeds, tasks, strict=True):
-            goal = goal_of(task)
-            self._lanes[number] = _Lane(goal, _start(goal, seed))
+            goal, lane = goal_of(task), self._lanes[number]
+            if lane is None or lane.goal.maze is not goal.maze:
+                self._lanes[number] = lane = _Lane(goal)
+            lane.begin(goal, _start(goal, seed))
         return self._observe(lanes)
 
     def step(

@@ -7,11 +7,10 @@ from typing import Any
 import gymnasium
 import mujoco
 import numpy as np
-from gymnasium.envs.mujoco.mujoco_rendering import MujocoRenderer
 from numpy.typing import NDArray
 
 from .mazes import GOALS
-from .scene import CAMERA
+from .scene import camera
 from .state import State
 from .vector_world import PointMazeVectorWorld
 
@@ -27,7 +26,7 @@ class PointMazeWorld(gymnasium.Env[State, NDArray[np.float32]]):
         self._world = PointMazeVectorWorld(lanes=1)
         self.observation_space = self._world.single_observation_space
         self.action_space = self._world.single_action_space
-        self._renderer: tuple[mujoco.MjData, MujocoRenderer] | None = None
+        self._renderers: dict[mujoco.MjModel, mujoco.Renderer] = {}
         self._task = next(iter(GOALS))
 
     def reset(
@@ -60,14 +59,15 @@ class PointMazeWorld(gymnasium.Env[State, NDArray[np.float32]]):
         if self.render_mode is None:
             return None
         model, data = self._world.picture_data(0)
-        if self._renderer is None or self._renderer[0] is not data:
-            self.close()
-            self._renderer = data, MujocoRenderer(model, data, CAMERA, 480, 480)
-        picture: NDArray[np.uint8] = self._renderer[1].render(self.render_mode)
+        if model not in self._renderers:
+            self._renderers[model] = mujoco.Renderer(model, 480, 480)
+        renderer = self._renderers[model]
+        renderer.update_scene(data, camera())
+        picture: NDArray[np.uint8] = renderer.render()
         return picture
 
     def close(self) -> None:
-        """Free the renderer, if there is one."""
-        if self._renderer is not None:
-            self._renderer[1].close()  # type: ignore[no-untyped-call]
-            self._renderer = None
+        """Free the renderers."""
+        for renderer in self._renderers.values():
+            renderer.close()
+        self._renderers.clear()

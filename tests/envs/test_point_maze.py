@@ -320,7 +320,7 @@ def test_pictures_show_the_maze_of_the_task_and_leave_the_episode_alone() -> Non
 import numpy as np
 from clbench.envs.point_maze.world import PointMazeWorld
 world, twin = PointMazeWorld(render_mode="rgb_array"), PointMazeWorld()
-for channel, task in ((0, "red_left"), (2, "blue_left"), (1, "green_left")):
+for channel, task in ((0, "red_left"), (2, "blue_left"), (1, "green_left"), (0, "red_left")):
     for one in (world, twin):
         one.reset(seed=0, options={"task": task})
     for action in np.random.default_rng(0).uniform(-1, 1, (10, 2)).astype(np.float32):
