@@ -8,3 +8,10 @@ register(
     vector_entry_point="clbench.scenario_vector_env:ScenarioVectorEnv",
     kwargs={"scenario": "clbench.envs.fetch:SCENARIO"},
 )
+
+register(
+    id="clbench/PointMaze-v0",
+    entry_point="clbench.scenario_env:ScenarioEnv",
+    vector_entry_point="clbench.scenario_vector_env:ScenarioVectorEnv",
+    kwargs={"scenario": "clbench.envs.point_maze:SCENARIO"},
+)

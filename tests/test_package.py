@@ -27,16 +27,6 @@ def test_importing_registers_the_scenarios_and_loads_nothing_heavy() -> None:
     assert _run(f"{code} print({heavy} & set(sys.modules))") == "set()"
 
 
-def test_listing_the_data_of_the_fetch_scenario_loads_no_simulator() -> None:
-    code = "import clbench, sys; clbench.load_scenario('clbench/Fetch-v0'); print('mujoco' in sys.modules)"
-    assert _run(code) == "False"
-
-
-def test_gymnasium_makes_a_scenario_without_an_import_of_clbench() -> None:
-    code = "import gymnasium; print(gymnasium.make('clbench:clbench/Fetch-v0').unwrapped.scenario.id)"
-    assert _run(code) == "clbench/Fetch-v0"
-
-
 def test_nothing_leaks_to_the_top_level() -> None:
     code = "import clbench.cli, clbench.methods.sft, clbench.envs.fetch, clbench.leaderboard, sys;"
     code += "print({'envs', 'methods', 'leaderboard'} & set(sys.modules))"

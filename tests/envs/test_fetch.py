@@ -2,14 +2,11 @@
 
 import copy
 import itertools
-import subprocess
-import sys
 from typing import Any
 
 import gymnasium
 import numpy as np
 import pytest
-from gymnasium.utils.env_checker import check_env
 from numpy.typing import NDArray
 
 from clbench.task import Task, load_scenario, resolve
@@ -69,19 +66,8 @@ def scene(
     return state
 
 
-def test_importing_the_scenario_loads_no_simulator() -> None:
-    program = (
-        "import sys; from clbench.task import load_scenario; load_scenario('clbench:clbench/Fetch-v0');"
-        "assert not {'mujoco', 'gymnasium_robotics'} & set(sys.modules)"
-    )
-    subprocess.run([sys.executable, "-c", program], check=True)
-
-
-# The state has no bounds, as in gymnasium-robotics; the checker suspects a mistake.
-@pytest.mark.filterwarnings("ignore:.*A Box observation space m:UserWarning")
-def test_the_world_keeps_the_rules_of_gymnasium() -> None:
+def test_states_have_28_numbers_and_actions_4() -> None:
     world = World()
-    check_env(world, skip_render_check=True)
     assert world.observation_space.shape == (28,)
     assert world.action_space == gymnasium.spaces.Box(-1.0, 1.0, (4,), np.float32)
 
@@ -107,14 +93,6 @@ def test_physics_and_observation_are_those_of_fetch_pick_and_place(seed: int) ->
     np.testing.assert_array_equal(np.stack(got)[:, :25], np.stack(expected).astype(np.float32))
 
 
-def test_an_episode_repeats_itself_whatever_ran_before() -> None:
-    world = World()
-    expected = rollout(World(), "push_left", seed=7)
-    for task, seed in [("lift", 1), ("push_left", 2), ("pick_and_place", 7)]:
-        rollout(world, task, seed, steps=31)
-        np.testing.assert_array_equal(rollout(world, "push_left", seed=7), expected)
-
-
 def test_worlds_that_run_side_by_side_do_not_touch_each_other() -> None:
     expected = [rollout(World(), "push", seed) for seed in (3, 4)]
     worlds = [World(), World()]
@@ -136,15 +114,6 @@ def test_a_copy_of_a_world_goes_on_as_the_world_does_and_leaves_it_alone() -> No
     for one in (copy.deepcopy(world), world):
         rows = [np.append(*one.step(action)[:2]) for action in actions[10:]]
         np.testing.assert_array_equal(rows, expected[11:])
-
-
-def test_an_episode_without_a_seed_continues_the_random_numbers() -> None:
-    world = World()
-    first = world.reset(seed=5)[0]
-    second = world.reset()[0]
-    assert not np.array_equal(first, second)
-    world.reset(seed=5)
-    np.testing.assert_array_equal(world.reset()[0], second)
 
 
 @pytest.mark.parametrize("task", NAMES)
@@ -195,13 +164,6 @@ def test_experts_of_retained_tasks_do_no_target_task_by_chance() -> None:
                 if terminated:
                     break
         assert successes <= 1, f"the expert of {known.name} does {task.name}"
-
-
-def test_an_unknown_task_is_an_error_that_names_the_nearest() -> None:
-    with pytest.raises(LookupError, match="Did you mean 'push_left'"):
-        World().reset(options={"task": "push_lefft"})
-    with pytest.raises(LookupError, match="Did you mean 'push_left'"):
-        resolve(SCENARIO.tasks[0].expert)("push_lefft")
 
 
 @pytest.mark.parametrize(
@@ -279,26 +241,3 @@ def test_questions_are_answered_as_one_sees_it(kind: str, expected: str | None, 
     question = QUESTIONS[kind]
     (index,) = question.answer(state)
     assert (None if index == -1 else question.answers[index]) == expected
-
-
-def test_questions_answer_many_states_as_they_answer_each() -> None:
-    world = World()
-    states = np.concatenate([rollout(world, name, seed=3)[:, :28] for name in ("push", "lift")])
-    states = states.astype(np.float32)
-    for kind in QUESTIONS.values():
-        answers = kind.answer(states)
-        assert answers.shape == (len(states),)
-        assert answers.dtype == np.int64
-        np.testing.assert_array_equal(answers, [kind.answer(state[None])[0] for state in states])
-
-
-def test_instructions_and_questions_are_plain_words() -> None:
-    sentences = [words for task in SCENARIO.tasks for words in task.instructions]
-    assert len(set(sentences)) == len(sentences) == 4 * len(SCENARIO.tasks)
-    for kind in QUESTIONS.values():
-        assert len(set(kind.wordings)) >= 3
-        sentences += [*kind.wordings, *kind.answers]
-    for sentence in sentences:
-        words = sentence.split(" ")
-        assert len(words) <= 12
-        assert all(word.isalpha() and word.islower() for word in words)

@@ -1,6 +1,5 @@
 """The vector world of Fetch, against the plain world and against gymnasium-robotics, bit for bit."""
 
-import itertools
 from typing import Any
 
 import gymnasium
@@ -103,24 +102,6 @@ def test_it_is_so_over_ten_thousand_steps_of_each_task(task: str) -> None:
     followed, successes = compare(task, steps=10_000, threads=2)
     assert followed > 5_000
     assert successes > 50
-
-
-def test_lanes_step_in_any_order_and_number_without_a_trace_in_the_others() -> None:
-    world, plain = fetch(lanes=5, threads=3), [PlainWorld() for _ in range(5)]
-    states = world.reset([4, 2, 0], [4, 2, 0], ["push", "lift", "reach"])
-    for row, lane in enumerate([4, 2, 0]):
-        task = ["push", "lift", "reach"][row]
-        np.testing.assert_array_equal(plain[lane].reset(seed=lane, options={"task": task})[0], states[row])
-    actions = np.random.default_rng(0).uniform(-1, 1, (30, 5, 4)).astype(np.float32)
-    for step, moving in zip(range(30), itertools.cycle([[4, 2, 0], [0], [2, 4], [0, 4]])):
-        states, rewards, _ = world.step(moving, actions[step, moving])
-        for row, lane in enumerate(moving):
-            state, reward, *_ = plain[lane].step(actions[step, lane])
-            assert states[row].tobytes() == state.tobytes()
-            assert rewards[row] == reward
-        if step == 15:
-            world.reset([1, 3], [9, 9], ["pull", "press"])
-    world.close()
 
 
 def test_an_action_that_cannot_be_done_is_an_error_that_names_it() -> None:

@@ -1,0 +1,74 @@
+"""The scenes of the PointMaze world: the ball of gymnasium-robotics' PointMaze with a maze around it."""
+
+from __future__ import annotations
+
+import functools
+import importlib.util
+from pathlib import Path
+
+import mujoco
+
+from .mazes import MAZES, SIZE, Cell, centre
+
+TARGET = "target"
+"""Site that marks the goal in pictures."""
+
+SUBSTEPS = 10
+"""Steps of the physics, each of 0.01 s, that an action lasts: PointMaze is made for 10 Hz."""
+
+WALL_HEIGHT = 0.4
+WALL_COLOURS = {"red": (0.70, 0.20, 0.15), "blue": (0.15, 0.30, 0.65), "green": (0.12, 0.45, 0.22)}
+FLOOR, BALL, GOAL = (0.75, 0.75, 0.72), (0.10, 0.10, 0.10), (0.95, 0.75, 0.10)
+
+
+@functools.cache
+def scene(colour: str) -> mujoco.MjModel:
+    """Return the compiled scene of a maze. All worlds of a process share it and only read.
+
+    It is what gymnasium-robotics makes of the same map, which it does by way of a file that it leaves behind.
+    """
+    specification = mujoco.MjSpec.from_file(str(_point_file()))
+    for cell in _walls(colour):
+        x, y = centre(cell)
+        specification.worldbody.add_geom(
+            name=f"block_{cell[0] + 1}_{cell[1] + 1}",
+            type=mujoco.mjtGeom.mjGEOM_BOX,
+            pos=(x, y, WALL_HEIGHT / 2),
+            size=(0.5, 0.5, WALL_HEIGHT / 2),
+            contype=1,
+            conaffinity=1,
+            rgba=(*WALL_COLOURS[colour], 1.0),
+        )
+    specification.worldbody.add_site(
+        name=TARGET,
+        type=mujoco.mjtGeom.mjGEOM_CYLINDER,
+        pos=(0.0, 0.0, 0.0),
+        size=(0.45, 0.01, 0.0),
+        rgba=(*GOAL, 0.6),
+    )
+    model = specification.compile()
+    model.geom("ground").matid = -1
+    model.geom("ground").rgba = (*FLOOR, 1.0)
+    model.site("particle_site").rgba = (*BALL, 1.0)
+    return model
+
+
+def camera() -> mujoco.MjvCamera:
+    """Return a camera above the maze: left is left, up is up, and all of it is in the picture."""
+    above = mujoco.MjvCamera()
+    above.distance, above.azimuth, above.elevation = 9.2, 90.0, -90.0
+    return above
+
+
+def _point_file() -> Path:
+    """Return the description of the ball. The package is not imported: it would load all its robots."""
+    specification = importlib.util.find_spec("gymnasium_robotics")
+    assert specification is not None
+    assert specification.origin is not None
+    return Path(specification.origin).parent / "envs" / "assets" / "point" / "point.xml"
+
+
+def _walls(colour: str) -> list[Cell]:
+    """Return the cells that are walls, row by row, those around the maze included."""
+    around = range(-1, SIZE + 1)
+    return [(row, column) for row in around for column in around if (row, column) not in MAZES[colour].free]

@@ -1,0 +1,220 @@
+"""What every built-in scenario keeps, whatever its suite: a new one is tested by being registered.
+
+A scenario that cannot be made here, for want of an extra or of a renderer, is skipped with the reason.
+"""
+
+import itertools
+import subprocess
+import sys
+import warnings
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+from numpy.typing import NDArray
+
+from clbench.policy import encode
+from clbench.scenario_env import ScenarioEnv
+from clbench.task import Scenario, Task, load_scenario, resolve, scenario_ids
+from clbench.world import Lanes, World
+
+BUILT_IN = [
+    scenario_id
+    for scenario_id in scenario_ids()
+    if str(gymnasium.registry[scenario_id].kwargs["scenario"]).startswith("clbench.envs.")
+]
+every_scenario = pytest.mark.parametrize("scenario", [load_scenario(name) for name in BUILT_IN], ids=BUILT_IN)
+
+Rows = NDArray[np.float64]
+
+
+def make(entry_point: str) -> World:
+    try:
+        world: World = resolve(entry_point)()
+    except LookupError as fault:
+        pytest.skip(str(fault))
+    return world
+
+
+def make_environment(scenario: Scenario, **options: Any) -> ScenarioEnv:
+    make(scenario.retained[0].world).close()
+    environment = gymnasium.make(scenario.id, **options).unwrapped
+    assert isinstance(environment, ScenarioEnv)
+    return environment
+
+
+def check(environment: gymnasium.Env[Any, Any]) -> None:
+    with warnings.catch_warnings():
+        # the checker prefers bounded boxes; what a simulator measures has no bound
+        warnings.filterwarnings("ignore", message=r".*A Box observation space (minimum|maximum) value is")
+        check_env(environment, skip_render_check=True)
+
+
+def actions(world: World, seed: int, steps: int) -> NDArray[np.float32]:
+    assert isinstance(world.action_space, gymnasium.spaces.Box)
+    generator = np.random.default_rng(seed)
+    return generator.uniform(-1.0, 1.0, (steps, *world.action_space.shape)).astype(np.float32)
+
+
+def rollout(world: World, task: str, seed: int, steps: int = 20) -> Rows:
+    """Return the states and rewards (steps + 1, S + 1) of an episode of random actions."""
+    state, _ = world.reset(seed=seed, options={"task": task})
+    rows = [np.append(state, 0.0)]
+    for action in actions(world, seed, steps):
+        state, reward, *_ = world.step(action)
+        rows.append(np.append(state, float(reward)))
+    return np.stack(rows)
+
+
+def first_task_of_each_world(scenario: Scenario) -> list[Task]:
+    worlds: dict[str, Task] = {}
+    for task in scenario.tasks:
+        worlds.setdefault(task.world, task)
+    return list(worlds.values())
+
+
+def run(program: str) -> None:
+    subprocess.run([sys.executable, "-c", program], check=True)
+
+
+def test_the_data_of_all_scenarios_load_no_simulator() -> None:
+    run(
+        "import clbench, sys\n"
+        f"for name in {BUILT_IN}: clbench.load_scenario(name)\n"
+        "assert not {'mujoco', 'gymnasium_robotics', 'dm_control', 'metaworld'} & set(sys.modules)"
+    )
+
+
+@every_scenario
+def test_an_outsiders_script_makes_it_without_an_import(scenario: Scenario) -> None:
+    make_environment(scenario).close()
+    run(
+        "import gymnasium\n"
+        f"environment = gymnasium.make('clbench:{scenario.id}')\n"
+        "environment.reset(seed=0)\n"
+        "environment.step(environment.action_space.sample())\n"
+        f"assert environment.unwrapped.scenario.id == '{scenario.id}'"
+    )
+
+
+@pytest.mark.parametrize("instruction", ["text", "tokens"])
+@every_scenario
+def test_gymnasiums_own_check_passes(scenario: Scenario, instruction: str) -> None:
+    check(make_environment(scenario, instruction=instruction))
+
+
+@every_scenario
+def test_gymnasiums_own_check_passes_for_its_worlds(scenario: Scenario) -> None:
+    for task in first_task_of_each_world(scenario):
+        check(make(task.world))
+
+
+@every_scenario
+def test_it_takes_two_hundred_random_steps(scenario: Scenario) -> None:
+    environment = make_environment(scenario, instruction="tokens", episodes_per_stage=1)
+    environment.reset(seed=0)
+    environment.action_space.seed(0)
+    for _ in range(200):
+        observation, reward, terminated, truncated, info = environment.step(environment.action_space.sample())
+        assert environment.observation_space.contains(observation)
+        assert np.isfinite(observation["state"]).all()
+        assert np.isfinite(reward)
+        assert info["success"] == terminated
+        if terminated or truncated:
+            environment.reset()
+    environment.close()
+
+
+@every_scenario
+def test_an_episode_repeats_itself_whatever_ran_before(scenario: Scenario) -> None:
+    others = scenario.tasks[-2:]
+    for task in first_task_of_each_world(scenario):
+        world = make(task.world)
+        expected = rollout(make(task.world), task.name, seed=7)
+        for other, seed in (
+            (other.name, seed) for other in others if other.world == task.world for seed in (1, 7)
+        ):
+            rollout(world, other, seed, steps=11)
+            np.testing.assert_array_equal(rollout(world, task.name, seed=7), expected)
+        rollout(world, task.name, seed=2)
+        np.testing.assert_array_equal(rollout(world, task.name, seed=7), expected)
+        assert not np.array_equal(rollout(world, task.name, seed=8), expected)
+
+
+@every_scenario
+def test_an_episode_without_a_seed_continues_the_random_numbers(scenario: Scenario) -> None:
+    world = make(scenario.tasks[0].world)
+    first, second = world.reset(seed=5)[0], world.reset()[0]
+    assert not np.array_equal(first, second)
+    world.reset(seed=5)
+    np.testing.assert_array_equal(world.reset()[0], second)
+
+
+@every_scenario
+def test_episodes_side_by_side_are_bit_for_bit_those_of_the_plain_world(scenario: Scenario) -> None:
+    tasks = [*scenario.tasks[:2], *scenario.tasks[-3:]]
+    plain, lanes = [make(task.world) for task in tasks], Lanes(5, threads=2)
+    states = lanes.reset([4, 2, 0], [4, 2, 0], [tasks[4], tasks[2], tasks[0]])
+    for row, lane in enumerate([4, 2, 0]):
+        state, _ = plain[lane].reset(seed=lane, options={"task": tasks[lane].name})
+        assert states[row].tobytes() == state.tobytes()
+    acts = np.stack([actions(plain[lane], lane, 20) for lane in range(5)], axis=1)
+    for step, moving in zip(range(20), itertools.cycle([[4, 2, 0], [0], [2, 4], [0, 4]])):
+        states, rewards, successes = lanes.step(moving, acts[step, moving])
+        for row, lane in enumerate(moving):
+            state, reward, success, *_ = plain[lane].step(acts[step, lane])
+            assert states[row].tobytes() == state.tobytes()
+            assert (rewards[row], successes[row]) == (reward, success)
+        if step == 10:
+            lanes.reset([1, 3], [9, 9], [tasks[1], tasks[3]])
+    lanes.close()
+
+
+@every_scenario
+def test_no_task_is_done_at_the_start(scenario: Scenario) -> None:
+    worlds = {task.world: make(task.world) for task in scenario.tasks}
+    for task in scenario.tasks:
+        world = worlds[task.world]
+        for seed in range(5):
+            _, info = world.reset(seed=seed, options={"task": task.name})
+            assert info == {"success": False, "task": task.name}
+            assert not world.step(np.zeros_like(actions(world, 0, 1)[0]))[2]
+
+
+@every_scenario
+def test_an_unknown_task_is_an_error_that_names_the_nearest(scenario: Scenario) -> None:
+    task = scenario.tasks[0]
+    message = f"{task.name}x'.* Did you mean '{task.name}'"
+    with pytest.raises(LookupError, match=message):
+        make(task.world).reset(options={"task": f"{task.name}x"})
+    with pytest.raises(LookupError, match=message):
+        resolve(task.expert)(f"{task.name}x")
+
+
+@every_scenario
+def test_instructions_and_questions_are_plain_words_of_the_vocabulary(scenario: Scenario) -> None:
+    sentences = []
+    for texts in (
+        *(task.instructions for task in scenario.tasks),
+        *(kind.wordings for kind in resolve(scenario.questions)),
+    ):
+        assert len(set(texts)) == len(texts) >= 3
+        sentences += texts
+    assert len(set(sentences)) == len(sentences), "a sentence means two things"
+    sentences += [answer for kind in resolve(scenario.questions) for answer in kind.answers]
+    assert all(word.isalpha() and word.islower() for sentence in sentences for word in sentence.split(" "))
+    encode(sentences)
+
+
+@every_scenario
+def test_questions_answer_many_states_as_they_answer_each(scenario: Scenario) -> None:
+    episodes = [rollout(make(task.world), task.name, seed=3) for task in scenario.retained[:2]]
+    states = np.concatenate(episodes)[:, :-1].astype(np.float32)
+    for kind in resolve(scenario.questions):
+        answers = kind.answer(states)
+        assert answers.shape == (len(states),)
+        assert answers.dtype == np.int64
+        assert set(answers.tolist()) <= set(range(-1, len(kind.answers)))
+        np.testing.assert_array_equal(answers, [kind.answer(state[None])[0] for state in states])
