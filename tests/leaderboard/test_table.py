@@ -219,12 +219,12 @@ def test_bytes_have_three_digits_and_go_on_to_the_next_unit(
     records: Path, add: Callable[..., Path], shown: Callable[[], tuple[str, str]]
 ) -> None:
     counts = {0: "0", 999: "999", 1234: "1.23k", 999_900: "1M", 45_678_901: "45.7M", 3 * 10**15: "3000T"}
-    for count in counts:
-        add(f"keeps_{count}", 0, edit=lambda record, count=count: record.costs.update(bytes_kept=count))
+    for number, count in enumerate(counts):
+        add(f"size_{number}", 0, edit=lambda record, count=count: record.costs.update(bytes_kept=count))
     printed = [line.split() for line in shown()[0].splitlines()]
     page = (records.parent / "index.html").read_text(encoding="utf-8")
-    for count, text in counts.items():
-        (size,) = (line[-2] for line in printed if f"keeps_{count}" in line)
+    for number, (count, text) in enumerate(counts.items()):
+        (size,) = (line[-2] for line in printed if f"size_{number}" in line)
         assert size == text
         unit = f" {text[-1]}B" if text[-1].isalpha() else ""
         assert f'<span title="{count:,} bytes">{text.rstrip("kMGT")}{unit}</span>' in page
