@@ -52,13 +52,13 @@ def main() -> None:
 def list_() -> None:
     """List the scenarios with their tasks, and the methods with the prior data that they use."""
     from clbench.method import load_method, method_names
-    from clbench.task import load_scenario, scenario_ids
+    from clbench.task import registered_scenario, scenario_ids
 
     console = Console()
     scenarios = Table(title="Scenarios", show_lines=True)
     for column in ("id", "retained", "target, in order", "held out"):
         scenarios.add_column(column, no_wrap=column == "id")
-    for scenario in map(load_scenario, scenario_ids()):
+    for scenario in map(registered_scenario, scenario_ids()):
         groups = (scenario.retained, scenario.target, scenario.held_out)
         scenarios.add_row(scenario.id, *(", ".join(task.name for task in group) for group in groups))
     console.print(scenarios)

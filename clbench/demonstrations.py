@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -23,8 +23,8 @@ from clbench.seeding import derive_seed, numpy_generator
 from clbench.task import Budget, Scenario, Task, resolve
 from clbench.world import World
 
-SIMULATORS = ("gymnasium", "gymnasium-robotics", "mujoco", "numpy")
-"""Packages whose version can change a trajectory."""
+SIMULATORS = ("gymnasium", "mujoco", "numpy")
+"""Packages whose version can change a trajectory in any suite; a task names those of its own suite."""
 
 DISTURBANCE = 0.1
 """Chance, at each step of a disturbed episode, that a disturbance begins."""
@@ -88,6 +88,12 @@ def demonstrate(world: World, task: Task, seed: int, disturb: bool) -> Demonstra
     )
 
 
+def simulator_versions(tasks: Iterable[Task]) -> dict[str, str]:
+    """Return the versions of all packages that can change a trajectory of one of the tasks."""
+    packages = {*SIMULATORS, *(package for task in tasks for package in task.packages)}
+    return {package: version(package) for package in sorted(packages)}
+
+
 def _action_bounds(world: World) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     assert isinstance(world.action_space, gymnasium.spaces.Box)
     return world.action_space.low, world.action_space.high
@@ -133,7 +139,7 @@ def dataset_folder(task: Task, budget: Budget, progress: Callable[[float], None]
         "source": source_hash(
             __name__, "clbench.seeding", *sorted({package_of(task.world), package_of(task.expert)})
         ),
-        "versions": {package: version(package) for package in SIMULATORS},
+        "versions": simulator_versions([task]),
     }
     folder = get_dataset_path(task.dataset_id)
     _declare_namespaces(folder, task.dataset_id)

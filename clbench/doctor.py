@@ -14,6 +14,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from clbench.cache import cache_folder
+from clbench.extras import extra_of
 from clbench.method import method_names
 from clbench.rendering import DEBIAN_PACKAGES, rendering_fault
 
@@ -31,7 +32,7 @@ def _packages() -> Table:
     table = Table("package", "found", "tried", "", title="Packages")
     for text in requires("clbench") or []:
         requirement = Requirement(text)
-        extra = str(requirement.marker).partition("==")[2].strip(" \"'") if requirement.marker else ""
+        extra = extra_of(requirement)
         if extra == "dev":
             continue
         try:

@@ -1,8 +1,13 @@
-"""Extras: packages that only some commands need."""
+"""Extras: packages that only some commands or scenarios need."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+from importlib import metadata
 from importlib.util import find_spec
+
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
 
 
 def require(module: str, extra: str, purpose: str) -> None:
@@ -18,3 +23,42 @@ def require(module: str, extra: str, purpose: str) -> None:
     """
     if find_spec(module) is None:
         raise LookupError(f"{purpose} needs the package {module}: pip install 'clbench[{extra}]'")
+
+
+def require_packages(packages: Iterable[str], purpose: str) -> None:
+    """Refuse to go on without distributions, before any work is done.
+
+    Args:
+        packages: Names of the distributions.
+        purpose: What needs them, as the subject of a sentence.
+
+    Raises:
+        LookupError: One is not installed; the message says how to get it.
+    """
+    for package in sorted(packages):
+        if not is_installed(package):
+            raise LookupError(f"{purpose} needs the package {package}: pip install {_wanted(package)}")
+
+
+def is_installed(package: str) -> bool:
+    """Return whether a distribution is there."""
+    try:
+        metadata.version(package)
+    except metadata.PackageNotFoundError:
+        return False
+    return True
+
+
+def extra_of(requirement: Requirement) -> str:
+    """Return the extra of clbench that a requirement belongs to, empty if it is always installed."""
+    return str(requirement.marker).partition("==")[2].strip(" \"'") if requirement.marker else ""
+
+
+def _wanted(package: str) -> str:
+    """Return what to install to get a distribution: the extra of clbench that brings it, else itself."""
+    for requirement in map(Requirement, metadata.requires("clbench") or []):
+        if canonicalize_name(requirement.name) == canonicalize_name(package) and extra_of(
+            requirement
+        ) not in ("", "dev"):
+            return f"'clbench[{extra_of(requirement)}]'"
+    return package

@@ -18,7 +18,6 @@ from clbench.task import Scenario, resolve
 PACKAGES = (
     "clbench",
     "gymnasium",
-    "gymnasium-robotics",
     "minari",
     "mujoco",
     "numpy",
@@ -26,6 +25,7 @@ PACKAGES = (
     "tokenizers",
     "torch",
 )
+"""Whose versions every record names, beside the packages of its scenario's tasks."""
 
 _ROLLOUT_STEPS = 50
 
@@ -52,11 +52,12 @@ def rollout_hash(world: str, task: str) -> str:
 
 def fingerprint(scenario: Scenario) -> dict[str, Any]:
     """Return versions, commit, hardware and the rollout hash of every world of the scenario."""
+    packages = {*PACKAGES, *(package for task in scenario.tasks for package in task.packages)}
     worlds: dict[str, str] = {}
     for task in scenario.tasks:
         worlds.setdefault(task.world, task.name)
     return {
-        "versions": {package: version(package) for package in PACKAGES},
+        "versions": {package: version(package) for package in sorted(packages)},
         "python": platform.python_version(),
         "commit": _commit(),
         "hardware": {"machine": platform.machine(), "system": platform.system(), "processor": _processor()},

@@ -11,7 +11,7 @@ from typing import Any
 from torch import Tensor
 
 from clbench.cache import cache_folder, cached, hash_of, is_cached, package_of, source_hash
-from clbench.demonstrations import SIMULATORS, Demonstrations, load_demonstrations
+from clbench.demonstrations import Demonstrations, load_demonstrations, simulator_versions
 from clbench.policy import Policy, PolicyConfig, load_policy, save_policy
 from clbench.questions import load_questions
 from clbench.seeding import derive_seed, torch_generator
@@ -42,7 +42,10 @@ def pretraining_inputs(scenario: Scenario, seed: int) -> dict[str, Any]:
         "budget": {name: value for name, value in budget.items() if name not in AFTER_PRETRAINING},
         "seed": seed,
         "source": source_hash(*core, *sorted(suites)),
-        "versions": {package: version(package) for package in (*SIMULATORS, "torch", "tokenizers")},
+        "versions": {
+            **simulator_versions(scenario.retained),
+            **{package: version(package) for package in ("torch", "tokenizers")},
+        },
     }
 
 

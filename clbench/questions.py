@@ -8,7 +8,6 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
-from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +17,7 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from clbench.cache import cache_folder, cached, hash_of, package_of, source_hash
-from clbench.demonstrations import SIMULATORS, demonstrate
+from clbench.demonstrations import demonstrate, simulator_versions
 from clbench.leaks import check_questions
 from clbench.policy import QuestionBatch, encode, word_id
 from clbench.seeding import derive_seed, torch_generator
@@ -56,7 +55,7 @@ def scenes_folder(scenario: Scenario, progress: Callable[[float], None] = lambda
             __name__,
             *sorted({package_of(name) for task in scenario.retained for name in (task.world, task.expert)}),
         ),
-        "versions": {package: version(package) for package in SIMULATORS},
+        "versions": simulator_versions(scenario.retained),
     }
     folder = cache_folder() / "scenes" / hash_of(inputs)
 

@@ -35,6 +35,9 @@ class ScenarioEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         instruction: How the observation gives the instruction.
         episodes_per_stage: Episodes after which `reset()` goes on to the next stage.
         render_mode: "rgb_array" or None; handed to the worlds.
+
+    Raises:
+        LookupError: A package that the tasks need is not installed; the message says how to get it.
     """
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 25}  # noqa: RUF012
@@ -47,6 +50,7 @@ class ScenarioEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         render_mode: str | None = None,
     ) -> None:
         self.scenario: Scenario = resolve(scenario) if isinstance(scenario, str) else scenario
+        self.scenario.require_packages()
         self.render_mode = render_mode
         self._walk = Walk(self.scenario, episodes_per_stage, instruction)
         self._worlds: dict[str, World] = {}

@@ -35,6 +35,9 @@ class ScenarioVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]
         instruction: How the observations give the instruction, "text" or "tokens".
         episodes_per_stage: Episodes after which an environment goes on to the next stage.
         threads: Threads that step the worlds, by default one for each core. Results do not depend on it.
+
+    Raises:
+        LookupError: A package that the tasks need is not installed; the message says how to get it.
     """
 
     metadata: dict[str, Any] = {"render_modes": [], "autoreset_mode": AutoresetMode.NEXT_STEP}  # noqa: RUF012
@@ -48,6 +51,7 @@ class ScenarioVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]
         threads: int | None = None,
     ) -> None:
         self.scenario: Scenario = resolve(scenario) if isinstance(scenario, str) else scenario
+        self.scenario.require_packages()
         self.num_envs = num_envs
         self._walks = [Walk(self.scenario, episodes_per_stage, instruction) for _ in range(num_envs)]
         self._generators: list[np.random.Generator] = [np_random()[0] for _ in range(num_envs)]

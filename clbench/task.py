@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, Literal
 
+from clbench.extras import require_packages
 from clbench.limits import Limits
 
 Group = Literal["retained", "target", "held_out"]
@@ -52,6 +53,9 @@ class Task:
     expert's action in a state. It must not remember earlier states: it also labels perturbed episodes."""
     version: int = 0
     """Raised whenever the task, its expert or its demonstrations change."""
+    packages: tuple[str, ...] = ()
+    """Distributions whose version can change a trajectory, beside those that all worlds have in common: the
+    simulator of its suite, as ("gymnasium-robotics",)."""
 
     @property
     def dataset_id(self) -> str:
@@ -141,6 +145,14 @@ class Scenario:
         """All tasks: retained, then target, then held out. Columns of every score table follow this order."""
         return self.retained + self.target + self.held_out
 
+    def require_packages(self) -> None:
+        """Refuse to go on without the packages of its tasks.
+
+        Raises:
+            LookupError: One is not installed; the message says how to get it.
+        """
+        require_packages({package for task in self.tasks for package in task.packages}, self.id)
+
     def group(self, task: str) -> Group:
         """Return which part of the scenario the task belongs to."""
         for group in ("retained", "target", "held_out"):
@@ -171,7 +183,22 @@ def scenario_ids() -> list[str]:
 
 
 def load_scenario(scenario_id: str) -> Scenario:
-    """Return the scenario registered with Gymnasium under this id; "module:id" imports `module` first.
+    """Return the scenario registered with Gymnasium under this id, ready to be used.
+
+    Raises:
+        LookupError: Nothing is registered under this id, what is registered is no scenario, or a package that
+            its tasks need is not installed; the message says how to get it.
+    """
+    scenario = registered_scenario(scenario_id)
+    scenario.require_packages()
+    return scenario
+
+
+def registered_scenario(scenario_id: str) -> Scenario:
+    """Return the scenario registered with Gymnasium under this id, as data: its packages may be missing.
+
+    Args:
+        scenario_id: Gymnasium id; "module:id" imports `module` first.
 
     Raises:
         LookupError: Nothing is registered under this id, or what is registered is no scenario.

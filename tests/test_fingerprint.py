@@ -17,6 +17,11 @@ def test_a_rollout_hash_is_the_same_in_another_process_and_differs_between_tasks
     assert rollout_hash(world, "lift") != rollout_hash(world, "reach")
 
 
+def test_a_fingerprint_names_the_simulator_of_its_own_suite_alone() -> None:
+    assert fingerprint(FETCH)["versions"]["gymnasium-robotics"] == version("gymnasium-robotics")
+    assert "gymnasium-robotics" not in fingerprint(TOY)["versions"]
+
+
 def test_a_fingerprint_names_versions_hardware_and_every_world() -> None:
     found = fingerprint(TOY)
     assert found["versions"]["mujoco"] == version("mujoco")

@@ -1,8 +1,15 @@
+import dataclasses
+import importlib.metadata
+from collections.abc import Iterator
+
+import gymnasium
 import pytest
 
-from clbench.task import Budget, load_scenario, resolve, scenario_ids
+from clbench.extras import require_packages
+from clbench.task import Budget, load_scenario, registered_scenario, resolve, scenario_ids
 
 FETCH = "clbench/Fetch-v0"
+TOY = load_scenario("clbench.testing:clbench/Toy-v0")
 
 
 def test_an_unknown_scenario_is_answered_with_the_nearest() -> None:
@@ -43,6 +50,40 @@ def test_a_scenario_has_distinct_tasks_whose_entry_points_resolve(scenario_id: s
         assert callable(resolve(task.expert)(task.name))
         assert scenario.task(task.name) is task
         assert task in getattr(scenario, scenario.group(task.name))
+
+
+@pytest.fixture
+def unusable() -> Iterator[str]:
+    """Register the toy as if it needed a simulator that nobody has, and return its id."""
+    tasks = {
+        group: tuple(dataclasses.replace(task, packages=("no-simulator",)) for task in getattr(TOY, group))
+        for group in ("retained", "target", "held_out")
+    }
+    name = "clbench/Unusable-v0"
+    scenario = dataclasses.replace(TOY, id=name, **tasks)
+    spec = gymnasium.envs.registration.EnvSpec(
+        name, "clbench.scenario_env:ScenarioEnv", kwargs={"scenario": "clbench.testing:UNUSABLE"}
+    )
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("clbench.testing.UNUSABLE", scenario, raising=False)
+        patch.setitem(gymnasium.registry, name, spec)
+        yield name
+
+
+def test_a_scenario_without_its_simulator_is_data_and_says_what_to_install(unusable: str) -> None:
+    assert registered_scenario(unusable).target[0].packages == ("no-simulator",)
+    for use in (load_scenario, gymnasium.make):
+        with pytest.raises(LookupError, match=f"{unusable} needs the package no-simulator: pip install no-"):
+            use(unusable)
+
+
+def test_what_an_extra_brings_is_installed_as_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+    def version(package: str) -> str:
+        raise importlib.metadata.PackageNotFoundError(package)
+
+    monkeypatch.setattr(importlib.metadata, "version", version)
+    with pytest.raises(LookupError, match=r"A film needs the package pillow: pip install 'clbench\[film\]'"):
+        require_packages(["pillow"], "A film")
 
 
 def test_the_fetch_scenario_has_the_promised_parts() -> None:

@@ -15,6 +15,7 @@ def _task(name: str, *instructions: str) -> Task:
         horizon=60,
         world="clbench.envs.fetch.world:FetchWorld",
         expert="clbench.envs.fetch.experts:expert",
+        packages=("gymnasium-robotics",),
     )
 
 
