@@ -19,7 +19,7 @@ from clbench.adaptation import Step, adapt
 from clbench.cache import package_of, source_hash
 from clbench.demonstrations import Demonstrations, load_demonstrations
 from clbench.leaks import check_policy, outside, seams
-from clbench.method import Access, Method, Prior, Source, Stage, State
+from clbench.method import Access, Method, Nothing, Prior, Source, Stage, State
 from clbench.policy import CheckpointError, Policy, load_policy, save_policy
 from clbench.pretraining import pretrained_policy, pretraining_inputs
 from clbench.questions import load_questions
@@ -104,7 +104,8 @@ class Learner:
         sources = {}
         if self.method.uses.demonstrations in when:
             before = self.scenario.retained + self.scenario.target[: max(0, number - 1)]
-            demonstrations = Demonstrations.cat([self.data[task.name] for task in before])
+            parts = [self.data[task.name] for task in before]
+            demonstrations = Demonstrations.cat(parts) if parts else Nothing()
             sources["demonstrations"] = self._source("prior demonstrations", number, demonstrations)
         if self.method.uses.questions in when:
             sources["questions"] = self._source("prior questions", number, self.questions)

@@ -10,7 +10,18 @@ import re
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from types import NoneType, UnionType
-from typing import Any, Generic, Literal, Protocol, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import (
+    Any,
+    Generic,
+    Literal,
+    NoReturn,
+    Protocol,
+    TypeVar,
+    Union,
+    get_args,
+    get_origin,
+    get_type_hints,
+)
 
 import torch
 from torch import Tensor, nn
@@ -31,7 +42,7 @@ class Uses:
     """Which prior data a method may touch, and when. The runner hands over nothing else."""
 
     demonstrations: Access = "never"
-    """Of the retained skills and of the targets learned before."""
+    """Of the retained skills and of the targets learned before; where there are none, the source is empty."""
     questions: Access = "never"
     """The training questions."""
     reference: bool = False
@@ -92,6 +103,30 @@ class Samples(Protocol[Drawn]):
     @property
     def bytes(self) -> int:
         """Memory that the data takes."""
+
+
+class MissingDataError(RuntimeError):
+    """A method draws from data that is not there."""
+
+
+class Nothing:
+    """The demonstrations of no task: what was learned before the first target where nothing is retained."""
+
+    bytes = 0
+
+    def __len__(self) -> int:
+        return 0
+
+    def sample(self, count: int, generator: torch.Generator) -> NoReturn:
+        """Refuse to draw.
+
+        Raises:
+            MissingDataError: Always.
+        """
+        raise MissingDataError(
+            "The method draws from prior demonstrations, but there are none: the scenario retains no tasks, "
+            "and this is before its second target. Where len(prior.demonstrations) is 0, it must do without."
+        )
 
 
 class Source(Generic[Rows]):

@@ -32,18 +32,20 @@ AFTER_PRETRAINING = (
 
 def pretraining_inputs(scenario: Scenario, seed: int) -> dict[str, Any]:
     """Return all that a pretrained policy depends on."""
-    suites = {package_of(name) for task in scenario.retained for name in (task.world, task.expert)}
+    tasks = scenario.retained + scenario.scenes
+    suites = {package_of(name) for task in tasks for name in (task.world, task.expert)}
     suites.add(package_of(scenario.questions))
     budget = dataclasses.asdict(scenario.budget)
     parts = ("policy", "demonstrations", "questions", "seeding", "training")
     core = (*(f"clbench.{part}" for part in parts), __name__)
     return {
         "retained": [dataclasses.asdict(task) for task in scenario.retained],
+        "scenes": [dataclasses.asdict(task) for task in scenario.scenes],
         "budget": {name: value for name, value in budget.items() if name not in AFTER_PRETRAINING},
         "seed": seed,
         "source": source_hash(*core, *sorted(suites)),
         "versions": {
-            **simulator_versions(scenario.retained),
+            **simulator_versions(tasks),
             **{package: version(package) for package in ("torch", "tokenizers")},
         },
     }
@@ -65,6 +67,9 @@ def pretrained_policy(
 ) -> tuple[Policy, Path]:
     """Return the policy pretrained on the retained tasks and the questions, and the folder it lies in.
 
+    Where no tasks are retained it is pretrained on the questions alone: its states are normalised by what is
+    asked about, its actions are not, and its action head is as it was drawn.
+
     It is trained on first use, and shared by all methods.
 
     Args:
@@ -83,7 +88,7 @@ def pretrained_policy(
 
 def policy_config(scenario: Scenario) -> PolicyConfig:
     """Return the sizes of a policy for the scenario's worlds."""
-    world = resolve(scenario.retained[0].world)()
+    world = resolve(scenario.tasks[0].world)()
     config = PolicyConfig(
         state_size=world.observation_space.shape[0],
         action_size=world.action_space.shape[0],
@@ -96,15 +101,19 @@ def policy_config(scenario: Scenario) -> PolicyConfig:
 
 def _pretrain(scenario: Scenario, seed: int, progress: Callable[[float], None]) -> Policy:
     config, budget = policy_config(scenario), scenario.budget
-    demonstrations = Demonstrations.cat(
-        [load_demonstrations(task, scenario, config) for task in scenario.retained]
-    )
     questions, _ = load_questions(scenario)
     policy = Policy(config, seed=derive_seed("weights", seed))
-    policy.normalise_like(demonstrations.state, demonstrations.action[:, 0])
+    parts = [load_demonstrations(task, scenario, config) for task in scenario.retained]
+    demonstrations = Demonstrations.cat(parts) if parts else None
+    if demonstrations is not None:
+        policy.normalise_like(demonstrations.state, demonstrations.action[:, 0])
+    else:
+        policy.normalise_like(questions.scenes)
     generator = torch_generator("pretraining", seed)
 
     def loss_at(step: int) -> Tensor:
+        if demonstrations is None:
+            return policy.answer_loss(questions.sample(budget.batch_size // 2, generator)).mean()
         batch = demonstrations.sample(budget.batch_size, generator)
         asked = questions.sample(budget.batch_size // 2, generator)
         return policy.action_loss(batch).mean() + policy.answer_loss(asked).mean()

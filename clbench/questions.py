@@ -42,20 +42,21 @@ class QuestionKind:
 def scenes_folder(scenario: Scenario, progress: Callable[[float], None] = lambda _: None) -> Path:
     """Return the folder of the states that questions are asked about; they are collected on first use.
 
-    The states come from disturbed expert episodes of the retained tasks, and are split by episode into
-    `train` and `report`.
+    The states come from disturbed expert episodes of the scenario's `scene_tasks`, and are split by episode
+    into `train` and `report`.
     """
+    tasks = scenario.scene_tasks
     inputs = {
         "scenario": scenario.id,
-        "tasks": [dataclasses.asdict(task) for task in scenario.retained],
+        "tasks": [dataclasses.asdict(task) for task in tasks],
         "episodes": scenario.budget.question_episodes,
         "source": source_hash(
             "clbench.demonstrations",
             "clbench.seeding",
             __name__,
-            *sorted({package_of(name) for task in scenario.retained for name in (task.world, task.expert)}),
+            *sorted({package_of(name) for task in tasks for name in (task.world, task.expert)}),
         ),
-        "versions": simulator_versions(scenario.retained),
+        "versions": simulator_versions(tasks),
     }
     folder = cache_folder() / "scenes" / hash_of(inputs)
 
@@ -72,7 +73,7 @@ def _scenes(scenario: Scenario, progress: Callable[[float], None]) -> dict[str, 
     for split, episodes in (("train", count), ("report", max(1, count // 4))):
         states = []
         for number in range(episodes):
-            task = scenario.retained[number % len(scenario.retained)]
+            task = scenario.scene_tasks[number % len(scenario.scene_tasks)]
             if task.world not in worlds:
                 worlds[task.world] = resolve(task.world)()
             seed = derive_seed("scene", scenario.id, split, number)

@@ -21,7 +21,8 @@ class ScenarioEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
     """A sequence of tasks as one environment.
 
     `reset()` begins the next episode of the walk: `episodes_per_stage` episodes of stage 0, in which the
-    retained tasks take turns, then as many of each target task; the last target goes on for ever.
+    retained tasks take turns, if there are any, then as many of each target task; the last target goes on for
+    ever.
     `reset(seed=...)` begins the walk anew. `reset(options={"stage": k})` goes on from the start of a stage,
     and `reset(options={"task": name})` chooses any task for one episode.
 
@@ -56,7 +57,7 @@ class ScenarioEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         self._worlds: dict[str, World] = {}
         self._begun: Start | None = None
         self._steps = 0
-        world = self._world(self.scenario.retained[0])
+        world = self._world(self.scenario.tasks[0])
         self.action_space = world.action_space
         self.observation_space = spaces.Dict(
             {"state": world.observation_space, "instruction": self._walk.instruction_space}

@@ -56,7 +56,7 @@ class ScenarioVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]
         self._walks = [Walk(self.scenario, episodes_per_stage, instruction) for _ in range(num_envs)]
         self._generators: list[np.random.Generator] = [np_random()[0] for _ in range(num_envs)]
         self._lanes = Lanes(num_envs, threads or os.cpu_count() or 1)
-        world = self._lanes.world(self.scenario.retained[0])
+        world = self._lanes.world(self.scenario.tasks[0])
         self.single_action_space = world.single_action_space
         self.single_observation_space = spaces.Dict(
             {"state": world.single_observation_space, "instruction": self._walks[0].instruction_space}

@@ -128,13 +128,15 @@ class Scenario:
     description: str
     """One sentence for lists."""
     retained: tuple[Task, ...]
-    """Skills that the policy is pretrained on and that are never trained again."""
+    """Skills that the policy is pretrained on and that are never trained again; there may be none."""
     target: tuple[Task, ...]
     """Tasks that are learned, in this order."""
     held_out: tuple[Task, ...]
     """Tasks that are never trained."""
     questions: str
     """Entry point of a tuple of `QuestionKind`: what can be asked about a state."""
+    scenes: tuple[Task, ...] = ()
+    """Tasks whose expert episodes' states the questions ask about, where these are not the retained ones."""
     budget: Budget = Budget()
     """What every method gets."""
     limits: Limits = field(default_factory=Limits)
@@ -144,6 +146,11 @@ class Scenario:
     def tasks(self) -> tuple[Task, ...]:
         """All tasks: retained, then target, then held out. Columns of every score table follow this order."""
         return self.retained + self.target + self.held_out
+
+    @property
+    def scene_tasks(self) -> tuple[Task, ...]:
+        """The tasks whose expert episodes' states the questions ask about."""
+        return self.scenes or self.retained
 
     def require_packages(self) -> None:
         """Refuse to go on without the packages of its tasks.

@@ -86,15 +86,16 @@ class Walk:
     def _choose(self, options: Mapping[str, Any]) -> tuple[Task, int]:
         """Return task and stage of the next episode."""
         scenario, stages = self._scenario, len(self._scenario.target)
+        first = 0 if scenario.retained else 1
         if "task" in options:
             task = scenario.task(options["task"])
             return task, scenario.target.index(task) + 1 if task in scenario.target else 0
         if "stage" in options:
-            if options["stage"] not in range(stages + 1):
-                raise ValueError(f"{scenario.id} has stages 0 to {stages}, not {options['stage']!r}.")
-            self._episode = options["stage"] * self._episodes_per_stage
+            if options["stage"] not in range(first, stages + 1):
+                raise ValueError(f"{scenario.id} has stages {first} to {stages}, not {options['stage']!r}.")
+            self._episode = (options["stage"] - first) * self._episodes_per_stage
         else:
             self._episode += 1
-        stage = min(self._episode // self._episodes_per_stage, stages)
+        stage = min(first + self._episode // self._episodes_per_stage, stages)
         retained = scenario.retained
         return scenario.target[stage - 1] if stage else retained[self._episode % len(retained)], stage

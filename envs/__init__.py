@@ -10,6 +10,20 @@ register(
 )
 
 register(
+    id="clbench/MetaWorld-v0",
+    entry_point="clbench.scenario_env:ScenarioEnv",
+    vector_entry_point="clbench.scenario_vector_env:ScenarioVectorEnv",
+    kwargs={"scenario": "clbench.envs.metaworld:SCENARIO"},
+)
+
+register(
+    id="clbench/MetaWorldCW-v0",
+    entry_point="clbench.scenario_env:ScenarioEnv",
+    vector_entry_point="clbench.scenario_vector_env:ScenarioVectorEnv",
+    kwargs={"scenario": "clbench.envs.metaworld:CONTINUAL_WORLD"},
+)
+
+register(
     id="clbench/PointMaze-v0",
     entry_point="clbench.scenario_env:ScenarioEnv",
     vector_entry_point="clbench.scenario_vector_env:ScenarioVectorEnv",

@@ -26,24 +26,28 @@ def require_loss_per_sample(policy: Policy, method: str) -> None:
     Raises:
         TypeError: `action_loss` of two samples has another shape than (2,).
     """
-    config = policy.config
-    chunks = (2, config.chunk, config.action_size)
-    device = policy.state_mean.device
-    blank = Batch(
-        state=torch.zeros(2, config.state_size),
-        words=torch.ones(2, TEXT_LENGTH, dtype=torch.int64),
-        action=torch.zeros(chunks),
-        valid=torch.ones(chunks[:2]),
-        draw=torch.full((2,), 0.5),
-        noise=torch.zeros(chunks),
-    )
     with torch.no_grad():
-        shape = tuple(policy.action_loss(blank.to(device)).shape)
+        shape = tuple(policy.action_loss(blank_batch(policy, 2)).shape)
     if shape != (2,):
         raise TypeError(
             f"{method} looks at samples one by one: action_loss of {type(policy).__name__} must return one "
             f"loss per sample, shape (2,) for two; its shape is {shape}."
         )
+
+
+def blank_batch(policy: Policy, count: int) -> Batch:
+    """Return `count` samples of the shapes that a policy reads, with nothing in them."""
+    config = policy.config
+    chunks = (count, config.chunk, config.action_size)
+    blank = Batch(
+        state=torch.zeros(count, config.state_size),
+        words=torch.ones(count, TEXT_LENGTH, dtype=torch.int64),
+        action=torch.zeros(chunks),
+        valid=torch.ones(chunks[:2]),
+        draw=torch.full((count,), 0.5),
+        noise=torch.zeros(chunks),
+    )
+    return blank.to(policy.state_mean.device)
 
 
 def in_range(name: str, value: float, low: float, high: float = float("inf")) -> None:

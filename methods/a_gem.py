@@ -7,6 +7,7 @@ Details:
 1. The memory is all prior demonstrations, as for experience replay; the batch drawn from it has the budget's
    size.
 2. One projection for all weights together.
+3. Where nothing was learned before, the gradient is the target's as it is.
 """
 
 from dataclasses import dataclass
@@ -27,11 +28,12 @@ class AGEM(Method):
     uses = Uses(demonstrations="throughout")
     metadata = Metadata(link="https://arxiv.org/abs/1812.00420")
 
-    def batch(self, target: Source[Batch], prior: Prior) -> tuple[Batch, Batch]:
-        """Return a batch of the target and one of prior demonstrations."""
-        return target.sample(target.batch_size), prior.demonstrations.sample(target.batch_size)
+    def batch(self, target: Source[Batch], prior: Prior) -> tuple[Batch, Batch | None]:
+        """Return a batch of the target and one of prior demonstrations, None if there are none."""
+        batch = target.sample(target.batch_size)
+        return batch, prior.demonstrations.sample(len(batch)) if len(prior.demonstrations) else None
 
-    def loss(self, policy: Policy, batch: tuple[Batch, Batch], progress: Progress) -> Tensor:
+    def loss(self, policy: Policy, batch: tuple[Batch, Batch | None], progress: Progress) -> Tensor:
         """Return the action loss on the target; the prior batch is for `gradients`."""
         demonstrations, self.remembered = batch
         return policy.action_loss(demonstrations).mean()
@@ -39,6 +41,8 @@ class AGEM(Method):
     def gradients(self, policy: Policy, loss: Tensor) -> None:
         """Set the target's gradients, projected."""
         loss.backward()  # type: ignore[no-untyped-call]
+        if self.remembered is None:
+            return
         trained = [weight for weight in policy.parameters() if weight.grad is not None]
         reference = torch.autograd.grad(policy.action_loss(self.remembered).mean(), trained)
         project_out([weight.grad for weight in trained if weight.grad is not None], reference)

@@ -8,6 +8,7 @@ Details:
    target; of each target the same share is added when it was learned. Nothing else of the prior data is seen
    again.
 2. As in `experience_replay`, half of every batch is replayed. Flow time and noise are drawn anew each time.
+   While the buffer is empty, as nothing was learned before, the batch is the target's alone.
 """
 
 import dataclasses
@@ -19,7 +20,7 @@ from torch import Tensor
 from clbench.method import Metadata, Method, Prior, Source, Stage, State, Uses
 from clbench.policy import Batch, Policy
 
-from ._requirements import in_range
+from ._requirements import blank_batch, in_range
 
 
 @dataclass
@@ -42,11 +43,14 @@ class BufferedReplay(Method):
         return source.sample(max(1, round(self.share * len(source))))
 
     def prepare(self, policy: Policy, prior: Prior) -> None:
-        """Fill the buffer from the retained skills."""
-        self.buffer = self._kept(prior.demonstrations)
+        """Fill the buffer from the retained skills, if there are any."""
+        known = len(prior.demonstrations)
+        self.buffer = self._kept(prior.demonstrations) if known else blank_batch(policy, 0)
 
     def batch(self, target: Source[Batch], prior: Prior) -> Batch:
         """Return target and buffered samples in one batch."""
+        if not len(self.buffer):
+            return target.sample(target.batch_size)
         count = round(self.replay * target.batch_size)
         rows = torch.randint(len(self.buffer), (count,)).to(self.buffer.state.device)
         replayed = Batch(**{name: value[rows] for name, value in vars(self.buffer).items()})

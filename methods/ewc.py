@@ -8,7 +8,8 @@ Details:
    target after it was learned; the sum of both pulls to the weights after the last target ("online" EWC, one
    anchor).
 3. The penalty is (strength / 2) sum_i F_i (theta_i - theta*_i)^2, its gradient added in its closed form.
-4. `strength` was chosen on selection episodes of seed 100.
+4. Where nothing is retained, no weight is important for the first target.
+5. `strength` was chosen on selection episodes of seed 100.
 """
 
 from dataclasses import dataclass
@@ -43,7 +44,8 @@ class EWC(Method):
         """Compute the importance of the weights for the retained skills."""
         require_loss_per_sample(policy, "EWC")
         self.anchor = copy_of(policy)
-        self.importance = fisher_information(policy, prior.demonstrations, self.samples)
+        known = self.samples if len(prior.demonstrations) else 0
+        self.importance = fisher_information(policy, prior.demonstrations, known)
 
     def gradients(self, policy: Policy, loss: Tensor) -> None:
         """Set the gradients of the loss and the penalty."""
@@ -66,7 +68,7 @@ class EWC(Method):
 
 
 def fisher_information(policy: Policy, source: Source[Batch], samples: int) -> Weights:
-    """Return the mean of the squared gradients of `samples` losses, for each weight by name."""
+    """Return the mean of the squared gradients of `samples` losses, for each weight by name; 0 of none."""
     names, weights = zip(*policy.named_parameters(), strict=True)
     squares = [torch.zeros_like(weight) for weight in weights]
     for _ in range(samples):

@@ -5,6 +5,7 @@ Details:
 1. Prior data are all demonstrations of the retained skills and of the targets learned before, each task as
    likely as the other.
 2. The batch has the budget's size: the share of replay is taken out of the target's.
+3. Where nothing was learned before, the batch is the target's alone.
 """
 
 from dataclasses import dataclass
@@ -30,4 +31,6 @@ class ExperienceReplay(Method):
     def batch(self, target: Source[Batch], prior: Prior) -> Batch:
         """Return target and prior samples in one batch."""
         replayed = round(self.replay * target.batch_size)
+        if not len(prior.demonstrations):
+            return target.sample(target.batch_size)
         return Batch.cat([target.sample(target.batch_size - replayed), prior.demonstrations.sample(replayed)])

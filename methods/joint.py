@@ -19,10 +19,12 @@ class Joint(Method):
     uses = Uses(demonstrations="throughout", questions="throughout", reference=True)
 
     def batch(self, target: Source[Batch], prior: Prior) -> tuple[Batch, QuestionBatch]:
-        """Return a full batch of the target, one of prior demonstrations, and half a one of questions."""
+        """Return a batch of the target, one of prior demonstrations, if any, and half a one of questions."""
         size = target.batch_size
-        both = Batch.cat([target.sample(size), prior.demonstrations.sample(size)])
-        return both, prior.questions.sample(size // 2)
+        batch = target.sample(size)
+        if len(prior.demonstrations):
+            batch = Batch.cat([batch, prior.demonstrations.sample(size)])
+        return batch, prior.questions.sample(size // 2)
 
     def loss(self, policy: Policy, batch: tuple[Batch, QuestionBatch], progress: Progress) -> Tensor:
         """Return the sum of the action loss and the answer loss, as in pretraining."""

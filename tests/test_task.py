@@ -43,7 +43,7 @@ def test_a_scenario_has_distinct_tasks_whose_entry_points_resolve(scenario_id: s
     scenario = load_scenario(scenario_id)
     names = [task.name for task in scenario.tasks]
     assert len(set(names)) == len(names)
-    assert scenario.retained
+    assert scenario.scene_tasks
     assert scenario.target
     for task in scenario.tasks:
         assert callable(resolve(task.world))

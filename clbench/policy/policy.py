@@ -77,9 +77,11 @@ class Policy(nn.Module):
             self.register_buffer(f"{name}_mean", torch.zeros(size))
             self.register_buffer(f"{name}_std", torch.ones(size))
 
-    def normalise_like(self, state: Tensor, action: Tensor) -> None:
-        """Set the normalisation to the mean and deviation of states (N, S) and actions (N, A)."""
+    def normalise_like(self, state: Tensor, action: Tensor | None = None) -> None:
+        """Set the normalisation to the mean and deviation of states (N, S) and, if given, actions (N, A)."""
         for name, values in (("state", state), ("action", action)):
+            if values is None:
+                continue
             getattr(self, f"{name}_mean").copy_(values.mean(dim=0))
             # at least 1e-2, a centimetre or a hundredth of the actions: what hardly varies stays small
             getattr(self, f"{name}_std").copy_(values.std(dim=0, correction=0).clamp(min=1e-2))

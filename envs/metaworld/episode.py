@@ -1,0 +1,161 @@
+"""One episode of Meta-World: its own environments, on a model that all episodes of a task share."""
+
+from __future__ import annotations
+
+import copy
+import functools
+from dataclasses import dataclass
+from typing import Any
+
+import mujoco
+import numpy as np
+from gymnasium.utils.seeding import np_random
+from metaworld.env_dict import ALL_V3_ENVIRONMENTS
+from metaworld.sawyer_xyz_env import SawyerXYZEnv
+from numpy.typing import NDArray
+
+from clbench.task import unknown
+
+from .state import State
+
+Vector = NDArray[np.float64]
+
+PHYSICS = ("model", "data", "mujoco_renderer", "init_left_pad", "init_right_pad", "_bodies", "_sites")
+"""Attributes of an episode that are its physics or views of it: also what Meta-World calls initial pads."""
+
+
+@dataclass(frozen=True)
+class Scene:
+    """The compiled scene of a task. All its episodes in a process share it."""
+
+    model: mujoco.MjModel
+    body_pos: Vector
+    """Places of the bodies as compiled, (bodies, 3): an episode begins by moving some."""
+    site_pos: Vector
+    """Places of the sites as compiled, (sites, 3)."""
+    start: mujoco.MjData
+    """The physics once the hand has gone to where it starts."""
+
+
+class Episode(SawyerXYZEnv):  # type: ignore[misc]
+    """What an episode does otherwise than Meta-World's environment, of which it is a subclass for each task.
+
+    1. The goal is part of the state: Meta-World's experts look at it.
+    2. All follows from the seed. In Meta-World the first state can still show things where they stood in the
+       episode before.
+    3. The hand's way to its start, 50 steps, is made once for each task.
+    4. The model is shared: an episode takes its own places of bodies and sites with it, see `place`.
+    5. Parts of the physics are looked up by name once.
+    """
+
+    scene: Scene
+
+    def __init__(self) -> None:
+        self._bodies: dict[str, Vector] = {}
+        self._sites: dict[str, Vector] = {}
+        super().__init__()
+        self._set_task_called = True
+        self._partially_observable = False
+        del self.sawyer_observation_space  # that of a hidden goal
+        self._places = self.scene.body_pos.copy(), self.scene.site_pos.copy()
+
+    def _initialize_simulation(self) -> tuple[mujoco.MjModel, mujoco.MjData]:
+        return self.scene.model, mujoco.MjData(self.scene.model)
+
+    def begin(self, seed: int) -> State:
+        """Draw the places of things from the seed, and return the first state (39,)."""
+        self.np_random = np_random(seed)[0]
+        self.seeded_rand_vec, self._freeze_rand_vec = True, False
+        self.model.body_pos[:], self.model.site_pos[:] = self.scene.body_pos, self.scene.site_pos
+        self.reset_model()  # draws, and moves what is drawn
+        self._freeze_rand_vec = True
+        self.reset_model()  # with the same draw: now all is measured where it stands
+        self._places = self.model.body_pos.copy(), self.model.site_pos.copy()
+        mujoco.mj_forward(self.model, self.data)
+        self._prev_obs = self._get_curr_obs_combined_no_goal()
+        self.curr_path_length = 0
+        return self._get_obs().astype(np.float32)  # type: ignore[no-any-return]
+
+    def place(self) -> None:
+        """Give the shared model this episode's places of bodies and sites."""
+        self.model.body_pos[:], self.model.site_pos[:] = self._places
+
+    def advance(self, action: NDArray[np.float32]) -> tuple[State, float, bool]:
+        """Move by an action (4,) in [-1, 1]; return the state (39,), Meta-World's reward, and the success."""
+        self.place()
+        self.curr_path_length = 0  # whoever uses the world counts the steps
+        state, reward, _, _, info = self.step(action)
+        return state.astype(np.float32), float(reward), bool(info["success"])
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> Episode:
+        """Return an episode with its own physics, in the same state."""
+        copied = type(self)()
+        mujoco.mj_copyData(copied.data, self.model, self.data)
+        for name, value in vars(self).items():
+            if name not in PHYSICS:
+                setattr(copied, name, copy.deepcopy(value, memo))
+        return copied
+
+    def _reset_hand(self, steps: int = 50) -> None:
+        mujoco.mj_copyData(self.data, self.model, self.scene.start)
+        mujoco.mj_forward(self.model, self.data)
+        super()._reset_hand(steps=0)
+
+    # ---- what is looked up by name ---------------------------------------------------------------------
+
+    def get_body_com(self, body_name: str) -> Vector:
+        """Return the place of a body (3,), as a view of the physics."""
+        if body_name not in self._bodies:
+            self._bodies[body_name] = self.data.body(body_name).xpos
+        return self._bodies[body_name]
+
+    def _get_site_pos(self, site_name: str) -> Vector:
+        if site_name not in self._sites:
+            self._sites[site_name] = self.data.site(site_name).xpos
+        return self._sites[site_name].copy()
+
+    def get_endeff_pos(self) -> Vector:
+        """Return the place of the hand (3,), as a view of the physics."""
+        return self.get_body_com("hand")
+
+    @property
+    def tcp_center(self) -> Vector:
+        """Place between the fingers (3,)."""
+        right, left = self._get_site_pos("rightEndEffector"), self._get_site_pos("leftEndEffector")
+        center: Vector = (right + left) / 2.0
+        return center
+
+    def _get_curr_obs_combined_no_goal(self) -> Vector:
+        observation = np.zeros(18)
+        observation[:3] = self.get_body_com("hand")
+        apart = np.linalg.norm(self.get_body_com("rightclaw") - self.get_body_com("leftclaw"))
+        observation[3] = min(max(apart / 0.1, 0.0), 1.0)
+        places, turns = self._get_pos_objects(), self._get_quat_objects()
+        for number in range(len(places) // 3):
+            first = 4 + 7 * number
+            observation[first : first + 3] = places[3 * number : 3 * number + 3]
+            observation[first + 3 : first + 7] = turns[4 * number : 4 * number + 4]
+        return observation
+
+
+@functools.cache
+def _episode_class(task: str) -> type[Episode]:
+    name = f"{task.replace('_', '-')}-v3"
+    if name not in ALL_V3_ENVIRONMENTS:
+        known = (entry.removesuffix("-v3").replace("-", "_") for entry in ALL_V3_ENVIRONMENTS)
+        raise unknown("task of the Meta-World world", task, known)
+    original = ALL_V3_ENVIRONMENTS[name]
+    env: Any = original()
+    env._reset_hand()
+    model = env.model
+    scene = Scene(model, model.body_pos.copy(), model.site_pos.copy(), env.data)
+    return type(f"Episode{original.__name__}", (Episode, original), {"scene": scene})
+
+
+def new_episode(task: str) -> Episode:
+    """Return a place for episodes of a task, as "drawer_open"; its scene is compiled when first needed.
+
+    Raises:
+        LookupError: No task has this name; the nearest one is named.
+    """
+    return _episode_class(task)()

@@ -1,0 +1,28 @@
+"""Layout of the state of the Meta-World world: Meta-World's observation, 39 numbers, lengths in metres.
+
+The robot stands at the origin and looks along y: x grows to its right, y away from it, z up. The first 18
+numbers say how things are, the next 18 are the same one step before, the last 3 the goal.
+"""
+
+from __future__ import annotations
+
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+State: TypeAlias = NDArray[np.float32]
+"""One state (39,), or many (N, 39)."""
+
+SIZE = 39
+HAND = slice(0, 3)
+"""Position of the hand: of its palm, 4.5 cm above the tips of the fingers."""
+OPENING = 3
+"""How far the fingers are apart: 1 open, about 0.2 closed on nothing."""
+OBJECT = slice(4, 7)
+"""Position of what the task is about, as a block or the handle of a drawer."""
+HAND_BEFORE = slice(18, 21)
+"""Position of the hand one step before."""
+OBJECT_BEFORE = slice(22, 25)
+GOAL = slice(36, 39)
+"""Where the object, or in a reach the hand, is to go."""

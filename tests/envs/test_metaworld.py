@@ -1,0 +1,262 @@
+"""The Meta-World world, its tasks, experts and questions."""
+
+import copy
+import itertools
+import subprocess
+import sys
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from clbench.task import Task, load_scenario, resolve
+
+SCENARIOS = {name: load_scenario(f"clbench:clbench/{name}-v0") for name in ("MetaWorld", "MetaWorldCW")}
+SCENARIO = SCENARIOS["MetaWorld"]
+TASKS = list({task.name: task for one in SCENARIOS.values() for task in one.tasks}.values())
+World = resolve(TASKS[0].world)
+QUESTIONS = {kind.name: kind for kind in resolve(SCENARIO.questions)}
+
+State = NDArray[np.float32]
+
+
+def random_actions(seed: int, steps: int) -> NDArray[np.float32]:
+    return np.random.default_rng(seed).uniform(-1.0, 1.0, (steps, 4)).astype(np.float32)
+
+
+def rollout(world: Any, task: str, seed: int, steps: int = 20) -> NDArray[np.float64]:
+    """Return the states and rewards (steps + 1, 40) of an episode of random actions."""
+    state, _ = world.reset(seed=seed, options={"task": task})
+    rows = [np.append(state, 0.0)]
+    for action in random_actions(seed, steps):
+        state, reward, *_ = world.step(action)
+        rows.append(np.append(state, reward))
+    return np.stack(rows)
+
+
+def expert_succeeds(task: Task, seed: int) -> bool:
+    world, expert = World(), resolve(task.expert)(task.name)
+    state, _ = world.reset(seed=seed, options={"task": task.name})
+    for _ in range(task.horizon):
+        state, _, terminated, truncated, info = world.step(expert(state))
+        assert not truncated
+        assert info == {"success": terminated, "task": task.name}
+        if terminated:
+            return True
+    return False
+
+
+def scene(
+    hand: tuple[float, float, float] = (0.0, 0.6, 0.15),
+    thing: tuple[float, float, float] = (0.0, 0.6, 0.15),
+    goal: tuple[float, float, float] = (0.0, 0.6, 0.15),
+    opening: float = 1.0,
+    hand_moved: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    thing_moved: tuple[float, float, float] = (0.0, 0.0, 0.0),
+) -> State:
+    """Return a state (1, 39) made by hand."""
+    state = np.zeros((1, 39), np.float32)
+    state[0, 0:3], state[0, 3], state[0, 4:7], state[0, 36:39] = hand, opening, thing, goal
+    state[0, 18:21], state[0, 22:25] = np.subtract(hand, hand_moved), np.subtract(thing, thing_moved)
+    return state
+
+
+def test_importing_the_scenarios_loads_no_simulator() -> None:
+    program = (
+        "import sys; from clbench.task import load_scenario; load_scenario('clbench:clbench/MetaWorld-v0');"
+        "load_scenario('clbench/MetaWorldCW-v0'); assert not {'mujoco', 'metaworld'} & set(sys.modules)"
+    )
+    subprocess.run([sys.executable, "-c", program], check=True)
+
+
+def test_the_scenario_has_the_promised_parts() -> None:
+    assert len(SCENARIO.retained) >= 8
+    assert len(SCENARIO.target) >= 4
+    assert len(SCENARIO.held_out) == 2
+    assert len(QUESTIONS) >= 8
+
+
+def test_the_ten_tasks_are_those_of_continual_world_in_their_order() -> None:
+    # Wolczyk et al. 2021, arXiv 2105.10919, CW10
+    names = (
+        "hammer push_wall faucet_close push_back stick_pull handle_press_side push shelf_place window_close"
+    )
+    scenario = SCENARIOS["MetaWorldCW"]
+    assert [task.name for task in scenario.target] == [*names.split(), "peg_unplug_side"]
+    assert not scenario.retained
+    assert not {task.name for task in scenario.scenes} & {task.name for task in scenario.tasks}
+
+
+@pytest.mark.parametrize("task", ["push", "window_close", "stick_pull"])
+def test_an_episode_repeats_itself_whatever_ran_before(task: str) -> None:
+    world = World()
+    expected = rollout(World(), task, seed=7)
+    for other, seed in [("drawer_open", 1), (task, 2), ("push", 7)]:
+        rollout(world, other, seed, steps=31)
+        np.testing.assert_array_equal(rollout(world, task, seed=7), expected)
+
+
+def test_global_generators_have_no_part_in_it_and_are_left_alone() -> None:
+    expected = rollout(World(), "push", seed=3)
+    np.random.seed(5)  # noqa: NPY002
+    before = np.random.get_state()[1].copy()  # type: ignore[index]  # noqa: NPY002
+    np.testing.assert_array_equal(rollout(World(), "push", seed=3), expected)
+    np.testing.assert_array_equal(np.random.get_state()[1], before)  # type: ignore[index]  # noqa: NPY002
+
+
+def test_worlds_that_run_side_by_side_do_not_touch_each_other() -> None:
+    expected = [rollout(World(), "drawer_close", seed) for seed in (3, 4)]
+    worlds = [World(), World()]
+    rows = []
+    for world, seed in zip(worlds, (3, 4), strict=True):
+        rows.append([np.append(world.reset(seed=seed, options={"task": "drawer_close"})[0], 0.0)])
+    for step, (index, seed) in itertools.product(range(20), enumerate((3, 4))):
+        state, reward, *_ = worlds[index].step(random_actions(seed, 20)[step])
+        rows[index].append(np.append(state, reward))
+    np.testing.assert_array_equal(np.array(rows), np.array(expected))
+
+
+@pytest.mark.parametrize("task", ["push", "hammer", "faucet_close"])
+def test_a_copy_of_a_world_goes_on_as_the_world_does_and_leaves_it_alone(task: str) -> None:
+    world, expected = World(), rollout(World(), task, seed=2)
+    world.reset(seed=2, options={"task": task})
+    actions = random_actions(2, 20)
+    for action in actions[:10]:
+        world.step(action)
+    for one in (copy.deepcopy(world), world):
+        rows = [np.append(*one.step(action)[:2]) for action in actions[10:]]
+        np.testing.assert_array_equal(rows, expected[11:])
+
+
+def test_an_episode_without_a_seed_continues_the_random_numbers() -> None:
+    world = World()
+    first = world.reset(seed=5)[0]
+    second = world.reset()[0]
+    assert not np.array_equal(first, second)
+    world.reset(seed=5)
+    np.testing.assert_array_equal(world.reset()[0], second)
+
+
+@pytest.mark.parametrize("task", TASKS, ids=lambda task: task.name)
+def test_no_task_is_done_at_the_start_and_things_stand_elsewhere_each_time(task: Task) -> None:
+    world, states = World(), []
+    for seed in range(5):
+        state, info = world.reset(seed=seed, options={"task": task.name})
+        assert info == {"success": False, "task": task.name}
+        np.testing.assert_array_equal(state[:18], state[18:36])
+        states.append(state)
+        assert not world.step(np.zeros(4, np.float32))[2]
+    assert np.ptp(np.array(states)[:, [*range(4, 18), 36, 37, 38]], axis=0).max() > 0.02
+
+
+@pytest.mark.parametrize("task", TASKS, ids=lambda task: task.name)
+def test_the_expert_does_its_task(task: Task) -> None:
+    # the least that an expert reaches on 100 episodes is 0.9
+    assert sum(expert_succeeds(task, seed) for seed in range(100, 103)) >= 2
+
+
+def test_an_unknown_task_is_an_error_that_names_the_nearest() -> None:
+    with pytest.raises(LookupError, match="Did you mean 'drawer_open'"):
+        World().reset(options={"task": "drawer_opn"})
+    with pytest.raises(LookupError, match="Did you mean 'drawer_open'"):
+        resolve(TASKS[0].expert)("drawer_opn")
+
+
+@pytest.mark.parametrize(
+    ("action", "message"),
+    [
+        (np.zeros(3), r"has shape \(4,\), not \(3,\)"),
+        (np.zeros((1, 4)), r"has shape \(4,\), not \(1, 4\)"),
+        (np.array([0.0, np.nan, 0.0, 0.0]), "finite"),
+        (np.array([0.0, 0.0, np.inf, 0.0]), "finite"),
+    ],
+)
+def test_an_action_that_cannot_be_done_is_an_error(action: NDArray[np.float64], message: str) -> None:
+    world = World()
+    world.reset(seed=0)
+    with pytest.raises(ValueError, match=message):
+        world.step(action)
+
+
+def test_actions_beyond_the_bounds_are_cut() -> None:
+    world = World()
+    world.reset(seed=0)
+    far = world.step(np.array([9.0, -9.0, 9.0, 9.0]))[0]
+    world.reset(seed=0)
+    np.testing.assert_array_equal(world.step(np.array([1.0, -1.0, 1.0, 1.0]))[0], far)
+
+
+@pytest.mark.parametrize(
+    ("kind", "expected", "state"),
+    [
+        ("object_side", "right", scene(thing=(0.05, 0.6, 0.15))),
+        ("object_side", "left", scene(thing=(-0.05, 0.6, 0.15))),
+        ("object_side", None, scene(thing=(0.01, 0.6, 0.15))),
+        ("object_depth", "farther", scene(thing=(0.0, 0.7, 0.15))),
+        ("object_depth", "nearer", scene(thing=(0.0, 0.5, 0.15))),
+        ("object_depth", None, scene()),
+        ("object_level", "above", scene(thing=(0.0, 0.6, 0.25))),
+        ("object_level", "below", scene(thing=(0.0, 0.6, 0.02))),
+        ("object_level", None, scene()),
+        ("target_side", "right", scene(goal=(0.05, 0.6, 0.15))),
+        ("target_side", "left", scene(goal=(-0.05, 0.6, 0.15))),
+        ("target_side", None, scene()),
+        ("target_depth", "farther", scene(goal=(0.0, 0.7, 0.15))),
+        ("target_depth", "nearer", scene(goal=(0.0, 0.5, 0.15))),
+        ("target_depth", None, scene()),
+        ("target_level", "above", scene(goal=(0.0, 0.6, 0.25))),
+        ("target_level", "below", scene(goal=(0.0, 0.6, 0.05))),
+        ("target_level", None, scene()),
+        ("target_side_of_object", "right", scene(goal=(0.05, 0.6, 0.15))),
+        ("target_side_of_object", "left", scene(thing=(0.05, 0.6, 0.15))),
+        ("target_side_of_object", None, scene()),
+        ("nearest", "object", scene(goal=(0.1, 0.6, 0.15))),
+        ("nearest", "target", scene(thing=(0.1, 0.6, 0.15))),
+        ("nearest", None, scene()),
+        ("near_object", "yes", scene(thing=(0.05, 0.6, 0.15))),
+        ("near_object", "no", scene(thing=(0.2, 0.6, 0.15))),
+        ("near_object", None, scene(thing=(0.09, 0.6, 0.15))),
+        ("gripper_opening", "open", scene(opening=1.0)),
+        ("gripper_opening", "closed", scene(opening=0.4)),
+        ("gripper_opening", None, scene(opening=0.75)),
+        ("gripper_moving", "yes", scene(hand_moved=(0.0, 0.006, 0.0))),
+        ("gripper_moving", "no", scene()),
+        ("gripper_moving", None, scene(hand_moved=(0.0, 0.003, 0.0))),
+        ("gripper_vertical", "up", scene(hand_moved=(0.0, 0.0, 0.005))),
+        ("gripper_vertical", "down", scene(hand_moved=(0.0, 0.0, -0.005))),
+        ("gripper_vertical", None, scene(hand_moved=(0.005, 0.0, 0.001))),
+        ("gripper_lateral", "right", scene(hand_moved=(0.005, 0.0, 0.0))),
+        ("gripper_lateral", "left", scene(hand_moved=(-0.005, 0.0, 0.0))),
+        ("gripper_lateral", None, scene(hand_moved=(0.001, 0.0, 0.005))),
+        ("object_moving", "yes", scene(thing_moved=(0.0, 0.004, 0.0))),
+        ("object_moving", "no", scene(hand_moved=(0.0, 0.004, 0.0))),
+        ("object_moving", None, scene(thing_moved=(0.0, 0.001, 0.0))),
+        ("gripper_height", "high", scene(hand=(0.0, 0.6, 0.2))),
+        ("gripper_height", "low", scene(hand=(0.0, 0.6, 0.08))),
+        ("gripper_height", None, scene()),
+        ("object_height", "high", scene(thing=(0.0, 0.6, 0.2))),
+        ("object_height", "low", scene(thing=(0.0, 0.6, 0.02))),
+        ("object_height", None, scene(thing=(0.0, 0.6, 0.1))),
+    ],
+)
+def test_questions_are_answered_as_one_sees_it(kind: str, expected: str | None, state: State) -> None:
+    question = QUESTIONS[kind]
+    (index,) = question.answer(state)
+    assert (None if index == -1 else question.answers[index]) == expected
+
+
+def test_every_kind_of_question_is_tested_and_answers_many_states_as_it_answers_each() -> None:
+    states = np.concatenate([rollout(World(), name, 3)[:, :39] for name in ("push", "drawer_open")])
+    states = states.astype(np.float32)
+    for kind in QUESTIONS.values():
+        answers = kind.answer(states)
+        assert answers.dtype == np.int64
+        np.testing.assert_array_equal(answers, [kind.answer(state[None])[0] for state in states])
+
+
+@pytest.mark.parametrize("name", list(SCENARIOS))
+def test_instructions_are_four_different_sentences_for_each_task(name: str) -> None:
+    tasks = SCENARIOS[name].tasks
+    sentences = [words for task in tasks for words in task.instructions]
+    assert len(set(sentences)) == len(sentences) == 4 * len(tasks)

@@ -1,0 +1,169 @@
+"""The vector world of Meta-World, against the plain world and against Meta-World itself, bit for bit."""
+
+import itertools
+from typing import Any
+
+import gymnasium
+import mujoco
+import numpy as np
+import pytest
+from clbench.envs.metaworld.episode import PHYSICS, Episode, new_episode
+from metaworld.env_dict import ALL_V3_ENVIRONMENTS
+from numpy.typing import NDArray
+
+from clbench.task import load_scenario, resolve
+from clbench.world import VectorWorld, vector_world
+
+SCENARIOS = [load_scenario(f"clbench:clbench/{name}-v0") for name in ("MetaWorld", "MetaWorldCW")]
+TASKS = {task.name: task for one in SCENARIOS for task in one.tasks}
+WORLD = SCENARIOS[0].tasks[0].world
+PlainWorld = resolve(WORLD)
+LONGEST = 120
+"""Steps after which an episode is begun anew if it has not ended."""
+
+State = NDArray[np.float32]
+
+
+def metaworld(lanes: int, threads: int = 1) -> VectorWorld:
+    return vector_world(WORLD, lanes, threads)
+
+
+class Peer:
+    """One episode of Meta-World's own environment and one of our plain world, step by step."""
+
+    def __init__(self, task: str) -> None:
+        self.task, self.plain, self.episode = task, PlainWorld(), new_episode(task)
+        self.original: Any = ALL_V3_ENVIRONMENTS[f"{task.replace('_', '-')}-v3"]()
+        self.original._set_task_called, self.original._partially_observable = True, False
+        del self.original.sawyer_observation_space
+
+    def reset(self, seed: int) -> State:
+        """Begin both as one of our episodes begins, and return the first state."""
+        state = self.episode.begin(seed)
+        self.original._last_rand_vec = self.episode._last_rand_vec
+        self.original.reset()
+        for places in ("body_pos", "site_pos"):
+            expected = getattr(self.original.model, places)
+            np.testing.assert_array_equal(getattr(self.episode.model, places), expected)
+        check_start(self.episode, self.original)
+        continue_as(self.original, self.episode)
+        np.testing.assert_array_equal(self.plain.reset(seed=seed, options={"task": self.task})[0], state)
+        return state
+
+    def step(self, action: NDArray[np.float32]) -> tuple[State, float, bool]:
+        state, reward, success, _, _ = self.plain.step(action)
+        self.original.curr_path_length = 0
+        observation, expected, _, _, info = self.original.step(action.clip(-1.0, 1.0))
+        np.testing.assert_array_equal(observation.astype(np.float32), state)
+        assert (float(expected), bool(info["success"])) == (reward, success)
+        return state, reward, success
+
+
+def check_start(episode: Episode, original: Any) -> None:
+    """Check that our start is Meta-World's second reset of the same draw, but for where its physics lags."""
+    # MuJoCo's positions are those before the last of the 250 steps of the hand's way; ours are up to date
+    mujoco.mj_forward(original.model, original.data)
+    np.testing.assert_allclose(episode.data.qpos, original.data.qpos, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(episode.data.xpos, original.data.xpos, rtol=0, atol=1e-6)
+    for name, value in vars(original).items():
+        if isinstance(value, float | np.ndarray) and name not in (*PHYSICS, "_prev_obs", "prev_obs"):
+            np.testing.assert_allclose(vars(episode)[name], value, rtol=0, atol=2e-4, err_msg=name)
+
+
+def continue_as(original: Any, episode: Episode) -> None:
+    """Put Meta-World's environment where our episode is."""
+    mujoco.mj_copyData(original.data, original.model, episode.data)
+    for name, value in vars(episode).items():
+        if isinstance(value, bool | int | float | np.ndarray) and name not in PHYSICS:
+            setattr(original, name, value)
+
+
+def compare(task: str, steps: int, lanes: int = 4) -> int:
+    """Compare `steps` steps of a task, and return the successes.
+
+    Expert and random actions take turns; an episode is begun anew after success, or at a random age.
+    """
+    world, peers = metaworld(lanes), [Peer(task) for _ in range(lanes)]
+    generator = np.random.default_rng([7, list(TASKS).index(task)])
+    expert = resolve(TASKS[task].expert)(task)
+    states = np.zeros((lanes, 39), np.float32)
+    left, numbers = np.zeros(lanes, np.int64), list(range(lanes))
+    successes = 0
+    for step in range(-(-steps // lanes)):
+        beginning = [lane for lane in numbers if left[lane] <= 0]
+        seeds = generator.integers(2**31, size=len(beginning)).tolist()
+        if beginning:
+            states[beginning] = world.reset(beginning, seeds, [task] * len(beginning))
+            left[beginning] = generator.integers(40, LONGEST, size=len(beginning))
+        for lane, seed in zip(beginning, seeds, strict=True):
+            np.testing.assert_array_equal(peers[lane].reset(seed), states[lane])
+        actions = generator.uniform(-1.2, 1.2, (lanes, 4)).astype(np.float32)
+        for lane in numbers:
+            if (step // 6 + lane) % 6:
+                actions[lane] = expert(states[lane])
+        states, rewards, ended = world.step(numbers, actions)
+        for lane, peer in enumerate(peers):
+            state, reward, success = peer.step(actions[lane])
+            np.testing.assert_array_equal(state, states[lane])
+            assert (reward, success) == (rewards[lane], ended[lane])
+        successes += int(ended.sum())
+        left = np.where(ended, 0, left - 1)
+    world.close()
+    return successes
+
+
+@pytest.mark.parametrize("task", ["drawer_open", "push"])
+def test_it_is_the_plain_world_and_meta_world_bit_for_bit(task: str) -> None:
+    compare(task, steps=160)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("task", list(TASKS))
+def test_it_is_so_over_ten_thousand_steps_of_each_task(task: str) -> None:
+    assert compare(task, steps=10_000) > 5
+
+
+def test_lanes_step_in_any_order_and_number_without_a_trace_in_the_others() -> None:
+    world, plain = metaworld(lanes=5, threads=3), [PlainWorld() for _ in range(5)]
+    tasks = ["push", "push", "drawer_open"]
+    states = world.reset([4, 2, 0], [4, 2, 0], tasks)
+    for row, lane in enumerate([4, 2, 0]):
+        expected = plain[lane].reset(seed=lane, options={"task": tasks[row]})[0]
+        np.testing.assert_array_equal(expected, states[row])
+    actions = np.random.default_rng(0).uniform(-1, 1, (30, 5, 4)).astype(np.float32)
+    for step, moving in zip(range(30), itertools.cycle([[4, 2, 0], [0], [2, 4], [0, 4]])):
+        states, rewards, _ = world.step(moving, actions[step, moving])
+        for row, lane in enumerate(moving):
+            state, reward, *_ = plain[lane].step(actions[step, lane])
+            assert states[row].tobytes() == state.tobytes()
+            assert rewards[row] == reward
+        if step == 15:
+            world.reset([1, 3], [9, 9], ["push", "drawer_open"])
+    world.close()
+
+
+def test_a_lane_that_begins_another_task_leaves_its_place_to_others() -> None:
+    world = metaworld(lanes=2)
+    expected = [world.reset([0], [seed], [task])[0] for task, seed in (("push", 1), ("drawer_open", 2))]
+    again = world.reset([1, 0], [1, 2], ["push", "drawer_open"])
+    np.testing.assert_array_equal(again, expected)
+
+
+def test_an_action_that_cannot_be_done_is_an_error_that_names_it() -> None:
+    world = metaworld(lanes=2)
+    world.reset([0, 1], [0, 1], ["push", "push"])
+    actions = np.zeros((2, 4), np.float32)
+    actions[1, 2] = np.nan
+    with pytest.raises(ValueError, match=r"is finite, not \[0.0, 0.0, nan, 0.0\]"):
+        world.step([0, 1], actions)
+    with pytest.raises(ValueError, match=r"has shape \(4,\), not \(3,\)"):
+        world.step([0, 1], np.zeros((2, 3), np.float32))
+
+
+def test_a_lane_without_an_episode_and_an_unknown_task_are_named() -> None:
+    world = metaworld(lanes=2)
+    world.reset([0], [0], ["push"])
+    with pytest.raises(gymnasium.error.ResetNeeded, match="Lane 1 of the Meta-World world has no episode"):
+        world.step([0, 1], np.zeros((2, 4), np.float32))
+    with pytest.raises(LookupError, match="Did you mean 'push_back'"):
+        world.reset([1], [0], ["push_bak"])

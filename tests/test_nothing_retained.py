@@ -1,0 +1,105 @@
+"""A scenario that retains no tasks, as Continual World: from the walk over a run to the page."""
+
+import dataclasses
+import importlib
+from collections.abc import Iterator
+from pathlib import Path
+
+import gymnasium
+import pytest
+import torch
+from gymnasium.envs.registration import EnvSpec
+
+from clbench.metrics import measure
+from clbench.pretraining import pretrained_policy
+from clbench.questions import load_questions
+from clbench.record import Record
+from clbench.run import RunSpec, execute
+from clbench.scenario_env import ScenarioEnv
+from clbench.scenario_vector_env import ScenarioVectorEnv
+from clbench.scores import Scores
+from clbench.task import load_scenario
+
+TOY = load_scenario("clbench.testing:clbench/Toy-v0")
+SCENARIO = dataclasses.replace(
+    TOY,
+    id="clbench/ToyUnretained-v0",
+    retained=(),
+    scenes=TOY.retained,
+    held_out=(),
+    budget=dataclasses.replace(TOY.budget, pretraining_steps=60, adaptation_steps=40),
+)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _registered() -> Iterator[None]:
+    spec = EnvSpec(
+        SCENARIO.id, "clbench.scenario_env:ScenarioEnv", kwargs={"scenario": "clbench.testing:UNRETAINED"}
+    )
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("clbench.testing.UNRETAINED", SCENARIO, raising=False)
+        patch.setitem(gymnasium.registry, SCENARIO.id, spec)
+        yield
+
+
+def run(method: str, folder: Path) -> Record:
+    return execute(RunSpec(SCENARIO.id, method, 0), folder)
+
+
+def test_the_walk_begins_with_the_first_target() -> None:
+    env = ScenarioEnv(SCENARIO, episodes_per_stage=2)
+    walk = [env.reset()[1] for _ in range(5)]
+    assert [info["stage"] for info in walk] == [1, 1, 2, 2, 2]
+    assert [info["task"] for info in walk] == ["right", "right", "down", "down", "down"]
+    assert env.reset(options={"stage": 1})[1]["task"] == "right"
+    with pytest.raises(ValueError, match="has stages 1 to 2, not 0"):
+        env.reset(options={"stage": 0})
+    many = ScenarioVectorEnv(SCENARIO, num_envs=2, episodes_per_stage=2)
+    assert many.reset(seed=0)[1]["task"].tolist() == ["right", "right"]
+    many.close()
+
+
+def test_the_policy_knows_answers_alone_and_its_actions_are_not_normalised() -> None:
+    policy, _ = pretrained_policy(SCENARIO, 0)
+    train, _ = load_questions(SCENARIO)
+    torch.testing.assert_close(policy.state_mean, train.scenes.mean(dim=0))
+    assert policy.action_mean.tolist() == [0.0, 0.0]
+    assert policy.action_std.tolist() == [1.0, 1.0]
+
+
+def test_questions_ask_about_the_scenes_of_other_tasks() -> None:
+    assert SCENARIO.scene_tasks == TOY.retained == TOY.scene_tasks
+    train, _ = load_questions(SCENARIO)
+    assert len(train) > SCENARIO.budget.question_episodes
+
+
+# one of each way to use prior demonstrations; where there are none yet, each is plain fine-tuning
+@pytest.mark.parametrize("method", ["experience_replay", "joint", "a_gem", "buffered_replay", "ewc"])
+def test_a_method_that_replays_begins_with_the_first_target(method: str, tmp_path: Path) -> None:
+    record = run(method, tmp_path)
+    assert record.error is None
+    assert record.costs["optimiser_steps"] == 80
+
+
+def test_a_method_that_cannot_do_without_says_so(tmp_path: Path) -> None:
+    record = run("fast_dvla", tmp_path)
+    assert record.status == "failed"
+    assert record.error is not None
+    assert record.error["where"] == "prepare"
+    assert "the scenario retains no tasks" in record.error["message"]
+
+
+def test_retention_is_missing_and_forgetting_is_of_earlier_targets(tmp_path: Path) -> None:
+    scores = Scores.from_record(run("sft", tmp_path))
+    assert measure("retention", scores) is None
+    assert measure("minimum_retention", scores) is None
+    learned, final = scores.success[1, 0].mean(), scores.success[2, 0].mean()
+    assert measure("forgetting", scores) == pytest.approx(learned - final)
+
+
+def test_table_and_page_are_drawn_without_retention(tmp_path: Path) -> None:
+    for method in ("sft", "joint"):
+        run(method, tmp_path / "records")
+    importlib.import_module("clbench.leaderboard.cli").show(records=tmp_path / "records")
+    assert SCENARIO.id in (tmp_path / "LEADERBOARD.md").read_text()
+    assert SCENARIO.id in (tmp_path / "index.html").read_text()
