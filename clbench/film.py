@@ -305,11 +305,14 @@ def film_run(
 
 
 def steps_per_second(task: Task) -> int:
-    """Return how many steps of a task's world are a second, as the world says; 25 if it does not."""
+    """Return how many steps of a task's world are a second, as the world says, but at most `FASTEST`.
+
+    It is 25 if the world does not say.
+    """
     world = resolve(task.world)()
     rate = world.metadata.get("render_fps", 25)
     world.close()
-    return int(rate)
+    return min(int(rate), FASTEST)
 
 
 @functools.cache

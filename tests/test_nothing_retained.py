@@ -2,18 +2,20 @@
 
 import dataclasses
 import importlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import gymnasium
+import numpy as np
 import pytest
 import torch
 from gymnasium.envs.registration import EnvSpec
 
+from clbench.method import load_method
 from clbench.metrics import measure
 from clbench.pretraining import pretrained_policy
 from clbench.questions import load_questions
-from clbench.record import Record
+from clbench.record import Record, record_path, write_record
 from clbench.run import RunSpec, execute
 from clbench.scenario_env import ScenarioEnv
 from clbench.scenario_vector_env import ScenarioVectorEnv
@@ -89,17 +91,31 @@ def test_a_method_that_cannot_do_without_says_so(tmp_path: Path) -> None:
     assert "the scenario retains no tasks" in record.error["message"]
 
 
-def test_retention_is_missing_and_forgetting_is_of_earlier_targets(tmp_path: Path) -> None:
-    scores = Scores.from_record(run("sft", tmp_path))
+@pytest.fixture
+def record(make_record: Callable[..., Record]) -> Record:
+    """Return a record of three targets, of which the first is half forgotten."""
+    success = [[0.0, 0.0, 0.0], [0.9, 0.0, 0.0], [0.6, 0.8, 0.0], [0.4, 0.8, 0.7]]
+    curves = [[0.2, 0.5, 0.7], [0.1, 0.4, 0.8], [0.3, 0.5, 0.6]]
+    answers = {(stage, "side"): (100, 90) for stage in range(4)}
+    return make_record(
+        success, curves=curves, selection=np.full((3, 4), 0.8), groups=(0, 3, 0), answers=answers
+    )
+
+
+def test_retention_is_missing_and_forgetting_is_of_earlier_targets(record: Record) -> None:
+    scores = Scores.from_record(record)
     assert measure("retention", scores) is None
     assert measure("minimum_retention", scores) is None
-    learned, final = scores.success[1, 0].mean(), scores.success[2, 0].mean()
-    assert measure("forgetting", scores) == pytest.approx(learned - final)
+    assert measure("retention_at_matched_adaptation", scores, {"sft": scores}) is None
+    assert measure("forgetting", scores) == pytest.approx((0.9 - 0.4 + 0.8 - 0.8) / 2)
+    assert measure("adaptation", scores) == pytest.approx(0.8)
 
 
-def test_table_and_page_are_drawn_without_retention(tmp_path: Path) -> None:
+def test_table_and_page_are_drawn_without_retention(record: Record, tmp_path: Path) -> None:
     for method in ("sft", "joint"):
-        run(method, tmp_path / "records")
+        run = {**record.run, "method": method, "uses": dataclasses.asdict(load_method(method).uses)}
+        other = dataclasses.replace(record, run=run)
+        write_record(other, record_path(tmp_path / "records", "clbench/Toy-v0", method, 0))
     importlib.import_module("clbench.leaderboard.cli").show(records=tmp_path / "records")
-    assert SCENARIO.id in (tmp_path / "LEADERBOARD.md").read_text()
-    assert SCENARIO.id in (tmp_path / "index.html").read_text()
+    assert "| sft |" in (tmp_path / "LEADERBOARD.md").read_text()
+    assert "clbench/Toy-v0" in (tmp_path / "index.html").read_text()

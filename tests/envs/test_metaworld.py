@@ -1,15 +1,20 @@
 """The Meta-World world, its tasks, experts and questions."""
 
 import copy
+import importlib.metadata
 import itertools
+import re
 import subprocess
 import sys
+from pathlib import Path
 from typing import Any
 
+import gymnasium
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from clbench import cli
 from clbench.task import Task, load_scenario, resolve
 
 SCENARIOS = {name: load_scenario(f"clbench:clbench/{name}-v0") for name in ("MetaWorld", "MetaWorldCW")}
@@ -68,6 +73,51 @@ def test_importing_the_scenarios_loads_no_simulator() -> None:
         "load_scenario('clbench/MetaWorldCW-v0'); assert not {'mujoco', 'metaworld'} & set(sys.modules)"
     )
     subprocess.run([sys.executable, "-c", program], check=True)
+
+
+@pytest.fixture
+def _without_metaworld(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Make it look as if the package metaworld were not installed."""
+    installed = importlib.metadata.version
+
+    def version(package: str) -> str:
+        if package == "metaworld":
+            raise importlib.metadata.PackageNotFoundError(package)
+        return installed(package)
+
+    monkeypatch.setattr(importlib.metadata, "version", version)
+
+
+@pytest.mark.usefixtures("_without_metaworld")
+@pytest.mark.parametrize("name", list(SCENARIOS))
+def test_without_the_package_whatever_would_use_it_says_what_to_install(
+    name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    message = f"clbench/{name}-v0 needs the package metaworld: pip install 'clbench[metaworld]'"
+    for make in (gymnasium.make, gymnasium.make_vec):
+        with pytest.raises(LookupError, match=re.escape(message)):
+            make(f"clbench/{name}-v0")
+    for command in (
+        lambda: cli.run(f"clbench/{name}-v0", "sft", records=tmp_path),
+        lambda: cli.tune(f"clbench/{name}-v0", "consft", values={"kappa": "1"}, records=tmp_path),
+        lambda: cli.film(f"clbench/{name}-v0", "sft"),
+        lambda: cli.demonstrations(f"clbench/{name}-v0"),
+    ):
+        with pytest.raises(SystemExit) as end:
+            command()
+        assert end.value.code == 2
+        assert message in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.usefixtures("_without_metaworld")
+def test_without_the_package_the_scenarios_are_listed_all_the_same(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "160")
+    cli.list_()
+    listed = capsys.readouterr().out
+    assert all(f"clbench/{name}-v0" in listed for name in SCENARIOS)
 
 
 def test_the_scenario_has_the_promised_parts() -> None:
