@@ -55,12 +55,9 @@ def test_a_scenario_has_distinct_tasks_whose_entry_points_resolve(scenario_id: s
 @pytest.fixture
 def unusable() -> Iterator[str]:
     """Register the toy as if it needed a simulator that nobody has, and return its id."""
-    tasks = {
-        group: tuple(dataclasses.replace(task, packages=("no-simulator",)) for task in getattr(TOY, group))
-        for group in ("retained", "target", "held_out")
-    }
     name = "clbench/Unusable-v0"
-    scenario = dataclasses.replace(TOY, id=name, **tasks)
+    targets = tuple(dataclasses.replace(task, packages=("no-simulator",)) for task in TOY.target)
+    scenario = dataclasses.replace(TOY, id=name, target=targets)
     spec = gymnasium.envs.registration.EnvSpec(
         name, "clbench.scenario_env:ScenarioEnv", kwargs={"scenario": "clbench.testing:UNUSABLE"}
     )

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 from metaworld.policies import ENV_POLICY_MAP
@@ -36,14 +36,16 @@ def expert(task: str) -> Callable[[State], Action]:
     if name not in ENV_POLICY_MAP:
         known = (entry.removesuffix("-v3").replace("-", "_") for entry in ENV_POLICY_MAP)
         raise unknown("expert of the Meta-World world", task, known)
-    policy = ENV_POLICY_MAP[name]()
+    make: Any = ENV_POLICY_MAP[name]
+    policy = make()
 
     def act(state: State) -> Action:
         with warnings.catch_warnings():
             # it asks for more than an action can do, and says so each time
             warnings.filterwarnings("ignore", "Constant")
             wished = policy.get_action(state.astype(np.float64))
-        return np.clip(wished, -1.0, 1.0).astype(np.float32)  # type: ignore[no-any-return]
+        action: Action = np.clip(wished, -1.0, 1.0).astype(np.float32)
+        return action
 
     return act
 
@@ -60,4 +62,5 @@ def _push_back(state: State) -> Action:
     elif state[OPENING] > 0.62:  # around the block they are at 0.5
         way = np.zeros(3)
     way[2] *= not low or fingers < 0.0  # what is held is dragged at the height at which it was taken
-    return np.clip(np.append(10.0 * way, fingers), -1.0, 1.0).astype(np.float32)  # type: ignore[no-any-return]
+    action: Action = np.clip(np.append(10.0 * way, fingers), -1.0, 1.0).astype(np.float32)
+    return action
