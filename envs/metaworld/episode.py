@@ -37,7 +37,7 @@ class Scene:
     """The physics once the hand has gone to where it starts."""
 
 
-class Episode(SawyerXYZEnv):  # type: ignore[misc]
+class Episode(SawyerXYZEnv):
     """What an episode does otherwise than Meta-World's environment, of which it is a subclass for each task.
 
     1. The goal is part of the state: Meta-World's experts look at it.
@@ -74,7 +74,7 @@ class Episode(SawyerXYZEnv):  # type: ignore[misc]
         mujoco.mj_forward(self.model, self.data)
         self._prev_obs = self._get_curr_obs_combined_no_goal()
         self.curr_path_length = 0
-        return self._get_obs().astype(np.float32)  # type: ignore[no-any-return]
+        return self._get_obs().astype(np.float32)
 
     def place(self) -> None:
         """Give the shared model this episode's places of bodies and sites."""
@@ -129,7 +129,7 @@ class Episode(SawyerXYZEnv):  # type: ignore[misc]
         observation = np.zeros(18)
         observation[:3] = self.get_body_com("hand")
         apart = np.linalg.norm(self.get_body_com("rightclaw") - self.get_body_com("leftclaw"))
-        observation[3] = min(max(apart / 0.1, 0.0), 1.0)
+        observation[3] = min(max(float(apart) / 0.1, 0.0), 1.0)
         places, turns = self._get_pos_objects(), self._get_quat_objects()
         for number in range(len(places) // 3):
             first = 4 + 7 * number

@@ -6,6 +6,7 @@ import itertools
 import re
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -97,12 +98,13 @@ def test_without_the_package_whatever_would_use_it_says_what_to_install(
     for make in (gymnasium.make, gymnasium.make_vec):
         with pytest.raises(LookupError, match=re.escape(message)):
             make(f"clbench/{name}-v0")
-    for command in (
+    commands: tuple[Callable[[], None], ...] = (
         lambda: cli.run(f"clbench/{name}-v0", "sft", records=tmp_path),
         lambda: cli.tune(f"clbench/{name}-v0", "consft", values={"kappa": "1"}, records=tmp_path),
         lambda: cli.film(f"clbench/{name}-v0", "sft"),
         lambda: cli.demonstrations(f"clbench/{name}-v0"),
-    ):
+    )
+    for command in commands:
         with pytest.raises(SystemExit) as end:
             command()
         assert end.value.code == 2

@@ -7,7 +7,6 @@ import gymnasium
 import mujoco
 import numpy as np
 import pytest
-from clbench.envs.metaworld.episode import PHYSICS, Episode, new_episode
 from metaworld.env_dict import ALL_V3_ENVIRONMENTS
 from numpy.typing import NDArray
 
@@ -18,6 +17,8 @@ SCENARIOS = [load_scenario(f"clbench:clbench/{name}-v0") for name in ("MetaWorld
 TASKS = {task.name: task for one in SCENARIOS for task in one.tasks}
 WORLD = SCENARIOS[0].tasks[0].world
 PlainWorld = resolve(WORLD)
+new_episode = resolve("clbench.envs.metaworld.episode:new_episode")
+PHYSICS = resolve("clbench.envs.metaworld.episode:PHYSICS")
 LONGEST = 120
 """Steps after which an episode is begun anew if it has not ended."""
 
@@ -39,7 +40,7 @@ class Peer:
 
     def reset(self, seed: int) -> State:
         """Begin both as one of our episodes begins, and return the first state."""
-        state = self.episode.begin(seed)
+        state: State = self.episode.begin(seed)
         self.original._last_rand_vec = self.episode._last_rand_vec
         self.original.reset()
         check_start(self.episode, self.original)
@@ -56,7 +57,7 @@ class Peer:
         return state, reward, success
 
 
-def check_start(episode: Episode, original: Any) -> None:
+def check_start(episode: Any, original: Any) -> None:
     """Check that our start is Meta-World's second reset of the same draw, but for where its physics lags."""
     # MuJoCo's positions are those before the last of the 250 steps of the hand's way; ours are up to date
     mujoco.mj_forward(original.model, original.data)
@@ -70,7 +71,7 @@ def check_start(episode: Episode, original: Any) -> None:
             np.testing.assert_allclose(vars(episode)[name], value, rtol=0, atol=2e-4, err_msg=name)
 
 
-def continue_as(original: Any, episode: Episode) -> None:
+def continue_as(original: Any, episode: Any) -> None:
     """Put Meta-World's environment where our episode is."""
     original.model.body_pos[:] = episode.model.body_pos
     original.model.site_pos[:] = episode.model.site_pos
