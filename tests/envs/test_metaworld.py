@@ -16,6 +16,8 @@ import pytest
 from numpy.typing import NDArray
 
 from clbench import cli
+from clbench.commands.film import film
+from clbench.commands.runs import run, tune
 from clbench.task import Task, load_scenario, resolve
 
 SCENARIOS = {name: load_scenario(f"clbench:clbench/{name}-v0") for name in ("MetaWorld", "MetaWorldCW")}
@@ -99,9 +101,9 @@ def test_without_the_package_whatever_would_use_it_says_what_to_install(
         with pytest.raises(LookupError, match=re.escape(message)):
             make(f"clbench/{name}-v0")
     commands: tuple[Callable[[], None], ...] = (
-        lambda: cli.run(f"clbench/{name}-v0", "sft", records=tmp_path),
-        lambda: cli.tune(f"clbench/{name}-v0", "consft", values={"kappa": "1"}, records=tmp_path),
-        lambda: cli.film(f"clbench/{name}-v0", "sft"),
+        lambda: run(f"clbench/{name}-v0", "sft", records=tmp_path),
+        lambda: tune(f"clbench/{name}-v0", "consft", values={"kappa": "1"}, records=tmp_path),
+        lambda: film(f"clbench/{name}-v0", "sft"),
         lambda: cli.demonstrations(f"clbench/{name}-v0"),
     )
     for command in commands:
