@@ -57,12 +57,12 @@ SCENARIO = Scenario(
     description="Meta-World's arm learns to close and press things, after eight skills on other things.",
     retained=(
         _task(
-            "reach",
-            80,
-            "move the gripper to the target",
-            "reach the target with the gripper",
-            "bring the hand to the target",
-            "go to the target",
+            "door_close",
+            110,
+            "close the door",
+            "push the door closed",
+            "swing the door until it is closed",
+            "push the handle of the door back",
         ),
         _task(
             "drawer_open",
@@ -228,6 +228,7 @@ CONTINUAL_WORLD = Scenario(
     questions="clbench.envs.metaworld.questions:QUESTIONS",
     scenes=(
         *SCENARIO.retained,
+        _task("reach", 80, "move the gripper to the target"),
         _task("pick_place", 120, "pick up the block and place it at the target"),
         _task("stick_push", 120, "push the container with the stick"),
     ),

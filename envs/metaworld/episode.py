@@ -45,7 +45,7 @@ class Episode(SawyerXYZEnv):
        episode before.
     3. The hand's way to its start, 50 steps, is made once for each task.
     4. The model is shared: an episode takes its own places of bodies and sites with it, see `place`.
-    5. Parts of the physics are looked up by name once.
+    5. Parts of the physics are looked up by name once, and contacts all together.
     """
 
     scene: Scene
@@ -124,6 +124,16 @@ class Episode(SawyerXYZEnv):
         right, left = self._get_site_pos("rightEndEffector"), self._get_site_pos("leftEndEffector")
         center: Vector = (right + left) / 2.0
         return center
+
+    def touching_object(self, object_geom_id: int) -> bool:
+        """Return whether both fingers press on a geom; Meta-World looks at each contact twice, in Python."""
+        contact, force = self.data.contact, self.data.efc_force
+        of_object = (contact.geom == object_geom_id).any(axis=1)
+        for pad in ("leftpad_geom", "rightpad_geom"):
+            of_both = of_object & (contact.geom == self.data.geom(pad).id).any(axis=1)
+            if not sum(force[address] for address in contact.efc_address[of_both]) > 0:
+                return False
+        return True
 
     def _get_curr_obs_combined_no_goal(self) -> Vector:
         observation = np.zeros(18)

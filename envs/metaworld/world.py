@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from .state import State
 from .vector_world import MetaWorldVectorWorld
 
-FIRST_TASK = "reach"
+FIRST_TASK = "drawer_open"
 """What `reset` starts if no task is asked for."""
 
 CAMERA = {"distance": 1.4, "azimuth": 135.0, "elevation": -30.0, "lookat": np.array([0.0, 0.6, 0.15])}
