@@ -15,7 +15,7 @@ from PIL import Image, ImageDraw
 
 from clbench.commands.film import film
 from clbench.evaluation import Episode, Trial
-from clbench.film import FAILURE, SUCCESS, Film, Take, film_run, shoot
+from clbench.film import FAILURE, FASTEST, SUCCESS, Film, Take, film_run, shoot, steps_per_second
 from clbench.record import Record
 from clbench.rendering import RenderingError, choose_back_end
 from clbench.run import RunSpec, execute
@@ -256,3 +256,8 @@ def test_the_fetch_world_is_drawn_where_anything_can_draw() -> None:
     assert length == 60  # the policy was never trained
     assert different == 61  # and it moves the arm all the time
     assert (width, height) == (96, 96)
+
+
+def test_a_film_shows_no_more_steps_in_a_second_than_a_gif_can() -> None:
+    assert steps_per_second(load_scenario("clbench/Fetch-v0").target[0]) == 25
+    assert steps_per_second(load_scenario("clbench/MetaWorld-v0").target[0]) == FASTEST == 50
