@@ -33,6 +33,7 @@ def _task(colour: str, room: str) -> Task:
         horizon=60,
         world="clbench.envs.point_maze.world:PointMazeWorld",
         expert="clbench.envs.point_maze.experts:expert",
+        packages=("gymnasium-robotics",),
     )
 
 

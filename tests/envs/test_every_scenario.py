@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from clbench.policy import encode
 from clbench.scenario_env import ScenarioEnv
-from clbench.task import Scenario, Task, load_scenario, resolve, scenario_ids
+from clbench.task import Scenario, Task, registered_scenario, resolve, scenario_ids
 from clbench.world import Lanes, World
 
 BUILT_IN = [
@@ -25,7 +25,7 @@ BUILT_IN = [
     for scenario_id in scenario_ids()
     if str(gymnasium.registry[scenario_id].kwargs["scenario"]).startswith("clbench.envs.")
 ]
-every_scenario = pytest.mark.parametrize("scenario", [load_scenario(name) for name in BUILT_IN], ids=BUILT_IN)
+every_scenario = pytest.mark.parametrize("scenario", map(registered_scenario, BUILT_IN), ids=BUILT_IN)
 
 Rows = NDArray[np.float64]
 
@@ -33,13 +33,13 @@ Rows = NDArray[np.float64]
 def make(entry_point: str) -> World:
     try:
         world: World = resolve(entry_point)()
-    except LookupError as fault:
+    except (ImportError, LookupError) as fault:
         pytest.skip(str(fault))
     return world
 
 
 def make_environment(scenario: Scenario, **options: Any) -> ScenarioEnv:
-    make(scenario.retained[0].world).close()
+    make(scenario.tasks[0].world).close()
     environment = gymnasium.make(scenario.id, **options).unwrapped
     assert isinstance(environment, ScenarioEnv)
     return environment
@@ -81,8 +81,8 @@ def run(program: str) -> None:
 
 def test_the_data_of_all_scenarios_load_no_simulator() -> None:
     run(
-        "import clbench, sys\n"
-        f"for name in {BUILT_IN}: clbench.load_scenario(name)\n"
+        "import clbench.task, sys\n"
+        f"for name in {BUILT_IN}: clbench.task.registered_scenario(name)\n"
         "assert not {'mujoco', 'gymnasium_robotics', 'dm_control', 'metaworld'} & set(sys.modules)"
     )
 
@@ -210,7 +210,7 @@ def test_instructions_and_questions_are_plain_words_of_the_vocabulary(scenario: 
 
 @every_scenario
 def test_questions_answer_many_states_as_they_answer_each(scenario: Scenario) -> None:
-    episodes = [rollout(make(task.world), task.name, seed=3) for task in scenario.retained[:2]]
+    episodes = [rollout(make(task.world), task.name, seed=3) for task in scenario.scene_tasks[:2]]
     states = np.concatenate(episodes)[:, :-1].astype(np.float32)
     for kind in resolve(scenario.questions):
         answers = kind.answer(states)

@@ -4,8 +4,6 @@ import copy
 import importlib.metadata
 import itertools
 import re
-import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -68,14 +66,6 @@ def scene(
     state[0, 0:3], state[0, 3], state[0, 4:7], state[0, 36:39] = hand, opening, thing, goal
     state[0, 18:21], state[0, 22:25] = np.subtract(hand, hand_moved), np.subtract(thing, thing_moved)
     return state
-
-
-def test_importing_the_scenarios_loads_no_simulator() -> None:
-    program = (
-        "import sys; from clbench.task import load_scenario; load_scenario('clbench:clbench/MetaWorld-v0');"
-        "load_scenario('clbench/MetaWorldCW-v0'); assert not {'mujoco', 'metaworld'} & set(sys.modules)"
-    )
-    subprocess.run([sys.executable, "-c", program], check=True)
 
 
 @pytest.fixture
@@ -183,24 +173,12 @@ def test_a_copy_of_a_world_goes_on_as_the_world_does_and_leaves_it_alone(task: s
         np.testing.assert_array_equal(rows, expected[11:])
 
 
-def test_an_episode_without_a_seed_continues_the_random_numbers() -> None:
-    world = World()
-    first = world.reset(seed=5)[0]
-    second = world.reset()[0]
-    assert not np.array_equal(first, second)
-    world.reset(seed=5)
-    np.testing.assert_array_equal(world.reset()[0], second)
-
-
 @pytest.mark.parametrize("task", TASKS, ids=lambda task: task.name)
-def test_no_task_is_done_at_the_start_and_things_stand_elsewhere_each_time(task: Task) -> None:
+def test_nothing_moves_in_the_first_state_and_things_stand_elsewhere_each_time(task: Task) -> None:
     world, states = World(), []
     for seed in range(5):
-        state, info = world.reset(seed=seed, options={"task": task.name})
-        assert info == {"success": False, "task": task.name}
-        np.testing.assert_array_equal(state[:18], state[18:36])
-        states.append(state)
-        assert not world.step(np.zeros(4, np.float32))[2]
+        states.append(world.reset(seed=seed, options={"task": task.name})[0])
+        np.testing.assert_array_equal(states[-1][:18], states[-1][18:36])
     assert np.ptp(np.array(states)[:, [*range(4, 18), 36, 37, 38]], axis=0).max() > 0.02
 
 
@@ -208,13 +186,6 @@ def test_no_task_is_done_at_the_start_and_things_stand_elsewhere_each_time(task:
 def test_the_expert_does_its_task(task: Task) -> None:
     # the least that an expert reaches on 100 episodes is 0.9
     assert sum(expert_succeeds(task, seed) for seed in range(100, 103)) >= 2
-
-
-def test_an_unknown_task_is_an_error_that_names_the_nearest() -> None:
-    with pytest.raises(LookupError, match="Did you mean 'drawer_open'"):
-        World().reset(options={"task": "drawer_opn"})
-    with pytest.raises(LookupError, match="Did you mean 'drawer_open'"):
-        resolve(TASKS[0].expert)("drawer_opn")
 
 
 @pytest.mark.parametrize(
@@ -298,19 +269,3 @@ def test_questions_are_answered_as_one_sees_it(kind: str, expected: str | None, 
     question = QUESTIONS[kind]
     (index,) = question.answer(state)
     assert (None if index == -1 else question.answers[index]) == expected
-
-
-def test_every_kind_of_question_is_tested_and_answers_many_states_as_it_answers_each() -> None:
-    states = np.concatenate([rollout(World(), name, 3)[:, :39] for name in ("push", "drawer_open")])
-    states = states.astype(np.float32)
-    for kind in QUESTIONS.values():
-        answers = kind.answer(states)
-        assert answers.dtype == np.int64
-        np.testing.assert_array_equal(answers, [kind.answer(state[None])[0] for state in states])
-
-
-@pytest.mark.parametrize("name", list(SCENARIOS))
-def test_instructions_are_four_different_sentences_for_each_task(name: str) -> None:
-    tasks = SCENARIOS[name].tasks
-    sentences = [words for task in tasks for words in task.instructions]
-    assert len(set(sentences)) == len(sentences) == 4 * len(tasks)
