@@ -172,7 +172,7 @@ _CW10 = (
         "push the block around the wall to the target",
         "slide the block along the wall to the target",
         "take the block behind the wall to the target",
-        "move the block past the wall until it is at the target",
+        "move the block around the wall until it is at the target",
     ),
     _FAUCET_CLOSE,
     _task(

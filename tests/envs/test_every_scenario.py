@@ -25,7 +25,9 @@ BUILT_IN = [
     for scenario_id in scenario_ids()
     if str(gymnasium.registry[scenario_id].kwargs["scenario"]).startswith("clbench.envs.")
 ]
-every_scenario = pytest.mark.parametrize("scenario", map(registered_scenario, BUILT_IN), ids=BUILT_IN)
+every_scenario = pytest.mark.parametrize(
+    "scenario", [registered_scenario(name) for name in BUILT_IN], ids=BUILT_IN
+)
 
 Rows = NDArray[np.float64]
 
