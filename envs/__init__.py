@@ -1,17 +1,6 @@
 """The scenarios, registered with Gymnasium by name: nothing of a simulator is imported here."""
 
-from gymnasium.envs.registration import register
+from clbench.registration import register
 
-register(
-    id="clbench/Fetch-v0",
-    entry_point="clbench.scenario_env:ScenarioEnv",
-    vector_entry_point="clbench.scenario_vector_env:ScenarioVectorEnv",
-    kwargs={"scenario": "clbench.envs.fetch:SCENARIO"},
-)
-
-register(
-    id="clbench/PointMaze-v0",
-    entry_point="clbench.scenario_env:ScenarioEnv",
-    vector_entry_point="clbench.scenario_vector_env:ScenarioVectorEnv",
-    kwargs={"scenario": "clbench.envs.point_maze:SCENARIO"},
-)
+register("clbench/Fetch-v0", "clbench.envs.fetch:SCENARIO")
+register("clbench/PointMaze-v0", "clbench.envs.point_maze:SCENARIO")
