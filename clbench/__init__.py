@@ -17,6 +17,8 @@ if TYPE_CHECKING:
     from clbench.method import Uses as Uses
     from clbench.method import load_method as load_method
     from clbench.method import method_names as method_names
+    from clbench.online import evaluate_agent as evaluate_agent
+    from clbench.online import next_stage as next_stage
     from clbench.policy import Batch as Batch
     from clbench.policy import Policy as Policy
     from clbench.policy import PolicyConfig as PolicyConfig
@@ -24,6 +26,7 @@ if TYPE_CHECKING:
     from clbench.questions import QuestionKind as QuestionKind
     from clbench.record import Record as Record
     from clbench.record import read_record as read_record
+    from clbench.registration import register as register
     from clbench.run import RunSpec as RunSpec
     from clbench.run import execute as execute
     from clbench.scenario_env import ScenarioEnv as ScenarioEnv
@@ -48,9 +51,11 @@ _HOMES = {
         "load_method",
         "method_names",
     ),
+    "online": ("evaluate_agent", "next_stage"),
     "policy": ("Batch", "Policy", "PolicyConfig", "QuestionBatch"),
     "questions": ("QuestionKind",),
     "record": ("Record", "read_record"),
+    "registration": ("register",),
     "run": ("RunSpec", "execute"),
     "scenario_env": ("ScenarioEnv",),
     "task": ("Budget", "Scenario", "Task", "load_scenario", "scenario_ids"),
@@ -79,11 +84,14 @@ __all__ = [
     "Stage",
     "Task",
     "Uses",
+    "evaluate_agent",
     "execute",
     "load_method",
     "load_scenario",
     "method_names",
+    "next_stage",
     "read_record",
+    "register",
     "scenario_ids",
 ]
 

@@ -38,7 +38,7 @@ In a tuning run, whose `Record.run` has the split "selection", selection episode
 """
 
 ANSWER_COLUMNS = ("stage", "step", "kind", "asked", "correct")
-"""One row for each stage, evaluation point and kind of question."""
+"""One row for each stage, evaluation point and kind of question; an agent that learned online is asked 0."""
 
 POLICY_COLUMNS = ("stage", "step", "update_sparsity", "activation_drift")
 """One row for each stage and evaluation point: how far the policy is from the pretrained one.
@@ -72,8 +72,15 @@ _SCENARIO: _Fields = {
     "evaluation_steps": list,
     "budget": dict,
 }
-_COSTS = ("optimiser_steps", "parameters", "preparation_steps", "parameters_added", "bytes_kept")
-"""A run that failed need not have all."""
+_COSTS = (
+    "optimiser_steps",
+    "parameters",
+    "preparation_steps",
+    "parameters_added",
+    "bytes_kept",
+    "environment_steps",
+)
+"""A run that failed need not have all, nor that of an agent that learned online."""
 _ERROR: _Fields = dict.fromkeys(("where", "type", "message", "traceback"), str)
 
 _WORDS = {str: "a text", int: "a whole number", list: "a list", dict: "an object with named entries"}
@@ -92,7 +99,7 @@ class Record:
     run: dict[str, Any]
     """What was run: `scenario`, `method`, `seed`, `device`, `split` ("report", or "selection" for a tuning
     run), `settings` (all hyper-parameters), `changes` (those that differ from the method's defaults), `uses`
-    (the prior data it may touch)."""
+    (the prior data it may touch; and `online`, true, for an agent that learned by trial in the worlds)."""
     scenario: dict[str, Any]
     """The scenario in full: `retained`, `target` and `held_out` task names in order, `evaluation_steps`
     (steps of a stage after which it is evaluated, the last one its end), and its `budget`."""
@@ -104,8 +111,8 @@ class Record:
     policy: dict[str, list[Any]] = field(default_factory=lambda: {name: [] for name in POLICY_COLUMNS})
     """What has become of the policy as columns of equal length, see `POLICY_COLUMNS`."""
     costs: dict[str, Any] = field(default_factory=dict)
-    """`parameters`, `parameters_added`, `optimiser_steps`, those of them that are `preparation_steps`, and
-    `bytes_kept`: whole numbers."""
+    """`parameters`, `parameters_added`, `optimiser_steps`, those of them that are `preparation_steps`,
+    `bytes_kept`, and `environment_steps` of an agent that learned online: whole numbers."""
     diagnostics: dict[str, Any] = field(default_factory=dict)
     """What the method tells about itself."""
     fingerprint: dict[str, Any] = field(default_factory=dict)
@@ -115,6 +122,12 @@ class Record:
     """Dates and seconds: all that may differ between two equal runs."""
     error: dict[str, str] | None = None
     """For a failed run: `where` (the seam and stage), `type`, `message`, `traceback`."""
+
+
+def append_row(columns: dict[str, list[Any]], row: Iterable[Any]) -> None:
+    """Append a row to columns of a record."""
+    for column, value in zip(columns.values(), row, strict=True):
+        column.append(value)
 
 
 def label_of(method: str, changes: Mapping[str, Any]) -> str:

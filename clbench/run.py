@@ -24,7 +24,15 @@ from clbench.learner import Learner, repeatable, sources
 from clbench.live import Log, require_tensorboard
 from clbench.method import Method, build_method, describe_method
 from clbench.questions import report_questions
-from clbench.record import Record, RecordError, label_of, read_record, record_path, write_record
+from clbench.record import (
+    Record,
+    RecordError,
+    append_row,
+    label_of,
+    read_record,
+    record_path,
+    write_record,
+)
 from clbench.stages import drop_stages, has_stages, keep_stage
 from clbench.strict_json import check_json
 from clbench.task import Scenario, Split, load_scenario
@@ -89,13 +97,18 @@ class RunSpec:
             "changes": {name: settings[name] for name in sorted(self.changes)},
             "uses": dataclasses.asdict(method.uses),
         }
-        groups = ("retained", "target", "held_out")
-        return run, {
-            "id": scenario.id,
-            **{group: [task.name for task in getattr(scenario, group)] for group in groups},
-            "evaluation_steps": list(scenario.budget.evaluation_steps),
-            "budget": dataclasses.asdict(scenario.budget),
-        }
+        return run, describe_scenario(scenario)
+
+
+def describe_scenario(scenario: Scenario) -> dict[str, Any]:
+    """Return `Record.scenario`."""
+    groups = ("retained", "target", "held_out")
+    return {
+        "id": scenario.id,
+        **{group: [task.name for task in getattr(scenario, group)] for group in groups},
+        "evaluation_steps": list(scenario.budget.evaluation_steps),
+        "budget": dataclasses.asdict(scenario.budget),
+    }
 
 
 def _plain(value: Any) -> Any:
@@ -362,9 +375,9 @@ class _Run:
         for name, asked, correct in answer(
             self.learner.policy, self.learner.questions.kinds, kind, questions
         ):
-            _append(self.record.answers, (number, step, name, asked, correct))
+            append_row(self.record.answers, (number, step, name, asked, correct))
         drift = float(self._activations().distance(self.anchor).mean())
-        _append(self.record.policy, (number, step, self._update_sparsity(), drift))
+        append_row(self.record.policy, (number, step, self._update_sparsity(), drift))
         self.log.report(self.record, number, step)
 
     def _play(self, number: int, step: int, trials: list[Trial]) -> None:
@@ -374,7 +387,7 @@ class _Run:
         )
         self.learner.policy.train()
         for episode in outcomes:
-            _append(self.record.episodes, episode_row(number, step, episode))
+            append_row(self.record.episodes, episode_row(number, step, episode))
 
     @torch.no_grad()
     def _activations(self) -> Gaussian:
@@ -486,8 +499,3 @@ def _checked(diagnostics: Any) -> dict[str, Any]:
         raise TypeError(f"diagnostics() must return a dictionary, not {type(diagnostics).__name__}.")
     check_json(json.loads(json.dumps(diagnostics, allow_nan=False)))
     return diagnostics
-
-
-def _append(columns: dict[str, list[Any]], row: tuple[Any, ...]) -> None:
-    for column, value in zip(columns.values(), row, strict=True):
-        column.append(value)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from copy import copy
 from typing import Any
 
@@ -10,7 +11,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from clbench.task import Scenario, Task, resolve
+from clbench.task import Scenario, Task, resolve, scenario_at
 from clbench.walk import InstructionFormat, Start, Walk
 from clbench.world import World
 
@@ -35,6 +36,7 @@ class ScenarioEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         scenario: The sequence, or its entry point "module:attribute".
         instruction: How the observation gives the instruction.
         episodes_per_stage: Episodes after which `reset()` goes on to the next stage.
+        stage: The stage to stay in, for an agent that is trained stage by stage; all of them if None.
         render_mode: "rgb_array" or None; handed to the worlds.
 
     Raises:
@@ -48,12 +50,19 @@ class ScenarioEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         scenario: Scenario | str,
         instruction: InstructionFormat = "text",
         episodes_per_stage: int = 100,
+        stage: int | None = None,
         render_mode: str | None = None,
     ) -> None:
-        self.scenario: Scenario = resolve(scenario) if isinstance(scenario, str) else scenario
+        self.scenario: Scenario = scenario_at(scenario) if isinstance(scenario, str) else scenario
         self.scenario.require_packages()
         self.render_mode = render_mode
-        self._walk = Walk(self.scenario, episodes_per_stage, instruction)
+        self.instruction: InstructionFormat = instruction
+        self.stage = stage
+        self.steps_taken = 0
+        """Steps since it was made."""
+        self.begun_at: float | None = None
+        """When the first episode began, by `time.perf_counter`."""
+        self._walk = Walk(self.scenario, episodes_per_stage, instruction, stage)
         self._worlds: dict[str, World] = {}
         self._begun: Start | None = None
         self._steps = 0
@@ -79,6 +88,7 @@ class ScenarioEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
             ValueError: It has no such stage, or an option is unknown.
         """
         super().reset(seed=seed)
+        self.begun_at = self.begun_at or time.perf_counter()
         if seed is not None:
             self._walk.begin()
         self._begun = start = self._walk.next(self.np_random, options or {})
@@ -97,6 +107,7 @@ class ScenarioEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         """Take one step of the current task."""
         state, reward, terminated, _, _ = self._world(self._start.task).step(action)
         self._steps += 1
+        self.steps_taken += 1
         truncated = not terminated and self._steps >= self._start.task.horizon
         return self._observation(state), float(reward), terminated, truncated, self._start.info(terminated)
 

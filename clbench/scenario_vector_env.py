@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import time
 from collections.abc import Sequence
 from typing import Any
 
@@ -15,7 +16,7 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from clbench.scenario_env import Observation
-from clbench.task import Scenario, resolve
+from clbench.task import Scenario, scenario_at
 from clbench.walk import InstructionFormat, Start, Walk
 from clbench.world import Lanes
 
@@ -34,6 +35,7 @@ class ScenarioVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]
         num_envs: How many environments.
         instruction: How the observations give the instruction, "text" or "tokens".
         episodes_per_stage: Episodes after which an environment goes on to the next stage.
+        stage: The stage to stay in, for an agent that is trained stage by stage; all of them if None.
         threads: Threads that step the worlds, by default one for each core. Results do not depend on it.
 
     Raises:
@@ -48,12 +50,19 @@ class ScenarioVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]
         num_envs: int = 1,
         instruction: InstructionFormat = "text",
         episodes_per_stage: int = 100,
+        stage: int | None = None,
         threads: int | None = None,
     ) -> None:
-        self.scenario: Scenario = resolve(scenario) if isinstance(scenario, str) else scenario
+        self.scenario: Scenario = scenario_at(scenario) if isinstance(scenario, str) else scenario
         self.scenario.require_packages()
         self.num_envs = num_envs
-        self._walks = [Walk(self.scenario, episodes_per_stage, instruction) for _ in range(num_envs)]
+        self.instruction: InstructionFormat = instruction
+        self.stage = stage
+        self.steps_taken = 0
+        """Steps since it was made, of all environments together."""
+        self.begun_at: float | None = None
+        """When the first episodes began, by `time.perf_counter`."""
+        self._walks = [Walk(self.scenario, episodes_per_stage, instruction, stage) for _ in range(num_envs)]
         self._generators: list[np.random.Generator] = [np_random()[0] for _ in range(num_envs)]
         self._lanes = Lanes(num_envs, threads or os.cpu_count() or 1)
         world = self._lanes.world(self.scenario.tasks[0])
@@ -81,6 +90,7 @@ class ScenarioVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]
             LookupError: The scenario has no such task.
             ValueError: It has no such stage, an option is unknown, or there are more or fewer seeds.
         """
+        self.begun_at = self.begun_at or time.perf_counter()
         seeds = self._seeds(seed)
         for number, own in enumerate(seeds):
             if own is not None:
@@ -115,6 +125,7 @@ class ScenarioVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]
             outcomes = self._lanes.step(going, np.asarray(actions)[going])
             self._states[going], rewards[going], terminated[going] = outcomes
             self._steps_left[going] -= 1
+            self.steps_taken += len(going)
         if beginning:
             for number in beginning:
                 self._starts[number] = self._walks[number].next(self._generators[number], {})

@@ -19,9 +19,31 @@ SPLITS: tuple[Split, ...] = ("selection", "report")
 
 
 def resolve(name: str) -> Any:
-    """Return the object that `name`, "module:attribute", names."""
+    """Return the object that `name`, "module:attribute", names.
+
+    Raises:
+        LookupError: There is no such module, or it has no such attribute; the nearest one is named.
+    """
     module, _, attribute = name.partition(":")
-    return getattr(importlib.import_module(module), attribute)
+    found = import_module(module, name)
+    if not hasattr(found, attribute):
+        near = difflib.get_close_matches(attribute, dir(found), n=1)
+        hint = f" Did you mean {near[0]!r}?" if near else ""
+        raise LookupError(f"No entry point {name!r}: module {module!r} has no {attribute!r}.{hint}")
+    return getattr(found, attribute)
+
+
+def import_module(module: str, needed_for: str) -> Any:
+    """Return a module.
+
+    Raises:
+        LookupError: It, or one that it imports, is not there.
+    """
+    try:
+        return importlib.import_module(module)
+    except (ModuleNotFoundError, ValueError) as error:  # ValueError: the name is empty
+        missing = getattr(error, "name", None) or module
+        raise LookupError(f"No module {missing!r} can be imported for {needed_for!r}.") from error
 
 
 def unknown(kind: str, name: str, known: Iterable[str]) -> LookupError:
@@ -56,6 +78,17 @@ class Task:
     packages: tuple[str, ...] = ()
     """Distributions whose version can change a trajectory, beside those that all worlds have in common: the
     simulator of its suite, as ("gymnasium-robotics",)."""
+
+    def __post_init__(self) -> None:
+        from clbench.names import check_plain  # it knows the scenarios
+
+        check_plain("task", self.name)
+        if isinstance(self.instructions, str):
+            raise TypeError(f"instructions of the task {self.name} must be a tuple of texts, not one text.")
+        if not self.instructions or not all(words.strip() for words in self.instructions):
+            raise ValueError(f"The task {self.name} needs an instruction, and none of them may be empty.")
+        if self.horizon < 1:
+            raise ValueError(f"horizon of the task {self.name} must be at least 1 step, not {self.horizon}.")
 
     @property
     def dataset_id(self) -> str:
@@ -142,6 +175,12 @@ class Scenario:
     limits: Limits = field(default_factory=Limits)
     """What the process of a submitted run may take."""
 
+    def __post_init__(self) -> None:
+        names = [task.name for task in self.tasks]
+        for name in names:
+            if names.count(name) > 1:
+                raise ValueError(f"{self.id}: two tasks are called {name!r}.")
+
     @cached_property
     def tasks(self) -> tuple[Task, ...]:
         """All tasks: retained, then target, then held out. Columns of every score table follow this order."""
@@ -214,12 +253,28 @@ def registered_scenario(scenario_id: str) -> Scenario:
 
     module, _, name = scenario_id.rpartition(":")
     if module:
-        try:
-            importlib.import_module(module)
-        except ModuleNotFoundError as error:
-            raise LookupError(f"No module {error.name!r} can be imported for {scenario_id!r}.") from error
+        import_module(module, scenario_id)
     if name not in gymnasium.registry or "scenario" not in (gymnasium.registry[name].kwargs or {}):
         raise unknown("scenario", name, scenario_ids())
-    scenario = resolve(gymnasium.registry[name].kwargs["scenario"])
-    assert isinstance(scenario, Scenario)
+    entry_point = gymnasium.registry[name].kwargs["scenario"]
+    scenario = scenario_at(entry_point)
+    if scenario.id != name:
+        raise LookupError(f"{entry_point!r} is registered as {name!r}, but its id is {scenario.id!r}.")
+    return scenario
+
+
+def scenario_at(entry_point: str) -> Scenario:
+    """Return the scenario at "module:attribute".
+
+    Raises:
+        LookupError: There is none.
+        ValueError: A word of its instructions is not in the vocabulary.
+    """
+    from clbench.policy import encode  # PyTorch takes seconds to import
+
+    scenario = resolve(entry_point)
+    if not isinstance(scenario, Scenario):
+        raise LookupError(f"{entry_point!r} is no Scenario but a {type(scenario).__name__}.")
+    for task in scenario.tasks:
+        encode(task.instructions)
     return scenario

@@ -47,15 +47,25 @@ class Walk:
         scenario: The sequence.
         episodes_per_stage: Episodes after which the next stage begins.
         instruction: How observations give the instruction.
+        stage: The stage that it never leaves; it goes through all of them if None.
     """
 
-    def __init__(self, scenario: Scenario, episodes_per_stage: int, instruction: InstructionFormat) -> None:
+    def __init__(
+        self,
+        scenario: Scenario,
+        episodes_per_stage: int,
+        instruction: InstructionFormat,
+        stage: int | None = None,
+    ) -> None:
         if instruction not in ("text", "tokens"):
             raise ValueError(f'instruction must be "text" or "tokens", not {instruction!r}.')
         if episodes_per_stage < 1:
             raise ValueError(f"episodes_per_stage must be at least 1, not {episodes_per_stage}.")
         self._scenario, self._episodes_per_stage, self._format = scenario, episodes_per_stage, instruction
-        self._episode = -1
+        self._stage, self._episode = stage, -1
+        self._first = 0 if scenario.retained else 1
+        if stage is not None:
+            self._check_stage(stage)
 
     @property
     def instruction_space(self) -> spaces.Space[Any]:
@@ -80,22 +90,35 @@ class Walk:
             raise ValueError(f'Options of reset are "task" and "stage", not {sorted(options)}.')
         task, stage = self._choose(options)
         words = task.instructions[int(generator.integers(len(task.instructions)))]
-        observed = encode([words])[0].numpy() if self._format == "tokens" else words
-        return Start(task, stage, words, observed, int(generator.integers(2**31)))
+        return Start(task, stage, words, observed(words, self._format), int(generator.integers(2**31)))
 
     def _choose(self, options: Mapping[str, Any]) -> tuple[Task, int]:
         """Return task and stage of the next episode."""
-        scenario, stages = self._scenario, len(self._scenario.target)
-        first = 0 if scenario.retained else 1
+        scenario = self._scenario
         if "task" in options:
             task = scenario.task(options["task"])
             return task, scenario.target.index(task) + 1 if task in scenario.target else 0
         if "stage" in options:
-            if options["stage"] not in range(first, stages + 1):
-                raise ValueError(f"{scenario.id} has stages {first} to {stages}, not {options['stage']!r}.")
-            self._episode = (options["stage"] - first) * self._episodes_per_stage
+            self._check_stage(options["stage"])
+            self._episode = (options["stage"] - self._first) * self._episodes_per_stage
         else:
             self._episode += 1
-        stage = min(first + self._episode // self._episodes_per_stage, stages)
+        stage = min(self._first + self._episode // self._episodes_per_stage, len(scenario.target))
+        stage = stage if self._stage is None else self._stage
         retained = scenario.retained
         return scenario.target[stage - 1] if stage else retained[self._episode % len(retained)], stage
+
+    def _check_stage(self, stage: Any) -> None:
+        """Refuse a stage that the scenario does not have, or that this walk never comes to."""
+        last = len(self._scenario.target)
+        if stage not in range(self._first, last + 1):
+            raise ValueError(f"{self._scenario.id} has stages {self._first} to {last}, not {stage!r}.")
+        if self._stage not in (None, stage):
+            raise ValueError(
+                f"This environment stays in stage {self._stage}: make another for stage {stage}."
+            )
+
+
+def observed(words: str, form: InstructionFormat) -> Any:
+    """Return an instruction as observations give it: text, or word ids (L,)."""
+    return encode([words])[0].numpy() if form == "tokens" else words

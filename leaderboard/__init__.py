@@ -19,7 +19,8 @@ def load(records: Path | str = Path("leaderboard/records")) -> pandas.DataFrame:
     The columns are `scenario`, `method`, `division`, `rank` (the place in the division, shared by what cannot
     be told apart), `tier`, `seeds` (how many); for every metric its value and the ends of its 95 % interval,
     as `retention`, `retention_low`, `retention_high`; then `relative_cost` (training time, sft's is 1),
-    `steps`, `bytes_kept`, `parameters` and `parameters_added`, each a mean over seeds. What is missing is
+    `steps`, `bytes_kept`, `parameters`, `parameters_added` and `environment_steps` (of agents that learned
+    online), each a mean over seeds. What is missing is
     NaN. `clbench leaderboard` lists the records that make no row, and why.
 
     Args:

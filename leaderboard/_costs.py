@@ -20,6 +20,7 @@ COSTS = {
     "bytes_kept": "bytes_kept",
     "parameters": "parameters",
     "parameters_added": "parameters_added",
+    "environment_steps": "environment_steps",
 }
 """Column of the table, and where a record's costs have it."""
 

@@ -18,8 +18,12 @@ from clbench.task import Split
 
 from ._tiers import tier_of
 
-DIVISIONS = ("prior-data-free", "prior questions", "prior demonstrations", "reference")
-"""In the order of the table: what a method may look at again; guides that do not compete are last."""
+DIVISIONS = ("prior-data-free", "prior questions", "prior demonstrations", "online", "reference")
+"""In the order of the table: what a method may look at again; agents that learned by trial and not from
+demonstrations, with which no method is compared; guides that do not compete."""
+
+METHODS = DIVISIONS[:3]
+"""Divisions of methods: they start from the same policy and learn from the same demonstrations."""
 
 ACCESS = ("never", "prepare", "throughout")
 """When a method may touch prior data."""
@@ -175,6 +179,10 @@ def division_of(uses: dict[str, Any]) -> str:
         RecordError: It is no declaration.
     """
     kinds = ("demonstrations", "questions")
+    if "online" in uses:
+        if uses != {**dict.fromkeys(kinds, "never"), "reference": False, "online": True}:
+            raise RecordError("run: uses of an agent that learned online must be of nothing else.")
+        return "online"
     if set(uses) != {*kinds, "reference"} or any(uses[kind] not in ACCESS for kind in kinds):
         raise RecordError(
             f"run: uses must say when demonstrations and questions are touched, {' or '.join(ACCESS)}, and "

@@ -207,6 +207,10 @@ def _check_horizons(record: Record, scenario: Scenario) -> Check:
 def _replay(subject: _Subject, progress: Callable[[float], None]) -> list[Check]:
     """Run episodes of a record again from the policies of its stages, and ask the questions again."""
     run, spec = subject.run, subject.spec
+    if run.division == "online":
+        return [
+            Check("policies", "an agent that learned online leaves none: it is recomputed at best", False)
+        ]
     if not subject.may_import:
         told = f"{run.method} is not installed: name it with --method to import and run its code"
         return [Check("policies", told, False)]

@@ -6,8 +6,7 @@ It walks the whole way from a class to a row; its scores mean nothing. Ask for i
 
 import dataclasses
 
-from gymnasium.envs.registration import register
-
+from clbench.registration import register
 from clbench.task import Budget, Task, load_scenario
 
 _FETCH = load_scenario("clbench/Fetch-v0")
@@ -41,8 +40,4 @@ FETCH_TOY = dataclasses.replace(
     ),
 )
 
-register(
-    id=FETCH_TOY.id,
-    entry_point="clbench.scenario_env:ScenarioEnv",
-    kwargs={"scenario": "clbench.testing.fetch_toy:FETCH_TOY"},
-)
+register(FETCH_TOY.id, "clbench.testing.fetch_toy:FETCH_TOY")

@@ -8,10 +8,10 @@ from typing import Any
 import gymnasium
 import numpy as np
 from gymnasium import spaces
-from gymnasium.envs.registration import register
 from numpy.typing import NDArray
 
 from clbench.questions import QuestionKind
+from clbench.registration import register
 from clbench.task import Budget, Scenario, Task, unknown
 
 State = NDArray[np.float32]
@@ -123,9 +123,4 @@ TOY = Scenario(
     ),
 )
 
-register(
-    id="clbench/Toy-v0",
-    entry_point="clbench.scenario_env:ScenarioEnv",
-    vector_entry_point="clbench.scenario_vector_env:ScenarioVectorEnv",
-    kwargs={"scenario": "clbench.testing:TOY"},
-)
+register(TOY.id, "clbench.testing:TOY")

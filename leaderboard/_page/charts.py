@@ -27,12 +27,13 @@ PALETTE: Mapping[str, tuple[str, str]] = {
     "mark-0": ("#0072b2", "#56b4e9"),
     "mark-1": ("#d55e00", "#e69f00"),
     "mark-2": ("#00805d", "#2bc49a"),
-    "mark-3": ("#6b7480", "#9aa4b0"),
+    "mark-3": ("#a0527f", "#cc79a7"),
+    "mark-4": ("#6b7480", "#9aa4b0"),
 }
 """Colours in the light and in the dark theme. Those of marks are of Okabe and Ito, which the colour-blind
 tell apart, or near them where the contrast to the paper was below 3."""
 
-SHAPES = ("circle", "square", "triangle-up", "diamond")
+SHAPES = ("circle", "square", "triangle-up", "cross", "diamond")
 """Of the marks of a division, by its place in `DIVISIONS`: colour is never the only sign."""
 
 FONT = "Liberation Sans, Arial, Helvetica, sans-serif"
@@ -167,10 +168,12 @@ def plane(
         _axis(name, title, scale={"domain": [LOW, HIGH]})
         for name, title in zip("xy", size.titles, strict=True)
     )
-    hues = [colour(f"mark-{number}") for number in range(len(DIVISIONS))]
-    hue = {"field": "division", "type": "nominal", "scale": {"domain": list(DIVISIONS), "range": hues}}
+    found = {one["division"] for one in points}
+    marks = [(name, colour(f"mark-{n}"), SHAPES[n]) for n, name in enumerate(DIVISIONS) if name in found]
+    names, hues, shapes = ([entry[part] for entry in marks] for part in range(3))
+    hue = {"field": "division", "type": "nominal", "scale": {"domain": names, "range": hues}}
     hue |= {"legend": {"columns": size.columns}}
-    shape = hue | {"scale": {"domain": list(DIVISIONS), "range": list(SHAPES)}}
+    shape = hue | {"scale": {"domain": names, "range": shapes}}
     across = {"x": x | {"field": "x_low"}, "x2": {"field": "x_high"}, "y": y, "color": hue}
     upright = {"x": x, "y": y | {"field": "y_low"}, "y2": {"field": "y_high"}, "color": hue}
     tooltip = [{"field": name} for name in ("method", "division", "adaptation", "retention")]
@@ -298,7 +301,7 @@ def along_a_run(targets: Sequence[str], steps: int) -> Spec:
         axis={"values": [number * steps for number in range(count + 1)], "grid": False},
     )
     y = _axis("y", "success", scale={"domain": [0, 1]})
-    hues = [colour(f"mark-{number}") for number in (0, 1, 3)]
+    hues = [colour(f"mark-{number}") for number in (0, 1, 4)]
     series = {"field": "series", "type": "nominal", "scale": {"domain": list(SERIES), "range": hues}}
     series |= {"legend": {"columns": {"expr": "width < 400 ? 1 : 3"}, "values": {"expr": "shown"}}}
     beside = {"test": {"field": "series", "equal": SERIES[-1]}, "value": [3, 3]}

@@ -103,6 +103,9 @@ def commands(row: Row) -> list[str]:
     lines = []
     for commit, runs in groupby(row.runs, key=_commit):
         lines += [f"git checkout {commit}", "pip install -c constraints.txt -e ."] if commit else []
+        if row.division == "online":
+            lines.append(f"# {printable(row.method)}: a program of its own, docs/online.md")
+            continue
         for device, members in groupby(runs, key=lambda run: str(run.record.run.get("device", "cpu"))):
             for first, count in _in_a_row([run.seed for run in members]):
                 words = ["clbench", "run", row.scenario, row.method, "--seeds", str(count)]

@@ -19,7 +19,7 @@ from clbench.statistics import Estimate, needed_references, row_generator
 from .._descriptions import Description, describe
 from .._markdown import arxiv_ids
 from .._rows import Row, Table, rank_mates
-from .._runs import DIVISIONS, printable
+from .._runs import DIVISIONS, METHODS, printable
 from .._table import SHOWN, interval, number_text, scaled, title_of
 from .charts import finite, rounded
 from .curves import estimated, retained_curve, target_curves
@@ -48,6 +48,7 @@ RULES: Mapping[str, str] = dict(
             "see nothing of what came before",
             "may look at questions from before, but at no demonstrations",
             "may look at demonstrations from before",
+            "learn by trial, without the pretrained policy and demonstrations: no method compares with them",
             "do not compete: they show what could be had at best, and what doing nothing gives",
         ),
         strict=True,
@@ -206,7 +207,7 @@ class ScenarioView:
     @property
     def competing(self) -> list[RowView]:
         """Rows of the methods that are no reference."""
-        return [view for view in self.rows if view.row.division != DIVISIONS[-1]]
+        return [view for view in self.rows if view.row.division in METHODS]
 
 
 def scenarios(table: Table) -> list[ScenarioView]:
@@ -217,7 +218,7 @@ def scenarios(table: Table) -> list[ScenarioView]:
         layout = rows[0].runs[0].scores.layout
         tasks = {"retained": layout.retained, "target": layout.target, "held out": layout.held_out}
         views = [_row(row, rows) for row in rows]
-        competing = [row for row in rows if row.division != DIVISIONS[-1]]
+        competing = [row for row in rows if row.division in METHODS]
         found.append(
             ScenarioView(
                 scenario,

@@ -25,7 +25,8 @@ def board() -> Any:
 
 
 def test_every_method_has_the_same_seeds_and_the_same_pretrained_policies() -> None:
-    records = [read_record(path) for path in RECORDS.rglob("*.json")]
+    every = [read_record(path) for path in RECORDS.rglob("*.json")]
+    records = [record for record in every if "online" not in record.run["uses"]]
     policies = {(record.run["seed"], record.fingerprint["pretrained"]) for record in records}
     assert len(policies) == len({seed for seed, _ in policies}) >= 3
     assert not any(record.run["changes"] for record in records)

@@ -1,0 +1,201 @@
+"""What a scenario must be before a score on it means anything.
+
+def test_my_scenario() -> None:
+    check_scenario(load_scenario("mypackage:me/Mine-v0"))
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import closing
+from dataclasses import dataclass
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from clbench.demonstrations import demonstrate
+from clbench.names import check_plain, check_scenario_id
+from clbench.policy import encode
+from clbench.questions import QuestionKind
+from clbench.seeding import derive_seed
+from clbench.task import Scenario, Task, resolve
+from clbench.world import Lanes, World
+
+STILL = 3
+"""Episodes in which nothing is done; a task that is done in all of them needs no skill."""
+
+
+class ScenarioError(AssertionError):
+    """A scenario is not what it must be: the message names the part, what was expected and what was found."""
+
+
+def check_scenario(scenario: Scenario, *, episodes: int = 10, success: float = 0.9) -> None:
+    """Check a scenario: its worlds, every task with its expert, its questions.
+
+    Of each world: spaces of numbers, of one size in the whole scenario, actions from -1 to 1. Of each task:
+    the expert succeeds often enough, and doing nothing does not; `terminated` and `info["success"]` are
+    success and nothing else; observations are in their space and rewards are numbers; the initial state
+    depends on the seed, and an episode on nothing but the seed and the actions, whatever ran before, in a new
+    world, and side by side in a vector world. Of each question: words of the vocabulary, and answers that all
+    occur in the experts' disturbed episodes.
+
+    Args:
+        scenario: What to check.
+        episodes: Of the expert on each task, and as many disturbed ones for the questions.
+        success: Share of them in which the expert must succeed.
+
+    Raises:
+        LookupError: An entry point is not there.
+        ScenarioError: Something else is wrong.
+    """
+    try:
+        check_scenario_id(scenario.id)
+        for task in scenario.tasks:
+            encode(task.instructions)
+    except ValueError as error:
+        raise ScenarioError(f"{scenario.id}: {error}") from error
+    if not scenario.target:
+        raise ScenarioError(f"{scenario.id}: there is no target to learn.")
+    sizes: dict[tuple[int, ...], str] = {}
+    for entry_point in dict.fromkeys(task.world for task in scenario.tasks):
+        world: World = resolve(entry_point)()
+        with closing(world):
+            state, action = _check_spaces(entry_point, world)
+            sizes.setdefault((*state.shape, *action.shape), entry_point)
+            for task in scenario.tasks:
+                if task.world == entry_point:
+                    _check_task(task, world, episodes, success)
+    if len(sizes) > 1:
+        told = ", ".join(f"{name} {size}" for size, name in sizes.items())
+        raise ScenarioError(
+            f"{scenario.id}: states and actions must have one size in all worlds, not {told}."
+        )
+    _check_questions(scenario, episodes)
+
+
+def _check_spaces(name: str, world: World) -> tuple[spaces.Box, spaces.Box]:
+    """Return the spaces of a world, if they are of numbers."""
+    for kind, space in (("observation", world.observation_space), ("action", world.action_space)):
+        if not (isinstance(space, spaces.Box) and len(space.shape) == 1 and space.dtype == np.float32):
+            raise ScenarioError(
+                f"{name}: the {kind} space must be a Box of one axis of float32, not {space}."
+            )
+    state, action = world.observation_space, world.action_space
+    assert isinstance(state, spaces.Box)
+    assert isinstance(action, spaces.Box)
+    if not (np.all(action.low == -1) and np.all(action.high == 1)):
+        raise ScenarioError(f"{name}: actions must go from -1 to 1, as a policy's do, not {action}.")
+    return state, action
+
+
+@dataclass(frozen=True)
+class _Episode:
+    """What came of an episode: states (T + 1, S), actions (T, A), and whether it was a success."""
+
+    states: NDArray[np.float32]
+    actions: NDArray[np.float32]
+    success: bool
+
+
+def _check_task(task: Task, world: World, episodes: int, success: float) -> None:
+    expert = resolve(task.expert)(task.name)
+    seeds = [derive_seed("check", task.name, number) for number in range(episodes)]
+    played = [_play(task, world, seed, expert) for seed in seeds]
+    share = sum(episode.success for episode in played) / episodes
+    if share < success:
+        raise ScenarioError(
+            f"task {task.name}: its expert {task.expert} succeeds in {share:.0%} of {episodes} episodes, not "
+            f"in {success:.0%}. Mend it, the success rule or the horizon of {task.horizon} steps."
+        )
+    nothing = np.zeros(world.action_space.shape or (), np.float32)
+    if all(_play(task, world, seed, lambda _: nothing).success for seed in seeds[:STILL]):
+        raise ScenarioError(f"task {task.name}: it is done by doing nothing.")
+    if episodes > 1 and len({episode.states[0].tobytes() for episode in played}) == 1:
+        raise ScenarioError(f"task {task.name}: all seeds have the same initial state.")
+    again = _play(task, world, seeds[0], expert)
+    with closing(resolve(task.world)()) as new:
+        afresh = _play(task, new, seeds[0], expert)
+    for other, where in ((again, "after other episodes"), (afresh, "in a new world")):
+        if not np.array_equal(other.states, played[0].states):
+            raise ScenarioError(f"task {task.name}: the same seed and actions give another episode {where}.")
+    _check_side_by_side(task, seeds[:2], played[:2])
+
+
+def _play(task: Task, world: World, seed: int, act: Any) -> _Episode:
+    """Run an episode, and hold the world to what a task says of it."""
+    state, info = world.reset(seed=seed, options={"task": task.name})
+    states, actions, done = [state], [], False
+    for step in range(task.horizon + 1):
+        where = f"task {task.name}, step {step}"
+        if not world.observation_space.contains(state) or not np.isfinite(state).all():
+            raise ScenarioError(f"{where}: the state is not in {world.observation_space}, or no number.")
+        if bool(info.get("success", False)) != bool(done):
+            raise ScenarioError(f'{where}: terminated is {done}, but info["success"] {info.get("success")}.')
+        if done or step == task.horizon:
+            break
+        action = np.asarray(act(state), np.float32)
+        if action.shape != world.action_space.shape or not np.isfinite(action).all():
+            raise ScenarioError(f"{where}: the action of {task.expert} must be in {world.action_space}.")
+        actions.append(action.clip(-1, 1))
+        state, reward, done, _, info = world.step(actions[-1])
+        states.append(state)
+        if not np.isfinite(float(reward)):
+            raise ScenarioError(f"{where}: the reward is {reward}.")
+    return _Episode(np.array(states), np.array(actions), bool(done))
+
+
+def _check_side_by_side(task: Task, seeds: list[int], alone: list[_Episode]) -> None:
+    """Check that episodes in lanes are those of the plain world."""
+    lanes = list(range(len(seeds)))
+    with closing(Lanes(len(seeds))) as places:
+        first = places.reset(lanes, seeds, [task] * len(seeds))
+        found = [[state] for state in first]
+        for step in range(max(len(episode.actions) for episode in alone)):
+            going = [lane for lane in lanes if step < len(alone[lane].actions)]
+            states, *_ = places.step(going, np.stack([alone[lane].actions[step] for lane in going]))
+            for lane, state in zip(going, states, strict=True):
+                found[lane].append(state)
+    if any(not np.array_equal(np.array(found[lane]), alone[lane].states) for lane in lanes):
+        raise ScenarioError(f"task {task.name}: side by side its episodes differ from those of {task.world}.")
+
+
+# ---- questions ---------------------------------------------------------------------------------------------
+
+
+def _check_questions(scenario: Scenario, episodes: int) -> None:
+    kinds: tuple[QuestionKind, ...] = resolve(scenario.questions)
+    if len({kind.name for kind in kinds}) != len(kinds) or not kinds:
+        raise ScenarioError(
+            f"{scenario.questions}: there must be questions, each kind with a name of its own."
+        )
+    scenes = np.concatenate(list(_scenes(scenario, episodes)))
+    for kind in kinds:
+        where = f"question {kind.name}"
+        try:
+            check_plain("kind of question", kind.name)
+            encode(kind.wordings)
+            words = [encode([answer])[0] for answer in kind.answers]
+        except ValueError as error:
+            raise ScenarioError(f"{where}: {error}") from error
+        if len(set(kind.answers)) < 2 or any(int((word > 0).sum()) != 1 for word in words):
+            raise ScenarioError(f"{where}: its answers must be two words or more, not {kind.answers}.")
+        answers = np.asarray(kind.answer(scenes))
+        if answers.shape != scenes.shape[:1] or answers.dtype.kind != "i":
+            raise ScenarioError(f"{where}: the answers to states (N, S) must be whole numbers (N,).")
+        if answers.min() < -1 or answers.max() >= len(kind.answers):
+            raise ScenarioError(f"{where}: answers must be from -1 to {len(kind.answers) - 1}.")
+        never = [word for number, word in enumerate(kind.answers) if not np.any(answers == number)]
+        if never:
+            raise ScenarioError(f"{where}: in {len(scenes):,} states {never[0]!r} is never the answer.")
+
+
+def _scenes(scenario: Scenario, episodes: int) -> Iterator[NDArray[np.float32]]:
+    """Yield states to ask about: of episodes of the retained tasks, or of all if there are none."""
+    for task in scenario.retained or scenario.tasks:
+        world: gymnasium.Env[Any, Any] = resolve(task.world)()
+        with closing(world):
+            for number in range(episodes):
+                yield demonstrate(world, task, derive_seed("check scene", task.name, number), True).state

@@ -1,0 +1,53 @@
+"""The worked example of `docs/your_scenario.md`, run as it stands by a stranger."""
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from clbench.record import read_record
+from clbench.scores import Scores
+
+PAGE = Path(__file__).parents[1] / "docs" / "your_scenario.md"
+
+
+def _blocks(language: str) -> list[str]:
+    return re.findall(rf"```{language}\n(.*?)```", PAGE.read_text(encoding="utf-8"), flags=re.DOTALL)
+
+
+def _python(folder: Path, *arguments: str) -> str:
+    environment = {
+        **os.environ,
+        "PYTHONPATH": os.pathsep.join([str(folder), os.environ.get("PYTHONPATH", "")]),
+    }
+    command = [sys.executable, *arguments]
+    done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A working directory that holds the package of the page."""
+    folder = tmp_path_factory.mktemp("stranger")
+    (folder / "mypackage.py").write_text(_blocks("python")[0], encoding="utf-8")
+    return folder
+
+
+def test_its_scenario_is_an_environment_and_passes_the_check(folder: Path) -> None:
+    _, environments, check = _blocks("python")
+    shown = "\nprint(env.unwrapped.scenario.id, envs.reset(seed=0)[0]['state'].shape)"
+    assert _python(folder, "-c", environments + check + shown) == "me/Mine-v0 (4, 4)\n"
+
+
+def test_its_commands_make_a_row_with_skills_that_are_forgotten(folder: Path) -> None:
+    for line in _blocks("console")[0].strip().splitlines():
+        told = _python(folder, "-m", *line.split())
+    assert "me/Mine-v0" in told
+    scores = Scores.from_record(read_record(folder / "leaderboard/records/me--Mine-v0/sft/seed-0.json"))
+    learned = scores.rates().learned.mean()
+    before, after = scores.rates().retained[[0, -1]].mean(axis=-1)
+    assert (before > 0.5, learned > 0.5, after < before) == (True, True, True), (before, learned, after)
