@@ -34,6 +34,7 @@ class ScenarioEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         scenario: The sequence, or its entry point "module:attribute".
         instruction: How the observation gives the instruction.
         episodes_per_stage: Episodes after which `reset()` goes on to the next stage.
+        order: In which order the targets come, as `Scenario.in_order` says; 0 is the published one.
         render_mode: "rgb_array" or None; handed to the worlds.
     """
 
@@ -44,9 +45,11 @@ class ScenarioEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         scenario: Scenario | str,
         instruction: InstructionFormat = "text",
         episodes_per_stage: int = 100,
+        order: int = 0,
         render_mode: str | None = None,
     ) -> None:
-        self.scenario: Scenario = resolve(scenario) if isinstance(scenario, str) else scenario
+        published: Scenario = resolve(scenario) if isinstance(scenario, str) else scenario
+        self.scenario = published.in_order(order)
         self.render_mode = render_mode
         self._walk = Walk(self.scenario, episodes_per_stage, instruction)
         self._worlds: dict[str, World] = {}

@@ -34,6 +34,7 @@ class ScenarioVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]
         num_envs: How many environments.
         instruction: How the observations give the instruction, "text" or "tokens".
         episodes_per_stage: Episodes after which an environment goes on to the next stage.
+        order: In which order the targets come, as `Scenario.in_order` says; 0 is the published one.
         threads: Threads that step the worlds, by default one for each core. Results do not depend on it.
     """
 
@@ -45,9 +46,11 @@ class ScenarioVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]
         num_envs: int = 1,
         instruction: InstructionFormat = "text",
         episodes_per_stage: int = 100,
+        order: int = 0,
         threads: int | None = None,
     ) -> None:
-        self.scenario: Scenario = resolve(scenario) if isinstance(scenario, str) else scenario
+        published: Scenario = resolve(scenario) if isinstance(scenario, str) else scenario
+        self.scenario = published.in_order(order)
         self.num_envs = num_envs
         self._walks = [Walk(self.scenario, episodes_per_stage, instruction) for _ in range(num_envs)]
         self._generators: list[np.random.Generator] = [np_random()[0] for _ in range(num_envs)]

@@ -19,8 +19,9 @@ def load(records: Path | str = Path("leaderboard/records")) -> pandas.DataFrame:
     The columns are `scenario`, `method`, `division`, `rank` (the place in the division, shared by what cannot
     be told apart), `tier`, `seeds` (how many); for every metric its value and the ends of its 95 % interval,
     as `retention`, `retention_low`, `retention_high`; then `relative_cost` (training time, sft's is 1),
-    `steps`, `bytes_kept`, `parameters` and `parameters_added`, each a mean over seeds. What is missing is
-    NaN. `clbench leaderboard` lists the records that make no row, and why.
+    `steps`, `bytes_kept`, `parameters` and `parameters_added`, each a mean over seeds; and
+    `order_sensitivity` (range of the final average over three or more orders of the targets). What is missing
+    is NaN. `clbench leaderboard` lists the records that make no row, and why.
 
     Args:
         records: Folder of the records.
