@@ -29,10 +29,11 @@ controls: .venv/installed
 	$(CONTROLS) lora --set.rank 4
 	$(CONTROLS) lora --set.rank 64
 
-# docs/claims.md and docs/methods/ from the records.
+# docs/claims.md, docs/methods/ and docs/scenarios/ from the records; experts are measured once.
 docs: .venv/installed
 	$(BIN)/clbench claims
 	$(BIN)/clbench method-pages
+	$(BIN)/clbench scenario-card
 
 # Speed, as ratios: benchmarks/results/.
 benchmark: .venv/installed

@@ -31,6 +31,7 @@ app.command("clbench.leaderboard.cli:submit", name="submit")
 app.command("clbench.leaderboard.cli:verify", name="verify")
 app.command("clbench.leaderboard.cli:claims", name="claims")
 app.command("clbench.leaderboard.cli:method_pages", name="method-pages")
+app.command("clbench.leaderboard.cli:scenario_card", name="scenario-card")
 app.command("clbench.doctor:doctor", name="doctor")
 
 

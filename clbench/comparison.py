@@ -9,13 +9,14 @@ at once, so that they are no metrics, which have a value for each run. Intervals
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import combinations
 
 import numpy as np
 
-from clbench.metrics import Metric, load_metric
+from clbench.metrics import Metric, load_metric, measure
 from clbench.scores import Array, Rates, rates_of
 from clbench.statistics import (
     MANY,
@@ -92,6 +93,31 @@ def share_of_wins(scores: Array, others: Array) -> Array:
 def _final(rates: Rates) -> Array:
     """Return the success after the last target on everything that was ever trained, (..., tasks)."""
     return np.concatenate([rates.retained[..., -1, :], rates.target[..., -1, :]], axis=-1)
+
+
+def deviation_of_differences(metric: str, rows: Iterable[Runs]) -> float | None:
+    """Return the standard deviation of the difference of two rows from seed to seed.
+
+    It is the root mean square over all pairs of rows, each over its common seeds. With it,
+    `student_quantile(n - 1) * deviation / sqrt(n)` is half of the width to expect of the interval of a
+    difference over n seeds: rows that are nearer are not told apart.
+
+    Args:
+        metric: Name of a metric that needs no reference.
+        rows: Runs by seed of each row.
+
+    Returns:
+        None if no two rows have two common seeds.
+    """
+    values = [{seed: measure(metric, run) for seed, run in runs.items()} for runs in rows]
+    total, degrees = 0.0, 0
+    for one, other in combinations(values, 2):
+        pairs = [(one[seed], other[seed]) for seed in one.keys() & other.keys()]
+        differences = np.array([a - b for a, b in pairs if a is not None and b is not None])
+        if len(differences) > 1:
+            total += float(((differences - differences.mean()) ** 2).sum())
+            degrees += len(differences) - 1
+    return math.sqrt(total / degrees) if degrees else None
 
 
 # ---- tie groups --------------------------------------------------------------------------------------------

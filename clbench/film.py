@@ -125,14 +125,14 @@ def _repeat(
     """Return the pictures of an episode whose actions are known, and whether it is a success."""
     task = trial[0]
     world.reset(seed=start_of(trial, seed)[0], options={"task": task.name})
-    pictures, success = [_picture(world, width)], False
+    pictures, success = [picture(world, width)], False
     for action in actions:
         _, _, success, _, _ = world.step(action)
-        pictures.append(_picture(world, width))
+        pictures.append(picture(world, width))
     return pictures, success
 
 
-def _picture(world: World, width: int) -> Image.Image:
+def picture(world: World, width: int) -> Image.Image:
     """Return what a world shows, `width` pixels wide. Small pictures keep their hard edges."""
     picture = Image.fromarray(np.asarray(world.render()))
     size = (width, round(picture.height * width / picture.width))

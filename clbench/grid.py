@@ -321,9 +321,11 @@ def benchmark_jobs(
     folders = {"records": records, "checkpoints": checkpoints, "tensorboard": tensorboard}
     jobs = _preparing_jobs(specs)
     for spec in specs:
-        title, needs = f"{spec.label} seed {spec.seed}", (f"pretraining seed {spec.seed}",)
+        needs = (f"pretraining seed {spec.seed}",)
         length = run_length(spec.load(), spec.split)
-        jobs.append(Job(title, "clbench.grid:run_job", {"spec": spec, **folders}, length, needs, limits))
+        jobs.append(
+            Job(_title(spec), "clbench.grid:run_job", {"spec": spec, **folders}, length, needs, limits)
+        )
     return jobs
 
 
@@ -336,12 +338,18 @@ def stages_jobs(specs: Sequence[RunSpec], checkpoints: Path | None) -> list[Job]
     """
     jobs = _preparing_jobs(specs)
     for spec in specs:
-        title, needs = f"stages of {spec.label} seed {spec.seed}", (f"pretraining seed {spec.seed}",)
+        title, needs = f"stages of {_title(spec)}", (f"pretraining seed {spec.seed}",)
         scenario = spec.load()
         length = len(scenario.target) * scenario.budget.adaptation_steps
         arguments = {"spec": spec, "checkpoints": checkpoints}
         jobs.append(Job(title, "clbench.grid:stages_job", arguments, length, needs))
     return jobs
+
+
+def _title(spec: RunSpec) -> str:
+    """Return what people see of a run."""
+    order = f" order {spec.order}" if spec.order else ""
+    return f"{spec.label} seed {spec.seed}{order}"
 
 
 def _preparing_jobs(specs: Sequence[RunSpec]) -> list[Job]:

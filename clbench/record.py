@@ -64,6 +64,8 @@ _RUN: _Fields = {
     "changes": dict,
     "uses": dict,
 }
+_MAY_RUN: _Fields = {"order": int}
+"""Of `Record.run` too, where it is not what it usually is."""
 _SCENARIO: _Fields = {
     "id": str,
     "retained": list,
@@ -99,7 +101,9 @@ class Record:
     run: dict[str, Any]
     """What was run: `scenario`, `method`, `seed`, `device`, `split` ("report", or "selection" for a tuning
     run), `settings` (all hyper-parameters), `changes` (those that differ from the method's defaults), `uses`
-    (the prior data it may touch; and `online`, true, for an agent that learned by trial in the worlds)."""
+    (the prior data it may touch; and `online`, true, for an agent that learned by trial in the worlds). Where
+    the targets were not learned in the published order, also `order`, the number of theirs: see
+    `clbench.task.target_order`."""
     scenario: dict[str, Any]
     """The scenario in full: `retained`, `target` and `held_out` task names in order, `evaluation_steps`
     (steps of a stage after which it is evaluated, the last one its end), and its `budget`."""
@@ -135,29 +139,31 @@ def label_of(method: str, changes: Mapping[str, Any]) -> str:
     return "+".join([method, *(f"{name}={value}" for name, value in sorted(changes.items()))])
 
 
-def record_name(scenario: str, label: str, seed: int) -> Path:
+def record_name(scenario: str, label: str, seed: int, order: int = 0) -> Path:
     """Return where the record of a run lies, seen from the folder of records; no other run has this place.
 
     Args:
         scenario: Gymnasium id.
         label: The method and what was changed of it, see `label_of`.
         seed: Of the run.
+        order: In which the targets were learned; 0 is the published one.
 
     Raises:
         ValueError: A name is refused.
     """
     check_scenario_id(scenario)
     check_label(label)
-    return Path(folder_name(scenario), folder_name(label), f"seed-{seed}.json")
+    name = f"seed-{seed}-order-{order}.json" if order else f"seed-{seed}.json"
+    return Path(folder_name(scenario), folder_name(label), name)
 
 
-def record_path(records: Path, scenario: str, label: str, seed: int) -> Path:
+def record_path(records: Path, scenario: str, label: str, seed: int, order: int = 0) -> Path:
     """Return where the record of a run lies below the folder `records`, see `record_name`.
 
     Raises:
         ValueError: A name is refused, or a symbolic link leads out of the folder.
     """
-    path = records / record_name(scenario, label, seed)
+    path = records / record_name(scenario, label, seed, order)
     if not path.parent.resolve().is_relative_to(records.resolve()):
         raise ValueError(f"{path.parent}: a symbolic link leads out of {records}.")
     return path
@@ -214,7 +220,9 @@ def _record(values: Any) -> Record:
     record = Record(**values)
     if record.status not in ("success", "failed"):
         raise RecordError(f"status must be success or failed, not {quoted(str(record.status))}.")
-    _check_fields("run", record.run, _RUN)
+    _check_fields("run", record.run, _RUN, _MAY_RUN)
+    if record.run.get("order", 1) < 1:
+        raise RecordError("run: order must be above 0; it is left out where the targets have theirs.")
     _check_fields("scenario", record.scenario, _SCENARIO)
     for name in ("costs", "diagnostics", "fingerprint", "timing"):
         _check_type(name, values[name], dict)
@@ -232,17 +240,18 @@ def _record(values: Any) -> Record:
     return record
 
 
-def _check_fields(where: str, values: Any, fields: _Fields) -> None:
-    """Refuse what is not an object with exactly these entries."""
+def _check_fields(where: str, values: Any, fields: _Fields, optional: _Fields | None = None) -> None:
+    """Refuse what is not an object with exactly these entries, but for the optional ones."""
     _check_type(where, values, dict)
     missing = [name for name in fields if name not in values]
     if missing:
         raise RecordError(f"{where}: {', '.join(missing)} is missing.")
+    known = {**fields, **(optional or {})}
     for name in values:
-        if name not in fields:
-            raise RecordError(str(unknown(f"field of {where}", name, fields)))
-    for name, kind in fields.items():
-        if kind is not None:
+        if name not in known:
+            raise RecordError(str(unknown(f"field of {where}", name, known)))
+    for name, kind in known.items():
+        if kind is not None and name in values:
             _check_type(f"{where}: {name}", values[name], kind)
 
 

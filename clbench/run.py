@@ -63,14 +63,16 @@ class RunSpec:
     """Which episodes it is evaluated on; those of "selection" may be looked at to choose settings."""
     targets: int | None = None
     """How many targets are learned, from the first; all if None."""
+    order: int = 0
+    """In which order the targets come, as `Scenario.in_order` says; 0 is the published one."""
 
     def path(self, records: Path) -> Path:
         """Return where the record lies below the folder `records`."""
-        return record_path(records, self.scenario.rpartition(":")[2], self.label, self.seed)
+        return record_path(records, self.scenario.rpartition(":")[2], self.label, self.seed, self.order)
 
     def load(self) -> Scenario:
         """Return the scenario, with the targets that are learned."""
-        scenario = load_scenario(self.scenario)
+        scenario = load_scenario(self.scenario).in_order(self.order)
         return dataclasses.replace(scenario, target=scenario.target[: self.targets])
 
     @property
@@ -91,6 +93,7 @@ class RunSpec:
             "scenario": scenario.id,
             "method": self.method,
             "seed": self.seed,
+            **({"order": self.order} if self.order else {}),
             "device": self.device,
             "split": self.split,
             "settings": settings,
@@ -421,7 +424,8 @@ class _Run:
             scenario=scenario,
             costs={"optimiser_steps": 0, "parameters": parameters},
             fingerprint={
-                **fingerprint(self.scenario),
+                # of each world the first task's rollout is taken: it must not depend on the order
+                **fingerprint(dataclasses.replace(self.spec, order=0).load()),
                 "method": describe_method(type(self.learner.method)),
                 "pretrained": pretrained_hash(self.learner.pretrained_folder),
             },

@@ -37,6 +37,7 @@ class ScenarioEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         instruction: How the observation gives the instruction.
         episodes_per_stage: Episodes after which `reset()` goes on to the next stage.
         stage: The stage to stay in, for an agent that is trained stage by stage; all of them if None.
+        order: In which order the targets come, as `Scenario.in_order` says; 0 is the published one.
         render_mode: "rgb_array" or None; handed to the worlds.
 
     Raises:
@@ -51,9 +52,11 @@ class ScenarioEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         instruction: InstructionFormat = "text",
         episodes_per_stage: int = 100,
         stage: int | None = None,
+        order: int = 0,
         render_mode: str | None = None,
     ) -> None:
-        self.scenario: Scenario = scenario_at(scenario) if isinstance(scenario, str) else scenario
+        published: Scenario = scenario_at(scenario) if isinstance(scenario, str) else scenario
+        self.scenario = published.in_order(order)
         self.scenario.require_packages()
         self.render_mode = render_mode
         self.instruction: InstructionFormat = instruction

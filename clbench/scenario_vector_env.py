@@ -36,6 +36,7 @@ class ScenarioVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]
         instruction: How the observations give the instruction, "text" or "tokens".
         episodes_per_stage: Episodes after which an environment goes on to the next stage.
         stage: The stage to stay in, for an agent that is trained stage by stage; all of them if None.
+        order: In which order the targets come, as `Scenario.in_order` says; 0 is the published one.
         threads: Threads that step the worlds, by default one for each core. Results do not depend on it.
 
     Raises:
@@ -51,9 +52,11 @@ class ScenarioVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]
         instruction: InstructionFormat = "text",
         episodes_per_stage: int = 100,
         stage: int | None = None,
+        order: int = 0,
         threads: int | None = None,
     ) -> None:
-        self.scenario: Scenario = scenario_at(scenario) if isinstance(scenario, str) else scenario
+        published: Scenario = scenario_at(scenario) if isinstance(scenario, str) else scenario
+        self.scenario = published.in_order(order)
         self.scenario.require_packages()
         self.num_envs = num_envs
         self.instruction: InstructionFormat = instruction

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import difflib
 import importlib
+import math
+import random
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, Literal
 
@@ -16,6 +18,10 @@ Group = Literal["retained", "target", "held_out"]
 Split = Literal["selection", "report"]
 
 SPLITS: tuple[Split, ...] = ("selection", "report")
+
+MOST_ORDERS = 99
+"""Orders of the targets besides the published one, where there are as many: a number in a stranger's record
+must not keep a reader busy."""
 
 
 def resolve(name: str) -> Any:
@@ -199,6 +205,20 @@ class Scenario:
         """
         require_packages({package for task in self.tasks for package in task.packages}, self.id)
 
+    def in_order(self, order: int) -> Scenario:
+        """Return the scenario with its targets in another order, see `target_order`; 0 is the published one.
+
+        All else is the same: pretrained policy, demonstrations, questions and the episodes' initial states.
+
+        Raises:
+            ValueError: There is no such order.
+        """
+        try:
+            places = target_order(len(self.target), order)
+        except ValueError as error:
+            raise ValueError(f"{self.id}: {error}") from error
+        return replace(self, target=tuple(self.target[place] for place in places)) if order else self
+
     def group(self, task: str) -> Group:
         """Return which part of the scenario the task belongs to."""
         for group in ("retained", "target", "held_out"):
@@ -219,6 +239,27 @@ class Scenario:
 
     def _unknown(self, name: str) -> LookupError:
         return unknown(f"task of {self.id}", name, (task.name for task in self.tasks))
+
+
+def target_order(count: int, order: int) -> tuple[int, ...]:
+    """Return which of `count` targets, by their published places from 0, is learned in each stage.
+
+    Order 0 is the published one. The others are different permutations, drawn at random once and for all.
+
+    Raises:
+        ValueError: There is no such order.
+    """
+    # the factorial of a stranger's list of targets may have millions of digits; that of 5 exceeds the limit
+    last = min(math.factorial(min(count, 5)) - 1, MOST_ORDERS)
+    if not 0 <= order <= last:
+        orders = f"orders 0 to {last}" if last else "order 0 alone"
+        raise ValueError(f"{count} targets have {orders}, not {order}.")
+    generator = random.Random(0)  # of all generators, its random() is the one that may never change
+    found = {tuple(range(count)): None}
+    while len(found) <= order:
+        draws = [generator.random() for _ in range(count)]
+        found[tuple(sorted(range(count), key=draws.__getitem__))] = None
+    return list(found)[order]
 
 
 def scenario_ids() -> list[str]:

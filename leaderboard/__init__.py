@@ -20,8 +20,9 @@ def load(records: Path | str = Path("leaderboard/records")) -> pandas.DataFrame:
     be told apart), `tier`, `seeds` (how many); for every metric its value and the ends of its 95 % interval,
     as `retention`, `retention_low`, `retention_high`; then `relative_cost` (training time, sft's is 1),
     `steps`, `bytes_kept`, `parameters`, `parameters_added` and `environment_steps` (of agents that learned
-    online), each a mean over seeds. What is missing is
-    NaN. `clbench leaderboard` lists the records that make no row, and why.
+    online), each a mean over seeds; and `order_sensitivity` (range of the final average over three or more
+    orders of the targets). What is missing is NaN. `clbench leaderboard` lists the records that make no row,
+    and why.
 
     Args:
         records: Folder of the records.

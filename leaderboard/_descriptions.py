@@ -118,7 +118,7 @@ def _hyper_parameters(cls: type[Method]) -> list[HyperParameter]:
     meanings: dict[str, list[str]] = {}
     for base in reversed(cls.__mro__):
         if issubclass(base, Method) and base is not Method:
-            for name, meaning in _field_docstrings(base).items():
+            for name, meaning in field_docstrings(base).items():
                 meanings.setdefault(name, []).append(meaning)
     return [
         HyperParameter(field.name, _default(field), " ".join(meanings.get(field.name, [])))
@@ -126,7 +126,7 @@ def _hyper_parameters(cls: type[Method]) -> list[HyperParameter]:
     ]
 
 
-def _field_docstrings(cls: type[Method]) -> dict[str, str]:
+def field_docstrings(cls: type) -> dict[str, str]:
     """Return the texts that stand under the fields of a class, by field; Python itself forgets them."""
     tree = ast.parse(inspect.getsource(sys.modules[cls.__module__]))
     bodies = [

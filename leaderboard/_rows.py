@@ -14,7 +14,8 @@ from clbench.metrics import METRICS
 from clbench.statistics import Estimate, Runs, estimate, row_generator
 
 from ._costs import COSTS, costs_of, read_step_times, step_time_of
-from ._runs import ALIKE, DIVISIONS, NotShown, Run, read_run, read_runs
+from ._orders import Orders, orders_of
+from ._runs import ALIKE, DIVISIONS, NotShown, Run, Sifted, no_row, read_run, read_runs
 from ._tiers import TIERS
 
 RANKED_BY = "final_average"
@@ -35,13 +36,15 @@ class Row:
     """Place inside its scenario and division, shared by rows that cannot be told apart. None for a reference,
     which does not compete, and for a row without a final average."""
     runs: tuple[Run, ...]
-    """Its runs by rising seed."""
+    """Its runs by rising seed, with the targets in the published order: all but `orders` is of these."""
     tier: str
     """The least of `TIERS` that its runs have: how far anyone but the submitter has checked them."""
     estimates: Mapping[str, Estimate]
     """Value and interval of every metric."""
     costs: Mapping[str, float | None]
     """Mean over seeds by column of the table."""
+    orders: Orders
+    """What came of it with the targets in this and in other orders."""
 
     @property
     def seeds(self) -> tuple[int, ...]:
@@ -75,22 +78,33 @@ def read_table(records: Path) -> Table:
     if not records.is_dir():
         raise FileNotFoundError(f"There is no folder of records at {records}.")
     runs, not_shown = read_runs(records, read_run, ALIKE)
+    runs, alone = _beside_rows(runs)
     times = read_step_times(step_time_of(records))
     rows: list[Row] = []
     for _, members in groupby(sorted(runs, key=lambda run: run.scenario), key=lambda run: run.scenario):
         rows += _scenario_rows(list(members), times)
     return Table(
-        scenarios={run.scenario: run.record.scenario for run in runs},
+        scenarios={run.scenario: run.published for run in runs},
         rows=tuple(rows),
-        not_shown=tuple(sorted(not_shown, key=lambda entry: entry.path)),
+        not_shown=tuple(sorted([*not_shown, *alone], key=lambda entry: entry.path)),
     )
+
+
+def _beside_rows(runs: list[Run]) -> Sifted:
+    """Keep the runs of methods that have a row: one with the targets in the published order."""
+    with_row = {(run.scenario, run.method) for run in runs if not run.order}
+    kept = [run for run in runs if (run.scenario, run.method) in with_row]
+    alone = [run for run in runs if (run.scenario, run.method) not in with_row]
+    reason = "its method has no run with the targets in the published order, of which rows are made."
+    return kept, [no_row(run.path, reason) for run in alone]
 
 
 def _scenario_rows(runs: list[Run], times: Mapping[str, Estimate]) -> list[Row]:
     """Return the rows of the runs of one scenario, by division and falling final average."""
     by_method: dict[str, list[Run]] = {}
     for run in sorted(runs, key=lambda run: run.seed):
-        by_method.setdefault(run.method, []).append(run)
+        if not run.order:
+            by_method.setdefault(run.method, []).append(run)
     rows = []
     for division in DIVISIONS:
         members = {method: runs for method, runs in by_method.items() if runs[0].division == division}
@@ -111,6 +125,7 @@ def _scenario_rows(runs: list[Run], times: Mapping[str, Estimate]) -> list[Row]:
                     min((run.tier for run in members[method]), key=TIERS.index),
                     estimates[method],
                     costs,
+                    orders_of(run for run in runs if run.method == method),
                 )
             )
     return rows
@@ -148,7 +163,18 @@ def column_names() -> list[str]:
     """Return the columns of the CSV file and of the data frame."""
     ends = ("", "_low", "_high")
     metrics = (name + end for name in METRICS for end in ends)
-    return ["scenario", "method", "division", "rank", "tier", "seeds", *metrics, "relative_cost", *COSTS]
+    return [
+        "scenario",
+        "method",
+        "division",
+        "rank",
+        "tier",
+        "seeds",
+        *metrics,
+        "relative_cost",
+        *COSTS,
+        "order_sensitivity",
+    ]
 
 
 def values_of(row: Row) -> list[str | float | None]:
@@ -156,4 +182,4 @@ def values_of(row: Row) -> list[str | float | None]:
     estimates = (row.estimates[name] for name in METRICS)
     numbers = [number for one in estimates for number in (one.value, one.low, one.high)]
     place = [row.scenario, row.method, row.division, row.rank, row.tier, len(row.seeds)]
-    return [*place, *numbers, *row.costs.values()]
+    return [*place, *numbers, *row.costs.values(), row.orders.sensitivity]

@@ -13,8 +13,8 @@ from typing import Any
 
 from clbench.names import built_in_methods
 from clbench.record import Record, RecordError, label_of, read_record, record_name
-from clbench.scores import Scores
-from clbench.task import Split
+from clbench.scores import Layout, Scores
+from clbench.task import Split, target_order
 
 from ._tiers import tier_of
 
@@ -55,6 +55,10 @@ class Run:
     division: str
     tier: str
     """One of `TIERS`."""
+    order: int
+    """In which the targets were learned; 0 is the published one."""
+    published: dict[str, Any]
+    """`Record.scenario` with the targets in their published order."""
 
 
 Sifted = tuple[list[Run], list[NotShown]]
@@ -116,8 +120,20 @@ def read_run(folder: Path, path: Path, split: Split = "report", changed: bool | 
     division = division_of(run["uses"])
     if name != home:
         raise RecordError(f"it is the record of {home}, and must lie there.")
-    scores = Scores.from_record(record)
-    return Run(name, record, scores, run["scenario"], label, run["seed"], division, tier_of(path))
+    scores, order, published = Scores.from_record(record), run.get("order", 0), _published(record)
+    return Run(
+        name, record, scores, run["scenario"], label, run["seed"], division, tier_of(path), order, published
+    )
+
+
+def _published(record: Record) -> dict[str, Any]:
+    """Return `Record.scenario` with the targets in their published order."""
+    targets = record.scenario["target"]
+    try:
+        places = target_order(len(targets), record.run.get("order", 0))
+    except ValueError as error:
+        raise RecordError(f"run: {error}") from error
+    return {**record.scenario, "target": [name for _, name in sorted(zip(places, targets, strict=True))]}
 
 
 def _home(run: dict[str, Any], label: str) -> str:
@@ -125,7 +141,7 @@ def _home(run: dict[str, Any], label: str) -> str:
     if run["seed"] < 0:
         raise RecordError(f"run: {run['seed']} cannot be a seed.")
     try:
-        return record_name(run["scenario"], label, run["seed"]).as_posix()
+        return record_name(run["scenario"], label, run["seed"], run.get("order", 0)).as_posix()
     except ValueError as error:
         raise RecordError(f"run: {error}") from error
 
@@ -210,13 +226,13 @@ def printable(text: str) -> str:
 
 def same_scenario(runs: list[Run]) -> Sifted:
     def reason(run: Run, other: Run) -> str:
-        fields = differences(run.record.scenario, other.record.scenario)
+        fields = differences(run.published, other.published)
         if fields == ["budget"]:
-            ours, theirs = run.record.scenario["budget"], other.record.scenario["budget"]
+            ours, theirs = run.published["budget"], other.published["budget"]
             fields = [f"budget ({', '.join(differences(ours, theirs))})"]
         return f"its scenario is not that of most records: {', '.join(fields)} differ."
 
-    return _most(runs, lambda run: run.scenario, lambda run: _text(run.record.scenario), reason)
+    return _most(runs, lambda run: run.scenario, lambda run: _text(run.published), reason)
 
 
 def same_simulator(runs: list[Run]) -> Sifted:
@@ -231,11 +247,14 @@ def same_simulator(runs: list[Run]) -> Sifted:
 
 
 def same_layout(runs: list[Run]) -> Sifted:
+    def layout(run: Run) -> Layout:
+        return dataclasses.replace(run.scores.layout, target=tuple(run.published["target"]))
+
     def reason(run: Run, other: Run) -> str:
-        fields = differences(vars(run.scores.layout), vars(other.scores.layout))
+        fields = differences(vars(layout(run)), vars(layout(other)))
         return f"it was not evaluated like most records: {', '.join(fields)} differ."
 
-    return _most(runs, lambda run: run.scenario, lambda run: run.scores.layout, reason)
+    return _most(runs, lambda run: run.scenario, layout, reason)
 
 
 def same_settings(runs: list[Run]) -> Sifted:

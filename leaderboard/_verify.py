@@ -10,7 +10,7 @@ import hashlib
 import json
 import tempfile
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -93,6 +93,7 @@ class _Subject:
             values["seed"],
             values["changes"],
             values["device"],
+            order=values.get("order", 0),
         )
 
     @property
@@ -108,7 +109,7 @@ class _Subject:
     @cached_property
     def here(self) -> dict[str, Any]:
         """The fingerprint of this machine; it plays a rollout of every world."""
-        return fingerprint(self.scenario)
+        return fingerprint(replace(self.spec, order=0).load())
 
 
 def verify(

@@ -1,4 +1,4 @@
-"""The commands `clbench leaderboard`, `clbench submit`, `clbench claims` and `clbench method-pages`."""
+"""The commands `clbench leaderboard`, `submit`, `verify`, `claims`, `method-pages` and `scenario-card`."""
 
 from __future__ import annotations
 
@@ -12,9 +12,10 @@ from rich.text import Text
 
 from clbench.arguments import at_least, checked_input, look_here
 from clbench.method import build_method
+from clbench.names import folder_name
 from clbench.record import RECORDS, TUNING, record_path
 from clbench.run import RunSpec
-from clbench.task import load_scenario, unknown
+from clbench.task import load_scenario, scenario_ids, unknown
 
 from . import _page
 from ._claims import page
@@ -24,6 +25,8 @@ from ._costs import STEP_TIME
 from ._descriptions import built_in_methods
 from ._method_pages import pages, read_sources
 from ._rows import Table, read_table
+from ._scenario_cards import Card
+from ._scenario_tasks import choose_renderer, make_missing, picture_path, undrawn
 from ._submit import placement, run_submission
 from ._table import csv_text, markdown, terminal, write_if_changed
 from ._tiers import TIERS
@@ -59,6 +62,7 @@ def submit(
     scenario: str = SCENARIO,
     seeds: int = 3,
     first_seed: int = 0,
+    order: int = 0,
     workers: int | None = None,
     records: Path = RECORDS,
 ) -> None:
@@ -73,6 +77,7 @@ def submit(
         scenario: Gymnasium id of the scenario, as clbench/Fetch-v0; module:id imports the module first.
         seeds: How many seeds.
         first_seed: The first of them.
+        order: In which order the targets are learned, as for `clbench run`: a row is of the published one, 0.
         workers: Runs at once, each a process with one thread; all cores if not given.
         records: Folder of the records.
     """
@@ -81,9 +86,10 @@ def submit(
         at_least(1, "--seeds", seeds)
         at_least(0, "--first-seed", first_seed)
         at_least(1, "--workers", workers)
-        name = load_scenario(scenario).id
+        name = load_scenario(scenario).in_order(order).id
         build_method(method, {})
-    specs = [RunSpec(scenario, method, seed) for seed in range(first_seed, first_seed + seeds)]
+    numbers = range(first_seed, first_seed + seeds)
+    specs = [RunSpec(scenario, method, seed, order=order) for seed in numbers]
     went_well = run_submission(specs, records, workers)
     if records.is_dir():
         table, console = read_table(records), _console()
@@ -195,6 +201,43 @@ def method_pages(
     for name, text in texts.items():
         write_if_changed(output / name, text)
     _console().print(Text(f"Written: {len(texts)} pages in {output}"), soft_wrap=True)
+
+
+def scenario_card(
+    *scenarios: str,
+    episodes: int = 100,
+    records: Path = RECORDS,
+    output: Path = Path("docs/scenarios"),
+) -> None:
+    """Write the card of each of SCENARIOS: its tasks with pictures, and whether it tells methods apart.
+
+    Experts are measured, and pictures drawn, where the folder beside the card does not have them yet. Where
+    nothing can draw, a card goes without the pictures that are missing, and says so.
+
+    Args:
+        scenarios: Gymnasium ids; those that have records if none is given.
+        episodes: How many episodes of each task the experts are measured on.
+        records: Folder of the records.
+        output: Folder of the cards.
+    """
+    look_here()
+    with checked_input():
+        at_least(1, "--episodes", episodes)
+        board = read_table(records) if records.is_dir() else Table({}, (), ())
+        names = scenarios or [name for name in scenario_ids() if name in board.scenarios]
+        if not names:
+            raise ValueError(f"No scenario has records in {records}: name one, as {SCENARIO}.")
+        loaded = [load_scenario(name) for name in names]
+    homes = {output / folder_name(scenario.id): scenario for scenario in loaded}
+    console = Console(stderr=True, soft_wrap=True)
+    fault = choose_renderer([task for home, scenario in homes.items() for task in undrawn(scenario, home)])
+    if fault is not None:
+        console.print(Text(f"No pictures are drawn; those that are there are kept. {fault}"))
+    for home, scenario in homes.items():
+        experts = make_missing(scenario, home, episodes, drawing=fault is None, console=console)
+        drawn = {task.name for task in scenario.tasks if picture_path(home, task).is_file()}
+        card = Card(scenario, board, experts, frozenset(drawn))
+        _write(_console(), output / f"{home.name}.md", card.page())
 
 
 def _write_table(console: Console, table: Table, records: Path) -> None:

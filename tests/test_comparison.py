@@ -20,6 +20,7 @@ from scipy import stats
 from clbench.commands.runs import run as run_command
 from clbench.comparison import (
     UNKNOWN_DEVIATION,
+    deviation_of_differences,
     interquartile_mean,
     probability_of_improvement,
     ranks,
@@ -260,6 +261,30 @@ def test_a_metric_that_says_nothing_of_better_ranks_nothing() -> None:
 def test_rows_of_other_tasks_are_not_ranked_together() -> None:
     with pytest.raises(ValueError, match="same tasks"):
         tie_groups("final_average", {"one": row(5, 6), "two": {0: equal_run(5, episodes=20)}})
+
+
+def of_rates(*rates: float) -> Runs:
+    """Return runs of seeds 0, 1, ... whose final success is `rates` on both of their tasks."""
+    return {seed: run(np.tile(np.arange(20) < round(20 * rate), (2, 1))) for seed, rate in enumerate(rates)}
+
+
+def test_the_deviation_of_differences_is_what_is_left_when_rows_and_seeds_have_their_means() -> None:
+    rows = [of_rates(0.5, 0.7, 0.6), of_rates(0.2, 0.5, 0.2), of_rates(0.9, 0.9, 1.0)]
+    values = np.array([[0.5, 0.7, 0.6], [0.2, 0.5, 0.2], [0.9, 0.9, 1.0]])
+    residuals = values - values.mean(axis=0) - values.mean(axis=1, keepdims=True) + values.mean()
+    expected = np.sqrt(2 * (residuals**2).sum() / 4)  # twice the variance of a run, on (3 - 1)(3 - 1) degrees
+    assert deviation_of_differences("final_average", rows) == pytest.approx(expected)
+
+
+def test_rows_that_move_together_from_seed_to_seed_differ_by_the_same() -> None:
+    together = [of_rates(0.5, 0.9), of_rates(0.1, 0.5)]
+    assert deviation_of_differences("final_average", together) == pytest.approx(0, abs=1e-12)
+
+
+def test_without_two_common_seeds_of_two_rows_no_deviation_is_known() -> None:
+    late = {seed + 1: scores for seed, scores in of_rates(0.5, 0.9).items()}
+    for rows in ([], [of_rates(0.5, 0.9)], [of_rates(0.5), of_rates(0.6)], [of_rates(0.5, 0.9), late]):
+        assert deviation_of_differences("final_average", rows) is None
 
 
 @pytest.mark.parametrize(("methods", "seeds", "deviation"), [(5, 3, 0.05), (8, 3, 0.1)])

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import os
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -50,10 +51,11 @@ def test_equal_records_are_equal_files(record: Record, tmp_path: Path) -> None:
 
 
 def test_every_run_has_a_path_of_its_own_below_the_folder(tmp_path: Path) -> None:
-    runs = [
+    runs: list[Any] = [
         ("clbench/Toy-v0", "sft", 0),
         ("clbench/Toy-v0", "sft", 1),
         ("clbench/Toy-v1", "sft", 0),
+        ("clbench/Toy-v0", "sft", 0, 1),
         ("clbench/Toy-v0", "theirs:SFT", 0),
         ("clbench/Toy-v0", "theirs/SFT", 0),
         ("clbench/Toy-v0", "theirs:SFT+strength=2", 0),
@@ -184,6 +186,27 @@ def test_a_field_that_does_not_fit_the_schema_is_refused_by_name(
     change(tmp_path / "record.json", **fields)
     with pytest.raises(RecordError, match=words):
         read_record(tmp_path / "record.json")
+
+
+@pytest.mark.parametrize(
+    ("field", "words"),
+    [
+        ({"order": "1"}, "run: order must be a whole number"),
+        ({"order": True}, "run: order must be a whole number"),
+        ({"order": 0}, "run: order must be above 0; it is left out where the targets have theirs"),
+        ({"oder": 1}, "No field of run is called 'oder'. Did you mean 'order'?"),
+    ],
+)
+def test_the_order_of_the_targets_is_a_number_above_0_or_left_out(
+    field: dict[str, Any], words: str, record: Record, tmp_path: Path
+) -> None:
+    path = tmp_path / "record.json"
+    write_record(record, path)
+    change(path, run={**record.run, "order": 3})
+    assert read_record(path).run["order"] == 3
+    change(path, run={**record.run, **field})
+    with pytest.raises(RecordError, match=re.escape(words)):
+        read_record(path)
 
 
 @pytest.mark.parametrize("name", ["episodes", "answers", "policy"])

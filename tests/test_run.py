@@ -116,6 +116,21 @@ def test_all_methods_meet_the_same_initial_states_and_the_same_pretrained_policy
     assert records[0].fingerprint == records[1].fingerprint
 
 
+def test_in_another_order_a_run_begins_with_the_same_policy_states_and_simulator(tmp_path: Path) -> None:
+    specs = [RunSpec(TOY, "frozen", seed=0, order=order) for order in range(2)]
+    published, other = (execute(spec, tmp_path) for spec in specs)
+    assert (published.scenario["target"], other.scenario["target"]) == (["right", "down"], ["down", "right"])
+    assert ("order" in published.run, other.run["order"]) == (False, 1)
+    assert specs[1].path(tmp_path) == tmp_path / "Toy-v0" / "frozen" / "seed-0-order-1.json"
+    assert all(has_record(spec, tmp_path) for spec in specs)
+    assert published.fingerprint == other.fingerprint  # the hash of the pretrained policy is in it
+    starts, others = (
+        {row[2:] for row in zip(*record.episodes.values(), strict=True) if row[0] == 0}
+        for record in (published, other)
+    )
+    assert starts == others
+
+
 def test_frozen_forgets_nothing_and_costs_nothing(tmp_path: Path) -> None:
     record = execute(RunSpec(TOY, "frozen", seed=0), tmp_path)
     rows = list(zip(*record.episodes.values(), strict=True))

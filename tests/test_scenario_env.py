@@ -30,6 +30,19 @@ def test_the_walk_goes_from_the_skills_to_each_target_and_stays_at_the_last() ->
     assert walk == skills + [(1, "right")] * 3 + [(2, "down")] * 6
 
 
+@pytest.mark.parametrize("vector", [False, True])
+def test_the_targets_come_in_the_order_that_is_asked_for(vector: bool) -> None:
+    if vector:
+        envs = gymnasium.make_vec("clbench.testing:clbench/Toy-v0", 2, order=1)
+        walk = [envs.reset(options={"stage": stage})[1]["task"][1] for stage in range(3)]
+    else:
+        env = gymnasium.make("clbench.testing:clbench/Toy-v0", order=1)
+        walk = [env.reset(options={"stage": stage})[1]["task"] for stage in range(3)]
+    assert walk == ["left", "down", "right"]
+    with pytest.raises(ValueError, match="clbench/Toy-v0: 2 targets have orders 0 to 1, not 2"):
+        _toy(order=2)
+
+
 def test_a_seed_begins_the_walk_anew_and_repeats_it_bit_for_bit() -> None:
     env = _toy(episodes_per_stage=2)
 

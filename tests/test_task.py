@@ -6,7 +6,15 @@ import gymnasium
 import pytest
 
 from clbench.extras import require_packages
-from clbench.task import Budget, load_scenario, registered_scenario, resolve, scenario_ids
+from clbench.task import (
+    MOST_ORDERS,
+    Budget,
+    load_scenario,
+    registered_scenario,
+    resolve,
+    scenario_ids,
+    target_order,
+)
 
 FETCH = "clbench/Fetch-v0"
 TOY = load_scenario("clbench.testing:clbench/Toy-v0")
@@ -105,3 +113,32 @@ def test_evaluation_points_double_and_end_with_the_stage(
 def test_a_budget_cannot_have_more_episodes_on_the_way_than_at_the_end() -> None:
     with pytest.raises(ValueError, match="first of the 5 report episodes: 6 are too many"):
         Budget(report_episodes=5, curve_episodes=6)
+
+
+@pytest.mark.parametrize(("count", "orders"), [(1, 1), (2, 2), (4, 24), (10, 1 + MOST_ORDERS)])
+def test_all_orders_are_different_permutations_and_the_first_is_the_published_one(
+    count: int, orders: int
+) -> None:
+    found = [target_order(count, order) for order in range(orders)]
+    assert found[0] == tuple(range(count))
+    assert len(set(found)) == orders
+    assert all(sorted(one) == list(range(count)) for one in found)
+
+
+@pytest.mark.parametrize("order", [-1, 24])
+def test_an_order_that_is_none_is_refused_with_what_there_is(order: int) -> None:
+    with pytest.raises(ValueError, match=rf"clbench/Fetch-v0: 4 targets have orders 0 to 23, not {order}"):
+        load_scenario(FETCH).in_order(order)
+
+
+def test_an_order_never_changes() -> None:
+    # records of these orders may lie about: whoever changes this line makes them lie
+    assert [target_order(4, order) for order in range(1, 4)] == [(3, 2, 1, 0), (3, 1, 0, 2), (0, 3, 1, 2)]
+
+
+def test_in_another_order_nothing_but_the_targets_differs() -> None:
+    published = load_scenario(FETCH)
+    other = published.in_order(1)
+    assert [task.name for task in other.target] == ["press", "pull", "push_right", "lift"]
+    assert dataclasses.replace(other, target=published.target) == published
+    assert published.in_order(0) is published

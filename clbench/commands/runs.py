@@ -32,6 +32,7 @@ def run(
     every: Annotated[bool, Parameter(name="--all", negative="")] = False,
     seeds: int = 3,
     first_seed: int = 0,
+    order: int = 0,
     workers: int | None = None,
     records: Path = RECORDS,
     device: str = "cpu",
@@ -50,6 +51,8 @@ def run(
         every: Run all installed methods.
         seeds: How many seeds.
         first_seed: The first of them.
+        order: In which order the targets are learned. 0 is the published one, of which the leaderboard's rows
+            are; others are permutations, from which it tells how much depends on the order.
         workers: Runs at once, each a process with one thread; all cores if not given.
         records: Folder of the records.
         device: Where policies are computed, as cpu or cuda.
@@ -70,10 +73,10 @@ def run(
         check_device(device)
         if tensorboard:
             require_tensorboard()
-        loaded = load_scenario(scenario)
+        loaded = load_scenario(scenario).in_order(order)
         values = {method: read_changes(method, changes or {}) for method in names}
     specs = [
-        RunSpec(scenario, method, seed, values[method], device)
+        RunSpec(scenario, method, seed, values[method], device, order=order)
         for seed in range(first_seed, first_seed + seeds)
         for method in names
     ]

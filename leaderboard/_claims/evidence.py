@@ -272,7 +272,7 @@ def read_evidence(scenario: str, records: Path, controls: Path, step_time: Path)
     changed, refused_controls = read_runs(controls, partial(read_run, changed=True), (_like(scored), *ALIKE))
     runs: dict[str, dict[int, Run]] = {}
     for run in (*scored, *changed):
-        if run.scenario == scenario and run.scores.layout.target:
+        if run.scenario == scenario and run.scores.layout.target and not run.order:
             runs.setdefault(run.method, {})[run.seed] = run
     not_used = [("records", entry) for entry in refused] + [("controls", entry) for entry in refused_controls]
     return Evidence(
@@ -289,9 +289,9 @@ def _like(scored: Sequence[Run]) -> Sift:
 
     def traits(run: Run) -> dict[str, Any]:
         return {
-            **run.record.scenario,
-            "rollouts": run.record.fingerprint.get("rollouts"),
             **vars(run.scores.layout),
+            **run.published,
+            "rollouts": run.record.fingerprint.get("rollouts"),
         }
 
     def sift(runs: list[Run]) -> Sifted:

@@ -160,6 +160,23 @@ class RowView:
         ]
 
     @property
+    def orders(self) -> list[tuple[str, str, str]]:
+        """Number, targets and final average of each order of the targets."""
+        return [
+            (
+                str(one.number),
+                printable(", ".join(one.targets)),
+                number_text(one.final_average, ".2f", MISSING),
+            )
+            for one in self.row.orders.orders
+        ]
+
+    @property
+    def order_sensitivity(self) -> str:
+        """How far these lie apart, nothing if they are too few."""
+        return number_text(self.row.orders.sensitivity, ".2f", "")
+
+    @property
     def commands(self) -> str:
         """What makes its records again."""
         return "\n".join(commands(self.row))

@@ -96,6 +96,8 @@ def test_the_committed_pages_are_those_of_the_committed_records(
     monkeypatch.chdir(checkout)
     cli.claims(output=tmp_path / "claims.md")
     cli.method_pages(output=tmp_path / "methods")
+    shutil.copytree(checkout / "docs" / "scenarios", tmp_path / "scenarios")  # pictures and measured experts
+    cli.scenario_card(output=tmp_path / "scenarios")
     for made in sorted(tmp_path.rglob("*.md")):
         page = made.relative_to(tmp_path)
         assert made.read_text() == (checkout / "docs" / page).read_text(), f"{page}: run `make docs`"

@@ -80,6 +80,16 @@ def test_an_honest_record_earns_every_tier_and_is_not_touched(tier: str, mine: P
     assert [check["name"] for check in told["checks"]] == [check.name for check in checks]
 
 
+def test_a_run_in_another_order_of_the_targets_is_verified_in_that_order(tmp_path: Path) -> None:
+    spec = RunSpec(TOY, "frozen", 0, order=1)
+    execute(spec, tmp_path / "records")
+    path = spec.path(tmp_path / "records")
+    assert failures(verify(path, "retrained")) == ""
+    assert tiers.tier_of(path) == "retrained"
+    edit(path, lambda values: values["scenario"]["target"].reverse())
+    assert "scenario.target differ from what is installed" in failures(verify(path, "recomputed"))
+
+
 def test_a_record_can_be_replayed_from_policies_that_are_made_again(mine: Path) -> None:
     checks = verify(mine, "replayed", episodes=20)
     assert failures(checks) == ""
