@@ -92,8 +92,9 @@ def evaluate_agent(
 
     Raises:
         TypeError: `env` is of no scenario, or `agent` is nothing that acts.
-        ValueError: The stage has no turn now, there is a record already, an action has another shape than the
-            action space, or a name, the seed, the steps or the settings are refused.
+        ValueError: The stage has no turn now, its targets are in another order, there is a record already, an
+            action has another shape than the action space, or a name, the seed, the steps or the settings are
+            refused.
     """
     world = env.unwrapped
     if not isinstance(world, ScenarioEnv | ScenarioVectorEnv):
@@ -105,6 +106,8 @@ def evaluate_agent(
             f"{env} goes through all stages: make one that stays in a stage, as "
             f"gymnasium.make({world.scenario.id!r}, stage=0)."
         )
+    if world.order:
+        raise ValueError(f"{env} has its targets in order {world.order}: agents are scored in order 0.")
     if not (callable(agent) or hasattr(agent, "predict")):
         raise TypeError(f"A {type(agent).__name__} is no agent: it can neither predict nor be called.")
     if steps is not None and (type(steps) is not int or steps < 0):

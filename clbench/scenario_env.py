@@ -60,7 +60,7 @@ class ScenarioEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         self.scenario.require_packages()
         self.render_mode = render_mode
         self.instruction: InstructionFormat = instruction
-        self.stage = stage
+        self.stage, self.order = stage, order
         self.steps_taken = 0
         """Steps since it was made."""
         self.begun_at: float | None = None

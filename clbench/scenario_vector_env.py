@@ -60,7 +60,7 @@ class ScenarioVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]
         self.scenario.require_packages()
         self.num_envs = num_envs
         self.instruction: InstructionFormat = instruction
-        self.stage = stage
+        self.stage, self.order = stage, order
         self.steps_taken = 0
         """Steps since it was made, of all environments together."""
         self.begun_at: float | None = None

@@ -259,6 +259,11 @@ def test_names_seeds_and_settings_that_cannot_be_are_refused(
         evaluate(Knowing(), stage_env(0), **options)
 
 
+def test_targets_in_another_order_are_refused(evaluate: Callable[..., Any]) -> None:
+    with pytest.raises(ValueError, match="in order 1: agents are scored in order 0"):
+        evaluate(Knowing(), gymnasium.make("clbench/Toy-v0", stage=0, order=1))
+
+
 def test_an_environment_without_a_scenario_or_a_stage_is_refused(evaluate: Callable[..., Any]) -> None:
     with pytest.raises(TypeError, match="is not of a scenario"):
         evaluate(Knowing(), gymnasium.make("CartPole-v1"))
