@@ -33,6 +33,12 @@ app.command("clbench.leaderboard.cli:claims", name="claims")
 app.command("clbench.leaderboard.cli:method_pages", name="method-pages")
 app.command("clbench.leaderboard.cli:scenario_card", name="scenario-card")
 app.command("clbench.doctor:doctor", name="doctor")
+experts = App(
+    name="experts", help="Measure the experts that demonstrate tasks, and train those that are learned."
+)
+experts.command("clbench.commands.experts:measure", name="measure")
+experts.command("clbench.envs.dm_control.cli:train", name="train")
+app.command(experts)
 
 
 def main() -> None:

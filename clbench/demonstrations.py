@@ -26,9 +26,6 @@ from clbench.world import World
 SIMULATORS = ("gymnasium", "mujoco", "numpy")
 """Packages whose version can change a trajectory in any suite; a task names those of its own suite."""
 
-DISTURBANCE = 0.1
-"""Chance, at each step of a disturbed episode, that a disturbance begins."""
-
 
 @dataclass(frozen=True)
 class Demonstration:
@@ -55,8 +52,8 @@ def demonstrate(world: World, task: Task, seed: int, disturb: bool) -> Demonstra
         world: An environment of the task's world.
         task: What to do.
         seed: Of the initial state and of the disturbances.
-        disturb: Whether now and then, about every 10 steps, 3 to 6 random actions replace the expert's, so
-            that the episode shows how to recover.
+        disturb: Whether now and then, as often as the task says, 3 to 6 random actions replace the expert's,
+            so that the episode shows how to recover.
     """
     expert = resolve(task.expert)(task.name)
     generator = np.random.default_rng([seed, 1])
@@ -65,7 +62,7 @@ def demonstrate(world: World, task: Task, seed: int, disturb: bool) -> Demonstra
     states, executed, labels, disturbed, rewards = [state], [], [expert(state)], [], []
     success, remaining = False, 0
     for _ in range(task.horizon):
-        if disturb and remaining == 0 and generator.random() < DISTURBANCE:
+        if disturb and remaining == 0 and generator.random() < task.disturbance:
             remaining = int(generator.integers(3, 7))
         action = generator.uniform(low, high).astype(np.float32) if remaining else labels[-1]
         disturbed.append(remaining > 0)

@@ -71,16 +71,16 @@ class Bars:
             share = min(1.0, self._done / self._total)
             # before anything is done nobody knows how long the rest takes
             left = f", about {_minutes((now - self._started) * (1 - share) / share)} left" if share else ""
-            self._say(f"{share:4.0%}{left}: {', '.join(self._bars)}")
+            self.say(f"{share:4.0%}{left}: {', '.join(self._bars)}")
 
     def finish(self, name: str, text: str) -> None:
         """Take a piece away, whatever was left of it, and say what came of it."""
         self.advance(name, self._left[name])
         del self._left[name]
         self._progress.remove_task(self._bars.pop(name))
-        self._say(f"{name}: {text}")
+        self.say(f"{name}: {text}")
 
-    def _say(self, line: str) -> None:
+    def say(self, line: str) -> None:
         """Print a line as it is: names may look like markup, and a log is not to be wrapped."""
         self.console.print(line, highlight=False, markup=False, soft_wrap=True)
 

@@ -81,6 +81,8 @@ class Task:
     expert's action in a state. It must not remember earlier states: it also labels perturbed episodes."""
     version: int = 0
     """Raised whenever the task, its expert or its demonstrations change."""
+    disturbance: float = 0.1
+    """Chance, at each step of a disturbed demonstration, that a disturbance of 3 to 6 steps begins."""
     packages: tuple[str, ...] = ()
     """Distributions whose version can change a trajectory, beside those that all worlds have in common: the
     simulator of its suite, as ("gymnasium-robotics",)."""

@@ -51,6 +51,10 @@ def _clbench(*arguments: str, folder: Path | None = None) -> subprocess.Complete
         ),
         (["metrics", "forgeting"], "No metric is called 'forgeting'. Did you mean 'forgetting'?"),
         (["leaderbord"], "leaderbord"),
+        (["experts", "train", "cartpole_lft"], "Did you mean 'cartpole_left'?"),
+        (["experts", "train", "cartpole_left", "--steps", "1500"], "for a multiple of 1,000 steps"),
+        (["experts", "measure", "clbench/Fetch"], "Did you mean 'clbench/Fetch-v0'"),
+        (["experts", "measure", "clbench/Fetch-v0", "pusch"], "Did you mean 'push'?"),
     ],
 )
 def test_bad_input_ends_with_exit_code_2_and_the_nearest_right_name(

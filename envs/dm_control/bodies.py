@@ -1,0 +1,132 @@
+"""The bodies of dm_control, stepped and observed without its Python code, bit for bit as it does."""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import importlib
+import os
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from .state import ACTION_SIZE, OBSERVATION_SIZE, Observation
+
+
+@dataclass(frozen=True)
+class Body:
+    """One domain of dm_control with the length of a step that we give it."""
+
+    name: str
+    """Name of the domain."""
+    substeps: int
+    """Steps of the physics in one step of ours, which has one action."""
+    scale: tuple[float, ...]
+    """Usual size of each number that is observed: experts train on numbers of about 1."""
+    camera: dict[str, Any]
+    """From where it is drawn."""
+    observer: Callable[[mujoco.MjModel, mujoco.MjData], Callable[[], Observation]]
+    """Takes the physics of one episode and returns what says what dm_control observes of it (K,): views of
+    the physics are made once, as each takes 0.3 us."""
+
+
+@dataclass(frozen=True, eq=False)
+class Start:
+    """A task of dm_control, which says how episodes begin; all worlds of a process share it."""
+
+    body: Body
+    physics: Any
+    """The `dm_control.mujoco.Physics` that an episode begins in, and is copied from."""
+    task: Any
+    """The `dm_control.suite.base.Task`."""
+    model: mujoco.MjModel
+
+    def begin(self, seed: int, data: mujoco.MjData) -> None:
+        """Put `data` into the initial state that dm_control draws for a seed."""
+        self.task.random.seed(seed)
+        with self.physics.reset_context():
+            self.task.initialize_episode(self.physics)
+        mujoco.mj_copyData(data, self.model, self.physics.data.ptr)
+
+    def advance(self, data: mujoco.MjData) -> None:
+        """Move `data` by one step, in dm_control's order of calls, which leaves all positions up to date."""
+        substeps = self.body.substeps
+        if self.model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4:
+            mujoco.mj_step(self.model, data, substeps)
+        else:
+            mujoco.mj_step2(self.model, data)
+            if substeps > 1:
+                mujoco.mj_step(self.model, data, substeps - 1)
+        mujoco.mj_step1(self.model, data)
+
+
+@functools.cache
+def start(body: str, task: str) -> Start:
+    """Return the task of dm_control's domain `body` that is called `task`; it takes 0.1 s, once per process.
+
+    Raises:
+        ValueError: The body has more motors, or is observed in more numbers, than there are places for.
+    """
+    with _without_dm_control_renderer():
+        domain = importlib.import_module(f"dm_control.suite.{body}")
+    environment = domain.SUITE[task]()
+    observed = sum(int(np.prod(spec.shape)) for spec in environment.observation_spec().values())
+    motors = int(environment.action_spec().shape[0])
+    if observed > OBSERVATION_SIZE:
+        raise ValueError(
+            f"{body} is observed in {observed} numbers; a state has places for {OBSERVATION_SIZE}."
+        )
+    if motors > ACTION_SIZE:
+        raise ValueError(f"{body} has {motors} motors; an action has places for {ACTION_SIZE}.")
+    return Start(BODY_OF[body], environment.physics, environment.task, environment.physics.model.ptr)
+
+
+@contextlib.contextmanager
+def _without_dm_control_renderer() -> Iterator[None]:
+    """Keep dm_control from looking for a screen when it is imported: it warns of each that is not there."""
+    before = os.environ.get("MUJOCO_GL")
+    os.environ["MUJOCO_GL"] = "off"
+    try:
+        yield
+    finally:
+        del os.environ["MUJOCO_GL"]
+        if before is not None:
+            os.environ["MUJOCO_GL"] = before
+
+
+def _position_and_velocity(_: mujoco.MjModel, data: mujoco.MjData) -> Callable[[], Observation]:
+    qpos, qvel = data.qpos, data.qvel
+    return lambda: np.concatenate([qpos, qvel])
+
+
+def _cartpole(model: mujoco.MjModel, data: mujoco.MjData) -> Callable[[], Observation]:
+    qpos, qvel, axes = data.qpos, data.qvel, data.xmat[model.body("pole_1").id]
+    return lambda: np.concatenate([qpos[:1], axes[[8, 2]], qvel])
+
+
+def _camera(distance: float, x: float, z: float, elevation: float = 0.0) -> dict[str, Any]:
+    return {
+        "distance": distance,
+        "azimuth": 90.0,
+        "elevation": elevation,
+        "lookat": np.array([x, 0.0, z]),
+    }
+
+
+BODY_OF = {
+    body.name: body
+    for body in (
+        Body("point_mass", 8, (0.15, 0.15, 0.1, 0.1), _camera(0.75, 0.0, 0.0, -90.0), _position_and_velocity),
+        Body("cartpole", 4, (0.7, 0.7, 0.7, 2.0, 4.0), _camera(4.0, 0.0, 1.2), _cartpole),
+        Body(
+            "ball_in_cup",
+            20,
+            (0.1, 0.1, 0.15, 0.15, 1.0, 1.0, 1.5, 1.5),
+            _camera(1.2, 0.0, 0.45),
+            _position_and_velocity,
+        ),
+    )
+}

@@ -1,0 +1,130 @@
+"""The experts of the dm_control world: small networks trained by SAC, read from files that hold no code."""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from safetensors import SafetensorError
+from safetensors.numpy import load, save
+
+from clbench.strict_json import StrictJSONError, read_json
+from clbench.task import unknown
+
+from .rules import RULES
+from .state import ACTION_SIZE, Observation, State
+
+FOLDER = Path(__file__).parent / "experts"
+"""Where the experts lie that are part of the project."""
+
+Layer = tuple[NDArray[np.float32], NDArray[np.float32]]
+"""Weights (out, in) and biases (out,)."""
+
+
+class ExpertError(LookupError):
+    """The files of an expert cannot be used; the message says why, and how to get others."""
+
+
+@dataclass(frozen=True)
+class Expert:
+    """A policy without memory: the mean action of a SAC actor, squashed by tanh."""
+
+    layers: tuple[Layer, ...]
+    """From the observation to the action, with rectifiers between them."""
+
+    def act(self, observation: Observation | NDArray[np.float32]) -> NDArray[np.float32]:
+        """Map an observation (K,) of the body to an action (A,) of its motors, in [-1, 1]."""
+        values = observation.astype(np.float32)
+        for weight, bias in self.layers[:-1]:
+            values = np.maximum(weight @ values + bias, np.float32(0))
+        weight, bias = self.layers[-1]
+        action: NDArray[np.float32] = np.tanh(weight @ values + bias)
+        return action
+
+    def __call__(self, state: State) -> NDArray[np.float32]:
+        """Map a state (19,) to an action (2,), zero where the body has no motor."""
+        action = np.zeros(ACTION_SIZE, np.float32)
+        moved = self.act(state[: self.layers[0][0].shape[1]])
+        action[: len(moved)] = moved
+        return action
+
+    def to_bytes(self) -> bytes:
+        """Return the content of a safetensors file, always the same for the same weights."""
+        return save(
+            {
+                f"{number}.{name}": np.ascontiguousarray(values)
+                for number, layer in enumerate(self.layers)
+                for name, values in zip(("weight", "bias"), layer, strict=True)
+            }
+        )
+
+
+def expert(task: str) -> Expert:
+    """Return the expert of the task that is part of the project.
+
+    Raises:
+        LookupError: No task has this name; the nearest one is named.
+        ExpertError: Its files are missing, torn, or not those of this task.
+    """
+    if task not in RULES:
+        raise unknown("expert of the dm_control world", task, RULES)
+    return _shipped(task)[0]
+
+
+def expert_return(task: str) -> float:
+    """Return the mean return of the expert's episodes, which says what success is.
+
+    Raises:
+        ExpertError: As `expert`.
+    """
+    return _shipped(task)[1]
+
+
+@functools.cache
+def _shipped(task: str) -> tuple[Expert, float]:
+    return read_expert(FOLDER, task)
+
+
+def read_expert(folder: Path, task: str) -> tuple[Expert, float]:
+    """Return an expert that lies in `folder` and the mean return of its episodes.
+
+    Raises:
+        ExpertError: Its files are missing, torn, or not those of this task.
+    """
+    weights, card = folder / f"{task}.safetensors", folder / f"{task}.json"
+    way_out = f"`clbench experts train {task}` makes it; if it came with clbench, install clbench again."
+    try:
+        said = read_json(card)
+        content = weights.read_bytes()
+        if said["task"] != task:
+            raise ValueError(f"is that of the task {said['task']!r}")
+        if hashlib.sha256(content).hexdigest() != said["sha256"]:
+            raise ValueError("has another hash than its JSON says")
+        layers = _layers(load(content), tuple(said["sizes"]))
+        mean = float(said["return"])
+    except (OSError, KeyError, TypeError, ValueError, SafetensorError, StrictJSONError) as error:
+        raise ExpertError(f"The expert {weights} cannot be used ({error}). {way_out}") from error
+    return Expert(layers), mean
+
+
+def _layers(tensors: dict[str, NDArray[np.float32]], sizes: Sequence[int]) -> tuple[Layer, ...]:
+    """Return the layers of a network whose values have `sizes`, from its input to its output.
+
+    Raises:
+        ValueError: The tensors are not those of such a network.
+    """
+    expected: dict[str, tuple[int, ...]] = {}
+    for number, (width, height) in enumerate(itertools.pairwise(sizes)):
+        expected |= {f"{number}.weight": (height, width), f"{number}.bias": (height,)}
+    found = {name: values.shape for name, values in tensors.items()}
+    if found != expected or any(values.dtype != np.float32 for values in tensors.values()):
+        raise ValueError(f"has tensors {found} where float32 of {expected} are expected")
+    if not all(np.isfinite(values).all() for values in tensors.values()):
+        raise ValueError("holds values that are not finite")
+    return tuple((tensors[f"{number}.weight"], tensors[f"{number}.bias"]) for number in range(len(sizes) - 1))

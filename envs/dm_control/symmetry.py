@@ -1,0 +1,46 @@
+"""Tasks that are other tasks seen in a mirror or from another place: one training serves them all."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from .expert import Expert
+
+
+@dataclass(frozen=True)
+class Symmetry:
+    """How the expert of a task follows from that of another task of the same body.
+
+    What the other expert is shown is the observation less `shift`, times `signs`; what it does counts times
+    `action_signs`.
+    """
+
+    of: str
+    """Name of the other task."""
+    signs: tuple[float, ...]
+    shift: tuple[float, ...]
+    action_signs: tuple[float, ...]
+
+    def apply(self, expert: Expert) -> Expert:
+        """Return the expert that follows; tanh is odd, so that its weights alone can hold the symmetry."""
+        layers = list(expert.layers)
+        weight, bias = layers[0]
+        seen = weight * np.array(self.signs, np.float32)
+        layers[0] = (seen, bias - seen @ np.array(self.shift, np.float32))
+        weight, bias = layers[-1]
+        signs = np.array(self.action_signs, np.float32)
+        layers[-1] = (signs[:, None] * weight, signs * bias)
+        return Expert(tuple(layers))
+
+
+SYMMETRIES: dict[str, Symmetry] = {
+    # left and right change places
+    "point_mass_left": Symmetry("point_mass_right", (-1.0, 1.0, -1.0, 1.0), (0.0,) * 4, (-1.0, 1.0)),
+    "ball_in_cup_left": Symmetry("ball_in_cup_right", (-1.0, 1.0) * 4, (0.0,) * 8, (-1.0, 1.0)),
+    "cartpole_right": Symmetry("cartpole_left", (-1.0, 1.0, -1.0, -1.0, -1.0), (0.0,) * 5, (-1.0,)),
+    # The rail looks alike everywhere, but for its ends.
+    "cartpole_balance": Symmetry("cartpole_left", (1.0,) * 5, (0.8, 0.0, 0.0, 0.0, 0.0), (1.0,)),
+}
+"""The tasks whose experts follow from that of another."""

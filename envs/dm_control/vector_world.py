@@ -1,0 +1,134 @@
+"""The dm_control world: many episodes side by side, of any bodies, advanced by a pool of threads."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import gymnasium
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from .episode import Episode
+from .expert import expert_return
+from .rules import HORIZON, SUCCESS_SHARE
+from .state import ACTION_SIZE, SIZE, Observation, State, padded
+
+
+class _Lane:
+    """A place for episodes, with what the present one has returned so far."""
+
+    def __init__(self) -> None:
+        self.episode = Episode()
+        self.steps, self.total, self.needed = 0, 0.0, 0.0
+
+
+class DMControlVectorWorld:
+    """Bodies of dm_control with the tasks of `RULES`; states are laid out as `state` says.
+
+    An action (2,) in [-1, 1] sets the motors for one step of 0.04 s, of the point mass 0.16 s; where a body
+    has one motor, the second number is ignored. An episode succeeds at its last step, the 100th, if its
+    return is at least 0.8 of the mean return of the expert's episodes. It is a `clbench.world.VectorWorld`.
+
+    Args:
+        lanes: Places for episodes. A lane takes its memory when it first has a body.
+        threads: Threads that advance the physics; MuJoCo releases the interpreter lock. Results do not depend
+            on it.
+    """
+
+    def __init__(self, lanes: int, threads: int = 1) -> None:
+        self.single_observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (SIZE,), np.float32)
+        self.single_action_space = gymnasium.spaces.Box(-1.0, 1.0, (ACTION_SIZE,), np.float32)
+        self._lanes: list[_Lane | None] = [None] * lanes
+        self._threads = threads
+        self._pool = ThreadPoolExecutor(threads - 1) if threads > 1 else None
+
+    def reset(self, lanes: Sequence[int], seeds: Sequence[int], tasks: Sequence[str]) -> State:
+        """Start an episode in each of `lanes` and return the states (N, 19).
+
+        The initial state is the one that dm_control draws for the seed.
+
+        Raises:
+            LookupError: No task has this name; the nearest one is named.
+        """
+        states = np.empty((len(lanes), SIZE), np.float32)
+        for row, (number, seed, task) in enumerate(zip(lanes, seeds, tasks, strict=True)):
+            lane = self._lanes[number] or _Lane()
+            observation = lane.episode.reset(task, seed)
+            lane.steps, lane.total = 0, 0.0
+            lane.needed = SUCCESS_SHARE * expert_return(task)
+            self._lanes[number] = lane
+            states[row] = padded(lane.episode.rule.body, observation)
+        return states
+
+    def step(
+        self, lanes: Sequence[int], actions: NDArray[np.float32]
+    ) -> tuple[State, NDArray[np.float64], NDArray[np.bool_]]:
+        """Move each of `lanes` for one step by its row of actions (N, 2).
+
+        Returns the states (N, 19), the rewards (N,) in [0, 1] and which of the episodes succeeded (N,).
+
+        Raises:
+            ValueError: An action has another shape than (2,), or a number in it is not finite.
+        """
+        actions = np.asarray(actions, np.float32)
+        if actions.shape[1:] != (ACTION_SIZE,):
+            raise ValueError(f"An action of the dm_control world has shape (2,), not {actions.shape[1:]}.")
+        finite = np.isfinite(actions).all(axis=1)
+        if not finite.all():
+            raise ValueError(
+                f"An action of the dm_control world is finite, not {actions[~finite][0].tolist()}."
+            )
+        observations = self._advance([self._lane(number) for number in lanes], actions.clip(-1.0, 1.0))
+        states = np.empty((len(lanes), SIZE), np.float32)
+        rewards, successes = np.empty(len(lanes)), np.empty(len(lanes), np.bool_)
+        for row, number in enumerate(lanes):
+            lane, observation = self._lane(number), observations[row]
+            rewards[row] = lane.episode.reward(observation)
+            lane.steps, lane.total = lane.steps + 1, lane.total + float(rewards[row])
+            successes[row] = lane.steps == HORIZON and lane.total >= lane.needed
+            states[row] = padded(lane.episode.rule.body, observation)
+        return states, rewards, successes
+
+    def picture(self, lane: int) -> tuple[mujoco.MjModel, mujoco.MjData, dict[str, Any]]:
+        """Return the model of a lane's body, its physics with the target at its place, and a camera."""
+        episode = self._lane(lane).episode
+        model, mark = episode.start.model, episode.rule.mark
+        if mark is not None:
+            # The place of a mark is an output of the physics: the next step computes it again.
+            episode.data.geom_xpos[model.geom("target").id][:2] = mark
+        return model, episode.data, episode.start.body.camera
+
+    def close(self) -> None:
+        """End the threads."""
+        if self._pool is not None:
+            self._pool.shutdown()
+
+    def _lane(self, number: int) -> _Lane:
+        lane = self._lanes[number]
+        if lane is None:
+            raise gymnasium.error.ResetNeeded(
+                f"Lane {number} of the dm_control world has no episode: reset it."
+            )
+        return lane
+
+    def _advance(self, lanes: Sequence[_Lane], actions: NDArray[np.float32]) -> list[Observation]:
+        """Move each lane by its action and return what is observed: each thread takes the next lane."""
+        observations: list[Observation] = [np.empty(0)] * len(lanes)
+        left = iter(range(len(lanes)))
+
+        def move(rows: Iterator[int]) -> None:
+            for row in rows:
+                observations[row] = lanes[row].episode.step(actions[row])
+
+        helpers = [
+            self._pool.submit(move, left)
+            for _ in range(min(self._threads, len(lanes)) - 1)
+            if self._pool is not None
+        ]
+        move(left)
+        for helper in helpers:
+            helper.result()
+        return observations
