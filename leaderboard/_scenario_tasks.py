@@ -16,6 +16,7 @@ from typing import Any
 from rich.console import Console
 
 from clbench.demonstrations import demonstrate
+from clbench.experts import measure
 from clbench.extras import require
 from clbench.progress import Bars
 from clbench.rendering import choose_back_end
@@ -95,25 +96,13 @@ def make_missing(
     with Bars(len(stale) * episodes + len(bare), console) as bars:
         bars.start(scenario.id, len(stale) * episodes + len(bare))
         _draw(bare, folder, lambda done: bars.advance(scenario.id, done))
-        for task, successes in _measure(stale, episodes, lambda done: bars.advance(scenario.id, done)):
-            kept[task.name] = {**asked[task.name], "successes": successes}
+        for row in measure(scenario, stale, episodes, lambda done: bars.advance(scenario.id, done)):
+            kept[row.task] = {**asked[row.task], "successes": round(row.success * episodes)}
         bars.finish(scenario.id, f"{len(stale)} experts measured, {len(bare)} pictures drawn")
     found = {task.name: kept[task.name] for task in scenario.tasks}
     lines = (f"{json.dumps(name)}: {json.dumps(entry)}" for name, entry in found.items())
     write_if_changed(folder / EXPERTS, "{\n" + ",\n".join(lines) + "\n}\n")
     return Experts(episodes, {name: entry["successes"] for name, entry in found.items()})
-
-
-def _measure(tasks: Sequence[Task], episodes: int, progress: Progress) -> Iterator[tuple[Task, int]]:
-    """Yield each task with the number of episodes in which its expert succeeds, undisturbed."""
-    with _worlds() as world:
-        for task in tasks:
-            successes = 0
-            for number in range(episodes):
-                seed = derive_seed("expert measure", task.suite, task.name, number)
-                successes += demonstrate(world(task), task, seed, disturb=False).success
-                progress(1)
-            yield task, successes
 
 
 def _draw(tasks: Sequence[Task], folder: Path, progress: Progress) -> None:
