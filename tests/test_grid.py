@@ -146,7 +146,7 @@ def _is_gone(group: int) -> bool:
 def test_stopping_the_command_ends_its_workers_and_keeps_finished_records(
     empty_caches: Path, send: Callable[[int, int], None], stop: int, code: int, said: str
 ) -> None:
-    command = [sys.executable, "-m", "clbench", "run", TOY, "frozen", "sft", "joint", "--seeds", "3"]
+    command = [sys.executable, "-m", "clbench", "run", TOY, "frozen", "sft", "joint", "--seeds", "1"]
     command += ["--workers", "1", "--records", str(empty_caches / "records")]
     process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, start_new_session=True)
     first = empty_caches / "records" / "Toy-v0" / "frozen" / "seed-0.json"
@@ -154,11 +154,11 @@ def test_stopping_the_command_ends_its_workers_and_keeps_finished_records(
     while not first.exists() and time.monotonic() < deadline:
         time.sleep(0.1)
     send(process.pid, stop)
-    _, output = process.communicate(timeout=20)
+    _, output = process.communicate(timeout=60)
     assert process.returncode == code
     assert said in output
     assert "Traceback" not in output
     assert _is_gone(process.pid)
     records = _records(empty_caches / "records")
     assert "Toy-v0/frozen/seed-0.json" in records
-    assert len(records) < 9
+    assert len(records) < 3

@@ -27,8 +27,11 @@ def board() -> Any:
 def test_every_method_has_the_same_seeds_and_the_same_pretrained_policies() -> None:
     every = [read_record(path) for path in RECORDS.rglob("*.json")]
     records = [record for record in every if "online" not in record.run["uses"]]
-    policies = {(record.run["seed"], record.fingerprint["pretrained"]) for record in records}
-    assert len(policies) == len({seed for seed, _ in policies}) >= 3
+    policies = {
+        (record.run["scenario"], record.run["seed"], record.fingerprint["pretrained"]) for record in records
+    }
+    scenarios = {scenario for scenario, _, _ in policies}
+    assert len(policies) == len({run[:2] for run in policies}) >= 3 * len(scenarios)
     assert not any(record.run["changes"] for record in records)
     assert not any(record.fingerprint["commit"]["dirty"] for record in records)
 
