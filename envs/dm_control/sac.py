@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import cast
 
 import numpy as np
 import torch
@@ -103,7 +104,10 @@ class WrittenOutSAC(SAC):
         assert self.log_ent_coef is not None
         rate, size = float(self.lr_schedule(1)), self.action_space.shape[0]  # type: ignore[index]
         # one head of both outputs: the mean, then the logarithm of the deviation
-        heads = list(zip(self.actor.mu.parameters(), self.actor.log_std.parameters(), strict=True))
+        deviations = cast(
+            torch.nn.Module, self.actor.log_std
+        )  # declared as a parameter, which it is elsewhere
+        heads = list(zip(self.actor.mu.parameters(), deviations.parameters(), strict=True))
         joined = [torch.cat([mean.data, deviation.data]) for mean, deviation in heads]
         self._actor_adam = _Adam([[*self.actor.latent_pi.parameters(), *joined]], rate)
         for (mean, deviation), whole in zip(heads, joined, strict=True):
