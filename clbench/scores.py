@@ -249,7 +249,8 @@ def _split(record: Record) -> str:
 
 def _check_when(where: str, stage: Any, step: Any, stages: int, steps: tuple[int, ...]) -> None:
     """Refuse a stage that is not in the scenario, and a step after which it is not evaluated."""
-    if any(type(value) is not int or not 0 <= value <= MOST for value in (stage, step)) or stage > stages:
+    whole = type(stage) is int and type(step) is int
+    if not (whole and 0 <= stage <= min(stages, MOST) and 0 <= step <= MOST):
         raise RecordError(f"{where} has an impossible stage or step.")
     if step not in (steps if stage else (0,)):
         raise RecordError(f"{where} is of stage {stage}, step {step}, which is no evaluation point.")
