@@ -134,7 +134,10 @@ def dataset_folder(task: Task, budget: Budget, progress: Callable[[float], None]
         "demonstrations": budget.demonstrations,
         "perturbation": budget.perturbation,
         "source": source_hash(
-            __name__, "clbench.seeding", *sorted({package_of(task.world), package_of(task.expert)})
+            __name__,
+            "clbench.seeding",
+            "clbench.world",
+            *sorted({package_of(task.world), package_of(task.expert)}),
         ),
         "versions": simulator_versions([task]),
     }

@@ -36,7 +36,7 @@ def pretraining_inputs(scenario: Scenario, seed: int) -> dict[str, Any]:
     suites = {package_of(name) for task in tasks for name in (task.world, task.expert)}
     suites.add(package_of(scenario.questions))
     budget = dataclasses.asdict(scenario.budget)
-    parts = ("policy", "demonstrations", "questions", "seeding", "training")
+    parts = ("policy", "demonstrations", "questions", "seeding", "training", "world")
     core = (*(f"clbench.{part}" for part in parts), __name__)
     return {
         "retained": [dataclasses.asdict(task) for task in scenario.retained],

@@ -53,6 +53,7 @@ def scenes_folder(scenario: Scenario, progress: Callable[[float], None] = lambda
         "source": source_hash(
             "clbench.demonstrations",
             "clbench.seeding",
+            "clbench.world",
             __name__,
             *sorted({package_of(name) for task in tasks for name in (task.world, task.expert)}),
         ),

@@ -11,7 +11,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from clbench.task import Scenario, Task, resolve, scenario_at
+from clbench.task import Scenario, Task, opened_scenario, resolve
 from clbench.walk import InstructionFormat, Start, Walk
 from clbench.world import World
 
@@ -55,9 +55,7 @@ class ScenarioEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         order: int = 0,
         render_mode: str | None = None,
     ) -> None:
-        published: Scenario = scenario_at(scenario) if isinstance(scenario, str) else scenario
-        self.scenario = published.in_order(order)
-        self.scenario.require_packages()
+        self.scenario = opened_scenario(scenario, order)
         self.render_mode = render_mode
         self.instruction: InstructionFormat = instruction
         self.stage, self.order = stage, order

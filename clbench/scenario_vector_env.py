@@ -16,7 +16,7 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from clbench.scenario_env import Observation
-from clbench.task import Scenario, scenario_at
+from clbench.task import Scenario, opened_scenario
 from clbench.walk import InstructionFormat, Start, Walk
 from clbench.world import Lanes
 
@@ -55,9 +55,7 @@ class ScenarioVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]
         order: int = 0,
         threads: int | None = None,
     ) -> None:
-        published: Scenario = scenario_at(scenario) if isinstance(scenario, str) else scenario
-        self.scenario = published.in_order(order)
-        self.scenario.require_packages()
+        self.scenario = opened_scenario(scenario, order)
         self.num_envs = num_envs
         self.instruction: InstructionFormat = instruction
         self.stage, self.order = stage, order

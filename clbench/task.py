@@ -306,6 +306,18 @@ def registered_scenario(scenario_id: str) -> Scenario:
     return scenario
 
 
+def opened_scenario(scenario: Scenario | str, order: int = 0) -> Scenario:
+    """Return a scenario, or the one at an entry point, in an order of its targets and ready to be used.
+
+    Raises:
+        LookupError: There is none, or a package that its tasks need is not installed.
+        ValueError: There is no such order, or a word of the instructions is not in the vocabulary.
+    """
+    published = scenario_at(scenario) if isinstance(scenario, str) else scenario
+    published.require_packages()
+    return published.in_order(order)
+
+
 def scenario_at(entry_point: str) -> Scenario:
     """Return the scenario at "module:attribute".
 

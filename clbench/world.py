@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from typing import Protocol, TypeAlias
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, ClassVar, Protocol, TypeAlias, TypeVar
 
 import gymnasium
 import numpy as np
@@ -16,6 +17,7 @@ World = gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]
 
 States: TypeAlias = NDArray[np.float32]
 """States of N lanes, (N, S)."""
+Item = TypeVar("Item")
 Outcomes: TypeAlias = tuple[States, NDArray[np.float64], NDArray[np.bool_]]
 """What a step led to in N lanes: states (N, S), rewards (N,), and which episodes succeeded (N,)."""
 
@@ -44,6 +46,116 @@ class VectorWorld(Protocol):
     def close(self) -> None:
         """Free what it holds."""
         ...
+
+
+class OneLaneWorld(World):
+    """A suite's own vector world with one lane, as the plain world: one physics serves both.
+
+    A suite names its vector world and its first task, and draws the picture in `picture`; its metadata say
+    how many steps a second has.
+
+    Args:
+        render_mode: "rgb_array", or None to draw nothing.
+    """
+
+    vector_world: ClassVar[Callable[[int, int], Any]]
+    """Makes the vector world, from the number of lanes and of threads."""
+    first_task: ClassVar[str]
+    """What `reset` starts if no task is asked for."""
+
+    def __init__(self, render_mode: str | None = None) -> None:
+        self.render_mode = render_mode
+        self._world = type(self).vector_world(1, 1)
+        self.observation_space = self._world.single_observation_space
+        self.action_space = self._world.single_action_space
+        self._task = self.first_task
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[States, dict[str, Any]]:
+        """Start an episode of the task `options["task"]`, by default of the first, and return the state (S,).
+
+        Raises:
+            LookupError: No task has this name; the nearest one is named.
+        """
+        super().reset(seed=seed)
+        seed = int(self.np_random.integers(2**31)) if seed is None else seed
+        task = (options or {}).get("task", self.first_task)
+        state = self._world.reset([0], [seed], [task])[0]
+        self._task = task
+        return state, {"success": False, "task": task}
+
+    def step(self, action: NDArray[np.float32]) -> tuple[States, float, bool, bool, dict[str, Any]]:
+        """Move for one step.
+
+        Raises:
+            ValueError: The action has another shape than the action space, or a number in it is not finite.
+        """
+        states, rewards, successes = self._world.step([0], np.asarray(action, np.float32)[None])
+        success = bool(successes[0])
+        return states[0], float(rewards[0]), success, False, {"success": success, "task": self._task}
+
+    def render(self) -> NDArray[np.uint8] | None:
+        """Return a picture (480, 480, 3) if the render mode is "rgb_array"."""
+        return None if self.render_mode is None else self.picture()
+
+    def picture(self) -> NDArray[np.uint8]:
+        """Draw the scene, (480, 480, 3)."""
+        raise NotImplementedError
+
+
+def checked_actions(actions: NDArray[np.float32], space: spaces.Box, world: str) -> NDArray[np.float32]:
+    """Return actions (N, A) within the bounds of the action space of a world.
+
+    Raises:
+        ValueError: An action has another shape than the space, or a number in it is not finite.
+    """
+    actions = np.asarray(actions, np.float32)
+    if actions.shape[1:] != space.shape:
+        raise ValueError(f"An action of the {world} world has shape {space.shape}, not {actions.shape[1:]}.")
+    finite = np.isfinite(actions).all(axis=1)
+    if not finite.all():
+        raise ValueError(f"An action of the {world} world is finite, not {actions[~finite][0].tolist()}.")
+    return actions.clip(space.low, space.high)
+
+
+def no_episode(lane: int, world: str) -> gymnasium.error.ResetNeeded:
+    """Return the error for a lane that is used before its first episode."""
+    return gymnasium.error.ResetNeeded(f"Lane {lane} of the {world} world has no episode: reset it.")
+
+
+class Team:
+    """Threads that share out work, the calling one among them; MuJoCo releases the interpreter lock.
+
+    Args:
+        threads: How many.
+    """
+
+    def __init__(self, threads: int) -> None:
+        self._threads = threads
+        self._pool = ThreadPoolExecutor(threads - 1) if threads > 1 else None
+
+    def each(self, work: Callable[[Item], None], items: Sequence[Item]) -> None:
+        """Do the work on each item, in any order: each thread takes the next that is left."""
+        left = iter(items)
+
+        def take(items: Iterable[Item]) -> None:
+            for item in items:
+                work(item)
+
+        helpers = [
+            self._pool.submit(take, left)
+            for _ in range(min(self._threads, len(items)) - 1)
+            if self._pool is not None
+        ]
+        take(left)
+        for helper in helpers:
+            helper.result()
+
+    def close(self) -> None:
+        """End the threads."""
+        if self._pool is not None:
+            self._pool.shutdown()
 
 
 class PlainVectorWorld:

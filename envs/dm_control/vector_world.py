@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Sequence
 from typing import Any
 
 import gymnasium
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
+
+from clbench.world import Team, checked_actions, no_episode
 
 from .episode import Episode
 from .expert import expert_return
@@ -42,8 +43,7 @@ class DMControlVectorWorld:
         self.single_observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (SIZE,), np.float32)
         self.single_action_space = gymnasium.spaces.Box(-1.0, 1.0, (ACTION_SIZE,), np.float32)
         self._lanes: list[_Lane | None] = [None] * lanes
-        self._threads = threads
-        self._pool = ThreadPoolExecutor(threads - 1) if threads > 1 else None
+        self._team = Team(threads)
 
     def reset(self, lanes: Sequence[int], seeds: Sequence[int], tasks: Sequence[str]) -> State:
         """Start an episode in each of `lanes` and return the states (N, 19).
@@ -73,15 +73,8 @@ class DMControlVectorWorld:
         Raises:
             ValueError: An action has another shape than (2,), or a number in it is not finite.
         """
-        actions = np.asarray(actions, np.float32)
-        if actions.shape[1:] != (ACTION_SIZE,):
-            raise ValueError(f"An action of the dm_control world has shape (2,), not {actions.shape[1:]}.")
-        finite = np.isfinite(actions).all(axis=1)
-        if not finite.all():
-            raise ValueError(
-                f"An action of the dm_control world is finite, not {actions[~finite][0].tolist()}."
-            )
-        observations = self._advance([self._lane(number) for number in lanes], actions.clip(-1.0, 1.0))
+        actions = checked_actions(actions, self.single_action_space, "dm_control")
+        observations = self._advance([self._lane(number) for number in lanes], actions)
         states = np.empty((len(lanes), SIZE), np.float32)
         rewards, successes = np.empty(len(lanes)), np.empty(len(lanes), np.bool_)
         for row, number in enumerate(lanes):
@@ -103,32 +96,20 @@ class DMControlVectorWorld:
 
     def close(self) -> None:
         """End the threads."""
-        if self._pool is not None:
-            self._pool.shutdown()
+        self._team.close()
 
     def _lane(self, number: int) -> _Lane:
         lane = self._lanes[number]
         if lane is None:
-            raise gymnasium.error.ResetNeeded(
-                f"Lane {number} of the dm_control world has no episode: reset it."
-            )
+            raise no_episode(number, "dm_control")
         return lane
 
     def _advance(self, lanes: Sequence[_Lane], actions: NDArray[np.float32]) -> list[Observation]:
-        """Move each lane by its action and return what is observed: each thread takes the next lane."""
+        """Move each lane by its action and return what is observed."""
         observations: list[Observation] = [np.empty(0)] * len(lanes)
-        left = iter(range(len(lanes)))
 
-        def move(rows: Iterator[int]) -> None:
-            for row in rows:
-                observations[row] = lanes[row].episode.step(actions[row])
+        def move(row: int) -> None:
+            observations[row] = lanes[row].episode.step(actions[row])
 
-        helpers = [
-            self._pool.submit(move, left)
-            for _ in range(min(self._threads, len(lanes)) - 1)
-            if self._pool is not None
-        ]
-        move(left)
-        for helper in helpers:
-            helper.result()
+        self._team.each(move, range(len(lanes)))
         return observations

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Sequence
 from typing import Any
 
 import gymnasium
@@ -13,6 +12,7 @@ from gymnasium.utils.seeding import np_random
 from numpy.typing import NDArray
 
 from clbench.task import unknown
+from clbench.world import Team, checked_actions, no_episode
 
 from .rules import RULES, Rule
 from .scene import Scene, mat2euler, scene
@@ -93,8 +93,7 @@ class FetchVectorWorld:
         self.single_action_space = gymnasium.spaces.Box(-1.0, 1.0, (4,), np.float32)
         self._scene = scene()
         self._lanes: list[_Lane | None] = [None] * lanes
-        self._threads = threads
-        self._pool = ThreadPoolExecutor(threads - 1) if threads > 1 else None
+        self._team = Team(threads)
         # of the gripper's and the block's place, and of the block's rotation
         self._jacobians = np.zeros((lanes, 3, 3, self._scene.model.nv))
 
@@ -133,14 +132,9 @@ class FetchVectorWorld:
         Raises:
             ValueError: An action has another shape than (4,), or a number in it is not finite.
         """
-        actions = np.asarray(actions, np.float32)
-        if actions.shape[1:] != (4,):
-            raise ValueError(f"An action of the Fetch world has shape (4,), not {actions.shape[1:]}.")
-        finite = np.isfinite(actions).all(axis=1)
-        if not finite.all():
-            raise ValueError(f"An action of the Fetch world is finite, not {actions[~finite][0].tolist()}.")
-        self._act(lanes, actions.clip(-1.0, 1.0))
-        self._advance(lanes)
+        actions = checked_actions(actions, self.single_action_space, "Fetch")
+        self._act(lanes, actions)
+        self._team.each(self._advance, lanes)
         states = self._observe(lanes)
         judged = [
             self._lane(number).rule.judge(state, self._lane(number).start)
@@ -158,13 +152,12 @@ class FetchVectorWorld:
 
     def close(self) -> None:
         """End the threads."""
-        if self._pool is not None:
-            self._pool.shutdown()
+        self._team.close()
 
     def _lane(self, number: int) -> _Lane:
         lane = self._lanes[number]
         if lane is None:
-            raise gymnasium.error.ResetNeeded(f"Lane {number} of the Fetch world has no episode: reset it.")
+            raise no_episode(number, "Fetch")
         return lane
 
     def _place_block(self, generator: np.random.Generator) -> Vectors:
@@ -208,22 +201,10 @@ class FetchVectorWorld:
             lane.goal[:], lane.goal_quaternion[:] = hands[row], quaternions[row]
             lane.control[:] = fingers[row]
 
-    def _advance(self, lanes: Sequence[int]) -> None:
-        """Advance the physics of each lane by one step: each thread takes the next lane that is left."""
-        left = iter(lanes)
-        helpers = [
-            self._pool.submit(self._advance_each, left)
-            for _ in range(min(self._threads, len(lanes)) - 1)
-            if self._pool is not None
-        ]
-        self._advance_each(left)
-        for helper in helpers:
-            helper.result()
-
-    def _advance_each(self, lanes: Iterator[int]) -> None:
-        for number in lanes:
-            mujoco.mj_step(self._scene.model, self._lane(number).data, nstep=self._scene.substeps)
-            self._measure(number)
+    def _advance(self, number: int) -> None:
+        """Advance the physics of a lane by one step."""
+        mujoco.mj_step(self._scene.model, self._lane(number).data, nstep=self._scene.substeps)
+        self._measure(number)
 
     def _measure(self, number: int) -> None:
         """Compute what the velocities of gripper and block depend on."""

@@ -10,6 +10,8 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from clbench.world import checked_actions, no_episode
+
 from .episode import Episode, new_episode
 from .state import SIZE, State
 
@@ -60,14 +62,7 @@ class MetaWorldVectorWorld:
         Raises:
             ValueError: An action has another shape than (4,), or a number in it is not finite.
         """
-        actions = np.asarray(actions, np.float32)
-        if actions.shape[1:] != (4,):
-            raise ValueError(f"An action of the Meta-World world has shape (4,), not {actions.shape[1:]}.")
-        finite = np.isfinite(actions).all(axis=1)
-        if not finite.all():
-            named = actions[~finite][0].tolist()
-            raise ValueError(f"An action of the Meta-World world is finite, not {named}.")
-        actions = actions.clip(-1.0, 1.0)
+        actions = checked_actions(actions, self.single_action_space, "Meta-World")
         outcomes = [self._episode(lane).advance(action) for lane, action in zip(lanes, actions, strict=True)]
         states, rewards, successes = zip(*outcomes, strict=True)
         return np.stack(states), np.array(rewards), np.array(successes)
@@ -86,6 +81,5 @@ class MetaWorldVectorWorld:
     def _episode(self, lane: int) -> Episode:
         found = self._lanes[lane]
         if found is None:
-            message = f"Lane {lane} of the Meta-World world has no episode: reset it."
-            raise gymnasium.error.ResetNeeded(message)
+            raise no_episode(lane, "Meta-World")
         return found[1]

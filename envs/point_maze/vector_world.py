@@ -11,6 +11,8 @@ import numpy as np
 from gymnasium.utils.seeding import np_random
 from numpy.typing import NDArray
 
+from clbench.world import checked_actions, no_episode
+
 from .mazes import MAZES, ROOMS, Goal, Place, centre, goal_of
 from .scene import SUBSTEPS, TARGET, scene
 from .state import COLOUR, PLACE, ROOM_AHEAD, SIZE, VELOCITY, State
@@ -112,15 +114,8 @@ class PointMazeVectorWorld:
         Raises:
             ValueError: An action has another shape than (2,), or a number in it is not finite.
         """
-        actions = np.asarray(actions, np.float32)
-        if actions.shape[1:] != (2,):
-            raise ValueError(f"An action of the PointMaze world has shape (2,), not {actions.shape[1:]}.")
-        finite = np.isfinite(actions).all(axis=1)
-        if not finite.all():
-            raise ValueError(
-                f"An action of the PointMaze world is finite, not {actions[~finite][0].tolist()}."
-            )
-        for number, action in zip(lanes, actions.clip(-1.0, 1.0), strict=True):
+        actions = checked_actions(actions, self.single_action_space, "PointMaze")
+        for number, action in zip(lanes, actions, strict=True):
             self._lane(number).advance(action)
         states = self._observe(lanes)
         judged = [self._lane(number).judge(state) for number, state in zip(lanes, states, strict=True)]
@@ -140,9 +135,7 @@ class PointMazeVectorWorld:
     def _lane(self, number: int) -> _Lane:
         lane = self._lanes[number]
         if lane is None:
-            raise gymnasium.error.ResetNeeded(
-                f"Lane {number} of the PointMaze world has no episode: reset it."
-            )
+            raise no_episode(number, "PointMaze")
         return lane
 
     def _observe(self, lanes: Sequence[int]) -> State:
