@@ -43,7 +43,7 @@ benchmark: .venv/installed
 test: .venv/installed-dev
 	$(BIN)/pytest
 
-# What takes minutes and finds little that `make test` does not: more of the same random input.
+# What takes minutes: more of the same random input, a Ray cluster, and all that a stranger types from nothing to a row.
 test-slow: .venv/installed-dev
 	$(BIN)/pytest -m slow
 
@@ -53,9 +53,10 @@ check: .venv/installed-dev
 	$(BIN)/mypy
 
 # What a wheel may do otherwise than the checkout, against a built one outside of it: its files, the parts that are
-# found by name, the commands.
-WHEEL_TESTS := tests/test_package.py tests/test_cli.py tests/test_readme.py tests/test_new_method.py \
-	tests/test_submission.py tests/methods/test_methods.py tests/leaderboard
+# found by name, the commands; and all that strangers type.
+WALKS := tests/test_cli.py tests/test_readme.py tests/test_submission.py tests/test_your_scenario.py
+WHEEL_TESTS := $(WALKS) tests/test_package.py tests/test_new_method.py tests/methods/test_methods.py \
+	$(addprefix tests/leaderboard/test_,table.py page.py submit.py verify.py claims.py method_pages.py scenario_cards.py)
 wheel-test: .venv/installed-dev
 	rm -rf build/wheel && mkdir -p build/wheel
 	$(BIN)/python -m build --wheel --outdir build/wheel . >/dev/null
@@ -63,7 +64,8 @@ wheel-test: .venv/installed-dev
 	$(PYTHON) -m venv build/wheel/venv
 	build/wheel/venv/bin/pip install -q -c constraints.txt "$$(ls build/wheel/*.whl)[dev]"
 	outside=$$(mktemp -d) && cp -r tests docs pyproject.toml *.md LICENSE "$$outside" && here=$$PWD && cd "$$outside" \
-		&& $$here/build/wheel/venv/bin/python -m pytest $(WHEEL_TESTS) && rm -rf "$$outside"
+		&& $$here/build/wheel/venv/bin/python -m pytest $(WHEEL_TESTS) \
+		&& $$here/build/wheel/venv/bin/python -m pytest -m slow $(WALKS) && rm -rf "$$outside"
 
 clean:
 	rm -rf .venv build dist

@@ -17,12 +17,8 @@ def checked_input() -> Iterator[None]:
         yield
     except (LookupError, ValueError, TypeError) as error:
         console = Console(stderr=True, soft_wrap=True)
-        console.print(
-            f"error: {error.args[0] if error.args else error!r}",
-            style="bold red",
-            highlight=False,
-            markup=False,
-        )
+        message = error.args[0] if error.args else type(error).__name__
+        console.print(f"error: {message}", style="bold red", highlight=False, markup=False)
         sys.exit(2)
 
 

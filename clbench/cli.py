@@ -138,12 +138,13 @@ def demonstrations(scenario: str, /, *, workers: int | None = None) -> None:
     from clbench.demonstrations import dataset_folder, read_dataset
     from clbench.grid import demonstration_jobs, run_with_bars
     from clbench.task import load_scenario
+    from clbench.workers import Processes
 
     with checked_input():
         at_least(1, "--workers", workers)
         loaded = load_scenario(scenario)
     jobs = demonstration_jobs(scenario, [task.name for task in loaded.tasks])
-    if run_with_bars(jobs, workers):
+    if run_with_bars(jobs, Processes(workers)):
         sys.exit(1)
     table = Table(title=f"Demonstrations of {loaded.id}")
     for column in ("dataset", "group", "episodes", "disturbed", "success", "mean length"):

@@ -10,13 +10,14 @@ from pathlib import Path
 from rich.console import Console
 
 from clbench.arguments import checked_input
-from clbench.grid import Job, JobError, benchmark_jobs, run_with_bars
+from clbench.grid import benchmark_jobs, run_with_bars
 from clbench.method import load_method
 from clbench.metrics import METRICS
 from clbench.record import label_of, record_path
 from clbench.run import RunSpec, has_record
 from clbench.task import load_scenario
 from clbench.testing import ContractError, check_method
+from clbench.workers import Job, JobError, Processes
 
 from ._rows import Row, Table, rank_mates
 from ._table import FITTING, interval, title_of
@@ -48,7 +49,7 @@ def run_submission(specs: Sequence[RunSpec], records: Path, workers: int | None)
     runs = benchmark_jobs(missing, records, limits)
     jobs = [check, *(dataclasses.replace(job, needs=(*job.needs, check.name)) for job in runs)]
     begin = time.monotonic()
-    failed = run_with_bars(jobs, workers, console)
+    failed = run_with_bars(jobs, Processes(workers), console)
     seconds = time.monotonic() - begin
     console.print(
         f"{len(missing)} runs in {seconds / 60:.1f} minutes; records in {records}.", highlight=False

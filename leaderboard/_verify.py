@@ -20,7 +20,7 @@ from rich.console import Console
 
 from clbench.evaluation import Evaluator, Trial, answer
 from clbench.fingerprint import fingerprint
-from clbench.grid import Job, JobError, run_with_bars
+from clbench.grid import run_with_bars
 from clbench.learner import repeatable
 from clbench.method import method_names
 from clbench.metrics import measure
@@ -31,6 +31,7 @@ from clbench.record import Record, RecordError
 from clbench.run import RunSpec, episode_row, execute, pretrained_hash, run_length
 from clbench.stages import kept_stages, load_stages, stage_policies
 from clbench.task import Scenario
+from clbench.workers import Job, JobError, Processes
 
 from ._runs import Run, differences, read_run
 from ._table import write_if_changed
@@ -314,7 +315,7 @@ def _some(wrong: Sequence[str]) -> str:
 def run_verifications(paths: Sequence[Path], records: Path, request: Request, workers: int | None) -> bool:
     """Verify records, each in a process of its own, and return whether all of them passed."""
     jobs = [_job(path, records, request) for path in paths]
-    return not run_with_bars(jobs, workers, Console())
+    return not run_with_bars(jobs, Processes(workers), Console())
 
 
 def _job(path: Path, records: Path, request: Request) -> Job:

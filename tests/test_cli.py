@@ -1,10 +1,12 @@
-"""The command line as people type it, in processes of its own."""
+"""The command line as people type it; what only a process shows, in one of its own."""
 
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+
+from clbench.cli import app
 
 TOY = "clbench.testing:clbench/Toy-v0"
 
@@ -40,6 +42,10 @@ def _clbench(*arguments: str, folder: Path | None = None) -> subprocess.Complete
             "replay must be from 0 to 1, not 7.0",
         ),
         (["run", "clbench/Fetch-v0", "sft", "--device", "gpu"], "The device 'gpu' cannot be used"),
+        (["run", "clbench/Fetch-v0,clbench/PointMase-v0", "sft"], "Did you mean 'clbench/PointMaze-v0'?"),
+        (["run", "clbench/Fetch-v0", "sft", "--shard", "0/8"], "--shard must be i/n with i from 1 to n"),
+        (["run", "clbench/Fetch-v0", "sft", "--shard", "9/8"], "--shard must be i/n with i from 1 to n"),
+        (["run", "clbench/Fetch-v0", "sft", "--shard", "half"], "as 2/8, not 'half'"),
         (["demonstrations", "clbench/Fetch"], "Did you mean 'clbench/Fetch-v0'"),
         (
             ["tune", "clbench/Fetch-v0", "consft", "--values.kapa", "1,2"],
@@ -58,13 +64,27 @@ def _clbench(*arguments: str, folder: Path | None = None) -> subprocess.Complete
     ],
 )
 def test_bad_input_ends_with_exit_code_2_and_the_nearest_right_name(
-    arguments: list[str], message: str, tmp_path: Path
+    arguments: list[str],
+    message: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
-    result = _clbench(*arguments, folder=tmp_path)
-    assert result.returncode == 2
-    assert " ".join(message.split()) in " ".join((result.stderr + result.stdout).replace("│", " ").split())
-    assert "Traceback" not in result.stderr
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)  # and take back what the command puts there
+    with pytest.raises(SystemExit) as ended:
+        app(arguments)
+    told = "".join(capsys.readouterr())
+    assert ended.value.code == 2
+    assert " ".join(message.split()) in " ".join(told.replace("│", " ").split())
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_wrong_name_ends_the_process_without_a_traceback(tmp_path: Path) -> None:
+    result = _clbench("run", "clbench/Fecth-v0", "sft", folder=tmp_path)
+    assert (result.returncode, result.stdout) == (2, "")
+    assert result.stderr.startswith("error: No scenario is called ")
+    assert "Traceback" not in result.stderr
 
 
 def test_help_names_every_command() -> None:
@@ -133,7 +153,7 @@ def test_a_stranger_runs_a_class_from_the_working_directory_and_sees_it_on_the_b
     assert result.returncode == 1  # the broken one; the others went on
     assert "mine:Broken seed 0: failed in stage 1 (right): ValueError: no idea" in result.stderr
     assert "Traceback" not in result.stderr  # it stands in the record
-    assert "1 failed: mine:Broken seed 0" in result.stderr
+    assert "1 failed: Toy-v0 mine:Broken seed 0" in result.stderr
     records = sorted(path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*.json"))
     assert records == [
         f"leaderboard/records/Toy-v0/{name}/seed-0.json" for name in ("mine.Broken", "mine.Gentle", "sft")
@@ -149,6 +169,7 @@ def test_a_stranger_runs_a_class_from_the_working_directory_and_sees_it_on_the_b
     assert "no idea" in text  # why the failed run is not a row
 
 
+@pytest.mark.slow
 def test_tune_compares_settings_without_a_look_at_what_is_reported(tmp_path: Path) -> None:
     arguments = ("tune", TOY, "low_rate_sft", "--values.speed", "0.2,1", "--seed", "3")
     result = _clbench(*arguments, folder=tmp_path)

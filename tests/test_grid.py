@@ -14,9 +14,10 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from clbench.grid import Job, benchmark_jobs, run_jobs
+from clbench.grid import benchmark_jobs, run_jobs
 from clbench.progress import Bars
 from clbench.run import RunSpec, has_record
+from clbench.workers import Job, Processes
 
 TOY = "clbench.testing:clbench/Toy-v0"
 
@@ -66,7 +67,7 @@ def test_a_job_starts_after_what_it_needs(tmp_path: Path, bars: Bars) -> None:
         _job("second", "good", "first", path=str(tmp_path / "2")),
         _job("first", "good", path=str(tmp_path / "1")),
     ]
-    assert run_jobs(jobs, 2, bars) == {}
+    assert run_jobs(jobs, Processes(2), bars) == {}
     assert (tmp_path / "1").stat().st_mtime_ns < (tmp_path / "2").stat().st_mtime_ns
     assert "first: went well" in _printed(bars)
 
@@ -79,7 +80,7 @@ def test_a_job_that_fails_or_is_killed_does_not_stop_the_others(bars: Bars) -> N
         _job("worse", "good", "hopeless"),
         _job("fine", "good"),
     ]
-    failed = run_jobs(jobs, 2, bars)
+    failed = run_jobs(jobs, Processes(2), bars)
     assert set(failed) == {"wrong", "dead", "hopeless", "worse"}
     assert "ValueError: went wrong" in failed["wrong"]
     assert "exit code -9" in failed["dead"]
@@ -97,11 +98,20 @@ def test_stopping_the_grid_ends_its_processes(
             time.sleep(0.05)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("clbench.grid.wait", interrupt)
+    monkeypatch.setattr("clbench.workers.wait", interrupt)
     with pytest.raises(KeyboardInterrupt):
-        run_jobs([_job("slow", "slow", path=str(path))], 1, bars)
+        run_jobs([_job("slow", "slow", path=str(path))], Processes(1), bars)
     with pytest.raises(ProcessLookupError):
         os.kill(int(path.read_text()), 0)
+
+
+def test_what_the_longest_work_waits_for_begins_first(bars: Bars) -> None:
+    lengths = {"short run": 1.0, "long run": 9.0, "pretraining of the long run": 2.0, "middle run": 5.0}
+    needs = {"long run": ("pretraining of the long run",)}
+    jobs = [Job(name, "some_jobs:good", {}, length, needs.get(name, ())) for name, length in lengths.items()]
+    assert run_jobs(jobs, Processes(1), bars) == {}
+    ended = [line.partition(":")[0] for line in _printed(bars).splitlines()]
+    assert ended == ["pretraining of the long run", "long run", "middle run", "short run"]
 
 
 def _records(folder: Path) -> dict[str, Any]:
@@ -113,18 +123,16 @@ def _records(folder: Path) -> dict[str, Any]:
     return found
 
 
-def test_one_worker_and_two_give_equal_records_and_a_stopped_grid_goes_on(
-    empty_caches: Path, bars: Bars
-) -> None:
+def test_one_worker_and_two_give_equal_records_and_a_stopped_grid_goes_on(tmp_path: Path, bars: Bars) -> None:
     specs = [RunSpec(TOY, method, seed) for seed in (0, 1) for method in ("sft", "frozen")]
-    assert run_jobs(benchmark_jobs(specs, empty_caches / "one"), 1, bars) == {}
-    assert run_jobs(benchmark_jobs(specs[:1], empty_caches / "two"), 2, bars) == {}
-    missing = [spec for spec in specs if not has_record(spec, empty_caches / "two")]
+    assert run_jobs(benchmark_jobs(specs, tmp_path / "one"), Processes(1), bars) == {}
+    assert run_jobs(benchmark_jobs(specs[:1], tmp_path / "two"), Processes(2), bars) == {}
+    missing = [spec for spec in specs if not has_record(spec, tmp_path / "two")]
     assert missing == specs[1:]
-    assert run_jobs(benchmark_jobs(missing, empty_caches / "two"), 2, bars) == {}
-    records = _records(empty_caches / "one")
+    assert run_jobs(benchmark_jobs(missing, tmp_path / "two"), Processes(2), bars) == {}
+    records = _records(tmp_path / "one")
     assert len(records) == 4
-    assert records == _records(empty_caches / "two")
+    assert records == _records(tmp_path / "two")
 
 
 def _is_gone(group: int) -> bool:
@@ -140,16 +148,18 @@ def _is_gone(group: int) -> bool:
 
 @pytest.mark.parametrize(
     ("send", "stop", "code", "said"),
-    [(os.killpg, signal.SIGINT, 130, "Finished records are kept"), (os.kill, signal.SIGTERM, 143, "")],
-    ids=["ctrl-c", "scheduler"],
+    [
+        pytest.param(os.killpg, signal.SIGINT, 130, "Finished records are kept", id="ctrl-c"),
+        pytest.param(os.kill, signal.SIGTERM, 143, "", id="scheduler", marks=pytest.mark.slow),
+    ],
 )
 def test_stopping_the_command_ends_its_workers_and_keeps_finished_records(
-    empty_caches: Path, send: Callable[[int, int], None], stop: int, code: int, said: str
+    tmp_path: Path, send: Callable[[int, int], None], stop: int, code: int, said: str
 ) -> None:
     command = [sys.executable, "-m", "clbench", "run", TOY, "frozen", "sft", "joint", "--seeds", "1"]
-    command += ["--workers", "1", "--records", str(empty_caches / "records")]
+    command += ["--workers", "1", "--records", str(tmp_path / "records")]
     process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, start_new_session=True)
-    first = empty_caches / "records" / "Toy-v0" / "frozen" / "seed-0.json"
+    first = tmp_path / "records" / "Toy-v0" / "frozen" / "seed-0.json"
     deadline = time.monotonic() + 100
     while not first.exists() and time.monotonic() < deadline:
         time.sleep(0.1)
@@ -159,6 +169,6 @@ def test_stopping_the_command_ends_its_workers_and_keeps_finished_records(
     assert said in output
     assert "Traceback" not in output
     assert _is_gone(process.pid)
-    records = _records(empty_caches / "records")
+    records = _records(tmp_path / "records")
     assert "Toy-v0/frozen/seed-0.json" in records
     assert len(records) < 3

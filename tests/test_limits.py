@@ -10,9 +10,10 @@ import psutil
 import pytest
 from rich.console import Console
 
-from clbench.grid import Job, run_jobs
+from clbench.grid import run_jobs
 from clbench.limits import Limits
 from clbench.progress import Bars
+from clbench.workers import Job, Processes
 
 JOBS = """
 import os, subprocess, sys, time
@@ -54,7 +55,7 @@ def done(*jobs: tuple[str, Limits | None], **arguments: Any) -> dict[str, str]:
         Job(name, f"limited_jobs:{name}", arguments if name in ("writer", "parent") else {}, 1, (), limits)
         for name, limits in jobs
     ]
-    return run_jobs(made, 2, bars)
+    return run_jobs(made, Processes(2), bars)
 
 
 def test_a_job_that_takes_too_long_is_stopped_and_the_others_are_not() -> None:

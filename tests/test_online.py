@@ -435,6 +435,7 @@ def test_the_page_s_own_lines_make_a_row(tmp_path: Path) -> None:
     assert "me/sac" in told
 
 
+@pytest.mark.slow
 def test_the_program_of_the_page_makes_a_record_of_each_seed_and_skips_those_it_has(tmp_path: Path) -> None:
     (line,) = _blocks("shell")
     python, script, scenario, *seeds = line.split()

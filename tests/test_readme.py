@@ -57,6 +57,7 @@ def test_the_second_snippet_is_a_method_that_keeps_all_answers(folder: Path) -> 
     assert len(set(correct.values())) == 1
 
 
+@pytest.mark.slow
 def test_three_commands_lead_from_nothing_to_a_row_on_the_board(tmp_path: Path) -> None:
     (block,) = _blocks("shell")
     new, check, submit = block.strip().splitlines()

@@ -49,12 +49,14 @@ def test_an_installed_submission_is_listed_as_package_and_name(installed: Path, 
     assert "Fine-tune, and keep the moving average of the weights." in output
 
 
+@pytest.mark.slow
 def test_its_own_test_passes_where_it_is_installed(installed: Path, copy: Path, tmp_path: Path) -> None:
     shutil.copy(copy / "test_weight_average.py", tmp_path)
     arguments = ("pytest", "-q", "-p", "no:cacheprovider", "test_weight_average.py")
     assert "1 passed" in _python(*arguments, folder=tmp_path, path=installed)
 
 
+@pytest.mark.slow
 def test_it_runs_by_entry_point_and_from_the_working_directory_to_the_same_record(
     installed: Path, copy: Path, tmp_path: Path
 ) -> None:

@@ -43,6 +43,7 @@ def test_its_scenario_is_an_environment_and_passes_the_check(folder: Path) -> No
     assert _python(folder, "-c", environments + check + shown) == "me/Mine-v0 (4, 4)\n"
 
 
+@pytest.mark.slow
 def test_its_commands_make_a_row_with_skills_that_are_forgotten(folder: Path) -> None:
     for line in _blocks("console")[0].strip().splitlines():
         told = _python(folder, "-m", *line.split())

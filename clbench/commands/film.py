@@ -17,6 +17,7 @@ from clbench.rendering import choose_back_end
 from clbench.run import RunSpec, check_device, read_changes
 from clbench.stages import find_stages, load_stages, make_stages
 from clbench.task import load_scenario
+from clbench.workers import Processes
 
 
 def film(
@@ -94,6 +95,6 @@ def _stages_folder(spec: RunSpec, checkpoints: Path | None, console: Console) ->
     found = find_stages(spec, checkpoints)
     if found is not None:
         return found
-    if run_with_bars(stages_jobs([spec], None), None, console):
+    if run_with_bars(stages_jobs([spec], None), Processes(), console):
         sys.exit(1)
     return make_stages(spec)

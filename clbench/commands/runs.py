@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated
 
@@ -23,10 +24,11 @@ from clbench.scores import Scores
 from clbench.stages import has_stages
 from clbench.statistics import expected_precision
 from clbench.task import load_scenario
+from clbench.workers import Processes, Workers
 
 
 def run(
-    scenario: str,
+    scenarios: str,
     /,
     *methods: str,
     every: Annotated[bool, Parameter(name="--all", negative="")] = False,
@@ -34,19 +36,22 @@ def run(
     first_seed: int = 0,
     order: int = 0,
     workers: int | None = None,
+    shard: str = "1/1",
+    ray: str | None = None,
     records: Path = RECORDS,
     device: str = "cpu",
     changes: Annotated[dict[str, str] | None, Parameter(name="--set")] = None,
     checkpoints: Path | None = None,
     tensorboard: Path | None = None,
 ) -> None:
-    """Run METHODS on SCENARIO, once per seed, and write a record of each run.
+    """Run METHODS on SCENARIOS, once per seed, and write a record of each run.
 
     What is missing is made first: demonstrations, then a pretrained policy for each seed. A run that has a
     record is skipped, so a stopped command goes on where it was.
 
     Args:
-        scenario: Gymnasium id of the scenario, as clbench/Fetch-v0; module:id imports the module first.
+        scenarios: Gymnasium id of the scenario, as clbench/Fetch-v0, or more with commas between; module:id
+            imports the module first.
         methods: Names of installed methods, or module:Class.
         every: Run all installed methods.
         seeds: How many seeds.
@@ -54,6 +59,8 @@ def run(
         order: In which order the targets are learned. 0 is the published one, of which the leaderboard's rows
             are; others are permutations, from which it tells how much depends on the order.
         workers: Runs at once, each a process with one thread; all cores if not given.
+        shard: Do only part i of n of the runs, as 2/8: for array jobs, whose tasks share a folder of records.
+        ray: Do the runs on a Ray cluster: its address, auto for one that runs here, or local to start one.
         records: Folder of the records.
         device: Where policies are computed, as cpu or cuda.
         changes: Hyper-parameters that differ from the methods' own, as --set.name value. Such a run has a
@@ -73,22 +80,51 @@ def run(
         check_device(device)
         if tensorboard:
             require_tensorboard()
-        loaded = load_scenario(scenario).in_order(order)
+        loaded = {name: load_scenario(name).in_order(order) for name in dict.fromkeys(scenarios.split(","))}
         values = {method: read_changes(method, changes or {}) for method in names}
-    specs = [
-        RunSpec(scenario, method, seed, values[method], device, order=order)
-        for seed in range(first_seed, first_seed + seeds)
-        for method in names
-    ]
-    Console(stderr=True).print(expected_precision(loaded, seeds), highlight=False)
-    if not _run_missing(specs, records, workers, checkpoints, tensorboard):
+        specs = _part(
+            shard,
+            [
+                RunSpec(scenario, method, seed, values[method], device, order=order)
+                for scenario in loaded
+                for seed in range(first_seed, first_seed + seeds)
+                for method in names
+            ],
+        )
+    console = Console(stderr=True)
+    for scenario in loaded.values():
+        console.print(expected_precision(scenario, seeds), highlight=False)
+    if not _run_missing(specs, records, lambda: _workers(workers, ray), checkpoints, tensorboard):
         sys.exit(1)
+
+
+def _part(shard: str, specs: list[RunSpec]) -> list[RunSpec]:
+    """Return part i of n of the runs: neighbours, so that few parts need the same pretrained policy.
+
+    Raises:
+        ValueError: The text is not i/n, with i from 1 to n.
+    """
+    number, _, count = shard.partition("/")
+    if not (number.isdecimal() and count.isdecimal() and 1 <= int(number) <= int(count)):
+        raise ValueError(f"--shard must be i/n with i from 1 to n, as 2/8, not {shard!r}.")
+    begin, end = (len(specs) * part // int(count) for part in (int(number) - 1, int(number)))
+    return specs[begin:end]
+
+
+def _workers(count: int | None, ray: str | None) -> Workers:
+    """Return who does the runs: processes of this machine, or a Ray cluster at an address."""
+    if ray is None:
+        return Processes(count)
+    from clbench.ray_workers import RayWorkers
+
+    with checked_input():
+        return RayWorkers(ray, count)
 
 
 def _run_missing(
     specs: list[RunSpec],
     records: Path,
-    workers: int | None,
+    workers: Callable[[], Workers],
     checkpoints: Path | None = None,
     tensorboard: Path | None = None,
 ) -> bool:
@@ -106,7 +142,7 @@ def _run_missing(
     runs = benchmark_jobs(missing, records, checkpoints=checkpoints, tensorboard=tensorboard)
     # what both need is made once
     jobs = list({job.name: job for job in (*runs, *stages_jobs(bare, checkpoints))}.values())
-    failed = run_with_bars(jobs, workers, console)
+    failed = run_with_bars(jobs, workers(), console)
     seconds = time.monotonic() - begin
     done = f"{len(missing)} runs" + (f" and the policies of {len(bare)}" if bare else "")
     console.print(f"{done} in {seconds / 60:.1f} minutes; records in {records}.", highlight=False)
@@ -154,7 +190,7 @@ def tune(
             changes = read_changes(method, combination)
             specs.append(RunSpec(scenario, method, seed, changes, split="selection", targets=targets))
     baseline = RunSpec(scenario, "sft", seed, split="selection", targets=targets)
-    going_well = _run_missing([baseline, *specs], records, workers)
+    going_well = _run_missing([baseline, *specs], records, lambda: Processes(workers))
     Console().print(_tuning_table(baseline, specs, records))
     if not going_well:
         sys.exit(1)

@@ -1,0 +1,109 @@
+"""Ray: the same records as on one machine, and nothing is lost with a worker."""
+
+import io
+import json
+import os
+import signal
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+from rich.console import Console
+
+from clbench.grid import benchmark_jobs, run_jobs
+from clbench.progress import Bars
+from clbench.ray_workers import RayWorkers
+from clbench.run import RunSpec
+from clbench.workers import Job, Processes
+
+TOY = "clbench.testing:clbench/Toy-v0"
+
+JOBS = """
+import os, time
+from pathlib import Path
+
+def good(progress):
+    progress(1)
+    return "went well"
+
+def bad(progress):
+    raise ValueError("went wrong")
+
+def lost_once(progress, path):
+    attempts = Path(path)
+    with attempts.open("a") as file:
+        file.write(f"{os.getpid()}\\n")
+    if len(attempts.read_text().split()) == 1:
+        time.sleep(60)
+    return "went well in the end"
+"""
+
+# a cluster of its own for each test; Ray leaves a socket and a log file to the garbage collector
+pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore::ResourceWarning")]
+
+
+@pytest.fixture
+def bars() -> Bars:
+    return Bars(10, Console(file=io.StringIO(), width=200))
+
+
+@pytest.fixture(autouse=True)
+def _jobs_module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "some_jobs.py").write_text(JOBS)
+    monkeypatch.syspath_prepend(tmp_path)
+
+
+def _kill_first(path: Path) -> None:
+    """Kill the process whose id is the first in a file, as soon as it is there."""
+    deadline = time.monotonic() + 100
+    while time.monotonic() < deadline:
+        if path.exists() and path.read_text().strip():
+            os.kill(int(path.read_text().split()[0]), signal.SIGKILL)
+            return
+        time.sleep(0.05)
+
+
+def test_a_job_that_fails_leaves_the_others_alone_and_one_whose_worker_is_killed_is_done_again(
+    tmp_path: Path, bars: Bars
+) -> None:
+    path = tmp_path / "attempts"
+    jobs = [
+        Job("wrong", "some_jobs:bad", {}, 1),
+        Job("hopeless", "some_jobs:good", {}, 1, ("wrong",)),
+        Job("fine", "some_jobs:good", {}, 1),
+        Job("lost", "some_jobs:lost_once", {"path": str(path)}, 1),
+    ]
+    killer = threading.Thread(target=_kill_first, args=(path,))
+    killer.start()
+    failed = run_jobs(jobs, RayWorkers("local", 2), bars)
+    killer.join()
+    assert set(failed) == {"wrong", "hopeless"}
+    assert "ValueError: went wrong" in failed["wrong"]
+    assert len(path.read_text().split()) == 2
+    assert isinstance(bars.console.file, io.StringIO)
+    assert "lost: went well in the end" in bars.console.file.getvalue()
+
+
+def _records(folder: Path) -> dict[str, Any]:
+    found = {}
+    for path in sorted(folder.rglob("*.json")):
+        record = json.loads(path.read_text())
+        del record["timing"]
+        found[path.relative_to(folder).as_posix()] = record
+    return found
+
+
+def test_the_records_are_those_of_one_machine(tmp_path: Path, bars: Bars) -> None:
+    specs = [RunSpec(TOY, method, 0) for method in ("sft", "frozen", "experience_replay")]
+    assert run_jobs(benchmark_jobs(specs, tmp_path / "here"), Processes(2), bars) == {}
+    assert run_jobs(benchmark_jobs(specs, tmp_path / "ray"), RayWorkers("local", 2), bars) == {}
+    records = _records(tmp_path / "here")
+    assert len(records) == 3
+    assert records == _records(tmp_path / "ray")
+
+
+def test_a_cluster_that_does_not_run_is_refused() -> None:
+    with pytest.raises(LookupError, match="No Ray cluster answers at 'auto'; --ray local starts one"):
+        RayWorkers("auto")
