@@ -2,11 +2,13 @@
 
 import subprocess
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
 
 from clbench.cli import app
+from clbench.workers import Job
 
 TOY = "clbench.testing:clbench/Toy-v0"
 
@@ -85,6 +87,30 @@ def test_a_wrong_name_ends_the_process_without_a_traceback(tmp_path: Path) -> No
     assert (result.returncode, result.stdout) == (2, "")
     assert result.stderr.startswith("error: No scenario is called ")
     assert "Traceback" not in result.stderr
+
+
+def test_the_shards_of_a_command_do_each_of_its_runs_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    done: list[str] = []
+
+    def note(jobs: Sequence[Job], *_: object) -> dict[str, str]:
+        done.extend(job.name for job in jobs if job.function == "clbench.grid:run_job")
+        return {}
+
+    monkeypatch.setattr("clbench.commands.runs.run_with_bars", note)
+    runs = ["run", f"{TOY},clbench/Fetch-v0", "sft", "frozen", "lora", "--seeds", "3"]
+    app(runs, result_action="return_value")
+    whole, parts = sorted(done), []
+    for part in range(1, 6):
+        done.clear()
+        app([*runs, "--shard", f"{part}/5"], result_action="return_value")
+        parts.append(list(done))
+    assert len(whole) == 18
+    assert sorted(name for part in parts for name in part) == whole
+    assert {len(part) for part in parts} == {3, 4}
 
 
 def test_help_names_every_command() -> None:

@@ -114,6 +114,23 @@ def test_what_the_longest_work_waits_for_begins_first(bars: Bars) -> None:
     assert ended == ["pretraining of the long run", "long run", "middle run", "short run"]
 
 
+def test_runs_of_two_scenarios_have_jobs_of_their_own_and_one_pretraining_for_each_seed(
+    tmp_path: Path,
+) -> None:
+    scenarios = ("clbench/Fetch-v0", TOY)
+    specs = [RunSpec(name, method, 0) for name in scenarios for method in ("sft", "frozen")]
+    jobs = benchmark_jobs(specs, tmp_path)
+    names = [job.name for job in jobs]
+    assert len(set(names)) == len(names)
+    assert [name for name in names if "pretraining" in name] == [
+        "Fetch-v0 pretraining seed 0",
+        "Toy-v0 pretraining seed 0",
+    ]
+    needs = {job.name: job.needs for job in jobs}
+    assert needs["Toy-v0 sft seed 0"] == ("Toy-v0 pretraining seed 0",)
+    assert "Toy-v0 demonstrations left" in needs["Toy-v0 pretraining seed 0"]
+
+
 def _records(folder: Path) -> dict[str, Any]:
     found = {}
     for path in sorted(folder.rglob("*.json")):
