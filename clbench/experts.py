@@ -1,10 +1,9 @@
-"""Experts, measured: how often each succeeds at its task, and the page that says so."""
+"""Experts, measured: how often each succeeds at its task, and what its episodes return."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from rich.table import Table
@@ -15,12 +14,6 @@ from clbench.task import Scenario, Task, resolve
 from clbench.world import World
 
 COLUMNS = ("task", "group", "success", "mean return", "lowest return", "mean steps")
-
-_HEAD = """# Experts
-
-What demonstrates each task, measured undisturbed on episodes that are used for nothing else: the share that
-succeeded, and what they returned. Each section is made again, with the same bytes, by the command below it.
-"""
 
 
 @dataclass(frozen=True)
@@ -98,23 +91,3 @@ def complaint(task: Task, row: Measurement) -> str | None:
         f"The expert of {task.name!r} succeeds in {row.success:.0%} of its episodes: no demonstrations can "
         f"be collected of it. Mend {task.expert} or the success rule; train it longer where it was trained."
     )
-
-
-def write_page(path: Path, scenario: Scenario, rows: Sequence[Measurement], episodes: int) -> None:
-    """Put the section of a scenario into a page such as docs/experts.md, and leave the others as they are."""
-    sections = {scenario.id: _section(scenario, rows, episodes)}
-    if path.exists():
-        for section in path.read_text(encoding="utf-8").split("\n## ")[1:]:
-            sections.setdefault(section.partition("\n")[0], f"## {section.rstrip()}\n")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    text = "\n".join([_HEAD, *(sections[name] for name in sorted(sections))])
-    path.write_text(text, encoding="utf-8", newline="\n")
-
-
-def _section(scenario: Scenario, rows: Sequence[Measurement], episodes: int) -> str:
-    grid = [COLUMNS, ("---", "---", *["---:"] * (len(COLUMNS) - 2)), *(row.cells for row in rows)]
-    lines = [f"## {scenario.id}", "", *("| " + " | ".join(row) + " |" for row in grid), ""]
-    lines.append(
-        f"    clbench experts measure {scenario.id} --episodes {episodes} --markdown docs/experts.md"
-    )
-    return "\n".join(lines) + "\n"

@@ -128,21 +128,6 @@ def test_an_expert_that_fails_more_than_it_succeeds_is_named_with_the_way_out() 
     assert TOY.tasks[0].expert in said
 
 
-def test_the_page_keeps_the_sections_of_other_scenarios_and_its_bytes(tmp_path: Path) -> None:
-    page = tmp_path / "experts.md"
-    rows = experts.measure(TOY, TOY.tasks, episodes=2)
-    experts.write_page(page, TOY, rows, 2)
-    first = page.read_text(encoding="utf-8")
-    assert "| " + " | ".join(rows[0].cells) + " |" in first
-    other = "## clbench/Another-v0\n\n| task |\n"
-    page.write_text(first.replace("## ", f"{other}\n## ", 1), encoding="utf-8")
-    experts.write_page(page, TOY, rows, 2)
-    second = page.read_bytes()
-    assert other in second.decode()
-    experts.write_page(page, TOY, rows, 2)
-    assert page.read_bytes() == second
-
-
 def test_training_without_the_extra_says_how_to_get_it(tmp_path: Path) -> None:
     hide = "import sys; sys.modules['stable_baselines3'] = None; from importlib.util import find_spec"
     program = (

@@ -3,38 +3,32 @@
 from __future__ import annotations
 
 import sys
-from pathlib import Path
 
 from rich.console import Console
 
 from clbench.arguments import at_least, checked_input
-from clbench.experts import complaint, table, write_page
+from clbench.experts import complaint, table
 from clbench.experts import measure as measure_experts
 from clbench.progress import Bars
 from clbench.task import load_scenario
 
 
-def measure(scenario: str, /, *tasks: str, episodes: int = 100, markdown: Path | None = None) -> None:
+def measure(scenario: str, /, *tasks: str, episodes: int = 100) -> None:
     """Measure the experts of SCENARIO, or of its TASKS alone: their success and what their episodes return.
 
     Args:
         scenario: Gymnasium id of the scenario.
         tasks: Names of tasks; all of the scenario if not given.
         episodes: How many of each task.
-        markdown: Write the table into this page too, as docs/experts.md; it takes all tasks.
     """
     with checked_input():
         at_least(1, "--episodes", episodes)
-        if tasks and markdown:
-            raise ValueError("The page has all tasks of a scenario: give tasks or --markdown, not both.")
         loaded = load_scenario(scenario)
         chosen = [loaded.task(name) for name in tasks] or list(loaded.tasks)
     with Bars(len(chosen) * episodes) as bars:
         bars.start(loaded.id, len(chosen) * episodes)
         rows = measure_experts(loaded, chosen, episodes, lambda done: bars.advance(loaded.id, done))
     Console().print(table(loaded, rows, episodes))
-    if markdown:
-        write_page(markdown, loaded, rows, episodes)
     complaints = [text for task, row in zip(chosen, rows, strict=True) if (text := complaint(task, row))]
     for text in complaints:
         Console(stderr=True).print(text, style="bold red", highlight=False, markup=False, soft_wrap=True)
