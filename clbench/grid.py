@@ -272,7 +272,9 @@ def run_job(
             f"failed in {record.error['where']}: {record.error['type']}: {record.error['message']}"
         )
     scores = Scores.from_record(record)
-    values = {name: measure(name, scores) for name in ("adaptation", "retention", "question_retention")}
+    names = ["adaptation", "retention", "question_retention"]
+    names[2:2] = ["perturbed_retention"] if spec.perturb else []
+    values = {name: measure(name, scores) for name in names}
     return ", ".join(f"{name} {'-' if value is None else f'{value:.2f}'}" for name, value in values.items())
 
 
@@ -322,7 +324,7 @@ def benchmark_jobs(
     jobs = _preparing_jobs(specs)
     for spec in specs:
         needs = (f"pretraining seed {spec.seed}",)
-        length = run_length(spec.load(), spec.split)
+        length = run_length(spec.load(), spec.split, spec.perturb)
         jobs.append(
             Job(_title(spec), "clbench.grid:run_job", {"spec": spec, **folders}, length, needs, limits)
         )

@@ -33,6 +33,7 @@ def run(
     seeds: int = 3,
     first_seed: int = 0,
     order: int = 0,
+    perturb: Annotated[bool, Parameter(negative="")] = False,
     workers: int | None = None,
     records: Path = RECORDS,
     device: str = "cpu",
@@ -53,6 +54,8 @@ def run(
         first_seed: The first of them.
         order: In which order the targets are learned. 0 is the published one, of which the leaderboard's rows
             are; others are permutations, from which it tells how much depends on the order.
+        perturb: Evaluate the retained skills in disturbed worlds too, from other start poses and with heavier
+            or lighter things. Such a record takes the place of one without, whose episodes are all in it.
         workers: Runs at once, each a process with one thread; all cores if not given.
         records: Folder of the records.
         device: Where policies are computed, as cpu or cuda.
@@ -73,13 +76,13 @@ def run(
         check_device(device)
         if tensorboard:
             require_tensorboard()
-        loaded = load_scenario(scenario).in_order(order)
         values = {method: read_changes(method, changes or {}) for method in names}
-    specs = [
-        RunSpec(scenario, method, seed, values[method], device, order=order)
-        for seed in range(first_seed, first_seed + seeds)
-        for method in names
-    ]
+        specs = [
+            RunSpec(scenario, method, seed, values[method], device, order=order, perturb=perturb)
+            for seed in range(first_seed, first_seed + seeds)
+            for method in names
+        ]
+        loaded = specs[0].load()
     Console(stderr=True).print(expected_precision(loaded, seeds), highlight=False)
     if not _run_missing(specs, records, workers, checkpoints, tensorboard):
         sys.exit(1)
