@@ -168,7 +168,9 @@ class Episode(SawyerXYZEnv):
 def _episode_class(task: str, mass: float | None) -> type[Episode]:
     if mass is not None:
         plain = _episode_class(task, None)
-        scene = replace(plain.scene, model=with_mass(plain.scene.model, _things(plain.scene.model), mass))
+        scene, model = plain.scene, plain.scene.model
+        model.body_pos[:], model.site_pos[:] = scene.body_pos, scene.site_pos  # an episode has moved them
+        scene = replace(scene, model=with_mass(model, _things(model), mass))
         return type(f"Perturbed{plain.__name__}", (plain,), {"scene": scene})
     name = f"{task.replace('_', '-')}-v3"
     if name not in ALL_V3_ENVIRONMENTS:
