@@ -106,7 +106,7 @@ class Evaluator:
         Args:
             policy: What acts.
             tasks: What it is asked to do.
-            split: Which episodes. Choose on "selection"; "report" is for scores alone.
+            split: Which episodes. Choose on "selection"; the others are for scores alone.
             progress: Called with the number of episodes that have ended since its last call.
         """
         numbers = range(self.scenario.budget.episodes(split))
@@ -125,7 +125,8 @@ class Evaluator:
             policy: What acts.
             trials: Which episodes: task, split and number.
             progress: Called with the number of episodes that have ended since its last call.
-            watch: Called with every action: the plain world, reset as `start_of` says, repeats the episode.
+            watch: Called with every action: the plain world, reset as `start_of` says, repeats the episode
+                unless it is perturbed.
         """
         check_episodes((task.name, split) for task, split, _ in trials)
         queue = list(reversed(trials))
@@ -150,7 +151,12 @@ class Evaluator:
             return []
         tasks = [task for _, (task, _, _) in starting]
         starts = [start_of(trial, self.seed) for _, trial in starting]
-        states = self._lanes.reset([lane for lane, _ in starting], [seed for seed, _ in starts], tasks)
+        states = self._lanes.reset(
+            [lane for lane, _ in starting],
+            [seed for seed, _ in starts],
+            tasks,
+            [split == "perturbed" for _, (_, split, _) in starting],
+        )
         lanes = []
         for (lane, trial), (seed, instruction), state in zip(starting, starts, states, strict=True):
             words = encode([instruction])[0]
@@ -193,10 +199,14 @@ class Evaluator:
 
 
 def start_of(trial: Trial, seed: int) -> tuple[int, str]:
-    """Return what a trial starts with in a run of `seed`: the seed of its initial state, its instruction."""
+    """Return what a trial starts with in a run of `seed`: the seed of its initial state, its instruction.
+
+    A perturbed episode starts with what the report episode of its number does.
+    """
     task, split, number = trial
     instruction = task.instructions[number % len(task.instructions)]
-    return derive_seed("episode", seed, task.name, split, number), instruction
+    same = "report" if split == "perturbed" else split
+    return derive_seed("episode", seed, task.name, same, number), instruction
 
 
 @torch.inference_mode()

@@ -140,7 +140,9 @@ def run_job(
             f"failed in {record.error['where']}: {record.error['type']}: {record.error['message']}"
         )
     scores = Scores.from_record(record)
-    values = {name: measure(name, scores) for name in ("adaptation", "retention", "question_retention")}
+    names = ["adaptation", "retention", "question_retention"]
+    names[2:2] = ["perturbed_retention"] if spec.perturb else []
+    values = {name: measure(name, scores) for name in names}
     return ", ".join(f"{name} {'-' if value is None else f'{value:.2f}'}" for name, value in values.items())
 
 
@@ -197,7 +199,7 @@ def benchmark_jobs(
                 _title(spec.scenario, _label(spec)),
                 "clbench.grid:run_job",
                 {"spec": spec, **folders},
-                run_length(spec.load(), spec.split),
+                run_length(spec.load(), spec.split, spec.perturb),
                 (_pretraining(spec),),
                 limits,
                 spec.device,

@@ -63,7 +63,7 @@ def check_demonstrations(task: str) -> None:
 
 
 def check_episodes(episodes: Iterable[tuple[str, Split]]) -> None:
-    """Refuse report episodes, and selection episodes of a later task, to the seams under way.
+    """Refuse all but selection episodes, and those of a later task, to the seams under way.
 
     Args:
         episodes: Task and split of each.
@@ -75,8 +75,8 @@ def check_episodes(episodes: Iterable[tuple[str, Split]]) -> None:
     if known is None:
         return
     for task, split in episodes:
-        if split == "report":
-            raise LeakError(f"The method runs report episodes of {task}: nothing may be chosen on them.")
+        if split != "selection":
+            raise LeakError(f"The method runs {split} episodes of {task}: nothing may be chosen on them.")
         if task not in known:
             raise LeakError(f"The method runs episodes of {task}, which its stage must not know yet.")
 

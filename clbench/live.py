@@ -26,9 +26,10 @@ def require_tensorboard() -> None:
 class Log:
     """The scalars of one run, over the optimiser steps since the first target; without a folder, nothing.
 
-    `training/` holds loss and step size every `LOG_STEPS` steps; `success_report/` and `success_selection/`
-    the success of each task, `question_accuracy/` that of each kind of question and of all, and `policy/` how
-    far the policy has moved, at every evaluation point; `diagnostics/` the numbers that the method tells.
+    `training/` holds loss and step size every `LOG_STEPS` steps; `success_report/`, `success_selection/` and
+    `success_perturbed/` the success of each task, `question_accuracy/` that of each kind of question and of
+    all, and `policy/` how far the policy has moved, at every evaluation point; `diagnostics/` the numbers
+    that the method tells.
 
     Args:
         folder: Where the event files go.

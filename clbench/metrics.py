@@ -166,6 +166,20 @@ def retention(rates: Rates) -> Array:
 
 
 @metric(
+    formula="mean over the retained skills s of the success on s after the last target in perturbed episodes",
+    source="clbench",
+    missing="The run did not meet perturbed episodes, as with `clbench run --perturb`.",
+)
+def perturbed_retention(rates: Rates) -> Array:
+    """Success on the retained skills after the last target, with start poses and masses disturbed.
+
+    The episodes are those of `retention`, number by number: what this is lower by is lost to the disturbance.
+    How much of that was lost before any target, the success of the pretrained policy says.
+    """
+    return average(rates.perturbed[..., -1, :])
+
+
+@metric(
     formula="mean over the stages k of the success on the retained skills at the first evaluation point of "
     f"stage k at which the success on target k is at least {MATCHED_SHARE:g} of that of sft at the end of "
     "its stage k; the point is chosen on selection episodes, the success at it is from report episodes",

@@ -35,6 +35,8 @@ the optimiser steps inside the stage; `episode` numbers the initial state inside
 After each stage come all report episodes of all tasks. At the points before, the retained skills and the
 stage's target have the first `curve_episodes` of these; at every point the target has all selection episodes.
 In a tuning run, whose `Record.run` has the split "selection", selection episodes take the place of all these.
+Where `Record.run` says `perturb`, the retained skills have perturbed episodes too, from stage 0 at the end of
+each: those of the report, number by number, in worlds that are disturbed.
 """
 
 ANSWER_COLUMNS = ("stage", "step", "kind", "asked", "correct")
@@ -64,7 +66,7 @@ _RUN: _Fields = {
     "changes": dict,
     "uses": dict,
 }
-_MAY_RUN: _Fields = {"order": int}
+_MAY_RUN: _Fields = {"order": int, "perturb": bool}
 """Of `Record.run` too, where it is not what it usually is."""
 _SCENARIO: _Fields = {
     "id": str,
@@ -85,7 +87,13 @@ _COSTS = (
 """A run that failed need not have all, nor that of an agent that learned online."""
 _ERROR: _Fields = dict.fromkeys(("where", "type", "message", "traceback"), str)
 
-_WORDS = {str: "a text", int: "a whole number", list: "a list", dict: "an object with named entries"}
+_WORDS = {
+    str: "a text",
+    int: "a whole number",
+    bool: "true or false",
+    list: "a list",
+    dict: "an object with named entries",
+}
 
 
 class RecordError(ValueError):
@@ -103,7 +111,7 @@ class Record:
     run), `settings` (all hyper-parameters), `changes` (those that differ from the method's defaults), `uses`
     (the prior data it may touch; and `online`, true, for an agent that learned by trial in the worlds). Where
     the targets were not learned in the published order, also `order`, the number of theirs: see
-    `clbench.task.target_order`."""
+    `clbench.task.target_order`. Where the skills met perturbed episodes, also `perturb`, true."""
     scenario: dict[str, Any]
     """The scenario in full: `retained`, `target` and `held_out` task names in order, `evaluation_steps`
     (steps of a stage after which it is evaluated, the last one its end), and its `budget`."""
@@ -223,6 +231,8 @@ def _record(values: Any) -> Record:
     _check_fields("run", record.run, _RUN, _MAY_RUN)
     if record.run.get("order", 1) < 1:
         raise RecordError("run: order must be above 0; it is left out where the targets have theirs.")
+    if not record.run.get("perturb", True):
+        raise RecordError("run: perturb must be true; it is left out where nothing was perturbed.")
     _check_fields("scenario", record.scenario, _SCENARIO)
     for name in ("costs", "diagnostics", "fingerprint", "timing"):
         _check_type(name, values[name], dict)

@@ -36,6 +36,7 @@ from clbench.record import (
 from clbench.stages import drop_stages, has_stages, keep_stage
 from clbench.strict_json import check_json
 from clbench.task import Scenario, Split, load_scenario
+from clbench.world import check_perturbable
 
 EPISODE_WEIGHT = 0.3
 """What an evaluation episode takes, in optimiser steps; for the time left that a progress bar shows."""
@@ -65,14 +66,25 @@ class RunSpec:
     """How many targets are learned, from the first; all if None."""
     order: int = 0
     """In which order the targets come, as `Scenario.in_order` says; 0 is the published one."""
+    perturb: bool = False
+    """Whether the retained skills are evaluated on perturbed episodes too."""
 
     def path(self, records: Path) -> Path:
         """Return where the record lies below the folder `records`."""
         return record_path(records, self.scenario.rpartition(":")[2], self.label, self.seed, self.order)
 
     def load(self) -> Scenario:
-        """Return the scenario, with the targets that are learned."""
+        """Return the scenario, with the targets that are learned.
+
+        Raises:
+            LookupError: There is no such scenario.
+            ValueError: There is no such order, or nothing that can be perturbed.
+        """
         scenario = load_scenario(self.scenario).in_order(self.order)
+        if self.perturb and not scenario.retained:
+            raise ValueError(f"{scenario.id} retains no skills that could be perturbed: leave out --perturb.")
+        if self.perturb:
+            check_perturbable(scenario.retained)
         return dataclasses.replace(scenario, target=scenario.target[: self.targets])
 
     @property
@@ -96,6 +108,7 @@ class RunSpec:
             **({"order": self.order} if self.order else {}),
             "device": self.device,
             "split": self.split,
+            **({"perturb": True} if self.perturb else {}),
             "settings": settings,
             "changes": {name: settings[name] for name in sorted(self.changes)},
             "uses": dataclasses.asdict(method.uses),
@@ -153,7 +166,7 @@ def execute(
 
 
 def has_record(spec: RunSpec, records: Path) -> bool:
-    """Return whether this very run went through before.
+    """Return whether this very run went through before, or one that has perturbed episodes besides.
 
     One that failed, that cannot be read, or that is of another budget, device or settings does not count.
     """
@@ -161,19 +174,28 @@ def has_record(spec: RunSpec, records: Path) -> bool:
         record = read_record(spec.path(records))
     except RecordError:
         return False
+    if not spec.perturb:
+        record.run.pop("perturb", None)
     return record.status == "success" and (record.run, record.scenario) == spec.describe()
 
 
-def run_length(scenario: Scenario, split: Split = "report") -> float:
-    """Return how long a run that is evaluated on `split` takes, in optimiser steps."""
+def run_length(scenario: Scenario, split: Split = "report", perturb: bool = False) -> float:
+    """Return how long a run takes, in optimiser steps.
+
+    Args:
+        scenario: With the targets that are learned.
+        split: Episodes that it is evaluated on.
+        perturb: Whether the retained skills are evaluated on perturbed episodes too.
+    """
     budget, stages, retained = scenario.budget, len(scenario.target), len(scenario.retained)
     points = len(budget.evaluation_steps)
     scored = split == "report"
     ends = (stages + 1) * len(scenario.tasks) * budget.episodes(split)
+    perturbed = (stages + 1) * retained * budget.episodes("perturbed") if perturb else 0
     on_the_way = stages * (points - 1) * (retained + 1)
     on_the_way *= budget.curve_episodes if scored else budget.selection_episodes
     selection = stages * points * budget.selection_episodes if scored else 0
-    episodes = ends + on_the_way + selection
+    episodes = ends + perturbed + on_the_way + selection
     return stages * budget.adaptation_steps + EPISODE_WEIGHT * episodes
 
 
@@ -311,7 +333,7 @@ class _Run:
         inputs = {
             "policy": hash_of_tensors(self.learner.policy.state_dict()),
             "scenario": self.record.scenario,
-            "spec": [self.spec.seed, self.spec.device, self.spec.split],
+            "spec": [self.spec.seed, self.spec.device, self.spec.split, self.spec.perturb],
             **sources(self.scenario, self.spec.seed),
         }
         folder = cache_folder() / "reports" / hash_of(inputs)
@@ -321,8 +343,7 @@ class _Run:
         for name, value in json.loads((folder / "report.json").read_text(encoding="utf-8")).items():
             setattr(self.record, name, value)
         self.log.report(self.record, 0, 0)
-        count = self.scenario.budget.episodes(self.spec.split)
-        self.progress(EPISODE_WEIGHT * len(self.scenario.tasks) * count)
+        self.progress(EPISODE_WEIGHT * len(self.record.episodes["task"]))
 
     def _stage(self, number: int) -> None:
         """Adapt to target `number`, evaluating on the way and at the end."""
@@ -373,6 +394,9 @@ class _Run:
         trials: list[Trial] = [(task, split, episode) for task in tasks for episode in range(count)]
         if split == "report":
             trials += [(task, "selection", n) for task in target for n in range(budget.selection_episodes)]
+        if self.spec.perturb and at_the_end:
+            numbers = range(budget.episodes("perturbed"))
+            trials += [(task, "perturbed", n) for task in self.scenario.retained for n in numbers]
         self._play(number, step, trials)
         kind, questions = self.asked
         for name, asked, correct in answer(
@@ -491,7 +515,7 @@ class _Run:
             self.record = read_record(folder / "record.json")
             self.seconds_before = self.record.timing["seconds"]
             self.record.timing.update({"started": started, "resumed_after": number})
-            length = run_length(self.scenario, self.spec.split)
+            length = run_length(self.scenario, self.spec.split, self.spec.perturb)
             self.progress(number * length / len(self.scenario.target))
             return number
         return None

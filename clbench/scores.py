@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clbench.record import EPISODE_COLUMNS, Record, RecordError
-from clbench.task import Group
+from clbench.task import SPLITS, Group
 
 Array = NDArray[np.float64]
 
@@ -75,6 +75,9 @@ class Scores:
     """Success at the end of each stage, (stages + 1, tasks, episodes)."""
     on_the_way: Array
     """Success at the points of each stage before its end, (targets, points - 1, tasks, curve episodes)."""
+    perturbed: Array
+    """Success on the retained skills at the end of each stage in the same episodes, perturbed:
+    (stages + 1, retained, episodes)."""
     selection: Array
     """Success rate on target k over the selection episodes at the points of stage k, (targets, points)."""
     asked: Array
@@ -105,7 +108,7 @@ class Scores:
         if not scored:
             raise RecordError(f"episodes: there is no {split} episode.")
         if split == "selection" and len(scored) < len(rows):
-            raise RecordError("episodes: a tuning run must not have report episodes.")
+            raise RecordError("episodes: a tuning run has selection episodes alone.")
         on_the_way = [row for row in scored if row.stage and row.step < steps[-1]]
         chosen_on = [
             row
@@ -130,6 +133,9 @@ class Scores:
         # one table for all points, with a place for the pretrained policy's; the end is the last point
         success = np.full((len(target) + 1, len(steps), len(tasks), len(layout.episodes)), np.nan)
         of_task, of_episode = _places(tasks), _places(layout.episodes)
+        perturbed = np.full((len(target) + 1, len(retained), len(layout.episodes)), np.nan)
+        for row in _perturbed(record, rows, layout):
+            perturbed[row.stage, of_task[row.task], of_episode[row.episode]] = row.success
         for row in scored:
             where = row.stage, _point(row.stage, row.step, steps), of_task[row.task], of_episode[row.episode]
             success[where] = row.success
@@ -143,6 +149,7 @@ class Scores:
             layout,
             success=success[:, -1],
             on_the_way=success[1:, :-1][..., in_curves],
+            perturbed=perturbed,
             selection=average(on_selection),
             asked=counts[0, :, -1],
             correct=counts[1, :, -1],
@@ -171,6 +178,11 @@ class Scores:
             return np.broadcast_to(array, batch + array.shape)
 
         success = np.einsum("lte,...te->...lt", self.success, counts) / number
+        if np.isnan(self.perturbed).all():  # most runs have none, and to count them takes long
+            perturbed = spread(np.full(self.perturbed.shape[:-1], np.nan))
+        else:
+            of_retained = counts[..., layout.columns("retained"), :]
+            perturbed = np.einsum("lre,...re->...lr", self.perturbed, of_retained) / number
         if layout.curve_episodes:
             weights = counts[..., np.searchsorted(layout.episodes, layout.curve_episodes)]
             weights = np.where(weights.sum(axis=-1, keepdims=True) > 0, weights, 1.0)
@@ -182,6 +194,7 @@ class Scores:
             layout,
             success=success,
             curves=np.concatenate([on_the_way, success[..., 1:, None, :]], axis=-2),
+            perturbed=perturbed,
             selection=spread(self.selection),
             asked=spread(self.asked),
             correct=spread(self.correct),
@@ -273,8 +286,8 @@ def _episodes(record: Record, tasks: tuple[str, ...], stages: int, steps: tuple[
             raise RecordError(f"{where} has an impossible number of an episode.")
         if not isinstance(task, str) or task not in known:
             raise RecordError(f"{where} is of a task that is not in the scenario: {task!r}.")
-        if split not in ("report", "selection"):
-            raise RecordError(f"{where} has the split {split!r}, neither report nor selection.")
+        if split not in SPLITS:
+            raise RecordError(f"{where} has the split {split!r}, which is none of {', '.join(SPLITS)}.")
         if success not in (0, 1):
             raise RecordError(f"{where} has the success {success!r}, neither true nor false.")
         if total_reward is not None and not _is_number(total_reward, FARTHEST, -FARTHEST):
@@ -285,6 +298,28 @@ def _episodes(record: Record, tasks: tuple[str, ...], stages: int, steps: tuple[
     if len({row[:5] for row in rows}) != len(rows):
         raise RecordError("episodes: an episode is there twice.")
     return rows
+
+
+def _perturbed(record: Record, rows: Iterable[_Episode], layout: Layout) -> list[_Episode]:
+    """Return the perturbed episodes: all that a run has which says `perturb`, and none otherwise."""
+    found = [row for row in rows if row.split == "perturbed"]
+    if not record.run.get("perturb", False):
+        if found:
+            raise RecordError("episodes: there are perturbed ones, but its run does not say perturb.")
+        return []
+    rule = "each retained skill has those of the report, at the end of each stage"
+    retained, numbers = set(layout.retained), set(layout.episodes)
+    for row in found:
+        at_an_end = row.step == (layout.steps[-1] if row.stage else 0)
+        if not (at_an_end and row.task in retained and row.episode in numbers):
+            raise RecordError(
+                f"episodes: the perturbed episode {row.episode} of {row.task} at stage {row.stage}, step "
+                f"{row.step}, must not be there: {rule}."
+            )
+    count = (len(layout.target) + 1) * len(retained) * len(numbers)
+    if len(found) != count:
+        raise RecordError(f"episodes: {len(found):,} are perturbed, not {count:,}: {rule}.")
+    return found
 
 
 def _curve_episodes(record: Record, split: str, episodes: tuple[int, ...]) -> tuple[int, ...]:
@@ -354,6 +389,7 @@ def _is_number(value: Any, high: float, low: float = 0) -> bool:
 _ARRAYS = (
     "success",
     "curves",
+    "perturbed",
     "selection",
     "asked",
     "correct",
@@ -374,6 +410,9 @@ class Rates:
     """Success rate at the end of each stage, (..., stages + 1, tasks)."""
     curves: Array
     """Success rate at the points of each stage, (..., targets, points, tasks); the last one is its end."""
+    perturbed: Array
+    """Success rate on the retained skills in perturbed episodes at the end of each stage,
+    (..., stages + 1, retained)."""
     selection: Array
     """Success rate on target k over selection episodes at the points of stage k, (..., targets, points)."""
     asked: Array

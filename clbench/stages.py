@@ -174,5 +174,6 @@ def drop_stages(spec: RunSpec, checkpoints: Path) -> None:
 def _identity(spec: RunSpec, number: int) -> dict[str, Any]:
     """Return what tells the policy of a stage from those of other runs, in every version of the code."""
     run, scenario = spec.describe()
-    del run["split"]
+    for name in ("split", "perturb"):  # on what it is evaluated makes no difference
+        run.pop(name, None)
     return {"run": run, "scenario": scenario, "stage": number}

@@ -15,9 +15,11 @@ from clbench.extras import require_packages
 from clbench.limits import Limits
 
 Group = Literal["retained", "target", "held_out"]
-Split = Literal["selection", "report"]
+Split = Literal["selection", "report", "perturbed"]
+"""What episodes are for. The perturbed ones are those of the report in disturbed worlds, see
+`clbench.perturbation`."""
 
-SPLITS: tuple[Split, ...] = ("selection", "report")
+SPLITS: tuple[Split, ...] = ("selection", "report", "perturbed")
 
 MOST_ORDERS = 99
 """Orders of the targets besides the published one, where there are as many: a number in a stranger's record
@@ -148,7 +150,7 @@ class Budget:
 
     def episodes(self, split: Split) -> int:
         """Return how many episodes per task `split` has."""
-        return self.report_episodes if split == "report" else self.selection_episodes
+        return self.selection_episodes if split == "selection" else self.report_episodes
 
     @property
     def evaluation_steps(self) -> tuple[int, ...]:

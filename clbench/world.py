@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+import inspect
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, ClassVar, Protocol, TypeAlias, TypeVar
@@ -29,6 +31,9 @@ class VectorWorld(Protocol):
     attribute `vector_world` of its world makes it, from the number of lanes and of threads. Each episode is
     bit for bit that of the plain world, whatever the other lanes do. Who uses it resets a lane before
     stepping it, counts the steps, and lets a lane rest once its episode has succeeded.
+
+    A world can be perturbed if what makes it takes `perturbed` besides, the vector world or, where there is
+    none, the plain world. Its episodes are then disturbed as `clbench.perturbation.draw_perturbation` says.
     """
 
     single_observation_space: spaces.Box
@@ -201,11 +206,38 @@ class PlainVectorWorld:
                 world.close()
 
 
-def vector_world(entry_point: str, lanes: int, threads: int = 1) -> VectorWorld:
-    """Return a vector world of the world that `entry_point` names: the suite's own if it has one."""
+def vector_world(entry_point: str, lanes: int, threads: int = 1, perturbed: bool = False) -> VectorWorld:
+    """Return a vector world of the world that `entry_point` names: the suite's own if it has one.
+
+    Args:
+        entry_point: Of the world.
+        lanes: Places for episodes.
+        threads: Threads that a suite's own vector world may use.
+        perturbed: Whether its episodes are perturbed, which not every world's can be: `check_perturbable`.
+    """
     world = resolve(entry_point)
-    own: Callable[[int, int], VectorWorld] | None = getattr(world, "vector_world", None)
-    return PlainVectorWorld(world, lanes) if own is None else own(lanes, threads)
+    disturbed = {"perturbed": True} if perturbed else {}
+    own: Callable[..., VectorWorld] | None = getattr(world, "vector_world", None)
+    if own is None:
+        return PlainVectorWorld(functools.partial(world, **disturbed), lanes)
+    return own(lanes, threads, **disturbed)
+
+
+def check_perturbable(tasks: Iterable[Task]) -> None:
+    """Refuse tasks whose worlds cannot be perturbed.
+
+    Raises:
+        ValueError: The world of a task takes no `perturbed`; the message says what to do.
+    """
+    for task in tasks:
+        world = resolve(task.world)
+        own = getattr(world, "vector_world", None)
+        if "perturbed" not in inspect.signature(own or world).parameters:
+            what = f"the vector world of {task.world}" if own else task.world
+            raise ValueError(
+                f"The task {task.name!r} cannot be perturbed: {what} takes no argument `perturbed`. Run "
+                "without --perturb, or give it one, as docs/your_scenario.md shows."
+            )
 
 
 class Lanes:
@@ -218,19 +250,33 @@ class Lanes:
 
     def __init__(self, count: int, threads: int = 1) -> None:
         self._count, self._threads = count, threads
-        self._worlds: dict[str, VectorWorld] = {}
+        self._worlds: dict[tuple[str, bool], VectorWorld] = {}
         self._home: list[VectorWorld | None] = [None] * count
 
-    def world(self, task: Task) -> VectorWorld:
-        """Return the vector world of a task; it is made when first needed."""
-        if task.world not in self._worlds:
-            self._worlds[task.world] = vector_world(task.world, self._count, self._threads)
-        return self._worlds[task.world]
+    def world(self, task: Task, perturbed: bool = False) -> VectorWorld:
+        """Return the vector world of a task, or its perturbed twin; it is made when first needed."""
+        key = task.world, perturbed
+        if key not in self._worlds:
+            self._worlds[key] = vector_world(task.world, self._count, self._threads, perturbed)
+        return self._worlds[key]
 
-    def reset(self, lanes: Sequence[int], seeds: Sequence[int], tasks: Sequence[Task]) -> States:
-        """Start an episode of a task in each of `lanes`, and return the states (N, S)."""
-        for lane, task in zip(lanes, tasks, strict=True):
-            self._home[lane] = self.world(task)
+    def reset(
+        self,
+        lanes: Sequence[int],
+        seeds: Sequence[int],
+        tasks: Sequence[Task],
+        perturbed: Sequence[bool] | None = None,
+    ) -> States:
+        """Start an episode of a task in each of `lanes`, and return the states (N, S).
+
+        Args:
+            lanes: Where to.
+            seeds: Of the initial states.
+            tasks: What to do.
+            perturbed: Which of the episodes are perturbed; none is if None.
+        """
+        for lane, task, disturbed in zip(lanes, tasks, perturbed or [False] * len(tasks), strict=True):
+            self._home[lane] = self.world(task, disturbed)
         states = self._empty(lanes)
         for world, rows in self._by_world(lanes):
             names = [tasks[row].name for row in rows]

@@ -15,7 +15,7 @@ from ._descriptions import Description, of_one_module
 from ._markdown import arxiv_ids, grid, linked, prose, run_command
 from ._rows import Row, Table
 from ._runs import DIVISIONS, Run, is_number, printable, read_run, read_runs
-from ._table import MISSING, SHOWN, escaped, interval, number_text, title_of
+from ._table import MISSING, escaped, interval, number_text, shown, title_of
 
 HEADINGS = (
     "Idea",
@@ -176,7 +176,9 @@ def _board(method: Description, sources: Sources) -> list[str]:
         return []
     names = [name for name in dict.fromkeys((method.name, *BESIDE)) if name in sources.rows]
     rows = [sources.rows[name] for name in names]
-    table = [(title_of(one.name), *(interval(row.estimates[one.name]) for row in rows)) for one in SHOWN]
+    table = [
+        (title_of(one.name), *(interval(row.estimates[one.name]) for row in rows)) for one in shown(rows)
+    ]
     table.append(("seeds", *(str(len(row.seeds)) for row in rows)))
     scenario = escaped(sources.evidence.scenario)
     return [f"On {scenario}, with 95 % intervals:", "", *grid(("", *map(escaped, names)), table, len(names))]

@@ -13,13 +13,14 @@ import re
 from collections.abc import Sequence
 from itertools import groupby
 from pathlib import Path
+from typing import TypeAlias
 
 from rich.box import SIMPLE_HEAD
 from rich.console import Group, RenderableType
 from rich.table import Table as Grid
 from rich.text import Text
 
-from clbench.metrics import METRICS
+from clbench.metrics import METRICS, Metric
 from clbench.statistics import Estimate
 
 from ._costs import COSTS
@@ -34,6 +35,7 @@ SHOWN = tuple(
         "final_average",
         "adaptation",
         "retention",
+        "perturbed_retention",
         "retention_at_matched_adaptation",
         "forgetting",
         "forward_transfer",
@@ -43,11 +45,16 @@ SHOWN = tuple(
 )
 """Metrics in Markdown; the CSV file has all."""
 
-FITTING = tuple(metric for metric in SHOWN if metric.name not in ("forward_transfer", "zero_shot"))
+RARE = ("perturbed_retention",)
+"""Those of them that take runs of a special kind: a table has them if one of its rows does."""
+
+FITTING = tuple(metric for metric in SHOWN if metric.name not in (*RARE, "forward_transfer", "zero_shot"))
 """Metrics in the terminal, as many as fit 108 columns."""
 
 SHORT_TITLES = {"retention_at_matched_adaptation": "matched retention"}
 """Titles of metrics whose name is too long for the head of a column."""
+
+Rows: TypeAlias = Sequence[Row] | Sequence[OverallRow]
 
 LEGEND = (
     "Rows of a division that cannot be told apart share a rank. ± is half the width of a 95 % interval. "
@@ -57,6 +64,12 @@ LEGEND = (
 
 MISSING = "-"
 """What stands for a value that could not be computed."""
+
+
+def shown(rows: Rows) -> tuple[Metric, ...]:
+    """Return the metrics in a table of `rows`: `SHOWN`, of `RARE` only what one of them has."""
+    found = {name for name in RARE if any(row.estimates[name].value is not None for row in rows)}
+    return tuple(metric for metric in SHOWN if metric.name not in RARE or metric.name in found)
 
 
 def write_if_changed(path: Path, text: str) -> None:
@@ -121,7 +134,7 @@ def markdown(table: Table) -> str:
     ]
     scenarios = groupby(table.rows, key=lambda row: row.scenario)
     parts = [line for scenario, rows in scenarios for line in _scenario(table, scenario, list(rows))]
-    return "\n".join([*head, *_overall(table), *parts, *_legend(), *_not_shown(table)]) + "\n"
+    return "\n".join([*head, *_overall(table), *parts, *_legend(table.rows), *_not_shown(table)]) + "\n"
 
 
 def _overall(table: Table) -> list[str]:
@@ -129,7 +142,8 @@ def _overall(table: Table) -> list[str]:
     rows = overall(table.rows)
     if not rows:
         return []
-    head = ["method", "division", "ranks", *(title_of(metric.name) for metric in SHOWN)]
+    metrics = shown(rows)
+    head = ["method", "division", "ranks", *(title_of(metric.name) for metric in metrics)]
     names = ", ".join(escaped(name) for name in sorted(table.scenarios))
     return [
         "",
@@ -139,13 +153,13 @@ def _overall(table: Table) -> list[str]:
         "",
         table_line(head),
         table_line(["---", "---", *["--:"] * (len(head) - 2)]),
-        *(table_line([escaped(row.method), row.division, *_overall_cells(row)]) for row in rows),
+        *(table_line([escaped(row.method), row.division, *_overall_cells(row, metrics)]) for row in rows),
     ]
 
 
-def _overall_cells(row: OverallRow) -> list[str]:
+def _overall_cells(row: OverallRow, metrics: Sequence[Metric]) -> list[str]:
     ranks = ", ".join(number_text(rank, ".0f") for rank in row.ranks)
-    return [ranks, *(interval(row.estimates[metric.name]) for metric in SHOWN)]
+    return [ranks, *(interval(row.estimates[metric.name]) for metric in metrics)]
 
 
 def _scenario(table: Table, scenario: str, rows: list[Row]) -> list[str]:
@@ -154,7 +168,8 @@ def _scenario(table: Table, scenario: str, rows: list[Row]) -> list[str]:
         group: ", ".join(map(escaped, table.scenarios[scenario][group])) or "none"
         for group in ("retained", "target", "held_out")
     }
-    columns = ["rank", "method", "division", "tier", "seeds", *(title_of(metric.name) for metric in SHOWN)]
+    metrics = shown(rows)
+    columns = ["rank", "method", "division", "tier", "seeds", *(title_of(metric.name) for metric in metrics)]
     columns += ["relative cost", "bytes kept", "parameters added"]
     return [
         "",
@@ -165,18 +180,18 @@ def _scenario(table: Table, scenario: str, rows: list[Row]) -> list[str]:
         "",
         table_line(columns),
         table_line(["--:", "---", "---", "---", *["--:"] * (len(columns) - 4)]),
-        *(table_line(_cells(row)) for row in rows),
+        *(table_line(_cells(row, metrics)) for row in rows),
     ]
 
 
-def _cells(row: Row) -> list[str]:
+def _cells(row: Row, metrics: Sequence[Metric]) -> list[str]:
     return [
         number_text(row.rank, ".0f"),
         escaped(row.method),
         row.division,
         row.tier,
         str(len(row.seeds)),
-        *(interval(row.estimates[metric.name]) for metric in SHOWN),
+        *(interval(row.estimates[metric.name]) for metric in metrics),
         number_text(row.costs["relative_cost"], ".2f"),
         *(number_text(row.costs[name], ",.0f") for name in ("bytes_kept", "parameters_added")),
     ]
@@ -192,7 +207,7 @@ def interval(estimate: Estimate, form: str = ".2f") -> str:
     return value if estimate.low is None else f"{value} [{low}, {high}]"
 
 
-def _legend() -> list[str]:
+def _legend(rows: Sequence[Row]) -> list[str]:
     """Return what the columns mean."""
     lines = [
         "",
@@ -204,7 +219,7 @@ def _legend() -> list[str]:
         ),
         "",
     ]
-    for metric in SHOWN:
+    for metric in shown(rows):
         better = {True: "higher is better", False: "lower is better", None: "neither high nor low is better"}
         low, high = ("unbounded" if math.isinf(end) else f"{end:g}" for end in (metric.low, metric.high))
         lines.append(

@@ -95,6 +95,7 @@ class _Subject:
             values["changes"],
             values["device"],
             order=values.get("order", 0),
+            perturb=values.get("perturb", False),
         )
 
     @property
@@ -236,7 +237,8 @@ def _replay(subject: _Subject, progress: Callable[[float], None]) -> list[Check]
 def _replay_episodes(subject: _Subject, policies: Sequence[Policy]) -> Check:
     scenario, request = subject.scenario, subject.request
     end = scenario.budget.adaptation_steps
-    at_ends = [row for row in _rows(subject.run.record.episodes) if row[1] in (0, end) and row[3] == "report"]
+    every = _rows(subject.run.record.episodes)
+    at_ends = [row for row in every if row[1] in (0, end) and row[3] != "selection"]
     generator = np.random.default_rng(request.seed)
     chosen = generator.permutation(len(at_ends))[: request.episodes]
     rows = [at_ends[index] for index in sorted(chosen)]
@@ -249,7 +251,8 @@ def _replay_episodes(subject: _Subject, policies: Sequence[Policy]) -> Check:
         again += [episode_row(stage, step, episode) for episode in evaluator.play(policy, trials)]
     evaluator.close()
     wrong = [
-        f"{theirs[2]} episode {theirs[4]} of stage {theirs[0]} has {_told(theirs)}, not {_told(ours)}"
+        f"{' '.join(theirs[2:4])} episode {theirs[4]} of stage {theirs[0]} has {_told(theirs)}, "
+        f"not {_told(ours)}"
         for theirs, ours in zip(rows, again, strict=True)
         if theirs != ours
     ]
@@ -322,12 +325,13 @@ def _job(path: Path, records: Path, request: Request) -> Job:
     """Return the job that verifies a record; how long it takes is known if it can be read."""
     length = 1.0
     try:
-        scenario = _Subject(read_run(records, path, changed=None), request).scenario
+        subject = _Subject(read_run(records, path, changed=None), request)
+        scenario = subject.scenario
         if request.tier in TIERS[2:]:
             length += len(scenario.target) * scenario.budget.adaptation_steps
         if request.tier == "retrained":
-            length += run_length(scenario)
-    except (RecordError, LookupError):
+            length += run_length(scenario, perturb=subject.spec.perturb)
+    except (LookupError, ValueError):
         pass  # the job itself says what is wrong
     arguments = {"path": str(path), "records": str(records), "request": request}
     return Job(str(path), "clbench.leaderboard._verify:verify_job", arguments, length)

@@ -130,6 +130,7 @@ def _make_record(
     curves: Any = None,
     retained_curves: Any = None,
     selection: Any = None,
+    perturbed: Any = None,
     sparsity: Any = None,
     drift: Any = None,
     steps: tuple[int, ...] = (100, 200, 300, 400),
@@ -147,6 +148,7 @@ def _make_record(
         curves: The same for the targets on the way, (targets, points before the end); none if None.
         retained_curves: The same for the retained skills, (targets, points before the end, retained).
         selection: The same for the targets on selection episodes, (targets, points).
+        perturbed: The same for the retained skills in perturbed episodes at the ends, (stages + 1, retained).
         sparsity: Update sparsity, (targets, points). No policy was looked at if it and `drift` are None.
         drift: Activation drift, (targets, points).
         steps: Steps of the evaluation points; the last one ends a stage.
@@ -183,6 +185,11 @@ def _make_record(
         (target + 1, steps[point], names[task], split, episode, int(value), value, 50)
         for (target, point, task, episode), value in _each(retained_curves, 3, on_the_way)
     ]
+    rows += [
+        (stage, steps[-1] if stage else 0, names[task], "perturbed", episode, int(value), value, 50)
+        for (stage, task, episode), value in _each(perturbed, 2, outcomes.shape[2])
+    ]
+    run |= {} if perturbed is None else {"perturb": True}
     given = answers or {}
     return Record(
         status="success",

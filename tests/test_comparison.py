@@ -56,6 +56,7 @@ def run(final: Any) -> Scores:
         layout,
         success=np.stack([np.ones_like(final), final]),
         on_the_way=np.zeros((1, 0, len(final), 0)),
+        perturbed=np.full((2, len(skills), final.shape[1]), np.nan),
         selection=missing,
         asked=np.full((2, 1), 50.0),
         correct=np.full((2, 1), 25.0),

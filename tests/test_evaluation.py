@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from clbench.evaluation import LANES, Episode, Evaluator, Trial, answer
+from clbench.evaluation import LANES, Episode, Evaluator, Trial, answer, start_of
 from clbench.policy import Policy, encode
 from clbench.pretraining import policy_config, pretrained_policy
 from clbench.questions import load_questions, report_questions
@@ -94,6 +94,32 @@ def test_selection_and_report_episodes_and_seeds_have_different_initial_states(f
     assert len(runs[1]) == FETCH.budget.report_episodes
     values = [value for run in runs for value in run]
     assert len(set(values)) == len(values)
+
+
+def test_a_perturbed_episode_begins_with_the_seed_and_the_words_of_the_report_episode() -> None:
+    task = FETCH.task("push")
+    for number in range(3):
+        assert start_of((task, "perturbed", number), 5) == start_of((task, "report", number), 5)
+    assert FETCH.budget.episodes("perturbed") == FETCH.budget.report_episodes
+
+
+def test_perturbed_outcomes_do_not_depend_on_what_else_is_evaluated_nor_change_it(
+    fetch_policy: Policy,
+) -> None:
+    tasks = [FETCH.task("push"), FETCH.task("reach")]
+    plain: list[Trial] = [(task, "report", number) for task in tasks for number in range(3)]
+    perturbed: list[Trial] = [(task, "perturbed", number) for task, _, number in plain]
+    with deterministic():
+        alone = (
+            Evaluator(FETCH, 0).play(fetch_policy, plain),
+            Evaluator(FETCH, 0).play(fetch_policy, perturbed),
+        )
+        evaluator = Evaluator(FETCH, 0, threads=2)
+        together = evaluator.play(fetch_policy, [*perturbed[::-1], *plain])
+        again = evaluator.play(fetch_policy, perturbed)
+    assert together == [*alone[1][::-1], *alone[0]]
+    assert again == alone[1]
+    assert all(one.total_reward != other.total_reward for one, other in zip(*alone, strict=True))
 
 
 def test_a_pretrained_toy_policy_does_its_skills_and_not_the_targets() -> None:

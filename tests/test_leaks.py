@@ -44,6 +44,13 @@ class Chooser(Method):
 
 
 @dataclasses.dataclass
+class RobustChooser(Chooser):
+    """It chooses its checkpoint on perturbed episodes, which are those of the report."""
+
+    split = "perturbed"
+
+
+@dataclasses.dataclass
 class EarlyChooser(Chooser):
     """It tunes on selection episodes of a target that comes later."""
 
@@ -96,6 +103,7 @@ def _methods(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     [
         ("Ahead", "reads demonstrations of down, which its stage must not know yet"),
         ("Chooser", "runs report episodes of right: nothing may be chosen on them"),
+        ("RobustChooser", "runs perturbed episodes of right: nothing may be chosen on them"),
         ("EarlyChooser", "runs episodes of down, which its stage must not know yet"),
         ("Asker", "loads questions by itself, those of the report too"),
         ("Normaliser", "changes state_mean: the normalisation comes from the retained skills alone"),

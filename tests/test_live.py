@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 
 from clbench.run import RunSpec, execute
+from clbench.scores import Scores
 
 TOY = "clbench.testing:clbench/Toy-v0"
 SPEC = RunSpec(TOY, "aegis", seed=0)
@@ -75,6 +76,16 @@ def test_a_log_shows_what_the_record_holds(logged: tuple[Any, Path]) -> None:
     assert dict(points["diagnostics/energy_shed_mean"]) == pytest.approx(shed)
     assert set(shed) == {60, 120}
     assert "diagnostics/anchor_distance" not in points  # a list, no number
+
+
+def test_a_log_shows_the_success_in_perturbed_episodes(tmp_path: Path) -> None:
+    spec = dataclasses.replace(SPEC, method="frozen", perturb=True)
+    rates = Scores.from_record(execute(spec, tmp_path, tensorboard=tmp_path / "logs")).rates()
+    points = _points(tmp_path / "logs" / "Toy-v0" / "frozen" / "seed-0")
+    for number, task in enumerate(("left", "up")):
+        expected = dict(zip((0, 60, 120), rates.perturbed[:, number], strict=True))
+        assert dict(points[f"success_perturbed/{task}"]) == pytest.approx(expected)
+    assert "success_perturbed/right" not in points
 
 
 def test_a_run_that_goes_on_has_no_point_twice(

@@ -43,6 +43,13 @@ def test_a_metric_has_the_value_worked_out_by_hand(name: str, scores: Callable[.
     assert measure(name, scores(MATRIX)) == pytest.approx(BY_HAND[name])
 
 
+def test_perturbed_retention_has_the_value_worked_out_by_hand(scores: Callable[..., Scores]) -> None:
+    run = scores(MATRIX, perturbed=[[0.9, 0.7], [0.5, 0.8], [0.4, 0.2]])
+    assert measure("perturbed_retention", run) == pytest.approx((0.4 + 0.2) / 2)
+    assert measure("retention", run) == pytest.approx(BY_HAND["retention"])
+    assert measure("perturbed_retention", scores(MATRIX)) is None
+
+
 def test_forward_transfer_has_the_value_worked_out_by_hand(scores: Callable[..., Scores]) -> None:
     steps = (200, 400)
     run = scores(MATRIX, curves=[[0.7], [0.6]], steps=steps)
@@ -184,11 +191,13 @@ def test_metrics_agree_with_plain_loops_on_random_matrices(scores: Callable[...,
         shape = (targets + 1, retained + targets + held_out)
         rates = generator.integers(0, 6, size=(2, *shape)) / 5
         curves = generator.integers(0, 6, size=(2, targets, 3)) / 5
+        disturbed = generator.integers(0, 6, size=(targets + 1, retained)) / 5
         run, scratch = (
-            scores(one, curves=curve, groups=(retained, targets, held_out), episodes=5)
+            scores(one, curves=curve, perturbed=disturbed, groups=(retained, targets, held_out), episodes=5)
             for one, curve in zip(rates, curves, strict=True)
         )
         expected = plain_loops(rates[0], rates[1], curves, retained, targets)
+        expected["perturbed_retention"] = sum(disturbed[targets][s] for s in range(retained)) / retained
         for name, value in expected.items():
             assert measure(name, run, {"from_scratch": scratch}) == (
                 None if value is None else pytest.approx(value)
@@ -315,6 +324,7 @@ def test_every_metric_keeps_to_its_range_and_to_batch_axes(name: str, scores: Ca
                 generator.integers(0, 2, size=(4, 6, 2)),
                 curves=generator.integers(0, 2, size=(3, 3, 2)),
                 retained_curves=generator.integers(0, 2, size=(3, 3, 2, 2)),
+                perturbed=generator.integers(0, 2, size=(4, 2, 2)),
                 # each target is learned in the end, as the matched point needs
                 selection=np.concatenate([generator.random((3, 3)), np.ones((3, 1))], axis=1),
                 sparsity=generator.random((3, 4)),
@@ -386,6 +396,7 @@ def test_a_published_definition_has_the_value_worked_out_by_hand(
 
 def test_every_metric_is_worked_out_by_hand_somewhere() -> None:
     others = {"forward_transfer", "question_retention", "retention_at_matched_adaptation"}
+    others.add("perturbed_retention")
     assert {*BY_HAND, *PUBLISHED_BY_HAND, *others, "update_sparsity", "activation_drift"} == set(METRICS)
 
 

@@ -194,6 +194,8 @@ def test_a_field_that_does_not_fit_the_schema_is_refused_by_name(
         ({"order": "1"}, "run: order must be a whole number"),
         ({"order": True}, "run: order must be a whole number"),
         ({"order": 0}, "run: order must be above 0; it is left out where the targets have theirs"),
+        ({"perturb": 1}, "run: perturb must be true or false, not 1"),
+        ({"perturb": False}, "run: perturb must be true; it is left out where nothing was perturbed"),
         ({"oder": 1}, "No field of run is called 'oder'. Did you mean 'order'?"),
     ],
 )

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import random
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, ClassVar
@@ -19,6 +20,7 @@ from clbench.record import read_record, write_record
 from clbench.run import RunSpec, execute, has_record, run_length
 from clbench.scores import Scores
 from clbench.task import load_scenario
+from clbench.testing import ToyWorld
 
 TOY = "clbench.testing:clbench/Toy-v0"
 
@@ -132,6 +134,61 @@ def test_in_another_order_a_run_begins_with_the_same_policy_states_and_simulator
     assert starts == others
 
 
+def test_perturbed_episodes_of_the_skills_stand_beside_all_that_a_plain_run_has(tmp_path: Path) -> None:
+    plain, perturbed = (
+        execute(RunSpec(TOY, "sft", 0, perturb=perturb), tmp_path) for perturb in (False, True)
+    )
+    assert ("perturb" in plain.run, perturbed.run["perturb"]) == (False, True)
+    rows = list(zip(*perturbed.episodes.values(), strict=True))
+    assert [row for row in rows if row[3] != "perturbed"] == list(zip(*plain.episodes.values(), strict=True))
+    assert [row[:5] for row in rows if row[3] == "perturbed"] == [
+        (stage, 60 * bool(stage), task, "perturbed", number)
+        for stage in range(3)
+        for task in ("left", "up")
+        for number in range(perturbed.scenario["budget"]["report_episodes"])
+    ]
+    assert (perturbed.answers, perturbed.policy) == (plain.answers, plain.policy)
+    retained = Scores.from_record(perturbed).rates().perturbed
+    assert retained[0].mean() > 0.5
+    assert np.isfinite(retained).all()
+
+
+def test_a_record_with_perturbed_episodes_counts_as_one_without_and_not_the_other_way_round(
+    tmp_path: Path,
+) -> None:
+    plain, perturbed = (RunSpec(TOY, "frozen", 0, perturb=perturb) for perturb in (False, True))
+    assert plain.path(tmp_path) == perturbed.path(tmp_path)
+    execute(plain, tmp_path)
+    assert (has_record(plain, tmp_path), has_record(perturbed, tmp_path)) == (True, False)
+    execute(perturbed, tmp_path)
+    assert (has_record(plain, tmp_path), has_record(perturbed, tmp_path)) == (True, True)
+    assert not has_record(RunSpec(TOY, "frozen", 0, perturb=True, order=1), tmp_path)
+
+
+def test_a_scenario_without_anything_that_can_be_perturbed_is_refused_before_any_work(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from clbench.commands.runs import run
+
+    monkeypatch.setattr(sys, "path", sys.path.copy())  # the command adds to it
+    world, toy = "clbench.testing:Steady", load_scenario(TOY)
+    monkeypatch.setattr(
+        "clbench.testing.Steady", lambda render_mode=None: ToyWorld(render_mode), raising=False
+    )
+    steady = dataclasses.replace(toy, retained=(dataclasses.replace(toy.retained[1], world=world),))
+    for scenario, message in (
+        (dataclasses.replace(toy, retained=()), "clbench/Toy-v0 retains no skills that could be perturbed"),
+        (steady, f"The task 'up' cannot be perturbed: {world} takes no argument `perturbed`."),
+    ):
+        monkeypatch.setattr("clbench.testing.TOY", scenario)
+        with pytest.raises(SystemExit) as left:
+            run(TOY, "sft", perturb=True, records=tmp_path)
+        assert left.value.code == 2
+        assert message in " ".join(capsys.readouterr().err.split())
+        assert list(tmp_path.iterdir()) == []
+        assert RunSpec(TOY, "sft", 0).load().retained == scenario.retained
+
+
 def test_frozen_forgets_nothing_and_costs_nothing(tmp_path: Path) -> None:
     record = execute(RunSpec(TOY, "frozen", seed=0), tmp_path)
     rows = list(zip(*record.episodes.values(), strict=True))
@@ -143,20 +200,23 @@ def test_frozen_forgets_nothing_and_costs_nothing(tmp_path: Path) -> None:
     assert (record.costs["optimiser_steps"], record.costs["bytes_kept"]) == (0, 0)
 
 
-def test_progress_adds_up_to_the_length_of_the_run(tmp_path: Path) -> None:
-    amounts: list[float] = []
-    execute(RunSpec(TOY, "sft", seed=0), tmp_path, amounts.append)
-    assert sum(amounts) == pytest.approx(run_length(load_scenario(TOY)))
+@pytest.mark.parametrize("perturb", [False, True])
+def test_progress_adds_up_to_the_length_of_the_run(perturb: bool, tmp_path: Path, empty_caches: Path) -> None:
+    for _ in range(2):  # the second time the report of the pretrained policy is there already
+        amounts: list[float] = []
+        execute(RunSpec(TOY, "sft", seed=0, perturb=perturb), tmp_path, amounts.append)
+        assert sum(amounts) == pytest.approx(run_length(load_scenario(TOY), perturb=perturb))
 
 
-@pytest.mark.parametrize("cls", [Counting, Adapting])
+@pytest.mark.parametrize(("cls", "perturb"), [(Counting, False), (Adapting, True)])
 def test_a_run_killed_anywhere_resumes_to_the_same_record(
     tmp_path: Path,
     stranger: Callable[[type[Method]], str],
     execute_and_kill: Callable[..., None],
     cls: type[Method],
+    perturb: bool,
 ) -> None:
-    spec = RunSpec(TOY, stranger(cls), seed=0)
+    spec = RunSpec(TOY, stranger(cls), seed=0, perturb=perturb)
     execute(spec, tmp_path / "whole")
     others = _unfinished()
     for share in (0.05, 0.45, 0.95):
@@ -234,6 +294,8 @@ def test_the_report_of_the_pretrained_policy_is_made_once(tmp_path: Path, empty_
         [row for row in zip(*one.episodes.values(), strict=True) if row[0] == 0] for one in (first, second)
     ]
     assert starts[0] == starts[1]
+    execute(RunSpec(TOY, "frozen", seed=0, perturb=True), tmp_path)
+    assert len(list(kept.iterdir())) == 2  # it has more in it
 
 
 def test_changes_are_recorded_and_lie_beside_the_unchanged_run(tmp_path: Path) -> None:

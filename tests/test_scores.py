@@ -27,6 +27,7 @@ ALL = {**ON_THE_WAY, "selection": SELECTION, "sparsity": SPARSITY, "drift": DRIF
 ARRAYS = (
     "success",
     "on_the_way",
+    "perturbed",
     "selection",
     "asked",
     "correct",
@@ -124,12 +125,77 @@ def test_the_episodes_on_the_way_weigh_as_often_as_they_were_drawn(scores: Calla
 def test_every_array_of_rates_has_the_batch_axes(scores: Callable[..., Scores]) -> None:
     run = scores(MATRIX, **ALL, curve_episodes=10, answers={(1, "left"): (8, 6)})
     rates, alone = run.rates(np.ones((3, 2, 5, 20))), run.rates()
-    for name in ("success", "curves", *ARRAYS[2:]):
+    names = ("success", "curves", *ARRAYS[2:])
+    for name in names:
         both = getattr(rates, name)
         np.testing.assert_allclose(both, np.broadcast_to(getattr(alone, name), both.shape))
         assert both.shape[:2] == (3, 2)
-    for name in ("success", "curves", *ARRAYS[2:]):
+    for name in names:
         np.testing.assert_allclose(getattr(rates.mean_over_runs(), name)[0], getattr(alone, name))
+
+
+PERTURBED = [[0.9, 0.7], [0.5, 0.8], [0.4, 0.2]]
+
+
+def test_perturbed_episodes_are_scores_of_their_own_and_change_no_other(
+    scores: Callable[..., Scores],
+) -> None:
+    plain, run = scores(MATRIX, **ALL), scores(MATRIX, perturbed=PERTURBED, **ALL)
+    np.testing.assert_allclose(run.perturbed.mean(axis=-1), PERTURBED)
+    np.testing.assert_allclose(run.rates().perturbed, PERTURBED)
+    assert np.isnan(plain.perturbed).all()
+    assert np.isnan(plain.rates().perturbed).all()
+    assert run.layout == plain.layout
+    for name in set(ARRAYS) - {"perturbed"}:
+        np.testing.assert_array_equal(getattr(run, name), getattr(plain, name))
+    both = rates_of([plain, run], {})
+    np.testing.assert_allclose(both.perturbed[1], PERTURBED)
+    assert np.isnan(both.mean_over_runs().perturbed).all()  # a mean over some seeds alone would be another
+
+
+def test_perturbed_episodes_are_drawn_with_those_of_their_numbers(scores: Callable[..., Scores]) -> None:
+    generator = np.random.default_rng(0)
+    outcomes = generator.integers(2, size=(3, 5, 6)).astype(float)
+    run = scores(outcomes, perturbed=1 - outcomes[:, :2])
+    counts = generator.multinomial(6, [1 / 6] * 6, size=(4, 5)).astype(float)
+    rates = run.rates(counts)
+    np.testing.assert_allclose(rates.perturbed, 1 - rates.retained)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({}, "119 are perturbed, not 120: each retained skill has those of the report, at the end of each"),
+        (
+            {"task": "target_0"},
+            "the perturbed episode 19 of target_0 at stage 2, step 400, must not be there",
+        ),
+        ({"task": "unseen_0"}, "the perturbed episode 19 of unseen_0"),
+        ({"episode": 20}, "the perturbed episode 20 of skill_1"),
+        ({"step": 300}, "the perturbed episode 19 of skill_1 at stage 2, step 300, must not be there"),
+        ({"episode": 3}, "an episode is there twice"),
+    ],
+)
+def test_perturbed_episodes_other_than_those_of_the_report_are_refused(
+    change: dict[str, Any], words: str, make_record: MakeRecord
+) -> None:
+    record = make_record(MATRIX, perturbed=PERTURBED)
+    last = {name: column.pop() for name, column in record.episodes.items()}
+    assert (last["split"], last["task"], last["episode"]) == ("perturbed", "skill_1", 19)
+    if change:
+        append(record.episodes, *{**last, **change}.values())
+    with pytest.raises(RecordError, match=words):
+        Scores.from_record(record)
+
+
+def test_a_run_that_says_perturb_and_has_no_such_episode_is_refused(make_record: MakeRecord) -> None:
+    with pytest.raises(RecordError, match="0 are perturbed, not 120"):
+        Scores.from_record(make_record(MATRIX, perturb=True))
+
+
+def test_a_tuning_run_with_perturbed_episodes_is_refused(make_record: MakeRecord) -> None:
+    with pytest.raises(RecordError, match="a tuning run has selection episodes alone"):
+        Scores.from_record(make_record(MATRIX, perturbed=PERTURBED, split="selection"))
 
 
 def test_a_stage_ends_at_the_last_of_the_evaluation_steps(scores: Callable[..., Scores]) -> None:
@@ -189,8 +255,9 @@ def test_the_order_of_rows_does_not_matter(make_record: MakeRecord) -> None:
         ("step", 100, "no evaluation point"),
         ("episode", None, "impossible"),
         ("episode", 1, "twice"),
-        ("split", "training", "neither report nor selection"),
-        ("split", [], "neither report nor selection"),
+        ("split", "training", "'training', which is none of selection, report, perturbed"),
+        ("split", [], "which is none of selection, report, perturbed"),
+        ("split", "perturbed", "there are perturbed ones, but its run does not say perturb"),
         ("success", 0.5, "neither true nor false"),
         ("success", "yes", "neither true nor false"),
         ("success", [], "neither true nor false"),

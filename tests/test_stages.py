@@ -97,8 +97,9 @@ def test_kept_policies_are_those_that_are_made_again(kept: Path) -> None:
     assert not any(first[name].equal(last[name]) for name in changed)
 
 
-def test_policies_of_a_tuning_run_of_the_same_settings_count(kept: Path) -> None:
+def test_policies_of_a_run_of_the_same_settings_that_is_evaluated_otherwise_count(kept: Path) -> None:
     assert has_stages(dataclasses.replace(SPEC, split="selection"), kept)
+    assert has_stages(dataclasses.replace(SPEC, perturb=True), kept)
     assert not has_stages(dataclasses.replace(SPEC, seed=1), kept)
     assert not has_stages(dataclasses.replace(SPEC, targets=1), kept)
     assert not has_stages(dataclasses.replace(SPEC, changes={"rank": 4}), kept)

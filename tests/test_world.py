@@ -1,4 +1,5 @@
 import dataclasses
+import functools
 
 import gymnasium
 import numpy as np
@@ -6,7 +7,7 @@ import pytest
 
 from clbench.task import Task, load_scenario, resolve
 from clbench.testing import ToyWorld
-from clbench.world import Lanes, PlainVectorWorld, vector_world
+from clbench.world import Lanes, PlainVectorWorld, check_perturbable, vector_world
 
 TOY = load_scenario("clbench.testing:clbench/Toy-v0")
 LEFT, UP = TOY.task("left"), TOY.task("up")
@@ -15,8 +16,8 @@ LEFT, UP = TOY.task("left"), TOY.task("up")
 class OwnVectorWorld(PlainVectorWorld):
     """A suite's own vector world: it remembers what it was made with."""
 
-    def __init__(self, lanes: int, threads: int) -> None:
-        super().__init__(ToyWorld, lanes)
+    def __init__(self, lanes: int, threads: int, perturbed: bool = False) -> None:
+        super().__init__(functools.partial(ToyWorld, perturbed=perturbed), lanes)
         self.made_with = (lanes, threads)
 
 
@@ -24,6 +25,20 @@ class OtherToyWorld(ToyWorld):
     """The toy world of another suite, which has its own vector world."""
 
     vector_world = OwnVectorWorld
+
+
+class SteadyWorld(ToyWorld):
+    """The toy world of somebody who never heard of perturbations."""
+
+    def __init__(self, render_mode: str | None = None) -> None:
+        super().__init__(render_mode)
+
+
+class SteadyVectorWorld(PlainVectorWorld):
+    """The same, with a vector world of its own."""
+
+    def __init__(self, lanes: int, threads: int) -> None:
+        super().__init__(SteadyWorld, lanes)
 
 
 @pytest.fixture
@@ -73,3 +88,48 @@ def test_a_lane_without_an_episode_cannot_be_stepped() -> None:
     world = vector_world(LEFT.world, lanes=2)
     with pytest.raises(gymnasium.error.ResetNeeded, match="Lane 1 has no episode"):
         world.step([1], np.zeros((1, 2), np.float32))
+
+
+def episode(lanes: Lanes, lane: int, seed: int, task: Task, perturbed: bool) -> bytes:
+    """Return the states of an episode of five steps in a lane."""
+    states = [lanes.reset([lane], [seed], [task], [perturbed])]
+    states += [lanes.step([lane], np.full((1, 2), 0.7, np.float32))[0] for _ in range(5)]
+    return np.concatenate(states).tobytes()
+
+
+def test_perturbed_episodes_run_beside_plain_ones_which_they_do_not_change(other_task: Task) -> None:
+    for task in (LEFT, other_task):
+        plain = episode(Lanes(1), 0, 3, task, perturbed=False)
+        disturbed = episode(Lanes(1), 0, 3, task, perturbed=True)
+        assert plain != disturbed
+        lanes = Lanes(3)
+        for lane, perturbed in ((0, True), (1, False), (1, True), (0, False), (2, True)):
+            assert episode(lanes, lane, 3, task, perturbed) == (disturbed if perturbed else plain)
+        seeds, flags = [3, 3, 3], [False, True, False]
+        first = [np.frombuffer(one, np.float32)[:4] for one in (plain, disturbed, plain)]
+        np.testing.assert_array_equal(lanes.reset([0, 1, 2], seeds, [task] * 3, flags), first)
+
+
+@pytest.mark.parametrize(
+    ("world", "own", "message"),
+    [
+        ("SteadyWorld", None, "clbench.testing:SteadyWorld takes no argument `perturbed`"),
+        (
+            "SteadyWorld",
+            SteadyVectorWorld,
+            "the vector world of clbench.testing:SteadyWorld takes no argument",
+        ),
+    ],
+)
+def test_a_task_whose_world_cannot_be_perturbed_is_named_with_the_way_out(
+    world: str, own: object, message: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    steady = type(world, (SteadyWorld,), {} if own is None else {"vector_world": own})
+    monkeypatch.setattr(f"clbench.testing.{world}", steady, raising=False)
+    task = dataclasses.replace(UP, world=f"clbench.testing:{world}")
+    check_perturbable([LEFT, UP])
+    with pytest.raises(ValueError, match="The task 'up' cannot be perturbed: ") as raised:
+        check_perturbable([LEFT, task])
+    assert message in str(raised.value)
+    assert "Run without --perturb, or give it one, as docs/your_scenario.md shows." in str(raised.value)
+    assert Lanes(1).reset([0], [3], [task]).shape == (1, 4)

@@ -4,6 +4,7 @@ import os
 import re
 import subprocess
 import sys
+import textwrap
 from pathlib import Path
 
 import pytest
@@ -41,6 +42,44 @@ def test_its_scenario_is_an_environment_and_passes_the_check(folder: Path) -> No
     _, environments, check = _blocks("python")
     shown = "\nprint(env.unwrapped.scenario.id, envs.reset(seed=0)[0]['state'].shape)"
     assert _python(folder, "-c", environments + check + shown) == "me/Mine-v0 (4, 4)\n"
+
+
+def test_its_world_is_perturbed_as_the_page_says(tmp_path: Path) -> None:
+    """The lines of the page go into the world, each before or after a line that stands there once."""
+    imported, made, drawn, displaced = _fragments()
+    world = _blocks("python")[0].replace("render_mode=None", "render_mode=None, perturbed=False")
+    for line, lines in (
+        ("import clbench\n", f"import clbench\n{imported}\n"),
+        ("self.data = mujoco.MjData(self.model)\n", f"self.data = mujoco.MjData(self.model)\n{made}\n"),
+        ("        mujoco.mj_resetData", f"{drawn}\n        mujoco.mj_resetData"),
+        ("        return self._state(), {", f"{displaced}\n        return self._state(), {{"),
+    ):
+        assert world.count(line) == 1
+        world = world.replace(line, lines)
+    (tmp_path / "mypackage.py").write_text(world, encoding="utf-8")
+    _python(tmp_path, "-c", LOOK_AT_IT)
+
+
+LOOK_AT_IT = """
+import mypackage
+from clbench.perturbation import draw_perturbation
+from clbench.world import check_perturbable
+
+check_perturbable(mypackage.SCENARIO.retained)
+plain, disturbed = mypackage.Table(), mypackage.Table(perturbed=True)
+for seed in range(4):
+    drawn = draw_perturbation(seed)
+    one, other = (world.reset(seed=seed)[0] for world in (plain, disturbed))
+    assert abs(other[:2] - one[:2] - 0.05 * mypackage.np.array(drawn.start[:2])).max() < 1e-6
+    assert disturbed.model.body("ball").mass == drawn.mass * plain.model.body("ball").mass
+"""
+
+
+def _fragments() -> list[str]:
+    """Return what the page adds to a world that can be perturbed: an import, and lines for three places."""
+    (block,) = re.findall(r"  ```py\n(.*?)  ```", PAGE.read_text(encoding="utf-8"), flags=re.DOTALL)
+    first, *others = textwrap.dedent(block).strip("\n").split("\n\n")
+    return [first, *(textwrap.indent(lines, " " * 8) for lines in others)]
 
 
 @pytest.mark.slow

@@ -35,6 +35,7 @@ def run(
     seeds: int = 3,
     first_seed: int = 0,
     order: int = 0,
+    perturb: Annotated[bool, Parameter(negative="")] = False,
     workers: int | None = None,
     shard: str = "1/1",
     ray: str | None = None,
@@ -58,6 +59,8 @@ def run(
         first_seed: The first of them.
         order: In which order the targets are learned. 0 is the published one, of which the leaderboard's rows
             are; others are permutations, from which it tells how much depends on the order.
+        perturb: Evaluate the retained skills in disturbed worlds too, from other start poses and with heavier
+            or lighter things. Such a record takes the place of one without, whose episodes are all in it.
         workers: Runs at once, each a process with one thread; all cores if not given.
         shard: Do only part i of n of the runs, as 2/8: for array jobs, whose tasks share a folder of records.
         ray: Do the runs on a Ray cluster: its address, auto for one that runs here, or local to start one.
@@ -80,17 +83,15 @@ def run(
         check_device(device)
         if tensorboard:
             require_tensorboard()
-        loaded = {name: load_scenario(name).in_order(order) for name in dict.fromkeys(scenarios.split(","))}
         values = {method: read_changes(method, changes or {}) for method in names}
-        specs = _part(
-            shard,
-            [
-                RunSpec(scenario, method, seed, values[method], device, order=order)
-                for scenario in loaded
-                for seed in range(first_seed, first_seed + seeds)
-                for method in names
-            ],
-        )
+        every_run = [
+            RunSpec(scenario, method, seed, values[method], device, order=order, perturb=perturb)
+            for scenario in dict.fromkeys(scenarios.split(","))
+            for seed in range(first_seed, first_seed + seeds)
+            for method in names
+        ]
+        loaded = {spec.scenario: spec.load() for spec in every_run}
+        specs = _part(shard, every_run)
     console = Console(stderr=True)
     for scenario in loaded.values():
         console.print(expected_precision(scenario, seeds), highlight=False)

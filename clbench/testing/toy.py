@@ -10,6 +10,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from clbench.perturbation import draw_perturbation
 from clbench.questions import QuestionKind
 from clbench.registration import register
 from clbench.task import Budget, Scenario, Task, unknown
@@ -30,14 +31,18 @@ class ToyWorld(gymnasium.Env[State, Action]):
     """A point with a marker beside it. State: point (2,), marker (2,). Action: velocity (2,).
 
     A task is done when the point has moved by 1 its way, and by less than 0.5 any other way.
+
+    Args:
+        render_mode: "rgb_array", or None to draw nothing.
+        perturbed: Whether the point starts up to 0.1 beside its place, and is faster or slower for its mass.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012
     observation_space = spaces.Box(-np.inf, np.inf, (4,), np.float32)
     action_space = spaces.Box(-1.0, 1.0, (2,), np.float32)
 
-    def __init__(self, render_mode: str | None = None) -> None:
-        self.render_mode = render_mode
+    def __init__(self, render_mode: str | None = None, perturbed: bool = False) -> None:
+        self.render_mode, self.perturbed = render_mode, perturbed
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -47,13 +52,17 @@ class ToyWorld(gymnasium.Env[State, Action]):
         self._task = (options or {}).get("task", "left")
         if self._task not in _DIRECTIONS:
             raise unknown("task of the toy world", self._task, _DIRECTIONS)
-        self._state = self.np_random.uniform(-1.0, 1.0, 4).astype(np.float32)
+        self._state, self._mass = self.np_random.uniform(-1.0, 1.0, 4).astype(np.float32), 1.0
+        if self.perturbed and seed is not None:
+            perturbation = draw_perturbation(seed)
+            self._state[:2] += 0.1 * np.array(perturbation.start[:2], np.float32)
+            self._mass = perturbation.mass
         self._start = self._state[:2].copy()
         return self._state.copy(), {"task": self._task, "success": False}
 
     def step(self, action: Action) -> tuple[State, float, bool, bool, dict[str, Any]]:
-        """Move the point by a fifth of the velocity."""
-        self._state[:2] += 0.2 * np.clip(np.asarray(action, np.float32), -1.0, 1.0)
+        """Move the point by a fifth of the velocity, divided by its mass."""
+        self._state[:2] += 0.2 / self._mass * np.clip(np.asarray(action, np.float32), -1.0, 1.0)
         error = float(np.abs(self._start + _DIRECTIONS[self._task] - self._state[:2]).max())
         success = error < 0.3
         return (

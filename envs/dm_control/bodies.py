@@ -7,11 +7,13 @@ import functools
 import importlib
 import os
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import mujoco
 import numpy as np
+
+from clbench.perturbation import with_mass
 
 from .state import ACTION_SIZE, OBSERVATION_SIZE, Observation
 
@@ -26,6 +28,11 @@ class Body:
     """Steps of the physics in one step of ours, which has one action."""
     scale: tuple[float, ...]
     """Usual size of each number that is observed: experts train on numbers of about 1."""
+    thing: str
+    """Body of its model that is heavier or lighter when perturbed."""
+    starts: tuple[float, ...]
+    """Most speed of each joint at a perturbed start, in m/s or rad/s and below what is usual on the way:
+    dm_control's bodies start nearly at rest, wherever they start."""
     camera: dict[str, Any]
     """From where it is drawn."""
     observer: Callable[[mujoco.MjModel, mujoco.MjData], Callable[[], Observation]]
@@ -84,6 +91,14 @@ def start(body: str, task: str) -> Start:
     return Start(BODY_OF[body], environment.physics, environment.task, environment.physics.model.ptr)
 
 
+@functools.cache
+def start_with_mass(body: str, task: str, mass: float) -> Start:
+    """Return the same with a thing that is `mass` times as heavy; all perturbed worlds share it."""
+    plain = start(body, task)
+    thing = int(plain.model.body(plain.body.thing).id)
+    return replace(plain, model=with_mass(plain.model, [thing], mass))
+
+
 @contextlib.contextmanager
 def _without_dm_control_renderer() -> Iterator[None]:
     """Keep dm_control from looking for a screen when it is imported: it warns of each that is not there."""
@@ -119,12 +134,30 @@ def _camera(distance: float, x: float, z: float, elevation: float = 0.0) -> dict
 BODY_OF = {
     body.name: body
     for body in (
-        Body("point_mass", 8, (0.15, 0.15, 0.1, 0.1), _camera(0.75, 0.0, 0.0, -90.0), _position_and_velocity),
-        Body("cartpole", 4, (0.7, 0.7, 0.7, 2.0, 4.0), _camera(4.0, 0.0, 1.2), _cartpole),
+        Body(
+            "point_mass",
+            8,
+            (0.15, 0.15, 0.1, 0.1),
+            "pointmass",
+            (0.1, 0.1),
+            _camera(0.75, 0.0, 0.0, -90.0),
+            _position_and_velocity,
+        ),
+        Body(
+            "cartpole",
+            4,
+            (0.7, 0.7, 0.7, 2.0, 4.0),
+            "pole_1",
+            (0.5, 0.5),
+            _camera(4.0, 0.0, 1.2),
+            _cartpole,
+        ),
         Body(
             "ball_in_cup",
             20,
             (0.1, 0.1, 0.15, 0.15, 1.0, 1.0, 1.5, 1.5),
+            "ball",
+            (0.0, 0.0, 0.3, 0.3),
             _camera(1.2, 0.0, 0.45),
             _position_and_velocity,
         ),

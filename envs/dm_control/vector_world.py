@@ -10,6 +10,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from clbench.perturbation import draw_perturbation
 from clbench.world import Team, checked_actions, no_episode
 
 from .episode import Episode
@@ -37,13 +38,15 @@ class DMControlVectorWorld:
         lanes: Places for episodes. A lane takes its memory when it first has a body.
         threads: Threads that advance the physics; MuJoCo releases the interpreter lock. Results do not depend
             on it.
+        perturbed: Whether the body, its pole or its ball is heavier or lighter, and starts in motion.
     """
 
-    def __init__(self, lanes: int, threads: int = 1) -> None:
+    def __init__(self, lanes: int, threads: int = 1, perturbed: bool = False) -> None:
         self.single_observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (SIZE,), np.float32)
         self.single_action_space = gymnasium.spaces.Box(-1.0, 1.0, (ACTION_SIZE,), np.float32)
         self._lanes: list[_Lane | None] = [None] * lanes
         self._team = Team(threads)
+        self._perturbed = perturbed
 
     def reset(self, lanes: Sequence[int], seeds: Sequence[int], tasks: Sequence[str]) -> State:
         """Start an episode in each of `lanes` and return the states (N, 19).
@@ -56,7 +59,8 @@ class DMControlVectorWorld:
         states = np.empty((len(lanes), SIZE), np.float32)
         for row, (number, seed, task) in enumerate(zip(lanes, seeds, tasks, strict=True)):
             lane = self._lanes[number] or _Lane()
-            observation = lane.episode.reset(task, seed)
+            perturbation = draw_perturbation(seed) if self._perturbed else None
+            observation = lane.episode.reset(task, seed, perturbation)
             lane.steps, lane.total = 0, 0.0
             lane.needed = SUCCESS_SHARE * expert_return(task)
             self._lanes[number] = lane

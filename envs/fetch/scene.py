@@ -5,11 +5,13 @@ from __future__ import annotations
 import contextlib
 import functools
 import io
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
+
+from clbench.perturbation import with_mass
 
 # Else each worker prints a notice about Adroit's hand, which is not used here.
 with contextlib.redirect_stderr(io.StringIO()):
@@ -19,7 +21,7 @@ with contextlib.redirect_stderr(io.StringIO()):
 CAMERA = {"distance": 1.2, "azimuth": 60.0, "elevation": -25.0, "lookat": np.array([1.3, 0.75, 0.56])}
 """From the robot's right, behind it: left is left, away goes right, and small pictures show the block."""
 
-__all__ = ["CAMERA", "Scene", "mat2euler", "scene"]
+__all__ = ["CAMERA", "Scene", "mat2euler", "scene", "scene_with_mass"]
 
 
 @dataclass(frozen=True)
@@ -77,3 +79,10 @@ def scene() -> Scene:
         fingers_qvel=np.array([finger.dofadr[0] for finger in fingers]),
         actuators_qpos=model.jnt_qposadr[model.actuator_trnid[:, 0]].astype(np.int64),
     )
+
+
+@functools.cache
+def scene_with_mass(mass: float) -> Scene:
+    """Return the scene with a block that is `mass` times as heavy; all perturbed worlds share it."""
+    model = scene().model
+    return replace(scene(), model=with_mass(model, [int(model.body("object0").id)], mass))

@@ -11,11 +11,12 @@ import numpy as np
 from gymnasium.utils.seeding import np_random
 from numpy.typing import NDArray
 
+from clbench.perturbation import draw_perturbation
 from clbench.task import unknown
 from clbench.world import Team, checked_actions, no_episode
 
 from .rules import RULES, Rule
-from .scene import Scene, mat2euler, scene
+from .scene import Scene, mat2euler, scene, scene_with_mass
 from .state import (
     BLOCK,
     BLOCK_ANGLES,
@@ -42,6 +43,14 @@ APART = 0.10
 NEARBY = 0.20
 """Most distance from target to block in the plane: on a longer way a block slips sideways off the fingers."""
 
+START = 0.025
+"""Metres along each axis that a perturbed gripper starts beside its place, 4.3 cm at most: the target, from
+`APART` on, is still farther away than the 5 cm that count as there."""
+SETTLE = 10
+"""Steps in which it gets there and comes to rest, as many as FetchPickAndPlace-v4 takes for its own start."""
+
+REACH = 0.05
+"""Metres along an axis that an action of 1 moves the goal of the hand."""
 HAND_TURN = np.array([1.0, 0.0, 1.0, 0.0])
 """What gymnasium-robotics adds to the hand's quaternion for its goal, which keeps the hand pointing down."""
 
@@ -86,12 +95,14 @@ class FetchVectorWorld:
         lanes: Places for episodes. A lane takes its memory when it is first reset.
         threads: Threads that advance the physics; MuJoCo releases the interpreter lock. Results do not depend
             on it.
+        perturbed: Whether the block is heavier or lighter, and the gripper starts elsewhere.
     """
 
-    def __init__(self, lanes: int, threads: int = 1) -> None:
+    def __init__(self, lanes: int, threads: int = 1, perturbed: bool = False) -> None:
         self.single_observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (SIZE,), np.float32)
         self.single_action_space = gymnasium.spaces.Box(-1.0, 1.0, (4,), np.float32)
         self._scene = scene()
+        self._perturbed = perturbed
         self._lanes: list[_Lane | None] = [None] * lanes
         self._team = Team(threads)
         # of the gripper's and the block's place, and of the block's rotation
@@ -109,13 +120,15 @@ class FetchVectorWorld:
         for number, seed, task in zip(lanes, seeds, tasks, strict=True):
             if task not in RULES:
                 raise unknown("task of the Fetch world", task, RULES)
-            lane = self._lanes[number] or _Lane(self._scene)
-            self._lanes[number] = lane
+            perturbation = draw_perturbation(seed) if self._perturbed else None
+            lane = self._lane_of(number, scene_with_mass(perturbation.mass) if perturbation else self._scene)
             generator, _ = np_random(seed)
             block = self._place_block(generator)
             lane.rule = RULES[task]
             lane.target = self._place_target(block, lane.rule, generator)
             self._reset_physics(lane, block)
+            if perturbation:
+                self._displace(number, perturbation.start)
             self._measure(number)
         states = self._observe(lanes)
         for number, state in zip(lanes, states, strict=True):
@@ -160,6 +173,13 @@ class FetchVectorWorld:
             raise no_episode(number, "Fetch")
         return lane
 
+    def _lane_of(self, number: int, scene: Scene) -> _Lane:
+        """Return a lane that has the physics of a scene; it is made anew if it had that of another one."""
+        lane = self._lanes[number]
+        if lane is None or lane.scene is not scene:
+            self._lanes[number] = lane = _Lane(scene)
+        return lane
+
     def _place_block(self, generator: np.random.Generator) -> Vectors:
         """Return a place (2,) on the table, drawn as FetchPickAndPlace-v4 does, but within reach."""
         gripper = self._scene.gripper[:2]
@@ -182,7 +202,7 @@ class FetchVectorWorld:
 
     def _reset_physics(self, lane: _Lane, block: Vectors) -> None:
         """Put the arm at its start and the block at `block` (2,), and forget all that was before."""
-        scene, data = self._scene, lane.data
+        scene, data = lane.scene, lane.data
         # Clears controls, mocap, and the solver's warm start too.
         mujoco.mj_resetData(scene.model, data)
         data.time = scene.time
@@ -191,9 +211,15 @@ class FetchVectorWorld:
         data.qpos[scene.block_qpos : scene.block_qpos + 2] = block
         mujoco.mj_forward(scene.model, data)
 
+    def _displace(self, number: int, start: tuple[float, float, float]) -> None:
+        """Move the gripper by a share `start` of `START` along each axis, and let it come to rest."""
+        lane = self._lane(number)
+        self._act([number], np.array([[*(START / REACH * one for one in start), 0.0]], np.float32))
+        mujoco.mj_step(lane.scene.model, lane.data, nstep=SETTLE * lane.scene.substeps)
+
     def _act(self, lanes: Sequence[int], actions: NDArray[np.float32]) -> None:
         """Set the hands' goals and the fingers' controls, in the arithmetic of gymnasium-robotics."""
-        hands = self._gather(lanes, "hand") + actions[:, :3] * np.float32(0.05)
+        hands = self._gather(lanes, "hand") + actions[:, :3] * np.float32(REACH)
         quaternions = self._gather(lanes, "hand_quaternion") + HAND_TURN
         fingers = self._gather(lanes, "qpos")[:, self._scene.actuators_qpos] + actions[:, 3:].astype(float)
         for row, number in enumerate(lanes):
@@ -203,12 +229,13 @@ class FetchVectorWorld:
 
     def _advance(self, number: int) -> None:
         """Advance the physics of a lane by one step."""
-        mujoco.mj_step(self._scene.model, self._lane(number).data, nstep=self._scene.substeps)
+        lane = self._lane(number)
+        mujoco.mj_step(lane.scene.model, lane.data, nstep=lane.scene.substeps)
         self._measure(number)
 
     def _measure(self, number: int) -> None:
         """Compute what the velocities of gripper and block depend on."""
-        scene, data = self._scene, self._lane(number).data
+        scene, data = self._lane(number).scene, self._lane(number).data
         gripper, block, rotation = self._jacobians[number]
         mujoco.mj_jacSite(scene.model, data, gripper, None, scene.gripper_site)
         mujoco.mj_jacSite(scene.model, data, block, rotation, scene.block_site)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import functools
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import mujoco
@@ -14,11 +14,17 @@ from metaworld.env_dict import ALL_V3_ENVIRONMENTS
 from metaworld.sawyer_xyz_env import SawyerXYZEnv
 from numpy.typing import NDArray
 
+from clbench.perturbation import with_mass
 from clbench.task import unknown
 
 from .state import State
 
 Vector = NDArray[np.float64]
+
+START = 0.03
+"""Metres along each axis that a perturbed hand starts beside its place, three steps of it."""
+SETTLE = 20
+"""Steps, of 0.0125 s, in which it gets there and comes to rest."""
 
 PHYSICS = ("model", "data", "mujoco_renderer", "init_left_pad", "init_right_pad", "_bodies", "_sites")
 """Attributes of an episode that are its physics or views of it: also what Meta-World calls initial pads."""
@@ -49,6 +55,7 @@ class Episode(SawyerXYZEnv):
     """
 
     scene: Scene
+    _settle = 0
 
     def __init__(self) -> None:
         self._bodies: dict[str, Vector] = {}
@@ -58,12 +65,21 @@ class Episode(SawyerXYZEnv):
         self._partially_observable = False
         del self.sawyer_observation_space  # that of a hidden goal
         self._places = self.scene.body_pos.copy(), self.scene.site_pos.copy()
+        self._hand_place = np.array(self.hand_init_pos)
 
     def _initialize_simulation(self) -> tuple[mujoco.MjModel, mujoco.MjData]:
         return self.scene.model, mujoco.MjData(self.scene.model)
 
-    def begin(self, seed: int) -> State:
-        """Draw the places of things from the seed, and return the first state (39,)."""
+    def begin(self, seed: int, start: tuple[float, float, float] | None = None) -> State:
+        """Draw the places of things from the seed, and return the first state (39,).
+
+        Args:
+            seed: Of the places.
+            start: Share of `START`, from -1 to 1 along each axis, by which the hand of a perturbed episode
+                starts beside its place; None in a plain one.
+        """
+        if start is not None:
+            self._settle, self.hand_init_pos = SETTLE, self._hand_place + START * np.array(start)
         self.np_random = np_random(seed)[0]
         self.seeded_rand_vec, self._freeze_rand_vec = True, False
         self.model.body_pos[:], self.model.site_pos[:] = self.scene.body_pos, self.scene.site_pos
@@ -99,7 +115,7 @@ class Episode(SawyerXYZEnv):
     def _reset_hand(self, steps: int = 50) -> None:
         mujoco.mj_copyData(self.data, self.model, self.scene.start)
         mujoco.mj_forward(self.model, self.data)
-        super()._reset_hand(steps=0)
+        super()._reset_hand(steps=self._settle)
 
     # ---- what is looked up by name ---------------------------------------------------------------------
 
@@ -149,7 +165,13 @@ class Episode(SawyerXYZEnv):
 
 
 @functools.cache
-def _episode_class(task: str) -> type[Episode]:
+def _episode_class(task: str, mass: float | None) -> type[Episode]:
+    if mass is not None:
+        plain = _episode_class(task, None)
+        scene, model = plain.scene, plain.scene.model
+        model.body_pos[:], model.site_pos[:] = scene.body_pos, scene.site_pos  # an episode has moved them
+        scene = replace(scene, model=with_mass(model, _things(model), mass))
+        return type(f"Perturbed{plain.__name__}", (plain,), {"scene": scene})
     name = f"{task.replace('_', '-')}-v3"
     if name not in ALL_V3_ENVIRONMENTS:
         known = (entry.removesuffix("-v3").replace("-", "_") for entry in ALL_V3_ENVIRONMENTS)
@@ -162,10 +184,20 @@ def _episode_class(task: str) -> type[Episode]:
     return type(f"Episode{original.__name__}", (Episode, original), {"scene": scene})
 
 
-def new_episode(task: str) -> Episode:
+def _things(model: mujoco.MjModel) -> list[int]:
+    """Return the bodies that can be moved and are no part of the robot."""
+    robot, moved = model.body("base").id, model.body_weldid != 0
+    return [int(body) for body in np.flatnonzero(moved & (model.body_rootid != robot))]
+
+
+def new_episode(task: str, mass: float | None = None) -> Episode:
     """Return a place for episodes of a task, as "drawer_open"; its scene is compiled when first needed.
+
+    Args:
+        task: What to do.
+        mass: How many times as heavy things are in perturbed episodes; those of a plain place if None.
 
     Raises:
         LookupError: No task has this name; the nearest one is named.
     """
-    return _episode_class(task)()
+    return _episode_class(task, mass)()

@@ -4,16 +4,22 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Sequence
+from typing import TypeAlias
 
 import gymnasium
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from clbench.perturbation import draw_perturbation
 from clbench.world import checked_actions, no_episode
 
 from .episode import Episode, new_episode
 from .state import SIZE, State
+
+_Kind: TypeAlias = tuple[str, float | None]
+"""A task, and how many times as heavy its things are if they are perturbed: what a place for episodes is made
+for."""
 
 
 class MetaWorldVectorWorld:
@@ -28,13 +34,15 @@ class MetaWorldVectorWorld:
         lanes: Places for episodes. A task's scene is compiled when it is first reset to.
         threads: Not used: an episode has its own physics, but shares the model, in which things stand where
             they stand in one episode at a time.
+        perturbed: Whether things are heavier or lighter, and the hand starts elsewhere.
     """
 
-    def __init__(self, lanes: int, threads: int = 1) -> None:
+    def __init__(self, lanes: int, threads: int = 1, perturbed: bool = False) -> None:
         self.single_observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (SIZE,), np.float32)
         self.single_action_space = gymnasium.spaces.Box(-1.0, 1.0, (4,), np.float32)
-        self._lanes: list[tuple[str, Episode] | None] = [None] * lanes
-        self._idle: defaultdict[str, list[Episode]] = defaultdict(list)
+        self._perturbed = perturbed
+        self._lanes: list[tuple[_Kind, Episode] | None] = [None] * lanes
+        self._idle: defaultdict[_Kind, list[Episode]] = defaultdict(list)
 
     def reset(self, lanes: Sequence[int], seeds: Sequence[int], tasks: Sequence[str]) -> State:
         """Start an episode in each of `lanes` and return the states (N, 39); all follows from the seed alone.
@@ -45,12 +53,14 @@ class MetaWorldVectorWorld:
         return np.stack([self._begin(*start) for start in zip(lanes, seeds, tasks, strict=True)])
 
     def _begin(self, lane: int, seed: int, task: str) -> State:
-        episode = self._idle[task].pop() if self._idle[task] else new_episode(task)
+        perturbation = draw_perturbation(seed) if self._perturbed else None
+        kind = task, perturbation.mass if perturbation else None
+        episode = self._idle[kind].pop() if self._idle[kind] else new_episode(*kind)
         before = self._lanes[lane]
         if before is not None:
             self._idle[before[0]].append(before[1])
-        self._lanes[lane] = task, episode
-        return episode.begin(seed)
+        self._lanes[lane] = kind, episode
+        return episode.begin(seed, perturbation.start if perturbation else None)
 
     def step(
         self, lanes: Sequence[int], actions: NDArray[np.float32]

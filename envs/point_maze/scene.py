@@ -8,6 +8,8 @@ from pathlib import Path
 
 import mujoco
 
+from clbench.perturbation import with_mass
+
 from .mazes import MAZES, SIZE, Cell, centre
 
 TARGET = "target"
@@ -51,6 +53,13 @@ def scene(colour: str) -> mujoco.MjModel:
     model.geom("ground").rgba = (*FLOOR, 1.0)
     model.site("particle_site").rgba = (*BALL, 1.0)
     return model
+
+
+@functools.cache
+def scene_with_mass(colour: str, mass: float) -> mujoco.MjModel:
+    """Return the scene of a maze with a ball that is `mass` times as heavy; all perturbed worlds share it."""
+    model = scene(colour)
+    return with_mass(model, [int(model.body("particle").id)], mass)
 
 
 def camera() -> mujoco.MjvCamera:

@@ -11,10 +11,11 @@ import numpy as np
 from gymnasium.utils.seeding import np_random
 from numpy.typing import NDArray
 
+from clbench.perturbation import Perturbation, draw_perturbation
 from clbench.world import checked_actions, no_episode
 
 from .mazes import MAZES, ROOMS, Goal, Place, centre, goal_of
-from .scene import SUBSTEPS, TARGET, scene
+from .scene import SUBSTEPS, TARGET, scene, scene_with_mass
 from .state import COLOUR, PLACE, ROOM_AHEAD, SIZE, VELOCITY, State
 
 TOP_SPEED = 5.0
@@ -23,6 +24,8 @@ APART = 3
 """Least way from the start to the goal, in cells: no task is nearly done at the start."""
 SPREAD = 0.25
 """How far from the centre of a cell the ball may start along an axis, as in PointMaze."""
+START = 0.1
+"""How much farther a perturbed ball may start: its radius is 0.1 m, and walls are 0.5 m from the centre."""
 NEAR = 0.45
 """How near to the centre of the room the ball counts as there, as in PointMaze."""
 SLOW = 0.5
@@ -32,12 +35,13 @@ SUCCESS_BONUS = 1.0
 
 
 class _Lane:
-    """The physics of one episode after the other in one maze."""
+    """The physics of one episode after the other in one maze, with a ball of one mass."""
 
-    def __init__(self, goal: Goal) -> None:
-        self.goal = goal
-        self.model = scene(goal.maze.colour)
-        self.data = mujoco.MjData(self.model)
+    goal: Goal
+
+    def __init__(self, model: mujoco.MjModel) -> None:
+        self.model = model
+        self.data = mujoco.MjData(model)
 
     def begin(self, goal: Goal, place: Place) -> None:
         """Put the ball at rest at a place, and forget all that was before."""
@@ -82,11 +86,13 @@ class PointMazeVectorWorld:
     Args:
         lanes: Places for episodes. A lane takes its memory when it is reset into another maze than before.
         threads: Not used: the steps of a ball are too short to share out.
+        perturbed: Whether the ball is heavier or lighter, and starts beside its place.
     """
 
-    def __init__(self, lanes: int, threads: int = 1) -> None:
+    def __init__(self, lanes: int, threads: int = 1, perturbed: bool = False) -> None:
         self.single_observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (SIZE,), np.float32)
         self.single_action_space = gymnasium.spaces.Box(-1.0, 1.0, (2,), np.float32)
+        self._perturbed = perturbed
         self._lanes: list[_Lane | None] = [None] * lanes
 
     def reset(self, lanes: Sequence[int], seeds: Sequence[int], tasks: Sequence[str]) -> State:
@@ -99,9 +105,12 @@ class PointMazeVectorWorld:
         """
         for number, seed, task in zip(lanes, seeds, tasks, strict=True):
             goal, lane = goal_of(task), self._lanes[number]
-            if lane is None or lane.goal.maze is not goal.maze:
-                self._lanes[number] = lane = _Lane(goal)
-            lane.begin(goal, _start(goal, seed))
+            perturbation = draw_perturbation(seed) if self._perturbed else None
+            colour = goal.maze.colour
+            model = scene_with_mass(colour, perturbation.mass) if perturbation else scene(colour)
+            if lane is None or lane.model is not model:
+                self._lanes[number] = lane = _Lane(model)
+            lane.begin(goal, _start(goal, seed, perturbation))
         return self._observe(lanes)
 
     def step(
@@ -145,10 +154,12 @@ class PointMazeVectorWorld:
         return states
 
 
-def _start(goal: Goal, seed: int) -> Place:
+def _start(goal: Goal, seed: int, perturbation: Perturbation | None) -> Place:
     """Return the place at which the ball starts."""
     generator, _ = np_random(seed)
     cells = [cell for cell in goal.maze.free if goal.maze.steps(cell, goal.room) >= APART]
     x, y = centre(cells[int(generator.integers(len(cells)))])
     dx, dy = generator.uniform(-SPREAD, SPREAD, size=2).tolist()
+    if perturbation:
+        dx, dy = dx + START * perturbation.start[0], dy + START * perturbation.start[1]
     return x + dx, y + dy

@@ -106,13 +106,19 @@ def commands(row: Row) -> list[str]:
         if row.division == "online":
             lines.append(f"# {printable(row.method)}: a program of its own, docs/online.md")
             continue
-        for device, members in groupby(runs, key=lambda run: str(run.record.run.get("device", "cpu"))):
+        for (device, perturb), members in groupby(runs, key=_how):
             for first, count in _in_a_row([run.seed for run in members]):
                 words = ["clbench", "run", row.scenario, row.method, "--seeds", str(count)]
                 words += ["--first-seed", str(first)] if first else []
                 words += [] if device == "cpu" else ["--device", printable(device)]
+                words += ["--perturb"] if perturb else []
                 lines.append(shlex.join(words))
     return lines
+
+
+def _how(run: Run) -> tuple[str, bool]:
+    """Return where a run was computed, and whether its skills met perturbed episodes."""
+    return str(run.record.run.get("device", "cpu")), run.record.run.get("perturb", False)
 
 
 def _commit(run: Run) -> str:

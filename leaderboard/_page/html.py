@@ -19,7 +19,7 @@ from .._rows import Row, Table
 from .._table import title_of
 from .._tiers import TIERS
 from .charts import FONT, NARROW, PALETTE, SERIES, SHAPES, WIDE, along_a_run, colour, in_theme, plane
-from .view import COLUMNS, OTHERS, SHADES, ScenarioView, grouped, number, scenarios
+from .view import OTHERS, SHADES, ScenarioView, columns, grouped, number, scenarios
 
 FOLDER = Path(__file__).parent
 """Where the templates, the style and the script are."""
@@ -70,6 +70,7 @@ def page(table: Table) -> str:
             data=Markup(_embedded(_data(views))),
             scenarios=views,
             overall=grouped(averages, [row.division for row in averages]),
+            overall_columns=columns(averages),
             not_shown=table.not_shown,
         )
     )
@@ -98,7 +99,6 @@ def _templates() -> Environment:
         lstrip_blocks=True,
     )
     templates.globals.update(
-        columns=COLUMNS,
         shapes=SHAPES,
         group_titles=GROUPS,
         tiers=TIERS,

@@ -20,7 +20,7 @@ from .._descriptions import Description, describe
 from .._markdown import arxiv_ids
 from .._rows import Row, Table, rank_mates
 from .._runs import DIVISIONS, METHODS, printable
-from .._table import SHOWN, interval, number_text, scaled, title_of
+from .._table import SHOWN, Rows, interval, number_text, scaled, shown, title_of
 from .charts import finite, rounded
 from .curves import estimated, retained_curve, target_curves
 from .definitions import Family, families
@@ -28,9 +28,6 @@ from .details import Diagnostics, Entry, commands, diagnostics, flat, same_or_ea
 
 MISSING = "\N{EN DASH}"
 """What stands for a value that could not be computed."""
-
-COLUMNS = tuple(metric for metric in SHOWN if metric.name != "zero_shot")
-"""Metrics of the table; a row's own section has all."""
 
 NAMED = 3
 """Methods that share a rank and are named; of more only the number is told."""
@@ -121,9 +118,9 @@ class RowView:
     place: str
     """Its rank in words."""
     cells: tuple[Number, ...]
-    """Of `COLUMNS`, then the relative cost and the bytes kept."""
+    """Of the table's `columns`, then the relative cost and the bytes kept."""
     metrics: tuple[MetricView, ...]
-    """Those of `SHOWN`."""
+    """What is shown of this row alone."""
     stages: tuple[Stage, ...]
     data: Mapping[str, Any]
     """What the page draws when the section is opened."""
@@ -199,6 +196,11 @@ class RowView:
         return same_or_each([(run.seed, flat(run.record.fingerprint)) for run in self.row.runs])
 
 
+def columns(rows: Rows) -> tuple[Metric, ...]:
+    """Return the metrics of a table of `rows`; a row's own section has all."""
+    return tuple(metric for metric in shown(rows) if metric.name != "zero_shot")
+
+
 @dataclass(frozen=True, eq=False)
 class ScenarioView:
     """A scenario and its rows."""
@@ -215,6 +217,11 @@ class ScenarioView:
     def divisions(self) -> list[Group[RowView]]:
         """Its rows by division."""
         return grouped(self.rows, [view.row.division for view in self.rows])
+
+    @property
+    def columns(self) -> tuple[Metric, ...]:
+        """Metrics of its table."""
+        return columns([view.row for view in self.rows])
 
     @property
     def runs(self) -> int:
@@ -253,8 +260,8 @@ def _row(row: Row, rows: Sequence[Row]) -> RowView:
     return RowView(
         row,
         *_rank(row, rows),
-        (*(number(row.estimates[metric.name], metric) for metric in COLUMNS), *_costs(row)),
-        tuple(_metric(metric, row.estimates[metric.name], seeds[metric.name]) for metric in SHOWN),
+        (*(number(row.estimates[metric.name], metric) for metric in columns(rows)), *_costs(row)),
+        tuple(_metric(metric, row.estimates[metric.name], seeds[metric.name]) for metric in shown([row])),
         tuple(_stages(row)),
         _drawn(row, seeds),
         _description(row.method) if row.method in built_in_methods() else None,

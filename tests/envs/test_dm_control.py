@@ -11,6 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from clbench.demonstrations import demonstrate
+from clbench.perturbation import draw_perturbation
 from clbench.policy import word_id
 from clbench.task import Task, load_scenario, resolve
 from clbench.world import World, vector_world
@@ -279,3 +280,27 @@ def _draws() -> bool:
 def test_a_step_before_the_first_reset_is_refused() -> None:
     with pytest.raises(gymnasium.error.ResetNeeded, match="Lane 0"):
         world().step(np.zeros(2, np.float32))
+
+
+THINGS = {"point_mass": "pointmass", "cartpole": "pole_1", "ball_in_cup": "ball"}
+
+
+@pytest.mark.parametrize("name", ["point_mass_easy", "cartpole_swingup", "ball_in_cup_catch"])
+def test_in_a_perturbed_episode_a_thing_is_heavier_and_the_body_in_motion(name: str) -> None:
+    worlds = [vector_world(SCENARIO.tasks[0].world, 1, 1, perturbed) for perturbed in (False, True)]
+    body = bodies.BODY_OF[RULES[name].body]
+    for seed in range(4):
+        for made in worlds:
+            made.reset([0], [seed], [name])
+        pictures = [made.picture(0) for made in worlds]  # type: ignore[attr-defined]
+        (plain, before, _), (perturbed, after, _) = pictures
+        drawn = draw_perturbation(seed)
+        thing = THINGS[body.name]
+        assert perturbed.body(thing).mass == drawn.mass * plain.body(thing).mass
+        assert perturbed.body_mass.sum() - plain.body_mass.sum() == pytest.approx(
+            (drawn.mass - 1) * plain.body(thing).mass[0]
+        )
+        np.testing.assert_array_equal(after.qpos, before.qpos)
+        pushed = [speed * drawn.start[joint % 2] for joint, speed in enumerate(body.starts)]
+        np.testing.assert_allclose(after.qvel - before.qvel, pushed, rtol=1e-12, atol=1e-12)
+        assert np.any(pushed)

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from clbench.policy import encode
 from clbench.scenario_env import ScenarioEnv
 from clbench.task import Scenario, Task, registered_scenario, resolve, scenario_ids
-from clbench.world import Lanes, World
+from clbench.world import Lanes, World, check_perturbable
 
 BUILT_IN = [
     scenario_id
@@ -172,6 +172,61 @@ def test_episodes_side_by_side_are_bit_for_bit_those_of_the_plain_world(scenario
         if step == 10:
             lanes.reset([1, 3], [9, 9], [tasks[1], tasks[3]])
     lanes.close()
+
+
+def steps(
+    lanes: Lanes, lane: int, task: Task, seed: int, perturbed: bool, count: int = 12
+) -> NDArray[np.float32]:
+    """Return the states (count + 1, S) of an episode of random actions in a lane."""
+    world = lanes.world(task, perturbed)
+    states = [lanes.reset([lane], [seed], [task], [perturbed])[0]]
+    space = world.single_action_space
+    for action in np.random.default_rng(seed).uniform(-1.0, 1.0, (count, 1, *space.shape)):
+        states.append(lanes.step([lane], action.astype(np.float32))[0][0])
+    return np.stack(states)
+
+
+@every_scenario
+def test_a_perturbed_episode_follows_from_its_seed_in_any_lane_and_changes_no_plain_one(
+    scenario: Scenario,
+) -> None:
+    check_perturbable(scenario.tasks)
+    for task in (*scenario.tasks[:1], *scenario.tasks[-2:]):
+        make(task.world).close()
+        plain, perturbed = (steps(Lanes(1), 0, task, 7, flag) for flag in (False, True))
+        assert np.isfinite(perturbed).all()
+        assert not np.array_equal(plain[0], perturbed[0])
+        lanes = Lanes(3, threads=2)
+        for lane, seed, flag in ((2, 1, True), (2, 7, True), (0, 2, False), (0, 7, True), (2, 3, True)):
+            found = steps(lanes, lane, task, seed, flag)
+            if seed == 7:
+                np.testing.assert_array_equal(found, perturbed)
+        np.testing.assert_array_equal(steps(lanes, 2, task, 7, False), plain)
+        starts = lanes.reset([0, 1, 2], [7, 7, 7], [task] * 3, [True, False, True])
+        np.testing.assert_array_equal(starts, [perturbed[0], plain[0], perturbed[0]])
+        still = np.zeros((1, *lanes.world(task).single_action_space.shape), np.float32)
+        assert not any(lanes.step([lane], still)[2][0] for lane in range(3))
+        lanes.close()
+
+
+@pytest.mark.slow
+@every_scenario
+def test_experts_do_the_skills_in_perturbed_worlds_too(scenario: Scenario) -> None:
+    episodes = 40
+    for task in scenario.retained:
+        make(task.world).close()
+        expert, lanes = resolve(task.expert)(task.name), Lanes(episodes)
+        going, done = list(range(episodes)), 0
+        states = lanes.reset(going, list(range(episodes)), [task] * episodes, [True] * episodes)
+        for _ in range(task.horizon):
+            actions = np.stack([expert(state) for state in states])
+            states, _, successes = lanes.step(going, actions)
+            going = [lane for lane, success in zip(going, successes, strict=True) if not success]
+            done, states = done + int(successes.sum()), states[~successes]
+            if not going:
+                break
+        assert done >= 0.9 * episodes, f"{task.name}: {done} of {episodes}"
+        lanes.close()
 
 
 @every_scenario

@@ -7,12 +7,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from clbench.perturbation import draw_perturbation
 from clbench.task import load_scenario, resolve
 from clbench.world import VectorWorld, vector_world
 
 SCENARIO = load_scenario("clbench:clbench/Fetch-v0")
 NAMES = [task.name for task in SCENARIO.tasks]
 PlainWorld = resolve(SCENARIO.tasks[0].world)
+GRIPPER_VELOCITY = resolve("clbench.envs.fetch.state:GRIPPER_VELOCITY")
 LONGEST = 80
 """Steps after which an episode is begun anew if it has not ended: more than the horizon."""
 
@@ -122,3 +124,25 @@ def test_a_lane_without_an_episode_and_an_unknown_task_are_named() -> None:
         world.step([0, 1], np.zeros((2, 4), np.float32))
     with pytest.raises(LookupError, match="Did you mean 'push_left'"):
         world.reset([1], [0], ["push_lefft"])
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_in_a_perturbed_episode_the_block_is_heavier_and_the_gripper_elsewhere_and_at_rest(seed: int) -> None:
+    plain, perturbed = (vector_world(SCENARIO.tasks[0].world, 2, 1, flag) for flag in (False, True))
+    states = [world.reset([1], [seed], ["push"])[0] for world in (plain, perturbed)]
+    models = [world.picture_data(1).model for world in (plain, perturbed)]  # type: ignore[attr-defined]
+    drawn = draw_perturbation(seed)
+    np.testing.assert_array_equal(models[1].body_mass, models[0].body_mass * heavier(models[0], drawn.mass))
+    moved = states[1] - states[0]
+    np.testing.assert_allclose(moved[:3], 0.025 * np.array(drawn.start), atol=0.006)
+    assert np.abs(moved[GRIPPER_VELOCITY]).max() < 1e-3
+    np.testing.assert_allclose(
+        moved[[3, 4, 5, -3, -2, -1]], 0, atol=1e-3
+    )  # block and target are where they were
+
+
+def heavier(model: Any, mass: float) -> NDArray[np.float64]:
+    """Return what the masses of the bodies are multiplied by."""
+    factors = np.ones(model.nbody)
+    factors[model.body("object0").id] = mass
+    return factors

@@ -10,6 +10,7 @@ import pytest
 from metaworld.env_dict import ALL_V3_ENVIRONMENTS
 from numpy.typing import NDArray
 
+from clbench.perturbation import draw_perturbation
 from clbench.task import load_scenario, resolve
 from clbench.world import VectorWorld, vector_world
 
@@ -170,3 +171,17 @@ def test_a_lane_without_an_episode_and_an_unknown_task_are_named() -> None:
         world.step([0, 1], np.zeros((2, 4), np.float32))
     with pytest.raises(LookupError, match="Did you mean 'push_back'"):
         world.reset([1], [0], ["push_bak"])
+
+
+@pytest.mark.parametrize("name", ["drawer_open", "faucet_close", "push_back"])
+def test_in_a_perturbed_episode_things_are_heavier_and_the_hand_elsewhere(name: str) -> None:
+    worlds = [vector_world(WORLD, 1, 1, perturbed) for perturbed in (False, True)]
+    for seed in range(3):
+        (plain,), (perturbed,) = (world.reset([0], [seed], [name]) for world in worlds)
+        models = [world.picture_of(0)[0] for world in worlds]  # type: ignore[attr-defined]
+        drawn = draw_perturbation(seed)
+        factors = models[1].body_mass[models[0].body_mass > 0] / models[0].body_mass[models[0].body_mass > 0]
+        assert set(factors) == {1.0, drawn.mass}
+        assert models[1].body("right_l1").mass == models[0].body("right_l1").mass
+        np.testing.assert_allclose((perturbed - plain)[:3], 0.03 * np.array(drawn.start), atol=0.01)
+        np.testing.assert_array_equal((perturbed - plain)[-3:], 0)  # the goal

@@ -17,9 +17,11 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
+from clbench.perturbation import draw_perturbation
 from clbench.policy import word_id
 from clbench.questions import load_questions, report_questions
 from clbench.task import Task, load_scenario, resolve
+from clbench.world import vector_world
 
 mazes = importlib.import_module("clbench.envs.point_maze.mazes")
 scene = resolve("clbench.envs.point_maze.scene:scene")
@@ -337,3 +339,22 @@ print("drawn")
     if result.returncode and "Assert" not in result.stderr:
         pytest.skip(f"nothing renders here: {result.stderr.strip().splitlines()[-1:]}")
     assert result.stdout.strip() == "drawn", result.stderr
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_in_a_perturbed_episode_the_ball_is_heavier_and_beside_its_place(seed: int) -> None:
+    worlds = [vector_world(SCENARIO.tasks[0].world, 1, 1, perturbed) for perturbed in (False, True)]
+    (plain,), (perturbed,) = (world.reset([0], [seed], [NAMES[0]]) for world in worlds)
+    models = [world.picture_data(0)[0] for world in worlds]  # type: ignore[attr-defined]
+    drawn = draw_perturbation(seed)
+    assert models[1].body("particle").mass == drawn.mass * models[0].body("particle").mass
+    np.testing.assert_allclose(perturbed[:2] - plain[:2], 0.1 * np.array(drawn.start[:2]), atol=1e-6)
+    pushed = [world.step([0], np.ones((1, 2), np.float32))[0][0, 2] for world in worlds]
+    assert (pushed[1] > pushed[0]) == (drawn.mass < 1)
+
+
+def test_a_perturbed_ball_never_starts_in_a_wall() -> None:
+    world = vector_world(SCENARIO.tasks[0].world, 1, 1, perturbed=True)
+    for seed, name in enumerate(NAMES * 20):
+        ahead = world.reset([0], [seed], [name])[0, 4:8]
+        assert ahead.min() > 0.1  # its radius

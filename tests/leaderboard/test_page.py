@@ -69,6 +69,27 @@ def test_the_page_is_valid_and_has_a_row_and_a_section_for_each_method(records: 
     assert "after target_1 0.50 0.40 0.30 0.80 0.10" in words(by_id(document, "clbench/Toy-v0/sft"))
 
 
+def test_perturbed_retention_has_a_column_only_where_a_row_has_it(
+    add: Callable[..., Path], records: Path
+) -> None:
+    plain = page(read_table(records))
+    assert "perturbed retention" not in plain
+    for seed in range(2):
+        add("sft", seed, perturbed=[[0.9, 0.8], [0.5, 0.7], [0.4, 0.2]])
+    document = parsed(page(read_table(records)))
+    section = by_id(document, "clbench/Toy-v0")
+    heads = [words(one) for one in section.iterfind(".//table/thead/tr/th")]
+    assert heads[heads.index("retention") + 1] == "perturbed retention"
+    assert ", missing: The run did not meet perturbed episodes" in words(section)
+    assert "perturbed retention 0.30 [" in words(by_id(document, "clbench/Toy-v0/sft"))
+    assert "clbench run clbench/Toy-v0 sft --seeds 2 --perturb" in words(
+        by_id(document, "clbench/Toy-v0/sft")
+    )
+    better = words(by_id(document, "clbench/Toy-v0/better"))
+    assert "perturbed retention" not in better
+    assert "--perturb" not in better
+
+
 def test_a_missing_value_is_a_dash_that_says_why(records: Path) -> None:
     text = words(by_id(parsed(page(read_table(records))), "clbench/Toy-v0"))
     assert ", missing: A point of a learning curve is missing, or there is no from_scratch" in text

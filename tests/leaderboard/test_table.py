@@ -93,7 +93,8 @@ def test_a_row_has_every_metric_with_its_interval_and_the_costs(records: Path) -
     assert row.steps == 800
     assert row.parameters == 1000
     assert np.isnan(row.intransigence)  # there is no joint
-    for name in set(METRICS) - {"intransigence"}:
+    assert np.isnan(row.perturbed_retention)
+    for name in set(METRICS) - {"intransigence", "perturbed_retention"}:
         assert row[f"{name}_low"] <= row[name] <= row[f"{name}_high"]
 
 
@@ -178,6 +179,34 @@ def test_the_markdown_has_values_with_intervals_and_says_what_they_are(
     assert "## clbench/Toy-v0" in page
     assert "Not shown" not in page
     assert len({line.count("|") for line in page.splitlines() if line.startswith("|")}) == 1
+
+
+PERTURBED = [[0.9, 0.8], [0.5, 0.7], [0.4, 0.2]]
+
+
+def test_perturbed_retention_stands_beside_retention_where_a_row_has_it(
+    records: Path, add: Callable[..., Path], shown: Callable[[], tuple[str, str]]
+) -> None:
+    before, (_, page) = load(records), shown()
+    assert "perturbed retention" not in page
+    for seed in range(2):
+        add("sft", seed, perturbed=PERTURBED)
+    add("asks", 1, uses=ASKS, perturbed=PERTURBED)  # one of its two seeds alone
+    after, (_, page) = load(records), shown()
+    head = next(line for line in page.splitlines() if line.startswith("| rank |"))
+    place = [cell.strip() for cell in head.split("|")].index("perturbed retention")
+    assert head.split("|")[place - 1].strip() == "retention"
+    cells = {
+        method: next(line for line in page.splitlines() if f"| {method} |" in line).split("|")[place].strip()
+        for method in ("sft", "asks", "replay")
+    }
+    assert cells["sft"].startswith("0.30 [")
+    assert (cells["asks"], cells["replay"]) == ("-", "-")
+    assert "**perturbed retention** (higher is better" in page
+    changed = [f"perturbed_retention{end}" for end in ("", "_low", "_high")]
+    pandas.testing.assert_frame_equal(after.drop(columns=changed), before.drop(columns=changed))
+    assert before.perturbed_retention.isna().all()
+    assert after.set_index("method").perturbed_retention["sft"] == pytest.approx(0.3)
 
 
 def test_what_is_missing_is_a_dash_in_markdown_and_empty_in_csv(

@@ -11,6 +11,7 @@ import pytest
 
 from clbench.record import read_record, record_path
 from clbench.run import RunSpec, execute
+from clbench.testing import ToyWorld
 
 verification = importlib.import_module("clbench.leaderboard._verify")
 tiers = importlib.import_module("clbench.leaderboard._tiers")
@@ -88,6 +89,44 @@ def test_a_run_in_another_order_of_the_targets_is_verified_in_that_order(tmp_pat
     assert tiers.tier_of(path) == "retrained"
     edit(path, lambda values: values["scenario"]["target"].reverse())
     assert "scenario.target differ from what is installed" in failures(verify(path, "recomputed"))
+
+
+def test_perturbed_episodes_are_replayed_like_those_of_the_report(tmp_path: Path) -> None:
+    spec = RunSpec(TOY, "frozen", 0, perturb=True)
+    execute(spec, tmp_path / "records")
+    path = spec.path(tmp_path / "records")
+    checks = verify(path, "retrained")
+    assert failures(checks) == ""
+    assert any(check.found.startswith("126 of 126 run again") for check in checks)  # 90 and 36
+    edit(path, lambda values: flip_perturbed(values))
+    assert "left perturbed episode " in failures(verify(path, "replayed"))
+    assert tiers.tier_of(path) == "recomputed"
+
+
+def flip_perturbed(values: dict[str, Any]) -> None:
+    """Turn a failure in a perturbed episode into a success, or make a success take a step less."""
+    episodes = values["episodes"]
+    row = episodes["split"].index("perturbed")
+    episodes["length"][row] -= episodes["success"][row]
+    episodes["success"][row] = 1
+
+
+def test_a_record_that_claims_perturbed_episodes_of_a_world_without_is_denied(
+    mine: Path, honest: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def claim(values: dict[str, Any]) -> None:
+        values["run"]["perturb"] = True
+        rows = list(zip(*values["episodes"].values(), strict=True))
+        ends = [row for row in rows if row[1] in (0, 60) and row[3] == "report" and row[2] in ("left", "up")]
+        for row in ends:
+            for column, value in zip(values["episodes"].values(), row, strict=True):
+                column.append("perturbed" if value == "report" else value)
+
+    edit(mine, claim)
+    assert "episodes: " in failures(verify(mine, "replayed", honest))
+    steady = lambda render_mode=None: ToyWorld(render_mode)  # noqa: E731 - a world that takes no `perturbed`
+    monkeypatch.setattr("clbench.testing.ToyWorld", steady)
+    assert "what was run: The task 'left' cannot be perturbed" in failures(verify(mine, "replayed", honest))
 
 
 def test_a_record_can_be_replayed_from_policies_that_are_made_again(mine: Path) -> None:
