@@ -1,6 +1,7 @@
 """Fixtures that several test files share."""
 
 import dataclasses
+import json
 import sys
 import types
 from collections.abc import Callable, Iterator, Mapping
@@ -42,6 +43,21 @@ def empty_caches(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setenv("CLBENCH_CACHE", str(tmp_path / "cache"))
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
     return tmp_path
+
+
+@pytest.fixture(scope="session")
+def lasting_records() -> Callable[[Path], dict[str, Any]]:
+    """Return a function that reads all records below a folder, without what may differ between equal runs."""
+
+    def lasting_records(folder: Path) -> dict[str, Any]:
+        found = {}
+        for path in sorted(folder.rglob("*.json")):
+            record = json.loads(path.read_text())
+            del record["timing"]
+            found[path.relative_to(folder).as_posix()] = record
+        return found
+
+    return lasting_records
 
 
 @pytest.fixture

@@ -1,7 +1,6 @@
 """The grid: processes that work, fail, die and are stopped."""
 
 import io
-import json
 import os
 import signal
 import subprocess
@@ -131,25 +130,18 @@ def test_runs_of_two_scenarios_have_jobs_of_their_own_and_one_pretraining_for_ea
     assert "Toy-v0 demonstrations left" in needs["Toy-v0 pretraining seed 0"]
 
 
-def _records(folder: Path) -> dict[str, Any]:
-    found = {}
-    for path in sorted(folder.rglob("*.json")):
-        record = json.loads(path.read_text())
-        del record["timing"]
-        found[path.relative_to(folder).as_posix()] = record
-    return found
-
-
-def test_one_worker_and_two_give_equal_records_and_a_stopped_grid_goes_on(tmp_path: Path, bars: Bars) -> None:
+def test_one_worker_and_two_give_equal_records_and_a_stopped_grid_goes_on(
+    tmp_path: Path, bars: Bars, lasting_records: Callable[[Path], dict[str, Any]]
+) -> None:
     specs = [RunSpec(TOY, method, seed) for seed in (0, 1) for method in ("sft", "frozen")]
     assert run_jobs(benchmark_jobs(specs, tmp_path / "one"), Processes(1), bars) == {}
     assert run_jobs(benchmark_jobs(specs[:1], tmp_path / "two"), Processes(2), bars) == {}
     missing = [spec for spec in specs if not has_record(spec, tmp_path / "two")]
     assert missing == specs[1:]
     assert run_jobs(benchmark_jobs(missing, tmp_path / "two"), Processes(2), bars) == {}
-    records = _records(tmp_path / "one")
+    records = lasting_records(tmp_path / "one")
     assert len(records) == 4
-    assert records == _records(tmp_path / "two")
+    assert records == lasting_records(tmp_path / "two")
 
 
 def _is_gone(group: int) -> bool:
@@ -171,7 +163,12 @@ def _is_gone(group: int) -> bool:
     ],
 )
 def test_stopping_the_command_ends_its_workers_and_keeps_finished_records(
-    tmp_path: Path, send: Callable[[int, int], None], stop: int, code: int, said: str
+    tmp_path: Path,
+    lasting_records: Callable[[Path], dict[str, Any]],
+    send: Callable[[int, int], None],
+    stop: int,
+    code: int,
+    said: str,
 ) -> None:
     command = [sys.executable, "-m", "clbench", "run", TOY, "frozen", "sft", "joint", "--seeds", "1"]
     command += ["--workers", "1", "--records", str(tmp_path / "records")]
@@ -186,6 +183,6 @@ def test_stopping_the_command_ends_its_workers_and_keeps_finished_records(
     assert said in output
     assert "Traceback" not in output
     assert _is_gone(process.pid)
-    records = _records(tmp_path / "records")
+    records = lasting_records(tmp_path / "records")
     assert "Toy-v0/frozen/seed-0.json" in records
     assert len(records) < 3

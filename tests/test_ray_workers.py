@@ -1,11 +1,11 @@
 """Ray: the same records as on one machine, and nothing is lost with a worker."""
 
 import io
-import json
 import os
 import signal
 import threading
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -86,22 +86,15 @@ def test_a_job_that_fails_leaves_the_others_alone_and_one_whose_worker_is_killed
     assert "lost: went well in the end" in bars.console.file.getvalue()
 
 
-def _records(folder: Path) -> dict[str, Any]:
-    found = {}
-    for path in sorted(folder.rglob("*.json")):
-        record = json.loads(path.read_text())
-        del record["timing"]
-        found[path.relative_to(folder).as_posix()] = record
-    return found
-
-
-def test_the_records_are_those_of_one_machine(tmp_path: Path, bars: Bars) -> None:
+def test_the_records_are_those_of_one_machine(
+    tmp_path: Path, bars: Bars, lasting_records: Callable[[Path], dict[str, Any]]
+) -> None:
     specs = [RunSpec(TOY, method, 0) for method in ("sft", "frozen", "experience_replay")]
     assert run_jobs(benchmark_jobs(specs, tmp_path / "here"), Processes(2), bars) == {}
     assert run_jobs(benchmark_jobs(specs, tmp_path / "ray"), RayWorkers("local", 2), bars) == {}
-    records = _records(tmp_path / "here")
+    records = lasting_records(tmp_path / "here")
     assert len(records) == 3
-    assert records == _records(tmp_path / "ray")
+    assert records == lasting_records(tmp_path / "ray")
 
 
 def test_a_cluster_that_does_not_run_is_refused() -> None:

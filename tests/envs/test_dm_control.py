@@ -128,14 +128,6 @@ def test_a_motor_that_a_body_lacks_is_ignored() -> None:
     np.testing.assert_array_equal(play(task, 0, actions)[0], play(task, 0, other)[0])
 
 
-@pytest.mark.parametrize("action", [[0.0], [0.0, np.nan], [0.0] * 3])
-def test_an_action_that_is_none_is_refused(action: list[float]) -> None:
-    plain = world()
-    plain.reset(seed=0)
-    with pytest.raises(ValueError, match="An action of the dm_control world"):
-        plain.step(np.array(action, np.float32))
-
-
 def test_success_is_the_return_of_the_whole_episode_and_comes_at_its_last_step() -> None:
     task = SCENARIO.task("cartpole_balance")
     act = experts.expert(task.name)
@@ -151,13 +143,6 @@ def test_success_is_the_return_of_the_whole_episode_and_comes_at_its_last_step()
     assert ends == [False] * (task.horizon - 1) + [True]
     _, rewards, success = play(task, 0, np.zeros((task.horizon, 2), np.float32))
     assert success == (sum(rewards) >= rules.SUCCESS_SHARE * experts.expert_return(task.name))
-
-
-def test_an_unknown_task_is_named_with_the_nearest() -> None:
-    with pytest.raises(LookupError, match="cartpole_left"):
-        world().reset(options={"task": "cartpole_lefd"})
-    with pytest.raises(LookupError, match="cartpole_left"):
-        experts.expert("cartpole_lefd")
 
 
 @pytest.mark.parametrize("task", SCENARIO.tasks, ids=NAMES)

@@ -4,6 +4,7 @@ A scenario that cannot be made here, for want of an extra or of a renderer, is s
 """
 
 import itertools
+import re
 import subprocess
 import sys
 import warnings
@@ -18,7 +19,7 @@ from numpy.typing import NDArray
 from clbench.policy import encode
 from clbench.scenario_env import ScenarioEnv
 from clbench.task import Scenario, Task, registered_scenario, resolve, scenario_ids
-from clbench.world import Lanes, World, check_perturbable
+from clbench.world import Lanes, World, check_perturbable, vector_world
 
 BUILT_IN = [
     scenario_id
@@ -247,7 +248,58 @@ def test_an_unknown_task_is_an_error_that_names_the_nearest(scenario: Scenario) 
     with pytest.raises(LookupError, match=message):
         make(task.world).reset(options={"task": f"{task.name}x"})
     with pytest.raises(LookupError, match=message):
+        vector_world(task.world, 1).reset([0], [0], [f"{task.name}x"])
+    with pytest.raises(LookupError, match=message):
         resolve(task.expert)(f"{task.name}x")
+
+
+@every_scenario
+def test_an_action_that_cannot_be_done_is_an_error_that_names_it(scenario: Scenario) -> None:
+    for task in first_task_of_each_world(scenario):
+        plain, lanes = make(task.world), Lanes(2)
+        plain.reset(seed=0, options={"task": task.name})
+        lanes.reset([0, 1], [0, 1], [task, task])
+        good = actions(plain, 0, 1)[0] * 0
+        size = len(good)
+        for number in (np.nan, np.inf, -np.inf):
+            bad = good.copy()
+            bad[-1] = number
+            message = re.escape(f"is finite, not {bad.tolist()}")
+            with pytest.raises(ValueError, match=message):
+                plain.step(bad)
+            with pytest.raises(ValueError, match=message):
+                lanes.step([0, 1], np.stack([good, bad]))
+        longer = np.zeros(size + 1, np.float32)
+        message = re.escape(f"has shape ({size},), not ({size + 1},)")
+        with pytest.raises(ValueError, match=message):
+            plain.step(longer)
+        with pytest.raises(ValueError, match=message):
+            lanes.step([0, 1], np.stack([longer, longer]))
+        with pytest.raises(ValueError, match=re.escape(f"has shape ({size},), not (1, {size})")):
+            plain.step(good[None])
+
+
+@every_scenario
+def test_actions_beyond_the_bounds_are_cut(scenario: Scenario) -> None:
+    for task in first_task_of_each_world(scenario):
+        world, states = make(task.world), []
+        for far in (1.0, 9.0):
+            world.reset(seed=0, options={"task": task.name})
+            action = np.full_like(actions(world, 0, 1)[0], far)
+            action[1::2] *= -1
+            states.append(world.step(action)[0])
+        np.testing.assert_array_equal(states[0], states[1])
+
+
+@every_scenario
+def test_a_lane_without_an_episode_is_named(scenario: Scenario) -> None:
+    for task in first_task_of_each_world(scenario):
+        action = actions(make(task.world), 0, 1)[0]
+        world = vector_world(task.world, 2)
+        world.reset([0], [0], [task.name])
+        with pytest.raises(gymnasium.error.ResetNeeded, match=r"Lane 1 of the .* has no episode: reset it"):
+            world.step([0, 1], np.stack([action, action]))
+        world.close()
 
 
 @every_scenario

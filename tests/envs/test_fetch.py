@@ -93,18 +93,6 @@ def test_physics_and_observation_are_those_of_fetch_pick_and_place(seed: int) ->
     np.testing.assert_array_equal(np.stack(got)[:, :25], np.stack(expected).astype(np.float32))
 
 
-def test_worlds_that_run_side_by_side_do_not_touch_each_other() -> None:
-    expected = [rollout(World(), "push", seed) for seed in (3, 4)]
-    worlds = [World(), World()]
-    rows = []
-    for world, seed in zip(worlds, (3, 4), strict=True):
-        rows.append([np.append(world.reset(seed=seed, options={"task": "push"})[0], 0.0)])
-    for step, (index, seed) in itertools.product(range(20), enumerate((3, 4))):
-        state, reward, *_ = worlds[index].step(random_actions(seed, 20)[step])
-        rows[index].append(np.append(state, reward))
-    np.testing.assert_array_equal(np.array(rows), np.array(expected))
-
-
 def test_a_copy_of_a_world_goes_on_as_the_world_does_and_leaves_it_alone() -> None:
     world, expected = World(), rollout(World(), "lift", seed=2)
     world.reset(seed=2, options={"task": "lift"})
@@ -164,30 +152,6 @@ def test_experts_of_retained_tasks_do_no_target_task_by_chance() -> None:
                 if terminated:
                     break
         assert successes <= 1, f"the expert of {known.name} does {task.name}"
-
-
-@pytest.mark.parametrize(
-    ("action", "message"),
-    [
-        (np.zeros(3), r"has shape \(4,\), not \(3,\)"),
-        (np.zeros((1, 4)), r"has shape \(4,\), not \(1, 4\)"),
-        (np.array([0.0, np.nan, 0.0, 0.0]), "finite"),
-        (np.array([0.0, 0.0, np.inf, 0.0]), "finite"),
-    ],
-)
-def test_an_action_that_cannot_be_done_is_an_error(action: NDArray[np.float64], message: str) -> None:
-    world = World()
-    world.reset(seed=0)
-    with pytest.raises(ValueError, match=message):
-        world.step(action)
-
-
-def test_actions_beyond_the_bounds_are_cut() -> None:
-    world = World()
-    world.reset(seed=0)
-    far = world.step(np.array([9.0, -9.0, 9.0, 9.0]))[0]
-    world.reset(seed=0)
-    np.testing.assert_array_equal(world.step(np.array([1.0, -1.0, 1.0, 1.0]))[0], far)
 
 
 @pytest.mark.parametrize(

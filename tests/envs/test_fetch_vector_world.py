@@ -106,26 +106,6 @@ def test_it_is_so_over_ten_thousand_steps_of_each_task(task: str) -> None:
     assert successes > 50
 
 
-def test_an_action_that_cannot_be_done_is_an_error_that_names_it() -> None:
-    world = fetch(lanes=2)
-    world.reset([0, 1], [0, 1], ["reach", "reach"])
-    actions = np.zeros((2, 4), np.float32)
-    actions[1, 2] = np.nan
-    with pytest.raises(ValueError, match=r"is finite, not \[0.0, 0.0, nan, 0.0\]"):
-        world.step([0, 1], actions)
-    with pytest.raises(ValueError, match=r"has shape \(4,\), not \(3,\)"):
-        world.step([0, 1], np.zeros((2, 3), np.float32))
-
-
-def test_a_lane_without_an_episode_and_an_unknown_task_are_named() -> None:
-    world = fetch(lanes=2)
-    world.reset([0], [0], ["reach"])
-    with pytest.raises(gymnasium.error.ResetNeeded, match="Lane 1 of the Fetch world has no episode"):
-        world.step([0, 1], np.zeros((2, 4), np.float32))
-    with pytest.raises(LookupError, match="Did you mean 'push_left'"):
-        world.reset([1], [0], ["push_lefft"])
-
-
 @pytest.mark.parametrize("seed", range(4))
 def test_in_a_perturbed_episode_the_block_is_heavier_and_the_gripper_elsewhere_and_at_rest(seed: int) -> None:
     plain, perturbed = (vector_world(SCENARIO.tasks[0].world, 2, 1, flag) for flag in (False, True))

@@ -2,7 +2,6 @@
 
 import copy
 import importlib.metadata
-import itertools
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -149,18 +148,6 @@ def test_global_generators_have_no_part_in_it_and_are_left_alone() -> None:
     np.testing.assert_array_equal(np.random.get_state()[1], before)  # type: ignore[index]  # noqa: NPY002
 
 
-def test_worlds_that_run_side_by_side_do_not_touch_each_other() -> None:
-    expected = [rollout(World(), "drawer_close", seed) for seed in (3, 4)]
-    worlds = [World(), World()]
-    rows = []
-    for world, seed in zip(worlds, (3, 4), strict=True):
-        rows.append([np.append(world.reset(seed=seed, options={"task": "drawer_close"})[0], 0.0)])
-    for step, (index, seed) in itertools.product(range(20), enumerate((3, 4))):
-        state, reward, *_ = worlds[index].step(random_actions(seed, 20)[step])
-        rows[index].append(np.append(state, reward))
-    np.testing.assert_array_equal(np.array(rows), np.array(expected))
-
-
 @pytest.mark.parametrize("task", ["push", "hammer", "faucet_close"])
 def test_a_copy_of_a_world_goes_on_as_the_world_does_and_leaves_it_alone(task: str) -> None:
     world, expected = World(), rollout(World(), task, seed=2)
@@ -186,30 +173,6 @@ def test_nothing_moves_in_the_first_state_and_things_stand_elsewhere_each_time(t
 def test_the_expert_does_its_task(task: Task) -> None:
     # the least that an expert reaches on 100 episodes is 0.9
     assert sum(expert_succeeds(task, seed) for seed in range(100, 103)) >= 2
-
-
-@pytest.mark.parametrize(
-    ("action", "message"),
-    [
-        (np.zeros(3), r"has shape \(4,\), not \(3,\)"),
-        (np.zeros((1, 4)), r"has shape \(4,\), not \(1, 4\)"),
-        (np.array([0.0, np.nan, 0.0, 0.0]), "finite"),
-        (np.array([0.0, 0.0, np.inf, 0.0]), "finite"),
-    ],
-)
-def test_an_action_that_cannot_be_done_is_an_error(action: NDArray[np.float64], message: str) -> None:
-    world = World()
-    world.reset(seed=0)
-    with pytest.raises(ValueError, match=message):
-        world.step(action)
-
-
-def test_actions_beyond_the_bounds_are_cut() -> None:
-    world = World()
-    world.reset(seed=0)
-    far = world.step(np.array([9.0, -9.0, 9.0, 9.0]))[0]
-    world.reset(seed=0)
-    np.testing.assert_array_equal(world.step(np.array([1.0, -1.0, 1.0, 1.0]))[0], far)
 
 
 @pytest.mark.parametrize(

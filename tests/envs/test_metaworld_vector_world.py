@@ -3,7 +3,6 @@
 import itertools
 from typing import Any
 
-import gymnasium
 import mujoco
 import numpy as np
 import pytest
@@ -151,26 +150,6 @@ def test_a_lane_that_begins_another_task_leaves_its_place_to_others() -> None:
     expected = [world.reset([0], [seed], [task])[0] for task, seed in (("push", 1), ("drawer_open", 2))]
     again = world.reset([1, 0], [1, 2], ["push", "drawer_open"])
     np.testing.assert_array_equal(again, expected)
-
-
-def test_an_action_that_cannot_be_done_is_an_error_that_names_it() -> None:
-    world = metaworld(lanes=2)
-    world.reset([0, 1], [0, 1], ["push", "push"])
-    actions = np.zeros((2, 4), np.float32)
-    actions[1, 2] = np.nan
-    with pytest.raises(ValueError, match=r"is finite, not \[0.0, 0.0, nan, 0.0\]"):
-        world.step([0, 1], actions)
-    with pytest.raises(ValueError, match=r"has shape \(4,\), not \(3,\)"):
-        world.step([0, 1], np.zeros((2, 3), np.float32))
-
-
-def test_a_lane_without_an_episode_and_an_unknown_task_are_named() -> None:
-    world = metaworld(lanes=2)
-    world.reset([0], [0], ["push"])
-    with pytest.raises(gymnasium.error.ResetNeeded, match="Lane 1 of the Meta-World world has no episode"):
-        world.step([0, 1], np.zeros((2, 4), np.float32))
-    with pytest.raises(LookupError, match="Did you mean 'push_back'"):
-        world.reset([1], [0], ["push_bak"])
 
 
 @pytest.mark.parametrize("name", ["drawer_open", "faucet_close", "push_back"])

@@ -214,37 +214,6 @@ def test_who_passes_through_the_room_without_a_stop_has_not_succeeded() -> None:
 
 
 @pytest.mark.parametrize(
-    ("action", "message"),
-    [
-        (np.zeros(3), r"has shape \(2,\), not \(3,\)"),
-        (np.zeros((1, 2)), r"has shape \(2,\), not \(1, 2\)"),
-        (np.array([0.0, np.nan]), r"finite, not \[0.0, nan\]"),
-        (np.array([np.inf, 0.0]), "finite"),
-    ],
-)
-def test_an_action_that_cannot_be_done_is_an_error(action: NDArray[np.float64], message: str) -> None:
-    world = World()
-    world.reset(seed=0)
-    with pytest.raises(ValueError, match=message):
-        world.step(action)
-
-
-def test_actions_beyond_the_bounds_are_cut() -> None:
-    world = World()
-    world.reset(seed=0)
-    far = world.step(np.array([9.0, -9.0]))[0]
-    world.reset(seed=0)
-    np.testing.assert_array_equal(world.step(np.array([1.0, -1.0]))[0], far)
-
-
-def test_a_lane_without_an_episode_is_named() -> None:
-    world = World.vector_world(lanes=2)
-    world.reset([0], [0], ["red_left"])
-    with pytest.raises(gymnasium.error.ResetNeeded, match="Lane 1 of the PointMaze world has no episode"):
-        world.step([0, 1], np.zeros((2, 2), np.float32))
-
-
-@pytest.mark.parametrize(
     ("kind", "expected", "seen"),
     [
         ("side", "left", state(x=-1.0)),
