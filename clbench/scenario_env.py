@@ -10,6 +10,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from clbench.observer import Observer
 from clbench.task import Scenario, Task, resolve
 from clbench.walk import InstructionFormat, Start, Walk
 from clbench.world import World
@@ -26,7 +27,8 @@ class ScenarioEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
     and `reset(options={"task": name})` chooses any task for one episode.
 
     Observation: a dictionary of `state`, float32 (S,), as the task's world gives it, and `instruction`, text,
-    or with `instruction="tokens"` the word ids, int64 (L,), for agents that want numbers.
+    or with `instruction="tokens"` the word ids, int64 (L,), for agents that want numbers. Where the task has
+    a camera, `state` is what it leaves of the numbers, and `image`, uint8 (N, N, 3), what it sees.
     Reward: the task's dense reward. An episode is terminated by success and truncated at the task's horizon.
     Info: `task`, `stage`, `instruction`, `success`.
 
@@ -50,18 +52,21 @@ class ScenarioEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         self.render_mode = render_mode
         self._walk = Walk(self.scenario, episodes_per_stage, instruction)
         self._worlds: dict[str, World] = {}
+        self._observers: dict[str, Observer] = {}
         self._begun: Start | None = None
         self._steps = 0
-        world = self._world(self.scenario.retained[0])
+        task = self.scenario.retained[0]
+        world = self._world(task)
+        assert isinstance(world.observation_space, spaces.Box)
         self.action_space = world.action_space
-        self.observation_space = spaces.Dict(
-            {"state": world.observation_space, "instruction": self._walk.instruction_space}
-        )
+        shown = self._observers[task.world].spaces(world.observation_space)
+        self.observation_space = spaces.Dict({**shown, "instruction": self._walk.instruction_space})
 
     def _world(self, task: Task) -> World:
         """Return the world of a task; each is made when first needed."""
         if task.world not in self._worlds:
             self._worlds[task.world] = resolve(task.world)(render_mode=self.render_mode)
+            self._observers[task.world] = Observer(task.world, task.camera)
         return self._worlds[task.world]
 
     def reset(
@@ -96,7 +101,9 @@ class ScenarioEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         return self._observation(state), float(reward), terminated, truncated, self._start.info(terminated)
 
     def _observation(self, state: NDArray[np.float32]) -> Observation:
-        return {"state": state, "instruction": copy(self._start.observed_instruction)}
+        shown, images = self._observers[self._start.task.world].observe(state[None])
+        image = {"image": images[0]} if images.size else {}
+        return {"state": shown[0], **image, "instruction": copy(self._start.observed_instruction)}
 
     def render(self) -> Any:
         """Return what the current world renders."""
@@ -106,4 +113,7 @@ class ScenarioEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         """Close all worlds."""
         for world in self._worlds.values():
             world.close()
+        for observer in self._observers.values():
+            observer.close()
         self._worlds.clear()
+        self._observers.clear()

@@ -50,6 +50,9 @@ class Task:
     expert: str
     """Entry point of a callable that takes the task's name and returns a callable (S,) -> (A,): the
     expert's action in a state. It must not remember earlier states: it also labels perturbed episodes."""
+    camera: str | None = None
+    """Entry point of the `clbench.camera.Camera` that a policy sees the world through, as the states hold
+    more than it may know; if None, it is shown the states."""
     version: int = 0
     """Raised whenever the task, its expert or its demonstrations change."""
 

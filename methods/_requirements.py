@@ -16,7 +16,7 @@ def require_hidden_states(policy: Policy, method: str) -> None:
     if not hasattr(policy, "hidden_states"):
         raise TypeError(
             f"{method} needs the hidden states of every backbone layer; {type(policy).__name__} has no "
-            "hidden_states(state, words) that returns them."
+            "hidden_states(state, words, image) that returns them."
         )
 
 
@@ -36,6 +36,7 @@ def require_loss_per_sample(policy: Policy, method: str) -> None:
         valid=torch.ones(chunks[:2]),
         draw=torch.full((2,), 0.5),
         noise=torch.zeros(chunks),
+        image=torch.zeros(2, config.image_size, config.image_size, 3, dtype=torch.uint8),
     )
     with torch.no_grad():
         shape = tuple(policy.action_loss(blank.to(device)).shape)
