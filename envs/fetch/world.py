@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, ClassVar
 
 import gymnasium
 import numpy as np
@@ -19,11 +19,11 @@ class FetchWorld(gymnasium.Env[State, NDArray[np.float32]]):
     """A `FetchVectorWorld` of one lane, which says what states, actions and rewards are."""
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 25}  # noqa: RUF012
-    vector_world = FetchVectorWorld
+    vector_world: ClassVar[type[FetchVectorWorld]] = FetchVectorWorld
 
     def __init__(self, render_mode: str | None = None) -> None:
         self.render_mode = render_mode
-        self._world = FetchVectorWorld(lanes=1)
+        self._world = self.vector_world(1)
         self.observation_space = self._world.single_observation_space
         self.action_space = self._world.single_action_space
         self._renderer: MujocoRenderer | None = None
