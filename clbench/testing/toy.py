@@ -11,7 +11,6 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from clbench.questions import QuestionKind
-from clbench.registration import register
 from clbench.task import Budget, Scenario, Task, unknown
 
 State = NDArray[np.float32]
@@ -122,5 +121,3 @@ TOY = Scenario(
         curve_episodes=3,
     ),
 )
-
-register(TOY.id, "clbench.testing:TOY")

@@ -6,6 +6,7 @@ import contextlib
 import functools
 import io
 from dataclasses import dataclass
+from pathlib import Path
 
 import mujoco
 import numpy as np
@@ -13,13 +14,14 @@ from numpy.typing import NDArray
 
 # Else each worker prints a notice about Adroit's hand, which is not used here.
 with contextlib.redirect_stderr(io.StringIO()):
+    import gymnasium_robotics
     from gymnasium_robotics.envs.fetch.pick_and_place import MujocoFetchPickAndPlaceEnv
     from gymnasium_robotics.utils.rotations import mat2euler
 
 CAMERA = {"distance": 1.2, "azimuth": 60.0, "elevation": -25.0, "lookat": np.array([1.3, 0.75, 0.56])}
 """From the robot's right, behind it: left is left, away goes right, and small pictures show the block."""
 
-__all__ = ["CAMERA", "Scene", "mat2euler", "scene"]
+__all__ = ["CAMERA", "Scene", "mat2euler", "scene", "scene_file"]
 
 
 @dataclass(frozen=True)
@@ -77,3 +79,8 @@ def scene() -> Scene:
         fingers_qvel=np.array([finger.dofadr[0] for finger in fingers]),
         actuators_qpos=model.jnt_qposadr[model.actuator_trnid[:, 0]].astype(np.int64),
     )
+
+
+def scene_file() -> Path:
+    """Return the file that the scene is compiled from."""
+    return Path(gymnasium_robotics.__file__).parent / "envs/assets/fetch/pick_and_place.xml"
