@@ -18,6 +18,7 @@ from torch import Tensor
 
 from clbench.cache import cached, package_of, source_hash
 from clbench.leaks import check_demonstrations
+from clbench.observer import observed
 from clbench.policy import Batch, PolicyConfig, encode
 from clbench.seeding import derive_seed, numpy_generator
 from clbench.task import Budget, Scenario, Task, resolve
@@ -216,7 +217,9 @@ class Demonstrations:
     """Demonstrations of one or more tasks as tensors: one row for each of N moments."""
 
     state: Tensor
-    """Observations, (N, S)."""
+    """What a policy is shown as numbers, (N, S)."""
+    image: Tensor
+    """What it is shown as a picture, uint8 (N, size, size, 3); the size is 0 if it sees none."""
     action: Tensor
     """The expert's next H actions, (N, H, A)."""
     valid: Tensor
@@ -228,12 +231,16 @@ class Demonstrations:
 
     @classmethod
     def of_task(cls, task: Task, episodes: Sequence[Demonstration], chunk: int) -> Demonstrations:
-        """Return the episodes of one task, cut into chunks of `chunk` actions."""
+        """Return the episodes of one task, cut into chunks of `chunk` actions.
+
+        Raises:
+            RenderingError: The task has a camera, and nothing here can draw.
+        """
         pieces = [_chunks(episode, chunk) for episode in episodes]
-        state, action, valid = (
-            torch.from_numpy(np.concatenate(column)) for column in zip(*pieces, strict=True)
-        )
-        return cls(state, action, valid, encode(task.instructions)[None], torch.tensor([[0, len(state)]]))
+        action, valid = (torch.from_numpy(np.concatenate(column)) for column in zip(*pieces, strict=True))
+        state, image = observed(task, np.concatenate([episode.state[:-1] for episode in episodes]))
+        rows = torch.tensor([[0, len(state)]])
+        return cls(state, image, action, valid, encode(task.instructions)[None], rows)
 
     @classmethod
     def cat(cls, parts: Sequence[Demonstrations]) -> Demonstrations:
@@ -242,10 +249,11 @@ class Demonstrations:
         words = [part.words[:, torch.arange(wordings) % part.words.shape[1]] for part in parts]
         starts = np.cumsum([0, *(len(part.state) for part in parts)])
         rows = [part.rows + torch.tensor([int(start), 0]) for part, start in zip(parts, starts, strict=False)]
-        state, action, valid = (
-            torch.cat([getattr(part, name) for part in parts]) for name in ("state", "action", "valid")
+        state, image, action, valid = (
+            torch.cat([getattr(part, name) for part in parts])
+            for name in ("state", "image", "action", "valid")
         )
-        return cls(state, action, valid, torch.cat(words), torch.cat(rows))
+        return cls(state, image, action, valid, torch.cat(words), torch.cat(rows))
 
     def __len__(self) -> int:
         """Return the number of moments."""
@@ -270,13 +278,12 @@ class Demonstrations:
             self.valid[row],
             torch.rand(count, generator=generator),
             torch.randn(action.shape, generator=generator),
+            self.image[row],
         )
 
 
-def _chunks(
-    episode: Demonstration, chunk: int
-) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
-    """Return states (T, S), chunks (T, chunk, A) and which of their steps count (T, chunk)."""
+def _chunks(episode: Demonstration, chunk: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return chunks (T, chunk, A) and which of their steps count (T, chunk)."""
     steps = len(episode.executed)
     index = np.arange(steps)[:, None] + np.arange(chunk)
     inside = index < steps
@@ -284,7 +291,7 @@ def _chunks(
     # what follows a disturbance answers a state that the chunk's own actions would not have led to
     earlier = np.cumsum(episode.disturbed[index], axis=1) - episode.disturbed[index]
     valid = (inside & (earlier == 0)).astype(np.float32)
-    return episode.state[:-1], episode.expert[index], valid
+    return episode.expert[index], valid
 
 
 def load_demonstrations(task: Task, scenario: Scenario, config: PolicyConfig) -> Demonstrations:

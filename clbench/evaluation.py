@@ -172,12 +172,14 @@ class Evaluator:
         state = torch.zeros(LANES, config.state_size)
         words = torch.ones(LANES, len(live[0].words), dtype=torch.int64)
         noise = torch.zeros(LANES, config.chunk, config.action_size)
+        image = torch.zeros(LANES, config.image_size, config.image_size, 3, dtype=torch.uint8)
         for row, lane in enumerate(live):
-            state[row] = torch.from_numpy(lane.state)
             words[row] = lane.words
             noise[row] = lane.noise[lane.length // config.executed]
+        shown = self._lanes.observe([lane.trial[0] for lane in live], np.stack([lane.state for lane in live]))
+        state[: len(live)], image[: len(live)] = map(torch.from_numpy, shown)
         device = policy.state_mean.device
-        chunks = policy.act(state.to(device), words.to(device), noise.to(device))
+        chunks = policy.act(state.to(device), words.to(device), noise.to(device), image.to(device))
         actions: NDArray[np.float32] = chunks[: len(live), : config.executed].cpu().numpy()
         # a diverged policy acts in NaN: it stands still and fails rather than stop the run
         return np.nan_to_num(actions).clip(-1.0, 1.0)
@@ -228,7 +230,8 @@ def answer(
         padding = LANES - len(questions.state[rows])
         state = torch.nn.functional.pad(questions.state[rows], (0, 0, 0, padding))
         words = torch.nn.functional.pad(questions.words[rows], (0, 0, 0, padding), value=1)
-        word = policy.answer_logits(state.to(device), words.to(device)).argmax(dim=1).cpu()
+        image = torch.nn.functional.pad(questions.image[rows], (0, 0, 0, 0, 0, 0, 0, padding))
+        word = policy.answer_logits(state.to(device), words.to(device), image.to(device)).argmax(dim=1).cpu()
         right.append(word[: LANES - padding] == questions.answer[rows])
     correct = torch.cat(right)
     return [

@@ -13,7 +13,8 @@ from typing import Any
 import gymnasium
 import numpy as np
 
-from clbench.task import Scenario, resolve
+from clbench.observer import frame_hash
+from clbench.task import Scenario, Task, resolve
 
 PACKAGES = (
     "clbench",
@@ -51,17 +52,22 @@ def rollout_hash(world: str, task: str) -> str:
 
 
 def fingerprint(scenario: Scenario) -> dict[str, Any]:
-    """Return versions, commit, hardware and the rollout hash of every world of the scenario."""
+    """Return versions, commit, hardware and the hashes of every world of the scenario.
+
+    Beside the rollout of a world stands, under the name of the camera if there is one, the hash of a picture.
+    """
     packages = {*PACKAGES, *(package for task in scenario.tasks for package in task.packages)}
-    worlds: dict[str, str] = {}
+    worlds: dict[str, Task] = {}
     for task in scenario.tasks:
-        worlds.setdefault(task.world, task.name)
+        worlds.setdefault(task.world, task)
+    rollouts = {world: rollout_hash(world, task.name) for world, task in worlds.items()}
+    frames = {task.camera: frame_hash(task) for task in worlds.values() if task.camera is not None}
     return {
         "versions": {package: version(package) for package in sorted(packages)},
         "python": platform.python_version(),
         "commit": _commit(),
         "hardware": {"machine": platform.machine(), "system": platform.system(), "processor": _processor()},
-        "rollouts": {world: rollout_hash(world, task) for world, task in worlds.items()},
+        "rollouts": {**rollouts, **frames},
     }
 
 

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from clbench.cache import cache_folder, cached, hash_of, is_cached, package_of, source_hash
 from clbench.demonstrations import Demonstrations, load_demonstrations, simulator_versions
+from clbench.observer import Observer, frame_hash
 from clbench.policy import Policy, PolicyConfig, load_policy, save_policy
 from clbench.questions import load_questions
 from clbench.seeding import derive_seed, torch_generator
@@ -36,13 +37,17 @@ def pretraining_inputs(scenario: Scenario, seed: int) -> dict[str, Any]:
     suites = {package_of(name) for task in tasks for name in (task.world, task.expert)}
     suites.add(package_of(scenario.questions))
     budget = dataclasses.asdict(scenario.budget)
-    parts = ("policy", "demonstrations", "questions", "seeding", "training", "world")
+    parts = (
+        *("policy", "demonstrations", "questions", "camera", "observer", "drawing"),
+        *("seeding", "training", "world"),
+    )
     core = (*(f"clbench.{part}" for part in parts), __name__)
     return {
         "retained": [dataclasses.asdict(task) for task in scenario.retained],
         "scenes": [dataclasses.asdict(task) for task in scenario.scenes],
         "budget": {name: value for name, value in budget.items() if name not in AFTER_PRETRAINING},
         "seed": seed,
+        "frame": frame_hash(scenario.scene_tasks[0]),
         "source": source_hash(*core, *sorted(suites)),
         "versions": {
             **simulator_versions(tasks),
@@ -88,10 +93,13 @@ def pretrained_policy(
 
 def policy_config(scenario: Scenario) -> PolicyConfig:
     """Return the sizes of a policy for the scenario's worlds."""
-    world = resolve(scenario.tasks[0].world)()
+    first = scenario.tasks[0]
+    world = resolve(first.world)()
+    observer = Observer(first.world, first.camera)
     config = PolicyConfig(
-        state_size=world.observation_space.shape[0],
+        state_size=observer.spaces(world.observation_space)["state"].shape[0],
         action_size=world.action_space.shape[0],
+        image_size=observer.image_size,
         width=scenario.budget.policy_width,
         layers=scenario.budget.policy_layers,
     )
@@ -108,7 +116,7 @@ def _pretrain(scenario: Scenario, seed: int, progress: Callable[[float], None]) 
     if demonstrations is not None:
         policy.normalise_like(demonstrations.state, demonstrations.action[:, 0])
     else:
-        policy.normalise_like(questions.scenes)
+        policy.normalise_like(questions.state)
     generator = torch_generator("pretraining", seed)
 
     def loss_at(step: int) -> Tensor:

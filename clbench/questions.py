@@ -19,6 +19,7 @@ from torch import Tensor
 from clbench.cache import cache_folder, cached, hash_of, package_of, source_hash
 from clbench.demonstrations import demonstrate, simulator_versions
 from clbench.leaks import check_questions
+from clbench.observer import observed
 from clbench.policy import QuestionBatch, encode, word_id
 from clbench.seeding import derive_seed, torch_generator
 from clbench.task import Scenario, resolve
@@ -92,14 +93,18 @@ class Questions:
     Args:
         kinds: What is asked.
         scenes: States (N, S) to ask about.
+        shown: What a policy is shown of them: numbers (N, P) and pictures. The states themselves if None.
 
     Raises:
         ValueError: A kind has an answer that no state gives.
     """
 
-    def __init__(self, kinds: tuple[QuestionKind, ...], scenes: Tensor) -> None:
+    def __init__(
+        self, kinds: tuple[QuestionKind, ...], scenes: Tensor, shown: tuple[Tensor, Tensor] | None = None
+    ) -> None:
         self.kinds = kinds
         self.scenes = scenes
+        self.state, self.image = shown or (scenes, torch.zeros(len(scenes), 0, 0, 3, dtype=torch.uint8))
         wordings = max(len(kind.wordings) for kind in kinds)
         self._words = torch.stack(
             [encode([kind.wordings[i % len(kind.wordings)] for i in range(wordings)]) for kind in kinds]
@@ -128,7 +133,7 @@ class Questions:
     @property
     def bytes(self) -> int:
         """Memory that the states and the lists of questions take."""
-        return self.scenes.nbytes + self._rows.nbytes + self._words.nbytes
+        return self.state.nbytes + self.image.nbytes + self._rows.nbytes + self._words.nbytes
 
     def sample(self, count: int, generator: torch.Generator) -> QuestionBatch:
         """Return `count` questions: a kind at random, then one of its answers, a state and a wording."""
@@ -140,15 +145,25 @@ class Questions:
         cell = self._first_cell[kind] + (draws[0] * self._answers[kind]).long()
         row = self._rows[self._cell_starts[cell] + (draws[1] * self._cell_sizes[cell]).long()]
         wording = (draws[2] * self._words.shape[1]).long()
-        return QuestionBatch(self.scenes[row], self._words[kind, wording], self._answer_ids[cell])
+        words, answers = self._words[kind, wording], self._answer_ids[cell]
+        return QuestionBatch(self.state[row], words, answers, self.image[row])
 
 
 def load_questions(scenario: Scenario) -> tuple[Questions, Questions]:
-    """Return the training and the report questions of a scenario."""
+    """Return the training and the report questions of a scenario.
+
+    Raises:
+        RenderingError: It has a camera, and nothing here can draw.
+    """
     check_questions()
     kinds = resolve(scenario.questions)
     scenes = load_file(scenes_folder(scenario) / "scenes.safetensors")
-    return Questions(kinds, scenes["train"]), Questions(kinds, scenes["report"])
+    first = scenario.scene_tasks[0]
+    train, report = (
+        Questions(kinds, scenes[split], observed(first, scenes[split].numpy()))
+        for split in ("train", "report")
+    )
+    return train, report
 
 
 def report_questions(questions: Questions, count: int) -> tuple[Tensor, QuestionBatch]:

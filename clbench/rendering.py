@@ -56,7 +56,7 @@ def rendering_fault(back_end: str, world: str | None = None) -> str | None:
 def choose_back_end(worlds: Iterable[str]) -> str:
     """Set `MUJOCO_GL` to the first back end that draws all worlds, EGL or OSMesa, and return it.
 
-    It must happen before MuJoCo is imported. Whoever has set the variable is obeyed.
+    It must happen before MuJoCo is imported.
 
     Args:
         worlds: Entry points of environments.
@@ -64,12 +64,25 @@ def choose_back_end(worlds: Iterable[str]) -> str:
     Raises:
         RenderingError: None of them does; the message says what to install.
     """
-    chosen = os.environ.get("MUJOCO_GL")
+    back_end = working_back_end(worlds, os.environ.get("MUJOCO_GL"))
+    os.environ["MUJOCO_GL"] = back_end
+    return back_end
+
+
+def working_back_end(worlds: Iterable[str], chosen: str | None) -> str:
+    """Return the first back end that draws all worlds, EGL or OSMesa.
+
+    Args:
+        worlds: Entry points of environments.
+        chosen: What the user has set `MUJOCO_GL` to, if he has: it is obeyed.
+
+    Raises:
+        RenderingError: None of them does; the message says what to install.
+    """
     faults = []
     for back_end in (chosen,) if chosen else _BACK_ENDS:
         found = [fault for world in sorted(set(worlds)) if (fault := rendering_fault(back_end, world))]
         if not found:
-            os.environ["MUJOCO_GL"] = back_end
             return back_end
         faults.append(f"{back_end} ({found[0]})")
     message = f"The worlds cannot be drawn with {' or '.join(faults)}."

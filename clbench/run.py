@@ -420,7 +420,7 @@ class _Run:
     def _activations(self) -> Gaussian:
         """Return where the hidden states of the scored questions lie."""
         questions = self.asked[1].to(self.spec.device)
-        hidden = self.learner.policy.hidden_states(questions.state, questions.words)
+        hidden = self.learner.policy.hidden_states(questions.state, questions.words, questions.image)
         return Gaussian.of(hidden, self.learner.policy.backbone.mask(questions.words))
 
     @torch.no_grad()

@@ -11,6 +11,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from clbench.observer import Observer
 from clbench.task import Scenario, Task, opened_scenario, resolve
 from clbench.walk import InstructionFormat, Start, Walk
 from clbench.world import World
@@ -28,7 +29,8 @@ class ScenarioEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
     and `reset(options={"task": name})` chooses any task for one episode.
 
     Observation: a dictionary of `state`, float32 (S,), as the task's world gives it, and `instruction`, text,
-    or with `instruction="tokens"` the word ids, int64 (L,), for agents that want numbers.
+    or with `instruction="tokens"` the word ids, int64 (L,), for agents that want numbers. Where the task has
+    a camera, `state` is what it leaves of the numbers, and `image`, uint8 (N, N, 3), what it sees.
     Reward: the task's dense reward. An episode is terminated by success and truncated at the task's horizon.
     Info: `task`, `stage`, `instruction`, `success`.
 
@@ -65,18 +67,21 @@ class ScenarioEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         """When the first episode began, by `time.perf_counter`."""
         self._walk = Walk(self.scenario, episodes_per_stage, instruction, stage)
         self._worlds: dict[str, World] = {}
+        self._observers: dict[str, Observer] = {}
         self._begun: Start | None = None
         self._steps = 0
-        world = self._world(self.scenario.tasks[0])
+        task = self.scenario.tasks[0]
+        world = self._world(task)
+        assert isinstance(world.observation_space, spaces.Box)
         self.action_space = world.action_space
-        self.observation_space = spaces.Dict(
-            {"state": world.observation_space, "instruction": self._walk.instruction_space}
-        )
+        shown = self._observers[task.world].spaces(world.observation_space)
+        self.observation_space = spaces.Dict({**shown, "instruction": self._walk.instruction_space})
 
     def _world(self, task: Task) -> World:
         """Return the world of a task; each is made when first needed."""
         if task.world not in self._worlds:
             self._worlds[task.world] = resolve(task.world)(render_mode=self.render_mode)
+            self._observers[task.world] = Observer(task.world, task.camera)
         return self._worlds[task.world]
 
     def reset(
@@ -113,7 +118,9 @@ class ScenarioEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         return self._observation(state), float(reward), terminated, truncated, self._start.info(terminated)
 
     def _observation(self, state: NDArray[np.float32]) -> Observation:
-        return {"state": state, "instruction": copy(self._start.observed_instruction)}
+        shown, images = self._observers[self._start.task.world].observe(state[None])
+        image = {"image": images[0]} if images.size else {}
+        return {"state": shown[0], **image, "instruction": copy(self._start.observed_instruction)}
 
     def render(self) -> Any:
         """Return what the current world renders."""
@@ -123,4 +130,7 @@ class ScenarioEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         """Close all worlds."""
         for world in self._worlds.values():
             world.close()
+        for observer in self._observers.values():
+            observer.close()
         self._worlds.clear()
+        self._observers.clear()

@@ -66,10 +66,12 @@ class ScenarioVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]
         self._walks = [Walk(self.scenario, episodes_per_stage, instruction, stage) for _ in range(num_envs)]
         self._generators: list[np.random.Generator] = [np_random()[0] for _ in range(num_envs)]
         self._lanes = Lanes(num_envs, threads or os.cpu_count() or 1)
-        world = self._lanes.world(self.scenario.tasks[0])
+        first = self.scenario.tasks[0]
+        world = self._lanes.world(first)
+        shown = self._lanes.observer(first).spaces(world.single_observation_space)
         self.single_action_space = world.single_action_space
         self.single_observation_space = spaces.Dict(
-            {"state": world.single_observation_space, "instruction": self._walks[0].instruction_space}
+            {**shown, "instruction": self._walks[0].instruction_space}
         )
         self.action_space = batch_space(self.single_action_space, num_envs)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
@@ -149,7 +151,9 @@ class ScenarioVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]
     def _observation(self) -> Observation:
         instructions = [start.observed_instruction for start in self._starts]
         observed = tuple(instructions) if isinstance(instructions[0], str) else np.stack(instructions)
-        return {"state": self._states.copy(), "instruction": observed}
+        state, image = self._lanes.observe([start.task for start in self._starts], self._states)
+        images = {"image": image} if image.size else {}
+        return {"state": state.copy(), **images, "instruction": observed}
 
     def _info(self, successes: Flags) -> dict[str, Any]:
         """Return the infos as Gymnasium's vector environments do: a column of each, and where it is known."""

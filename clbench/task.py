@@ -81,6 +81,9 @@ class Task:
     expert: str
     """Entry point of a callable that takes the task's name and returns a callable (S,) -> (A,): the
     expert's action in a state. It must not remember earlier states: it also labels perturbed episodes."""
+    camera: str | None = None
+    """Entry point of the `clbench.camera.Camera` that a policy sees the world through, as the states hold
+    more than it may know; if None, it is shown the states."""
     version: int = 0
     """Raised whenever the task, its expert or its demonstrations change."""
     disturbance: float = 0.1
@@ -190,6 +193,9 @@ class Scenario:
         for name in names:
             if names.count(name) > 1:
                 raise ValueError(f"{self.id}: two tasks are called {name!r}.")
+        cameras = {task.camera or "none" for task in self.tasks + self.scenes}
+        if len(cameras) > 1:
+            raise ValueError(f"{self.id}: all tasks must have the same camera, not {sorted(cameras)}.")
 
     @cached_property
     def tasks(self) -> tuple[Task, ...]:

@@ -13,6 +13,8 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from clbench.camera import Images
+from clbench.observer import Observer
 from clbench.task import Task, resolve
 
 World = gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]
@@ -251,6 +253,7 @@ class Lanes:
     def __init__(self, count: int, threads: int = 1) -> None:
         self._count, self._threads = count, threads
         self._worlds: dict[tuple[str, bool], VectorWorld] = {}
+        self._observers: dict[tuple[str, str] | None, Observer] = {}
         self._home: list[VectorWorld | None] = [None] * count
 
     def world(self, task: Task, perturbed: bool = False) -> VectorWorld:
@@ -259,6 +262,26 @@ class Lanes:
         if key not in self._worlds:
             self._worlds[key] = vector_world(task.world, self._count, self._threads, perturbed)
         return self._worlds[key]
+
+    def observer(self, task: Task) -> Observer:
+        """Return what shows the states of a task to a policy; it is made when first needed."""
+        key = None if task.camera is None else (task.world, task.camera)
+        if key not in self._observers:
+            self._observers[key] = Observer(task.world, task.camera)
+        return self._observers[key]
+
+    def observe(self, tasks: Sequence[Task], states: States) -> tuple[States, Images]:
+        """Return what a policy is shown of states (N, S), one of each task: numbers (N, P) and pictures.
+
+        Raises:
+            RenderingError: Nothing here can draw a world.
+        """
+        observers = [self.observer(task) for task in tasks]
+        if all(observer is observers[0] for observer in observers):
+            return observers[0].observe(states)
+        shown = [observer.observe(state[None]) for observer, state in zip(observers, states, strict=True)]
+        numbers, images = zip(*shown, strict=True)
+        return np.concatenate(numbers), np.concatenate(images)
 
     def reset(
         self,
@@ -295,7 +318,10 @@ class Lanes:
         """Close all worlds."""
         for world in self._worlds.values():
             world.close()
+        for observer in self._observers.values():
+            observer.close()
         self._worlds.clear()
+        self._observers.clear()
         self._home = [None] * self._count
 
     def _empty(self, lanes: Sequence[int]) -> States:

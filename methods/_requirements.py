@@ -16,7 +16,7 @@ def require_hidden_states(policy: Policy, method: str) -> None:
     if not hasattr(policy, "hidden_states"):
         raise TypeError(
             f"{method} needs the hidden states of every backbone layer; {type(policy).__name__} has no "
-            "hidden_states(state, words) that returns them."
+            "hidden_states(state, words, image) that returns them."
         )
 
 
@@ -46,6 +46,7 @@ def blank_batch(policy: Policy, count: int) -> Batch:
         valid=torch.ones(chunks[:2]),
         draw=torch.full((count,), 0.5),
         noise=torch.zeros(chunks),
+        image=torch.zeros(count, config.image_size, config.image_size, 3, dtype=torch.uint8),
     )
     return blank.to(policy.state_mean.device)
 

@@ -60,7 +60,7 @@ class Aegis(Method):
         """Compute the anchor."""
         require_hidden_states(policy, "AEGIS")
         questions = prior.questions.sample(self.samples)
-        hidden = policy.hidden_states(questions.state, questions.words)
+        hidden = policy.hidden_states(questions.state, questions.words, questions.image)
         self.anchor = Gaussian.of(hidden, policy.backbone.mask(questions.words))
 
     def start_task(self, policy: Policy, stage: Stage) -> Iterable[nn.Parameter]:
@@ -72,7 +72,7 @@ class Aegis(Method):
 
     def loss(self, policy: Policy, batch: Batch, progress: Progress) -> Tensor:
         """Return the action loss; the distance of its hidden states to the anchor is kept for `gradients`."""
-        hidden = policy.hidden_states(batch.state, batch.words)
+        hidden = policy.hidden_states(batch.state, batch.words, batch.image)
         now = Gaussian.of(hidden, policy.backbone.mask(batch.words))
         self.distances.append(now.distance(self.anchor).mean())
         return policy.action_loss(batch, hidden).mean()

@@ -44,6 +44,6 @@ class KnowledgeInsulation(Method):
         """Return the answer loss, and the action loss whose gradient ends at the head."""
         demonstrations, questions = batch
         with torch.no_grad():
-            hidden = policy.hidden_states(demonstrations.state, demonstrations.words)
+            hidden = policy.hidden_states(demonstrations.state, demonstrations.words, demonstrations.image)
         action_loss = policy.action_loss(demonstrations, hidden)
         return policy.answer_loss(questions).mean() + self.alpha * action_loss.mean()

@@ -37,5 +37,5 @@ class StopGradient(Method):
     def loss(self, policy: Policy, batch: Batch, progress: Progress) -> Tensor:
         """Return the action loss on hidden states that have no graph."""
         with torch.no_grad():
-            hidden = policy.hidden_states(batch.state, batch.words)
+            hidden = policy.hidden_states(batch.state, batch.words, batch.image)
         return policy.action_loss(batch, hidden).mean()

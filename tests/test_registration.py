@@ -119,3 +119,9 @@ def test_a_task_that_cannot_be_is_refused_where_it_is_built(
 def test_two_tasks_of_one_name_are_refused_where_the_scenario_is_built() -> None:
     with pytest.raises(ValueError, match="me/Mine-v0: two tasks are called 'left'"):
         Scenario("me/Mine-v0", "", TOY.retained, TOY.target, TOY.retained[:1], TOY.questions)
+
+
+def test_tasks_that_are_seen_differently_are_refused_where_the_scenario_is_built() -> None:
+    seen = tuple(dataclasses.replace(task, camera="mine:Camera") for task in TOY.target)
+    with pytest.raises(ValueError, match=r"the same camera, not \['mine:Camera', 'none'\]"):
+        Scenario("me/Mine-v0", "", TOY.retained, seen, (), TOY.questions)

@@ -8,6 +8,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from clbench.policy.vision import Vision
+
 
 class Attention(nn.Module):
     """Multi-head attention; its queries read the memory, and themselves where they are part of it."""
@@ -50,15 +52,27 @@ class Layer(nn.Module):
 
 
 class Backbone(nn.Module):
-    """Reads [observation tokens; a readout token; word tokens], every token attending to every other."""
+    """Reads [observation tokens; a readout token; word tokens], every token attending to every other.
 
-    observation_tokens = 4
+    The observation is the state, in `state_tokens` tokens, and where there is an image its patches.
+    """
+
+    state_tokens = 4
 
     def __init__(
-        self, state_size: int, vocabulary_size: int, text_length: int, width: int, layers: int, heads: int
+        self,
+        state_size: int,
+        vocabulary_size: int,
+        text_length: int,
+        width: int,
+        layers: int,
+        heads: int,
+        image_size: int = 0,
     ):
         super().__init__()
-        self.observation = nn.Linear(state_size, self.observation_tokens * width)
+        self.vision = Vision(image_size, width) if image_size else None
+        self.observation_tokens = self.state_tokens + (0 if self.vision is None else self.vision.tokens)
+        self.observation = nn.Linear(state_size, self.state_tokens * width)
         self.words = nn.Embedding(vocabulary_size, width)
         self.readout = nn.Parameter(torch.zeros(1, 1, width))
         self.position = nn.Parameter(0.02 * torch.randn(1, self.observation_tokens + 1 + text_length, width))
@@ -71,11 +85,17 @@ class Backbone(nn.Module):
         always = torch.ones(len(words), self.observation_tokens + 1, dtype=torch.bool, device=words.device)
         return torch.cat([always, words != 0], dim=1)[:, None, None, :]
 
-    def forward(self, state: Tensor, words: Tensor) -> list[Tensor]:
-        """Map normalised states (B, S) and words (B, L) to the hidden state (B, P, W) of every layer."""
+    def forward(self, state: Tensor, words: Tensor, image: Tensor | None = None) -> list[Tensor]:
+        """Map normalised states (B, S), words (B, L) and images to the hidden state (B, P, W) of every layer.
+
+        Raises:
+            ValueError: There is no image (B, N, N, 3), uint8, of the size that the policy reads.
+        """
         batch = len(state)
-        observation = self.observation(state).view(batch, self.observation_tokens, -1)
-        tokens = torch.cat([observation, self.readout.expand(batch, -1, -1), self.words(words)], dim=1)
+        observation = [self.observation(state).view(batch, self.state_tokens, -1)]
+        if self.vision is not None:
+            observation.append(self.vision(image))
+        tokens = torch.cat([*observation, self.readout.expand(batch, -1, -1), self.words(words)], dim=1)
         tokens = tokens + self.position
         mask, hidden = self.mask(words), []
         for layer in self.layers:

@@ -14,9 +14,20 @@ from typing import Self
 import torch
 from torch import Tensor
 
+NO_IMAGE = torch.zeros(0, 0, 0, 3, dtype=torch.uint8)
+"""Stands for images of no pixel, (B, 0, 0, 3): what a batch has where the policy reads states alone."""
+
 
 class _Rows:
-    """Dataclass of tensors that share their first dimension."""
+    """Dataclass of tensors that share their first dimension; `state` and `image` are among them."""
+
+    state: Tensor
+    image: Tensor
+
+    def __post_init__(self) -> None:
+        if self.image is NO_IMAGE:
+            blank = NO_IMAGE.new_zeros((len(self.state), 0, 0, 3), device=self.state.device)
+            object.__setattr__(self, "image", blank)
 
     @classmethod
     def cat(cls, parts: Sequence[Self]) -> Self:
@@ -42,7 +53,7 @@ class Batch(_Rows):
     """Demonstrated action chunks, B samples of H actions."""
 
     state: Tensor
-    """Observations as the world gives them, (B, S)."""
+    """Observations as the world, or its camera, gives them, (B, S)."""
     words: Tensor
     """Word ids of the instructions, (B, L)."""
     action: Tensor
@@ -53,6 +64,8 @@ class Batch(_Rows):
     """Uniform draws in [0, 1) for the action head, (B,)."""
     noise: Tensor
     """Standard normal draws for the action head, (B, H, A)."""
+    image: Tensor = NO_IMAGE
+    """What the camera sees, uint8 (B, N, N, 3); N is 0 where the policy has no eyes."""
 
 
 @dataclass(frozen=True)
@@ -60,8 +73,10 @@ class QuestionBatch(_Rows):
     """Questions with their answers, B samples."""
 
     state: Tensor
-    """Observations as the world gives them, (B, S)."""
+    """Observations as the world, or its camera, gives them, (B, S)."""
     words: Tensor
     """Word ids of the questions, (B, L)."""
     answer: Tensor
     """Word id of the right answer, (B,)."""
+    image: Tensor = NO_IMAGE
+    """What the camera sees, uint8 (B, N, N, 3); N is 0 where the policy has no eyes."""

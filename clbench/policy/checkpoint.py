@@ -74,8 +74,9 @@ def _kinds(tensors: Mapping[str, Tensor]) -> dict[str, tuple[Any, ...]]:
 def _fault(config: PolicyConfig, tensors: Mapping[str, Tensor]) -> str | None:
     """Return why a policy of these sizes must not be built, or None: it may be larger than the memory is."""
     for name, size in dataclasses.asdict(config).items():
-        if type(size) is not int or not 0 < size <= LARGEST:
-            return f"{name} must be a whole number from 1 to {LARGEST:,}, not {size!r}"
+        least = 0 if name == "image_size" else 1
+        if type(size) is not int or not least <= size <= LARGEST:
+            return f"{name} must be a whole number from {least} to {LARGEST:,}, not {size!r}"
     if config.width % config.heads:
         return f"width {config.width} cannot be shared among {config.heads} heads"
     if config.layers > len(tensors):

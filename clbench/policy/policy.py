@@ -37,10 +37,14 @@ class PolicyConfig:
     """Integration steps of the flow."""
     vocabulary_size: int = VOCABULARY_SIZE
     """Words it can read and answer."""
+    image_size: int = 0
+    """Width and height of the image that it sees, in pixels; 0 if it sees none."""
 
 
 class Policy(nn.Module):
-    """A small vision-language-action model: state and words in, action chunks and answers out.
+    """A small vision-language-action model: state, image and words in, action chunks and answers out.
+
+    Where a policy sees images, each function that takes states also takes images, uint8 (B, N, N, 3).
 
     Args:
         config: Sizes.
@@ -64,6 +68,7 @@ class Policy(nn.Module):
                 config.width,
                 config.layers,
                 config.heads,
+                config.image_size,
             )
             self.head = FlowHead(
                 config.action_size,
@@ -86,43 +91,43 @@ class Policy(nn.Module):
             # at least 1e-2, a centimetre or a hundredth of the actions: what hardly varies stays small
             getattr(self, f"{name}_std").copy_(values.std(dim=0, correction=0).clamp(min=1e-2))
 
-    def hidden_states(self, state: Tensor, words: Tensor) -> list[Tensor]:
+    def hidden_states(self, state: Tensor, words: Tensor, image: Tensor | None = None) -> list[Tensor]:
         """Return the hidden state (B, P, W) of every backbone layer, of states (B, S), words (B, L)."""
         normalised = ((state - self.state_mean) / self.state_std).clamp(-10, 10)
-        return cast(list[Tensor], self.backbone(normalised, words))
+        return cast(list[Tensor], self.backbone(normalised, words, image))
 
     def action_loss(self, batch: Batch, hidden: list[Tensor] | None = None) -> Tensor:
         """Return the head's loss of each sample, (B,).
 
         Args:
             batch: What to learn.
-            hidden: Hidden states to use instead of `hidden_states(batch.state, batch.words)`: detached ones
-                stop the gradient at the backbone.
+            hidden: Hidden states to use instead of `hidden_states(batch.state, batch.words, batch.image)`:
+                detached ones stop the gradient at the backbone.
         """
-        hidden = self.hidden_states(batch.state, batch.words) if hidden is None else hidden
+        hidden = self.hidden_states(batch.state, batch.words, batch.image) if hidden is None else hidden
         action = (batch.action - self.action_mean) / self.action_std
         mask = self.backbone.mask(batch.words)
         return self.head.loss(action, batch.valid, batch.draw, batch.noise, hidden, mask)
 
     def predict(self, batch: Batch) -> Tensor:
         """Return what the head predicts for the batch's noisy chunks, (B, H, A): how two policies compare."""
-        hidden = self.hidden_states(batch.state, batch.words)
+        hidden = self.hidden_states(batch.state, batch.words, batch.image)
         action = (batch.action - self.action_mean) / self.action_std
         mask = self.backbone.mask(batch.words)
         return self.head.predict(action, batch.draw, batch.noise, hidden, mask)
 
-    def answer_logits(self, state: Tensor, words: Tensor) -> Tensor:
+    def answer_logits(self, state: Tensor, words: Tensor, image: Tensor | None = None) -> Tensor:
         """Return the logits (B, V) of the word that answers the question `words` about `state`."""
-        return self.backbone.answer_logits(self.hidden_states(state, words)[-1])
+        return self.backbone.answer_logits(self.hidden_states(state, words, image)[-1])
 
     def answer_loss(self, questions: QuestionBatch) -> Tensor:
         """Return the cross-entropy of each right answer, (B,)."""
-        logits = self.answer_logits(questions.state, questions.words)
+        logits = self.answer_logits(questions.state, questions.words, questions.image)
         return F.cross_entropy(logits, questions.answer, reduction="none")
 
     @torch.inference_mode()
-    def act(self, state: Tensor, words: Tensor, noise: Tensor) -> Tensor:
+    def act(self, state: Tensor, words: Tensor, noise: Tensor, image: Tensor | None = None) -> Tensor:
         """Return the action chunk (B, H, A) for states (B, S) and words (B, L), from noise (B, H, A)."""
-        hidden = self.hidden_states(state, words)
+        hidden = self.hidden_states(state, words, image)
         chunk = self.head.sample(noise, hidden, self.backbone.mask(words))
         return chunk * self.action_std + self.action_mean

@@ -3,10 +3,30 @@
 Import this package to register the toy as `clbench/Toy-v0`, or ask for "clbench.testing:clbench/Toy-v0".
 """
 
-from clbench.testing.contract import Check, check_method, method_checks
-from clbench.testing.error import ContractError
-from clbench.testing.scenario import ScenarioError, check_scenario
-from clbench.testing.toy import TOY, TOY_QUESTIONS, ToyWorld, toy_expert
+import importlib
+from typing import TYPE_CHECKING, Any
+
+from clbench.registration import register
+
+if TYPE_CHECKING:
+    from clbench.testing.contract import Check as Check
+    from clbench.testing.contract import check_method as check_method
+    from clbench.testing.contract import method_checks as method_checks
+    from clbench.testing.error import ContractError as ContractError
+    from clbench.testing.scenario import ScenarioError as ScenarioError
+    from clbench.testing.scenario import check_scenario as check_scenario
+    from clbench.testing.toy import TOY as TOY
+    from clbench.testing.toy import TOY_QUESTIONS as TOY_QUESTIONS
+    from clbench.testing.toy import ToyWorld as ToyWorld
+    from clbench.testing.toy import toy_expert as toy_expert
+
+_HOMES = {
+    "contract": ("Check", "check_method", "method_checks"),
+    "error": ("ContractError",),
+    "scenario": ("ScenarioError", "check_scenario"),
+    "toy": ("TOY", "TOY_QUESTIONS", "ToyWorld", "toy_expert"),
+}
+"""In which module each name lives. It is imported when first used: a process that draws needs no PyTorch."""
 
 __all__ = [
     "TOY",
@@ -20,3 +40,17 @@ __all__ = [
     "method_checks",
     "toy_expert",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    for module, names in _HOMES.items():
+        if name in names:
+            return getattr(importlib.import_module(f"{__name__}.{module}"), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})
+
+
+register("clbench/Toy-v0", "clbench.testing:TOY")

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from clbench.perturbation import draw_perturbation
 from clbench.questions import QuestionKind
-from clbench.registration import register
 from clbench.task import Budget, Scenario, Task, unknown
 
 State = NDArray[np.float32]
@@ -131,5 +130,3 @@ TOY = Scenario(
         curve_episodes=3,
     ),
 )
-
-register(TOY.id, "clbench.testing:TOY")

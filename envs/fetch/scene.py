@@ -6,6 +6,7 @@ import contextlib
 import functools
 import io
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import mujoco
 import numpy as np
@@ -15,13 +16,14 @@ from clbench.perturbation import with_mass
 
 # Else each worker prints a notice about Adroit's hand, which is not used here.
 with contextlib.redirect_stderr(io.StringIO()):
+    import gymnasium_robotics
     from gymnasium_robotics.envs.fetch.pick_and_place import MujocoFetchPickAndPlaceEnv
     from gymnasium_robotics.utils.rotations import mat2euler
 
 CAMERA = {"distance": 1.2, "azimuth": 60.0, "elevation": -25.0, "lookat": np.array([1.3, 0.75, 0.56])}
 """From the robot's right, behind it: left is left, away goes right, and small pictures show the block."""
 
-__all__ = ["CAMERA", "Scene", "mat2euler", "scene", "scene_with_mass"]
+__all__ = ["CAMERA", "Scene", "mat2euler", "scene", "scene_file", "scene_with_mass"]
 
 
 @dataclass(frozen=True)
@@ -86,3 +88,8 @@ def scene_with_mass(mass: float) -> Scene:
     """Return the scene with a block that is `mass` times as heavy; all perturbed worlds share it."""
     model = scene().model
     return replace(scene(), model=with_mass(model, [int(model.body("object0").id)], mass))
+
+
+def scene_file() -> Path:
+    """Return the file that the scene is compiled from."""
+    return Path(gymnasium_robotics.__file__).parent / "envs/assets/fetch/pick_and_place.xml"

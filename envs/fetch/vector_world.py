@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import gymnasium
@@ -96,13 +96,16 @@ class FetchVectorWorld:
         threads: Threads that advance the physics; MuJoCo releases the interpreter lock. Results do not depend
             on it.
         perturbed: Whether the block is heavier or lighter, and the gripper starts elsewhere.
+        rules: What each task asks for, by name.
     """
 
-    def __init__(self, lanes: int, threads: int = 1, perturbed: bool = False) -> None:
+    def __init__(
+        self, lanes: int, threads: int = 1, perturbed: bool = False, rules: Mapping[str, Rule] = RULES
+    ) -> None:
         self.single_observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (SIZE,), np.float32)
         self.single_action_space = gymnasium.spaces.Box(-1.0, 1.0, (4,), np.float32)
         self._scene = scene()
-        self._perturbed = perturbed
+        self._perturbed, self._rules = perturbed, rules
         self._lanes: list[_Lane | None] = [None] * lanes
         self._team = Team(threads)
         # of the gripper's and the block's place, and of the block's rotation
@@ -118,13 +121,13 @@ class FetchVectorWorld:
             LookupError: No task has this name; the nearest one is named.
         """
         for number, seed, task in zip(lanes, seeds, tasks, strict=True):
-            if task not in RULES:
-                raise unknown("task of the Fetch world", task, RULES)
+            if task not in self._rules:
+                raise unknown("task of the Fetch world", task, self._rules)
             perturbation = draw_perturbation(seed) if self._perturbed else None
             lane = self._lane_of(number, scene_with_mass(perturbation.mass) if perturbation else self._scene)
             generator, _ = np_random(seed)
             block = self._place_block(generator)
-            lane.rule = RULES[task]
+            lane.rule = self._rules[task]
             lane.target = self._place_target(block, lane.rule, generator)
             self._reset_physics(lane, block)
             if perturbation:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 import numpy as np
 from gymnasium.envs.mujoco.mujoco_rendering import MujocoRenderer
 from numpy.typing import NDArray
@@ -17,7 +19,7 @@ class FetchWorld(OneLaneWorld):
     """A `FetchVectorWorld` of one lane, which says what states, actions and rewards are."""
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 25}  # noqa: RUF012
-    vector_world = FetchVectorWorld
+    vector_world: ClassVar[type[FetchVectorWorld]] = FetchVectorWorld
     first_task = next(iter(RULES))
 
     def __init__(self, render_mode: str | None = None) -> None:

@@ -20,6 +20,7 @@ from clbench.policy import (
     load_policy,
     save_policy,
 )
+from clbench.training import deterministic
 
 CONFIG = PolicyConfig(state_size=5, action_size=3, width=32, layers=2)
 
@@ -189,3 +190,63 @@ def test_a_damaged_checkpoint_is_refused_by_name(
     with pytest.raises(CheckpointError, match=message) as error:
         load_policy(tmp_path)
     assert str(tmp_path) in str(error.value)
+
+
+# ---- images ------------------------------------------------------------------------------------------------
+
+
+SEEING = dataclasses.replace(CONFIG, image_size=32)
+
+
+def _seen(count: int, seed: int = 0) -> Batch:
+    generator = torch.Generator().manual_seed(seed)
+    image = torch.randint(0, 256, (count, 32, 32, 3), generator=generator).to(torch.uint8)
+    return dataclasses.replace(_batch(count, seed), image=image)
+
+
+def test_a_batch_without_images_has_a_row_of_no_pixels_for_each_sample() -> None:
+    batch = _batch(3)
+    assert batch.image.shape == (3, 0, 0, 3)
+    assert Batch.cat([batch, batch]).image.shape == (6, 0, 0, 3)
+    assert not any("vision" in name for name in Policy(CONFIG).state_dict())
+
+
+def test_a_policy_reads_a_token_for_each_patch_of_the_image() -> None:
+    policy, batch = Policy(SEEING), _seen(3)
+    hidden = policy.hidden_states(batch.state, batch.words, batch.image)
+    assert hidden[0].shape == (3, 4 + 4 + 1 + 12, 32)
+    assert policy.backbone.mask(batch.words).shape == (3, 1, 1, 21)
+    questions = QuestionBatch(batch.state, batch.words, torch.full((3,), 3), batch.image)
+    dark = dataclasses.replace(batch, image=torch.zeros_like(batch.image))
+    assert policy.action_loss(batch).shape == policy.answer_loss(questions).shape == (3,)
+    assert not policy.action_loss(batch).equal(policy.action_loss(dark))
+    eyes = [weight for name, weight in policy.named_parameters() if "vision" in name]
+    gradients = torch.autograd.grad(policy.action_loss(batch).mean(), eyes)
+    assert all(gradient.abs().sum() > 0 for gradient in gradients)
+
+
+def test_a_policy_with_eyes_refuses_to_act_without_an_image() -> None:
+    batch = _batch(2)
+    with pytest.raises(ValueError, match=r"image of \(32, 32, 3\), not none: hand over `batch.image`"):
+        Policy(SEEING).hidden_states(batch.state, batch.words)
+    with pytest.raises(ValueError, match=r"not \(0, 0, 3\)"):
+        Policy(SEEING).action_loss(batch)
+    with pytest.raises(ValueError, match="image_size must be a multiple of 16, not 30"):
+        Policy(dataclasses.replace(CONFIG, image_size=30))
+
+
+def test_rows_of_a_forward_with_images_do_not_depend_on_their_place() -> None:
+    policy, batch = Policy(SEEING), _seen(40)
+    order = torch.randperm(40, generator=torch.Generator().manual_seed(1))
+    with deterministic():
+        chunks = policy.act(batch.state, batch.words, batch.noise, batch.image)
+        moved = policy.act(batch.state[order], batch.words[order], batch.noise[order], batch.image[order])
+    assert moved.equal(chunks[order])
+
+
+def test_a_checkpoint_keeps_the_eyes(tmp_path: Path) -> None:
+    policy, batch = Policy(SEEING, seed=2), _seen(4)
+    save_policy(policy, tmp_path)
+    loaded = load_policy(tmp_path)
+    assert loaded.config == SEEING
+    assert loaded.action_loss(batch).equal(policy.action_loss(batch))

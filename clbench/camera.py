@@ -1,0 +1,38 @@
+"""Cameras: what a policy is shown of a world whose state it must not know.
+
+The states of a task with a camera hold everything: experts act on them, questions are answered from them,
+and pictures are drawn from them alone. A policy is shown a part of the numbers, and the picture. So
+demonstrations stay small data sets of states, and a picture is drawn where it is looked at: when a policy
+replans, and once for each state of the demonstrations and of the questions (`clbench.observer`).
+"""
+
+from __future__ import annotations
+
+from typing import ClassVar, Protocol, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+States: TypeAlias = NDArray[np.float32]
+Images: TypeAlias = NDArray[np.uint8]
+
+
+class Camera(Protocol):
+    """Looks at the states of a world. Made without arguments in a process that may draw."""
+
+    image_size: ClassVar[int]
+    """Width and height of a picture, in pixels."""
+    state_size: ClassVar[int]
+    """How many numbers of a state a policy is shown."""
+
+    @staticmethod
+    def proprioception(states: States) -> States:
+        """Return the part (N, `state_size`) of the states (N, S) that a policy is shown as numbers."""
+        ...
+
+    def draw(self, states: States) -> Images:
+        """Return a picture of each of the states (N, S), (N, `image_size`, `image_size`, 3).
+
+        A picture depends on its state alone, not on those that were drawn before.
+        """
+        ...

@@ -1,0 +1,39 @@
+"""A process that draws: it reads states and writes pictures, for an observer (`clbench.observer`).
+
+It is started as `python -m clbench.drawing CAMERA`.
+"""
+
+from __future__ import annotations
+
+import os
+import struct
+import sys
+
+import numpy as np
+
+from clbench.camera import Camera
+from clbench.task import resolve
+
+HEADER = struct.Struct("<II")
+"""How many states come, and how many numbers each has."""
+
+
+def main(entry_point: str) -> None:
+    """Draw the states that come on standard input, as bare numbers after a header, until it ends.
+
+    Args:
+        entry_point: Of the camera.
+    """
+    # what a library prints must not come between the pictures
+    pictures = os.fdopen(os.dup(1), "wb")
+    os.dup2(2, 1)
+    camera: Camera = resolve(entry_point)()
+    while header := sys.stdin.buffer.read(HEADER.size):
+        count, size = HEADER.unpack(header)
+        numbers = np.frombuffer(sys.stdin.buffer.read(4 * count * size), np.float32)
+        pictures.write(camera.draw(numbers.reshape(count, size)).tobytes())
+        pictures.flush()
+
+
+if __name__ == "__main__":
+    main(sys.argv[1])

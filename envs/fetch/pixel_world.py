@@ -1,0 +1,114 @@
+"""The Fetch world of the pixel scenario: two coloured things lie about, and a camera looks at the scene."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from typing import ClassVar
+
+import gymnasium
+import numpy as np
+from numpy.typing import NDArray
+
+from .camera import COLOURS, JOINTS, PIXEL_SIZE, THINGS, FetchCamera
+from .rules import RULES
+from .state import BLOCK, SIZE, TARGET, State
+from .vector_world import FetchVectorWorld
+from .world import FetchWorld
+
+PIXEL_RULES = {name: dataclasses.replace(rule, target_on_table=True) for name, rule in RULES.items()}
+"""Those of the Fetch world with every target on the table: one camera does not tell how high a ball hangs."""
+
+THING_PLACES = np.array([[1.12, 0.52], [1.50, 0.96]])
+"""Corners of the part of the table that things lie on, x and y in metres."""
+NEAR_SIDE = 0.56
+"""Least x - y of a thing, in metres: it lies on the camera's side of the gripper, which starts at 0.59."""
+THINGS_APART = 0.10
+"""Least distance of a thing to the block, to the target and to the other thing."""
+
+Vectors = NDArray[np.float64]
+
+
+class FetchPixelsVectorWorld(FetchVectorWorld):
+    """Episodes as those of `FetchVectorWorld`, with targets on the table, and two things in each.
+
+    States (N, 56) have all that the experts, the questions and the camera need. A policy is shown the numbers
+    that `FetchCamera.proprioception` leaves of them, and pictures.
+
+    Args:
+        lanes: Places for episodes.
+        threads: Threads that advance the physics.
+        perturbed: Whether the block is heavier or lighter, and the gripper starts elsewhere.
+    """
+
+    def __init__(self, lanes: int, threads: int = 1, perturbed: bool = False) -> None:
+        super().__init__(lanes, threads, perturbed, PIXEL_RULES)
+        self.single_observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (PIXEL_SIZE,), np.float32)
+        self._states = np.zeros((lanes, PIXEL_SIZE), np.float32)
+
+    def reset(self, lanes: Sequence[int], seeds: Sequence[int], tasks: Sequence[str]) -> State:
+        """Start an episode in each of `lanes` and return the states (N, 56).
+
+        Raises:
+            LookupError: No task has this name; the nearest one is named.
+        """
+        states = super().reset(lanes, seeds, tasks)
+        for lane, seed, state in zip(lanes, seeds, states, strict=True):
+            self._states[lane, THINGS] = _things(state, np.random.default_rng([seed, 2]))
+        return self._complete(lanes, states)
+
+    def step(
+        self, lanes: Sequence[int], actions: NDArray[np.float32]
+    ) -> tuple[State, NDArray[np.float64], NDArray[np.bool_]]:
+        """Move each of `lanes` for one step by its row of actions (N, 4), as `FetchVectorWorld` does."""
+        states, rewards, successes = super().step(lanes, actions)
+        return self._complete(lanes, states), rewards, successes
+
+    def state(self, lane: int) -> State:
+        """Return the state (56,) that a lane is in."""
+        state: State = self._states[lane]
+        return state
+
+    def _complete(self, lanes: Sequence[int], states: State) -> State:
+        """Return the states (N, 28) with joints and things, (N, 56)."""
+        for lane, state in zip(lanes, states, strict=True):
+            self._states[lane, :SIZE] = state
+            self._states[lane, JOINTS] = self._lane(lane).qpos
+        complete: State = self._states[list(lanes)]
+        return complete
+
+
+def _things(state: State, generator: np.random.Generator) -> Vectors:
+    """Return places and colours of the two things (6,), apart from each other, block and target."""
+    taken = [state[BLOCK][:2], state[TARGET][:2]]
+    things: list[float] = []
+    for colour in generator.permutation(len(COLOURS))[:2]:
+        while True:
+            place = generator.uniform(*THING_PLACES)
+            apart = min(float(np.linalg.norm(place - other)) for other in taken) >= THINGS_APART
+            if apart and place[0] - place[1] >= NEAR_SIDE:
+                break
+        taken.append(place)
+        things += [*place, colour]
+    return np.array(things)
+
+
+class FetchPixelsWorld(FetchWorld):
+    """A `FetchPixelsVectorWorld` of one lane, which experts know and policies see by `FetchCamera`."""
+
+    vector_world: ClassVar[type[FetchVectorWorld]] = FetchPixelsVectorWorld
+    _world: FetchPixelsVectorWorld
+    _camera: FetchCamera | None = None
+
+    def picture(self) -> NDArray[np.uint8]:
+        """Draw what the camera sees, (480, 480, 3)."""
+        if self._camera is None:
+            self._camera = FetchCamera(480, scale=1)
+        picture: NDArray[np.uint8] = self._camera.draw(self._world.state(0)[None])[0]
+        return picture
+
+    def close(self) -> None:
+        """Free the camera, if there is one."""
+        if self._camera is not None:
+            self._camera.close()
+            self._camera = None

@@ -1,0 +1,195 @@
+"""The pixel scenario: its world, its camera and its questions."""
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from clbench.observer import Observer
+from clbench.policy import encode
+from clbench.rendering import RenderingError
+from clbench.scenario_env import ScenarioEnv
+from clbench.task import Task, load_scenario, resolve
+
+SCENARIO = resolve("clbench.envs.fetch.pixels:SCENARIO")
+FETCH = load_scenario("clbench:clbench/Fetch-v0")
+QUESTIONS = {kind.name: kind for kind in resolve(SCENARIO.questions)}
+WORLD, CAMERA = SCENARIO.tasks[0].world, SCENARIO.tasks[0].camera
+World = resolve(WORLD)
+
+State = NDArray[np.float32]
+Images = NDArray[np.uint8]
+
+BLOCK, TARGET, JOINTS, THINGS = slice(3, 6), slice(25, 28), slice(28, 50), slice(50, 56)
+COLOURS = ("green", "blue", "yellow", "purple")
+
+
+@pytest.fixture(scope="module")
+def observer() -> Iterator[Observer]:
+    """What shows the world to a policy; without graphics there is none."""
+    observer = Observer(WORLD, CAMERA)
+    try:
+        observer.observe(_start(0)[None])
+    except RenderingError as error:
+        pytest.skip(str(error))
+    yield observer
+    observer.close()
+
+
+def _start(seed: int, task: str = "push") -> State:
+    state, _ = World().reset(seed=seed, options={"task": task})
+    return np.asarray(state)
+
+
+def _expert_succeeds(task: Task, seed: int) -> bool:
+    world, expert = World(), resolve(task.expert)(task.name)
+    state, _ = world.reset(seed=seed, options={"task": task.name})
+    for _ in range(task.horizon):
+        state, _, terminated, _, _ = world.step(expert(state))
+        if terminated:
+            return True
+    return False
+
+
+def _shown(colour: str, image: Images) -> NDArray[np.bool_]:
+    """Return where an image (64, 64, 3) shows a colour: red, green, blue, yellow or purple."""
+    red, green, blue = np.moveaxis(image.astype(int), -1, 0)
+    others = {
+        "red": red - np.maximum(green, blue),
+        "green": green - np.maximum(red, blue),
+        "blue": blue - np.maximum(red, green),
+        "yellow": np.minimum(red, green) - blue,
+        "purple": np.minimum(red, blue) - green,
+    }
+    return np.asarray(others[colour] > 50)
+
+
+def test_the_tasks_are_those_of_fetch_with_the_target_on_the_table() -> None:
+    assert [task.name for task in SCENARIO.tasks] == [task.name for task in FETCH.tasks]
+    assert not {task.dataset_id for task in SCENARIO.tasks} & {task.dataset_id for task in FETCH.tasks}
+    heights = [_start(seed, task.name)[TARGET][2] for seed in range(5) for task in SCENARIO.tasks]
+    assert np.ptp(heights) < 1e-3
+
+
+def test_an_episode_is_bit_for_bit_that_of_fetch() -> None:
+    plain, expert = resolve(FETCH.tasks[0].world)(), resolve(FETCH.tasks[0].expert)("push")
+    world = World()
+    state, other = (one.reset(seed=6, options={"task": "push"})[0] for one in (plain, world))
+    things = other[THINGS]
+    for _ in range(12):
+        assert np.array_equal(other[:28], state)
+        assert np.array_equal(other[THINGS], things)
+        action = expert(state)
+        (state, reward, *_), (other, its_reward, *_) = plain.step(action), world.step(action)
+        assert reward == its_reward
+
+
+@pytest.mark.parametrize("task", SCENARIO.tasks, ids=lambda task: task.name)
+def test_experts_act_on_what_policies_do_not_see(task: Task) -> None:
+    assert all(_expert_succeeds(task, seed) for seed in range(3))
+
+
+def test_things_lie_apart_in_two_colours_and_follow_from_the_seed() -> None:
+    starts = np.stack([_start(seed) for seed in range(40)])
+    assert np.array_equal(starts[7], _start(7))
+    things = starts[:, THINGS].reshape(-1, 2, 3)
+    fixed = [starts[:, None, thing][..., :2] for thing in (BLOCK, TARGET)]
+    places = np.concatenate([things[:, :, :2], *fixed], axis=1)
+    ways = np.linalg.norm(places[:, :, None] - places[:, None], axis=-1)[:, :2]
+    assert (ways[ways > 0] >= 0.0999).all()
+    assert (things[:, 0, 2] != things[:, 1, 2]).all()
+    assert set(things[:, :, 2].ravel()) == {0, 1, 2, 3}
+
+
+def test_a_picture_shows_the_target_and_both_things_and_no_other_colour(observer: Observer) -> None:
+    starts = np.stack([_start(seed) for seed in range(12)])
+    numbers, images = observer.observe(starts)
+    assert numbers.shape == (12, 10)
+    assert images.shape == (12, 64, 64, 3)
+    for state, image in zip(starts, images, strict=True):
+        there = {COLOURS[int(number)] for number in state[THINGS][2::3]}
+        assert _shown("red", image).sum() >= 3
+        assert {colour for colour in COLOURS if _shown(colour, image).sum() >= 3} == there
+
+
+def test_a_policy_is_not_told_where_block_and_target_are(observer: Observer) -> None:
+    state = _start(3)
+    moved = state.copy()
+    moved[BLOCK] += 0.05
+    moved[TARGET] += 0.05
+    moved[THINGS] = 0.0
+    numbers, its_numbers = (observer.observe(one[None])[0] for one in (state, moved))
+    assert np.array_equal(numbers, its_numbers)
+
+
+def test_a_picture_follows_the_block_and_the_target(observer: Observer) -> None:
+    state = _start(3)
+    block, target = state.copy(), state.copy()
+    block[JOINTS][15] += 0.04  # x of the block's joint
+    target[TARGET][1] += 0.04
+    _, (image, block_moved, target_moved) = observer.observe(np.stack([state, block, target]))
+    assert (image != block_moved).any()
+    columns = [np.nonzero(_shown("red", one))[1].mean() for one in (image, target_moved)]
+    assert columns[1] - columns[0] > 1.5
+
+
+def test_a_picture_depends_on_its_state_alone(observer: Observer) -> None:
+    starts = np.stack([_start(seed) for seed in range(4)])
+    together, backwards = observer.observe(starts)[1], observer.observe(starts[::-1])[1]
+    other = Observer(WORLD, CAMERA, processes=2)
+    assert np.array_equal(together, backwards[::-1])
+    assert np.array_equal(together, other.observe(starts)[1])
+    other.close()
+
+
+def test_an_agent_of_the_scenario_sees_the_picture(observer: Observer) -> None:
+    env = ScenarioEnv(SCENARIO)
+    observation, _ = env.reset(seed=1, options={"task": "lift"})
+    assert observation["state"].shape == (10,)
+    observation, *_ = env.step(env.action_space.sample())
+    assert env.observation_space.contains(observation)
+    assert _shown("red", observation["image"]).any()
+    env.close()
+
+
+# ---- questions ---------------------------------------------------------------------------------------------
+
+
+def _scene(left: int, right: int, left_y: float = 0.80, right_y: float = 0.70) -> State:
+    """Return a state (1, 56) with two things; the block is on the left, the target on the right."""
+    state = np.zeros((1, 56), np.float32)
+    state[0, BLOCK], state[0, TARGET] = (1.30, 0.90, 0.425), (1.30, 0.60, 0.425)
+    state[0, THINGS] = (1.30, right_y, right, 1.30, left_y, left)
+    return state
+
+
+def _answer(name: str, state: State) -> str | None:
+    kind = QUESTIONS[name]
+    (index,) = kind.answer(state)
+    return None if index < 0 else kind.answers[index]
+
+
+@pytest.mark.parametrize(
+    ("name", "expected"),
+    [
+        ("colour_left", "yellow"),
+        ("colour_right", "blue"),
+        ("colour_near_block", "yellow"),
+        ("colour_near_target", "blue"),
+    ],
+)
+def test_colours_are_told_by_place(name: str, expected: str) -> None:
+    assert _answer(name, _scene(COLOURS.index("yellow"), COLOURS.index("blue"))) == expected
+    assert _answer(name, _scene(2, 1, left_y=0.76, right_y=0.74)) is None
+
+
+def test_no_question_is_answered_by_what_a_robot_knows_of_itself() -> None:
+    assert set(QUESTIONS) >= {"block_side", "nearest", "block_place", "colour_left"}
+    assert not {"gripper_opening", "gripper_moving"} & set(QUESTIONS)
+
+
+def test_all_words_are_in_the_vocabulary() -> None:
+    texts: list[Any] = [wording for kind in QUESTIONS.values() for wording in kind.wordings]
+    encode(texts + [answer for kind in QUESTIONS.values() for answer in kind.answers])

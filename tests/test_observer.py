@@ -1,0 +1,144 @@
+"""What a policy is shown of a world: its states, or what a camera leaves of them."""
+
+import dataclasses
+import os
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from gymnasium.utils.env_checker import check_env
+from numpy.typing import NDArray
+
+from clbench.cache import cache_folder
+from clbench.evaluation import Evaluator
+from clbench.learner import Learner
+from clbench.method import build_method, method_names
+from clbench.observer import TOGETHER, Observer, frame_hash, observed
+from clbench.policy import Policy
+from clbench.pretraining import policy_config, pretrained_policy
+from clbench.questions import load_questions
+from clbench.rendering import RenderingError
+from clbench.task import load_scenario
+from clbench.testing.seen_toy import SEEN_TOY
+from clbench.testing.toy_camera import ToyCamera
+from clbench.training import deterministic, optimise
+
+TOY = load_scenario("clbench.testing:clbench/Toy-v0")
+TASK = SEEN_TOY.retained[0]
+SHORT = dataclasses.replace(
+    SEEN_TOY,
+    target=SEEN_TOY.target[:1],
+    budget=dataclasses.replace(SEEN_TOY.budget, pretraining_steps=5, adaptation_steps=2),
+)
+FEWER = {"aegis": {"samples": 8}, "ewc": {"samples": 4}, "fast_dvla": {"steps": 3}}
+"""Hyper-parameters that make a long preparation short."""
+
+
+def _states(count: int) -> NDArray[np.float32]:
+    return np.random.default_rng(0).uniform(-1.0, 1.0, (count, 4)).astype(np.float32)
+
+
+def test_without_a_camera_states_are_shown_as_they_are() -> None:
+    states = _states(3)
+    numbers, images = Observer(TASK.world, None).observe(states)
+    assert np.array_equal(numbers, states)
+    assert images.shape == (3, 0, 0, 3)
+    assert frame_hash(TOY.retained[0]) is None
+
+
+def test_processes_draw_what_the_camera_draws_in_the_order_of_the_states() -> None:
+    states = _states(2 * TOGETHER + 3)
+    observer = Observer(TASK.world, TASK.camera, processes=2)
+    numbers, images = observer.observe(states)
+    one = observer.observe(states[:1])[1]
+    observer.close()
+    assert np.array_equal(numbers, states[:, :1])
+    assert np.array_equal(images, ToyCamera().draw(states))
+    assert np.array_equal(one, images[:1])
+
+
+def test_pictures_of_a_data_set_are_drawn_once(empty_caches: Path) -> None:
+    first = observed(TASK, _states(5))
+    (file,) = cache_folder().rglob("frames.safetensors")
+    written = file.stat().st_mtime_ns
+    again = observed(TASK, _states(5))
+    other = observed(TASK, _states(6))
+    assert all(a.equal(b) for a, b in zip(first, again, strict=True))
+    assert file.stat().st_mtime_ns == written
+    assert other[1].shape == (6, 16, 16, 3)
+    assert len(list(cache_folder().rglob("frames.safetensors"))) == 2
+
+
+def test_a_process_that_dies_is_named_with_its_last_words(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "dim.py").write_text(
+        "from clbench.testing.toy_camera import ToyCamera\n"
+        "class Dim(ToyCamera):\n"
+        "    def draw(self, states): raise RuntimeError('no light')\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")]))
+    observer = Observer(TASK.world, "dim:Dim")
+    with pytest.raises(
+        RenderingError, match="process of dim:Dim that draws has ended: RuntimeError: no light"
+    ):
+        observer.observe(_states(2))
+    observer.close()
+
+
+def test_where_nothing_draws_it_is_said_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("MUJOCO_GL", raising=False)
+    monkeypatch.setattr("clbench.rendering.rendering_fault", lambda *_: "no driver")
+    with pytest.raises(RenderingError, match=r"\(no driver\).*apt-get install"):
+        Observer("clbench.testing.toy:ToyWorld", TASK.camera).observe(_states(1))
+
+
+@pytest.mark.filterwarnings("ignore:.*(minimum|maximum) value.*infinity.*")
+def test_an_agent_of_the_scenario_sees_the_picture_and_no_more() -> None:
+    env = gymnasium.make(SEEN_TOY.id, instruction="tokens", disable_env_checker=True)
+    check_env(env.unwrapped, skip_render_check=True)
+    observation, _ = env.reset(seed=4)
+    many = gymnasium.make_vec(SEEN_TOY.id, num_envs=2, instruction="tokens")
+    side_by_side, _ = many.reset(seed=4)
+    assert observation["state"].shape == (1,)
+    assert observation["image"].shape == (16, 16, 3)
+    for name, value in observation.items():
+        assert np.array_equal(side_by_side[name][0], value)
+    many.close()
+    env.close()
+
+
+def test_a_policy_learns_what_only_the_picture_shows() -> None:
+    policy = Policy(policy_config(SEEN_TOY), seed=0)
+    assert (policy.config.state_size, policy.config.image_size) == (1, 16)
+    asked = load_questions(SEEN_TOY)[0].sample(32, torch.Generator().manual_seed(0))
+    asked = dataclasses.replace(asked, state=torch.zeros_like(asked.state))
+    blind = dataclasses.replace(asked, image=torch.zeros_like(asked.image))
+    with deterministic():
+        optimise(policy.parameters(), 2e-3, 150, lambda _: policy.answer_loss(asked).mean())
+    assert policy.answer_loss(asked).mean() < 0.2
+    assert policy.answer_loss(blind).mean() > 0.5
+
+
+def test_an_outcome_does_not_depend_on_what_else_is_seen() -> None:
+    policy, _ = pretrained_policy(SHORT, 0)
+    evaluator = Evaluator(SHORT, seed=0)
+    together = evaluator.evaluate(policy.eval(), SHORT.tasks)
+    alone = evaluator.evaluate(policy, SHORT.tasks[1:2])
+    evaluator.close()
+    assert together[4:8] == alone
+
+
+@pytest.mark.parametrize("name", method_names())
+def test_every_method_learns_from_pictures(name: str, tmp_path: Path) -> None:
+    learner = Learner(SHORT, lambda: build_method(name, FEWER.get(name, {})), 0, "cpu")
+    learner.prepare()
+    learner.save(tmp_path / "0", 0)
+    learner.load(tmp_path / "0", 0)
+    learner.learn(1, lambda _: None)
+    assert learner.policy.config == policy_config(SEEN_TOY)
+    learner.save(tmp_path / "1", 1)
+    learner.load(tmp_path / "1", 1)
