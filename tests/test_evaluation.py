@@ -9,7 +9,7 @@ from clbench.policy import Policy, encode
 from clbench.pretraining import policy_config, pretrained_policy
 from clbench.questions import load_questions, report_questions
 from clbench.seeding import derive_seed, torch_generator
-from clbench.task import Task, load_scenario, resolve
+from clbench.task import Scenario, Task, load_scenario, resolve
 from clbench.training import deterministic
 
 TOY = load_scenario("clbench.testing:clbench/Toy-v0")
@@ -22,16 +22,20 @@ def fetch_policy() -> Policy:
     return Policy(policy_config(FETCH), seed=3).eval()
 
 
+def _with_episodes(**numbers: int) -> Scenario:
+    return dataclasses.replace(FETCH, budget=dataclasses.replace(FETCH.budget, **numbers))
+
+
 def test_an_outcome_does_not_depend_on_what_else_is_evaluated(fetch_policy: Policy) -> None:
-    scenario = dataclasses.replace(FETCH, budget=dataclasses.replace(FETCH.budget, selection_episodes=8))
+    scenario = _with_episodes(selection_episodes=4)
     evaluator = Evaluator(scenario, seed=0)
     with deterministic():
-        together = evaluator.evaluate(fetch_policy, scenario.tasks)  # 96 episodes: more than lanes
+        together = evaluator.evaluate(fetch_policy, scenario.tasks)  # 48 episodes: more than lanes
         alone = Evaluator(scenario, seed=0).evaluate(fetch_policy, [scenario.tasks[5]])
         again = evaluator.evaluate(fetch_policy, reversed(scenario.tasks))
     assert len(together) > LANES
-    assert alone == together[40:48]
-    assert again == [episode for start in range(88, -8, -8) for episode in together[start : start + 8]]
+    assert alone == together[20:24]
+    assert again == [episode for start in range(44, -4, -4) for episode in together[start : start + 4]]
 
 
 def _played_alone(policy: Policy, task: Task, number: int, seed: int) -> Episode:
@@ -86,12 +90,12 @@ def test_rows_of_a_forward_do_not_depend_on_their_place_or_their_neighbours(fetc
 
 def test_selection_and_report_episodes_and_seeds_have_different_initial_states(fetch_policy: Policy) -> None:
     task = FETCH.task("reach")
+    scenario = _with_episodes(selection_episodes=2, report_episodes=3, curve_episodes=1)
     runs = [
-        [episode.total_reward for episode in Evaluator(FETCH, seed).evaluate(fetch_policy, [task], split)]  # type: ignore[arg-type]
+        [episode.total_reward for episode in Evaluator(scenario, seed).evaluate(fetch_policy, [task], split)]  # type: ignore[arg-type]
         for seed, split in ((0, "selection"), (0, "report"), (1, "report"))
     ]
-    assert len(runs[0]) == FETCH.budget.selection_episodes
-    assert len(runs[1]) == FETCH.budget.report_episodes
+    assert [len(run) for run in runs] == [2, 3, 3]
     values = [value for run in runs for value in run]
     assert len(set(values)) == len(values)
 
@@ -134,7 +138,7 @@ def test_a_pretrained_toy_policy_does_its_skills_and_not_the_targets() -> None:
 def test_a_policy_that_acts_in_nan_fails_its_episodes_and_stops_nothing(fetch_policy: Policy) -> None:
     broken = Policy(fetch_policy.config)
     next(broken.head.parameters()).data.fill_(float("nan"))
-    episodes = Evaluator(FETCH, 0).evaluate(broken, [FETCH.task("lift")])
+    episodes = Evaluator(_with_episodes(selection_episodes=2), 0).evaluate(broken, [FETCH.task("lift")])
     assert not any(episode.success for episode in episodes)
     assert {episode.length for episode in episodes} == {FETCH.task("lift").horizon}
 
