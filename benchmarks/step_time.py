@@ -3,6 +3,8 @@
 Methods take turns in blocks of steps, in a new order each round, so that what else the machine does meets all
 of them alike. A ratio is that of two blocks of one round; reported are the median over rounds and a 95 %
 bootstrap interval of it. The policy, the data and the batches are those of a real run's first target.
+The limit is a bare PyTorch loop of the same model on batches that are there already: what plain fine-tuning
+takes beyond it is the price of seams, sources and checks.
 """
 
 from __future__ import annotations
@@ -18,6 +20,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from ratios import median_ratio
 from rich.progress import track
 
@@ -31,10 +34,11 @@ from clbench.pretraining import pretrained_policy
 from clbench.questions import load_questions
 from clbench.seeding import seeded, torch_generator
 from clbench.task import Scenario, load_scenario
-from clbench.training import deterministic
+from clbench.training import BETAS, GRADIENT_NORM, deterministic
 
 RESULTS = Path(__file__).parent / "results"
 BASELINE = "sft"
+LIMIT = "bare loop"
 
 
 class Bench:
@@ -78,6 +82,37 @@ class Bench:
         return marks[-1] - marks[0]
 
 
+class BareLoop:
+    """The same steps as plain fine-tuning takes, with nothing around them: the limit.
+
+    Args:
+        bench: Plain fine-tuning, prepared; its policy is copied.
+    """
+
+    def __init__(self, bench: Bench) -> None:
+        self.budget, self.policy = bench.scenario.budget, deepcopy(bench.policy)
+        self.target = bench.data["target"]
+
+    def seconds(self, steps: int) -> float:
+        """Return what `steps` steps take; the one before them is not counted."""
+        generator = torch_generator("benchmark", "target")
+        size = self.budget.batch_size
+        batches = [self.target.sample(size, generator) for _ in range(steps + 1)]
+        parameters = list(self.policy.parameters())
+        optimiser = torch.optim.AdamW(
+            parameters, lr=self.budget.learning_rate, betas=BETAS, weight_decay=1e-10, fused=True
+        )
+        begin = 0.0
+        for number, batch in enumerate(batches):
+            loss = self.policy.action_loss(batch).mean()
+            optimiser.zero_grad()
+            torch.autograd.backward(loss)
+            torch.nn.utils.clip_grad_norm_(parameters, GRADIENT_NORM)
+            optimiser.step()
+            begin = begin if number else time.perf_counter()
+        return time.perf_counter() - begin
+
+
 def main() -> None:
     """Measure, print a table and write results/step_time.json."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
@@ -97,25 +132,33 @@ def main() -> None:
     generator = np.random.default_rng(0)
     rounds: list[dict[str, float]] = []
     with deterministic():
-        benches = {name: Bench(name, scenario, policy, data) for name in names}
+        benches: dict[str, Bench | BareLoop] = {}
+        for name in names:
+            benches[name] = bench = Bench(name, scenario, policy, data)
+            if name == BASELINE:
+                benches[LIMIT] = BareLoop(bench)
         for number in track(range(arguments.rounds + 1), "rounds"):
             taken = {}
-            for name in generator.permutation(names):
+            for name in generator.permutation(list(benches)):
                 taken[str(name)] = benches[str(name)].seconds(arguments.steps)
             if number:  # the first round warms up
                 rounds.append(taken)
-    ratios = {name: median_ratio([one[name] / one[BASELINE] for one in rounds], generator) for name in names}
+    ratios = {
+        name: median_ratio([one[name] / one[BASELINE] for one in rounds], generator) for name in benches
+    }
+    limit = ratios.pop(LIMIT)
     baseline = statistics.median(one[BASELINE] for one in rounds) / arguments.steps
     result = {
         "clbench": clbench.__version__,
         "hardware": fingerprint(scenario)["hardware"],
         "baseline_seconds_per_step": round(baseline, 4),
         "rounds": arguments.rounds,
+        "bare_loop": limit,
         "ratios": ratios,
     }
     RESULTS.mkdir(exist_ok=True)
     (RESULTS / "step_time.json").write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
-    for name, ratio in sorted(ratios.items(), key=lambda item: item[1]["median_ratio"]):
+    for name, ratio in sorted({LIMIT: limit, **ratios}.items(), key=lambda item: item[1]["median_ratio"]):
         print(f"{name:24} {ratio['median_ratio']:.2f} [{ratio['low']:.2f}, {ratio['high']:.2f}]")
 
 
