@@ -76,8 +76,7 @@ class Scores:
     on_the_way: Array
     """Success at the points of each stage before its end, (targets, points - 1, tasks, curve episodes)."""
     perturbed: Array
-    """Success on the retained skills at the end of each stage in the same episodes, perturbed:
-    (stages + 1, retained, episodes)."""
+    """Success on the retained skills at the ends of stages, perturbed, (stages + 1, retained, episodes)."""
     selection: Array
     """Success rate on target k over the selection episodes at the points of stage k, (targets, points)."""
     asked: Array
@@ -303,20 +302,19 @@ def _episodes(record: Record, tasks: tuple[str, ...], stages: int, steps: tuple[
 def _perturbed(record: Record, rows: Iterable[_Episode], layout: Layout) -> list[_Episode]:
     """Return the perturbed episodes: all that a run has which says `perturb`, and none otherwise."""
     found = [row for row in rows if row.split == "perturbed"]
-    if not record.run.get("perturb", False):
-        if found:
-            raise RecordError("episodes: there are perturbed ones, but its run does not say perturb.")
-        return []
+    perturb = record.run.get("perturb", False)
+    if found and not perturb:
+        raise RecordError("episodes: there are perturbed ones, but its run does not say perturb.")
     rule = "each retained skill has those of the report, at the end of each stage"
     retained, numbers = set(layout.retained), set(layout.episodes)
     for row in found:
         at_an_end = row.step == (layout.steps[-1] if row.stage else 0)
         if not (at_an_end and row.task in retained and row.episode in numbers):
+            where = f"of {row.task} at stage {row.stage}, step {row.step}"
             raise RecordError(
-                f"episodes: the perturbed episode {row.episode} of {row.task} at stage {row.stage}, step "
-                f"{row.step}, must not be there: {rule}."
+                f"episodes: the perturbed episode {row.episode} {where}, must not be there: {rule}."
             )
-    count = (len(layout.target) + 1) * len(retained) * len(numbers)
+    count = (len(layout.target) + 1) * len(retained) * len(numbers) if perturb else 0
     if len(found) != count:
         raise RecordError(f"episodes: {len(found):,} are perturbed, not {count:,}: {rule}.")
     return found
@@ -411,8 +409,7 @@ class Rates:
     curves: Array
     """Success rate at the points of each stage, (..., targets, points, tasks); the last one is its end."""
     perturbed: Array
-    """Success rate on the retained skills in perturbed episodes at the end of each stage,
-    (..., stages + 1, retained)."""
+    """Success rate on the retained skills in perturbed episodes, (..., stages + 1, retained)."""
     selection: Array
     """Success rate on target k over selection episodes at the points of stage k, (..., targets, points)."""
     asked: Array
