@@ -110,9 +110,9 @@ def test_it_meets_the_initial_states_that_every_method_meets(
     seen: list[tuple[list[int], list[str]]] = []
     reset = Lanes.reset
 
-    def watched(self: Lanes, lanes: Any, seeds: Any, tasks: Any) -> Any:
+    def watched(self: Lanes, lanes: Any, seeds: Any, tasks: Any, *perturbed: Any) -> Any:
         seen.append((list(seeds), [task.name for task in tasks]))
-        return reset(self, lanes, seeds, tasks)
+        return reset(self, lanes, seeds, tasks, *perturbed)
 
     monkeypatch.setattr(Lanes, "reset", watched)
     record = evaluate(Knowing(), stage_env(0), seed=5)
