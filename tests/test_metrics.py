@@ -32,7 +32,7 @@ BY_HAND = {
 }
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def scores(make_record: MakeRecord) -> Callable[..., Scores]:
     return lambda *arguments, **options: Scores.from_record(make_record(*arguments, **options))
 
@@ -313,10 +313,10 @@ def test_every_metric_describes_itself(name: str) -> None:
     assert metric.low < metric.high
 
 
-@pytest.mark.parametrize("name", METRICS)
-def test_every_metric_keeps_to_its_range_and_to_batch_axes(name: str, scores: Callable[..., Scores]) -> None:
+@pytest.fixture(scope="module")
+def random_pairs(scores: Callable[..., Scores]) -> tuple[list[Scores], list[Scores]]:
+    """Twenty runs at random, and as many references."""
     generator = np.random.default_rng(1)
-    metric = load_metric(name)
     runs, others = (
         [
             scores(
@@ -334,6 +334,14 @@ def test_every_metric_keeps_to_its_range_and_to_batch_axes(name: str, scores: Ca
         ]
         for _ in range(2)
     )
+    return runs, others
+
+
+@pytest.mark.parametrize("name", METRICS)
+def test_every_metric_keeps_to_its_range_and_to_batch_axes(
+    name: str, random_pairs: tuple[list[Scores], list[Scores]]
+) -> None:
+    (runs, others), metric = random_pairs, load_metric(name)
     values = [
         measure(name, run, dict.fromkeys(metric.references, other))
         for run, other in zip(runs, others, strict=True)
