@@ -51,7 +51,7 @@ def records(add: Callable[..., Path], matrix: Any, tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def shown(records: Path, capsys: pytest.CaptureFixture[str]) -> Callable[[], tuple[str, str]]:
+def shown_with_page(records: Path, capsys: pytest.CaptureFixture[str]) -> Callable[[], tuple[str, str]]:
     """Return a function that shows the leaderboard and returns what is printed and the Markdown."""
 
     def shown() -> tuple[str, str]:
@@ -59,6 +59,16 @@ def shown(records: Path, capsys: pytest.CaptureFixture[str]) -> Callable[[], tup
         return capsys.readouterr().out, (records.parent / "LEADERBOARD.md").read_text(encoding="utf-8")
 
     return shown
+
+
+@pytest.fixture
+def shown(
+    shown_with_page: Callable[[], tuple[str, str]], monkeypatch: pytest.MonkeyPatch
+) -> Callable[[], tuple[str, str]]:
+    """Return the same without the HTML page and its pictures, which take most of the time."""
+    monkeypatch.setattr("clbench.leaderboard._page.page", lambda _: "")
+    monkeypatch.setattr("clbench.leaderboard._page.pictures", lambda _: {})
+    return shown_with_page
 
 
 def flat(text: str) -> str:
@@ -142,13 +152,13 @@ def test_a_row_does_not_depend_on_the_other_rows(records: Path, add: Callable[..
 
 
 def test_showing_twice_changes_no_byte_and_writes_no_file_again(
-    records: Path, shown: Callable[[], tuple[str, str]]
+    records: Path, shown_with_page: Callable[[], tuple[str, str]]
 ) -> None:
     (records / "torn.json").write_text("{", encoding="utf-8")
-    first = shown()
+    first = shown_with_page()
     files = [records.parent / name for name in ("LEADERBOARD.md", "leaderboard.csv")]
     stamps = [(path.read_bytes(), path.stat().st_mtime_ns, path.stat().st_ino) for path in files]
-    assert shown() == first
+    assert shown_with_page() == first
     assert [(path.read_bytes(), path.stat().st_mtime_ns, path.stat().st_ino) for path in files] == stamps
     made = ["LEADERBOARD.md", "index.html", "leaderboard.csv", "pareto-dark.svg", "pareto.svg"]
     assert sorted(os.listdir(records.parent)) == [*made, "records"]
@@ -245,12 +255,12 @@ def test_the_terminal_shows_all_rows_in_108_columns(
 
 
 def test_bytes_have_three_digits_and_go_on_to_the_next_unit(
-    records: Path, add: Callable[..., Path], shown: Callable[[], tuple[str, str]]
+    records: Path, add: Callable[..., Path], shown_with_page: Callable[[], tuple[str, str]]
 ) -> None:
     counts = {0: "0", 999: "999", 1234: "1.23k", 999_900: "1M", 45_678_901: "45.7M", 3 * 10**15: "3000T"}
     for number, count in enumerate(counts):
         add(f"size_{number}", 0, edit=lambda record, count=count: record.costs.update(bytes_kept=count))
-    printed = [line.split() for line in shown()[0].splitlines()]
+    printed = [line.split() for line in shown_with_page()[0].splitlines()]
     page = (records.parent / "index.html").read_text(encoding="utf-8")
     for number, (count, text) in enumerate(counts.items()):
         (size,) = (line[-2] for line in printed if f"size_{number}" in line)
