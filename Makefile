@@ -54,7 +54,8 @@ check: .venv/installed-dev
 
 # What a wheel may do otherwise than the checkout, against a built one outside of it: its files, the parts that are
 # found by name, the commands; and all that strangers type.
-WALKS := tests/test_cli.py tests/test_readme.py tests/test_submission.py tests/test_your_scenario.py
+WALKS := tests/test_cli.py tests/test_readme.py tests/test_submission.py tests/test_your_scenario.py \
+	tests/test_online.py
 WHEEL_TESTS := $(WALKS) tests/test_package.py tests/test_new_method.py tests/methods/test_methods.py \
 	$(addprefix tests/leaderboard/test_,table.py page.py submit.py verify.py claims.py method_pages.py scenario_cards.py)
 wheel-test: .venv/installed-dev

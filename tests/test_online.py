@@ -418,6 +418,7 @@ def _output(command: list[str], folder: Path) -> str:
     return done.stdout
 
 
+@pytest.mark.slow
 def test_the_page_s_own_lines_make_a_row(tmp_path: Path) -> None:
     learning, flat = _blocks("python")
     small = learning.replace("clbench/Fetch-v0", ID).replace("range(5)", "range(3)").replace("5_000", "120")

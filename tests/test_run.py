@@ -78,7 +78,13 @@ class Adapting(Method):
         return policy.action_loss(batch).mean() * (1 + noise) + (scale * torch.rand(3)).sum()
 
 
-@pytest.mark.parametrize("method", ["aegis", "buffered_replay", "fast_dvla", "lora"])
+@pytest.mark.parametrize(
+    "method",
+    [
+        "lora",
+        *(pytest.param(name, marks=pytest.mark.slow) for name in ("aegis", "buffered_replay", "fast_dvla")),
+    ],
+)
 def test_the_same_run_twice_gives_equal_records(tmp_path: Path, method: str) -> None:
     paths = []
     for name in ("first", "second"):
@@ -208,7 +214,9 @@ def test_progress_adds_up_to_the_length_of_the_run(perturb: bool, tmp_path: Path
         assert sum(amounts) == pytest.approx(run_length(load_scenario(TOY), perturb=perturb))
 
 
-@pytest.mark.parametrize(("cls", "perturb"), [(Counting, False), (Adapting, True)])
+@pytest.mark.parametrize(
+    ("cls", "perturb"), [pytest.param(Counting, False, marks=pytest.mark.slow), (Adapting, True)]
+)
 def test_a_run_killed_anywhere_resumes_to_the_same_record(
     tmp_path: Path,
     stranger: Callable[[type[Method]], str],
