@@ -133,7 +133,7 @@ def test_runs_of_two_scenarios_have_jobs_of_their_own_and_one_pretraining_for_ea
 def test_one_worker_and_two_give_equal_records_and_a_stopped_grid_goes_on(
     tmp_path: Path, bars: Bars, lasting_records: Callable[[Path], dict[str, Any]]
 ) -> None:
-    specs = [RunSpec(TOY, method, 0) for method in ("frozen", "sft", "lora")]
+    specs = [RunSpec(TOY, method, 0) for method in ("frozen", "sft", "joint")]
     assert run_jobs(benchmark_jobs(specs, tmp_path / "one"), Processes(1), bars) == {}
     assert run_jobs(benchmark_jobs(specs[:1], tmp_path / "two"), Processes(2), bars) == {}
     missing = [spec for spec in specs if not has_record(spec, tmp_path / "two")]
