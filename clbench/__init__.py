@@ -3,7 +3,9 @@
 import importlib
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from clbench.lazy import lazy_names
 
 if TYPE_CHECKING:
     from clbench.evaluation import Episode as Episode
@@ -95,16 +97,7 @@ __all__ = [
     "scenario_ids",
 ]
 
-
-def __getattr__(name: str) -> Any:
-    for module, names in _HOMES.items():
-        if name in names:
-            return getattr(importlib.import_module(f"{__name__}.{module}"), name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-
-
-def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})
+__getattr__, __dir__ = lazy_names(__name__, _HOMES)
 
 
 # A wheel has envs/, methods/ and leaderboard/ inside this directory, a checkout beside it.

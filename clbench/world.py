@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import inspect
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, ClassVar, Protocol, TypeAlias, TypeVar
@@ -55,7 +56,7 @@ class VectorWorld(Protocol):
         ...
 
 
-class OneLaneWorld(World):
+class OneLaneWorld(World, ABC):
     """A suite's own vector world with one lane, as the plain world: one physics serves both.
 
     A suite names its vector world and its first task, and draws the picture in `picture`; its metadata say
@@ -106,9 +107,9 @@ class OneLaneWorld(World):
         """Return a picture (480, 480, 3) if the render mode is "rgb_array"."""
         return None if self.render_mode is None else self.picture()
 
+    @abstractmethod
     def picture(self) -> NDArray[np.uint8]:
         """Draw the scene, (480, 480, 3)."""
-        raise NotImplementedError
 
 
 def checked_actions(actions: NDArray[np.float32], space: spaces.Box, world: str) -> NDArray[np.float32]:

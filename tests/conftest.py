@@ -1,6 +1,7 @@
 """Fixtures that several test files share."""
 
 import dataclasses
+import io
 import json
 import sys
 import types
@@ -10,9 +11,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from rich.console import Console
 
 from clbench.method import Method, Uses, load_method
 from clbench.names import built_in_methods
+from clbench.progress import Bars
 from clbench.record import (
     ANSWER_COLUMNS,
     EPISODE_COLUMNS,
@@ -43,6 +46,23 @@ def empty_caches(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setenv("CLBENCH_CACHE", str(tmp_path / "cache"))
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
     return tmp_path
+
+
+@pytest.fixture
+def bars() -> Bars:
+    """Bars that draw into a text: `bars.console.file`."""
+    return Bars(10, Console(file=io.StringIO(), width=200))
+
+
+@pytest.fixture
+def write_module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str, str], None]:
+    """Return a function that writes a module, from its name and source, where tests and workers find it."""
+
+    def write_module(name: str, source: str) -> None:
+        (tmp_path / f"{name}.py").write_text(source)
+        monkeypatch.syspath_prepend(tmp_path)
+
+    return write_module
 
 
 @pytest.fixture(scope="session")

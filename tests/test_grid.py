@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from rich.console import Console
 
 from clbench.grid import benchmark_jobs, run_jobs
 from clbench.progress import Bars
@@ -41,15 +40,9 @@ def slow(progress, path):
 """
 
 
-@pytest.fixture
-def bars() -> Bars:
-    return Bars(10, Console(file=io.StringIO(), width=200))
-
-
 @pytest.fixture(autouse=True)
-def _jobs_module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "some_jobs.py").write_text(JOBS)
-    monkeypatch.syspath_prepend(tmp_path)
+def _jobs_module(write_module: Callable[[str, str], None]) -> None:
+    write_module("some_jobs", JOBS)
 
 
 def _job(name: str, function: str, *needs: str, **arguments: Any) -> Job:

@@ -1,19 +1,20 @@
 """Limits: a process that takes too much is ended, said why, and the others go on."""
 
-import io
 import os
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import psutil
 import pytest
-from rich.console import Console
 
 from clbench.grid import run_jobs
 from clbench.limits import Limits
 from clbench.progress import Bars
 from clbench.workers import Job, Processes
+
+Done = Callable[..., dict[str, str]]
 
 JOBS = """
 import os, subprocess, sys, time
@@ -43,40 +44,47 @@ def parent(progress, path):
 
 
 @pytest.fixture(autouse=True)
-def _jobs_module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "limited_jobs.py").write_text(JOBS)
-    monkeypatch.syspath_prepend(tmp_path)
+def _jobs_module(write_module: Callable[[str, str], None]) -> None:
+    write_module("limited_jobs", JOBS)
 
 
-def done(*jobs: tuple[str, Limits | None], **arguments: Any) -> dict[str, str]:
-    """Return what went wrong with jobs, each its function and limits."""
-    bars = Bars(10, Console(file=io.StringIO(), width=200))
-    made = [
-        Job(name, f"limited_jobs:{name}", arguments if name in ("writer", "parent") else {}, 1, (), limits)
-        for name, limits in jobs
-    ]
-    return run_jobs(made, Processes(2), bars)
+@pytest.fixture
+def done(bars: Bars) -> Done:
+    """Return a function that does jobs, each its function and limits, and returns what went wrong."""
+
+    def done(*jobs: tuple[str, Limits | None], **arguments: Any) -> dict[str, str]:
+        made = [
+            Job(
+                name, f"limited_jobs:{name}", arguments if name in ("writer", "parent") else {}, 1, (), limits
+            )
+            for name, limits in jobs
+        ]
+        return run_jobs(made, Processes(2), bars)
+
+    return done
 
 
-def test_a_job_that_takes_too_long_is_stopped_and_the_others_are_not() -> None:
+def test_a_job_that_takes_too_long_is_stopped_and_the_others_are_not(
+    done: Done,
+) -> None:
     failed = done(("long", Limits(seconds=1.0)), ("short", Limits(seconds=60.0)))
     assert failed == {"long": "stopped, because it took longer than 1 s"}
 
 
-def test_a_job_that_takes_too_much_memory_is_stopped() -> None:
+def test_a_job_that_takes_too_much_memory_is_stopped(done: Done) -> None:
     (message,) = done(("large", Limits(memory=600_000_000))).values()
     assert message.startswith("stopped, because it took ")
     assert message.endswith("GB of memory, more than 0.6 GB")
 
 
-def test_a_job_that_writes_too_much_is_stopped(tmp_path: Path) -> None:
+def test_a_job_that_writes_too_much_is_stopped(tmp_path: Path, done: Done) -> None:
     limits = Limits(written=20_000_000)
     (message,) = done(("writer", limits), path=os.fspath(tmp_path / "file")).values()
     assert message.startswith("stopped, because it wrote 0.")
     assert message.endswith("GB, more than 0.0 GB")
 
 
-def test_what_a_stopped_job_started_is_stopped_too(tmp_path: Path) -> None:
+def test_what_a_stopped_job_started_is_stopped_too(tmp_path: Path, done: Done) -> None:
     path = tmp_path / "child"
     done(("parent", Limits(seconds=2.0)), path=os.fspath(path))
     child = int(path.read_text())

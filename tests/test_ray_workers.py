@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from rich.console import Console
 
 from clbench.grid import benchmark_jobs, run_jobs
 from clbench.progress import Bars
@@ -44,15 +43,9 @@ def lost_once(progress, path):
 pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore::ResourceWarning")]
 
 
-@pytest.fixture
-def bars() -> Bars:
-    return Bars(10, Console(file=io.StringIO(), width=200))
-
-
 @pytest.fixture(autouse=True)
-def _jobs_module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "some_jobs.py").write_text(JOBS)
-    monkeypatch.syspath_prepend(tmp_path)
+def _jobs_module(write_module: Callable[[str, str], None]) -> None:
+    write_module("some_jobs", JOBS)
 
 
 def _kill_first(path: Path) -> None:

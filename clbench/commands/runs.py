@@ -90,10 +90,10 @@ def run(
             for seed in range(first_seed, first_seed + seeds)
             for method in names
         ]
-        loaded = {spec.scenario: spec.load() for spec in every_run}
+        loaded = [spec.load() for spec in {spec.scenario: spec for spec in every_run}.values()]
         specs = _part(shard, every_run)
     console = Console(stderr=True)
-    for scenario in loaded.values():
+    for scenario in loaded:
         console.print(expected_precision(scenario, seeds), highlight=False)
     if not _run_missing(specs, records, lambda: _workers(workers, ray), checkpoints, tensorboard):
         sys.exit(1)

@@ -3,9 +3,9 @@
 Import this package to register the toy as `clbench/Toy-v0`, or ask for "clbench.testing:clbench/Toy-v0".
 """
 
-import importlib
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
+from clbench.lazy import lazy_names
 from clbench.registration import register
 
 if TYPE_CHECKING:
@@ -41,16 +41,6 @@ __all__ = [
     "toy_expert",
 ]
 
-
-def __getattr__(name: str) -> Any:
-    for module, names in _HOMES.items():
-        if name in names:
-            return getattr(importlib.import_module(f"{__name__}.{module}"), name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-
-
-def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})
-
+__getattr__, __dir__ = lazy_names(__name__, _HOMES)
 
 register("clbench/Toy-v0", "clbench.testing:TOY")
