@@ -1,10 +1,12 @@
-"""How fast environments step on Fetch, against the vector environments of others and the physics alone.
+"""How fast environments step, by suite, against the vector environments of others and the physics alone.
 
 Contenders take turns in blocks of steps, in a new order each round, so that what else the machine does meets
 all of them alike. A ratio is that of two blocks of one round; reported are the median over rounds and a 95 %
-bootstrap interval of it. All take the same random actions and begin episodes anew as they end. The peers step
-gymnasium-robotics' own FetchPickAndPlace-v4, whose scene, physics and observation ours has, and our plain
-environment besides; the physics alone is as many threads that do nothing but `mujoco.mj_step`.
+bootstrap interval of it. All take the same random actions and begin episodes anew as they end. The peers
+step the suite's own environment, whose physics ours has, for as much simulated time a step; the physics alone
+is as many threads that do nothing but `mujoco.mj_step` on it.
+
+    python benchmarks/rollouts.py fetch
 """
 
 from __future__ import annotations
@@ -19,6 +21,7 @@ import statistics
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -33,18 +36,162 @@ import clbench
 from clbench.fingerprint import fingerprint
 from clbench.task import load_scenario, resolve
 
-RESULTS = Path(__file__).parent / "results"
-OURS = "clbench/Fetch-v0"
-PEERS = "FetchPickAndPlace-v4"
+RESULTS = Path(__file__).parent / "results" / "rollouts.json"
 
 Actions = NDArray[np.float32]
+Env = gymnasium.Env[Any, Any]
+
+
+@dataclass(frozen=True)
+class Physics:
+    """A scene, as an episode begins in it."""
+
+    model: mujoco.MjModel
+    start: mujoco.MjData
+    substeps: int
+    move: Callable[[mujoco.MjData, Actions], None]
+    """Sets what an action (A,) asks for."""
+
+
+@dataclass(frozen=True)
+class Suite:
+    """What a suite's environments are compared on."""
+
+    ours: str
+    """Our scenario."""
+    stage: int | None
+    """The stage that ours stays in, where the peer has but one task."""
+    task: str
+    """What the peer does, in words."""
+    peer: Callable[[], Env]
+    """Makes an environment of the peer; called in its own process."""
+    physics: Callable[[Env], Physics]
+    """Takes an environment of the peer, reset, and returns what is left if all else costs nothing."""
+
+
+# ---- the peers -----------------------------------------------------------------------------------------
+
+
+def _fetch_peer() -> Env:
+    with contextlib.redirect_stderr(io.StringIO()):  # else each process prints a notice about Adroit's hand
+        import gymnasium_robotics
+
+    gymnasium.register_envs(gymnasium_robotics)
+    return gymnasium.make("FetchPickAndPlace-v4")
+
+
+def _fetch_physics(env: Env) -> Physics:
+    scene = resolve("clbench.envs.fetch.scene:scene")()
+
+    def move(data: mujoco.MjData, action: Actions) -> None:
+        data.mocap_pos[0] = data.xpos[scene.hand_body] + 0.05 * action[:3]
+        data.mocap_quat[0] = data.xquat[scene.hand_body]
+        data.ctrl[:] = data.qpos[scene.actuators_qpos] + action[3]
+
+    unwrapped: Any = env.unwrapped
+    return Physics(unwrapped.model, unwrapped.data, scene.substeps, move)
+
+
+def _maze_peer() -> Env:
+    with contextlib.redirect_stderr(io.StringIO()):
+        import gymnasium_robotics
+
+    gymnasium.register_envs(gymnasium_robotics)
+    return gymnasium.make("PointMaze_Medium-v3", continuing_task=False)
+
+
+def _maze_physics(env: Env) -> Physics:
+    point: Any = env.unwrapped
+    point = point.point_env
+
+    def move(data: mujoco.MjData, action: Actions) -> None:
+        data.ctrl[:] = action
+
+    return Physics(point.model, point.data, point.frame_skip, move)
+
+
+class DMControlEnv(gymnasium.Env[NDArray[np.float64], NDArray[np.float32]]):
+    """A task of dm_control as Gymnasium has it, whose steps last as long as ours."""
+
+    def __init__(self, domain: str, task: str, seconds: float) -> None:
+        from dm_control import suite
+        from dm_control.rl.control import Environment
+
+        loaded = suite.load(domain, task, task_kwargs={"random": 0})
+        self.env = Environment(
+            loaded.physics, loaded.task, time_limit=100 * seconds, control_timestep=seconds
+        )
+        motors = self.env.action_spec()
+        self.action_space = gymnasium.spaces.Box(-1.0, 1.0, motors.shape, np.float32)
+        size = sum(int(np.prod(spec.shape)) for spec in self.env.observation_spec().values())
+        self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (size,), np.float64)
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[NDArray[np.float64], dict[str, Any]]:
+        """Begin an episode."""
+        return self._flat(self.env.reset()), {}
+
+    def step(self, action: Actions) -> tuple[NDArray[np.float64], float, bool, bool, dict[str, Any]]:
+        """Move for one step."""
+        moment = self.env.step(action)
+        return self._flat(moment), float(moment.reward or 0.0), False, bool(moment.last()), {}
+
+    def _flat(self, moment: Any) -> NDArray[np.float64]:
+        return np.concatenate([np.ravel(part) for part in moment.observation.values()])
+
+
+def _dm_control_peer() -> Env:
+    os.environ["MUJOCO_GL"] = "off"
+    return DMControlEnv("ball_in_cup", "catch", 0.04)
+
+
+def _dm_control_physics(env: Env) -> Physics:
+    def move(data: mujoco.MjData, action: Actions) -> None:
+        data.ctrl[:] = action
+
+    unwrapped: Any = env.unwrapped
+    physics = unwrapped.env.physics
+    return Physics(physics.model.ptr, physics.data.ptr, round(0.04 / physics.timestep()), move)
+
+
+def _metaworld_peer() -> Env:
+    import metaworld  # noqa: F401 - registers its environments
+
+    return gymnasium.make("Meta-World/MT1", env_name="faucet-close-v3", disable_env_checker=True)
+
+
+def _metaworld_physics(env: Env) -> Physics:
+    unwrapped: Any = env.unwrapped
+
+    def move(data: mujoco.MjData, action: Actions) -> None:
+        low, high = unwrapped.mocap_low, unwrapped.mocap_high
+        data.mocap_pos[0] = np.clip(data.mocap_pos[0] + action[:3] / 100.0, low, high)
+        data.ctrl[:] = action[3], -action[3]
+
+    return Physics(unwrapped.model, unwrapped.data, unwrapped.frame_skip, move)
+
+
+SUITES = {
+    "fetch": Suite("clbench/Fetch-v0", None, "FetchPickAndPlace-v4", _fetch_peer, _fetch_physics),
+    "point_maze": Suite("clbench/PointMaze-v0", None, "PointMaze_Medium-v3", _maze_peer, _maze_physics),
+    "dm_control": Suite(
+        "clbench/DMControl-v0", 3, "ball_in_cup catch", _dm_control_peer, _dm_control_physics
+    ),
+    "metaworld": Suite(
+        "clbench/MetaWorld-v0", 1, "Meta-World/MT1 faucet-close-v3", _metaworld_peer, _metaworld_physics
+    ),
+}
+
+
+# ---- the contenders ------------------------------------------------------------------------------------
 
 
 class Contender(Protocol):
     """Something that steps environments."""
 
     def run(self, actions: Actions) -> None:
-        """Step each environment by its actions (steps, num_envs, 4)."""
+        """Step each environment by its actions (steps, num_envs, A)."""
         ...
 
     def close(self) -> None:
@@ -52,15 +199,15 @@ class Contender(Protocol):
         ...
 
 
-class VectorContender:
+class Gymnasium:
     """A vector environment of Gymnasium."""
 
-    def __init__(self, env_id: str, num_envs: int, **options: Any) -> None:
-        self.env = gymnasium.make_vec(env_id, num_envs=num_envs, **options)
+    def __init__(self, env: gymnasium.vector.VectorEnv[Any, Any, Any]) -> None:
+        self.env = env
         self.env.reset(seed=0)
 
     def run(self, actions: Actions) -> None:
-        """Step each environment by its actions (steps, num_envs, 4)."""
+        """Step each environment by its actions (steps, num_envs, A)."""
         for batch in actions:
             self.env.step(batch)
 
@@ -69,19 +216,18 @@ class VectorContender:
         self.env.close()
 
 
-class SubprocContender:
+class Subproc:
     """The vector environment of Stable-Baselines3: a process for each environment."""
 
-    def __init__(self, env_id: str, num_envs: int, **options: Any) -> None:
+    def __init__(self, make: Callable[[], Env], num_envs: int) -> None:
         from stable_baselines3.common.vec_env import SubprocVecEnv
 
-        make: Callable[[], Any] = functools.partial(_make, env_id, options)
         self.env = SubprocVecEnv([make] * num_envs)
         self.env.seed(0)
         self.env.reset()
 
     def run(self, actions: Actions) -> None:
-        """Step each environment by its actions (steps, num_envs, 4)."""
+        """Step each environment by its actions (steps, num_envs, A)."""
         for batch in actions:
             self.env.step(batch)
 
@@ -90,118 +236,128 @@ class SubprocContender:
         self.env.close()
 
 
-def _make(env_id: str, options: dict[str, Any]) -> gymnasium.Env[Any, Any]:
-    """Make an environment in a process of its own."""
-    _register_peers()
-    return gymnasium.make(env_id, **options)
-
-
-def _register_peers() -> None:
-    with contextlib.redirect_stderr(io.StringIO()):  # else each process prints a notice about Adroit's hand
-        import gymnasium_robotics
-
-    gymnasium.register_envs(gymnasium_robotics)
-
-
-class PhysicsContender:
-    """The physics alone, on as many threads: what is left if all else costs nothing.
+class Raw:
+    """The physics alone, on as many threads: the limit.
 
     Args:
+        physics: Of the suite.
         num_envs: How many copies of the scene.
         threads: How many threads share them.
+        horizon: Steps after which an episode begins anew.
     """
 
-    def __init__(self, num_envs: int, threads: int) -> None:
-        self.scene = resolve("clbench.envs.fetch.scene:scene")()
-        self.data = [mujoco.MjData(self.scene.model) for _ in range(num_envs)]
+    def __init__(self, physics: Physics, num_envs: int, threads: int, horizon: int) -> None:
+        self.physics, self.horizon = physics, horizon
+        self.data = [mujoco.MjData(physics.model) for _ in range(num_envs)]
         self.threads, self.pool = threads, ThreadPoolExecutor(threads)
 
     def run(self, actions: Actions) -> None:
-        """Step each copy by its actions (steps, num_envs, 4), 60 steps from the start and then anew."""
+        """Step each copy by its actions (steps, num_envs, A)."""
         list(self.pool.map(functools.partial(self._run, actions), range(self.threads)))
 
     def _run(self, actions: Actions, first: int) -> None:
+        physics = self.physics
         for number in range(first, len(self.data), self.threads):
+            data = self.data[number]
             for step, action in enumerate(actions[:, number]):
-                if step % 60 == 0:
-                    self._reset(self.data[number])
-                self._step(self.data[number], action)
-
-    def _reset(self, data: mujoco.MjData) -> None:
-        mujoco.mj_resetData(self.scene.model, data)
-        data.qpos[:], data.qvel[:] = self.scene.qpos, self.scene.qvel
-        mujoco.mj_forward(self.scene.model, data)
-
-    def _step(self, data: mujoco.MjData, action: Actions) -> None:
-        data.mocap_pos[0] = data.xpos[self.scene.hand_body] + 0.05 * action[:3]
-        data.mocap_quat[0] = data.xquat[self.scene.hand_body]
-        data.ctrl[:] = data.qpos[self.scene.actuators_qpos] + action[3]
-        mujoco.mj_step(self.scene.model, data, nstep=self.scene.substeps)
+                if step % self.horizon == 0:
+                    mujoco.mj_copyData(data, physics.model, physics.start)
+                physics.move(data, action)
+                mujoco.mj_step(physics.model, data, nstep=physics.substeps)
 
     def close(self) -> None:
         """End its threads."""
         self.pool.shutdown()
 
 
-def contenders(num_envs: int, threads: int) -> dict[str, Contender]:
+def contenders(suite: Suite, num_envs: int, threads: int) -> dict[str, Contender]:
     """Return all that is compared, by name; `clbench` is ours."""
-    tokens = {"instruction": "tokens"}
+    options: dict[str, Any] = {"instruction": "tokens"}
+    if suite.stage is not None:
+        options["stage"] = suite.stage
+    horizon = load_scenario(suite.ours).tasks[0].horizon
+    peer = suite.peer()
+    peer.reset(seed=0)
+    physics = suite.physics(peer)
+
+    def ours(**how: Any) -> Gymnasium:
+        return Gymnasium(gymnasium.make_vec(suite.ours, num_envs=num_envs, **options, **how))
+
     return {
-        "clbench": VectorContender(OURS, num_envs, threads=threads, **tokens),
-        "clbench, one thread": VectorContender(OURS, num_envs, threads=1, **tokens),
-        "SyncVectorEnv of ours": VectorContender(OURS, num_envs, vectorization_mode="sync", **tokens),
-        "AsyncVectorEnv of ours": VectorContender(OURS, num_envs, vectorization_mode="async", **tokens),
-        "SubprocVecEnv of ours": SubprocContender(OURS, num_envs, **tokens),
-        "AsyncVectorEnv": VectorContender(PEERS, num_envs, vectorization_mode="async"),
-        "SubprocVecEnv": SubprocContender(PEERS, num_envs),
-        "mj_step": PhysicsContender(num_envs, threads),
-        "mj_step, one thread": PhysicsContender(num_envs, 1),
+        "clbench": ours(threads=threads),
+        "clbench, one thread": ours(threads=1),
+        "SyncVectorEnv of ours": ours(vectorization_mode="sync"),
+        "AsyncVectorEnv": Gymnasium(gymnasium.vector.AsyncVectorEnv([suite.peer] * num_envs)),
+        "SubprocVecEnv": Subproc(suite.peer, num_envs),
+        "mj_step": Raw(physics, num_envs, threads, horizon),
+        "mj_step, one thread": Raw(physics, num_envs, 1, horizon),
+    }
+
+
+# ---- the measurement -----------------------------------------------------------------------------------
+
+
+def measure(name: str, num_envs: int, threads: int, rounds: int, steps: int) -> dict[str, Any]:
+    """Return the rates and ratios of a suite."""
+    suite, generator = SUITES[name], np.random.default_rng(0)
+    compared = contenders(suite, num_envs, threads)
+    ours: Any = compared["clbench"]
+    size = ours.env.single_action_space.shape[0]
+    taken: list[dict[str, float]] = []
+    for number in track(range(rounds + 1), name):
+        actions = generator.uniform(-1.0, 1.0, (steps, num_envs, size)).astype(np.float32)
+        rates = {}
+        for contender in generator.permutation(list(compared)):
+            begin = time.perf_counter()
+            compared[str(contender)].run(actions)
+            rates[str(contender)] = steps * num_envs / (time.perf_counter() - begin)
+        if number:  # the first round warms up
+            taken.append(rates)
+    for one in compared.values():
+        one.close()
+    return {
+        "peer": suite.task,
+        "num_envs": num_envs,
+        "threads": threads,
+        "rounds": rounds,
+        "steps_per_second": {
+            one: round(statistics.median(rates[one] for rates in taken)) for one in compared
+        },
+        "ratios_of_clbench_to": {
+            one: median_ratio([rates["clbench"] / rates[one] for rates in taken], generator)
+            for one in compared
+            if one != "clbench"
+        },
     }
 
 
 def main() -> None:
     """Measure, print a table and write results/rollouts.json."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("suites", nargs="*", default=list(SUITES), help=f"of {', '.join(SUITES)}")
     parser.add_argument("--num-envs", type=int, default=16)
     parser.add_argument("--threads", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--rounds", type=int, default=15)
     parser.add_argument("--steps", type=int, default=60, help="steps of each environment in a block")
     arguments = parser.parse_args()
-    _register_peers()
-    generator = np.random.default_rng(0)
-    compared = contenders(arguments.num_envs, arguments.threads)
-    rounds: list[dict[str, float]] = []
-    for number in track(range(arguments.rounds + 1), "rounds"):
-        shape = (arguments.steps, arguments.num_envs, 4)
-        actions = generator.uniform(-1.0, 1.0, shape).astype(np.float32)
-        rates = {}
-        for name in generator.permutation(list(compared)):
-            begin = time.perf_counter()
-            compared[str(name)].run(actions)
-            rates[str(name)] = actions[..., 0].size / (time.perf_counter() - begin)
-        if number:  # the first round warms up
-            rounds.append(rates)
-    for contender in compared.values():
-        contender.close()
-    others = [name for name in compared if name != "clbench"]
-    result = {
-        "clbench": clbench.__version__,
-        "hardware": fingerprint(load_scenario(OURS))["hardware"],
-        "num_envs": arguments.num_envs,
-        "threads": arguments.threads,
-        "rounds": arguments.rounds,
-        "steps_per_second": {
-            name: round(statistics.median(one[name] for one in rounds)) for name in compared
-        },
-        "ratios_of_clbench_to": {
-            name: median_ratio([one["clbench"] / one[name] for one in rounds], generator) for name in others
-        },
-    }
-    RESULTS.mkdir(exist_ok=True)
-    (RESULTS / "rollouts.json").write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
-    for name, ratio in result["ratios_of_clbench_to"].items():
-        interval = f"[{ratio['low']:.2f}, {ratio['high']:.2f}]"
-        print(f"{ratio['median_ratio']:.2f} {interval} times {name} ({result['steps_per_second'][name]} /s)")
+    if unknown := set(arguments.suites) - set(SUITES):
+        parser.error(f"unknown: {', '.join(sorted(unknown))}; there are {', '.join(SUITES)}")
+    RESULTS.parent.mkdir(exist_ok=True)
+    kept = json.loads(RESULTS.read_text(encoding="utf-8"))["suites"] if RESULTS.exists() else {}
+    for name in arguments.suites:
+        found = measure(name, arguments.num_envs, arguments.threads, arguments.rounds, arguments.steps)
+        kept[name] = found
+        result = {
+            "clbench": clbench.__version__,
+            "hardware": fingerprint(load_scenario(SUITES[name].ours))["hardware"],
+            "suites": kept,
+        }
+        RESULTS.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+        print(f"{name}: {found['steps_per_second']['clbench']} steps/s, with {found['peer']} as the peer")
+        rates = found["steps_per_second"]
+        for other, ratio in found["ratios_of_clbench_to"].items():
+            interval = f"[{ratio['low']:.2f}, {ratio['high']:.2f}]"
+            print(f"  {ratio['median_ratio']:.2f} {interval} times {other}, {rates[other]} /s")
 
 
 if __name__ == "__main__":

@@ -30,6 +30,14 @@ class Camera(Protocol):
         """Return the part (N, `state_size`) of the states (N, S) that a policy is shown as numbers."""
         ...
 
+    @staticmethod
+    def pictured(states: States) -> States:
+        """Return in numbers (N, K) what pictures of the states (N, S) show: eyes learn to tell it.
+
+        No policy is shown these numbers.
+        """
+        ...
+
     def draw(self, states: States) -> Images:
         """Return a picture of each of the states (N, S), (N, `image_size`, `image_size`, 3).
 

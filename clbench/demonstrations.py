@@ -216,8 +216,10 @@ def _demonstration(episode: dict[str, Any]) -> Demonstration:
 class Demonstrations:
     """Demonstrations of one or more tasks as tensors: one row for each of N moments."""
 
+    scenes: Tensor
+    """The states of the world, (N, W); no method gets them."""
     state: Tensor
-    """What a policy is shown as numbers, (N, S)."""
+    """What a policy is shown of them as numbers, (N, S)."""
     image: Tensor
     """What it is shown as a picture, uint8 (N, size, size, 3); the size is 0 if it sees none."""
     action: Tensor
@@ -238,9 +240,12 @@ class Demonstrations:
         """
         pieces = [_chunks(episode, chunk) for episode in episodes]
         action, valid = (torch.from_numpy(np.concatenate(column)) for column in zip(*pieces, strict=True))
-        state, image = observed(task, np.concatenate([episode.state[:-1] for episode in episodes]))
+        scenes = np.concatenate([episode.state[:-1] for episode in episodes])
+        state, image = observed(task, scenes)
         rows = torch.tensor([[0, len(state)]])
-        return cls(state, image, action, valid, encode(task.instructions)[None], rows)
+        return cls(
+            torch.from_numpy(scenes), state, image, action, valid, encode(task.instructions)[None], rows
+        )
 
     @classmethod
     def cat(cls, parts: Sequence[Demonstrations]) -> Demonstrations:
@@ -249,11 +254,11 @@ class Demonstrations:
         words = [part.words[:, torch.arange(wordings) % part.words.shape[1]] for part in parts]
         starts = np.cumsum([0, *(len(part.state) for part in parts)])
         rows = [part.rows + torch.tensor([int(start), 0]) for part, start in zip(parts, starts, strict=False)]
-        state, image, action, valid = (
+        scenes, state, image, action, valid = (
             torch.cat([getattr(part, name) for part in parts])
-            for name in ("state", "image", "action", "valid")
+            for name in ("scenes", "state", "image", "action", "valid")
         )
-        return cls(state, image, action, valid, torch.cat(words), torch.cat(rows))
+        return cls(scenes, state, image, action, valid, torch.cat(words), torch.cat(rows))
 
     def __len__(self) -> int:
         """Return the number of moments."""
@@ -261,8 +266,8 @@ class Demonstrations:
 
     @property
     def bytes(self) -> int:
-        """Memory that the data takes."""
-        return sum(value.nbytes for value in vars(self).values())
+        """Memory that the data takes, without the scenes, of which nothing is learned."""
+        return sum(value.nbytes for name, value in vars(self).items() if name != "scenes")
 
     def sample(self, count: int, generator: torch.Generator) -> Batch:
         """Return `count` samples: a task at random, then a moment and a wording of it."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -14,10 +14,12 @@ from clbench.cache import cache_folder, cached, hash_of, is_cached, package_of, 
 from clbench.demonstrations import Demonstrations, load_demonstrations, simulator_versions
 from clbench.observer import Observer, frame_hash
 from clbench.policy import Policy, PolicyConfig, load_policy, save_policy
-from clbench.questions import load_questions
+from clbench.policy.vision import Vision
+from clbench.questions import Questions, load_questions
 from clbench.seeding import derive_seed, torch_generator
 from clbench.task import Scenario, resolve
 from clbench.training import deterministic, optimise
+from clbench.vision_pretraining import STEPS_SHARE, pictures_of, pretrain_vision
 
 AFTER_PRETRAINING = (
     "adaptation_steps",
@@ -39,7 +41,7 @@ def pretraining_inputs(scenario: Scenario, seed: int) -> dict[str, Any]:
     budget = dataclasses.asdict(scenario.budget)
     parts = (
         *("policy", "demonstrations", "questions", "camera", "observer", "drawing"),
-        *("seeding", "training", "world"),
+        *("vision_pretraining", "seeding", "training", "world"),
     )
     core = (*(f"clbench.{part}" for part in parts), __name__)
     return {
@@ -117,6 +119,13 @@ def _pretrain(scenario: Scenario, seed: int, progress: Callable[[float], None]) 
         policy.normalise_like(demonstrations.state, demonstrations.action[:, 0])
     else:
         policy.normalise_like(questions.state)
+    if policy.backbone.vision is not None:
+        _open_eyes(
+            policy.backbone.vision,
+            scenario,
+            seed,
+            [questions, demonstrations] if demonstrations else [questions],
+        )
     generator = torch_generator("pretraining", seed)
 
     def loss_at(step: int) -> Tensor:
@@ -135,3 +144,21 @@ def _pretrain(scenario: Scenario, seed: int, progress: Callable[[float], None]) 
             after=lambda _: progress(1),
         )
     return policy
+
+
+def _open_eyes(
+    vision: Vision, scenario: Scenario, seed: int, data: Sequence[Questions | Demonstrations]
+) -> None:
+    """Pretrain the eyes on the pictures of all data."""
+    budget, entry_point = scenario.budget, scenario.scene_tasks[0].camera
+    assert entry_point is not None
+    kinds = resolve(scenario.questions)
+    with deterministic():
+        pretrain_vision(
+            vision,
+            pictures_of([(part.scenes, part.image) for part in data], resolve(entry_point), kinds),
+            kinds,
+            budget.pretraining_learning_rate,
+            round(STEPS_SHARE * budget.pretraining_steps),
+            torch_generator("vision", seed),
+        )

@@ -100,7 +100,7 @@ def test_undeclared_prior_data_cannot_be_touched(name: str) -> None:
 
 
 def test_declared_prior_data_counts_in_bytes() -> None:
-    data = Demonstrations(*(torch.zeros(4, 2) for _ in range(6)))
+    data = Demonstrations(*(torch.zeros(4, 2) for _ in range(7)))
     prior = Prior({"demonstrations": Source(data, torch.Generator(), 8)})
     assert prior.bytes == 6 * 4 * 2 * 4
     prior.close()

@@ -29,7 +29,7 @@ class Vision(nn.Module):
         super().__init__()
         if image_size % PATCH:
             raise ValueError(f"image_size must be a multiple of {PATCH}, not {image_size}.")
-        self.image_size = image_size
+        self.image_size, self.width = image_size, width
         self.tokens = (image_size // PATCH) ** 2
         channels = (3, width // 6, width // 3, width // 2, width)
         layers: list[nn.Module] = []

@@ -23,6 +23,11 @@ class ToyCamera:
         """Return how far right the point is, (N, 1)."""
         return states[:, :1]
 
+    @staticmethod
+    def pictured(states: States) -> States:
+        """Return where point and marker are, (N, 4)."""
+        return states[:, :4]
+
     def draw(self, states: States) -> Images:
         """Return pictures (N, 16, 16, 3); up is where it is in the plane."""
         centres = np.linspace(-REACH, REACH, self.image_size)

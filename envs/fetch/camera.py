@@ -13,7 +13,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .scene import scene_file
-from .state import FINGERS, FINGERS_VELOCITY, GRIPPER, GRIPPER_VELOCITY, REST_HEIGHT, SIZE, TARGET, State
+from .state import (
+    BLOCK,
+    FINGERS,
+    FINGERS_VELOCITY,
+    GRIPPER,
+    GRIPPER_VELOCITY,
+    REST_HEIGHT,
+    SIZE,
+    TARGET,
+    State,
+)
 
 JOINTS = slice(SIZE, SIZE + 22)
 """Positions of all joints, the block's too: with the target and the things they are the whole picture."""
@@ -33,14 +43,11 @@ COLOURS = {
 PROPRIOCEPTION = np.r_[GRIPPER, FINGERS, GRIPPER_VELOCITY, FINGERS_VELOCITY]
 """What a policy is shown of the state as numbers: what a robot knows of itself."""
 
-VIEW = {"distance": 0.72, "azimuth": 135.0, "elevation": -42.0, "lookat": np.array([1.34, 0.75, 0.42])}
-"""From the front right: no task pushes straight away from it, so that the hand seldom hides the block."""
+VIEW = {"distance": 0.60, "azimuth": 180.0, "elevation": -65.0, "lookat": np.array([1.34, 0.75, 0.42])}
+"""From the front, high up: the width of the table is that of the picture, and a pixel is a centimetre."""
 
-_HIDDEN = {
-    *("base_link", "torso_lift_link", "torso_fixed_link", "head_pan_link", "head_tilt_link"),
-    *("shoulder_pan_link", "estop_link", "laser_link", "mocap"),
-}
-"""Bodies that are not in the picture, or only as green beams."""
+ARM = (0.75, 0.75, 0.75, 1.0)
+"""Colour of the fingers. They are all of the arm that is drawn: the rest would hide the table."""
 
 
 class FetchCamera:
@@ -74,6 +81,13 @@ class FetchCamera:
         """Return the part of the states (N, 56) that a policy is shown as numbers, (N, 10)."""
         return states[:, PROPRIOCEPTION]
 
+    @staticmethod
+    def pictured(states: State) -> State:
+        """Return where block, target and things are, (N, 9), in metres."""
+        places = [states[:, BLOCK], states[:, TARGET][:, :2]]
+        places += [states[:, THINGS][:, first : first + 2] for first in (0, 3)]
+        return np.concatenate(places, axis=1)
+
     def draw(self, states: State) -> NDArray[np.uint8]:
         """Return a picture of each of the states (N, 56), (N, size, size, 3)."""
         pictures = np.empty((len(states), self._size, self._size, 3), np.uint8)
@@ -104,7 +118,7 @@ class FetchCamera:
 
 
 def _model(pixels: int) -> mujoco.MjModel:
-    """Return the scene with two things more, and without what is not to be seen."""
+    """Return the scene with two things more, and with no more of the robot than its fingers."""
     spec = mujoco.MjSpec.from_file(str(scene_file()))
     spec.visual.global_.offwidth = spec.visual.global_.offheight = pixels
     spec.visual.quality.offsamples = 0
@@ -119,9 +133,9 @@ def _model(pixels: int) -> mujoco.MjModel:
         )
     model = spec.compile()
     for geom in range(model.ngeom):
-        body = model.body(model.geom_bodyid[geom]).name.removeprefix("robot0:")
-        if body in _HIDDEN or model.geom(geom).name == "floor0":
+        body = model.body(model.geom_bodyid[geom]).name
+        if "finger" in body:
+            model.geom_rgba[geom] = ARM
+        elif body.startswith("robot0:") or model.geom(geom).name == "floor0":
             model.geom_rgba[geom, 3] = 0.0
-        elif body.endswith("link") and "finger" not in body:
-            model.geom_rgba[geom] = (0.75, 0.75, 0.75, 1.0)
     return model

@@ -21,8 +21,6 @@ PIXEL_RULES = {name: dataclasses.replace(rule, target_on_table=True) for name, r
 
 THING_PLACES = np.array([[1.12, 0.52], [1.50, 0.96]])
 """Corners of the part of the table that things lie on, x and y in metres."""
-NEAR_SIDE = 0.56
-"""Least x - y of a thing, in metres: it lies on the camera's side of the gripper, which starts at 0.59."""
 THINGS_APART = 0.10
 """Least distance of a thing to the block, to the target and to the other thing."""
 
@@ -85,8 +83,7 @@ def _things(state: State, generator: np.random.Generator) -> Vectors:
     for colour in generator.permutation(len(COLOURS))[:2]:
         while True:
             place = generator.uniform(*THING_PLACES)
-            apart = min(float(np.linalg.norm(place - other)) for other in taken) >= THINGS_APART
-            if apart and place[0] - place[1] >= NEAR_SIDE:
+            if min(float(np.linalg.norm(place - other)) for other in taken) >= THINGS_APART:
                 break
         taken.append(place)
         things += [*place, colour]

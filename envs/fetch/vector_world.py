@@ -63,8 +63,8 @@ class _Lane:
     Asking MjData for a view costs 0.2 to 0.4 us each time.
     """
 
-    def __init__(self, scene: Scene) -> None:
-        self.scene = scene
+    def __init__(self, number: int, scene: Scene) -> None:
+        self.number, self.scene = number, scene
         self.data = data = mujoco.MjData(scene.model)
         self.qpos, self.qvel = data.qpos, data.qvel
         self.gripper, self.block = data.site_xpos[scene.gripper_site], data.site_xpos[scene.block_site]
@@ -78,7 +78,7 @@ class _Lane:
 
     def __deepcopy__(self, _: dict[int, Any]) -> _Lane:
         """Return a lane whose views are of its own physics."""
-        lane = _Lane(self.scene)
+        lane = _Lane(self.number, self.scene)
         mujoco.mj_copyData(lane.data, self.scene.model, self.data)
         lane.rule, lane.target, lane.start = self.rule, self.target, self.start
         return lane
@@ -131,11 +131,12 @@ class FetchVectorWorld:
             lane.target = self._place_target(block, lane.rule, generator)
             self._reset_physics(lane, block)
             if perturbation:
-                self._displace(number, perturbation.start)
-            self._measure(number)
-        states = self._observe(lanes)
-        for number, state in zip(lanes, states, strict=True):
-            self._lane(number).start = state.copy()
+                self._displace(lane, perturbation.start)
+            self._measure(lane)
+        begun = [self._lane(number) for number in lanes]
+        states = self._observe(begun)
+        for lane, state in zip(begun, states, strict=True):
+            lane.start = state.copy()
         return states
 
     def step(
@@ -149,13 +150,11 @@ class FetchVectorWorld:
             ValueError: An action has another shape than (4,), or a number in it is not finite.
         """
         actions = checked_actions(actions, self.single_action_space, "Fetch")
-        self._act(lanes, actions)
-        self._team.each(self._advance, lanes)
-        states = self._observe(lanes)
-        judged = [
-            self._lane(number).rule.judge(state, self._lane(number).start)
-            for number, state in zip(lanes, states, strict=True)
-        ]
+        moved = [self._lane(number) for number in lanes]
+        self._act(moved, actions)
+        self._team.each(self._advance, moved)
+        states = self._observe(moved)
+        judged = [lane.rule.judge(state, lane.start) for lane, state in zip(moved, states, strict=True)]
         rewards, successes = zip(*judged, strict=True)
         return states, np.array(rewards), np.array(successes)
 
@@ -180,7 +179,7 @@ class FetchVectorWorld:
         """Return a lane that has the physics of a scene; it is made anew if it had that of another one."""
         lane = self._lanes[number]
         if lane is None or lane.scene is not scene:
-            self._lanes[number] = lane = _Lane(scene)
+            self._lanes[number] = lane = _Lane(number, scene)
         return lane
 
     def _place_block(self, generator: np.random.Generator) -> Vectors:
@@ -214,55 +213,54 @@ class FetchVectorWorld:
         data.qpos[scene.block_qpos : scene.block_qpos + 2] = block
         mujoco.mj_forward(scene.model, data)
 
-    def _displace(self, number: int, start: tuple[float, float, float]) -> None:
+    def _displace(self, lane: _Lane, start: tuple[float, float, float]) -> None:
         """Move the gripper by a share `start` of `START` along each axis, and let it come to rest."""
-        lane = self._lane(number)
-        self._act([number], np.array([[*(START / REACH * one for one in start), 0.0]], np.float32))
+        self._act([lane], np.array([[*(START / REACH * one for one in start), 0.0]], np.float32))
         mujoco.mj_step(lane.scene.model, lane.data, nstep=SETTLE * lane.scene.substeps)
 
-    def _act(self, lanes: Sequence[int], actions: NDArray[np.float32]) -> None:
+    def _act(self, lanes: Sequence[_Lane], actions: NDArray[np.float32]) -> None:
         """Set the hands' goals and the fingers' controls, in the arithmetic of gymnasium-robotics."""
-        hands = self._gather(lanes, "hand") + actions[:, :3] * np.float32(REACH)
-        quaternions = self._gather(lanes, "hand_quaternion") + HAND_TURN
-        fingers = self._gather(lanes, "qpos")[:, self._scene.actuators_qpos] + actions[:, 3:].astype(float)
-        for row, number in enumerate(lanes):
-            lane = self._lane(number)
-            lane.goal[:], lane.goal_quaternion[:] = hands[row], quaternions[row]
-            lane.control[:] = fingers[row]
+        hands = _gather(lanes, "hand") + actions[:, :3] * np.float32(REACH)
+        quaternions = _gather(lanes, "hand_quaternion") + HAND_TURN
+        fingers = _gather(lanes, "qpos")[:, self._scene.actuators_qpos] + actions[:, 3:].astype(float)
+        for lane, hand, quaternion, finger in zip(lanes, hands, quaternions, fingers, strict=True):
+            lane.goal[:], lane.goal_quaternion[:], lane.control[:] = hand, quaternion, finger
 
-    def _advance(self, number: int) -> None:
+    def _advance(self, lane: _Lane) -> None:
         """Advance the physics of a lane by one step."""
-        lane = self._lane(number)
         mujoco.mj_step(lane.scene.model, lane.data, nstep=lane.scene.substeps)
-        self._measure(number)
+        self._measure(lane)
 
-    def _measure(self, number: int) -> None:
+    def _measure(self, lane: _Lane) -> None:
         """Compute what the velocities of gripper and block depend on."""
-        scene, data = self._lane(number).scene, self._lane(number).data
-        gripper, block, rotation = self._jacobians[number]
+        scene, data = lane.scene, lane.data
+        gripper, block, rotation = self._jacobians[lane.number]
         mujoco.mj_jacSite(scene.model, data, gripper, None, scene.gripper_site)
         mujoco.mj_jacSite(scene.model, data, block, rotation, scene.block_site)
 
-    def _gather(self, lanes: Sequence[int], name: str) -> Vectors:
-        """Return what each lane has under `name`, (N, its size)."""
-        return np.concatenate([getattr(self._lane(number), name) for number in lanes]).reshape(len(lanes), -1)
-
-    def _observe(self, lanes: Sequence[int]) -> State:
+    def _observe(self, lanes: Sequence[_Lane]) -> State:
         """Return the states (N, 28): gymnasium-robotics' arithmetic in double precision, then rounded."""
         scene, seconds = self._scene, self._scene.step_seconds
-        gripper, block = self._gather(lanes, "gripper"), self._gather(lanes, "block")
-        qvel = self._gather(lanes, "qvel")
-        velocities = (self._jacobians[np.asarray(lanes)] @ qvel[:, None, :, None])[..., 0] * seconds
+        gripper, block = _gather(lanes, "gripper"), _gather(lanes, "block")
+        qvel = _gather(lanes, "qvel")
+        velocities = (self._jacobians[[lane.number for lane in lanes]] @ qvel[:, None, :, None])[
+            ..., 0
+        ] * seconds
         gripper_velocity, block_velocity, block_spin = velocities.swapaxes(0, 1)
         states = np.empty((len(lanes), SIZE), np.float32)
         states[:, GRIPPER] = gripper
         states[:, BLOCK] = block
         states[:, BLOCK_FROM_GRIPPER] = block - gripper
-        states[:, FINGERS] = self._gather(lanes, "qpos")[:, scene.fingers_qpos]
-        states[:, BLOCK_ANGLES] = mat2euler(self._gather(lanes, "block_axes").reshape(-1, 3, 3))
+        states[:, FINGERS] = _gather(lanes, "qpos")[:, scene.fingers_qpos]
+        states[:, BLOCK_ANGLES] = mat2euler(_gather(lanes, "block_axes").reshape(-1, 3, 3))
         states[:, BLOCK_FROM_GRIPPER_VELOCITY] = block_velocity - gripper_velocity
         states[:, BLOCK_SPIN] = block_spin
         states[:, GRIPPER_VELOCITY] = gripper_velocity
         states[:, FINGERS_VELOCITY] = qvel[:, scene.fingers_qvel] * seconds
-        states[:, TARGET] = self._gather(lanes, "target")
+        states[:, TARGET] = _gather(lanes, "target")
         return states
+
+
+def _gather(lanes: Sequence[_Lane], name: str) -> Vectors:
+    """Return what each lane has under `name`, (N, its size)."""
+    return np.concatenate([getattr(lane, name) for lane in lanes]).reshape(len(lanes), -1)

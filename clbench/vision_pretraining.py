@@ -1,0 +1,109 @@
+"""Pretraining of the eyes: before a policy learns to act, its vision learns to tell what a picture shows.
+
+It stands for the vision encoder of a vision-language model, which knows pictures before it sees a robot. A
+linear probe on the patch tokens, thrown away after, is to say what the camera's `pictured` says of the state,
+and the answer to everything that can be asked about it. Questions alone teach seeing too slowly: in 2,400
+steps of one answer to a picture, colours stayed at chance; 800 steps of all answers made 0.95 of them right.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from clbench.camera import Camera
+from clbench.policy.vision import Vision
+from clbench.questions import QuestionKind
+from clbench.training import optimise
+
+STEPS_SHARE = 0.25
+"""Steps of it for each step of pretraining."""
+PICTURES = 64
+"""Pictures of each set that a step looks at."""
+
+
+@dataclass(frozen=True)
+class Pictures:
+    """Pictures with all that is to be told of them."""
+
+    image: Tensor
+    """Pictures, uint8 (N, size, size, 3)."""
+    numbers: Tensor
+    """What they show in numbers of about 1, (N, K)."""
+    answers: Tensor
+    """Index of the right answer to each kind of question, -1 where it is too close to tell, (N, kinds)."""
+
+    def sample(self, count: int, generator: torch.Generator) -> Pictures:
+        """Return `count` of them at random."""
+        rows = torch.randint(len(self.image), (count,), generator=generator)
+        return Pictures(self.image[rows], self.numbers[rows], self.answers[rows])
+
+
+def pictures_of(
+    sets: Sequence[tuple[Tensor, Tensor]], camera: type[Camera], kinds: Sequence[QuestionKind]
+) -> list[Pictures]:
+    """Return sets of pictures with what is to be told of them.
+
+    Args:
+        sets: States of the world (N, W) with their pictures, (N, size, size, 3).
+        camera: What drew them.
+        kinds: What can be asked about a state.
+    """
+    shown = [torch.from_numpy(camera.pictured(scene.numpy())) for scene, _ in sets]
+    everything = torch.cat(shown)
+    mean, deviation = everything.mean(dim=0), everything.std(dim=0, correction=0).clamp(min=1e-2)
+    return [
+        Pictures(
+            image,
+            ((numbers - mean) / deviation).clamp(-5.0, 5.0),  # a block that fell off the table is far away
+            torch.stack([torch.from_numpy(kind.answer(scene.numpy())) for kind in kinds], dim=1),
+        )
+        for (scene, image), numbers in zip(sets, shown, strict=True)
+    ]
+
+
+def pretrain_vision(
+    vision: Vision,
+    sets: Sequence[Pictures],
+    kinds: Sequence[QuestionKind],
+    learning_rate: float,
+    steps: int,
+    generator: torch.Generator,
+    after: Callable[[int], None] = lambda _: None,
+) -> None:
+    """Teach the eyes of a policy, in place, to tell what pictures show.
+
+    Args:
+        vision: The eyes.
+        sets: Pictures; each step looks at `PICTURES` of each.
+        kinds: What can be asked about them.
+        learning_rate: Peak step size.
+        steps: How many.
+        generator: Draws the probe and the pictures.
+        after: Called after each step with the number of steps done.
+    """
+    numbers = sets[0].numbers.shape[1]
+    choices = [len(kind.answers) for kind in kinds]
+    probe = nn.Linear(vision.tokens * vision.width, numbers + sum(choices))
+    with torch.no_grad():
+        probe.weight.normal_(std=0.02, generator=generator)
+        probe.bias.zero_()
+
+    def loss_at(_: int) -> Tensor:
+        parts = [one.sample(PICTURES, generator) for one in sets]
+        told = probe(vision(torch.cat([part.image for part in parts])).flatten(1))
+        shown = torch.cat([part.numbers for part in parts])
+        loss = F.mse_loss(told[:, :numbers], shown)
+        answers = torch.cat([part.answers for part in parts])
+        answer_losses = [
+            F.cross_entropy(logits, answer, ignore_index=-1, reduction="sum")
+            / max(1, int((answer >= 0).sum()))
+            for logits, answer in zip(told[:, numbers:].split(choices, dim=1), answers.T, strict=True)
+        ]
+        return loss + torch.stack(answer_losses).mean()
+
+    optimise([*vision.parameters(), *probe.parameters()], learning_rate, steps, loss_at, after=after)
