@@ -1,0 +1,167 @@
+"""How cost grows with tasks, episodes, environments and demonstrations: `python benchmarks/scaling.py`.
+
+Each is measured at several sizes in turns, in a new order each round; reported are the medians, the straight
+line through them and how far they lie off it. Tasks are those of Meta-World, each with a scene of its own,
+and episodes those of Fetch, both with a policy as it was drawn: its episodes last to their horizons.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import resource
+import statistics
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import torch
+from metaworld.env_dict import ALL_V3_ENVIRONMENTS
+from rich.progress import track
+
+import clbench
+from clbench.demonstrations import Demonstrations, load_demonstrations
+from clbench.evaluation import Evaluator
+from clbench.fingerprint import fingerprint
+from clbench.policy import Policy
+from clbench.pretraining import policy_config
+from clbench.seeding import torch_generator
+from clbench.task import load_scenario
+from clbench.training import deterministic, optimise
+
+RESULTS = Path(__file__).parent / "results" / "scaling.json"
+FETCH, META_WORLD = "clbench/Fetch-v0", "clbench/MetaWorld-v0"
+
+
+def evaluation_of_tasks() -> Callable[[int], float]:
+    """Return what evaluates 2 episodes of each of a number of tasks."""
+    scenario = load_scenario(META_WORLD)
+    names = [name.removesuffix("-v3").replace("-", "_") for name in ALL_V3_ENVIRONMENTS]
+    tasks = [dataclasses.replace(scenario.target[0], name=name, horizon=100) for name in names]
+    policy = Policy(policy_config(scenario), seed=0)
+    evaluators: dict[int, Evaluator] = {}
+
+    def seconds(count: int) -> float:
+        evaluator = evaluators.setdefault(count, Evaluator(scenario, seed=0))
+        trials = [(task, "selection", number) for task in tasks[:count] for number in range(2)]
+        begin = time.perf_counter()
+        evaluator.play(policy, trials)  # type: ignore[arg-type]
+        return time.perf_counter() - begin
+
+    return seconds
+
+
+def evaluation_of_episodes() -> Callable[[int], float]:
+    """Return what evaluates a number of episodes of one task."""
+    scenario = load_scenario(FETCH)
+    policy = Policy(policy_config(scenario), seed=0)
+    evaluator = Evaluator(scenario, seed=0)
+
+    def seconds(count: int) -> float:
+        begin = time.perf_counter()
+        evaluator.play(policy, [(scenario.retained[3], "selection", number) for number in range(count)])
+        return time.perf_counter() - begin
+
+    return seconds
+
+
+def steps_of_environments() -> Callable[[int], float]:
+    """Return what steps a number of environments 20 times."""
+    made: dict[int, gymnasium.vector.VectorEnv[Any, Any, Any]] = {}
+
+    def seconds(count: int) -> float:
+        if count not in made:
+            made[count] = gymnasium.make_vec(FETCH, num_envs=count, instruction="tokens")
+            made[count].reset(seed=0)
+        actions = np.random.default_rng(0).uniform(-1.0, 1.0, (20, count, 4)).astype(np.float32)
+        begin = time.perf_counter()
+        for batch in actions:
+            made[count].step(batch)
+        return time.perf_counter() - begin
+
+    return seconds
+
+
+def steps_on_demonstrations() -> Callable[[int], float]:
+    """Return what takes 10 optimiser steps on so many demonstrations."""
+    scenario = load_scenario(FETCH)
+    policy = Policy(policy_config(scenario), seed=0)
+    data = load_demonstrations(scenario.target[0], scenario, policy.config)
+    copies: dict[int, Demonstrations] = {}
+
+    def seconds(count: int) -> float:
+        times = count // scenario.budget.demonstrations
+        if count not in copies:
+            whole = Demonstrations.cat([data] * times)
+            rows = torch.tensor([[0, len(whole)]])
+            copies[count] = dataclasses.replace(whole, words=data.words, rows=rows)
+        generator = torch_generator("scaling", count)
+        many = copies[count]
+        begin = time.perf_counter()
+        with deterministic():
+            optimise(
+                policy.parameters(),
+                1e-4,
+                10,
+                lambda _: policy.action_loss(many.sample(scenario.budget.batch_size, generator)).mean(),
+            )
+        return time.perf_counter() - begin
+
+    return seconds
+
+
+MEASURES: dict[str, tuple[Callable[[], Callable[[int], float]], tuple[int, ...]]] = {
+    "tasks": (evaluation_of_tasks, (10, 20, 30, 40, 50)),
+    "episodes": (evaluation_of_episodes, (25, 50, 100, 150, 200)),
+    "environments": (steps_of_environments, (4, 8, 16, 32, 64)),
+    "demonstrations": (steps_on_demonstrations, (200, 400, 800, 1600, 3200)),
+}
+"""What is measured, and at which sizes."""
+
+
+def line(sizes: Sequence[int], seconds: Sequence[float]) -> dict[str, float]:
+    """Return the straight line by least squares, and the largest relative distance of a point from it."""
+    slope, offset = np.polyfit(sizes, seconds, 1)
+    fitted = slope * np.array(sizes) + offset
+    return {
+        "seconds_each": float(slope),
+        "seconds_at_none": float(offset),
+        "farthest_off": round(float(np.abs(np.array(seconds) / fitted - 1.0).max()), 3),
+    }
+
+
+def main() -> None:
+    """Measure, print a table and write results/scaling.json."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("--rounds", type=int, default=5)
+    arguments = parser.parse_args()
+    generator = np.random.default_rng(0)
+    found: dict[str, Any] = {}
+    for name, (prepare, sizes) in MEASURES.items():
+        measure = prepare()
+        for size in sizes:  # makes what is made once: scenes, memory
+            measure(size)
+        rounds = [
+            {int(size): measure(int(size)) for size in generator.permutation(sizes)}
+            for _ in track(range(arguments.rounds), name)
+        ]
+        seconds = [statistics.median(taken[size] for taken in rounds) for size in sizes]
+        found[name] = {"sizes": sizes, "seconds": [round(one, 3) for one in seconds], **line(sizes, seconds)}
+        print(name, found[name])
+    result = {
+        "clbench": clbench.__version__,
+        "hardware": fingerprint(load_scenario(FETCH))["hardware"],
+        "peak_memory_gb": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20, 2),
+        "measures": found,
+    }
+    RESULTS.parent.mkdir(exist_ok=True)
+    RESULTS.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+    print(f"peak memory {result['peak_memory_gb']} GB")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,116 @@
+"""Where the time of a whole run goes, and how much memory it takes: `python benchmarks/whole_run.py`.
+
+One run of plain fine-tuning with one thread, as `clbench run` does it, with its data and its pretrained
+policy in the cache. The clock is read around the physics, the pictures and the policy of the evaluation;
+training is what the loop takes beside evaluations. A bare number says how fast the machine is at the moment:
+matrix products of a policy's size, in GFLOPS, before and after.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import resource
+import tempfile
+import time
+from collections import defaultdict
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import torch
+from rich.progress import Progress
+
+import clbench
+from clbench.fingerprint import fingerprint
+from clbench.policy import Policy
+from clbench.pretraining import pretrained_policy
+from clbench.run import RunSpec, execute, run_length
+from clbench.task import load_scenario
+from clbench.world import Lanes
+
+RESULTS = Path(__file__).parent / "results" / "whole_run.json"
+PARTS = {
+    "physics": (Lanes, ("step", "reset")),
+    "pictures": (Lanes, ("observe",)),
+    "policy": (Policy, ("act",)),
+}
+
+
+def main() -> None:
+    """Measure, print a table and write results/whole_run.json."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("scenarios", nargs="*", default=["clbench/Fetch-v0"])
+    parser.add_argument("--method", default="sft")
+    parser.add_argument("--seed", type=int, default=0)
+    arguments = parser.parse_args()
+    kept = json.loads(RESULTS.read_text(encoding="utf-8"))["runs"] if RESULTS.exists() else {}
+    for scenario in arguments.scenarios:
+        kept[scenario] = found = measure(RunSpec(scenario, arguments.method, arguments.seed))
+        result = {
+            "clbench": clbench.__version__,
+            "hardware": fingerprint(load_scenario(scenario))["hardware"],
+            "runs": kept,
+        }
+        RESULTS.parent.mkdir(exist_ok=True)
+        RESULTS.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+        print(f"{scenario}, {arguments.method}: {found['seconds']:.0f} s, {found['peak_memory_gb']:.2f} GB")
+        for part, seconds in found["parts"].items():
+            print(f"  {part:10} {seconds:6.1f} s, {seconds / found['seconds']:4.0%}")
+
+
+def measure(spec: RunSpec) -> dict[str, Any]:
+    """Return how long a run takes, and its parts."""
+    pretrained_policy(spec.load(), spec.seed)
+    clocks: defaultdict[str, float] = defaultdict(float)
+    for part, (owner, names) in PARTS.items():
+        for name in names:
+            setattr(owner, name, _clocked(getattr(owner, name), clocks, part))
+    speeds = [_gigaflops()]
+    with tempfile.TemporaryDirectory() as records, Progress(transient=True) as bars:
+        bar = bars.add_task(spec.scenario, total=run_length(spec.load()))
+        begin = time.perf_counter()
+        record = execute(spec, Path(records), lambda amount: bars.advance(bar, amount))
+        seconds = time.perf_counter() - begin
+    speeds.append(_gigaflops())
+    training = sum(stage["training"] for stage in record.timing["stages"])
+    parts = {"training": training, **{part: clocks[part] for part in PARTS}}
+    parts["other"] = seconds - sum(parts.values())
+    return {
+        "method": spec.method,
+        "seconds": round(seconds, 1),
+        "parts": {part: round(value, 1) for part, value in parts.items()},
+        "environment_steps": sum(record.episodes["length"]),
+        "optimiser_steps": record.costs["optimiser_steps"],
+        "peak_memory_gb": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20, 2),
+        "gigaflops": [round(speed, 1) for speed in speeds],
+    }
+
+
+def _clocked(function: Callable[..., Any], clocks: defaultdict[str, float], part: str) -> Callable[..., Any]:
+    def timed(*arguments: Any, **options: Any) -> Any:
+        begin = time.perf_counter()
+        try:
+            return function(*arguments, **options)
+        finally:
+            clocks[part] += time.perf_counter() - begin
+
+    return timed
+
+
+def _gigaflops() -> float:
+    """Return how fast one thread multiplies matrices (1088, 96) x (96, 192): a layer of the policy's."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    left, right = torch.randn(1088, 96), torch.randn(96, 192)
+    times = []
+    for _ in range(500):
+        begin = time.perf_counter()
+        torch.mm(left, right)
+        times.append(time.perf_counter() - begin)
+    torch.set_num_threads(threads)
+    return 2 * 1088 * 96 * 192 / sorted(times)[len(times) // 2] / 1e9
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,99 @@
+"""What a second worker brings to a grid, and what Ray costs: `python benchmarks/workers.py`.
+
+The same runs, plain fine-tuning on the first target with several seeds, by one worker, by one for each core
+and by a Ray cluster of this machine, in turns. What they need is in the cache before; a cluster starts before
+the clock does, as one would be there. The records of all ways must be the same, but for their times.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import io
+import json
+import os
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from ratios import median_ratio
+from rich.console import Console
+
+import clbench
+from clbench.fingerprint import fingerprint
+from clbench.grid import benchmark_jobs, run_with_bars
+from clbench.ray_workers import RayWorkers
+from clbench.record import read_record
+from clbench.run import RunSpec
+from clbench.task import load_scenario
+from clbench.workers import Processes, Workers
+
+RESULTS = Path(__file__).parent / "results" / "workers.json"
+
+
+def main() -> None:
+    """Measure, print the ratios and write results/workers.json."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("--scenario", default="clbench/Fetch-v0")
+    parser.add_argument("--runs", type=int, default=4)
+    parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
+    arguments = parser.parse_args()
+    count = arguments.workers
+    specs = [
+        RunSpec(arguments.scenario, "sft", seed, split="selection", targets=1)
+        for seed in range(arguments.runs)
+    ]
+    ways: dict[str, Callable[[], Workers]] = {
+        "one worker": lambda: Processes(1),
+        f"{count} workers": lambda: Processes(count),
+        f"Ray, {count} workers": lambda: RayWorkers("local", count),
+    }
+    with tempfile.TemporaryDirectory() as folder:
+        _seconds(specs, Path(folder), ways[f"{count} workers"])  # makes what runs need
+    rounds, generator = [], np.random.default_rng(0)
+    for number in range(arguments.rounds):
+        taken, found = {}, []
+        for way in generator.permutation(list(ways)):
+            with tempfile.TemporaryDirectory() as folder:
+                taken[str(way)] = _seconds(specs, Path(folder), ways[str(way)])
+                found.append(_outcomes(specs, Path(folder)))
+        assert all(outcomes == found[0] for outcomes in found), "ways differ in their records"
+        print(f"round {number + 1}:", ", ".join(f"{way} {seconds:.0f} s" for way, seconds in taken.items()))
+        rounds.append(taken)
+    one, many, ray = ways
+    result = {
+        "clbench": clbench.__version__,
+        "hardware": fingerprint(load_scenario(arguments.scenario))["hardware"],
+        "runs": arguments.runs,
+        "workers": count,
+        "seconds": {way: round(float(np.median([taken[way] for taken in rounds])), 1) for way in ways},
+        "one_worker_to_many": median_ratio([taken[one] / taken[many] for taken in rounds], generator),
+        "ray_to_many": median_ratio([taken[ray] / taken[many] for taken in rounds], generator),
+    }
+    RESULTS.parent.mkdir(exist_ok=True)
+    RESULTS.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+    print(json.dumps({name: result[name] for name in ("one_worker_to_many", "ray_to_many")}, indent=1))
+
+
+def _seconds(specs: list[RunSpec], records: Path, make: Callable[[], Workers]) -> float:
+    """Return how long the runs take."""
+    jobs, workers = benchmark_jobs(specs, records), make()
+    begin = time.perf_counter()
+    with contextlib.redirect_stderr(io.StringIO()):
+        failed = run_with_bars(jobs, workers, Console(file=io.StringIO()))
+    assert not failed, failed
+    return time.perf_counter() - begin
+
+
+def _outcomes(specs: list[RunSpec], records: Path) -> list[dict[str, Any]]:
+    """Return what the records say was seen."""
+    kept = (read_record(spec.path(records)) for spec in specs)
+    return [{"episodes": one.episodes, "answers": one.answers, "policy": one.policy} for one in kept]
+
+
+if __name__ == "__main__":
+    main()
