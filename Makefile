@@ -35,10 +35,14 @@ docs: .venv/installed
 	$(BIN)/clbench method-pages
 	$(BIN)/clbench scenario-card
 
-# Speed, as ratios: benchmarks/results/.
-benchmark: .venv/installed
-	$(BIN)/python benchmarks/step_time.py
+# Speed, as ratios: benchmarks/results/, and docs/performance.md from them. It takes an hour of a quiet machine.
+benchmark: .venv/installed-dev
 	$(BIN)/python benchmarks/rollouts.py
+	$(BIN)/python benchmarks/step_time.py
+	$(BIN)/python benchmarks/whole_run.py clbench/Fetch-v0 clbench/PointMaze-v0 clbench/DMControl-v0 clbench/MetaWorld-v0
+	$(BIN)/python benchmarks/workers.py
+	$(BIN)/python benchmarks/scaling.py
+	$(BIN)/python benchmarks/report.py
 
 test: .venv/installed-dev
 	$(BIN)/pytest

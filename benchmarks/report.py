@@ -1,0 +1,192 @@
+"""docs/performance.md and its picture, from benchmarks/results/: `python benchmarks/report.py`."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import vl_convert
+
+HERE = Path(__file__).parent
+RESULTS, DOCS = HERE / "results", HERE.parent / "docs"
+VEGA_LITE = "6.4"
+
+INTRODUCTION = """\
+# Performance
+
+Made by `python benchmarks/report.py` from `benchmarks/results/`, which `make benchmark` measures. Ratios are
+of blocks that take turns on one machine, the median with a 95 % bootstrap interval; seconds are of that
+machine and of no use beside another's. Nothing else ran beside them.
+"""
+UNITS = {
+    "tasks": "tasks of Meta-World, 2 episodes each",
+    "episodes": "episodes of Fetch",
+    "environments": "Fetch environments, 20 steps each",
+    "demonstrations": "demonstrations, 10 optimiser steps",
+}
+
+
+def _read(name: str) -> Any:
+    path = RESULTS / f"{name}.json"
+    if not path.exists():
+        raise SystemExit(f"There is no {path}: python benchmarks/{name}.py makes it.")
+    return json.loads(path.read_text(encoding="utf-8"))
+
+
+def _ratio(ratio: dict[str, float]) -> str:
+    return f"{ratio['median_ratio']:.2f} [{ratio['low']:.2f}, {ratio['high']:.2f}]"
+
+
+def _table(head: list[str], rows: list[list[str]]) -> Iterator[str]:
+    yield f"| {' | '.join(head)} |"
+    yield f"| --- |{' --: |' * (len(head) - 1)}"
+    yield from (f"| {' | '.join(row)} |" for row in rows)
+    yield ""
+
+
+def _rollouts() -> Iterator[str]:
+    suites = _read("rollouts")["suites"]
+    first = next(iter(suites.values()))
+    yield "## Environment steps"
+    yield ""
+    yield (
+        f"`gym.make_vec(id, num_envs={first['num_envs']})` with {first['threads']} threads, as a multiple of "
+        "the vector environments that people use, on the suite's own environment, and of `mj_step` alone on "
+        "as many threads: the limit."
+    )
+    yield ""
+    others = ["AsyncVectorEnv", "SubprocVecEnv", "SyncVectorEnv of ours", "clbench, one thread", "mj_step"]
+    yield from _table(
+        ["suite (peer)", "steps / s", *others],
+        [
+            [
+                f"{name} ({suite['peer']})",
+                str(suite["steps_per_second"]["clbench"]),
+                *(_ratio(suite["ratios_of_clbench_to"][other]) for other in others),
+            ]
+            for name, suite in suites.items()
+        ],
+    )
+
+
+def _whole_run() -> Iterator[str]:
+    runs = _read("whole_run")["runs"]
+    yield "## A whole run"
+    yield ""
+    yield "One thread; data and pretrained policy are in the cache."
+    yield ""
+    parts = list(next(iter(runs.values()))["parts"])
+    yield from _table(
+        ["run", "seconds", *parts, "environment steps", "peak memory"],
+        [
+            [
+                f"{name}, {run['method']}",
+                f"{run['seconds']:.0f}",
+                *(f"{run['parts'][part] / run['seconds']:.0%}" for part in parts),
+                f"{run['environment_steps']:,}",
+                f"{run['peak_memory_gb']:.2f} GB",
+            ]
+            for name, run in runs.items()
+        ],
+    )
+
+
+def _steps() -> Iterator[str]:
+    steps = _read("step_time")
+    yield "## A step of adaptation"
+    yield ""
+    yield (
+        f"Plain fine-tuning takes {1000 * steps['baseline_seconds_per_step']:.0f} ms a step. A bare PyTorch "
+        f"loop on the same model and batches takes {_ratio(steps['bare_loop'])} of that. Others, as ratios:"
+    )
+    yield ""
+    ratios = sorted(steps["ratios"].items(), key=lambda item: item[1]["median_ratio"])
+    yield from _table(["method", "step time"], [[name, _ratio(ratio)] for name, ratio in ratios])
+
+
+def _workers() -> Iterator[str]:
+    found = _read("workers")
+    yield "## Workers"
+    yield ""
+    yield (
+        f"{found['runs']} runs by one worker take {_ratio(found['one_worker_to_many'])} times as long as by "
+        f"{found['workers']}; by a Ray cluster of {found['workers']} workers "
+        f"{_ratio(found['ray_to_many'])} times as long as by these. The records are the same."
+    )
+    yield ""
+
+
+def _scaling() -> Iterator[str]:
+    found = _read("scaling")
+    yield "## How cost grows"
+    yield ""
+    yield "![Seconds over size, with the straight line through the points](performance.svg)"
+    yield ""
+    yield from _table(
+        ["of what", "sizes", "seconds", "each more", "farthest off the line"],
+        [
+            [
+                UNITS[name],
+                ", ".join(map(str, one["sizes"])),
+                ", ".join(f"{seconds:.2f}" for seconds in one["seconds"]),
+                f"{1000 * one['seconds_each']:.2g} ms",
+                f"{one['farthest_off']:.0%}",
+            ]
+            for name, one in found["measures"].items()
+        ],
+    )
+    yield f"Peak memory of all together: {found['peak_memory_gb']:.2f} GB."
+
+
+def _picture() -> str:
+    panels = []
+    for name, one in _read("scaling")["measures"].items():
+        points = [
+            {"size": size, "seconds": seconds, "line": one["seconds_each"] * size + one["seconds_at_none"]}
+            for size, seconds in zip(one["sizes"], one["seconds"], strict=True)
+        ]
+        x = {"field": "size", "type": "quantitative", "title": name, "axis": {"tickCount": 5, "grid": False}}
+        axis = {"tickCount": 4}
+        panels.append(
+            {
+                "width": 170,
+                "height": 130,
+                "data": {"values": points},
+                "layer": [
+                    {
+                        "mark": {"type": "line", "color": "#9aa4b2"},
+                        "encoding": {"x": x, "y": {"field": "line", "type": "quantitative"}},
+                    },
+                    {
+                        "mark": {"type": "point", "filled": True, "size": 45, "color": "#1f6feb"},
+                        "encoding": {
+                            "x": x,
+                            "y": {
+                                "field": "seconds",
+                                "type": "quantitative",
+                                "title": "seconds",
+                                "axis": axis,
+                                "scale": {"domainMin": 0},
+                            },
+                        },
+                    },
+                ],
+            }
+        )
+    spec = {"hconcat": panels, "config": {"background": "white", "view": {"stroke": None}}}
+    return str(vl_convert.vegalite_to_svg(spec, vl_version=VEGA_LITE)) + "\n"
+
+
+def main() -> None:
+    """Write the page and the picture."""
+    sections = (_rollouts, _whole_run, _steps, _workers, _scaling)
+    text = "\n".join([INTRODUCTION, *(line for section in sections for line in section())])
+    (DOCS / "performance.md").write_text(text.rstrip("\n") + "\n", encoding="utf-8")
+    (DOCS / "performance.svg").write_text(_picture(), encoding="utf-8")
+    print(f"{DOCS / 'performance.md'} and performance.svg are written.")
+
+
+if __name__ == "__main__":
+    main()
