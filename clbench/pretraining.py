@@ -158,7 +158,6 @@ def _open_eyes(
             vision,
             pictures_of([(part.scenes, part.image) for part in data], resolve(entry_point), kinds),
             kinds,
-            budget.pretraining_learning_rate,
             round(STEPS_SHARE * budget.pretraining_steps),
             torch_generator("vision", seed),
         )

@@ -83,9 +83,10 @@ class FetchCamera:
 
     @staticmethod
     def pictured(states: State) -> State:
-        """Return where block, target and things are, (N, 9), in metres."""
-        places = [states[:, BLOCK], states[:, TARGET][:, :2]]
-        places += [states[:, THINGS][:, first : first + 2] for first in (0, 3)]
+        """Return where block, target, and the right and the left thing are, (N, 9), in metres."""
+        things = states[:, THINGS].reshape(-1, 2, 3)[:, :, :2]
+        from_the_right = np.take_along_axis(things, things[:, :, 1:].argsort(axis=1), axis=1)
+        places = [states[:, BLOCK], states[:, TARGET][:, :2], from_the_right.reshape(-1, 4)]
         return np.concatenate(places, axis=1)
 
     def draw(self, states: State) -> NDArray[np.uint8]:

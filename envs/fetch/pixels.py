@@ -31,7 +31,7 @@ SCENARIO = Scenario(
     target=_seen(FETCH.target),
     held_out=_seen(FETCH.held_out),
     questions="clbench.envs.fetch.pixel_questions:PIXEL_QUESTIONS",
-    budget=Budget(demonstrations=500, question_episodes=1200, pretraining_steps=6000),
+    budget=Budget(demonstrations=500, question_episodes=1200, pretraining_steps=4000),
 )
 """The sequence of `clbench/Fetch-v0`; nothing tells a policy where block and target are but the picture.
 

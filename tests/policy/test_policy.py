@@ -211,7 +211,7 @@ def test_a_batch_without_images_has_a_row_of_no_pixels_for_each_sample() -> None
     assert not any("vision" in name for name in Policy(CONFIG).state_dict())
 
 
-def test_a_policy_reads_a_token_for_each_patch_of_the_image() -> None:
+def test_a_policy_reads_an_image_in_four_tokens() -> None:
     policy, batch = Policy(SEEING), _seen(3)
     hidden = policy.hidden_states(batch.state, batch.words, batch.image)
     assert hidden[0].shape == (3, 4 + 4 + 1 + 12, 32)
