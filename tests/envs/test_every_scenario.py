@@ -17,6 +17,7 @@ from gymnasium.utils.env_checker import check_env
 from numpy.typing import NDArray
 
 from clbench.policy import encode
+from clbench.rendering import RenderingError
 from clbench.scenario_env import ScenarioEnv
 from clbench.task import Scenario, Task, registered_scenario, resolve, scenario_ids
 from clbench.world import Lanes, World, check_perturbable, vector_world
@@ -45,6 +46,10 @@ def make_environment(scenario: Scenario, **options: Any) -> ScenarioEnv:
     make(scenario.tasks[0].world).close()
     environment = gymnasium.make(scenario.id, **options).unwrapped
     assert isinstance(environment, ScenarioEnv)
+    try:
+        environment.reset(seed=0)
+    except RenderingError as fault:
+        pytest.skip(str(fault))
     return environment
 
 

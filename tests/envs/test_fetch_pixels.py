@@ -14,7 +14,7 @@ from clbench.rendering import RenderingError
 from clbench.scenario_env import ScenarioEnv
 from clbench.task import Task, load_scenario, resolve
 
-SCENARIO = resolve("clbench.envs.fetch.pixels:SCENARIO")
+SCENARIO = load_scenario("clbench:clbench/FetchPixels-v0")
 FETCH = load_scenario("clbench:clbench/Fetch-v0")
 QUESTIONS = {kind.name: kind for kind in resolve(SCENARIO.questions)}
 WORLD, CAMERA = SCENARIO.tasks[0].world, SCENARIO.tasks[0].camera
@@ -103,6 +103,18 @@ def test_a_picture_shows_the_target_and_both_things_and_no_other_colour(observer
         there = {COLOURS[int(number)] for number in state[THINGS][2::3]}
         assert _shown("red", image).sum() >= 3
         assert {colour for colour in COLOURS if _shown(colour, image).sum() >= 3} == there
+
+
+def test_what_eyes_learn_to_tell_is_where_block_target_and_things_are() -> None:
+    state = _start(3)[None]
+    swapped = state.copy()
+    swapped[0, THINGS] = state[0, THINGS].reshape(2, 3)[::-1].ravel()
+    camera = resolve(str(CAMERA))
+    (told,), (again,) = camera.pictured(state), camera.pictured(swapped)
+    assert np.array_equal(told, again)  # nothing but their places tells the things apart
+    places = state[0, THINGS].reshape(2, 3)[:, :2]
+    right, left = places[places[:, 1].argsort()]
+    np.testing.assert_array_equal(told, [*state[0, BLOCK], *state[0, TARGET][:2], *right, *left])
 
 
 def test_a_policy_is_not_told_where_block_and_target_are(observer: Observer) -> None:
