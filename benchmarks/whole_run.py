@@ -25,7 +25,8 @@ import clbench
 from clbench.fingerprint import fingerprint
 from clbench.policy import Policy
 from clbench.pretraining import pretrained_policy
-from clbench.run import RunSpec, execute, run_length
+from clbench.run import execute
+from clbench.run_spec import RunSpec, run_length
 from clbench.task import load_scenario
 from clbench.world import Lanes
 

@@ -27,7 +27,7 @@ from clbench.fingerprint import fingerprint
 from clbench.grid import benchmark_jobs, run_with_bars
 from clbench.ray_workers import RayWorkers
 from clbench.record import read_record
-from clbench.run import RunSpec
+from clbench.run_spec import RunSpec
 from clbench.task import load_scenario
 from clbench.workers import Processes, Workers
 

@@ -29,8 +29,8 @@ if TYPE_CHECKING:
     from clbench.record import Record as Record
     from clbench.record import read_record as read_record
     from clbench.registration import register as register
-    from clbench.run import RunSpec as RunSpec
     from clbench.run import execute as execute
+    from clbench.run_spec import RunSpec as RunSpec
     from clbench.scenario_env import ScenarioEnv as ScenarioEnv
     from clbench.task import Budget as Budget
     from clbench.task import Scenario as Scenario
@@ -58,7 +58,8 @@ _HOMES = {
     "questions": ("QuestionKind",),
     "record": ("Record", "read_record"),
     "registration": ("register",),
-    "run": ("RunSpec", "execute"),
+    "run": ("execute",),
+    "run_spec": ("RunSpec",),
     "scenario_env": ("ScenarioEnv",),
     "task": ("Budget", "Scenario", "Task", "load_scenario", "scenario_ids"),
 }

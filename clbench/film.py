@@ -21,7 +21,7 @@ from PIL import Image, ImageColor, ImageDraw, ImageFont
 from clbench.evaluation import Episode, Evaluator, Trial, start_of
 from clbench.extras import require
 from clbench.policy import Policy
-from clbench.run import RunSpec
+from clbench.run_spec import RunSpec
 from clbench.task import Scenario, Task, resolve
 from clbench.training import deterministic
 from clbench.world import World

@@ -12,7 +12,8 @@ from rich.console import Console
 from clbench.limits import Limits
 from clbench.names import folder_name
 from clbench.progress import Bars
-from clbench.run import RunSpec, execute, run_length
+from clbench.run import execute
+from clbench.run_spec import RunSpec, run_length
 from clbench.task import load_scenario
 from clbench.training import MethodError
 from clbench.workers import Job, JobError, Workers

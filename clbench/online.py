@@ -34,7 +34,8 @@ from clbench.fingerprint import fingerprint
 from clbench.learner import sources
 from clbench.names import built_in_methods, check_method_name
 from clbench.record import RECORDS, Record, append_row, read_record, record_path, write_record
-from clbench.run import describe_scenario, episode_row
+from clbench.run import episode_row
+from clbench.run_spec import describe_scenario
 from clbench.scenario_env import Observation, ScenarioEnv
 from clbench.scenario_vector_env import ScenarioVectorEnv
 from clbench.seeding import seeded

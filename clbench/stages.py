@@ -19,7 +19,7 @@ from clbench.policy import Policy
 from clbench.training import MethodError
 
 if TYPE_CHECKING:
-    from clbench.run import RunSpec
+    from clbench.run_spec import RunSpec
 
 LOG = logging.getLogger("clbench")
 

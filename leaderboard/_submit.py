@@ -14,7 +14,7 @@ from clbench.grid import benchmark_jobs, run_with_bars
 from clbench.method import load_method
 from clbench.metrics import METRICS
 from clbench.record import label_of, record_path
-from clbench.run import RunSpec, has_record
+from clbench.run_spec import RunSpec, has_record
 from clbench.task import load_scenario
 from clbench.testing import ContractError, check_method
 from clbench.workers import Job, JobError, Processes

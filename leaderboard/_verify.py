@@ -28,7 +28,8 @@ from clbench.policy import Policy
 from clbench.pretraining import pretrained_policy
 from clbench.questions import load_questions, report_questions
 from clbench.record import Record, RecordError
-from clbench.run import RunSpec, episode_row, execute, pretrained_hash, run_length
+from clbench.run import episode_row, execute, pretrained_hash
+from clbench.run_spec import RunSpec, run_length
 from clbench.stages import kept_stages, load_stages, stage_policies
 from clbench.task import Scenario
 from clbench.workers import Job, JobError, Processes

@@ -14,7 +14,7 @@ from clbench.arguments import at_least, checked_input, look_here
 from clbench.method import build_method
 from clbench.names import folder_name
 from clbench.record import RECORDS, TUNING, record_path
-from clbench.run import RunSpec
+from clbench.run_spec import RunSpec
 from clbench.task import load_scenario, scenario_ids, unknown
 
 from . import _page

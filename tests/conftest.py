@@ -24,7 +24,8 @@ from clbench.record import (
     record_path,
     write_record,
 )
-from clbench.run import RunSpec, execute, run_length
+from clbench.run import execute
+from clbench.run_spec import RunSpec, run_length
 from clbench.training import deterministic
 
 collect_ignore = ["submission"]

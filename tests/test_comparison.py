@@ -28,7 +28,7 @@ from clbench.comparison import (
     trimmed_mean,
 )
 from clbench.record import Record, write_record
-from clbench.run import RunSpec
+from clbench.run_spec import RunSpec
 from clbench.scores import Layout, Scores
 from clbench.statistics import (
     REPLICATES,

@@ -18,7 +18,8 @@ from clbench.evaluation import Episode, Trial
 from clbench.film import FAILURE, FASTEST, SUCCESS, Film, Take, film_run, shoot, steps_per_second
 from clbench.record import Record
 from clbench.rendering import RenderingError, choose_back_end
-from clbench.run import RunSpec, execute
+from clbench.run import execute
+from clbench.run_spec import RunSpec
 from clbench.stages import stage_policies
 from clbench.task import load_scenario
 from clbench.testing import ToyWorld

@@ -14,7 +14,7 @@ import pytest
 
 from clbench.grid import benchmark_jobs, run_jobs
 from clbench.progress import Bars
-from clbench.run import RunSpec, has_record
+from clbench.run_spec import RunSpec, has_record
 from clbench.workers import Job, Processes
 
 TOY = "clbench.testing:clbench/Toy-v0"

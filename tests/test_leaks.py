@@ -4,7 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from clbench.run import RunSpec, execute
+from clbench.run import execute
+from clbench.run_spec import RunSpec
 
 TOY = "clbench.testing:clbench/Toy-v0"
 

@@ -8,7 +8,8 @@ from typing import Any
 
 import pytest
 
-from clbench.run import RunSpec, execute
+from clbench.run import execute
+from clbench.run_spec import RunSpec
 from clbench.scores import Scores
 
 TOY = "clbench.testing:clbench/Toy-v0"

@@ -10,7 +10,8 @@ import pytest
 
 from clbench.method import load_method
 from clbench.new_method import class_name, write_method
-from clbench.run import RunSpec, execute
+from clbench.run import execute
+from clbench.run_spec import RunSpec
 from clbench.testing import check_method
 
 

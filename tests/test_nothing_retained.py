@@ -16,7 +16,8 @@ from clbench.metrics import measure
 from clbench.pretraining import pretrained_policy
 from clbench.questions import load_questions
 from clbench.record import Record, record_path, write_record
-from clbench.run import RunSpec, execute
+from clbench.run import execute
+from clbench.run_spec import RunSpec
 from clbench.scenario_env import ScenarioEnv
 from clbench.scenario_vector_env import ScenarioVectorEnv
 from clbench.scores import Scores

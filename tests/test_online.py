@@ -321,7 +321,8 @@ def test_a_killed_program_goes_on_with_the_stage_that_it_was_in(empty_caches: Pa
 @pytest.fixture(scope="module")
 def board(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Folder of a board that has a run of sft and one of an agent."""
-    from clbench.run import RunSpec, execute
+    from clbench.run import execute
+    from clbench.run_spec import RunSpec
 
     folder = tmp_path_factory.mktemp("board")
     execute(RunSpec(ID, "sft", 0), folder / "records")

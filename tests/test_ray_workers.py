@@ -14,7 +14,7 @@ import pytest
 from clbench.grid import benchmark_jobs, run_jobs
 from clbench.progress import Bars
 from clbench.ray_workers import RayWorkers
-from clbench.run import RunSpec
+from clbench.run_spec import RunSpec
 from clbench.workers import Job, Processes
 
 TOY = "clbench.testing:clbench/Toy-v0"

@@ -17,7 +17,8 @@ from clbench.cache import cache_folder
 from clbench.method import Method, Stage, State, Uses
 from clbench.policy import Policy
 from clbench.record import read_record, write_record
-from clbench.run import RunSpec, execute, has_record, run_length
+from clbench.run import execute
+from clbench.run_spec import RunSpec, has_record, run_length
 from clbench.scores import Scores
 from clbench.task import load_scenario
 from clbench.testing import ToyWorld

@@ -17,7 +17,8 @@ from torch import Tensor
 from clbench.commands.runs import run
 from clbench.method import Method, Stage, State
 from clbench.policy import CheckpointError, Policy
-from clbench.run import RunSpec, execute
+from clbench.run import execute
+from clbench.run_spec import RunSpec
 from clbench.stages import find_stages, has_stages, keep_stages, load_stages, stage_policies
 from clbench.training import MethodError
 

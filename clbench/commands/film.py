@@ -14,7 +14,7 @@ from clbench.film import FASTEST, FILMS, check_format, film_run, steps_per_secon
 from clbench.grid import run_with_bars, stages_jobs
 from clbench.progress import Bars
 from clbench.rendering import choose_back_end
-from clbench.run import RunSpec, check_device, read_changes
+from clbench.run_spec import RunSpec, check_device, read_changes
 from clbench.stages import find_stages, load_stages, make_stages
 from clbench.task import load_scenario
 from clbench.workers import Processes

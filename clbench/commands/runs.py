@@ -19,7 +19,7 @@ from clbench.live import require_tensorboard
 from clbench.method import method_names
 from clbench.metrics import measure
 from clbench.record import RECORDS, TUNING, read_record
-from clbench.run import RunSpec, check_device, has_record, read_changes
+from clbench.run_spec import RunSpec, check_device, has_record, read_changes
 from clbench.scores import Scores
 from clbench.stages import has_stages
 from clbench.statistics import expected_precision

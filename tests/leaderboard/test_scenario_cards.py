@@ -14,7 +14,7 @@ from PIL import Image
 from scipy import stats
 
 from clbench.record import Record, write_record
-from clbench.run import RunSpec
+from clbench.run_spec import RunSpec
 from clbench.task import resolve
 from clbench.testing import TOY
 

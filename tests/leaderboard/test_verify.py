@@ -10,7 +10,8 @@ from typing import Any
 import pytest
 
 from clbench.record import read_record, record_path
-from clbench.run import RunSpec, execute
+from clbench.run import execute
+from clbench.run_spec import RunSpec
 from clbench.testing import ToyWorld
 
 verification = importlib.import_module("clbench.leaderboard._verify")

@@ -27,7 +27,8 @@ from clbench.method import (
 from clbench.metrics import METRICS, measure
 from clbench.policy import Batch, Policy
 from clbench.record import Record
-from clbench.run import RunSpec, execute
+from clbench.run import execute
+from clbench.run_spec import RunSpec
 from clbench.scores import Scores
 from clbench.testing import check_method
 
