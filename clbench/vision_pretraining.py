@@ -8,7 +8,7 @@ steps of one answer to a picture, colours stayed at chance; 800 steps of all ans
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -58,15 +58,14 @@ def pictures_of(
         camera: What drew them.
         kinds: What can be asked about a state.
     """
-    shown = [torch.from_numpy(camera.pictured(scene.numpy())) for scene, _ in sets]
-    everything = torch.cat(shown)
+    shown = [camera.pictured(scene.numpy()) for scene, _ in sets]
     # quartiles, as the few pictures of a block that fell off the table would stretch a standard deviation
-    low, middle, high = np.quantile(everything.numpy(), (0.25, 0.5, 0.75), axis=0)
-    mean, deviation = torch.from_numpy(middle), torch.from_numpy(((high - low) / 1.35).clip(1e-2))
+    low, middle, high = np.quantile(np.concatenate(shown), (0.25, 0.5, 0.75), axis=0)
+    scale = ((high - low) / 1.35).clip(1e-2)  # that of a normal distribution is its standard deviation
     return [
         Pictures(
             image,
-            ((numbers - mean) / deviation).clamp(-5.0, 5.0).float(),
+            torch.from_numpy((numbers - middle) / scale).clamp(-5.0, 5.0).float(),
             torch.stack([torch.from_numpy(kind.answer(scene.numpy())) for kind in kinds], dim=1),
         )
         for (scene, image), numbers in zip(sets, shown, strict=True)
@@ -79,7 +78,6 @@ def pretrain_vision(
     kinds: Sequence[QuestionKind],
     steps: int,
     generator: torch.Generator,
-    after: Callable[[int], None] = lambda _: None,
 ) -> None:
     """Teach the eyes of a policy, in place, to tell what pictures show.
 
@@ -89,7 +87,6 @@ def pretrain_vision(
         kinds: What can be asked about them.
         steps: How many.
         generator: Draws the probe and the pictures.
-        after: Called after each step with the number of steps done.
     """
     numbers = sets[0].numbers.shape[1]
     choices = [len(kind.answers) for kind in kinds]
@@ -111,4 +108,4 @@ def pretrain_vision(
         ]
         return loss + torch.stack(answer_losses).mean()
 
-    optimise([*vision.parameters(), *probe.parameters()], LEARNING_RATE, steps, loss_at, after=after)
+    optimise([*vision.parameters(), *probe.parameters()], LEARNING_RATE, steps, loss_at)
