@@ -249,7 +249,7 @@ def _pretraining(spec: RunSpec) -> str:
 
 def _preparing_jobs(specs: Sequence[RunSpec]) -> list[Job]:
     """Return the jobs that make what runs begin with: demonstrations, questions, a policy for each seed."""
-    from clbench.pretraining import is_pretrained
+    from clbench.pretraining import is_pretrained, vision_steps
 
     jobs = []
     for name in dict.fromkeys(spec.scenario for spec in specs):
@@ -259,13 +259,14 @@ def _preparing_jobs(specs: Sequence[RunSpec]) -> list[Job]:
         questions = _title(name, "questions")
         data.append(Job(questions, "clbench.grid:scenes_job", arguments, scenario.budget.question_episodes))
         jobs += data
+        steps = scenario.budget.pretraining_steps + vision_steps(scenario)
         for spec in {spec.seed: spec for spec in specs if spec.scenario == name}.values():
             jobs.append(
                 Job(
                     _pretraining(spec),
                     "clbench.grid:pretrain_job",
                     {**arguments, "seed": spec.seed},
-                    0 if is_pretrained(scenario, spec.seed) else scenario.budget.pretraining_steps,
+                    0 if is_pretrained(scenario, spec.seed) else steps,
                     tuple(job.name for job in data),
                 )
             )

@@ -93,6 +93,12 @@ def pretrained_policy(
     return load_policy(folder), folder
 
 
+def vision_steps(scenario: Scenario) -> int:
+    """Return how many optimiser steps the eyes are pretrained for, before the policy; 0 if it has none."""
+    seen = scenario.scene_tasks[0].camera is not None
+    return round(STEPS_SHARE * scenario.budget.pretraining_steps) if seen else 0
+
+
 def policy_config(scenario: Scenario) -> PolicyConfig:
     """Return the sizes of a policy for the scenario's worlds."""
     first = scenario.tasks[0]
@@ -125,6 +131,7 @@ def _pretrain(scenario: Scenario, seed: int, progress: Callable[[float], None]) 
             scenario,
             seed,
             [questions, demonstrations] if demonstrations else [questions],
+            progress,
         )
     generator = torch_generator("pretraining", seed)
 
@@ -147,10 +154,14 @@ def _pretrain(scenario: Scenario, seed: int, progress: Callable[[float], None]) 
 
 
 def _open_eyes(
-    vision: Vision, scenario: Scenario, seed: int, data: Sequence[Questions | Demonstrations]
+    vision: Vision,
+    scenario: Scenario,
+    seed: int,
+    data: Sequence[Questions | Demonstrations],
+    progress: Callable[[float], None],
 ) -> None:
     """Pretrain the eyes on the pictures of all data."""
-    budget, entry_point = scenario.budget, scenario.scene_tasks[0].camera
+    entry_point = scenario.scene_tasks[0].camera
     assert entry_point is not None
     kinds = resolve(scenario.questions)
     with deterministic():
@@ -158,6 +169,7 @@ def _open_eyes(
             vision,
             pictures_of([(part.scenes, part.image) for part in data], resolve(entry_point), kinds),
             kinds,
-            round(STEPS_SHARE * budget.pretraining_steps),
+            vision_steps(scenario),
             torch_generator("vision", seed),
+            lambda _: progress(1),
         )

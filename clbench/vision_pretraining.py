@@ -8,7 +8,7 @@ steps of one answer to a picture, colours stayed at chance; 800 steps of all ans
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -78,6 +78,7 @@ def pretrain_vision(
     kinds: Sequence[QuestionKind],
     steps: int,
     generator: torch.Generator,
+    after: Callable[[int], None] = lambda _: None,
 ) -> None:
     """Teach the eyes of a policy, in place, to tell what pictures show.
 
@@ -87,6 +88,7 @@ def pretrain_vision(
         kinds: What can be asked about them.
         steps: How many.
         generator: Draws the probe and the pictures.
+        after: Called after each step with the number of steps done.
     """
     numbers = sets[0].numbers.shape[1]
     choices = [len(kind.answers) for kind in kinds]
@@ -108,4 +110,4 @@ def pretrain_vision(
         ]
         return loss + torch.stack(answer_losses).mean()
 
-    optimise([*vision.parameters(), *probe.parameters()], LEARNING_RATE, steps, loss_at)
+    optimise([*vision.parameters(), *probe.parameters()], LEARNING_RATE, steps, loss_at, after=after)

@@ -1,14 +1,17 @@
 """Eyes that learn to tell what pictures show, before a policy learns to act."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
 from clbench.policy.vision import Vision
-from clbench.pretraining import policy_config
+from clbench.pretraining import policy_config, pretrained_policy, vision_steps
 from clbench.questions import Questions, load_questions
 from clbench.seeding import torch_generator
+from clbench.testing import TOY
 from clbench.testing.seen_toy import SEEN_TOY
 from clbench.testing.toy_camera import ToyCamera
 from clbench.vision_pretraining import Pictures, pictures_of, pretrain_vision
@@ -92,3 +95,14 @@ def test_a_question_that_no_picture_of_a_step_answers_does_no_harm(
     eyes = _eyes()
     pretrain_vision(eyes, [silent], questions[0].kinds, 3, torch_generator("vision", 0))
     assert all(torch.isfinite(parameter).all() for parameter in eyes.parameters())
+
+
+@pytest.mark.usefixtures("empty_caches")
+def test_progress_counts_the_steps_of_the_eyes_too() -> None:
+    scenario = dataclasses.replace(
+        SEEN_TOY, budget=dataclasses.replace(SEEN_TOY.budget, demonstrations=4, pretraining_steps=8)
+    )
+    done: list[float] = []
+    pretrained_policy(scenario, 0, done.append)
+    assert sum(done) == 8 + vision_steps(scenario) == 10
+    assert vision_steps(TOY) == 0
