@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Sequence
+from copy import copy
 from typing import Any
 
 import gymnasium
@@ -76,6 +77,8 @@ class ScenarioVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]
         self.action_space = batch_space(self.single_action_space, num_envs)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self._starts: list[Start] = []
+        self._instructions: tuple[str, ...] | NDArray[np.int64] = ()
+        self._told: dict[str, NDArray[Any]] = {}
         self._states = np.zeros((num_envs, *world.single_observation_space.shape), np.float32)
         self._steps_left = np.zeros(num_envs, np.int64)
         self._ended = np.zeros(num_envs, np.bool_)
@@ -147,20 +150,28 @@ class ScenarioVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]
         tasks = [start.task for start in starts]
         self._states[numbers] = self._lanes.reset(numbers, [start.seed for start in starts], tasks)
         self._steps_left[numbers] = [task.horizon for task in tasks]
+        self._tell()
+
+    def _tell(self) -> None:
+        """Put together what is said of the present episodes at each of their steps."""
+        instructions = [start.observed_instruction for start in self._starts]
+        self._instructions = tuple(instructions) if self.instruction == "text" else np.stack(instructions)
+        rows = [start.info(success=False) for start in self._starts]
+        self._told = {
+            name: np.array(
+                [row[name] for row in rows], dtype=object if isinstance(value, str) else type(value)
+            )
+            for name, value in rows[0].items()
+        }
 
     def _observation(self) -> Observation:
-        instructions = [start.observed_instruction for start in self._starts]
-        observed = tuple(instructions) if isinstance(instructions[0], str) else np.stack(instructions)
         state, image = self._lanes.observe([start.task for start in self._starts], self._states)
         images = {"image": image} if image.size else {}
-        return {"state": state.copy(), **images, "instruction": observed}
+        return {"state": state.copy(), **images, "instruction": copy(self._instructions)}
 
     def _info(self, successes: Flags) -> dict[str, Any]:
         """Return the infos as Gymnasium's vector environments do: a column of each, and where it is known."""
-        rows = [start.info(bool(success)) for start, success in zip(self._starts, successes, strict=True)]
         info: dict[str, Any] = {}
-        for name, value in rows[0].items():
-            kind = object if isinstance(value, str) else type(value)
-            info[name] = np.array([row[name] for row in rows], dtype=kind)
-            info[f"_{name}"] = np.ones(self.num_envs, np.bool_)
+        for name, column in {**self._told, "success": successes}.items():
+            info[name], info[f"_{name}"] = column.copy(), np.ones(self.num_envs, np.bool_)
         return info
