@@ -13,6 +13,8 @@ from typing import ClassVar, Protocol, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from clbench.task import resolve
+
 States: TypeAlias = NDArray[np.float32]
 Images: TypeAlias = NDArray[np.uint8]
 
@@ -44,3 +46,20 @@ class Camera(Protocol):
         A picture depends on its state alone, not on those that were drawn before.
         """
         ...
+
+
+def load_camera(entry_point: str) -> type[Camera]:
+    """Return the camera at "module:attribute".
+
+    Raises:
+        LookupError: There is none.
+        TypeError: It lacks a member of a camera.
+    """
+    camera: type[Camera] = resolve(entry_point)
+    members = ("image_size", "state_size", "proprioception", "pictured", "draw")
+    missing = [name for name in members if not hasattr(camera, name)]
+    if missing:
+        raise TypeError(
+            f"{entry_point} is no camera: it lacks {', '.join(missing)}. docs/pixels.md shows one."
+        )
+    return camera

@@ -22,7 +22,7 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from clbench.cache import cache_folder, cached, hash_of, package_of, source_hash
-from clbench.camera import Camera, Images, States
+from clbench.camera import Camera, Images, States, load_camera
 from clbench.drawing import HEADER
 from clbench.rendering import RenderingError, working_back_end
 from clbench.task import Task, resolve
@@ -42,7 +42,7 @@ class Observer:
 
     def __init__(self, world: str, camera: str | None, processes: int = 1) -> None:
         self._world, self._entry_point, self._count = world, camera, processes
-        self._camera: type[Camera] | None = None if camera is None else resolve(camera)
+        self._camera: type[Camera] | None = None if camera is None else load_camera(camera)
         self._processes: list[_DrawingProcess] = []
 
     @property

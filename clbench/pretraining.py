@@ -11,6 +11,7 @@ from typing import Any
 from torch import Tensor
 
 from clbench.cache import cache_folder, cached, hash_of, is_cached, package_of, source_hash
+from clbench.camera import load_camera
 from clbench.demonstrations import Demonstrations, load_demonstrations, simulator_versions
 from clbench.observer import Observer, frame_hash
 from clbench.policy import Policy, PolicyConfig, load_policy, save_policy
@@ -167,7 +168,7 @@ def _open_eyes(
     with deterministic():
         pretrain_vision(
             vision,
-            pictures_of([(part.scenes, part.image) for part in data], resolve(entry_point), kinds),
+            pictures_of([(part.scenes, part.image) for part in data], load_camera(entry_point), kinds),
             kinds,
             vision_steps(scenario),
             torch_generator("vision", seed),

@@ -48,6 +48,13 @@ def test_without_a_camera_states_are_shown_as_they_are() -> None:
     assert frame_hash(TOY.retained[0]) is None
 
 
+def test_a_camera_that_lacks_something_is_refused_by_name() -> None:
+    with pytest.raises(
+        TypeError, match=r"ToyWorld is no camera: it lacks .*pictured.* docs/pixels\.md shows"
+    ):
+        Observer(TASK.world, "clbench.testing.toy:ToyWorld")
+
+
 def test_processes_draw_what_the_camera_draws_in_the_order_of_the_states() -> None:
     states = _states(2 * TOGETHER + 3)
     observer = Observer(TASK.world, TASK.camera, processes=2)
