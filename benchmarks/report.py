@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import vl_convert
+from result_files import read_results
 
-HERE = Path(__file__).parent
-RESULTS, DOCS = HERE / "results", HERE.parent / "docs"
-VEGA_LITE = "6.4"
+from clbench.task import resolve
+
+DOCS = Path(__file__).parents[1] / "docs"
+grid = resolve("clbench.leaderboard._markdown:grid")
+VEGA_LITE = resolve("clbench.leaderboard._page.html:VEGA_LITE")
 
 INTRODUCTION = """\
 # Performance
@@ -29,10 +31,10 @@ UNITS = {
 
 
 def _read(name: str) -> Any:
-    path = RESULTS / f"{name}.json"
-    if not path.exists():
-        raise SystemExit(f"There is no {path}: python benchmarks/{name}.py makes it.")
-    return json.loads(path.read_text(encoding="utf-8"))
+    found = read_results(name)
+    if found is None:
+        raise SystemExit(f"There is no results/{name}.json: python benchmarks/{name}.py makes it.")
+    return found
 
 
 def _ratio(ratio: dict[str, float]) -> str:
@@ -40,9 +42,7 @@ def _ratio(ratio: dict[str, float]) -> str:
 
 
 def _table(head: list[str], rows: list[list[str]]) -> Iterator[str]:
-    yield f"| {' | '.join(head)} |"
-    yield f"| --- |{' --: |' * (len(head) - 1)}"
-    yield from (f"| {' | '.join(row)} |" for row in rows)
+    yield from grid(head, rows, numbers=len(head) - 1)
     yield ""
 
 

@@ -15,14 +15,12 @@ import argparse
 import contextlib
 import functools
 import io
-import json
 import os
 import statistics
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Protocol
 
 import gymnasium
@@ -30,13 +28,10 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 from ratios import median_ratio
+from result_files import read_results, write_results
 from rich.progress import track
 
-import clbench
-from clbench.fingerprint import fingerprint
 from clbench.task import load_scenario, resolve
-
-RESULTS = Path(__file__).parent / "results" / "rollouts.json"
 
 Actions = NDArray[np.float32]
 Env = gymnasium.Env[Any, Any]
@@ -72,12 +67,16 @@ class Suite:
 # ---- the peers -----------------------------------------------------------------------------------------
 
 
-def _fetch_peer() -> Env:
+def _robotics_peer(env_id: str, **options: Any) -> Env:
     with contextlib.redirect_stderr(io.StringIO()):  # else each process prints a notice about Adroit's hand
         import gymnasium_robotics
 
     gymnasium.register_envs(gymnasium_robotics)
-    return gymnasium.make("FetchPickAndPlace-v4")
+    return gymnasium.make(env_id, **options)
+
+
+def _set_controls(data: mujoco.MjData, action: Actions) -> None:
+    data.ctrl[:] = action
 
 
 def _fetch_physics(env: Env) -> Physics:
@@ -92,22 +91,10 @@ def _fetch_physics(env: Env) -> Physics:
     return Physics(unwrapped.model, unwrapped.data, scene.substeps, move)
 
 
-def _maze_peer() -> Env:
-    with contextlib.redirect_stderr(io.StringIO()):
-        import gymnasium_robotics
-
-    gymnasium.register_envs(gymnasium_robotics)
-    return gymnasium.make("PointMaze_Medium-v3", continuing_task=False)
-
-
 def _maze_physics(env: Env) -> Physics:
     point: Any = env.unwrapped
     point = point.point_env
-
-    def move(data: mujoco.MjData, action: Actions) -> None:
-        data.ctrl[:] = action
-
-    return Physics(point.model, point.data, point.frame_skip, move)
+    return Physics(point.model, point.data, point.frame_skip, _set_controls)
 
 
 class DMControlEnv(gymnasium.Env[NDArray[np.float64], NDArray[np.float32]]):
@@ -147,12 +134,9 @@ def _dm_control_peer() -> Env:
 
 
 def _dm_control_physics(env: Env) -> Physics:
-    def move(data: mujoco.MjData, action: Actions) -> None:
-        data.ctrl[:] = action
-
     unwrapped: Any = env.unwrapped
     physics = unwrapped.env.physics
-    return Physics(physics.model.ptr, physics.data.ptr, round(0.04 / physics.timestep()), move)
+    return Physics(physics.model.ptr, physics.data.ptr, round(0.04 / physics.timestep()), _set_controls)
 
 
 def _metaworld_peer() -> Env:
@@ -173,8 +157,20 @@ def _metaworld_physics(env: Env) -> Physics:
 
 
 SUITES = {
-    "fetch": Suite("clbench/Fetch-v0", None, "FetchPickAndPlace-v4", _fetch_peer, _fetch_physics),
-    "point_maze": Suite("clbench/PointMaze-v0", None, "PointMaze_Medium-v3", _maze_peer, _maze_physics),
+    "fetch": Suite(
+        "clbench/Fetch-v0",
+        None,
+        "FetchPickAndPlace-v4",
+        functools.partial(_robotics_peer, "FetchPickAndPlace-v4"),
+        _fetch_physics,
+    ),
+    "point_maze": Suite(
+        "clbench/PointMaze-v0",
+        None,
+        "PointMaze_Medium-v3",
+        functools.partial(_robotics_peer, "PointMaze_Medium-v3", continuing_task=False),
+        _maze_physics,
+    ),
     "dm_control": Suite(
         "clbench/DMControl-v0", 3, "ball_in_cup catch", _dm_control_peer, _dm_control_physics
     ),
@@ -342,17 +338,11 @@ def main() -> None:
     arguments = parser.parse_args()
     if unknown := set(arguments.suites) - set(SUITES):
         parser.error(f"unknown: {', '.join(sorted(unknown))}; there are {', '.join(SUITES)}")
-    RESULTS.parent.mkdir(exist_ok=True)
-    kept = json.loads(RESULTS.read_text(encoding="utf-8"))["suites"] if RESULTS.exists() else {}
+    kept = (read_results("rollouts") or {"suites": {}})["suites"]
     for name in arguments.suites:
         found = measure(name, arguments.num_envs, arguments.threads, arguments.rounds, arguments.steps)
         kept[name] = found
-        result = {
-            "clbench": clbench.__version__,
-            "hardware": fingerprint(load_scenario(SUITES[name].ours))["hardware"],
-            "suites": kept,
-        }
-        RESULTS.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+        write_results("rollouts", SUITES[name].ours, {"suites": kept})
         print(f"{name}: {found['steps_per_second']['clbench']} steps/s, with {found['peer']} as the peer")
         rates = found["steps_per_second"]
         for other, ratio in found["ratios_of_clbench_to"].items():

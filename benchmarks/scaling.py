@@ -9,31 +9,27 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import json
 import resource
 import statistics
 import time
 from collections.abc import Callable, Sequence
-from pathlib import Path
 from typing import Any
 
 import gymnasium
 import numpy as np
 import torch
 from metaworld.env_dict import ALL_V3_ENVIRONMENTS
+from result_files import write_results
 from rich.progress import track
 
-import clbench
 from clbench.demonstrations import Demonstrations, load_demonstrations
 from clbench.evaluation import Evaluator
-from clbench.fingerprint import fingerprint
 from clbench.policy import Policy
 from clbench.pretraining import policy_config
 from clbench.seeding import torch_generator
 from clbench.task import load_scenario
 from clbench.training import deterministic, optimise
 
-RESULTS = Path(__file__).parent / "results" / "scaling.json"
 FETCH, META_WORLD = "clbench/Fetch-v0", "clbench/MetaWorld-v0"
 
 
@@ -43,10 +39,9 @@ def evaluation_of_tasks() -> Callable[[int], float]:
     names = [name.removesuffix("-v3").replace("-", "_") for name in ALL_V3_ENVIRONMENTS]
     tasks = [dataclasses.replace(scenario.target[0], name=name, horizon=100) for name in names]
     policy = Policy(policy_config(scenario), seed=0)
-    evaluators: dict[int, Evaluator] = {}
+    evaluator = Evaluator(scenario, seed=0)
 
     def seconds(count: int) -> float:
-        evaluator = evaluators.setdefault(count, Evaluator(scenario, seed=0))
         trials = [(task, "selection", number) for task in tasks[:count] for number in range(2)]
         begin = time.perf_counter()
         evaluator.play(policy, trials)  # type: ignore[arg-type]
@@ -153,13 +148,10 @@ def main() -> None:
         found[name] = {"sizes": sizes, "seconds": [round(one, 3) for one in seconds], **line(sizes, seconds)}
         print(name, found[name])
     result = {
-        "clbench": clbench.__version__,
-        "hardware": fingerprint(load_scenario(FETCH))["hardware"],
         "peak_memory_gb": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20, 2),
         "measures": found,
     }
-    RESULTS.parent.mkdir(exist_ok=True)
-    RESULTS.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+    write_results("scaling", FETCH, result)
     print(f"peak memory {result['peak_memory_gb']} GB")
 
 

@@ -11,23 +11,20 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import json
 import statistics
 import time
 from collections.abc import Mapping
 from copy import deepcopy
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from ratios import median_ratio
+from result_files import write_results
 from rich.progress import track
 
-import clbench
 from clbench.adaptation import adapt
 from clbench.demonstrations import Demonstrations, load_demonstrations
-from clbench.fingerprint import fingerprint
 from clbench.method import Prior, Source, Stage, build_method, method_names
 from clbench.policy import Policy
 from clbench.pretraining import pretrained_policy
@@ -36,7 +33,6 @@ from clbench.seeding import seeded, torch_generator
 from clbench.task import Scenario, load_scenario
 from clbench.training import BETAS, GRADIENT_NORM, deterministic
 
-RESULTS = Path(__file__).parent / "results"
 BASELINE = "sft"
 LIMIT = "bare loop"
 
@@ -149,15 +145,12 @@ def main() -> None:
     limit = ratios.pop(LIMIT)
     baseline = statistics.median(one[BASELINE] for one in rounds) / arguments.steps
     result = {
-        "clbench": clbench.__version__,
-        "hardware": fingerprint(scenario)["hardware"],
         "baseline_seconds_per_step": round(baseline, 4),
         "rounds": arguments.rounds,
         "bare_loop": limit,
         "ratios": ratios,
     }
-    RESULTS.mkdir(exist_ok=True)
-    (RESULTS / "step_time.json").write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+    write_results("step_time", arguments.scenario, result)
     for name, ratio in sorted({LIMIT: limit, **ratios}.items(), key=lambda item: item[1]["median_ratio"]):
         print(f"{name:24} {ratio['median_ratio']:.2f} [{ratio['low']:.2f}, {ratio['high']:.2f}]")
 

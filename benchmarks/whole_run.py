@@ -9,7 +9,6 @@ matrix products of a policy's size, in GFLOPS, before and after.
 from __future__ import annotations
 
 import argparse
-import json
 import resource
 import tempfile
 import time
@@ -19,18 +18,15 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from result_files import read_results, write_results
 from rich.progress import Progress
 
-import clbench
-from clbench.fingerprint import fingerprint
 from clbench.policy import Policy
 from clbench.pretraining import pretrained_policy
 from clbench.run import execute
 from clbench.run_spec import RunSpec, run_length
-from clbench.task import load_scenario
 from clbench.world import Lanes
 
-RESULTS = Path(__file__).parent / "results" / "whole_run.json"
 PARTS = {
     "physics": (Lanes, ("step", "reset")),
     "pictures": (Lanes, ("observe",)),
@@ -45,16 +41,10 @@ def main() -> None:
     parser.add_argument("--method", default="sft")
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
-    kept = json.loads(RESULTS.read_text(encoding="utf-8"))["runs"] if RESULTS.exists() else {}
+    kept = (read_results("whole_run") or {"runs": {}})["runs"]
     for scenario in arguments.scenarios:
         kept[scenario] = found = measure(RunSpec(scenario, arguments.method, arguments.seed))
-        result = {
-            "clbench": clbench.__version__,
-            "hardware": fingerprint(load_scenario(scenario))["hardware"],
-            "runs": kept,
-        }
-        RESULTS.parent.mkdir(exist_ok=True)
-        RESULTS.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+        write_results("whole_run", scenario, {"runs": kept})
         print(f"{scenario}, {arguments.method}: {found['seconds']:.0f} s, {found['peak_memory_gb']:.2f} GB")
         for part, seconds in found["parts"].items():
             print(f"  {part:10} {seconds:6.1f} s, {seconds / found['seconds']:4.0%}")

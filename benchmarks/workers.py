@@ -8,7 +8,6 @@ the clock does, as one would be there. The records of all ways must be the same,
 from __future__ import annotations
 
 import argparse
-import contextlib
 import io
 import json
 import os
@@ -20,18 +19,14 @@ from typing import Any
 
 import numpy as np
 from ratios import median_ratio
+from result_files import write_results
 from rich.console import Console
 
-import clbench
-from clbench.fingerprint import fingerprint
 from clbench.grid import benchmark_jobs, run_with_bars
 from clbench.ray_workers import RayWorkers
 from clbench.record import read_record
 from clbench.run_spec import RunSpec
-from clbench.task import load_scenario
 from clbench.workers import Processes, Workers
-
-RESULTS = Path(__file__).parent / "results" / "workers.json"
 
 
 def main() -> None:
@@ -66,16 +61,13 @@ def main() -> None:
         rounds.append(taken)
     one, many, ray = ways
     result = {
-        "clbench": clbench.__version__,
-        "hardware": fingerprint(load_scenario(arguments.scenario))["hardware"],
         "runs": arguments.runs,
         "workers": count,
         "seconds": {way: round(float(np.median([taken[way] for taken in rounds])), 1) for way in ways},
         "one_worker_to_many": median_ratio([taken[one] / taken[many] for taken in rounds], generator),
         "ray_to_many": median_ratio([taken[ray] / taken[many] for taken in rounds], generator),
     }
-    RESULTS.parent.mkdir(exist_ok=True)
-    RESULTS.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+    write_results("workers", arguments.scenario, result)
     print(json.dumps({name: result[name] for name in ("one_worker_to_many", "ray_to_many")}, indent=1))
 
 
@@ -83,8 +75,7 @@ def _seconds(specs: list[RunSpec], records: Path, make: Callable[[], Workers]) -
     """Return how long the runs take."""
     jobs, workers = benchmark_jobs(specs, records), make()
     begin = time.perf_counter()
-    with contextlib.redirect_stderr(io.StringIO()):
-        failed = run_with_bars(jobs, workers, Console(file=io.StringIO()))
+    failed = run_with_bars(jobs, workers, Console(file=io.StringIO()))
     assert not failed, failed
     return time.perf_counter() - begin
 

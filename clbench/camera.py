@@ -56,7 +56,7 @@ def load_camera(entry_point: str) -> type[Camera]:
         TypeError: It lacks a member of a camera.
     """
     camera: type[Camera] = resolve(entry_point)
-    members = ("image_size", "state_size", "proprioception", "pictured", "draw")
+    members = [name for name in (*Camera.__annotations__, *vars(Camera)) if not name.startswith("_")]
     missing = [name for name in members if not hasattr(camera, name)]
     if missing:
         raise TypeError(

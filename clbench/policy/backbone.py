@@ -54,7 +54,7 @@ class Layer(nn.Module):
 class Backbone(nn.Module):
     """Reads [observation tokens; a readout token; word tokens], every token attending to every other.
 
-    The observation is the state, in `state_tokens` tokens, and where there is an image as many of it.
+    The observation is the state, in `state_tokens` tokens, and the tokens of the image, where there is one.
     """
 
     state_tokens = 4

@@ -1,0 +1,34 @@
+"""Results of benchmarks: one file each in results/, with the version and the machine that they are of."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import clbench
+from clbench.fingerprint import fingerprint
+from clbench.task import load_scenario
+
+FOLDER = Path(__file__).parent / "results"
+
+
+def write_results(name: str, scenario: str, values: Mapping[str, Any]) -> None:
+    """Write results/`name`.json.
+
+    Args:
+        name: Of the benchmark.
+        scenario: Whose fingerprint names the machine.
+        values: What was measured.
+    """
+    hardware = fingerprint(load_scenario(scenario))["hardware"]
+    result = {"clbench": clbench.__version__, "hardware": hardware, **values}
+    FOLDER.mkdir(exist_ok=True)
+    (FOLDER / f"{name}.json").write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+
+
+def read_results(name: str) -> Any:
+    """Return results/`name`.json, or None if there is none."""
+    path = FOLDER / f"{name}.json"
+    return json.loads(path.read_text(encoding="utf-8")) if path.exists() else None
