@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from clbench.cache import cached, package_of, source_hash
+from clbench.extras import versions
 from clbench.leaks import check_demonstrations
 from clbench.observer import observed
 from clbench.policy import Batch, PolicyConfig, encode
@@ -89,7 +90,7 @@ def demonstrate(world: World, task: Task, seed: int, disturb: bool) -> Demonstra
 def simulator_versions(tasks: Iterable[Task]) -> dict[str, str]:
     """Return the versions of all packages that can change a trajectory of one of the tasks."""
     packages = {*SIMULATORS, *(package for task in tasks for package in task.packages)}
-    return {package: version(package) for package in sorted(packages)}
+    return versions(packages)
 
 
 def _action_bounds(world: World) -> tuple[NDArray[np.float32], NDArray[np.float32]]:

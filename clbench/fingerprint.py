@@ -6,13 +6,13 @@ import hashlib
 import os
 import platform
 import subprocess
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import gymnasium
 import numpy as np
 
+from clbench.extras import versions
 from clbench.observer import frame_hash
 from clbench.task import Scenario, Task, resolve
 
@@ -63,7 +63,7 @@ def fingerprint(scenario: Scenario) -> dict[str, Any]:
     rollouts = {world: rollout_hash(world, task.name) for world, task in worlds.items()}
     frames = {task.camera: frame_hash(task) for task in worlds.values() if task.camera is not None}
     return {
-        "versions": {package: version(package) for package in sorted(packages)},
+        "versions": versions(packages),
         "python": platform.python_version(),
         "commit": _commit(),
         "hardware": {"machine": platform.machine(), "system": platform.system(), "processor": _processor()},

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Sequence
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +12,7 @@ from torch import Tensor
 from clbench.cache import cache_folder, cached, hash_of, is_cached, package_of, source_hash
 from clbench.camera import load_camera
 from clbench.demonstrations import Demonstrations, load_demonstrations, simulator_versions
+from clbench.extras import versions
 from clbench.observer import Observer, frame_hash
 from clbench.policy import Policy, PolicyConfig, load_policy, save_policy
 from clbench.policy.vision import Vision
@@ -54,7 +54,7 @@ def pretraining_inputs(scenario: Scenario, seed: int) -> dict[str, Any]:
         "source": source_hash(*core, *sorted(suites)),
         "versions": {
             **simulator_versions(tasks),
-            **{package: version(package) for package in ("torch", "tokenizers")},
+            **versions(("torch", "tokenizers")),
         },
     }
 

@@ -10,7 +10,6 @@ import os
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +22,7 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from clbench.cache import cache_folder, hash_of
+from clbench.extras import versions
 from clbench.seeding import derive_seed, seeded
 
 from .episode import Episode
@@ -326,7 +326,7 @@ def _ship(settings: Settings, expert: Expert, curve: list[list[float]], folder: 
         "curve": curve,
         "sizes": [expert.layers[0][0].shape[1], *(len(bias) for _, bias in expert.layers)],
         "sha256": hashlib.sha256(content).hexdigest(),
-        "versions": {package: version(package) for package in PACKAGES},
+        "versions": versions(PACKAGES),
     }
     folder.mkdir(parents=True, exist_ok=True)
     (folder / f"{task}.safetensors").write_bytes(content)
