@@ -49,6 +49,9 @@ COLUMNS = ("retention", "adaptation", RANKED_BY, "zero_shot", "question_retentio
 COMPARED = ("retention", "adaptation", RANKED_BY, "question_retention")
 """Metrics that methods are told apart by; none needs a reference."""
 
+METHODS = tuple(division for division in DIVISIONS if division not in ("online", "reference"))
+"""Divisions of methods: agents that learn online start from nothing, and references do not compete."""
+
 SEEDS = (3, 5, 10)
 """The first is what `clbench run` and `clbench submit` do."""
 
@@ -256,7 +259,7 @@ class Card:
 
     def _resolution(self) -> list[str]:
         """Return how far two methods must lie apart to be told apart."""
-        competing = [row for row in self.rows.values() if row.division != DIVISIONS[-1]]
+        competing = [row for row in self.rows.values() if row.division in METHODS]
         episodes = self.scenario.budget.report_episodes
         rows = []
         for metric in COMPARED:
@@ -326,7 +329,7 @@ def _cells(name: str, estimates: Sequence[Estimate], row: Row) -> tuple[str, ...
 def _ranks(competing: Sequence[Row]) -> list[str]:
     """Return how many methods of each division the board tells apart."""
     lines = []
-    for division in DIVISIONS[:-1]:
+    for division in METHODS:
         members = [row for row in competing if row.division == division and row.rank is not None]
         if len(members) > 1:
             ranks = len({row.rank for row in members})

@@ -19,6 +19,7 @@ from clbench.task import resolve
 from clbench.testing import TOY
 
 GROUPS = ("retained", "target", "held_out")
+ONLINE = {"demonstrations": "never", "questions": "never", "reference": False, "online": True}
 NAMES = [task.name for task in TOY.tasks]
 KEEPS = [[1, 1, 0, 0, 0], [1, 1, 1, 0, 0], [1, 1, 1, 1, 0]]
 FORGETS = [[1, 1, 0, 0, 0], [0, 0, 1, 0, 0], [0, 0, 0, 1, 0]]
@@ -32,7 +33,14 @@ class Bench:
     def __init__(self, folder: Path, make_record: Callable[..., Record]) -> None:
         self.records, self.output, self.make_record = folder / "records", folder / "cards", make_record
 
-    def add(self, method: str, success: Any, seeds: Iterable[int] = range(3), order: int = 0) -> None:
+    def add(
+        self,
+        method: str,
+        success: Any,
+        seeds: Iterable[int] = range(3),
+        order: int = 0,
+        online: bool = False,
+    ) -> None:
         """Add records of a method that has a success rate on each task after each stage."""
         for seed in seeds:
             asked = {(stage, "side"): (100, 90) for stage in range(3)}
@@ -42,6 +50,8 @@ class Bench:
             record.episodes["task"] = [names[name] for name in record.episodes["task"]]
             spec = RunSpec("clbench.testing:clbench/Toy-v0", method, seed, order=order)
             record.run, record.scenario = spec.describe()
+            if online:
+                record.run["uses"] = ONLINE
             steps = dict(zip((100, 200, 300, 400), (7, 15, 30, 60), strict=True))
             for table in (record.episodes, record.answers):
                 table["step"] = [steps.get(step, step) for step in table["step"]]
@@ -175,7 +185,9 @@ def test_what_is_resolved_is_half_of_the_interval_of_a_difference_at_the_measure
     for method, kept in (("sft", (0.2, 0.4, 0.3)), ("lwf", (0.5, 0.5, 0.6))):
         for seed, rate in enumerate(kept):
             bench.add(method, [*FORGETS[:2], [rate, rate, 0, 1, 0]], [seed])
-    bench.add("joint", KEEPS)  # a reference does not compete
+    bench.add("joint", KEEPS)  # a reference does not compete,
+    for seed in range(3):  # nor what learned by trial
+        bench.add("ewc", [*FORGETS[:2], [0, seed / 2, 0, 1, 0]], [seed], online=True)
     table = part(bench.card(), "How small a difference it resolves")
     row = next(line for line in table.splitlines() if line.startswith("| retention |"))
     found = [float(cell) for cell in row.strip("| ").split(" | ")[1:]]
