@@ -27,7 +27,7 @@ import torch
 from torch import Tensor, nn
 
 from clbench.cache import package_of, source_hash
-from clbench.names import installed_methods
+from clbench.names import built_in_methods, installed_methods
 from clbench.policy import Batch, Policy, QuestionBatch
 from clbench.task import Task
 
@@ -317,7 +317,7 @@ def load_method(spec: str) -> type[Method]:
     """
     if ":" in spec:
         cls = _import_method(spec)
-    elif spec in (installed := installed_methods()):
+    elif spec in (installed := built_in_methods()) or spec in (installed := installed_methods()):
         cls = _guarded(spec, installed[spec].load)
     else:
         near = difflib.get_close_matches(spec, installed, n=1)
