@@ -73,7 +73,17 @@ def test_the_frozen_policy_forgets_exactly_nothing_and_does_not_know_the_targets
 
 
 def test_every_built_in_method_has_a_row(board: Any) -> None:
-    assert set(board.index) == {name for name in method_names() if "/" not in name}
+    assert set(board.index[board["division"] != "online"]) == {
+        name for name in method_names() if "/" not in name
+    }
+
+
+@pytest.mark.parametrize("scenario", sorted(path.name for path in RECORDS.glob("*")))
+def test_every_scenario_on_the_board_is_known_to_tell_methods_apart(scenario: str) -> None:
+    card = (RECORDS.parents[1] / "docs" / "scenarios" / f"{scenario}.md").read_text()
+    bars = card.partition("| bar |")[2].partition("\n\n")[0].splitlines()[2:]
+    assert len(bars) >= 3
+    assert all(bar.endswith("| holds |") for bar in bars), bars
 
 
 def test_every_row_has_three_seeds(board: Any) -> None:
@@ -88,6 +98,8 @@ def test_stop_gradient_keeps_every_answer(board: Any) -> None:
 def test_what_a_row_may_touch_is_what_its_class_declares() -> None:
     for path in (RECORDS / "Fetch-v0").rglob("*.json"):
         run = read_record(path).run
+        if "online" in run["uses"]:  # an agent, not a method
+            continue
         assert run["uses"] == dataclasses.asdict(load_method(run["method"]).uses), path
 
 
