@@ -23,7 +23,7 @@ of blocks that take turns on one machine, the median with a 95 % bootstrap inter
 machine and of no use beside another's. Nothing else ran beside them.
 """
 UNITS = {
-    "tasks": "tasks of Meta-World, 2 episodes each",
+    "tasks": "tasks of Meta-World, 4 episodes of 50 steps each",
     "episodes": "episodes of Fetch",
     "environments": "Fetch environments, 20 steps each",
     "demonstrations": "demonstrations, 10 optimiser steps",
