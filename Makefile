@@ -39,7 +39,7 @@ docs: .venv/installed
 benchmark: .venv/installed-dev
 	$(BIN)/python benchmarks/rollouts.py
 	$(BIN)/python benchmarks/step_time.py
-	$(BIN)/python benchmarks/whole_run.py clbench/Fetch-v0 clbench/PointMaze-v0 clbench/DMControl-v0 clbench/MetaWorld-v0
+	for id in Fetch PointMaze DMControl MetaWorld MetaWorldCW; do $(BIN)/python benchmarks/whole_run.py clbench/$$id-v0 || exit; done
 	$(BIN)/python benchmarks/workers.py
 	$(BIN)/python benchmarks/scaling.py
 	$(BIN)/python benchmarks/report.py

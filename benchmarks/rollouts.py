@@ -67,12 +67,12 @@ class Suite:
 # ---- the peers -----------------------------------------------------------------------------------------
 
 
-def _robotics_peer(env_id: str, **options: Any) -> Env:
+def _fetch_peer() -> Env:
     with contextlib.redirect_stderr(io.StringIO()):  # else each process prints a notice about Adroit's hand
         import gymnasium_robotics
 
     gymnasium.register_envs(gymnasium_robotics)
-    return gymnasium.make(env_id, **options)
+    return gymnasium.make("FetchPickAndPlace-v4")
 
 
 def _set_controls(data: mujoco.MjData, action: Actions) -> None:
@@ -89,12 +89,6 @@ def _fetch_physics(env: Env) -> Physics:
 
     unwrapped: Any = env.unwrapped
     return Physics(unwrapped.model, unwrapped.data, scene.substeps, move)
-
-
-def _maze_physics(env: Env) -> Physics:
-    point: Any = env.unwrapped
-    point = point.point_env
-    return Physics(point.model, point.data, point.frame_skip, _set_controls)
 
 
 class DMControlEnv(gymnasium.Env[NDArray[np.float64], NDArray[np.float32]]):
@@ -161,15 +155,8 @@ SUITES = {
         "clbench/Fetch-v0",
         None,
         "FetchPickAndPlace-v4",
-        functools.partial(_robotics_peer, "FetchPickAndPlace-v4"),
+        _fetch_peer,
         _fetch_physics,
-    ),
-    "point_maze": Suite(
-        "clbench/PointMaze-v0",
-        None,
-        "PointMaze_Medium-v3",
-        functools.partial(_robotics_peer, "PointMaze_Medium-v3", continuing_task=False),
-        _maze_physics,
     ),
     "dm_control": Suite(
         "clbench/DMControl-v0", 3, "ball_in_cup catch", _dm_control_peer, _dm_control_physics
@@ -271,7 +258,8 @@ def contenders(suite: Suite, num_envs: int, threads: int) -> dict[str, Contender
     options: dict[str, Any] = {"instruction": "tokens"}
     if suite.stage is not None:
         options["stage"] = suite.stage
-    horizon = load_scenario(suite.ours).tasks[0].horizon
+    scenario = load_scenario(suite.ours)
+    horizon = (scenario.target[suite.stage - 1] if suite.stage else scenario.tasks[0]).horizon
     peer = suite.peer()
     peer.reset(seed=0)
     physics = suite.physics(peer)

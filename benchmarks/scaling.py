@@ -2,8 +2,8 @@
 
 Each is measured at several sizes in turns, in a new order each round; reported are the medians, the straight
 line through them and how far they lie off it. Tasks are those of Meta-World, each with a scene of its own,
-and episodes those of Fetch, both with a policy as it was drawn: its episodes last to their horizons. Sizes are
-multiples of the 40 episodes that are stepped together: fewer take a forward of as many rows.
+and episodes those of Fetch, both with a policy as it was drawn: its episodes last to their horizons. Sizes
+are multiples of the 40 episodes that are stepped together: fewer take a forward of as many rows.
 """
 
 from __future__ import annotations

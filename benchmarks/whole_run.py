@@ -1,4 +1,4 @@
-"""Where the time of a whole run goes, and how much memory it takes: `python benchmarks/whole_run.py`.
+"""Where the time of a whole run goes, and how much memory it takes: `python benchmarks/whole_run.py ID`.
 
 One run of plain fine-tuning with one thread, as `clbench run` does it, with its data and its pretrained
 policy in the cache. The clock is read around the physics, the pictures and the policy of the evaluation;
@@ -9,11 +9,13 @@ matrix products of a policy's size, in GFLOPS, before and after.
 from __future__ import annotations
 
 import argparse
+import os
 import resource
 import tempfile
 import time
 from collections import defaultdict
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +23,7 @@ import torch
 from result_files import read_results, write_results
 from rich.progress import Progress
 
+from clbench.cache import cache_folder
 from clbench.policy import Policy
 from clbench.pretraining import pretrained_policy
 from clbench.run import execute
@@ -37,22 +40,41 @@ PARTS = {
 def main() -> None:
     """Measure, print a table and write results/whole_run.json."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("scenarios", nargs="*", default=["clbench/Fetch-v0"])
+    parser.add_argument("scenario", help="one for each process, as its memory is that of the process")
     parser.add_argument("--method", default="sft")
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
-    kept = (read_results("whole_run") or {"runs": {}})["runs"]
-    for scenario in arguments.scenarios:
-        kept[scenario] = found = measure(RunSpec(scenario, arguments.method, arguments.seed))
-        write_results("whole_run", scenario, {"runs": kept})
-        print(f"{scenario}, {arguments.method}: {found['seconds']:.0f} s, {found['peak_memory_gb']:.2f} GB")
-        for part, seconds in found["parts"].items():
-            print(f"  {part:10} {seconds:6.1f} s, {seconds / found['seconds']:4.0%}")
+    spec = RunSpec(arguments.scenario, arguments.method, arguments.seed)
+    pretrained_policy(spec.load(), spec.seed)
+    with _cache_without_reports():
+        found = measure(spec)
+    runs = (read_results("whole_run") or {"runs": {}})["runs"]
+    write_results("whole_run", spec.scenario, {"runs": {**runs, spec.scenario: found}})
+    print(f"{spec.scenario}, {spec.method}: {found['seconds']:.0f} s, {found['peak_memory_gb']:.2f} GB")
+    for part, seconds in found["parts"].items():
+        print(f"  {part:10} {seconds:6.1f} s, {seconds / found['seconds']:4.0%}")
+
+
+@contextmanager
+def _cache_without_reports() -> Iterator[None]:
+    """Hide the evaluations before any target that other runs left: a run would take them for its own."""
+    with tempfile.TemporaryDirectory() as folder:
+        for kept in cache_folder().iterdir():
+            if kept.name != "reports":
+                (Path(folder) / kept.name).symlink_to(kept)
+        before = os.environ.get("CLBENCH_CACHE")
+        os.environ["CLBENCH_CACHE"] = folder
+        try:
+            yield
+        finally:
+            if before is None:
+                del os.environ["CLBENCH_CACHE"]
+            else:
+                os.environ["CLBENCH_CACHE"] = before
 
 
 def measure(spec: RunSpec) -> dict[str, Any]:
     """Return how long a run takes, and its parts."""
-    pretrained_policy(spec.load(), spec.seed)
     clocks: defaultdict[str, float] = defaultdict(float)
     for part, (owner, names) in PARTS.items():
         for name in names:

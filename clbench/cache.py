@@ -9,12 +9,14 @@ import logging
 import os
 import shutil
 import uuid
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from torch import Tensor
+
+    from clbench.task import Task
 
 LOG = logging.getLogger("clbench")
 
@@ -63,6 +65,12 @@ def _origin(module: str) -> Path | None:
     except ValueError:
         return None
     return Path(spec.origin) if spec is not None and spec.origin is not None else None
+
+
+def packages_of(tasks: Iterable[Task], *parts: str) -> list[str]:
+    """Return the packages that parts of the tasks lie in, as "world", "expert" and "camera", in order."""
+    entry_points = (getattr(task, part) for task in tasks for part in parts)
+    return sorted({package_of(entry_point) for entry_point in entry_points if entry_point is not None})
 
 
 def package_of(entry_point: str) -> str:

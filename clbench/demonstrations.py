@@ -16,7 +16,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from clbench.cache import cached, package_of, source_hash
+from clbench.cache import cached, packages_of, source_hash
 from clbench.extras import versions
 from clbench.leaks import check_demonstrations
 from clbench.observer import observed
@@ -139,7 +139,7 @@ def dataset_folder(task: Task, budget: Budget, progress: Callable[[float], None]
             __name__,
             "clbench.seeding",
             "clbench.world",
-            *sorted({package_of(task.world), package_of(task.expert)}),
+            *packages_of([task], "world", "expert"),
         ),
         "versions": simulator_versions([task]),
     }

@@ -31,7 +31,11 @@ def main(entry_point: str) -> None:
     while header := sys.stdin.buffer.read(HEADER.size):
         count, size = HEADER.unpack(header)
         numbers = np.frombuffer(sys.stdin.buffer.read(4 * count * size), np.float32)
-        pictures.write(camera.draw(numbers.reshape(count, size)).tobytes())
+        drawn = camera.draw(numbers.reshape(count, size))
+        wanted = (count, camera.image_size, camera.image_size, 3)
+        if drawn.shape != wanted or drawn.dtype != np.uint8:
+            raise TypeError(f"draw() must return {wanted} of uint8, not {drawn.shape} of {drawn.dtype}.")
+        pictures.write(drawn.tobytes())
         pictures.flush()
 
 

@@ -16,7 +16,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 
 from clbench.adaptation import Step, adapt
-from clbench.cache import package_of, source_hash
+from clbench.cache import packages_of, source_hash
 from clbench.demonstrations import Demonstrations, load_demonstrations
 from clbench.leaks import check_policy, outside, seams
 from clbench.method import Access, Method, Nothing, Prior, Source, Stage, State
@@ -153,11 +153,10 @@ def load_stage(folder: Path, method: Method, device: str) -> Policy:
 
 def sources(scenario: Scenario, seed: int, *modules: str) -> dict[str, Any]:
     """Return the code and data that any result of a run depends on, `modules` besides, as JSON."""
-    suites = {package_of(name) for task in scenario.tasks for name in (task.world, task.expert)}
     return {
         "pretraining": pretraining_inputs(scenario, seed),
         "tasks": [dataclasses.asdict(task) for task in scenario.tasks],
-        "source": source_hash("clbench", *modules, *sorted(suites)),
+        "source": source_hash("clbench", *modules, *packages_of(scenario.tasks, "world", "expert", "camera")),
     }
 
 

@@ -24,7 +24,7 @@ from torch import Tensor
 from clbench.cache import cache_folder, cached, hash_of, package_of, source_hash
 from clbench.camera import Camera, Images, States, load_camera
 from clbench.drawing import HEADER
-from clbench.rendering import RenderingError, working_back_end
+from clbench.rendering import RenderingError, environment_of, working_back_end
 from clbench.task import Task, resolve
 
 TOGETHER = 256
@@ -69,10 +69,16 @@ class Observer:
 
         Raises:
             RenderingError: Nothing here can draw the world; the message says what to install.
+            TypeError: The camera returns numbers of another shape.
         """
         if self._camera is None:
             return states, np.zeros((len(states), 0, 0, 3), np.uint8)
-        return self._camera.proprioception(states), self._draw(np.ascontiguousarray(states, np.float32))
+        numbers = self._camera.proprioception(states)
+        if numbers.shape != (wanted := (len(states), self._camera.state_size)):
+            raise TypeError(
+                f"{self._entry_point}: proprioception() must return {wanted}, not {numbers.shape}."
+            )
+        return numbers, self._draw(np.ascontiguousarray(states, np.float32))
 
     def _draw(self, states: States) -> Images:
         if not self._processes:
@@ -110,7 +116,7 @@ class _DrawingProcess:
             stdout=subprocess.PIPE,
             stderr=self._complaints,
             # Mesa's own threads would fight for the cores with other runs, and take longer for small pictures
-            env={**os.environ, "MUJOCO_GL": back_end, "LP_NUM_THREADS": "0"},
+            env={**environment_of(back_end), "LP_NUM_THREADS": "0"},
         )
 
     def ask(self, states: States) -> None:

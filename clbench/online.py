@@ -155,6 +155,11 @@ class _OnlineRun:
     records: Path
 
     def __post_init__(self) -> None:
+        if not self.scenario.retained:
+            raise ValueError(
+                f"{self.scenario.id} retains nothing: agents are evaluated after stage 0, which trains the "
+                "retained skills, and here there is none. Choose a scenario with retained skills."
+            )
         check_method_name(self.method)
         if self.method in built_in_methods():
             raise ValueError(
@@ -307,7 +312,10 @@ class _Player:
         states = self.lanes.reset([0], [world_seed], [task])
         memory, total, length, success = None, 0.0, 0, False
         while length < task.horizon and not success:
-            action, memory = self._act({"state": states[0], "instruction": instruction}, memory, space)
+            numbers, images = self.lanes.observe([task], states)
+            picture = {} if task.camera is None else {"image": images[0]}
+            observation: Observation = {"state": numbers[0], **picture, "instruction": instruction}
+            action, memory = self._act(observation, memory, space)
             states, rewards, successes = self.lanes.step([0], action[None])
             total, length, success = total + float(rewards[0]), length + 1, bool(successes[0])
         return Episode(task.name, split, number, success, total, length)

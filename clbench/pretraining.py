@@ -9,7 +9,7 @@ from typing import Any
 
 from torch import Tensor
 
-from clbench.cache import cache_folder, cached, hash_of, is_cached, package_of, source_hash
+from clbench.cache import cache_folder, cached, hash_of, is_cached, package_of, packages_of, source_hash
 from clbench.camera import load_camera
 from clbench.demonstrations import Demonstrations, load_demonstrations, simulator_versions
 from clbench.extras import versions
@@ -37,8 +37,7 @@ AFTER_PRETRAINING = (
 def pretraining_inputs(scenario: Scenario, seed: int) -> dict[str, Any]:
     """Return all that a pretrained policy depends on."""
     tasks = scenario.retained + scenario.scenes
-    suites = {package_of(name) for task in tasks for name in (task.world, task.expert)}
-    suites.add(package_of(scenario.questions))
+    suites = {*packages_of(tasks, "world", "expert", "camera"), package_of(scenario.questions)}
     budget = dataclasses.asdict(scenario.budget)
     parts = (
         *("policy", "demonstrations", "questions", "camera", "observer", "drawing"),

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
-from clbench.cache import cache_folder, cached, hash_of, package_of, source_hash
+from clbench.cache import cache_folder, cached, hash_of, packages_of, source_hash
 from clbench.demonstrations import demonstrate, simulator_versions
 from clbench.leaks import check_questions
 from clbench.observer import observed
@@ -56,7 +56,7 @@ def scenes_folder(scenario: Scenario, progress: Callable[[float], None] = lambda
             "clbench.seeding",
             "clbench.world",
             __name__,
-            *sorted({package_of(name) for task in tasks for name in (task.world, task.expert)}),
+            *packages_of(tasks, "world", "expert"),
         ),
         "versions": simulator_versions(tasks),
     }

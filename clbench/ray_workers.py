@@ -99,6 +99,8 @@ class RayWorkers:
         """Write the records of a job that ended, and return how it did."""
         try:
             result: _Result = self._ray.get(reference)
+        except self._ray.exceptions.RayTaskError as error:
+            return "failed", f"its worker could not do it: {str(error).strip().splitlines()[-1]}"
         except self._ray.exceptions.RayError as error:
             first = str(error).strip().partition("\n")[0]
             return "failed", f"its worker was lost {RETRIES + 1} times: {type(error).__name__}: {first}"

@@ -39,10 +39,9 @@ def rendering_fault(back_end: str, world: str | None = None) -> str | None:
         world: Entry point of an environment; if None, MuJoCo only makes ready to draw.
     """
     command = [sys.executable, "-c", *((_MAKE_CONTEXT,) if world is None else (_DRAW, world))]
-    environment = {**os.environ, "MUJOCO_GL": back_end}
     try:
         result = subprocess.run(
-            command, env=environment, capture_output=True, text=True, timeout=120, check=False
+            command, env=environment_of(back_end), capture_output=True, text=True, timeout=120, check=False
         )
     except subprocess.TimeoutExpired:
         return "no answer in two minutes"
@@ -53,8 +52,14 @@ def rendering_fault(back_end: str, world: str | None = None) -> str | None:
     return lines[-1] if lines else f"exit code {result.returncode}"
 
 
+def environment_of(back_end: str) -> dict[str, str]:
+    """Return the variables of a process that draws with a back end, and finds what this one can import."""
+    path = os.pathsep.join(entry for entry in sys.path if entry)
+    return {**os.environ, "MUJOCO_GL": back_end, "PYTHONPATH": path}
+
+
 def choose_back_end(worlds: Iterable[str]) -> str:
-    """Set `MUJOCO_GL` to the first back end that draws all worlds, EGL or OSMesa, and return it.
+    """Set `MUJOCO_GL` to the first back end that draws all worlds, and return it.
 
     It must happen before MuJoCo is imported.
 
@@ -70,7 +75,7 @@ def choose_back_end(worlds: Iterable[str]) -> str:
 
 
 def working_back_end(worlds: Iterable[str], chosen: str | None) -> str:
-    """Return the first back end that draws all worlds, EGL or OSMesa.
+    """Return the first back end that draws all worlds: EGL or OSMesa, GLFW where there is no Linux.
 
     Args:
         worlds: Entry points of environments.

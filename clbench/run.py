@@ -168,9 +168,12 @@ class _Run:
     def _report_start(self) -> None:
         """Evaluate the policy before any target; the report is kept, as most methods start with the same."""
         tables = ("episodes", "answers", "policy")
+        evaluated = False
 
         def write(folder: Path) -> None:
+            nonlocal evaluated
             self._report(0, 0)
+            evaluated = True
             values = {name: getattr(self.record, name) for name in tables}
             (folder / "report.json").write_text(json.dumps(values), encoding="utf-8")
 
@@ -181,8 +184,8 @@ class _Run:
             **sources(self.scenario, self.spec.seed),
         }
         folder = cache_folder() / "reports" / hash_of(inputs)
-        if not is_cached(folder, inputs):
-            cached(folder, inputs, write)
+        cached(folder, inputs, write)
+        if evaluated:
             return
         for name, value in json.loads((folder / "report.json").read_text(encoding="utf-8")).items():
             setattr(self.record, name, value)

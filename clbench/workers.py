@@ -23,6 +23,7 @@ SEND_SECONDS = 0.2
 """How often a worker tells how far it is, at most."""
 
 _LOOK_SECONDS = 0.5
+_LEAVE_SECONDS = 5.0
 
 
 class JobError(Exception):
@@ -120,7 +121,7 @@ class Processes:
             event = Event(worker.job, *_receive(worker))
             if event.kind != "progress":
                 del self._running[connection]
-                worker.process.join()
+                _leave(worker.process)
             yield event
 
     def close(self) -> None:
@@ -141,6 +142,15 @@ class Processes:
             worker.broken = limits.exceeded(worker.process.pid, now - worker.started)
             if worker.broken:
                 end(worker.process.pid)
+
+
+def _leave(process: BaseProcess) -> None:
+    """Wait until a process that has told how it ended is gone; what a thread of it still does is cut off."""
+    process.join(_LEAVE_SECONDS)
+    if process.is_alive():
+        assert process.pid is not None
+        end(process.pid)
+        process.join()
 
 
 @contextmanager

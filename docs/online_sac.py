@@ -53,7 +53,14 @@ def learn(scenario: str, seed: int, steps: int, records: Path) -> None:
         env = gymnasium.make(scenario, instruction="tokens", stage=stage)
         if agent is None:
             features = {"features_extractor_class": StateAndWords}
-            agent = SAC("MultiInputPolicy", env, policy_kwargs=features, buffer_size=steps, device="cpu")
+            agent = SAC(
+                "MultiInputPolicy",
+                env,
+                seed=100 * seed,
+                policy_kwargs=features,
+                buffer_size=steps,
+                device="cpu",
+            )
         agent.set_env(env)
         agent.set_random_seed(100 * seed + stage)
         assert agent.replay_buffer is not None

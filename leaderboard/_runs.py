@@ -258,20 +258,18 @@ def same_layout(runs: list[Run]) -> Sifted:
 
 
 def same_settings(runs: list[Run]) -> Sifted:
+    def parts(run: Run) -> list[dict[str, Any]]:
+        told = run.record.run
+        # one that is missing in an older record came later, with a default that changes nothing
+        defaults = _declared(told["method"])[1] if told["method"] in built_in_methods() else {}
+        return [{**defaults, **told["settings"]}, told["uses"], {"device": told["device"]}]
+
     def reason(run: Run, other: Run) -> str:
-        fields = [
-            name
-            for part in ("settings", "uses")
-            for name in differences(run.record.run[part], other.record.run[part])
-        ]
+        both = zip(parts(run), parts(other), strict=True)
+        fields = [name for one, another in both for name in differences(one, another)]
         return f"its settings are not those of most seeds: {', '.join(fields)} differ."
 
-    return _most(
-        runs,
-        lambda run: (run.scenario, run.method),
-        lambda run: _text([run.record.run["settings"], run.record.run["uses"]]),
-        reason,
-    )
+    return _most(runs, lambda run: (run.scenario, run.method), lambda run: _text(parts(run)), reason)
 
 
 ALIKE: tuple[Sift, ...] = (same_scenario, same_simulator, same_layout, same_settings)

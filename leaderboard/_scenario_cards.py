@@ -30,7 +30,7 @@ from clbench.task import Budget, Scenario, Task, resolve
 from ._descriptions import field_docstrings
 from ._markdown import grid, prose, run_command
 from ._rows import RANKED_BY, Row, Table
-from ._runs import DIVISIONS, differences, printable
+from ._runs import METHODS, differences, printable
 from ._scenario_tasks import Experts, picture_path
 from ._table import MISSING, escaped, interval, number_text, title_of
 
@@ -48,9 +48,6 @@ COLUMNS = ("retention", "adaptation", RANKED_BY, "zero_shot", "question_retentio
 
 COMPARED = ("retention", "adaptation", RANKED_BY, "question_retention")
 """Metrics that methods are told apart by; none needs a reference."""
-
-METHODS = tuple(division for division in DIVISIONS if division not in ("online", "reference"))
-"""Divisions of methods: agents that learn online start from nothing, and references do not compete."""
 
 SEEDS = (3, 5, 10)
 """The first is what `clbench run` and `clbench submit` do."""

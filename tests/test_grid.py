@@ -20,7 +20,7 @@ from clbench.workers import Job, Processes
 TOY = "clbench.testing:clbench/Toy-v0"
 
 JOBS = """
-import os, signal, time
+import os, signal, threading, time
 from pathlib import Path
 
 def good(progress, path=None):
@@ -33,6 +33,10 @@ def bad(progress):
 
 def killed(progress):
     os.kill(os.getpid(), signal.SIGKILL)
+
+def leaves_a_thread(progress):
+    threading.Thread(target=time.sleep, args=(60,)).start()
+    return "went well"
 
 def slow(progress, path):
     Path(path).write_text(str(os.getpid()))
@@ -78,6 +82,16 @@ def test_a_job_that_fails_or_is_killed_does_not_stop_the_others(bars: Bars) -> N
     assert "exit code -9" in failed["dead"]
     assert failed["hopeless"] == "left out, because dead failed"
     assert "fine: went well" in _printed(bars)
+
+
+def test_a_job_that_leaves_a_thread_behind_is_over_when_it_says_so(
+    bars: Bars, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("clbench.workers._LEAVE_SECONDS", 0.2)
+    begin = time.monotonic()
+    assert run_jobs([_job("loose", "leaves_a_thread"), _job("next", "good")], Processes(1), bars) == {}
+    assert time.monotonic() - begin < 50
+    assert "next: went well" in _printed(bars)
 
 
 def test_stopping_the_grid_ends_its_processes(

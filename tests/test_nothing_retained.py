@@ -13,6 +13,7 @@ from gymnasium.envs.registration import EnvSpec
 
 from clbench.method import load_method
 from clbench.metrics import measure
+from clbench.online import evaluate_agent, next_stage
 from clbench.pretraining import pretrained_policy
 from clbench.questions import load_questions
 from clbench.record import Record, record_path, write_record
@@ -68,6 +69,14 @@ def test_the_walk_begins_with_the_first_target() -> None:
     many = ScenarioVectorEnv(SCENARIO, num_envs=2, episodes_per_stage=2)
     assert many.reset(seed=0)[1]["task"].tolist() == ["right", "right"]
     many.close()
+
+
+def test_agents_that_learn_by_trial_are_told_that_there_is_no_stage_0(tmp_path: Path) -> None:
+    env = gymnasium.make(SCENARIO.id, stage=1)
+    with pytest.raises(ValueError, match="clbench/ToyUnretained-v0 retains nothing"):
+        evaluate_agent(lambda _: np.zeros(2), env, method="me/still", records=tmp_path)
+    with pytest.raises(ValueError, match="retains nothing"):
+        next_stage(SCENARIO.id, method="me/still", records=tmp_path)
 
 
 def test_the_policy_knows_answers_alone_and_its_actions_are_not_normalised() -> None:

@@ -2,7 +2,10 @@
 
 import dataclasses
 import os
+import sys
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -17,7 +20,7 @@ from clbench.learner import Learner
 from clbench.method import build_method, method_names
 from clbench.observer import TOGETHER, Observer, frame_hash, observed
 from clbench.policy import Policy
-from clbench.pretraining import policy_config, pretrained_policy
+from clbench.pretraining import policy_config, pretrained_policy, pretraining_inputs
 from clbench.questions import load_questions
 from clbench.rendering import RenderingError
 from clbench.task import load_scenario
@@ -53,6 +56,62 @@ def test_a_camera_that_lacks_something_is_refused_by_name() -> None:
         TypeError, match=r"ToyWorld is no camera: it lacks .*pictured.* docs/pixels\.md shows"
     ):
         Observer(TASK.world, "clbench.testing.toy:ToyWorld")
+
+
+@pytest.fixture
+def camera_of(write_module: Callable[[str, str], None]) -> Callable[[str], str]:
+    """Return a function that writes a camera, the toy's but for some lines, and returns its entry point."""
+
+    def write(lines: str) -> str:
+        head = (
+            "import numpy as np\nfrom clbench.testing.toy_camera import ToyCamera\nclass Other(ToyCamera):\n"
+        )
+        write_module("other_camera", head + lines)
+        sys.modules.pop("other_camera", None)  # that of another test
+        return "other_camera:Other"
+
+    return write
+
+
+@pytest.mark.parametrize(
+    ("returned", "said"),
+    [
+        ("np.zeros((len(states), 16, 16, 3))", "of float64"),  # eight bytes for each that is read
+        ("np.zeros((len(states), 8, 8, 3), np.uint8)", r"\(3, 8, 8, 3\)"),  # the rest would never come
+    ],
+)
+def test_pictures_of_another_size_or_kind_are_refused(
+    camera_of: Callable[[str], str], returned: str, said: str
+) -> None:
+    camera = camera_of(f"    def draw(self, states): return {returned}\n")
+    observer = Observer(TASK.world, camera)
+    with pytest.raises(
+        RenderingError, match=rf"draw\(\) must return \(3, 16, 16, 3\) of uint8, not .*{said}"
+    ):
+        observer.observe(_states(3))
+    observer.close()
+
+
+def test_numbers_of_another_size_are_refused(camera_of: Callable[[str], str]) -> None:
+    camera = camera_of("    proprioception = staticmethod(lambda states: states[:, :3])\n")
+    with pytest.raises(TypeError, match=r"proprioception\(\) must return \(3, 1\), not \(3, 3\)"):
+        Observer(TASK.world, camera).observe(_states(3))
+
+
+def test_where_the_source_of_the_camera_changes_the_policy_is_pretrained_anew(
+    camera_of: Callable[[str], str],
+) -> None:
+    def inputs(column: int) -> Any:
+        camera = camera_of(
+            f"    proprioception = staticmethod(lambda states: states[:, {column} : {column + 1}])\n"
+        )
+        groups: dict[str, Any] = {
+            group: tuple(dataclasses.replace(task, camera=camera) for task in getattr(SEEN_TOY, group))
+            for group in ("retained", "target", "held_out")
+        }
+        return pretraining_inputs(dataclasses.replace(SEEN_TOY, **groups), 0)
+
+    assert inputs(0) != inputs(1)
 
 
 def test_processes_draw_what_the_camera_draws_in_the_order_of_the_states() -> None:

@@ -45,6 +45,17 @@ def stage_env(stage: int, **options: Any) -> gymnasium.Env[Any, Any]:
     return gymnasium.make(ID, stage=stage, **options)
 
 
+class Looking:
+    """An agent that keeps what it was shown."""
+
+    def __init__(self) -> None:
+        self.shown: list[Observation] = []
+
+    def predict(self, observation: Observation, *, deterministic: bool) -> tuple[Any, Any]:
+        self.shown.append(observation)
+        return np.zeros(2), None
+
+
 def trained(stage: int, steps: int) -> gymnasium.Env[Any, Any]:
     """Return the environment of a stage in which so many steps were taken."""
     env = stage_env(stage)
@@ -69,6 +80,14 @@ def evaluate(tmp_path: Path, empty_caches: Path) -> Callable[..., Any]:
 
 LEARNED = (("left", "up"), ("up", "right"), ("up", "right", "down"))
 """What an agent knows after each stage: it forgets "left" when it learns "right"."""
+
+
+def test_an_agent_is_shown_what_the_environment_shows_and_nothing_else(evaluate: Callable[..., Any]) -> None:
+    env = gymnasium.make("clbench.testing.seen_toy:clbench/SeenToy-v0", stage=0)
+    agent = Looking()
+    evaluate(agent, env)
+    assert all(env.observation_space.contains(shown) for shown in agent.shown)
+    assert any(shown["image"].any() for shown in agent.shown)
 
 
 def test_an_agent_leaves_a_record_of_what_it_knew_after_each_stage(

@@ -307,6 +307,17 @@ def test_the_report_of_the_pretrained_policy_is_made_once(tmp_path: Path, empty_
     assert len(list(kept.iterdir())) == 2  # it has more in it
 
 
+def test_a_report_that_another_run_makes_at_the_same_time_is_taken(
+    tmp_path: Path, empty_caches: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first = execute(RunSpec(TOY, "frozen", seed=0), tmp_path)
+    # what was looked for was not there yet; when it is to be made, it is
+    monkeypatch.setattr("clbench.run.is_cached", lambda *_: False)
+    second = execute(RunSpec(TOY, "sft", seed=0), tmp_path)
+    starts = [[stage for stage in one.episodes["stage"] if stage == 0] for one in (first, second)]
+    assert starts[0] == starts[1] != []
+
+
 def test_changes_are_recorded_and_lie_beside_the_unchanged_run(tmp_path: Path) -> None:
     record = execute(RunSpec(TOY, "experience_replay", 0, {"replay": "0.25"}), tmp_path)
     assert record.run["settings"] == record.run["changes"] == {"replay": 0.25}

@@ -140,7 +140,8 @@ def _run_missing(
     if not missing and not bare:
         return True
     begin = time.monotonic()
-    runs = benchmark_jobs(missing, records, checkpoints=checkpoints, tensorboard=tensorboard)
+    with checked_input():  # where nothing draws, a scenario with a camera is refused
+        runs = benchmark_jobs(missing, records, checkpoints=checkpoints, tensorboard=tensorboard)
     # what both need is made once
     jobs = list({job.name: job for job in (*runs, *stages_jobs(bare, checkpoints))}.values())
     failed = run_with_bars(jobs, workers(), console)

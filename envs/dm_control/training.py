@@ -21,7 +21,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
-from clbench.cache import cache_folder, hash_of
+from clbench.cache import cache_folder, hash_of, source_hash
 from clbench.extras import versions
 from clbench.seeding import derive_seed, seeded
 
@@ -40,6 +40,8 @@ ROUND = 8
 REPLAY_SIZE = 100_000
 """Decisions that are kept, and the most of a training."""
 PACKAGES = ("dm-control", "mujoco", "numpy", "stable-baselines3", "torch")
+SOURCES = ("bodies", "episode", "expert", "rules", "sac", "state", "symmetry")
+"""Modules beside this one that a training depends on."""
 
 
 STEPS = {
@@ -135,7 +137,11 @@ def steps_of(task: str) -> int:
 
 def checkpoint_path(settings: Settings) -> Path:
     """Return where the checkpoint of a training lies, or will lie; a longer training goes on from it."""
-    inputs = {name: value for name, value in asdict(settings).items() if name != "steps"}
+    inputs = {
+        **{name: value for name, value in asdict(settings).items() if name != "steps"},
+        "source": source_hash(__name__, *(f"{__package__}.{part}" for part in SOURCES), "clbench.seeding"),
+        "versions": versions(PACKAGES),
+    }
     name = f"{settings.task}-seed-{settings.seed}-{hash_of(inputs)}.safetensors"
     return cache_folder() / "experts" / name
 

@@ -376,6 +376,7 @@ def lose_selection_episode(record: Record) -> None:
         (set_in("run", "split", "selection"), "it is a tuning run: its episodes may be chosen on."),
         (set_in("run", "split", "all"), "split must be report or selection"),
         (set_in("run", "settings", {"strength": 2}), "settings are not those of most seeds: strength"),
+        (set_in("run", "device", "cuda"), "settings are not those of most seeds: device"),
     ],
 )
 def test_a_record_that_cannot_be_a_row_is_listed_with_its_reason_and_hides_no_other(
