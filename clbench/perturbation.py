@@ -3,7 +3,7 @@
 A perturbed episode begins with the seed, the instruction and the policy's draws of the report episode of its
 number; only the start pose and the mass of what is moved differ. What these become follows from that seed
 alone, in a stream of its own: no other draw of the episode moves. Each suite says how far it displaces a
-start, and why. Camera and light are not drawn: no world that is observed as a state shows them.
+start, and why. Camera and light are not among them: a picture is a function of the state alone.
 """
 
 from __future__ import annotations
