@@ -9,6 +9,7 @@ import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeAlias
 
 import numpy as np
 import torch
@@ -25,6 +26,21 @@ from clbench.seeding import derive_seed, torch_generator
 from clbench.task import Scenario, resolve
 from clbench.world import World
 
+Truths: TypeAlias = NDArray[np.bool_]
+"""Whether something holds in each of the states (N,)."""
+Answers: TypeAlias = NDArray[np.int64]
+"""The index of the right answer in each of the states (N,), or -1 where it is too close to tell."""
+
+
+def which(*truths: Truths) -> Answers:
+    """Return the index of the first of the truths that holds, -1 where none does."""
+    return np.select(truths, range(len(truths)), default=-1).astype(np.int64)
+
+
+def sign(difference: NDArray[np.float32], margin: float) -> Answers:
+    """Return 0 where the difference (N,) is above the margin, 1 where it is below minus that, else -1."""
+    return which(difference > margin, difference < -margin)
+
 
 @dataclass(frozen=True)
 class QuestionKind:
@@ -36,8 +52,8 @@ class QuestionKind:
     """The question in words; each means the same."""
     answers: tuple[str, ...]
     """The possible answers, each one word of the vocabulary."""
-    answer: Callable[[NDArray[np.float32]], NDArray[np.int64]]
-    """Maps states (N, S) to the index of the right answer (N,), or -1 where it is too close to tell."""
+    answer: Callable[[NDArray[np.float32]], Answers]
+    """Maps states (N, S) to answers (N,)."""
 
 
 def scenes_folder(scenario: Scenario, progress: Callable[[float], None] = lambda _: None) -> Path:

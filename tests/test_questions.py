@@ -5,11 +5,17 @@ import pytest
 import torch
 
 from clbench.policy import word_id
-from clbench.questions import QuestionKind, Questions, load_questions, report_questions
+from clbench.questions import QuestionKind, Questions, load_questions, report_questions, sign, which
 from clbench.task import load_scenario
 
 TOY = load_scenario("clbench.testing:clbench/Toy-v0")
 FETCH = load_scenario("clbench/Fetch-v0")
+
+
+def test_an_answer_is_the_first_truth_that_holds_and_none_where_it_is_too_close_to_tell() -> None:
+    first, second = np.array([True, False, True, False]), np.array([False, True, True, False])
+    assert which(first, second).tolist() == [0, 1, 0, -1]
+    assert sign(np.array([0.3, -0.3, 0.2, -0.2, 0.1], np.float32), 0.25).tolist() == [0, 1, -1, -1, -1]
 
 
 def test_every_kind_and_every_answer_of_it_is_as_frequent_and_right() -> None:

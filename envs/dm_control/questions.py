@@ -10,22 +10,20 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from clbench.questions import QuestionKind
+from clbench.questions import Answers, QuestionKind, Truths, which
 
 from .state import BODIES, BODY, State
 
 SIDE_MARGIN = 0.02
 """Metres that things must lie apart along an axis before one is called left of, or above, the other."""
 
-Answers = NDArray[np.int64]
-Truths = NDArray[np.bool_]
 Values = NDArray[np.float32]
 
 
 def _about(body: str, states: State, first: Truths, second: Truths) -> Answers:
     """Return 0 where `first` holds, else 1 where `second` holds, else -1; and -1 for all other bodies."""
     asked = states[:, BODY][:, BODIES.index(body)] > 0.5
-    return np.select([asked & first, asked & second], [0, 1], default=-1).astype(np.int64)
+    return which(asked & first, asked & second)
 
 
 def _sign(

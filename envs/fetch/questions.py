@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from clbench.questions import QuestionKind
+from clbench.questions import Answers, QuestionKind, sign, which
 
 from .state import (
     BLOCK,
@@ -23,19 +23,6 @@ SIDE_MARGIN = 0.015
 """Metres that two things must lie apart along an axis before one is called left, nearer or farther."""
 DISTANCE_MARGIN = 0.02
 """Metres by which two distances must differ before one thing is called the nearer one."""
-
-Answers = NDArray[np.int64]
-Truths = NDArray[np.bool_]
-
-
-def _choose(first: Truths, second: Truths) -> Answers:
-    """Return 0 where `first` holds, else 1 where `second` holds, else -1: all have shape (N,)."""
-    return np.select([first, second], [0, 1], default=-1).astype(np.int64)
-
-
-def _sign(difference: NDArray[np.float32], margin: float) -> Answers:
-    """Return 0 where the difference (N,) is above the margin, 1 where it is below minus that, else -1."""
-    return _choose(difference > margin, difference < -margin)
 
 
 def _opening(states: State) -> NDArray[np.float32]:
@@ -56,66 +43,66 @@ def _length(vectors: State) -> NDArray[np.float32]:
 
 
 def _block_side(states: State) -> Answers:
-    return _sign(states[:, BLOCK_FROM_GRIPPER][:, 1], SIDE_MARGIN)
+    return sign(states[:, BLOCK_FROM_GRIPPER][:, 1], SIDE_MARGIN)
 
 
 def _block_depth(states: State) -> Answers:
-    return _sign(-states[:, BLOCK_FROM_GRIPPER][:, 0], SIDE_MARGIN)
+    return sign(-states[:, BLOCK_FROM_GRIPPER][:, 0], SIDE_MARGIN)
 
 
 def _gripper_above(states: State) -> Answers:
     above = -states[:, BLOCK_FROM_GRIPPER][:, 2]
-    return _choose(above > 0.07, above < 0.05)
+    return which(above > 0.07, above < 0.05)
 
 
 def _gripper_opening(states: State) -> Answers:
     """Around the block, at 0.05, the gripper is neither open nor closed."""
-    return _choose(_opening(states) > 0.08, _opening(states) < 0.02)
+    return which(_opening(states) > 0.08, _opening(states) < 0.02)
 
 
 def _gripper_holding(states: State) -> Answers:
     distance, opening = _length(states[:, BLOCK_FROM_GRIPPER]), _opening(states)
-    return _choose((distance < 0.02) & (opening > 0.03) & (opening < 0.055), distance > 0.035)
+    return which((distance < 0.02) & (opening > 0.03) & (opening < 0.055), distance > 0.035)
 
 
 def _gripper_moving(states: State) -> Answers:
     speed = _length(states[:, GRIPPER_VELOCITY])
-    return _choose(speed > 0.01, speed < 0.004)
+    return which(speed > 0.01, speed < 0.004)
 
 
 def _block_place(states: State) -> Answers:
-    return _choose(_height(states, BLOCK) > 0.02, abs(_height(states, BLOCK)) < 0.01)
+    return which(_height(states, BLOCK) > 0.02, abs(_height(states, BLOCK)) < 0.01)
 
 
 def _block_moving(states: State) -> Answers:
     speed = _length(states[:, BLOCK_FROM_GRIPPER_VELOCITY] + states[:, GRIPPER_VELOCITY])
-    return _choose(speed > 0.004, speed < 0.001)
+    return which(speed > 0.004, speed < 0.001)
 
 
 def _target_side(states: State) -> Answers:
-    return _sign((states[:, TARGET] - states[:, BLOCK])[:, 1], SIDE_MARGIN)
+    return sign((states[:, TARGET] - states[:, BLOCK])[:, 1], SIDE_MARGIN)
 
 
 def _target_side_of_gripper(states: State) -> Answers:
-    return _sign((states[:, TARGET] - states[:, GRIPPER])[:, 1], SIDE_MARGIN)
+    return sign((states[:, TARGET] - states[:, GRIPPER])[:, 1], SIDE_MARGIN)
 
 
 def _target_place(states: State) -> Answers:
-    return _choose(_height(states, TARGET) > 0.02, abs(_height(states, TARGET)) < 0.01)
+    return which(_height(states, TARGET) > 0.02, abs(_height(states, TARGET)) < 0.01)
 
 
 def _target_higher(states: State) -> Answers:
     higher = (states[:, TARGET] - states[:, BLOCK])[:, 2]
-    return _choose(higher > 0.03, higher < 0.015)
+    return which(higher > 0.03, higher < 0.015)
 
 
 def _nearest(states: State) -> Answers:
     to_target = _length(states[:, TARGET] - states[:, GRIPPER])
-    return _sign(to_target - _length(states[:, BLOCK_FROM_GRIPPER]), DISTANCE_MARGIN)
+    return sign(to_target - _length(states[:, BLOCK_FROM_GRIPPER]), DISTANCE_MARGIN)
 
 
 def _farthest(states: State) -> Answers:
-    return _sign((states[:, BLOCK] - states[:, TARGET])[:, 0], DISTANCE_MARGIN)
+    return sign((states[:, BLOCK] - states[:, TARGET])[:, 0], DISTANCE_MARGIN)
 
 
 QUESTIONS: tuple[QuestionKind, ...] = (

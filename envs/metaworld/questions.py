@@ -7,30 +7,24 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from clbench.questions import QuestionKind
+from clbench.questions import Answers, QuestionKind, sign, which
 
 from .state import GOAL, HAND, HAND_BEFORE, OBJECT, OBJECT_BEFORE, OPENING, State
 
 MARGIN = 0.02
 """Metres by which two things must differ along an axis, or two distances, before an answer is asked for."""
 
-Answers = NDArray[np.int64]
 Numbers = NDArray[np.float32]
 
 
-def _sign(difference: Numbers, margin: float) -> Answers:
-    """Return 0 where the difference (N,) is above the margin, 1 where it is below minus that, else -1."""
-    return _choose(difference, margin, -margin)
-
-
-def _choose(value: Numbers, high: float, low: float) -> Answers:
+def _outside(value: Numbers, high: float, low: float) -> Answers:
     """Return 0 where the value (N,) is above `high`, 1 where it is below `low`, else -1."""
-    return np.select([value > high, value < low], [0, 1], default=-1).astype(np.int64)
+    return which(value > high, value < low)
 
 
 def _between(first: slice, second: slice, axis: int) -> Callable[[State], Answers]:
     """Return the rule that tells whether the first thing is further along an axis than the second."""
-    return lambda states: _sign(states[:, first][:, axis] - states[:, second][:, axis], MARGIN)
+    return lambda states: sign(states[:, first][:, axis] - states[:, second][:, axis], MARGIN)
 
 
 def _distance(states: State, first: slice, second: slice) -> Numbers:
@@ -40,36 +34,36 @@ def _distance(states: State, first: slice, second: slice) -> Numbers:
 
 
 def _nearest(states: State) -> Answers:
-    return _sign(_distance(states, GOAL, HAND) - _distance(states, OBJECT, HAND), MARGIN)
+    return sign(_distance(states, GOAL, HAND) - _distance(states, OBJECT, HAND), MARGIN)
 
 
 def _touching(states: State) -> Answers:
-    return _sign(0.09 - _distance(states, OBJECT, HAND), MARGIN)
+    return sign(0.09 - _distance(states, OBJECT, HAND), MARGIN)
 
 
 def _gripper_opening(states: State) -> Answers:
-    return _choose(states[:, OPENING], 0.85, 0.65)
+    return _outside(states[:, OPENING], 0.85, 0.65)
 
 
 def _gripper_moving(states: State) -> Answers:
-    return _choose(_distance(states, HAND, HAND_BEFORE), 0.004, 0.0015)
+    return _outside(_distance(states, HAND, HAND_BEFORE), 0.004, 0.0015)
 
 
 def _object_moving(states: State) -> Answers:
-    return _choose(_distance(states, OBJECT, OBJECT_BEFORE), 0.002, 0.0005)
+    return _outside(_distance(states, OBJECT, OBJECT_BEFORE), 0.002, 0.0005)
 
 
 def _gripper_motion(axis: int) -> Callable[[State], Answers]:
     """Return the rule that tells which way the hand moves along an axis."""
-    return lambda states: _sign(states[:, HAND][:, axis] - states[:, HAND_BEFORE][:, axis], 0.002)
+    return lambda states: sign(states[:, HAND][:, axis] - states[:, HAND_BEFORE][:, axis], 0.002)
 
 
 def _gripper_height(states: State) -> Answers:
-    return _choose(states[:, HAND][:, 2], 0.17, 0.13)
+    return _outside(states[:, HAND][:, 2], 0.17, 0.13)
 
 
 def _object_height(states: State) -> Answers:
-    return _choose(states[:, OBJECT][:, 2], 0.12, 0.08)
+    return _outside(states[:, OBJECT][:, 2], 0.12, 0.08)
 
 
 def _kind(

@@ -7,7 +7,7 @@ import functools
 import numpy as np
 from numpy.typing import NDArray
 
-from clbench.questions import QuestionKind
+from clbench.questions import Answers, QuestionKind, sign, which
 
 from .mazes import MAZES
 from .state import COLOUR, PLACE, ROOM_AHEAD, VELOCITY, State
@@ -24,18 +24,6 @@ OPEN, CLOSED = 1.05, 0.95
 """Metres to a wall: a ball of radius 0.1 is at most 0.9 from one beside its cell, else at least 1.1."""
 
 Numbers = NDArray[np.float32]
-Answers = NDArray[np.int64]
-Truths = NDArray[np.bool_]
-
-
-def _choose(*truths: Truths) -> Answers:
-    """Return the index of the first of `truths` that holds, else -1: all have shape (N,)."""
-    return np.select(truths, range(len(truths)), default=-1).astype(np.int64)
-
-
-def _sign(difference: Numbers, margin: float) -> Answers:
-    """Return 0 where the difference (N,) is above the margin, 1 where it is below minus that, else -1."""
-    return _choose(difference > margin, difference < -margin)
 
 
 def _speed(states: State) -> Numbers:
@@ -44,16 +32,16 @@ def _speed(states: State) -> Numbers:
 
 
 def _side(states: State) -> Answers:
-    return _sign(-states[:, PLACE][:, 0], SIDE_MARGIN)
+    return sign(-states[:, PLACE][:, 0], SIDE_MARGIN)
 
 
 def _height(states: State) -> Answers:
-    return _sign(states[:, PLACE][:, 1], SIDE_MARGIN)
+    return sign(states[:, PLACE][:, 1], SIDE_MARGIN)
 
 
 def _middle(states: State) -> Answers:
     away = np.linalg.norm(states[:, PLACE], axis=1)
-    return _choose(away < 0.9, away > 1.2)
+    return which(away < 0.9, away > 1.2)
 
 
 def _edge(states: State) -> Answers:
@@ -70,7 +58,7 @@ def _part(states: State) -> Answers:
     offset = states[:, PLACE] - np.round(states[:, PLACE])
     clear = (abs(offset) < 0.5 - EDGE_MARGIN).all(axis=1)
     room = (np.round(states[:, PLACE]) % 2 == 0).all(axis=1)
-    return _choose(clear & room, clear & ~room)
+    return which(clear & room, clear & ~room)
 
 
 def _colour(states: State) -> Answers:
@@ -79,35 +67,35 @@ def _colour(states: State) -> Answers:
 
 
 def _moving(states: State) -> Answers:
-    return _choose(_speed(states) > 0.5, _speed(states) < 0.2)
+    return which(_speed(states) > 0.5, _speed(states) < 0.2)
 
 
 def _pace(states: State) -> Answers:
-    return _choose(_speed(states) > 2.0, _speed(states) < 1.4)
+    return which(_speed(states) > 2.0, _speed(states) < 1.4)
 
 
 def _heading_side(states: State) -> Answers:
-    return _sign(-states[:, VELOCITY][:, 0], SPEED_MARGIN)
+    return sign(-states[:, VELOCITY][:, 0], SPEED_MARGIN)
 
 
 def _heading_height(states: State) -> Answers:
-    return _sign(states[:, VELOCITY][:, 1], SPEED_MARGIN)
+    return sign(states[:, VELOCITY][:, 1], SPEED_MARGIN)
 
 
 def _way(direction: int, states: State) -> Answers:
     """Open or closed: whether the next cell in a direction, an index of `ROOM_AHEAD`, is free."""
     metres = states[:, ROOM_AHEAD][:, direction]
-    return _choose(metres > OPEN, metres < CLOSED)
+    return which(metres > OPEN, metres < CLOSED)
 
 
 def _nearer_side_wall(states: State) -> Answers:
     right, left, _, _ = states[:, ROOM_AHEAD].T
-    return _sign(right - left, NEARER_MARGIN)
+    return sign(right - left, NEARER_MARGIN)
 
 
 def _nearer_height_wall(states: State) -> Answers:
     _, _, above, below = states[:, ROOM_AHEAD].T
-    return _sign(below - above, NEARER_MARGIN)
+    return sign(below - above, NEARER_MARGIN)
 
 
 def _open_way(name: str, words: str, direction: int) -> QuestionKind:
