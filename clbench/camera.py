@@ -17,6 +17,11 @@ from clbench.task import resolve
 
 States: TypeAlias = NDArray[np.float32]
 Images: TypeAlias = NDArray[np.uint8]
+Views: TypeAlias = NDArray[np.float32]
+"""How a picture is disturbed: the camera's azimuth, elevation and distance, and the light, from -1 to 1,
+(N, 4). They are 0 but in perturbed episodes (`clbench.perturbation`)."""
+
+VIEW_SIZE = 4
 
 
 class Camera(Protocol):
@@ -40,10 +45,14 @@ class Camera(Protocol):
         """
         ...
 
-    def draw(self, states: States) -> Images:
+    def draw(self, states: States, views: Views) -> Images:
         """Return a picture of each of the states (N, S), (N, `image_size`, `image_size`, 3).
 
-        A picture depends on its state alone, not on those that were drawn before.
+        A picture depends on its state and its view alone, not on those that were drawn before.
+
+        Args:
+            states: What is drawn.
+            views: By what share of the camera's own scales each picture is disturbed, (N, 4).
         """
         ...
 

@@ -1,4 +1,4 @@
-"""A process that draws: it reads states and writes pictures, for an observer (`clbench.observer`).
+"""A process that draws: it reads views and states and writes pictures, for an observer (`clbench.observer`).
 
 It is started as `python -m clbench.drawing CAMERA`.
 """
@@ -11,15 +11,15 @@ import sys
 
 import numpy as np
 
-from clbench.camera import Camera
+from clbench.camera import VIEW_SIZE, Camera
 from clbench.task import resolve
 
 HEADER = struct.Struct("<II")
-"""How many states come, and how many numbers each has."""
+"""How many rows come, and how many numbers each has: those of a view, then those of the state."""
 
 
 def main(entry_point: str) -> None:
-    """Draw the states that come on standard input, as bare numbers after a header, until it ends.
+    """Draw what comes on standard input, as bare numbers after a header, until it ends.
 
     Args:
         entry_point: Of the camera.
@@ -31,7 +31,8 @@ def main(entry_point: str) -> None:
     while header := sys.stdin.buffer.read(HEADER.size):
         count, size = HEADER.unpack(header)
         numbers = np.frombuffer(sys.stdin.buffer.read(4 * count * size), np.float32)
-        drawn = camera.draw(numbers.reshape(count, size))
+        views, states = np.split(numbers.reshape(count, size), [VIEW_SIZE], axis=1)
+        drawn = camera.draw(states, views)
         wanted = (count, camera.image_size, camera.image_size, 3)
         if drawn.shape != wanted or drawn.dtype != np.uint8:
             raise TypeError(f"draw() must return {wanted} of uint8, not {drawn.shape} of {drawn.dtype}.")

@@ -176,7 +176,11 @@ class Evaluator:
         for row, lane in enumerate(live):
             words[row] = lane.words
             noise[row] = lane.noise[lane.length // config.executed]
-        shown = self._lanes.observe([lane.trial[0] for lane in live], np.stack([lane.state for lane in live]))
+        shown = self._lanes.observe(
+            [lane.number for lane in live],
+            [lane.trial[0] for lane in live],
+            np.stack([lane.state for lane in live]),
+        )
         state[: len(live)], image[: len(live)] = map(torch.from_numpy, shown)
         device = policy.state_mean.device
         chunks = policy.act(state.to(device), words.to(device), noise.to(device), image.to(device))

@@ -22,7 +22,7 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from clbench.cache import cache_folder, cached, hash_of, package_of, source_hash
-from clbench.camera import Camera, Images, States, load_camera
+from clbench.camera import VIEW_SIZE, Camera, Images, States, Views, load_camera
 from clbench.drawing import HEADER
 from clbench.rendering import RenderingError, environment_of, working_back_end
 from clbench.task import Task, resolve
@@ -64,8 +64,12 @@ class Observer:
             "image": spaces.Box(0, 255, (size, size, 3), np.uint8),
         }
 
-    def observe(self, states: States) -> tuple[States, Images]:
+    def observe(self, states: States, views: Views | None = None) -> tuple[States, Images]:
         """Return what is shown of the states (N, S): numbers (N, P), and pictures (N, size, size, 3).
+
+        Args:
+            states: Of the world.
+            views: How the pictures are disturbed, (N, 4); none is if None.
 
         Raises:
             RenderingError: Nothing here can draw the world; the message says what to install.
@@ -78,9 +82,11 @@ class Observer:
             raise TypeError(
                 f"{self._entry_point}: proprioception() must return {wanted}, not {numbers.shape}."
             )
-        return numbers, self._draw(np.ascontiguousarray(states, np.float32))
+        if views is None:
+            views = np.zeros((len(states), VIEW_SIZE), np.float32)
+        return numbers, self._draw(np.concatenate([views, states], axis=1, dtype=np.float32))
 
-    def _draw(self, states: States) -> Images:
+    def _draw(self, rows: States) -> Images:
         if not self._processes:
             assert self._entry_point is not None
             back_end = _back_end(self._world, os.environ.get("MUJOCO_GL", ""))
@@ -89,8 +95,8 @@ class Observer:
             ]
         pictures = [np.empty((0, self.image_size, self.image_size, 3), np.uint8)]
         share = TOGETHER * len(self._processes)
-        for start in range(0, len(states), share):
-            parts = np.array_split(states[start : start + share], len(self._processes))
+        for start in range(0, len(rows), share):
+            parts = np.array_split(rows[start : start + share], len(self._processes))
             for process, part in zip(self._processes, parts, strict=True):
                 process.ask(part)
             pictures += [process.answer() for process in self._processes]
@@ -104,7 +110,7 @@ class Observer:
 
 
 class _DrawingProcess:
-    """A process that draws: it reads states and writes pictures, as bare numbers, until its input ends."""
+    """A process that draws: it reads views and states and writes pictures, until its input ends."""
 
     def __init__(self, camera: str, image_size: int, back_end: str) -> None:
         self._camera, self._image_size = camera, image_size
@@ -119,18 +125,18 @@ class _DrawingProcess:
             env={**environment_of(back_end), "LP_NUM_THREADS": "0"},
         )
 
-    def ask(self, states: States) -> None:
-        """Send states (N, S); whoever sends waits until the process is done with those before."""
+    def ask(self, rows: States) -> None:
+        """Send views and states (N, 4 + S); whoever sends waits until those before are drawn."""
         assert self._process.stdin is not None
-        self._asked = len(states)
+        self._asked = len(rows)
         try:
-            self._process.stdin.write(HEADER.pack(*states.shape) + states.tobytes())
+            self._process.stdin.write(HEADER.pack(*rows.shape) + rows.tobytes())
             self._process.stdin.flush()
         except BrokenPipeError as error:
             raise self._end() from error
 
     def answer(self) -> Images:
-        """Return the pictures of the states that were sent, (N, size, size, 3)."""
+        """Return the pictures of what was sent, (N, size, size, 3)."""
         assert self._process.stdout is not None
         shape = (self._asked, self._image_size, self._image_size, 3)
         answer = self._process.stdout.read(int(np.prod(shape)))

@@ -312,7 +312,7 @@ class _Player:
         states = self.lanes.reset([0], [world_seed], [task])
         memory, total, length, success = None, 0.0, 0, False
         while length < task.horizon and not success:
-            numbers, images = self.lanes.observe([task], states)
+            numbers, images = self.lanes.observe([0], [task], states)
             picture = {} if task.camera is None else {"image": images[0]}
             observation: Observation = {"state": numbers[0], **picture, "instruction": instruction}
             action, memory = self._act(observation, memory, space)

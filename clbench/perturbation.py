@@ -1,9 +1,9 @@
 """Perturbations: what is disturbed in the world of a perturbed episode.
 
 A perturbed episode begins with the seed, the instruction and the policy's draws of the report episode of its
-number; only the start pose and the mass of what is moved differ. What these become follows from that seed
-alone, in a stream of its own: no other draw of the episode moves. Each suite says how far it displaces a
-start, and why. Camera and light are not among them: a picture is a function of the state alone.
+number; only the start pose, the mass of what is moved and, where a policy sees pictures, camera and light
+differ. What these become follows from that seed alone, in a stream of its own: no other draw of the episode
+moves. Each suite says how far it displaces a start, and each camera how far its view, and why.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from clbench.camera import VIEW_SIZE
 from clbench.seeding import numpy_generator
 
 if TYPE_CHECKING:
@@ -32,6 +33,8 @@ class Perturbation:
     """What masses and moments of inertia are multiplied by, one of `MASSES`."""
     start: tuple[float, float, float]
     """Displacement of the start pose, from -1 to 1 along each axis; the suite gives it a scale."""
+    view: tuple[float, ...]
+    """Displacement of camera and light, `VIEW_SIZE` numbers from -1 to 1; the camera gives them scales."""
 
 
 def draw_perturbation(seed: int) -> Perturbation:
@@ -39,7 +42,7 @@ def draw_perturbation(seed: int) -> Perturbation:
     generator = numpy_generator("perturbation", seed)
     mass = MASSES[int(generator.integers(len(MASSES)))]
     x, y, z = generator.uniform(-1.0, 1.0, 3).tolist()
-    return Perturbation(mass, (x, y, z))
+    return Perturbation(mass, (x, y, z), tuple(generator.uniform(-1.0, 1.0, VIEW_SIZE).tolist()))
 
 
 def with_mass(model: mujoco.MjModel, bodies: Sequence[int], mass: float) -> mujoco.MjModel:

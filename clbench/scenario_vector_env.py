@@ -165,7 +165,8 @@ class ScenarioVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]
         }
 
     def _observation(self) -> Observation:
-        state, image = self._lanes.observe([start.task for start in self._starts], self._states)
+        tasks = [start.task for start in self._starts]
+        state, image = self._lanes.observe(range(self.num_envs), tasks, self._states)
         images = {"image": image} if image.size else {}
         return {"state": state.copy(), **images, "instruction": copy(self._instructions)}
 

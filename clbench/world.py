@@ -14,8 +14,9 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from clbench.camera import Images
+from clbench.camera import VIEW_SIZE, Images
 from clbench.observer import Observer
+from clbench.perturbation import draw_perturbation
 from clbench.task import Task, resolve
 
 World = gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]
@@ -256,6 +257,7 @@ class Lanes:
         self._worlds: dict[tuple[str, bool], VectorWorld] = {}
         self._observers: dict[tuple[str, str] | None, Observer] = {}
         self._home: list[VectorWorld | None] = [None] * count
+        self._views = np.zeros((count, VIEW_SIZE), np.float32)
 
     def world(self, task: Task, perturbed: bool = False) -> VectorWorld:
         """Return the vector world of a task, or its perturbed twin; it is made when first needed."""
@@ -271,16 +273,24 @@ class Lanes:
             self._observers[key] = Observer(task.world, task.camera)
         return self._observers[key]
 
-    def observe(self, tasks: Sequence[Task], states: States) -> tuple[States, Images]:
-        """Return what a policy is shown of states (N, S), one of each task: numbers (N, P) and pictures.
+    def observe(self, lanes: Sequence[int], tasks: Sequence[Task], states: States) -> tuple[States, Images]:
+        """Return what a policy is shown of the states (N, S) of `lanes`: numbers (N, P) and pictures.
+
+        Args:
+            lanes: Whose states they are; in a perturbed episode camera and light are disturbed.
+            tasks: What each of them does.
+            states: What is shown.
 
         Raises:
             RenderingError: Nothing here can draw a world.
         """
-        observers = [self.observer(task) for task in tasks]
+        observers, views = [self.observer(task) for task in tasks], self._views[list(lanes)]
         if all(observer is observers[0] for observer in observers):
-            return observers[0].observe(states)
-        shown = [observer.observe(state[None]) for observer, state in zip(observers, states, strict=True)]
+            return observers[0].observe(states, views)
+        shown = [
+            observer.observe(state[None], view[None])
+            for observer, state, view in zip(observers, states, views, strict=True)
+        ]
         numbers, images = zip(*shown, strict=True)
         return np.concatenate(numbers), np.concatenate(images)
 
@@ -299,8 +309,10 @@ class Lanes:
             tasks: What to do.
             perturbed: Which of the episodes are perturbed; none is if None.
         """
-        for lane, task, disturbed in zip(lanes, tasks, perturbed or [False] * len(tasks), strict=True):
-            self._home[lane] = self.world(task, disturbed)
+        disturbed = perturbed or [False] * len(tasks)
+        for lane, seed, task, is_disturbed in zip(lanes, seeds, tasks, disturbed, strict=True):
+            self._home[lane] = self.world(task, is_disturbed)
+            self._views[lane] = draw_perturbation(seed).view if is_disturbed else 0.0
         states = self._empty(lanes)
         for world, rows in self._by_world(lanes):
             names = [tasks[row].name for row in rows]

@@ -275,7 +275,6 @@ class Card:
             f"of the {len(competing)} competing methods.",
             "",
             *grid(head, rows, len(head) - 1),
-            "",
             *_ranks(competing),
         ]
 
@@ -331,7 +330,7 @@ def _ranks(competing: Sequence[Row]) -> list[str]:
         if len(members) > 1:
             ranks = len({row.rank for row in members})
             lines.append(f"- {division}: {len(members)} methods, {ranks} ranks.")
-    return ["Rows that share a rank on the board are not told apart:", "", *lines] if lines else []
+    return ["", "Rows that share a rank on the board are not told apart:", "", *lines] if lines else []
 
 
 # ---- quantities of the pretrained policy, (..., runs) ------------------------------------------------------

@@ -15,10 +15,12 @@ from gymnasium.utils.env_checker import check_env
 from numpy.typing import NDArray
 
 from clbench.cache import cache_folder
+from clbench.camera import VIEW_SIZE
 from clbench.evaluation import Evaluator
 from clbench.learner import Learner
 from clbench.method import build_method, method_names
 from clbench.observer import TOGETHER, Observer, frame_hash, observed
+from clbench.perturbation import draw_perturbation
 from clbench.policy import Policy
 from clbench.pretraining import policy_config, pretrained_policy, pretraining_inputs
 from clbench.questions import load_questions
@@ -27,6 +29,7 @@ from clbench.task import load_scenario
 from clbench.testing.seen_toy import SEEN_TOY
 from clbench.testing.toy_camera import ToyCamera
 from clbench.training import deterministic, optimise
+from clbench.world import Lanes
 
 TOY = load_scenario("clbench.testing:clbench/Toy-v0")
 TASK = SEEN_TOY.retained[0]
@@ -83,7 +86,7 @@ def camera_of(write_module: Callable[[str, str], None]) -> Callable[[str], str]:
 def test_pictures_of_another_size_or_kind_are_refused(
     camera_of: Callable[[str], str], returned: str, said: str
 ) -> None:
-    camera = camera_of(f"    def draw(self, states): return {returned}\n")
+    camera = camera_of(f"    def draw(self, states, views): return {returned}\n")
     observer = Observer(TASK.world, camera)
     with pytest.raises(
         RenderingError, match=rf"draw\(\) must return \(3, 16, 16, 3\) of uint8, not .*{said}"
@@ -116,13 +119,31 @@ def test_where_the_source_of_the_camera_changes_the_policy_is_pretrained_anew(
 
 def test_processes_draw_what_the_camera_draws_in_the_order_of_the_states() -> None:
     states = _states(2 * TOGETHER + 3)
+    views = np.zeros((len(states), VIEW_SIZE), np.float32)
+    views[::2] = np.random.default_rng(1).uniform(-1.0, 1.0, views[::2].shape)
     observer = Observer(TASK.world, TASK.camera, processes=2)
     numbers, images = observer.observe(states)
+    disturbed = observer.observe(states, views)[1]
     one = observer.observe(states[:1])[1]
     observer.close()
     assert np.array_equal(numbers, states[:, :1])
-    assert np.array_equal(images, ToyCamera().draw(states))
+    assert np.array_equal(images, ToyCamera().draw(states, np.zeros_like(views)))
+    assert np.array_equal(disturbed, ToyCamera().draw(states, views))
     assert np.array_equal(one, images[:1])
+
+
+def test_what_is_seen_is_disturbed_in_perturbed_episodes_alone() -> None:
+    lanes = Lanes(3)
+    seeds, tasks = [3, 3, 3], [TASK] * 3
+    states = lanes.reset(range(3), seeds, tasks, [True, False, True])
+    drawn = draw_perturbation(3).view
+    expected = ToyCamera().draw(states, np.array([drawn, [0.0] * VIEW_SIZE, drawn], np.float32))
+    _, images = lanes.observe(range(3), tasks, states)
+    assert np.array_equal(images, expected)
+    lanes.reset([0], [3], [TASK])
+    _, (again,) = lanes.observe([0], [TASK], states[1:2])
+    lanes.close()
+    assert np.array_equal(again, images[1])
 
 
 def test_pictures_of_a_data_set_are_drawn_once(empty_caches: Path) -> None:
@@ -143,7 +164,7 @@ def test_a_process_that_dies_is_named_with_its_last_words(
     (tmp_path / "dim.py").write_text(
         "from clbench.testing.toy_camera import ToyCamera\n"
         "class Dim(ToyCamera):\n"
-        "    def draw(self, states): raise RuntimeError('no light')\n"
+        "    def draw(self, states, views): raise RuntimeError('no light')\n"
     )
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")]))

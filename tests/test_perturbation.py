@@ -4,6 +4,7 @@ import mujoco
 import numpy as np
 import pytest
 
+from clbench.camera import VIEW_SIZE
 from clbench.perturbation import MASSES, Perturbation, draw_perturbation, with_mass
 
 XML = """
@@ -33,17 +34,20 @@ def test_a_perturbation_follows_from_the_seed_alone_and_never_changes() -> None:
     # records of these episodes may lie about: whoever changes this line makes them lie
     drawn = draw_perturbation(7)
     assert drawn == draw_perturbation(7) != draw_perturbation(8)
-    assert drawn == Perturbation(0.5, (0.2693702600102559, 0.4668422362346363, -0.3841252256565115))
+    start = (0.2693702600102559, 0.4668422362346363, -0.3841252256565115)
+    view = (0.7447663944902996, -0.29620558239074124, -0.6648929182898105, -0.2283548940515543)
+    assert drawn == Perturbation(0.5, start, view)
 
 
 def test_all_masses_and_all_sides_are_drawn() -> None:
     drawn = [draw_perturbation(seed) for seed in range(400)]
     shares = [sum(one.mass == mass for one in drawn) / 400 for mass in MASSES]
     assert shares == pytest.approx([1 / len(MASSES)] * len(MASSES), abs=0.1)
-    starts = np.array([one.start for one in drawn])
-    assert (np.abs(starts) <= 1).all()
-    np.testing.assert_allclose(starts.mean(axis=0), 0, atol=0.1)
-    np.testing.assert_allclose(np.abs(starts).mean(axis=0), 0.5, atol=0.1)
+    shares_drawn = np.array([[*one.start, *one.view] for one in drawn])
+    assert shares_drawn.shape == (400, 3 + VIEW_SIZE)
+    assert (np.abs(shares_drawn) <= 1).all()
+    np.testing.assert_allclose(shares_drawn.mean(axis=0), 0, atol=0.1)
+    np.testing.assert_allclose(np.abs(shares_drawn).mean(axis=0), 0.5, atol=0.1)
 
 
 def test_a_heavier_thing_is_as_much_harder_to_turn_and_to_push_and_the_rest_is_as_it_was() -> None:

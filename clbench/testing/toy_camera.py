@@ -6,7 +6,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from clbench.camera import Images, States
+from clbench.camera import Images, States, Views
 
 REACH = 2.5
 """How far from the middle the picture reaches, in the units of the toy."""
@@ -28,12 +28,13 @@ class ToyCamera:
         """Return where point and marker are, (N, 4)."""
         return states[:, :4]
 
-    def draw(self, states: States) -> Images:
-        """Return pictures (N, 16, 16, 3); up is where it is in the plane."""
+    def draw(self, states: States, views: Views) -> Images:
+        """Return pictures (N, 16, 16, 3); up is where it is in the plane. views make them darker."""
         centres = np.linspace(-REACH, REACH, self.image_size)
         images = np.zeros((len(states), self.image_size, self.image_size, 3), np.uint8)
         for channel, thing in enumerate((states[:, :2], states[:, 2:4])):
             right = np.exp(-(((centres - thing[:, :1]) / 0.4) ** 2))
             up = np.exp(-(((centres[::-1] - thing[:, 1:]) / 0.4) ** 2))
-            images[..., channel] = np.round(255 * up[:, :, None] * right[:, None, :])
+            light = 255 - 50 * abs(views[:, 3, None, None])
+            images[..., channel] = np.round(light * up[:, :, None] * right[:, None, :])
         return images

@@ -12,6 +12,8 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from clbench.camera import Views
+
 from .scene import scene_file
 from .state import (
     BLOCK,
@@ -43,8 +45,15 @@ COLOURS = {
 PROPRIOCEPTION = np.r_[GRIPPER, FINGERS, GRIPPER_VELOCITY, FINGERS_VELOCITY]
 """What a policy is shown of the state as numbers: what a robot knows of itself."""
 
-VIEW = {"distance": 0.60, "azimuth": 180.0, "elevation": -65.0, "lookat": np.array([1.34, 0.75, 0.42])}
+LOOK_AT = (1.34, 0.75, 0.42)
+VIEW = {"azimuth": 180.0, "elevation": -65.0, "distance": 0.60}
 """From the front, high up: the width of the table is that of the picture, and a pixel is a centimetre."""
+
+DISTURBANCE = {"azimuth": 5.0, "elevation": 5.0, "distance": 0.04}
+"""How far a perturbed view is displaced at most, in degrees and metres, as after a touch of the camera: what
+lies on the table moves by up to 3 of the 64 pixels, which are centimetres there."""
+LIGHT = 0.4
+"""By what share a perturbed scene is lighter or darker at most."""
 
 ARM = (0.75, 0.75, 0.75, 1.0)
 """Colour of the fingers. They are all of the arm that is drawn: the rest would hide the table."""
@@ -73,8 +82,10 @@ class FetchCamera:
             self._renderer.scene.flags[getattr(mujoco.mjtRndFlag, f"mjRND_{flag}")] = False
         self._view = mujoco.MjvCamera()
         mujoco.mjv_defaultFreeCamera(self._model, self._view)
-        for name, value in VIEW.items():
-            setattr(self._view, name, value)
+        self._view.lookat[:] = LOOK_AT
+        head = self._model.vis.headlight
+        self._lights = [self._model.light_ambient, self._model.light_diffuse, head.ambient, head.diffuse]
+        self._plain_lights = [light.copy() for light in self._lights]
 
     @staticmethod
     def proprioception(states: State) -> State:
@@ -89,12 +100,20 @@ class FetchCamera:
         places = [states[:, BLOCK], states[:, TARGET][:, :2], from_the_right.reshape(-1, 4)]
         return np.concatenate(places, axis=1)
 
-    def draw(self, states: State) -> NDArray[np.uint8]:
-        """Return a picture of each of the states (N, 56), (N, size, size, 3)."""
+    def draw(self, states: State, views: Views) -> NDArray[np.uint8]:
+        """Return pictures of the states (N, 56), as `views` (N, 4) disturb them, (N, size, size, 3)."""
         pictures = np.empty((len(states), self._size, self._size, 3), np.uint8)
-        for picture, state in zip(pictures, states, strict=True):
+        for picture, state, view in zip(pictures, states, views, strict=True):
+            self._disturb(view)
             picture[:] = self._draw(state)
         return pictures
+
+    def _disturb(self, view: Views) -> None:
+        """Put the camera in its place and light the scene, both displaced by the shares of a view (4,)."""
+        for (name, value), share in zip(VIEW.items(), view, strict=False):
+            setattr(self._view, name, value + DISTURBANCE[name] * float(share))
+        for light, plain in zip(self._lights, self._plain_lights, strict=True):
+            light[:] = plain * (1.0 + LIGHT * float(view[-1]))
 
     def _draw(self, state: State) -> NDArray[np.uint8]:
         model, data = self._model, self._data

@@ -10,6 +10,8 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
+from clbench.camera import VIEW_SIZE
+
 from .camera import COLOURS, JOINTS, PIXEL_SIZE, THINGS, FetchCamera
 from .rules import RULES
 from .state import BLOCK, SIZE, TARGET, State
@@ -23,6 +25,9 @@ THING_PLACES = np.array([[1.12, 0.52], [1.50, 0.96]])
 """Corners of the part of the table that things lie on, x and y in metres."""
 THINGS_APART = 0.10
 """Least distance of a thing to the block, to the target and to the other thing."""
+
+PLAIN = np.zeros((1, VIEW_SIZE), np.float32)
+"""The view of a camera that nothing disturbs."""
 
 Vectors = NDArray[np.float64]
 
@@ -101,7 +106,7 @@ class FetchPixelsWorld(FetchWorld):
         """Draw what the camera sees, (480, 480, 3)."""
         if self._camera is None:
             self._camera = FetchCamera(480, scale=1)
-        picture: NDArray[np.uint8] = self._camera.draw(self._world.state(0)[None])[0]
+        picture: NDArray[np.uint8] = self._camera.draw(self._world.state(0)[None], PLAIN)[0]
         return picture
 
     def close(self) -> None:

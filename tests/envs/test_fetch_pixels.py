@@ -57,6 +57,11 @@ def _shown(colour: str, image: Images) -> NDArray[np.bool_]:
     return np.asarray(others[colour] > 50)
 
 
+def _place(images: Images) -> NDArray[np.float64]:
+    """Return the row and the column of the target in each image, (2, N)."""
+    return np.array([np.mean(np.nonzero(_shown("red", image)), axis=1) for image in images]).T
+
+
 def test_the_tasks_are_those_of_fetch_with_the_target_on_the_table() -> None:
     assert [task.name for task in SCENARIO.tasks] == [task.name for task in FETCH.tasks]
     assert not {task.dataset_id for task in SCENARIO.tasks} & {task.dataset_id for task in FETCH.tasks}
@@ -145,6 +150,21 @@ def test_a_picture_depends_on_its_state_alone(observer: Observer) -> None:
     assert np.array_equal(together, backwards[::-1])
     assert np.array_equal(together, other.observe(starts)[1])
     other.close()
+
+
+def test_a_disturbed_view_moves_what_is_seen_by_pixels_and_its_light_is_another(observer: Observer) -> None:
+    states = np.stack([_start(seed) for seed in range(6)])
+    whole = np.eye(4, dtype=np.float32)
+    _, plain = observer.observe(states)
+    for view in (*whole[:3], *-whole[:3]):
+        _, images = observer.observe(states, np.tile(view, (6, 1)))
+        moved = np.hypot(*(_place(images) - _place(plain)))
+        assert 0.3 < moved.max() < 3.5
+    darker, lighter = (observer.observe(states, np.tile(sign * whole[3], (6, 1)))[1] for sign in (-1, 1))
+    assert (darker <= plain).all()
+    assert (plain <= lighter).all()
+    assert darker.mean() < 0.97 * plain.mean() < 0.97 * lighter.mean()
+    assert np.array_equal(observer.observe(states)[1], plain)
 
 
 def test_an_agent_of_the_scenario_sees_the_picture(observer: Observer) -> None:
