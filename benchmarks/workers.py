@@ -1,8 +1,9 @@
 """What a second worker brings to a grid, and what Ray costs: `python benchmarks/workers.py`.
 
-The same runs, plain fine-tuning on the first target with several seeds, by one worker, by one for each core
-and by a Ray cluster of this machine, in turns. What they need is in the cache before; a cluster starts before
-the clock does, as one would be there. The records of all ways must be the same, but for their times.
+The same runs, methods that take as long as plain fine-tuning on the first target, by one worker, by one for
+each core and by a Ray cluster of this machine, in turns. What they need is in the cache before; a cluster
+starts before the clock does, as one would be there. The records of all ways must be the same, but for their
+times.
 """
 
 from __future__ import annotations
@@ -29,19 +30,18 @@ from clbench.run_spec import RunSpec
 from clbench.workers import Processes, Workers
 
 
+METHODS = ("sft", "l2_sp", "low_rate_sft", "constant_weight")
+
+
 def main() -> None:
     """Measure, print the ratios and write results/workers.json."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--scenario", default="clbench/Fetch-v0")
-    parser.add_argument("--runs", type=int, default=4)
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
     arguments = parser.parse_args()
     count = arguments.workers
-    specs = [
-        RunSpec(arguments.scenario, "sft", seed, split="selection", targets=1)
-        for seed in range(arguments.runs)
-    ]
+    specs = [RunSpec(arguments.scenario, name, 0, split="selection", targets=1) for name in METHODS]
     ways: dict[str, Callable[[], Workers]] = {
         "one worker": lambda: Processes(1),
         f"{count} workers": lambda: Processes(count),
@@ -61,7 +61,7 @@ def main() -> None:
         rounds.append(taken)
     one, many, ray = ways
     result = {
-        "runs": arguments.runs,
+        "runs": len(specs),
         "workers": count,
         "seconds": {way: round(float(np.median([taken[way] for taken in rounds])), 1) for way in ways},
         "one_worker_to_many": median_ratio([taken[one] / taken[many] for taken in rounds], generator),

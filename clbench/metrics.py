@@ -171,7 +171,7 @@ def retention(rates: Rates) -> Array:
     missing="The run did not meet perturbed episodes, as with `clbench run --perturb`.",
 )
 def perturbed_retention(rates: Rates) -> Array:
-    """Success on the retained skills after the last target, with start poses and masses disturbed.
+    """Success on the retained skills after the last target, with start poses, masses and views disturbed.
 
     The episodes are those of `retention`, number by number: what this is lower by is lost to the disturbance.
     How much of that was lost before any target, the success of the pretrained policy says.

@@ -59,8 +59,9 @@ def run(
         first_seed: The first of them.
         order: In which order the targets are learned. 0 is the published one, of which the leaderboard's rows
             are; others are permutations, from which it tells how much depends on the order.
-        perturb: Evaluate the retained skills in disturbed worlds too, from other start poses and with heavier
-            or lighter things. Such a record takes the place of one without, whose episodes are all in it.
+        perturb: Evaluate the retained skills in disturbed worlds too, from other start poses, with heavier or
+            lighter things and, in pictures, another camera and light. Such a record takes the place of one
+            without, whose episodes are all in it.
         workers: Runs at once, each a process with one thread; all cores if not given.
         shard: Do only part i of n of the runs, as 2/8: for array jobs, whose tasks share a folder of records.
         ray: Do the runs on a Ray cluster: its address, auto for one that runs here, or local to start one.
