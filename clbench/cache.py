@@ -101,7 +101,7 @@ def cached(folder: Path, inputs: Mapping[str, Any], make: Callable[[Path], None]
     partial.mkdir(parents=True)
     try:
         make(partial)
-        manifest = {"inputs": key, "files": _file_hashes(partial)}
+        manifest = {"inputs": key, "files": _file_hashes(partial), "made_from": dict(inputs)}
         (partial / _MANIFEST).write_text(json.dumps(manifest, indent=1), encoding="utf-8")
         if folder.exists() and _fault(folder, key) is not None:
             folder.rename(partial.with_suffix(".old"))

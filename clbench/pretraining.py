@@ -22,6 +22,9 @@ from clbench.task import Scenario, resolve
 from clbench.training import deterministic, optimise
 from clbench.vision_pretraining import STEPS_SHARE, pictures_of, pretrain_vision
 
+SHIPPED = Path(__file__).parent / "pretrained"
+"""Where the policies lie that ship with the package."""
+
 AFTER_PRETRAINING = (
     "adaptation_steps",
     "learning_rate",
@@ -58,10 +61,17 @@ def pretraining_inputs(scenario: Scenario, seed: int) -> dict[str, Any]:
     }
 
 
+def shipped_folder(scenario: Scenario, seed: int) -> Path:
+    """Return where the pretrained policy lies if it ships."""
+    return SHIPPED / f"{scenario.id.replace('/', '--')}-seed-{seed}"
+
+
 def pretrained_folder(scenario: Scenario, seed: int) -> Path:
-    """Return where the pretrained policy lies, or will lie."""
-    name = f"{scenario.id.replace('/', '--')}-seed-{seed}-{hash_of(pretraining_inputs(scenario, seed))}"
-    return cache_folder() / "pretrained" / name
+    """Return where the pretrained policy lies, or will lie: in the cache, unless the same one ships."""
+    inputs, shipped = pretraining_inputs(scenario, seed), shipped_folder(scenario, seed)
+    if is_cached(shipped, inputs):
+        return shipped
+    return cache_folder() / "pretrained" / f"{shipped.name}-{hash_of(inputs)}"
 
 
 def is_pretrained(scenario: Scenario, seed: int) -> bool:
