@@ -47,6 +47,7 @@ def pretraining_inputs(scenario: Scenario, seed: int) -> dict[str, Any]:
         *("vision_pretraining", "seeding", "training", "world"),
     )
     core = (*(f"clbench.{part}" for part in parts), __name__)
+    installed = {**simulator_versions(tasks), **versions(("torch", "tokenizers"))}
     return {
         "retained": [dataclasses.asdict(task) for task in scenario.retained],
         "scenes": [dataclasses.asdict(task) for task in scenario.scenes],
@@ -54,10 +55,8 @@ def pretraining_inputs(scenario: Scenario, seed: int) -> dict[str, Any]:
         "seed": seed,
         "frame": frame_hash(scenario.scene_tasks[0]),
         "source": source_hash(*core, *sorted(suites)),
-        "versions": {
-            **simulator_versions(tasks),
-            **versions(("torch", "tokenizers")),
-        },
+        # a label, as +cpu of torch, names what else a build can do: policies are pretrained without it
+        "versions": {name: version.partition("+")[0] for name, version in installed.items()},
     }
 
 
