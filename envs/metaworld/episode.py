@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import functools
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import mujoco
@@ -30,6 +30,30 @@ PHYSICS = ("model", "data", "mujoco_renderer", "init_left_pad", "init_right_pad"
 """Attributes of an episode that are its physics or views of it: also what Meta-World calls initial pads."""
 
 
+class Models:
+    """A model, and copies of it: threads that step at the same time move things in one of their own.
+
+    Args:
+        model: Used by whichever asks first; a copy takes 19 MB, so none is made before it is needed.
+    """
+
+    def __init__(self, model: mujoco.MjModel) -> None:
+        self._model = model
+        self._free = [(model, model.body_pos, model.site_pos)]
+
+    def take(self) -> tuple[mujoco.MjModel, Vector, Vector]:
+        """Return a model that no other thread has, with its places of bodies and sites."""
+        try:
+            return self._free.pop()
+        except IndexError:
+            model = copy.copy(self._model)
+            return model, model.body_pos, model.site_pos
+
+    def give_back(self, taken: tuple[mujoco.MjModel, Vector, Vector]) -> None:
+        """Let others take a model."""
+        self._free.append(taken)
+
+
 @dataclass(frozen=True)
 class Scene:
     """The compiled scene of a task. All its episodes in a process share it."""
@@ -41,6 +65,11 @@ class Scene:
     """Places of the sites as compiled, (sites, 3)."""
     start: mujoco.MjData
     """The physics once the hand has gone to where it starts."""
+    models: Models = field(init=False)
+    """The model, for threads that advance episodes at the same time."""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "models", Models(self.model))
 
 
 class Episode(SawyerXYZEnv):
@@ -102,6 +131,28 @@ class Episode(SawyerXYZEnv):
         self.curr_path_length = 0  # whoever uses the world counts the steps
         state, reward, _, _, info = self.step(action)
         return state.astype(np.float32), float(reward), bool(info["success"])
+
+    def move(self) -> None:
+        """Advance the physics by one step, as far as observations and rewards depend on it.
+
+        Many threads may do so at once, each with an episode of its own. What Meta-World computes in addition,
+        forces in joints and contacts as they are after the step, is in nothing that is returned.
+        """
+        taken = self.scene.models.take()
+        model, body_pos, site_pos = taken
+        body_pos[:], site_pos[:] = self._places
+        mujoco.mj_step(model, self.data, nstep=self.frame_skip)
+        mujoco.mj_kinematics(model, self.data)
+        self.scene.models.give_back(taken)
+
+    @property
+    def before(self) -> Vector:
+        """How things were after the last step, (18,)."""
+        return self._prev_obs
+
+    @before.setter
+    def before(self, now: Vector) -> None:
+        self._prev_obs = now
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Episode:
         """Return an episode with its own physics, in the same state."""

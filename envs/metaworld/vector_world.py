@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import TypeAlias
 
 import gymnasium
@@ -12,14 +13,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clbench.perturbation import draw_perturbation
-from clbench.world import checked_actions, no_episode
+from clbench.world import Team, checked_actions, no_episode
 
+from .batch import Batch
 from .episode import Episode, new_episode
+from .rules import RULES
 from .state import SIZE, State
 
 _Kind: TypeAlias = tuple[str, float | None]
 """A task, and how many times as heavy its things are if they are perturbed: what a place for episodes is made
 for."""
+
+
+@dataclass(eq=False)
+class _Lane:
+    """An episode in its place; the next one there is another lane."""
+
+    kind: _Kind
+    episode: Episode
 
 
 class MetaWorldVectorWorld:
@@ -32,8 +43,9 @@ class MetaWorldVectorWorld:
 
     Args:
         lanes: Places for episodes. A task's scene is compiled when it is first reset to.
-        threads: Not used: an episode has its own physics, but shares the model, in which things stand where
-            they stand in one episode at a time.
+        threads: Threads that advance the physics of the tasks of `RULES`; MuJoCo releases the interpreter lock.
+            Each but the first makes copies of the models that it needs, 19 MB a task. Results do not depend on
+            it.
         perturbed: Whether things are heavier or lighter, and the hand starts elsewhere.
     """
 
@@ -41,8 +53,10 @@ class MetaWorldVectorWorld:
         self.single_observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (SIZE,), np.float32)
         self.single_action_space = gymnasium.spaces.Box(-1.0, 1.0, (4,), np.float32)
         self._perturbed = perturbed
-        self._lanes: list[tuple[_Kind, Episode] | None] = [None] * lanes
+        self._lanes: list[_Lane | None] = [None] * lanes
         self._idle: defaultdict[_Kind, list[Episode]] = defaultdict(list)
+        self._batches: dict[tuple[_Lane, ...], Batch] = {}
+        self._team = Team(threads)
 
     def reset(self, lanes: Sequence[int], seeds: Sequence[int], tasks: Sequence[str]) -> State:
         """Start an episode in each of `lanes` and return the states (N, 39); all follows from the seed alone.
@@ -58,8 +72,8 @@ class MetaWorldVectorWorld:
         episode = self._idle[kind].pop() if self._idle[kind] else new_episode(*kind)
         before = self._lanes[lane]
         if before is not None:
-            self._idle[before[0]].append(before[1])
-        self._lanes[lane] = kind, episode
+            self._idle[before.kind].append(before.episode)
+        self._lanes[lane] = _Lane(kind, episode)
         return episode.begin(seed, perturbation.start if perturbation else None)
 
     def step(
@@ -73,23 +87,50 @@ class MetaWorldVectorWorld:
             ValueError: An action has another shape than (4,), or a number in it is not finite.
         """
         actions = checked_actions(actions, self.single_action_space, "Meta-World")
-        outcomes = [self._episode(lane).advance(action) for lane, action in zip(lanes, actions, strict=True)]
-        states, rewards, successes = zip(*outcomes, strict=True)
-        return np.stack(states), np.array(rewards), np.array(successes)
+        moved = [self._lane(lane) for lane in lanes]
+        states = np.empty((len(lanes), SIZE), np.float32)
+        rewards, successes = np.empty(len(lanes)), np.empty(len(lanes), np.bool_)
+        batches = self._by_task(moved)
+        for batch, rows in batches:
+            batch.aim(actions[rows])
+        self._team.each(Episode.move, [lane.episode for lane in moved if lane.kind[0] in RULES])
+        for batch, rows in batches:
+            states[rows], rewards[rows], successes[rows] = batch.outcome()
+        for row, lane in enumerate(moved):
+            if lane.kind[0] not in RULES:
+                states[row], rewards[row], successes[row] = lane.episode.advance(actions[row])
+        return states, rewards, successes
+
+    def _by_task(self, lanes: Sequence[_Lane]) -> list[tuple[Batch, list[int]]]:
+        """Return batches of the lanes whose task has a rule, with the rows of each."""
+        by_task: defaultdict[str, list[int]] = defaultdict(list)
+        for row, lane in enumerate(lanes):
+            if lane.kind[0] in RULES:
+                by_task[lane.kind[0]].append(row)
+        known, self._batches, batches = self._batches, {}, []
+        for task, rows in by_task.items():
+            members = tuple(lanes[row] for row in rows)
+            batch = known.get(members) or Batch(RULES[task], [lane.episode for lane in members])
+            self._batches[members] = batch
+            batches.append((batch, rows))
+        return batches
 
     def picture_of(self, lane: int) -> tuple[mujoco.MjModel, mujoco.MjData]:
         """Return the scene of a lane, with things where they stand in its episode, and its physics."""
-        episode = self._episode(lane)
+        episode = self._lane(lane).episode
         episode.place()
+        mujoco.mj_forward(episode.model, episode.data)  # what is drawn is more than what a step computes
         return episode.model, episode.data
 
     def close(self) -> None:
-        """Forget all episodes."""
+        """Forget all episodes, and end the threads."""
+        self._team.close()
+        self._batches.clear()
         self._lanes = [None] * len(self._lanes)
         self._idle.clear()
 
-    def _episode(self, lane: int) -> Episode:
-        found = self._lanes[lane]
-        if found is None:
-            raise no_episode(lane, "Meta-World")
-        return found[1]
+    def _lane(self, number: int) -> _Lane:
+        lane = self._lanes[number]
+        if lane is None:
+            raise no_episode(number, "Meta-World")
+        return lane

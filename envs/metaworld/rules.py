@@ -1,0 +1,170 @@
+"""What Meta-World shows and rewards in the tasks of our scenarios: `compute_reward` of each, of many episodes.
+
+The numbers and formulas are those of `metaworld/envs/sawyer_<task>_v3.py`, in their order of operations. Tasks
+that are not in `RULES` can be done all the same, by Meta-World's own code.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+import numpy as np
+
+from .batch import Batch, Part, Rule, Verdict
+from .gripping import GRIPPING_RULES
+from .rewards import Vector, gaussian, hamacher, long_tail, magnitude, near, norm
+
+
+def _door_close(batch: Batch) -> Verdict:
+    """Reward of sawyer_door_close_v3.py."""
+    to_goal = norm(batch.thing - batch.goal)
+    in_place = near(to_goal, 0.05, norm(batch.start("obj_init_pos") - batch.goal), gaussian)
+    hand_margin = norm(batch.start("hand_init_pos") - batch.thing) + 0.1
+    hand_in_place = near(norm(batch.tcp - batch.goal), 0.25 * 0.05, hand_margin, gaussian)
+    reward = 3 * hand_in_place + 6 * in_place
+    return np.where(to_goal < 0.05, 10.0, reward), to_goal <= 0.08
+
+
+def _door_unlock(batch: Batch) -> Verdict:
+    """Reward of sawyer_door_unlock_v3.py, where the lock's initial place is the one it has now."""
+    shoulder, scale = np.array([0.0, 0.055, 0.07]), np.array([0.25, 1.0, 0.5])
+    to_lock = norm((batch.hand_seen + shoulder - batch.thing) * scale)
+    to_lock_first = norm((batch.start("init_tcp") + shoulder - batch.place("body", "lock_link")) * scale)
+    ready = near(to_lock, 0.02, to_lock_first)
+    to_goal = np.abs(batch.goal[:, 0] - batch.thing[:, 0])
+    pushed = near(to_goal, 0.005, 0.1)
+    return 2 * ready + 8 * pushed, to_goal <= 0.02
+
+
+def _drawer_open(batch: Batch) -> Verdict:
+    """Reward of sawyer_drawer_open_v3.py."""
+    to_goal = norm(batch.thing - batch.goal)
+    opening = near(to_goal, 0.02, 0.2)
+    scale = np.array([3.0, 3.0, 1.0])
+    handle_first = batch.goal + np.array([0.0, 0.2, 0.0])
+    margin = norm((handle_first - batch.start("init_tcp")) * scale)
+    caging = near(norm((batch.thing - batch.hand_seen) * scale), 0.01, margin)
+    return (caging + opening) * 5.0, to_goal <= 0.03
+
+
+def _drawer_close(batch: Batch) -> Verdict:
+    """Reward of sawyer_drawer_close_v3.py."""
+    first = batch.start("obj_init_pos")
+    to_goal = norm(batch.thing - batch.goal)
+    in_place = near(to_goal, 0.04, np.abs(norm(first - batch.goal) - 0.04))
+    reach_margin = np.abs(norm(first - batch.start("init_tcp")) - 0.005)
+    reach = near(norm(batch.thing - batch.tcp), 0.005, reach_margin, gaussian)
+    reward = batch.closed().into(
+        lambda closed, reach, in_place: hamacher(hamacher(reach, closed), in_place) * 10, reach, in_place
+    )
+    success = to_goal <= 0.04 + 0.015
+    return np.where(success, 10.0, reward.numbers), success
+
+
+def _faucet(offset: tuple[float, float, float] | None = None) -> Callable[[Batch], Verdict]:
+    """Return the reward of sawyer_faucet_close_v3.py, or with an offset that of sawyer_faucet_open_v3.py."""
+
+    def judge(batch: Batch) -> Verdict:
+        first = batch.start("obj_init_pos")
+        thing = batch.thing if offset is None else batch.thing + np.array(offset)
+        to_goal = norm(thing - batch.goal)
+        in_place = near(to_goal, 0.07, np.abs(norm(first - batch.goal) - 0.07))
+        reach_margin = np.abs(norm(first - batch.start("init_tcp")) - 0.01)
+        reach = near(norm(thing - batch.tcp), 0.01, reach_margin, gaussian)
+        success = to_goal <= 0.07
+        return np.where(success, 10.0, (2 * reach + 3 * in_place) * 2), success
+
+    return judge
+
+
+def _window(first_place: str, sigmoid: Callable[[Vector], Vector]) -> Callable[[Batch], Verdict]:
+    """Return the reward of sawyer_window_open_v3.py or sawyer_window_close_v3.py.
+
+    Args:
+        first_place: What the way along x is measured from.
+        sigmoid: By which reaching is rewarded.
+    """
+
+    def judge(batch: Batch) -> Verdict:
+        goal = batch.goal[:, 0]
+        to_goal = magnitude(batch.thing[:, 0] - goal)
+        in_place = near(to_goal, 0.05, np.abs(magnitude(batch.start(first_place)[:, 0] - goal) - 0.05))
+        handle_first = batch.start("window_handle_pos_init")
+        reach_margin = np.abs(norm(handle_first - batch.start("init_tcp")) - 0.02)
+        reach = near(norm(batch.thing - batch.tcp), 0.02, reach_margin, sigmoid)
+        return 10 * hamacher(reach, in_place), to_goal <= 0.05
+
+    return judge
+
+
+def _handle_press(batch: Batch) -> Verdict:
+    """Reward of sawyer_handle_press_v3.py and sawyer_handle_press_side_v3.py."""
+    first, goal = batch.start("_handle_init_pos"), batch.goal[:, 2]
+    to_goal = magnitude(batch.thing[:, 2] - goal)
+    in_place = near(to_goal, 0.02, np.abs(magnitude(first[:, 2] - goal) - 0.02))
+    reach_margin = np.abs(norm(first - batch.start("init_tcp")) - 0.02)
+    reach = near(norm(batch.thing - batch.tcp), 0.02, reach_margin)
+    success = to_goal <= 0.02
+    return np.where(success, 1.0, hamacher(reach, in_place)) * 10, success
+
+
+def _button_press(batch: Batch) -> Verdict:
+    """Reward of sawyer_button_press_v3.py."""
+    to_button = norm(batch.thing - batch.tcp)
+    to_goal = np.abs(batch.goal[:, 1] - batch.thing[:, 1])
+    near_button = near(to_button, 0.05, norm(batch.thing - batch.start("init_tcp")))
+    pressed = near(to_goal, 0.005, batch.start("_obj_to_target_init"))
+    reward = 2 * hamacher(batch.opening, near_button)
+    return np.where(to_button <= 0.05, reward + 8 * pressed, reward), to_goal <= 0.02
+
+
+def _button_press_topdown(batch: Batch) -> Verdict:
+    """Reward of sawyer_button_press_topdown_v3.py and sawyer_button_press_topdown_wall_v3.py."""
+    to_button = norm(batch.thing - batch.tcp)
+    to_goal = np.abs(batch.goal[:, 2] - batch.thing[:, 2])
+    near_button = near(to_button, 0.01, norm(batch.thing - batch.start("init_tcp")))
+    pressed = near(to_goal, 0.005, batch.start("_obj_to_target_init"))
+    reward = 5 * hamacher(1 - batch.opening, near_button)
+    return np.where(to_button <= 0.03, reward + 5 * pressed, reward), to_goal <= 0.024
+
+
+def _plate_slide(batch: Batch) -> Verdict:
+    """Reward of sawyer_plate_slide_v3.py."""
+    first = batch.start("obj_init_pos")
+    to_goal = norm(batch.thing - batch.goal)
+    in_place = near(to_goal, 0.05, norm(first - batch.goal))
+    grasped = near(norm(batch.tcp - batch.thing), 0.05, norm(batch.start("init_tcp") - first))
+    return np.where(to_goal < 0.05, 10.0, 8 * hamacher(grasped, in_place)), to_goal <= 0.07
+
+
+RULES: Mapping[str, Rule] = {
+    "button_press": Rule(_button_press, (Part("body", "button", (0.0, -0.193, 0.0), turned="button"),)),
+    "button_press_topdown": Rule(
+        _button_press_topdown, (Part("body", "button", (0.0, 0.0, 0.193), turned="button"),)
+    ),
+    "button_press_topdown_wall": Rule(
+        _button_press_topdown, (Part("body", "button", (0.0, 0.0, 0.193), turned="button"),)
+    ),
+    "door_close": Rule(_door_close, (Part("geom", "handle", axes=("geom", "handle")),)),
+    "door_unlock": Rule(_door_unlock, (Part("site", "lockStartUnlock", turned="door_link"),)),
+    "drawer_close": Rule(_drawer_close, (Part("body", "drawer_link", (0.0, -0.16, 0.05)),)),
+    "drawer_open": Rule(
+        _drawer_open, (Part("body", "drawer_link", (0.0, -0.16, 0.0), turned="drawer_link"),)
+    ),
+    "faucet_close": Rule(
+        _faucet(), (Part("site", "handleStartClose", (0.0, 0.0, -0.01), turned="faucetBase"),)
+    ),
+    "faucet_open": Rule(
+        _faucet((-0.04, 0.0, 0.03)),
+        (Part("site", "handleStartOpen", (0.0, 0.0, -0.01), turned="faucetBase"),),
+    ),
+    "handle_press": Rule(_handle_press, (Part("site", "handleStart"),)),
+    "handle_press_side": Rule(_handle_press, (Part("site", "handleStart"),)),
+    "plate_slide": Rule(_plate_slide, (Part("geom", "puck", axes=("geom", "puck")),)),
+    "window_close": Rule(
+        _window("window_handle_pos_init", gaussian), (Part("site", "handleCloseStart"),)
+    ),
+    "window_open": Rule(_window("obj_init_pos", long_tail), (Part("site", "handleOpenStart"),)),
+    **GRIPPING_RULES,
+}
+"""By task."""
