@@ -1,21 +1,20 @@
-"""Episodes of one task side by side: what `Episode.advance` does, computed for all of them at once.
+"""Episodes side by side: what `Episode.advance` does, computed for all of them at once.
 
-Each number has the bits that it has there; `rewards` says what that takes.
+Each number has the bits that it has there; `rewards` says what that takes. Rewards and successes depend on
+the task, and are computed in groups of episodes of one task.
 """
 
 from __future__ import annotations
 
-import copy
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, TypeAlias
+from typing import TypeAlias
 
-import mujoco
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from .episode import Episode
+from .episode import Episode, Look
 from .rewards import Mixed, Vector, closed, norm
 from .state import SIZE
 
@@ -23,119 +22,70 @@ Numbers: TypeAlias = NDArray[np.float32]
 Verdict: TypeAlias = tuple[Vector, NDArray[np.bool_]]
 """The rewards (N,) and which of the episodes succeeded (N,)."""
 
-_KINDS = {"body": mujoco.mjtObj.mjOBJ_BODY, "site": mujoco.mjtObj.mjOBJ_SITE, "geom": mujoco.mjtObj.mjOBJ_GEOM}
-_PLACES = {"body": "xpos", "site": "site_xpos", "geom": "geom_xpos"}
-_AXES = {"body": "xmat", "geom": "geom_xmat"}
-
 NOW = 18
 """How many numbers of an observation say how things are: as many follow of the step before, then the goal."""
+_PARTS = (slice(4, 7), slice(7, 11)), (slice(11, 14), slice(14, 18))
+"""Where an observation has the place and the rotation of its first part, and of its second."""
+_ARM: tuple[Look, ...] = (
+    ("body", "hand", "xpos"),
+    ("body", "rightclaw", "xpos"),
+    ("body", "leftclaw", "xpos"),
+    ("body", "rightpad", "xpos"),
+    ("body", "leftpad", "xpos"),
+    ("site", "rightEndEffector", "xpos"),
+    ("site", "leftEndEffector", "xpos"),
+)
+"""What is looked at of the robot."""
 
 
 @dataclass(frozen=True)
 class Part:
     """A thing that is part of the observation: its place, and its rotation as a quaternion."""
 
-    kind: Literal["body", "site", "geom"]
+    place: Look
     """What has its place."""
-    name: str
-    """Of what has its place."""
     offset: tuple[float, float, float] | None = None
     """Added to the place, in metres."""
-    turned: str | None = None
-    """The body whose quaternion is the rotation; zeros stand for it if this is None, and `axes` too."""
-    axes: tuple[Literal["body", "geom"], str] | None = None
-    """What has the rotation, where it is computed from a matrix."""
+    rotation: Look | None = None
+    """What has its rotation, as a quaternion or a matrix; zeros stand for it if this is None."""
 
 
 @dataclass(frozen=True)
 class Rule:
     """What Meta-World shows and rewards in a task."""
 
-    judge: Callable[[Batch], Verdict]
+    judge: Callable[[Group], Verdict]
     """Computes rewards and successes."""
     parts: tuple[Part, ...]
-    """What the observation is about."""
+    """What the observation is about, one thing or two."""
 
 
-class Batch:
-    """Episodes of one task, which take their steps together.
+class Group:
+    """Episodes of one task, which take their steps together: what its rule asks for.
 
     Args:
         rule: Of the task.
         episodes: Begun, and not begun again while this is used.
     """
 
+    actions: Numbers
+    """What was asked for in this step (N, 4)."""
+    observation: Vector
+    """What is observed after it (N, 39), within its bounds."""
+    arm: Vector
+    """Places of the parts of the robot (N, 7, 3), as `_ARM` names them."""
+    tcp: Vector
+    """Places between the fingers (N, 3)."""
+
     def __init__(self, rule: Rule, episodes: Sequence[Episode]) -> None:
-        self._rule, self.episodes = rule, tuple(episodes)
-        self._first = self.episodes[0]
-        bounds = self._first.sawyer_observation_space
-        self._low, self._high = bounds.low, bounds.high
-        self._views: dict[str, list[NDArray[np.float64]]] = {}
+        self.rule, self.episodes = rule, episodes
         self._starts: dict[str, Vector] = {}
-        self._indices: dict[tuple[str, str], int] = {}
-        self._goals = self.start("_target_pos")
-        self._mocaps = [episode.data.mocap_pos[0] for episode in self.episodes]
-        self._controls = [episode.data.ctrl for episode in self.episodes]
-        self._read: dict[str, NDArray[np.float64]] = {}
-
-    def __deepcopy__(self, memo: dict[int, Any]) -> Batch:
-        """Return a batch that looks at copies of the episodes."""
-        return Batch(self._rule, copy.deepcopy(self.episodes, memo))
-
-    def aim(self, actions: Numbers) -> None:
-        """Set what the physics is to do in the next step, by actions (N, 4) in [-1, 1]."""
-        self._actions = actions
-        first = self._first
-        goals = np.concatenate(self._mocaps).reshape(-1, 3) + actions[:, :3] * first.action_scale
-        goals = np.clip(goals, first.mocap_low, first.mocap_high)
-        fingers = np.stack([actions[:, 3], -actions[:, 3]], axis=1)
-        for mocap, goal, control, effort in zip(self._mocaps, goals, self._controls, fingers, strict=True):
-            mocap[:], control[:] = goal, effort
-
-    def outcome(self) -> tuple[Vector, Vector, NDArray[np.bool_]]:
-        """Return the observations (N, 39), the rewards (N,) and the successes (N,) after the physics' step."""
-        self._read.clear()
-        observation = np.zeros((len(self.episodes), SIZE))
-        self._show(observation[:, :NOW])
-        observation[:, NOW : 2 * NOW] = np.array([episode.before for episode in self.episodes])
-        observation[:, 2 * NOW :] = self._goals
-        for episode, now in zip(self.episodes, observation[:, :NOW].copy(), strict=True):
-            episode.before = now
-        self.observation: Vector = np.clip(observation, self._low, self._high)
-        return self.observation, *self._rule.judge(self)
-
-    def _show(self, now: Vector) -> None:
-        """Write how things are (N, 18)."""
-        now[:, :3] = self.hand
-        apart = norm(self.place("body", "rightclaw") - self.place("body", "leftclaw"))
-        now[:, 3] = np.clip(apart / 0.1, 0.0, 1.0)
-        for number, part in enumerate(self._rule.parts):
-            first = 4 + 7 * number
-            place = self.place(part.kind, part.name)
-            now[:, first : first + 3] = place if part.offset is None else place + np.array(part.offset)
-            if part.turned is not None:
-                now[:, first + 3 : first + 7] = self._rows("xquat", 4)[:, self._index("body", part.turned)]
-            elif part.axes is not None:
-                matrices = self._rows(_AXES[part.axes[0]], 9)[:, self._index(*part.axes)]
-                turns = Rotation.from_matrix(matrices.reshape(-1, 3, 3), assume_valid=True)
-                now[:, first + 3 : first + 7] = turns.as_quat()
-
-    # ---- what rules ask for ----------------------------------------------------------------------------
+        self.goal = self.start("_target_pos")
+        """Where the thing is to go (N, 3): not as it is observed, which is within bounds."""
 
     @property
     def hand(self) -> Vector:
-        """Places of the hand (N, 3)."""
-        return self.place("body", "hand")
-
-    @property
-    def tcp(self) -> Vector:
-        """Places between the fingers (N, 3)."""
-        center: Vector = (self.place("site", "rightEndEffector") + self.place("site", "leftEndEffector")) / 2.0
-        return center
-
-    @property
-    def hand_seen(self) -> Vector:
-        """Places of the hand (N, 3) as they are observed, which is within bounds."""
+        """Places of the hand (N, 3), as they are observed."""
         return self.observation[:, :3]
 
     @property
@@ -149,22 +99,13 @@ class Batch:
         return self.observation[:, 4:7]
 
     @property
-    def goal(self) -> Vector:
-        """Where the thing is to go (N, 3): not as it is observed, which is within bounds."""
-        return self._goals
+    def pads(self) -> Vector:
+        """Places of the pads of the fingers along y (2, N), first that of the right one."""
+        return self.arm[:, 3:5, 1].T
 
     def closed(self, effort: float = 1.0, counts: NDArray[np.bool_] | bool = True) -> Mixed:
-        """Return how far the actions close the fingers, as a share of an effort, where that `counts`; else 0."""
-        return closed(self._actions[:, 3], effort, counts)
-
-    def place(self, kind: Literal["body", "site", "geom"], name: str) -> Vector:
-        """Return the places (N, 3) of a body, a site or a geom."""
-        return self._rows(_PLACES[kind], 3)[:, self._index(kind, name)]
-
-    def joint(self, name: str) -> Vector:
-        """Return the position (N,) of a hinge or a slide."""
-        address = self._first.model.joint(name).qposadr[0]
-        return self._rows("qpos", 1)[:, address, 0]
+        """Return how far actions close the fingers, as a share of an effort; 0 where that does not count."""
+        return closed(self.actions[:, 3], effort, counts)
 
     def start(self, name: str) -> Vector:
         """Return what Meta-World's reset measured, as `obj_init_pos` or `init_tcp`, of each episode."""
@@ -172,16 +113,113 @@ class Batch:
             self._starts[name] = np.array([getattr(episode, name) for episode in self.episodes], np.float64)
         return self._starts[name]
 
-    def _rows(self, name: str, size: int) -> Vector:
-        """Return an array of the physics, (N, rows of it, size), as it is after this step."""
-        if name not in self._read:
-            if name not in self._views:
-                self._views[name] = [getattr(episode.data, name) for episode in self.episodes]
-            views = self._views[name]
-            self._read[name] = np.concatenate(views).reshape(len(views), -1, size)
-        return self._read[name]
+    def look(self, look: Look) -> Vector:
+        """Return something of the physics (N, its size) as it is now."""
+        return _rows([episode.look(look) for episode in self.episodes])
 
-    def _index(self, kind: str, name: str) -> int:
-        if (kind, name) not in self._indices:
-            self._indices[kind, name] = mujoco.mj_name2id(self._first.model, _KINDS[kind], name)
-        return self._indices[kind, name]
+
+class Batch:
+    """Episodes that take their steps together.
+
+    Args:
+        groups: Of the tasks; their episodes are those of the batch, in this order.
+    """
+
+    def __init__(self, groups: Sequence[Group]) -> None:
+        self._groups, self.episodes = groups, [episode for group in groups for episode in group.episodes]
+        self._mocaps = [episode.data.mocap_pos[0] for episode in self.episodes]
+        self._controls = [episode.data.ctrl for episode in self.episodes]
+        self._reach = [
+            np.array([getattr(one, name) for one in self.episodes]) for name in ("mocap_low", "mocap_high")
+        ]
+        bounds = [episode.sawyer_observation_space for episode in self.episodes]
+        self._bounds = [np.array([getattr(one, name) for one in bounds]) for name in ("low", "high")]
+        self._goals = np.concatenate([group.goal for group in groups])
+        self._arms = [episode.look(look) for episode in self.episodes for look in _ARM]
+        parts = [group.rule.parts for group in groups for _ in group.episodes]
+        self._views = [_Views(self.episodes, parts, number) for number in range(max(map(len, parts)))]
+
+    def aim(self, actions: Numbers) -> None:
+        """Set what the physics is to do in the next step, by actions (N, 4) in [-1, 1]."""
+        self._actions = actions
+        low, high = self._reach
+        goals = _rows(self._mocaps) + actions[:, :3] * self.episodes[0].action_scale
+        goals = np.minimum(np.maximum(goals, low), high)
+        efforts = actions[:, 3:] * np.array([1.0, -1.0], np.float32)
+        for mocap, goal, control, effort in zip(self._mocaps, goals, self._controls, efforts, strict=True):
+            mocap[:], control[:] = goal, effort
+
+    def outcome(self) -> tuple[Vector, Vector, NDArray[np.bool_]]:
+        """Return observations (N, 39), rewards (N,) and successes (N,), once the physics has advanced."""
+        arm = _rows(self._arms).reshape(len(self.episodes), -1, 3)
+        observation = self._observe(arm)
+        tcp = (arm[:, 5] + arm[:, 6]) / 2.0
+        rewards, successes = np.empty(len(tcp)), np.empty(len(tcp), np.bool_)
+        first = 0
+        # beyond a margin of 0, as may happen by chance, the reward is 0: that of an infinite distance
+        with np.errstate(divide="ignore", invalid="ignore"):
+            for group in self._groups:
+                rows = slice(first, first + len(group.episodes))
+                group.actions, group.observation = self._actions[rows], observation[rows]
+                group.arm, group.tcp = arm[rows], tcp[rows]
+                rewards[rows], successes[rows] = group.rule.judge(group)
+                first = rows.stop
+        return observation, rewards, successes
+
+    def _observe(self, arm: Vector) -> Vector:
+        observation = np.zeros((len(self.episodes), SIZE))
+        observation[:, :3] = arm[:, 0]
+        apart = norm(arm[:, 1] - arm[:, 2]) / 0.1
+        observation[:, 3] = np.minimum(np.maximum(apart, 0.0), 1.0)
+        for views in self._views:
+            views.show(observation)
+        observation[:, NOW : 2 * NOW] = _rows([episode.before for episode in self.episodes])
+        observation[:, 2 * NOW :] = self._goals
+        for episode, now in zip(self.episodes, observation[:, :NOW].copy(), strict=True):
+            episode.before = now
+        low, high = self._bounds
+        seen: Vector = np.minimum(np.maximum(observation, low), high)
+        return seen
+
+
+class _Views:
+    """What observations show of their first parts, or of their second: views of it in the physics."""
+
+    def __init__(self, episodes: Sequence[Episode], parts: Sequence[tuple[Part, ...]], number: int) -> None:
+        self._place, self._rotation = _PARTS[number]
+        shown = [(row, part[number]) for row, part in enumerate(parts) if len(part) > number]
+        moved = [(row, part.offset) for row, part in shown if part.offset is not None]
+        self._rows = [row for row, _ in shown]
+        self._places = [episodes[row].look(part.place) for row, part in shown]
+        self._moved = [row for row, _ in moved]
+        self._offsets = np.array([offset for _, offset in moved])
+        turned = [
+            (row, episodes[row].look(part.rotation)) for row, part in shown if part.rotation is not None
+        ]
+        self._quaternions = _split((row, view) for row, view in turned if view.size == 4)
+        self._matrices = _split((row, view) for row, view in turned if view.size == 9)
+
+    def show(self, observation: Vector) -> None:
+        """Write it into observations (N, 39)."""
+        observation[self._rows, self._place] = _rows(self._places)
+        if self._moved:
+            observation[self._moved, self._place] += self._offsets
+        rows, views = self._quaternions
+        if rows:
+            observation[rows, self._rotation] = _rows(views)
+        rows, views = self._matrices
+        if rows:
+            # MuJoCo's are rotations: what is skipped is to make them so
+            turns = Rotation.from_matrix(_rows(views).reshape(-1, 3, 3), assume_valid=True)
+            observation[rows, self._rotation] = turns.as_quat()
+
+
+def _split(pairs: Iterable[tuple[int, Vector]]) -> tuple[list[int], list[Vector]]:
+    """Return the rows, and what is written into each."""
+    listed = list(pairs)
+    return [row for row, _ in listed], [view for _, view in listed]
+
+
+def _rows(views: Sequence[Vector]) -> Vector:
+    """Return what views of one size are of, (N, size)."""
+    return np.concatenate(views).reshape(len(views), -1)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import functools
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, TypeAlias
 
 import mujoco
 import numpy as np
@@ -20,13 +20,15 @@ from clbench.task import unknown
 from .state import State
 
 Vector = NDArray[np.float64]
+Look: TypeAlias = tuple[str, str, str]
+"""Something in the physics: of what kind it is, what it is called, and which of its arrays is asked for."""
 
 START = 0.03
 """Metres along each axis that a perturbed hand starts beside its place, three steps of it."""
 SETTLE = 20
 """Steps, of 0.0125 s, in which it gets there and comes to rest."""
 
-PHYSICS = ("model", "data", "mujoco_renderer", "init_left_pad", "init_right_pad", "_bodies", "_sites")
+PHYSICS = ("model", "data", "mujoco_renderer", "init_left_pad", "init_right_pad", "_looks")
 """Attributes of an episode that are its physics or views of it: also what Meta-World calls initial pads."""
 
 
@@ -87,8 +89,7 @@ class Episode(SawyerXYZEnv):
     _settle = 0
 
     def __init__(self) -> None:
-        self._bodies: dict[str, Vector] = {}
-        self._sites: dict[str, Vector] = {}
+        self._looks: dict[Look, Vector] = {}
         super().__init__()
         self._set_task_called = True
         self._partially_observable = False
@@ -170,16 +171,19 @@ class Episode(SawyerXYZEnv):
 
     # ---- what is looked up by name ---------------------------------------------------------------------
 
+    def look(self, look: Look) -> Vector:
+        """Return a view of something in the physics."""
+        if look not in self._looks:
+            kind, name, array = look
+            self._looks[look] = getattr(getattr(self.data, kind)(name), array)
+        return self._looks[look]
+
     def get_body_com(self, body_name: str) -> Vector:
         """Return the place of a body (3,), as a view of the physics."""
-        if body_name not in self._bodies:
-            self._bodies[body_name] = self.data.body(body_name).xpos
-        return self._bodies[body_name]
+        return self.look(("body", body_name, "xpos"))
 
     def _get_site_pos(self, site_name: str) -> Vector:
-        if site_name not in self._sites:
-            self._sites[site_name] = self.data.site(site_name).xpos
-        return self._sites[site_name].copy()
+        return self.look(("site", site_name, "xpos")).copy()
 
     def get_endeff_pos(self) -> Vector:
         """Return the place of the hand (3,), as a view of the physics."""

@@ -6,12 +6,12 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from .batch import Batch, Part, Rule, Verdict
+from .batch import Group, Part, Rule, Verdict
 from .rewards import Floats, Mixed, Vector, between, hamacher, near, norm
 
 
 def _caging(
-    batch: Batch,
+    group: Group,
     thing: Vector,
     radius: float,
     pads_apart: float,
@@ -22,7 +22,7 @@ def _caging(
     """Return how well the fingers are around things (N, 3), and close: sawyer_xyz_env.py's caging reward.
 
     Args:
-        batch: Of the things.
+        group: Of the things.
         thing: Where they are.
         radius: Of a ball around one (`obj_radius`).
         pads_apart: Distance of a finger's pad along y that is near enough (`pad_success_thresh`).
@@ -30,14 +30,13 @@ def _caging(
         effort: Action of the fingers that is enough (`desired_gripper_effort`).
         dense: Whether there is a reward before they close (`high_density`).
     """
-    first, tcp_first = batch.start("obj_init_pos"), batch.start("init_tcp")
-    pads = np.stack([batch.place("body", "leftpad")[:, 1], batch.place("body", "rightpad")[:, 1]])
-    margins = np.abs(np.abs(pads - first[:, 1]) - pads_apart)
-    beside = between(np.abs(pads - thing[:, 1]), radius, pads_apart, margins)
+    first, tcp_first = group.start("obj_init_pos"), group.start("init_tcp")
+    margins = np.abs(np.abs(group.pads - first[:, 1]) - pads_apart)
+    beside = between(np.abs(group.pads - thing[:, 1]), radius, pads_apart, margins)
     above_margin = _checked(norm(first[:, ::2] - tcp_first[:, ::2]) - close)
-    above = near(norm(batch.tcp[:, ::2] - thing[:, ::2]), close, above_margin)
+    above = near(norm(group.tcp[:, ::2] - thing[:, ::2]), close, above_margin)
     caging = hamacher(hamacher(beside[0], beside[1]), above)
-    gripping = batch.closed(effort, caging > 0.97)
+    gripping = group.closed(effort, caging > 0.97)
     if not dense:
         return gripping.into(lambda gripping, caging: hamacher(caging, gripping), caging)
     return gripping.into(lambda gripping, caging: (hamacher(caging, gripping) + caging) / 2, caging)
@@ -54,29 +53,29 @@ def _checked(margin: Vector) -> Vector:
     return margin
 
 
-def _push(batch: Batch) -> Verdict:
+def _push(group: Group) -> Verdict:
     """Reward of sawyer_push_v3.py."""
-    to_goal = norm(batch.thing - batch.goal)
-    in_place = near(to_goal, 0.05, norm(batch.start("obj_init_pos") - batch.goal))
-    held = (norm(batch.thing - batch.tcp) < 0.02) & (batch.opening > 0)
+    to_goal = norm(group.thing - group.goal)
+    in_place = near(to_goal, 0.05, norm(group.start("obj_init_pos") - group.goal))
+    held = (norm(group.thing - group.tcp) < 0.02) & (group.opening > 0)
 
     def total(grasped: Floats, placed: Floats) -> Floats:
         reward = 2 * grasped
         return np.where(held, reward + (1.0 + reward + placed), reward)
 
-    reward = _caging(batch, batch.thing, 0.015, 0.05, 0.005).into(total, 5.0 * in_place)
+    reward = _caging(group, group.thing, 0.015, 0.05, 0.005).into(total, 5.0 * in_place)
     return np.where(to_goal < 0.05, 10.0, reward.numbers), to_goal <= 0.05
 
 
-def _push_wall(batch: Batch) -> Verdict:
+def _push_wall(group: Group) -> Verdict:
     """Reward of sawyer_push_wall_v3.py: first to the middle of the way around the wall, then to the goal."""
-    thing, first = batch.thing, batch.start("obj_init_pos")
+    thing, first = group.thing, group.start("obj_init_pos")
     middle, scale = np.full_like(thing, (-0.05, 0.77, 0.0)), np.array([3.0, 1.0, 1.0])
     middle[:, 2] = thing[:, 2]
     half_way = near(norm((thing - middle) * scale), 0.05, norm((first - middle) * scale))
-    to_goal = norm(thing - batch.goal)
-    in_place = near(to_goal, 0.05, norm(first - batch.goal))
-    held = (norm(thing - batch.tcp) < 0.02) & (batch.opening > 0)
+    to_goal = norm(thing - group.goal)
+    in_place = near(to_goal, 0.05, norm(first - group.goal))
+    held = (norm(thing - group.tcp) < 0.02) & (group.opening > 0)
     past = held & (thing[:, 1] > 0.75)
 
     def total(grasped: Floats, half_way: Floats, placed: Floats) -> Floats:
@@ -84,100 +83,100 @@ def _push_wall(batch: Batch) -> Verdict:
         later = np.where(past, reward + 1.0 + 4.0 + placed, reward + 1.0 + half_way)
         return np.where(held, later, reward)
 
-    caging = _caging(batch, thing, 0.015, 0.05, 0.005)
+    caging = _caging(group, thing, 0.015, 0.05, 0.005)
     reward = caging.into(total, 4.0 * half_way, 3.0 * in_place)
     return np.where(to_goal < 0.05, 10.0, reward.numbers), to_goal <= 0.07
 
 
-def _push_back(batch: Batch) -> Verdict:
-    """Reward of sawyer_push_back_v3.py, where what it calls initial places of the pads are those they have now."""
-    thing, first = batch.thing, batch.start("obj_init_pos")
-    to_goal, to_goal_first = norm(thing - batch.goal), norm(first - batch.goal)
+def _push_back(group: Group) -> Verdict:
+    """Reward of sawyer_push_back_v3.py, where the pads' "initial" places are those they have now."""
+    thing, first = group.thing, group.start("obj_init_pos")
+    to_goal, to_goal_first = norm(thing - group.goal), norm(first - group.goal)
     in_place = near(to_goal, 0.05, to_goal_first)
-    left, right = batch.place("body", "leftpad")[:, 1], batch.place("body", "rightpad")[:, 1]
+    right, left = group.pads
     aside = np.stack([thing[:, 1] - right, left - thing[:, 1]])
     margins = np.abs(np.abs(aside) - 0.05)
     around, on = (between(aside, 0.007, far, margins) for far in (0.05, 0.007 + 0.003))
     plane = np.array([1.0, 0.0, 1.0])
-    above_margin = _checked(norm((first - batch.start("init_tcp")) * plane) - 0.01)
-    above = near(norm((batch.tcp - thing) * plane), 0.01, above_margin)
+    above_margin = _checked(norm((first - group.start("init_tcp")) * plane) - 0.01)
+    above = near(norm((group.tcp - thing) * plane), 0.01, above_margin)
     caging = hamacher(hamacher(around[0], around[1]), above)
     grasped = (caging + np.where(caging > 0.95, hamacher(on[0], on[1]), 0.0)) / 2
     reward = hamacher(grasped, in_place)
-    held = (norm(thing - batch.tcp) < 0.01) & (0 < batch.opening) & (batch.opening < 0.55)
+    held = (norm(thing - group.tcp) < 0.01) & (group.opening > 0) & (group.opening < 0.55)
     held &= to_goal_first - to_goal > 0.01
     reward = np.where(held, reward + (1.0 + 5.0 * in_place), reward)
     return np.where(to_goal < 0.05, 10.0, reward), to_goal <= 0.07
 
 
-def _shelf_place(batch: Batch) -> Verdict:
-    """Reward of sawyer_shelf_place_v3.py: less in front of the shelf the nearer and the lower, none behind it."""
-    thing, goal, first = batch.thing, batch.goal, batch.start("obj_init_pos")
+def _shelf_place(group: Group) -> Verdict:
+    """Reward of sawyer_shelf_place_v3.py: less where a way straight on would end below the shelf."""
+    thing, goal, first = group.thing, group.goal, group.start("obj_init_pos")
     to_goal = norm(thing - goal)
     in_place = near(to_goal, 0.05, norm(first - goal))
-    reward = _caging(batch, thing, 0.02, 0.05, 0.01, dense=False).into(hamacher, in_place)
+    reward = _caging(group, thing, 0.02, 0.05, 0.01, dense=False).into(hamacher, in_place)
     x, y, z = thing.T
-    low = (0.0 < z) & (z < 0.24) & (goal[:, 0] - 0.15 < x) & (x < goal[:, 0] + 0.15)
+    low = (z > 0.0) & (z < 0.24) & (goal[:, 0] - 0.15 < x) & (x < goal[:, 0] + 0.15)
     before = low & (goal[:, 1] - 3 * 0.05 < y) & (y < goal[:, 1])
     depth, height = (y - (goal[:, 1] - 3 * 0.05)) / (3 * 0.05), (0.24 - z) / 0.24
     loss = hamacher(np.where(before, depth, 0.0), np.where(before, height, 0.0))
     in_place = np.where(before, np.clip(in_place - loss, 0.0, 1.0), in_place)
     in_place = np.where(low & (y > goal[:, 1]), 0.0, in_place)
-    held = (norm(thing - batch.tcp) < 0.025) & (batch.opening > 0) & (z - 0.01 > first[:, 2])
-    # what the loss is taken from is one of NumPy's numbers: added to, single precision becomes double
+    held = (norm(thing - group.tcp) < 0.025) & (group.opening > 0) & (z - 0.01 > first[:, 2])
+    # what a loss was taken from is a number of NumPy, not of Python: with it, single precision becomes double
     lifted = Mixed(reward.numbers, reward.single & ~before).into(np.add, 1.0 + 5.0 * in_place)
     return np.where(to_goal < 0.05, 10.0, np.where(held, lifted.numbers, reward.numbers)), to_goal <= 0.07
 
 
-def _peg_unplug_side(batch: Batch) -> Verdict:
+def _peg_unplug_side(group: Group) -> Verdict:
     """Reward of sawyer_peg_unplug_side_v3.py."""
-    thing, first = batch.thing, batch.start("obj_init_pos")
-    to_goal = norm(thing - batch.goal)
-    in_place = near(to_goal, 0.05, norm(first - batch.goal))
-    held = (batch.opening > 0.5) & (thing[:, 0] - first[:, 0] > 0.015) & (norm(thing - batch.tcp) < 0.035)
+    thing, first = group.thing, group.start("obj_init_pos")
+    to_goal = norm(thing - group.goal)
+    in_place = near(to_goal, 0.05, norm(first - group.goal))
+    held = (group.opening > 0.5) & (thing[:, 0] - first[:, 0] > 0.015) & (norm(thing - group.tcp) < 0.035)
 
     def total(grasped: Floats, placed: Floats) -> Floats:
         return np.where(held, 1 + 2 * grasped + placed, 2 * grasped)
 
-    caging = _caging(batch, thing, 0.025, 0.05, 0.005, effort=0.8)
+    caging = _caging(group, thing, 0.025, 0.05, 0.005, effort=0.8)
     reward = caging.into(total, 5 * in_place)
     return np.where(to_goal <= 0.05, 10.0, reward.numbers), to_goal <= 0.07
 
 
-def _hammer(batch: Batch) -> Verdict:
+def _hammer(group: Group) -> Verdict:
     """Reward of sawyer_hammer_v3.py."""
-    hammer, grip = batch.thing, batch.thing.copy()
-    beside = np.abs(hammer[:, 0] - batch.hand_seen[:, 0]) < 0.14 / 2.0
-    grip[beside, 0] = batch.hand_seen[beside, 0]
+    hammer, grip = group.thing, group.thing.copy()
+    beside = np.abs(hammer[:, 0] - group.hand[:, 0]) < 0.14 / 2.0
+    grip[beside, 0] = group.hand[beside, 0]
     head = hammer + np.array([0.16, 0.06, 0.0])
-    level = np.maximum(1.0 - norm(batch.observation[:, 7:11] - np.array([1.0, 0.0, 0.0, 0.0])) / 0.4, 0.0)
-    in_place = 0.1 * (head[:, 2] > 0.02) + 0.9 * near(norm(batch.goal - head), 0.02, 0.2)
+    level = np.maximum(1.0 - norm(group.observation[:, 7:11] - np.array([1.0, 0.0, 0.0, 0.0])) / 0.4, 0.0)
+    in_place = 0.1 * (head[:, 2] > 0.02) + 0.9 * near(norm(group.goal - head), 0.02, 0.2)
 
     def total(grasped: Floats, placed: Floats, level: Floats) -> Floats:
         return (2.0 * grasped + placed) * level
 
-    reward = _caging(batch, grip, 0.015, 0.02, 0.01).into(total, 6.0 * in_place, level).numbers
-    success = batch.joint("NailSlideJoint") > 0.09
+    reward = _caging(group, grip, 0.015, 0.02, 0.01).into(total, 6.0 * in_place, level).numbers
+    success = group.look(("joint", "NailSlideJoint", "qpos"))[:, 0] > 0.09
     return np.where(success & (reward > 5.0), 10.0, reward), success
 
 
-def _stick_pull(batch: Batch) -> Verdict:
+def _stick_pull(group: Group) -> Verdict:
     """Reward of sawyer_stick_pull_v3.py: grasp the stick, put it in the container's handle, and pull."""
-    stick, handle, goal = batch.thing, batch.observation[:, 11:14], batch.goal
-    stick_first, container_first = batch.start("stick_init_pos"), batch.start("obj_init_pos")
+    stick, handle, goal = group.thing, group.observation[:, 11:14], group.goal
+    stick_first, container_first = group.start("stick_init_pos"), group.start("obj_init_pos")
     ahead, scale = np.array([0.05, 0.0, 0.0]), np.array([1.0, 1.0, 2.0])
     container = handle + ahead
     margin = norm((stick_first - (container_first + ahead)) * scale)
     at_container = near(norm((stick - container) * scale), 0.05, margin)
     stick_in_place = near(norm(stick - goal), 0.05, norm(stick_first - goal))
     container_in_place = near(norm(container - goal), 0.05, norm(container_first - goal))
-    held = (norm(stick - batch.tcp) < 0.02) & (batch.opening > 0) & (stick[:, 2] - 0.01 > stick_first[:, 2])
-    end = batch.place("site", "stick_end")
+    held = (norm(stick - group.tcp) < 0.02) & (group.opening > 0) & (stick[:, 2] - 0.01 > stick_first[:, 2])
+    end = group.look(("site", "stick_end", "xpos"))
     apart = np.abs(end - handle)
     inserted = (end[:, 0] >= handle[:, 0]) & (apart[:, 1] <= 0.04) & (apart[:, 2] <= 0.06)
     there = norm(handle - goal) <= 0.12
 
-    grasping = _caging(batch, stick, 0.014, 0.05, 0.01).into(hamacher, at_container).numbers
+    grasping = _caging(group, stick, 0.014, 0.05, 0.01).into(hamacher, at_container).numbers
     grasped = hamacher(np.ones_like(at_container), at_container)
     pulling = 1.0 + grasped + 5.0 + 2.0 * stick_in_place + 1.0 * container_in_place
     reward = np.where(inserted, np.where(there, 10.0, pulling), 1.0 + grasped + 5.0 * at_container)
@@ -186,15 +185,25 @@ def _stick_pull(batch: Batch) -> Verdict:
 
 GRIPPING_RULES: Mapping[str, Rule] = {
     "hammer": Rule(
-        _hammer, (Part("body", "hammer", turned="hammer"), Part("body", "nail_link", turned="nail_link"))
+        _hammer,
+        (
+            Part(("body", "hammer", "xpos"), rotation=("body", "hammer", "xquat")),
+            Part(("body", "nail_link", "xpos"), rotation=("body", "nail_link", "xquat")),
+        ),
     ),
-    "peg_unplug_side": Rule(_peg_unplug_side, (Part("site", "pegEnd", turned="plug1"),)),
-    "push": Rule(_push, (Part("body", "obj", axes=("geom", "objGeom")),)),
-    "push_back": Rule(_push_back, (Part("geom", "objGeom", axes=("geom", "objGeom")),)),
-    "push_wall": Rule(_push_wall, (Part("geom", "objGeom", axes=("geom", "objGeom")),)),
-    "shelf_place": Rule(_shelf_place, (Part("body", "obj", axes=("geom", "objGeom")),)),
+    "peg_unplug_side": Rule(
+        _peg_unplug_side, (Part(("site", "pegEnd", "xpos"), rotation=("body", "plug1", "xquat")),)
+    ),
+    "push": Rule(_push, (Part(("body", "obj", "xpos"), rotation=("geom", "objGeom", "xmat")),)),
+    "push_back": Rule(_push_back, (Part(("geom", "objGeom", "xpos"), rotation=("geom", "objGeom", "xmat")),)),
+    "push_wall": Rule(_push_wall, (Part(("geom", "objGeom", "xpos"), rotation=("geom", "objGeom", "xmat")),)),
+    "shelf_place": Rule(_shelf_place, (Part(("body", "obj", "xpos"), rotation=("geom", "objGeom", "xmat")),)),
     "stick_pull": Rule(
-        _stick_pull, (Part("body", "stick", axes=("body", "stick")), Part("site", "insertion"))
+        _stick_pull,
+        (
+            Part(("body", "stick", "xpos"), rotation=("body", "stick", "xmat")),
+            Part(("site", "insertion", "xpos")),
+        ),
     ),
 }
 """By task."""

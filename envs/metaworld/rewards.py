@@ -1,8 +1,6 @@
 """What Meta-World's rewards are made of, over many episodes at once, bit for bit what it computes for one.
 
-Sources: `metaworld/utils/reward_utils.py` and `_gripper_caging_reward` of `metaworld/sawyer_xyz_env.py`. Sums of
-squares are `np.vecdot`, the dot product that is inside `np.linalg.norm` of one vector; sums along an axis need
-not have its bits.
+The sources are `metaworld/utils/reward_utils.py` and `metaworld/sawyer_xyz_env.py`.
 """
 
 from __future__ import annotations
@@ -24,7 +22,11 @@ _GAUSSIAN_SCALE = np.sqrt(-2 * np.log(0.1))
 
 
 def norm(vectors: Vector) -> Vector:
-    """Return the lengths (N,) of vectors (N, K)."""
+    """Return the lengths (N,) of vectors (N, K).
+
+    `np.linalg.norm` of one vector takes its dot product, and so does `vecdot`. A sum of squares along an axis
+    need not have the same bits.
+    """
     length: Vector = np.sqrt(np.vecdot(vectors, vectors))
     return length
 
@@ -38,8 +40,8 @@ def magnitude(numbers: Vector) -> Vector:
 def _square(numbers: Vector) -> Vector:
     """Return the squares as Meta-World has them, from `**` of one number.
 
-    That calls the C library's pow, which differs from a product in the last bit once in a thousand times. So does
-    `float_power`, while `**` of an array multiplies.
+    That calls the C library's pow, which differs in the last bit from a product once in a thousand times.
+    `float_power` calls it too, while `**` of an array multiplies.
     """
     squares: Vector = np.float_power(numbers, 2.0)
     return squares
@@ -105,7 +107,7 @@ class Mixed:
 
 
 def closed(fingers: NDArray[np.float32], effort: float, counts: NDArray[np.bool_] | bool) -> Mixed:
-    """Return how far the actions of the fingers (N,) close them, as a share of `effort`; 0 where none `counts`."""
+    """Return how far the actions of the fingers (N,) close them, as a share; 0 where that does not count."""
     wished = (fingers > 0) & counts
     share = np.where(wished, np.minimum(fingers, effort) / effort, 0.0)
     return Mixed(share, wished & (fingers <= np.float32(effort)))

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import gymnasium
 import mujoco
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from clbench.perturbation import draw_perturbation
 from clbench.world import Team, checked_actions, no_episode
 
-from .batch import Batch
+from .batch import Batch, Group
 from .episode import Episode, new_episode
 from .rules import RULES
 from .state import SIZE, State
@@ -33,6 +33,34 @@ class _Lane:
     episode: Episode
 
 
+class _Order:
+    """Lanes in the order in which they take a step: first those whose task has a rule, task by task.
+
+    Args:
+        lanes: That take the step.
+        known: Groups of lanes as they were before, of which some may not have changed.
+    """
+
+    def __init__(self, lanes: Sequence[_Lane], known: Mapping[tuple[_Lane, ...], Group]) -> None:
+        by_task: defaultdict[str, list[int]] = defaultdict(list)
+        for row, lane in enumerate(lanes):
+            by_task[lane.kind[0]].append(row)
+        self.lanes = lanes
+        self.others = [(row, lane.episode) for row, lane in enumerate(lanes) if lane.kind[0] not in RULES]
+        self.rows = [row for task, rows in by_task.items() if task in RULES for row in rows]
+        self.groups: dict[tuple[_Lane, ...], Group] = {}
+        for task, rows in by_task.items():
+            members = tuple(lanes[row] for row in rows)
+            if task in RULES:
+                new = members not in known
+                episodes = [lane.episode for lane in members]
+                self.groups[members] = Group(RULES[task], episodes) if new else known[members]
+        self.batch = Batch(list(self.groups.values())) if self.groups else None
+
+    def __deepcopy__(self, _: dict[int, Any]) -> None:
+        """Return nothing: a copy of a world makes its own, of its own physics."""
+
+
 class MetaWorldVectorWorld:
     """Meta-World's tasks with their own physics, observations, rewards and rules of success, bit for bit.
 
@@ -43,9 +71,8 @@ class MetaWorldVectorWorld:
 
     Args:
         lanes: Places for episodes. A task's scene is compiled when it is first reset to.
-        threads: Threads that advance the physics of the tasks of `RULES`; MuJoCo releases the interpreter lock.
-            Each but the first makes copies of the models that it needs, 19 MB a task. Results do not depend on
-            it.
+        threads: Threads that advance the physics; MuJoCo releases the interpreter lock. Results do not depend
+            on it. Each thread but one makes copies of the models that it needs, of 19 MB.
         perturbed: Whether things are heavier or lighter, and the hand starts elsewhere.
     """
 
@@ -55,7 +82,7 @@ class MetaWorldVectorWorld:
         self._perturbed = perturbed
         self._lanes: list[_Lane | None] = [None] * lanes
         self._idle: defaultdict[_Kind, list[Episode]] = defaultdict(list)
-        self._batches: dict[tuple[_Lane, ...], Batch] = {}
+        self._order: _Order | None = None
         self._team = Team(threads)
 
     def reset(self, lanes: Sequence[int], seeds: Sequence[int], tasks: Sequence[str]) -> State:
@@ -87,33 +114,23 @@ class MetaWorldVectorWorld:
             ValueError: An action has another shape than (4,), or a number in it is not finite.
         """
         actions = checked_actions(actions, self.single_action_space, "Meta-World")
-        moved = [self._lane(lane) for lane in lanes]
+        order = self._order_of([self._lane(lane) for lane in lanes])
         states = np.empty((len(lanes), SIZE), np.float32)
         rewards, successes = np.empty(len(lanes)), np.empty(len(lanes), np.bool_)
-        batches = self._by_task(moved)
-        for batch, rows in batches:
-            batch.aim(actions[rows])
-        self._team.each(Episode.move, [lane.episode for lane in moved if lane.kind[0] in RULES])
-        for batch, rows in batches:
-            states[rows], rewards[rows], successes[rows] = batch.outcome()
-        for row, lane in enumerate(moved):
-            if lane.kind[0] not in RULES:
-                states[row], rewards[row], successes[row] = lane.episode.advance(actions[row])
+        if order.batch is not None:
+            rows = order.rows
+            order.batch.aim(actions[rows])
+            self._team.each(Episode.move, order.batch.episodes)
+            states[rows], rewards[rows], successes[rows] = order.batch.outcome()
+        for row, episode in order.others:
+            states[row], rewards[row], successes[row] = episode.advance(actions[row])
         return states, rewards, successes
 
-    def _by_task(self, lanes: Sequence[_Lane]) -> list[tuple[Batch, list[int]]]:
-        """Return batches of the lanes whose task has a rule, with the rows of each."""
-        by_task: defaultdict[str, list[int]] = defaultdict(list)
-        for row, lane in enumerate(lanes):
-            if lane.kind[0] in RULES:
-                by_task[lane.kind[0]].append(row)
-        known, self._batches, batches = self._batches, {}, []
-        for task, rows in by_task.items():
-            members = tuple(lanes[row] for row in rows)
-            batch = known.get(members) or Batch(RULES[task], [lane.episode for lane in members])
-            self._batches[members] = batch
-            batches.append((batch, rows))
-        return batches
+    def _order_of(self, lanes: Sequence[_Lane]) -> _Order:
+        """Return in which order lanes take their steps; it is kept while they are the same."""
+        if self._order is None or self._order.lanes != lanes:
+            self._order = _Order(lanes, {} if self._order is None else self._order.groups)
+        return self._order
 
     def picture_of(self, lane: int) -> tuple[mujoco.MjModel, mujoco.MjData]:
         """Return the scene of a lane, with things where they stand in its episode, and its physics."""
@@ -125,7 +142,7 @@ class MetaWorldVectorWorld:
     def close(self) -> None:
         """Forget all episodes, and end the threads."""
         self._team.close()
-        self._batches.clear()
+        self._order = None
         self._lanes = [None] * len(self._lanes)
         self._idle.clear()
 
