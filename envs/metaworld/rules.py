@@ -53,13 +53,13 @@ def _drawer_close(group: Group) -> Verdict:
     """Reward of sawyer_drawer_close_v3.py."""
     first = group.start("obj_init_pos")
     to_goal = norm(group.thing - group.goal)
-    in_place = near(to_goal, 0.04, np.abs(norm(first - group.goal) - 0.04))
+    in_place = near(to_goal, 0.05, np.abs(norm(first - group.goal) - 0.05))
     reach_margin = np.abs(norm(first - group.start("init_tcp")) - 0.005)
     reach = near(norm(group.thing - group.tcp), 0.005, reach_margin, gaussian)
     reward = group.closed().into(
         lambda closed, reach, in_place: hamacher(hamacher(reach, closed), in_place) * 10, reach, in_place
     )
-    success = to_goal <= 0.04 + 0.015
+    success = to_goal <= 0.05 + 0.015
     return np.where(success, 10.0, reward.numbers), success
 
 

@@ -66,7 +66,11 @@ def check_start(episode: Any, original: Any) -> None:
     for places in ("body_pos", "site_pos"):
         expected = getattr(original.model, places)
         np.testing.assert_allclose(getattr(episode.model, places), expected, rtol=0, atol=1e-6)
-    seen = ("_prev_obs", "prev_obs", "_last_stable_obs")  # in earlier steps, of which the episode here has none
+    seen = (
+        "_prev_obs",
+        "prev_obs",
+        "_last_stable_obs",
+    )  # in earlier steps, of which the episode here has none
     for name, value in vars(original).items():
         if isinstance(value, float | np.ndarray) and name not in (*PHYSICS, *seen):
             np.testing.assert_allclose(vars(episode)[name], value, rtol=0, atol=2e-4, err_msg=name)

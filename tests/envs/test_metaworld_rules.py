@@ -1,0 +1,123 @@
+"""What is computed for many episodes at once, against Meta-World's own step of each, bit for bit."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from clbench.perturbation import draw_perturbation
+from clbench.task import load_scenario, resolve
+from clbench.world import VectorWorld, vector_world
+
+SCENARIOS = [load_scenario(f"clbench:clbench/{name}-v0") for name in ("MetaWorld", "MetaWorldCW")]
+TASKS = list({task.name: task for one in SCENARIOS for task in one.tasks})
+WORLD = SCENARIOS[0].tasks[0].world
+RULES = resolve("clbench.envs.metaworld.rules:RULES")
+new_episode = resolve("clbench.envs.metaworld.episode:new_episode")
+expert = resolve(SCENARIOS[0].tasks[0].expert)
+
+State = NDArray[np.float32]
+
+
+class Peer:
+    """One lane of a vector world, and an episode that takes Meta-World's own steps."""
+
+    def __init__(self, world: VectorWorld, lane: int, task: str, perturbed: bool) -> None:
+        self.world, self.lane, self.task, self.perturbed = world, lane, task, perturbed
+        self.act = expert(task)
+        self.left = 0
+
+    def begin(self, generator: np.random.Generator) -> None:
+        """Begin both anew from one seed."""
+        seed, self.left = int(generator.integers(2**31)), int(generator.integers(50, 140))
+        drawn = draw_perturbation(seed) if self.perturbed else None
+        self.episode = new_episode(self.task, drawn.mass if drawn else None)
+        self.state = self.episode.begin(seed, drawn.start if drawn else None)
+        (state,) = self.world.reset([self.lane], [seed], [self.task])
+        assert state.tobytes() == self.state.tobytes()
+
+    def follow(self, action: State, state: State, reward: float, success: bool) -> None:
+        """Let the episode take the step that the lane took, and compare what they return."""
+        self.state, expected, succeeded = self.episode.advance(action.clip(-1.0, 1.0))
+        assert state.tobytes() == self.state.tobytes()
+        assert (reward, success) == (expected, succeeded)
+        self.left = 0 if success else self.left - 1
+
+    def check_physics(self) -> None:
+        """Compare what the next step depends on."""
+        _, data = self.world.picture_of(self.lane)  # type: ignore[attr-defined]
+        for name in ("qpos", "qvel", "qacc_warmstart", "mocap_pos", "mocap_quat", "ctrl", "time"):
+            np.testing.assert_array_equal(getattr(data, name), getattr(self.episode.data, name))
+
+
+def compare(tasks: Sequence[str], steps: int, threads: int = 1, perturbed: bool = False) -> int:
+    """Compare `steps` steps of a lane for each of `tasks`, and return how many episodes succeeded.
+
+    Expert and random actions take turns; an episode is begun anew after success, or at a random age. Where
+    lanes have several tasks, three quarters of them take a step, in any order.
+    """
+    world = vector_world(WORLD, len(tasks), threads, perturbed)
+    peers = [Peer(world, lane, task, perturbed) for lane, task in enumerate(tasks)]
+    generator = np.random.default_rng([len(tasks), *tasks[0].encode()])
+    successes = 0
+    for step in range(steps):
+        for peer in peers:
+            if peer.left <= 0:
+                peer.begin(generator)
+        some = len(tasks) if len(set(tasks)) == 1 else -(-3 * len(tasks) // 4)
+        moving = [peers[lane] for lane in generator.permutation(len(tasks))[:some]]
+        actions = generator.uniform(-1.2, 1.2, (some, 4)).astype(np.float32)
+        for row, peer in enumerate(moving):
+            if (step // 6 + peer.lane) % 6:
+                actions[row] = peer.act(peer.state)
+        outcomes = zip(*world.step([peer.lane for peer in moving], actions), strict=True)
+        for peer, action, outcome in zip(moving, actions, outcomes, strict=True):
+            peer.follow(action, *outcome)
+            successes += int(outcome[2])
+    for peer in peers:
+        peer.check_physics()
+    world.close()
+    return successes
+
+
+def test_all_tasks_of_the_scenarios_have_a_rule() -> None:
+    assert set(TASKS) == set(RULES)
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_lanes_of_a_task_do_what_meta_world_does(task: str) -> None:
+    compare([task] * 3, steps=60)
+
+
+def test_lanes_of_all_tasks_do_so_in_any_order_on_two_threads_beside_those_without_a_rule() -> None:
+    assert "reach" not in RULES
+    compare([*TASKS, *TASKS[::3], "reach", "dial_turn"], steps=40, threads=2)
+
+
+def test_perturbed_lanes_of_all_tasks_do_so() -> None:
+    compare([*TASKS, *TASKS[::3]], steps=20, perturbed=True)
+
+
+def test_threads_do_not_change_a_bit() -> None:
+    tasks, lanes = ["push", "drawer_open", "push", "push", "reach", "push"], list(range(6))
+    actions = np.random.default_rng(0).uniform(-1.0, 1.0, (30, 6, 4)).astype(np.float32)
+    trails: list[list[Any]] = []
+    for threads in (1, 2, 5):
+        world = vector_world(WORLD, 6, threads)
+        trails.append([world.reset(lanes, lanes, tasks).tobytes()])
+        trails[-1] += [part.tobytes() for batch in actions for part in world.step(lanes, batch)]
+        world.close()
+    assert trails[0] == trails[1] == trails[2]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("task", TASKS)
+def test_lanes_of_a_task_do_so_over_ten_thousand_steps(task: str) -> None:
+    assert compare([task] * 8, steps=1250) > 5
+
+
+@pytest.mark.slow
+def test_lanes_of_all_tasks_do_so_over_ten_thousand_steps() -> None:
+    assert compare([*TASKS, *TASKS, "reach"], steps=320, threads=2) > 5
