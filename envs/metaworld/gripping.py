@@ -37,9 +37,30 @@ def _caging(
     above = near(norm(group.tcp[:, ::2] - thing[:, ::2]), close, above_margin)
     caging = hamacher(hamacher(beside[0], beside[1]), above)
     gripping = group.closed(effort, caging > 0.97)
-    if not dense:
-        return gripping.into(lambda gripping, caging: hamacher(caging, gripping), caging)
-    return gripping.into(lambda gripping, caging: (hamacher(caging, gripping) + caging) / 2, caging)
+    return gripping.into(_dense if dense else hamacher, caging)
+
+
+def _dense(gripping: Floats, caging: Floats) -> Floats:
+    return (hamacher(caging, gripping) + caging) / 2
+
+
+def _straddling(group: Group, radius: float, close: float) -> tuple[Vector, Vector, Vector]:
+    """Return how well the fingers are around the things, as push_back and pick_place have it of their own.
+
+    What they call the initial places of the pads are those that the pads have now.
+
+    Returns:
+        That (N,), how far the things are from the right pad and from the left one along y (2, N), and the
+        margins of that (2, N).
+    """
+    (right, left), y = group.pads, group.thing[:, 1]
+    aside = np.stack([y - right, left - y])
+    margins = np.abs(np.abs(aside) - 0.05)
+    plane = np.array([1.0, 0.0, 1.0])
+    above_margin = _checked(norm((group.start("obj_init_pos") - group.start("init_tcp")) * plane) - close)
+    above = near(norm((group.tcp - group.thing) * plane), close, above_margin)
+    beside = between(aside, radius, 0.05, margins)
+    return hamacher(hamacher(beside[0], beside[1]), above), aside, margins
 
 
 def _checked(margin: Vector) -> Vector:
@@ -89,24 +110,35 @@ def _push_wall(group: Group) -> Verdict:
 
 
 def _push_back(group: Group) -> Verdict:
-    """Reward of sawyer_push_back_v3.py, where the pads' "initial" places are those they have now."""
+    """Reward of sawyer_push_back_v3.py."""
     thing, first = group.thing, group.start("obj_init_pos")
     to_goal, to_goal_first = norm(thing - group.goal), norm(first - group.goal)
     in_place = near(to_goal, 0.05, to_goal_first)
-    right, left = group.pads
-    aside = np.stack([thing[:, 1] - right, left - thing[:, 1]])
-    margins = np.abs(np.abs(aside) - 0.05)
-    around, on = (between(aside, 0.007, far, margins) for far in (0.05, 0.007 + 0.003))
-    plane = np.array([1.0, 0.0, 1.0])
-    above_margin = _checked(norm((first - group.start("init_tcp")) * plane) - 0.01)
-    above = near(norm((group.tcp - thing) * plane), 0.01, above_margin)
-    caging = hamacher(hamacher(around[0], around[1]), above)
+    caging, aside, margins = _straddling(group, 0.007, 0.01)
+    on = between(aside, 0.007, 0.007 + 0.003, margins)
     grasped = (caging + np.where(caging > 0.95, hamacher(on[0], on[1]), 0.0)) / 2
     reward = hamacher(grasped, in_place)
     held = (norm(thing - group.tcp) < 0.01) & (group.opening > 0) & (group.opening < 0.55)
     held &= to_goal_first - to_goal > 0.01
     reward = np.where(held, reward + (1.0 + 5.0 * in_place), reward)
     return np.where(to_goal < 0.05, 10.0, reward), to_goal <= 0.07
+
+
+def _pick_place(group: Group) -> Verdict:
+    """Reward of sawyer_pick_place_v3.py."""
+    thing, first = group.thing, group.start("obj_init_pos")
+    to_goal = norm(thing - group.goal)
+    in_place = near(to_goal, 0.05, norm(first - group.goal))
+    caging, _, _ = _straddling(group, 0.015, 0.005)
+    grasped = group.closed(counts=caging > 0.97).into(_dense, caging)
+    held = (norm(thing - group.tcp) < 0.02) & (group.opening > 0) & (thing[:, 2] - 0.01 > first[:, 2])
+
+    def total(grasped: Floats, in_place: Floats, placed: Floats) -> Floats:
+        reward = hamacher(grasped, in_place)
+        return np.where(held, reward + placed, reward)
+
+    reward = grasped.into(total, in_place, 1.0 + 5.0 * in_place)
+    return np.where(to_goal < 0.05, 10.0, reward.numbers), to_goal <= 0.07
 
 
 def _shelf_place(group: Group) -> Verdict:
@@ -194,6 +226,7 @@ GRIPPING_RULES: Mapping[str, Rule] = {
     "peg_unplug_side": Rule(
         _peg_unplug_side, (Part(("site", "pegEnd", "xpos"), rotation=("body", "plug1", "xquat")),)
     ),
+    "pick_place": Rule(_pick_place, (Part(("body", "obj", "xpos"), rotation=("geom", "objGeom", "xmat")),)),
     "push": Rule(_push, (Part(("body", "obj", "xpos"), rotation=("geom", "objGeom", "xmat")),)),
     "push_back": Rule(_push_back, (Part(("geom", "objGeom", "xpos"), rotation=("geom", "objGeom", "xmat")),)),
     "push_wall": Rule(_push_wall, (Part(("geom", "objGeom", "xpos"), rotation=("geom", "objGeom", "xmat")),)),

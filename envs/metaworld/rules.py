@@ -15,6 +15,12 @@ from .gripping import GRIPPING_RULES
 from .rewards import Vector, gaussian, hamacher, long_tail, magnitude, near, norm
 
 
+def _reach(group: Group) -> Verdict:
+    """Reward of sawyer_reach_v3.py."""
+    to_goal = norm(group.tcp - group.goal)
+    return 10 * near(to_goal, 0.05, norm(group.start("hand_init_pos") - group.goal)), to_goal <= 0.05
+
+
 def _door_close(group: Group) -> Verdict:
     """Reward of sawyer_door_close_v3.py."""
     to_goal = norm(group.thing - group.goal)
@@ -188,6 +194,7 @@ RULES: Mapping[str, Rule] = {
     "handle_press": Rule(_handle_press, (Part(("site", "handleStart", "xpos")),)),
     "handle_press_side": Rule(_handle_press, (Part(("site", "handleStart", "xpos")),)),
     "plate_slide": Rule(_plate_slide, (Part(("geom", "puck", "xpos"), rotation=("geom", "puck", "xmat")),)),
+    "reach": Rule(_reach, (Part(("body", "obj", "xpos"), rotation=("geom", "objGeom", "xmat")),)),
     "window_close": Rule(
         _window("window_handle_pos_init", gaussian), (Part(("site", "handleCloseStart", "xpos")),)
     ),
