@@ -86,10 +86,10 @@ def hamacher(first: Floats, second: Floats) -> Floats:
 
 @dataclass(frozen=True)
 class Mixed:
-    """Numbers of which some are in single precision, as all is in Meta-World that an open action entered.
+    """Numbers of which some are in single precision, as in Meta-World what follows from the fingers' action.
 
-    An action has single precision, and what Python's own numbers are added to keeps that. Where the fingers'
-    action is cut to 0 or to its greatest effort, it is a number of Python, and so are all that follow.
+    An action has single precision, and keeps it where numbers of Python are added or multiplied. Where it is
+    cut to 0 or to the greatest effort it has become such a number, and what follows has double precision.
     """
 
     numbers: Vector
@@ -110,4 +110,4 @@ def closed(fingers: NDArray[np.float32], effort: float, counts: NDArray[np.bool_
     """Return how far the actions of the fingers (N,) close them, as a share; 0 where that does not count."""
     wished = (fingers > 0) & counts
     share = np.where(wished, np.minimum(fingers, effort) / effort, 0.0)
-    return Mixed(share, wished & (fingers <= np.float32(effort)))
+    return Mixed(share.astype(np.float64), wished & (fingers <= np.float32(effort)))
