@@ -29,7 +29,6 @@ from clbench.record import read_record
 from clbench.run_spec import RunSpec
 from clbench.workers import Processes, Workers
 
-
 METHODS = ("sft", "l2_sp", "low_rate_sft", "constant_weight")
 
 
