@@ -24,6 +24,7 @@ from result_files import read_results, write_results
 from rich.progress import Progress
 
 from clbench.cache import cache_folder
+from clbench.demonstrations import load_demonstrations
 from clbench.policy import Policy
 from clbench.pretraining import pretrained_policy
 from clbench.run import execute
@@ -45,7 +46,10 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
     spec = RunSpec(arguments.scenario, arguments.method, arguments.seed)
-    pretrained_policy(spec.load(), spec.seed)
+    scenario = spec.load()
+    policy, _ = pretrained_policy(scenario, spec.seed)
+    for task in scenario.target:
+        load_demonstrations(task, scenario, policy.config)
     with _cache_without_reports():
         found = measure(spec)
     runs = (read_results("whole_run") or {"runs": {}})["runs"]
