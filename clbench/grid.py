@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import cache
 from pathlib import Path
 
@@ -14,7 +14,7 @@ from clbench.names import folder_name
 from clbench.progress import Bars
 from clbench.run import execute
 from clbench.run_spec import RunSpec, run_length
-from clbench.task import load_scenario
+from clbench.task import Task, load_scenario
 from clbench.training import MethodError
 from clbench.workers import Job, JobError, Workers
 
@@ -201,7 +201,7 @@ def benchmark_jobs(
                 "clbench.grid:run_job",
                 {"spec": spec, **folders},
                 run_length(spec.load(), spec.split, spec.perturb),
-                (_pretraining(spec),),
+                _needs(spec),
                 limits,
                 spec.device,
             )
@@ -225,7 +225,7 @@ def stages_jobs(specs: Sequence[RunSpec], checkpoints: Path | None) -> list[Job]
                 "clbench.grid:stages_job",
                 {"spec": spec, "checkpoints": checkpoints},
                 len(scenario.target) * scenario.budget.adaptation_steps,
-                (_pretraining(spec),),
+                _needs(spec),
                 device=spec.device,
             )
         )
@@ -247,27 +247,49 @@ def _pretraining(spec: RunSpec) -> str:
     return _title(spec.scenario, f"pretraining seed {spec.seed}")
 
 
+def _questions(scenario: str) -> str:
+    """Return the name of the job that collects what questions are asked about."""
+    return _title(scenario, "questions")
+
+
+def _demonstrations(scenario: str, tasks: Iterable[Task]) -> tuple[str, ...]:
+    """Return the names of the jobs that collect the demonstrations of tasks."""
+    return tuple(_title(scenario, f"demonstrations {task.name}") for task in tasks)
+
+
+def _needs(spec: RunSpec) -> tuple[str, ...]:
+    """Return the names of the jobs that a run waits for."""
+    scenario = spec.load()
+    prior = scenario.retained if spec.build().uses.demonstrations != "never" else ()
+    data = _demonstrations(spec.scenario, scenario.target + prior)
+    return _pretraining(spec), _questions(spec.scenario), *data
+
+
 def _preparing_jobs(specs: Sequence[RunSpec]) -> list[Job]:
-    """Return the jobs that make what runs begin with: demonstrations, questions, a policy for each seed."""
+    """Return the jobs that make what runs begin with: demonstrations, questions, a policy for each seed.
+
+    What a policy is pretrained on is not collected for its sake if it lies in the cache or ships.
+    """
     from clbench.pretraining import is_pretrained, vision_steps
 
-    jobs = []
+    jobs: list[Job] = []
+    needed = {name for spec in specs for name in _needs(spec)}
     for name in dict.fromkeys(spec.scenario for spec in specs):
         scenario = load_scenario(name)
         arguments = {"scenario": name}
-        data = demonstration_jobs(name, [task.name for task in scenario.retained + scenario.target])
-        questions = _title(name, "questions")
-        data.append(Job(questions, "clbench.grid:scenes_job", arguments, scenario.budget.question_episodes))
-        jobs += data
         steps = scenario.budget.pretraining_steps + vision_steps(scenario)
+        length = scenario.budget.question_episodes
+        data = [
+            *demonstration_jobs(name, [task.name for task in scenario.target + scenario.retained]),
+            Job(_questions(name), "clbench.grid:scenes_job", arguments, length),
+        ]
         for spec in {spec.seed: spec for spec in specs if spec.scenario == name}.values():
-            jobs.append(
-                Job(
-                    _pretraining(spec),
-                    "clbench.grid:pretrain_job",
-                    {**arguments, "seed": spec.seed},
-                    0 if is_pretrained(scenario, spec.seed) else steps,
-                    tuple(job.name for job in data),
-                )
+            made = is_pretrained(scenario, spec.seed)
+            needs = () if made else (_questions(name), *_demonstrations(name, scenario.retained))
+            needed.update(needs)
+            job = "clbench.grid:pretrain_job"
+            data.append(
+                Job(_pretraining(spec), job, {**arguments, "seed": spec.seed}, 0 if made else steps, needs)
             )
+        jobs += [job for job in data if job.name in needed]
     return jobs

@@ -13,8 +13,10 @@ from typing import Any
 import pytest
 
 from clbench.grid import benchmark_jobs, run_jobs
+from clbench.pretraining import pretrained_policy
 from clbench.progress import Bars
 from clbench.run_spec import RunSpec, has_record
+from clbench.task import load_scenario
 from clbench.workers import Job, Processes
 
 TOY = "clbench.testing:clbench/Toy-v0"
@@ -132,9 +134,30 @@ def test_runs_of_two_scenarios_have_jobs_of_their_own_and_one_pretraining_for_ea
         "Fetch-v0 pretraining seed 0",
         "Toy-v0 pretraining seed 0",
     ]
-    needs = {job.name: job.needs for job in jobs}
-    assert needs["Toy-v0 sft seed 0"] == ("Toy-v0 pretraining seed 0",)
-    assert "Toy-v0 demonstrations left" in needs["Toy-v0 pretraining seed 0"]
+
+
+def test_a_run_waits_for_what_it_is_made_from_and_nothing_else_is_made(
+    tmp_path: Path, empty_caches: Path
+) -> None:
+    def needs(*methods: str) -> dict[str, set[str]]:
+        jobs = benchmark_jobs([RunSpec(TOY, method, 0) for method in methods], tmp_path)
+        return {job.name: set(job.needs) for job in jobs}
+
+    scenario = load_scenario(TOY)
+    skills = {f"Toy-v0 demonstrations {task.name}" for task in scenario.retained}
+    targets = {f"Toy-v0 demonstrations {task.name}" for task in scenario.target}
+    policy, questions, sft, joint = (
+        f"Toy-v0 {name}" for name in ("pretraining seed 0", "questions", "sft seed 0", "joint seed 0")
+    )
+    found = needs("sft", "joint")
+    assert found[policy] == {questions} | skills
+    assert found[sft] == {policy, questions} | targets
+    assert found[joint] == {policy, questions} | targets | skills
+    assert set(found) == {sft, joint} | found[joint]
+    pretrained_policy(scenario, 0)
+    found = needs("sft")
+    assert found[policy] == set()
+    assert set(found) == {sft} | found[sft]
 
 
 def test_one_worker_and_two_give_equal_records_and_a_stopped_grid_goes_on(
