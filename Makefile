@@ -10,7 +10,7 @@ QUICK := build/quick
 leaderboard:
 	@start=$$(date +%s) \
 		&& $(MAKE) --no-print-directory .venv/installed \
-		&& $(BIN)/clbench run $(SCENARIO) sft experience_replay frozen --seeds 1 --records $(QUICK)/records \
+		&& $(BIN)/clbench run $(SCENARIO) sft experience_replay --seeds 1 --records $(QUICK)/records \
 		&& $(BIN)/clbench leaderboard --records $(QUICK)/records \
 		&& seconds=$$(($$(date +%s) - start)) \
 		&& echo "This table took $$((seconds / 60)) min $$((seconds % 60)) s, installing included."
