@@ -20,7 +20,8 @@ INTRODUCTION = """\
 
 Made by `python benchmarks/report.py` from `benchmarks/results/`, which `make benchmark` measures. Ratios are
 of blocks that take turns on one machine, the median with a 95 % bootstrap interval; seconds are of that
-machine and of no use beside another's. Nothing else ran beside them.
+machine and of no use beside another's. Nothing else ran beside them but, on the other core, beside whole runs
+and steps of adaptation.
 """
 TRIED = """\
 ## What was tried
@@ -54,6 +55,8 @@ def _read(name: str) -> Any:
 
 
 def _ratio(ratio: dict[str, float]) -> str:
+    if ratio["low"] == ratio["high"]:  # of one round, or of a thing to itself
+        return f"{ratio['median_ratio']:.2f}"
     return f"{ratio['median_ratio']:.2f} [{ratio['low']:.2f}, {ratio['high']:.2f}]"
 
 
@@ -124,12 +127,14 @@ def _steps() -> Iterator[str]:
 
 def _workers() -> Iterator[str]:
     found = _read("workers")
+    seconds = ", ".join(f"{way} {taken:.0f} s" for way, taken in found["seconds"].items())
     yield "## Workers"
     yield ""
     yield (
         f"{found['runs']} runs by one worker take {_ratio(found['one_worker_to_many'])} times as long as by "
         f"{found['workers']}; by a Ray cluster of {found['workers']} workers "
-        f"{_ratio(found['ray_to_many'])} times as long as by these. The records are the same."
+        f"{_ratio(found['ray_to_many'])} times as long as by these: {seconds}. The records are the same. Each "
+        "task of Ray is a process that imports everything anew, which takes about 5 s; whole runs take minutes."
     )
     yield ""
 
