@@ -133,8 +133,8 @@ def _workers() -> Iterator[str]:
     yield (
         f"{found['runs']} runs by one worker take {_ratio(found['one_worker_to_many'])} times as long as by "
         f"{found['workers']}; by a Ray cluster of {found['workers']} workers "
-        f"{_ratio(found['ray_to_many'])} times as long as by these: {seconds}. The records are the same. Each "
-        "task of Ray is a process that imports everything anew, which takes about 5 s; whole runs take minutes."
+        f"{_ratio(found['ray_to_many'])} times as long as by these: {seconds}. The records are the same. "
+        "Each task of Ray is a process that imports everything anew, about 5 s; whole runs take minutes."
     )
     yield ""
 
