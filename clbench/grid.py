@@ -279,9 +279,11 @@ def _preparing_jobs(specs: Sequence[RunSpec]) -> list[Job]:
         arguments = {"scenario": name}
         steps = scenario.budget.pretraining_steps + vision_steps(scenario)
         length = scenario.budget.question_episodes
+        # what all runs wait for comes before what some do
         data = [
-            *demonstration_jobs(name, [task.name for task in scenario.target + scenario.retained]),
+            *demonstration_jobs(name, [task.name for task in scenario.target]),
             Job(_questions(name), "clbench.grid:scenes_job", arguments, length),
+            *demonstration_jobs(name, [task.name for task in scenario.retained]),
         ]
         for spec in {spec.seed: spec for spec in specs if spec.scenario == name}.values():
             made = is_pretrained(scenario, spec.seed)
