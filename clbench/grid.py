@@ -259,18 +259,21 @@ def _demonstrations(scenario: str, tasks: Iterable[Task]) -> tuple[str, ...]:
 
 def _needs(spec: RunSpec) -> tuple[str, ...]:
     """Return the names of the jobs that a run waits for."""
+    from clbench.pretraining import is_pretrained
+
     scenario = spec.load()
     prior = scenario.retained if spec.build().uses.demonstrations != "never" else ()
     data = _demonstrations(spec.scenario, scenario.target + prior)
-    return _pretraining(spec), _questions(spec.scenario), *data
+    made = is_pretrained(load_scenario(spec.scenario), spec.seed)
+    return *(() if made else (_pretraining(spec),)), _questions(spec.scenario), *data
 
 
 def _preparing_jobs(specs: Sequence[RunSpec]) -> list[Job]:
     """Return the jobs that make what runs begin with: demonstrations, questions, a policy for each seed.
 
-    What a policy is pretrained on is not collected for its sake if it lies in the cache or ships.
+    A policy that lies in the cache or ships has no job, nor has what it was pretrained on for its sake.
     """
-    from clbench.pretraining import is_pretrained, vision_steps
+    from clbench.pretraining import vision_steps
 
     jobs: list[Job] = []
     needed = {name for spec in specs for name in _needs(spec)}
@@ -286,12 +289,9 @@ def _preparing_jobs(specs: Sequence[RunSpec]) -> list[Job]:
             *demonstration_jobs(name, [task.name for task in scenario.retained]),
         ]
         for spec in {spec.seed: spec for spec in specs if spec.scenario == name}.values():
-            made = is_pretrained(scenario, spec.seed)
-            needs = () if made else (_questions(name), *_demonstrations(name, scenario.retained))
-            needed.update(needs)
+            needs = (_questions(name), *_demonstrations(name, scenario.retained))
+            needed.update(needs if _pretraining(spec) in needed else ())
             job = "clbench.grid:pretrain_job"
-            data.append(
-                Job(_pretraining(spec), job, {**arguments, "seed": spec.seed}, 0 if made else steps, needs)
-            )
+            data.append(Job(_pretraining(spec), job, {**arguments, "seed": spec.seed}, steps, needs))
         jobs += [job for job in data if job.name in needed]
     return jobs

@@ -126,13 +126,13 @@ def test_runs_of_two_scenarios_have_jobs_of_their_own_and_one_pretraining_for_ea
     tmp_path: Path,
 ) -> None:
     scenarios = ("clbench/Fetch-v0", TOY)
-    specs = [RunSpec(name, method, 0) for name in scenarios for method in ("sft", "frozen")]
+    specs = [RunSpec(name, method, 1) for name in scenarios for method in ("sft", "frozen")]
     jobs = benchmark_jobs(specs, tmp_path)
     names = [job.name for job in jobs]
     assert len(set(names)) == len(names)
     assert [name for name in names if "pretraining" in name] == [
-        "Fetch-v0 pretraining seed 0",
-        "Toy-v0 pretraining seed 0",
+        "Fetch-v0 pretraining seed 1",
+        "Toy-v0 pretraining seed 1",
     ]
 
 
@@ -155,9 +155,7 @@ def test_a_run_waits_for_what_it_is_made_from_and_nothing_else_is_made(
     assert found[joint] == {policy, questions} | targets | skills
     assert set(found) == {sft, joint} | found[joint]
     pretrained_policy(scenario, 0)
-    found = needs("sft")
-    assert found[policy] == set()
-    assert set(found) == {sft} | found[sft]
+    assert needs("sft") == {sft: {questions} | targets, questions: set(), **{name: set() for name in targets}}
 
 
 def test_one_worker_and_two_give_equal_records_and_a_stopped_grid_goes_on(
