@@ -67,7 +67,8 @@ def test_three_commands_lead_from_nothing_to_a_row_on_the_board(tmp_path: Path) 
     command = [sys.executable, "-m"]
     subprocess.run([*command, *new.split()], cwd=tmp_path, check=True, capture_output=True)
     plain = ["-p", "no:cacheprovider", "-p", "no:xdist"]
-    subprocess.run([*command, *check.split(), *plain], cwd=tmp_path, check=True, capture_output=True)
+    test = check.removeprefix("python -m ").split()
+    subprocess.run([*command, *test, *plain], cwd=tmp_path, check=True, capture_output=True)
     words = [*submit.split(), *toy.split()]
     told = subprocess.run([*command, *words], cwd=tmp_path, check=True, capture_output=True, text=True).stdout
     assert "Rank 1 of 1 in the division prior-data-free." in told
