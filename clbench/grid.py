@@ -45,10 +45,10 @@ def run_jobs(jobs: Sequence[Job], workers: Workers, bars: Bars) -> dict[str, str
                 if kind == "progress":
                     bars.advance(job.name, value)
                     continue
-                if kind == "failed":
-                    failed[job.name] = value
-                else:
+                if kind == "done":
                     ended.add(job.name)
+                else:
+                    failed[job.name] = value
                 bars.finish(job.name, f"{value} ({time.monotonic() - started.pop(job.name):.0f} s)")
     finally:
         workers.close()
@@ -193,15 +193,15 @@ def benchmark_jobs(
         tensorboard: Folder below which the runs are logged for TensorBoard; they are not if None.
     """
     folders = {"records": records, "checkpoints": checkpoints, "tensorboard": tensorboard}
-    jobs = _preparing_jobs(specs)
-    for spec in specs:
+    jobs, needs = _preparing_jobs(specs)
+    for spec, needed in zip(specs, needs, strict=True):
         jobs.append(
             Job(
                 _title(spec.scenario, _label(spec)),
                 "clbench.grid:run_job",
                 {"spec": spec, **folders},
                 run_length(spec.load(), spec.split, spec.perturb),
-                _needs(spec),
+                needed,
                 limits,
                 spec.device,
             )
@@ -216,8 +216,8 @@ def stages_jobs(specs: Sequence[RunSpec], checkpoints: Path | None) -> list[Job]
         specs: The runs.
         checkpoints: Folder below which the policies are kept; they stay in the cache alone if None.
     """
-    jobs = _preparing_jobs(specs)
-    for spec in specs:
+    jobs, needs = _preparing_jobs(specs)
+    for spec, needed in zip(specs, needs, strict=True):
         scenario = spec.load()
         jobs.append(
             Job(
@@ -225,7 +225,7 @@ def stages_jobs(specs: Sequence[RunSpec], checkpoints: Path | None) -> list[Job]
                 "clbench.grid:stages_job",
                 {"spec": spec, "checkpoints": checkpoints},
                 len(scenario.target) * scenario.budget.adaptation_steps,
-                _needs(spec),
+                needed,
                 device=spec.device,
             )
         )
@@ -242,9 +242,9 @@ def _label(spec: RunSpec) -> str:
     return f"{spec.label} seed {spec.seed}{order}"
 
 
-def _pretraining(spec: RunSpec) -> str:
-    """Return the name of the job that makes the policy that a run begins with."""
-    return _title(spec.scenario, f"pretraining seed {spec.seed}")
+def _pretraining(scenario: str, seed: int) -> str:
+    """Return the name of the job that makes the policy that the runs of a seed begin with."""
+    return _title(scenario, f"pretraining seed {seed}")
 
 
 def _questions(scenario: str) -> str:
@@ -257,26 +257,27 @@ def _demonstrations(scenario: str, tasks: Iterable[Task]) -> tuple[str, ...]:
     return tuple(_title(scenario, f"demonstrations {task.name}") for task in tasks)
 
 
-def _needs(spec: RunSpec) -> tuple[str, ...]:
+def _needs(spec: RunSpec, pretrained: bool) -> tuple[str, ...]:
     """Return the names of the jobs that a run waits for."""
-    from clbench.pretraining import is_pretrained
-
     scenario = spec.load()
     prior = scenario.retained if spec.build().uses.demonstrations != "never" else ()
     data = _demonstrations(spec.scenario, scenario.target + prior)
-    made = is_pretrained(load_scenario(spec.scenario), spec.seed)
-    return *(() if made else (_pretraining(spec),)), _questions(spec.scenario), *data
+    policy = () if pretrained else (_pretraining(spec.scenario, spec.seed),)
+    return *policy, _questions(spec.scenario), *data
 
 
-def _preparing_jobs(specs: Sequence[RunSpec]) -> list[Job]:
-    """Return the jobs that make what runs begin with: demonstrations, questions, a policy for each seed.
+def _preparing_jobs(specs: Sequence[RunSpec]) -> tuple[list[Job], list[tuple[str, ...]]]:
+    """Return the jobs that make what runs begin with, and for each run the names of those it waits for.
 
     A policy that lies in the cache or ships has no job, nor has what it was pretrained on for its sake.
     """
-    from clbench.pretraining import vision_steps
+    from clbench.pretraining import is_pretrained, vision_steps
 
+    starts = dict.fromkeys((spec.scenario, spec.seed) for spec in specs)
+    missing = [start for start in starts if not is_pretrained(load_scenario(start[0]), start[1])]
+    needs = [_needs(spec, (spec.scenario, spec.seed) not in missing) for spec in specs]
+    needed = {name for names in needs for name in names}
     jobs: list[Job] = []
-    needed = {name for spec in specs for name in _needs(spec)}
     for name in dict.fromkeys(spec.scenario for spec in specs):
         scenario = load_scenario(name)
         arguments = {"scenario": name}
@@ -288,10 +289,10 @@ def _preparing_jobs(specs: Sequence[RunSpec]) -> list[Job]:
             Job(_questions(name), "clbench.grid:scenes_job", arguments, length),
             *demonstration_jobs(name, [task.name for task in scenario.retained]),
         ]
-        for spec in {spec.seed: spec for spec in specs if spec.scenario == name}.values():
-            needs = (_questions(name), *_demonstrations(name, scenario.retained))
-            needed.update(needs if _pretraining(spec) in needed else ())
+        seen = (_questions(name), *_demonstrations(name, scenario.retained))
+        for seed in (seed for owner, seed in missing if owner == name):
+            needed.update(seen)
             job = "clbench.grid:pretrain_job"
-            data.append(Job(_pretraining(spec), job, {**arguments, "seed": spec.seed}, steps, needs))
+            data.append(Job(_pretraining(name, seed), job, {**arguments, "seed": seed}, steps, seen))
         jobs += [job for job in data if job.name in needed]
-    return jobs
+    return jobs, needs

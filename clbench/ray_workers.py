@@ -9,18 +9,23 @@ import sys
 import time
 from collections import defaultdict
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 from clbench.cache import cache_folder, hash_of
 from clbench.extras import require
 from clbench.record import Record, read_record, write_record
-from clbench.workers import Event, Job, do_job
+from clbench.workers import Event, Job, Processes
 
 RETRIES = 3
 """How often a job begins again after its worker was lost. A run goes on with its last finished stage."""
 
 _PASSED_ON = ("CLBENCH_CACHE", "MINARI_DATASETS_PATH", "MUJOCO_GL")
+
+
+class LostProcessError(Exception):
+    """The process of a job ended and said nothing: it was killed, perhaps for want of memory."""
 
 
 class RayWorkers:
@@ -64,13 +69,13 @@ class RayWorkers:
     def start(self, job: Job) -> None:
         """Begin a job as a task of the cluster."""
         gpus = 0 if job.device == "cpu" else 1
-        # a process for each job, as on one machine: what a method leaves behind meets no other
-        task = self._ray.remote(num_cpus=1, num_gpus=gpus, max_retries=RETRIES, max_calls=1)(_do)
+        options = {"max_retries": RETRIES, "retry_exceptions": [LostProcessError]}
+        task = self._ray.remote(num_cpus=1, num_gpus=gpus, **options)(_do)
         arguments = {
             name: value.absolute() if isinstance(value, Path) else value
             for name, value in job.arguments.items()
         }
-        self._running[task.remote(self._told, job.name, job.function, arguments)] = job
+        self._running[task.remote(self._told, replace(job, arguments=arguments))] = job
 
     def events(self) -> Iterator[Event]:
         """Give what was told since the last call; wait for it, but no longer than a second."""
@@ -97,13 +102,16 @@ class RayWorkers:
 
     def _end(self, job: Job, reference: Any) -> tuple[Literal["done", "failed"], str]:
         """Write the records of a job that ended, and return how it did."""
+        lost = f"its worker was lost {RETRIES + 1} times: "
         try:
             result: _Result = self._ray.get(reference)
         except self._ray.exceptions.RayTaskError as error:
+            if isinstance(error.cause, LostProcessError):
+                return "failed", f"{lost}{error.cause}"
             return "failed", f"its worker could not do it: {str(error).strip().splitlines()[-1]}"
         except self._ray.exceptions.RayError as error:
             first = str(error).strip().partition("\n")[0]
-            return "failed", f"its worker was lost {RETRIES + 1} times: {type(error).__name__}: {first}"
+            return "failed", f"{lost}{type(error).__name__}: {first}"
         for path, record in result.records.items():
             write_record(record, job.arguments["records"] / path)
         return result.kind, result.value
@@ -137,21 +145,44 @@ class _Told:
         return self._amounts
 
 
-def _do(told: Any, name: str, function: str, arguments: dict[str, Any]) -> _Result:
+def _do(told: Any, job: Job) -> _Result:
     """Do a job on a node of the cluster. Its records are returned: the node may not see their folder."""
-    told.begin.remote(name)
-    arguments, folder = dict(arguments), None
-    if "records" in arguments:
-        # the same on every attempt, for it is part of what a run goes on by
-        folder = cache_folder() / "ray" / hash_of([name, str(arguments["records"])])
-        shutil.rmtree(folder, ignore_errors=True)
-        arguments["records"] = folder
-    kind, value = do_job(function, arguments, lambda amount: told.add.remote(name, amount))
-    found = sorted(folder.rglob("*.json")) if folder else []
-    records = {path.relative_to(folder).as_posix(): read_record(path) for path in found} if folder else {}
-    if folder:
-        shutil.rmtree(folder, ignore_errors=True)
-    return _Result(kind, value, records)
+    told.begin.remote(job.name)
+    if "records" not in job.arguments:
+        return _Result(*_do_apart(told, job), {})
+    # the same on every attempt, for it is part of what a run goes on by
+    folder = cache_folder() / "ray" / hash_of([job.name, str(job.arguments["records"])])
+    shutil.rmtree(folder, ignore_errors=True)
+    ended = _do_apart(told, replace(job, arguments=job.arguments | {"records": folder}))
+    found = sorted(folder.rglob("*.json"))
+    records = {path.relative_to(folder).as_posix(): read_record(path) for path in found}
+    shutil.rmtree(folder, ignore_errors=True)
+    return _Result(*ended, records)
+
+
+def _do_apart(told: Any, job: Job) -> tuple[Literal["done", "failed"], str]:
+    """Do a job in a process of its own, as on one machine: what a method leaves behind meets no other.
+
+    It is forked from one that this worker keeps and that has imported all; a worker for each job takes 5 s.
+
+    Raises:
+        LostProcessError: The process was killed.
+    """
+    # else the process reads the program of this one, which is Ray's, and imports Ray
+    vars(sys.modules["__main__"]).pop("__file__", None)
+    processes = Processes(1)
+    processes.start(job)
+    try:
+        while True:
+            for _, kind, value in processes.events():
+                if kind == "progress":
+                    told.add.remote(job.name, value)
+                elif kind == "lost":
+                    raise LostProcessError(value)
+                else:
+                    return kind, value
+    finally:
+        processes.close()
 
 
 def _environment() -> dict[str, str]:

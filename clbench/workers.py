@@ -54,8 +54,8 @@ class Event(NamedTuple):
     """What a worker tells."""
 
     job: Job
-    kind: Literal["progress", "done", "failed"]
-    """The last two are the end of the job."""
+    kind: Literal["progress", "done", "failed", "lost"]
+    """All but the first are the end of the job; it is lost if its process ended and said nothing."""
     value: Any
     """How much was done since the last event, the text that the job returned, or what went wrong."""
 
@@ -205,7 +205,7 @@ def _receive(worker: _Worker) -> tuple[Any, Any]:
         worker.process.join()
         if worker.broken:
             return "failed", f"stopped, because {worker.broken}"
-        return "failed", f"its process ended without a result (exit code {worker.process.exitcode})"
+        return "lost", f"its process ended without a result (exit code {worker.process.exitcode})"
     return kind, value
 
 
@@ -222,10 +222,10 @@ def _work(
         except OSError:  # nobody listens any more: stop as if killed, so that the run can be resumed
             sys.exit(1)
 
-    connection.send(do_job(function, arguments, send))
+    connection.send(_do_job(function, arguments, send))
 
 
-def do_job(
+def _do_job(
     function: str, arguments: dict[str, Any], send: Callable[[float], None]
 ) -> tuple[Literal["done", "failed"], str]:
     """Do one job in this process, and return how it ended and what came of it.

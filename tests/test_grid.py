@@ -123,7 +123,7 @@ def test_what_the_longest_work_waits_for_begins_first(bars: Bars) -> None:
 
 
 def test_runs_of_two_scenarios_have_jobs_of_their_own_and_one_pretraining_for_each_seed(
-    tmp_path: Path,
+    tmp_path: Path, empty_caches: Path
 ) -> None:
     scenarios = ("clbench/Fetch-v0", TOY)
     specs = [RunSpec(name, method, 1) for name in scenarios for method in ("sft", "frozen")]

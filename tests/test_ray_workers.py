@@ -1,14 +1,13 @@
 """Ray: the same records as on one machine, and nothing is lost with a worker."""
 
 import io
-import os
-import signal
 import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import psutil
 import pytest
 
 from clbench.grid import benchmark_jobs, run_jobs
@@ -34,9 +33,13 @@ def lost_once(progress, path):
     attempts = Path(path)
     with attempts.open("a") as file:
         file.write(f"{os.getpid()}\\n")
-    if len(attempts.read_text().split()) == 1:
-        time.sleep(60)
+    while len(attempts.read_text().split()) == 1:
+        time.sleep(0.1)
+        progress(0)
     return "went well in the end"
+
+def lost_always(progress):
+    os._exit(3)
 """
 
 # a cluster of its own for each test; Ray leaves a socket and a log file to the garbage collector
@@ -48,18 +51,20 @@ def _jobs_module(write_module: Callable[[str, str], None]) -> None:
     write_module("some_jobs", JOBS)
 
 
-def _kill_first(path: Path) -> None:
-    """Kill the process whose id is the first in a file, as soon as it is there."""
+def _kill_first(path: Path, ancestor: int) -> None:
+    """Kill the process whose id is the first in a file, or one that it comes from, as soon as it is there."""
     deadline = time.monotonic() + 100
     while time.monotonic() < deadline:
         if path.exists() and path.read_text().strip():
-            os.kill(int(path.read_text().split()[0]), signal.SIGKILL)
+            process = psutil.Process(int(path.read_text().split()[0]))
+            [process, *process.parents()][ancestor].kill()
             return
         time.sleep(0.05)
 
 
+@pytest.mark.parametrize("ancestor", [0, 2], ids=["process", "worker"])
 def test_a_job_that_fails_leaves_the_others_alone_and_one_whose_worker_is_killed_is_done_again(
-    tmp_path: Path, bars: Bars
+    ancestor: int, tmp_path: Path, bars: Bars
 ) -> None:
     path = tmp_path / "attempts"
     jobs = [
@@ -67,12 +72,16 @@ def test_a_job_that_fails_leaves_the_others_alone_and_one_whose_worker_is_killed
         Job("hopeless", "some_jobs:good", {}, 1, ("wrong",)),
         Job("fine", "some_jobs:good", {}, 1),
         Job("lost", "some_jobs:lost_once", {"path": str(path)}, 1),
+        Job("cursed", "some_jobs:lost_always", {}, 1),
     ]
-    killer = threading.Thread(target=_kill_first, args=(path,))
+    killer = threading.Thread(target=_kill_first, args=(path, ancestor))
     killer.start()
     failed = run_jobs(jobs, RayWorkers("local", 2), bars)
     killer.join()
-    assert set(failed) == {"wrong", "hopeless"}
+    assert set(failed) == {"wrong", "hopeless", "cursed"}
+    assert failed["cursed"] == (
+        "its worker was lost 4 times: its process ended without a result (exit code 3)"
+    )
     assert "ValueError: went wrong" in failed["wrong"]
     assert len(path.read_text().split()) == 2
     assert isinstance(bars.console.file, io.StringIO)

@@ -29,7 +29,7 @@ class ToyCamera:
         return states[:, :4]
 
     def draw(self, states: States, views: Views) -> Images:
-        """Return pictures (N, 16, 16, 3); up is where it is in the plane. views make them darker."""
+        """Return pictures (N, 16, 16, 3); up is where it is in the plane. A view makes one darker."""
         centres = np.linspace(-REACH, REACH, self.image_size)
         images = np.zeros((len(states), self.image_size, self.image_size, 3), np.uint8)
         for channel, thing in enumerate((states[:, :2], states[:, 2:4])):
