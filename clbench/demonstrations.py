@@ -242,7 +242,7 @@ class Demonstrations:
         pieces = [_chunks(episode, chunk) for episode in episodes]
         action, valid = (torch.from_numpy(np.concatenate(column)) for column in zip(*pieces, strict=True))
         scenes = np.concatenate([episode.state[:-1] for episode in episodes])
-        state, image = observed(task, scenes)
+        state, image = map(torch.from_numpy, observed(task, scenes))
         rows = torch.tensor([[0, len(state)]])
         return cls(
             torch.from_numpy(scenes), state, image, action, valid, encode(task.instructions)[None], rows

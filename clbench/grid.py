@@ -12,8 +12,8 @@ from rich.console import Console
 from clbench.limits import Limits
 from clbench.names import folder_name
 from clbench.progress import Bars
-from clbench.run import execute
-from clbench.run_spec import RunSpec, run_length
+from clbench.run import evaluate_pretrained, execute, is_reported
+from clbench.run_spec import EPISODE_WEIGHT, RunSpec, run_length
 from clbench.task import Task, load_scenario
 from clbench.training import MethodError
 from clbench.workers import Job, JobError, Workers
@@ -124,6 +124,12 @@ def pretrain_job(scenario: str, seed: int, progress: Callable[[float], None]) ->
     return f"{sum(parameter.numel() for parameter in policy.parameters()):,} parameters"
 
 
+def report_job(spec: RunSpec, progress: Callable[[float], None]) -> str:
+    """Evaluate the pretrained policy that a run begins with, unless that is in the cache."""
+    evaluate_pretrained(spec, progress)
+    return "what runs of most methods begin with"
+
+
 def run_job(
     spec: RunSpec,
     records: Path,
@@ -194,14 +200,17 @@ def benchmark_jobs(
     """
     folders = {"records": records, "checkpoints": checkpoints, "tensorboard": tensorboard}
     jobs, needs = _preparing_jobs(specs)
+    reports = _report_jobs(specs, needs)
+    jobs += reports.values()
     for spec, needed in zip(specs, needs, strict=True):
+        report = _report(spec)
         jobs.append(
             Job(
                 _title(spec.scenario, _label(spec)),
                 "clbench.grid:run_job",
                 {"spec": spec, **folders},
                 run_length(spec.load(), spec.split, spec.perturb),
-                needed,
+                (*needed, report) if report in reports else needed,
                 limits,
                 spec.device,
             )
@@ -238,13 +247,21 @@ def _title(scenario: str, work: str) -> str:
 
 
 def _label(spec: RunSpec) -> str:
-    order = f" order {spec.order}" if spec.order else ""
-    return f"{spec.label} seed {spec.seed}{order}"
+    return f"{spec.label} {_seed(spec)}"
+
+
+def _seed(spec: RunSpec) -> str:
+    return f"seed {spec.seed} order {spec.order}" if spec.order else f"seed {spec.seed}"
 
 
 def _pretraining(scenario: str, seed: int) -> str:
     """Return the name of the job that makes the policy that the runs of a seed begin with."""
     return _title(scenario, f"pretraining seed {seed}")
+
+
+def _report(spec: RunSpec) -> str:
+    """Return the name of the job that evaluates the policy that a run begins with."""
+    return _title(spec.scenario, f"evaluation of the pretrained policy {_seed(spec)}")
 
 
 def _questions(scenario: str) -> str:
@@ -296,3 +313,23 @@ def _preparing_jobs(specs: Sequence[RunSpec]) -> tuple[list[Job], list[tuple[str
             data.append(Job(_pretraining(name, seed), job, {**arguments, "seed": seed}, steps, seen))
         jobs += [job for job in data if job.name in needed]
     return jobs, needs
+
+
+def _report_jobs(specs: Sequence[RunSpec], needs: Sequence[tuple[str, ...]]) -> dict[str, Job]:
+    """Return the jobs that evaluate what runs begin with, by name, where that is not in the cache.
+
+    Args:
+        specs: The runs.
+        needs: Names of the jobs that each of them waits for.
+    """
+    jobs = {}
+    for name, (spec, needed) in {_report(pair[0]): pair for pair in zip(specs, needs, strict=True)}.items():
+        if is_reported(spec):
+            continue
+        scenario = spec.load()
+        perturbed = len(scenario.retained) * scenario.budget.episodes("perturbed") if spec.perturb else 0
+        length = EPISODE_WEIGHT * (len(scenario.tasks) * scenario.budget.episodes(spec.split) + perturbed)
+        shared = (_pretraining(spec.scenario, spec.seed), _questions(spec.scenario))
+        waits = tuple(other for other in needed if other in shared)
+        jobs[name] = Job(name, "clbench.grid:report_job", {"spec": spec}, length, waits, device=spec.device)
+    return jobs

@@ -25,7 +25,7 @@ from clbench.pretraining import pretrained_policy, pretraining_inputs
 from clbench.questions import load_questions
 from clbench.seeding import derive_seed, seeded, torch_generator
 from clbench.strict_json import check_json, read_json
-from clbench.task import Scenario
+from clbench.task import Scenario, Task
 from clbench.training import deterministic
 
 STAGE_FILES = ("policy.safetensors", "policy.json", "method.safetensors", "method.json")
@@ -54,10 +54,7 @@ class Learner:
         pretrained, self.pretrained_folder = pretrained_policy(scenario, seed)
         self.pretrained = pretrained.to(device)
         self.policy = copy.deepcopy(self.pretrained)
-        self.data = {
-            task.name: load_demonstrations(task, scenario, self.policy.config)
-            for task in scenario.retained + scenario.target
-        }
+        self._demonstrations: dict[str, Demonstrations] = {}
         self.questions, self.report_questions = load_questions(scenario)
 
     def prepare(self) -> int:
@@ -79,7 +76,7 @@ class Learner:
         """
         budget, task = self.scenario.budget, self.scenario.target[number - 1]
         self.where = f"stage {number} ({task.name})"
-        target = self._source("target", number, self.data[task.name])
+        target = self._source("target", number, self._demonstrations_of(task))
         prior = self.prior(number, ("throughout",))
         method_seed = derive_seed("method", self.seed, number)
         stage = Stage(number, task, method_seed, budget.adaptation_steps, target, prior)
@@ -104,12 +101,18 @@ class Learner:
         sources = {}
         if self.method.uses.demonstrations in when:
             before = self.scenario.retained + self.scenario.target[: max(0, number - 1)]
-            parts = [self.data[task.name] for task in before]
+            parts = [self._demonstrations_of(task) for task in before]
             demonstrations = Demonstrations.cat(parts) if parts else Nothing()
             sources["demonstrations"] = self._source("prior demonstrations", number, demonstrations)
         if self.method.uses.questions in when:
             sources["questions"] = self._source("prior questions", number, self.questions)
         return Prior(sources)
+
+    def _demonstrations_of(self, task: Task) -> Demonstrations:
+        """Return the demonstrations of a task; most methods never see those of the retained skills."""
+        if task.name not in self._demonstrations:
+            self._demonstrations[task.name] = load_demonstrations(task, self.scenario, self.policy.config)
+        return self._demonstrations[task.name]
 
     def _source(self, name: str, number: int, data: Any) -> Source[Any]:
         """Return data with its own random stream: what one source draws does not move another's draws."""

@@ -14,12 +14,12 @@ import subprocess
 import sys
 import tempfile
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-import torch
 from gymnasium import spaces
-from safetensors.torch import load_file, save_file
-from torch import Tensor
+from numpy.typing import NDArray
+from safetensors.numpy import load_file, save_file
 
 from clbench.cache import cache_folder, cached, hash_of, package_of, source_hash
 from clbench.camera import VIEW_SIZE, Camera, Images, States, Views, load_camera
@@ -174,7 +174,7 @@ def _back_end(world: str, chosen: str) -> str:
     return working_back_end([world], chosen)
 
 
-def observed(task: Task, states: States) -> tuple[Tensor, Tensor]:
+def observed(task: Task, states: States) -> tuple[States, Images]:
     """Return what a policy is shown of a data set's states (N, S): numbers (N, P) and pictures.
 
     Pictures are drawn on first use, by all cores, and kept in the cache.
@@ -183,8 +183,7 @@ def observed(task: Task, states: States) -> tuple[Tensor, Tensor]:
         RenderingError: Nothing here can draw the world; the message says what to install.
     """
     if task.camera is None:
-        numbers, images = Observer(task.world, None).observe(states)
-        return torch.from_numpy(numbers), torch.from_numpy(images)
+        return Observer(task.world, None).observe(states)
     states = np.ascontiguousarray(states, np.float32)
     inputs = {
         "camera": task.camera,
@@ -198,11 +197,8 @@ def observed(task: Task, states: States) -> tuple[Tensor, Tensor]:
         observer = Observer(task.world, task.camera, min(os.cpu_count() or 1, -(-len(states) // TOGETHER)))
         numbers, images = observer.observe(states)
         observer.close()
-        tensors = {
-            "state": torch.from_numpy(np.ascontiguousarray(numbers)),
-            "image": torch.from_numpy(images),
-        }
-        save_file(tensors, partial / "frames.safetensors")
+        arrays: dict[str, NDArray[Any]] = {"state": np.ascontiguousarray(numbers), "image": images}
+        save_file(arrays, partial / "frames.safetensors")
 
     shown = load_file(cached(folder, inputs, make) / "frames.safetensors")
     return shown["state"], shown["image"]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -67,15 +67,20 @@ def shipped_folder(scenario: Scenario, seed: int) -> Path:
 
 def pretrained_folder(scenario: Scenario, seed: int) -> Path:
     """Return where the pretrained policy lies, or will lie: in the cache, unless the same one ships."""
-    inputs, shipped = pretraining_inputs(scenario, seed), shipped_folder(scenario, seed)
-    if is_cached(shipped, inputs):
-        return shipped
-    return cache_folder() / "pretrained" / f"{shipped.name}-{hash_of(inputs)}"
+    return _folder(scenario, seed, pretraining_inputs(scenario, seed))
 
 
 def is_pretrained(scenario: Scenario, seed: int) -> bool:
-    """Return whether the pretrained policy is in the cache."""
-    return is_cached(pretrained_folder(scenario, seed), pretraining_inputs(scenario, seed))
+    """Return whether the pretrained policy ships or is in the cache."""
+    inputs = pretraining_inputs(scenario, seed)
+    return is_cached(_folder(scenario, seed, inputs), inputs)
+
+
+def _folder(scenario: Scenario, seed: int, inputs: Mapping[str, Any]) -> Path:
+    shipped = shipped_folder(scenario, seed)
+    if is_cached(shipped, inputs):
+        return shipped
+    return cache_folder() / "pretrained" / f"{shipped.name}-{hash_of(inputs)}"
 
 
 def pretrained_policy(
@@ -95,7 +100,7 @@ def pretrained_policy(
     """
     inputs = pretraining_inputs(scenario, seed)
     folder = cached(
-        pretrained_folder(scenario, seed),
+        _folder(scenario, seed, inputs),
         inputs,
         lambda partial: save_policy(_pretrain(scenario, seed, progress), partial),
     )

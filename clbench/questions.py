@@ -18,6 +18,7 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from clbench.cache import cache_folder, cached, hash_of, packages_of, source_hash
+from clbench.camera import Images, States
 from clbench.demonstrations import demonstrate, simulator_versions
 from clbench.leaks import check_questions
 from clbench.observer import observed
@@ -116,11 +117,13 @@ class Questions:
     """
 
     def __init__(
-        self, kinds: tuple[QuestionKind, ...], scenes: Tensor, shown: tuple[Tensor, Tensor] | None = None
+        self, kinds: tuple[QuestionKind, ...], scenes: Tensor, shown: tuple[States, Images] | None = None
     ) -> None:
         self.kinds = kinds
         self.scenes = scenes
-        self.state, self.image = shown or (scenes, torch.zeros(len(scenes), 0, 0, 3, dtype=torch.uint8))
+        self.state, self.image = scenes, torch.zeros(len(scenes), 0, 0, 3, dtype=torch.uint8)
+        if shown is not None:
+            self.state, self.image = map(torch.from_numpy, shown)
         wordings = max(len(kind.wordings) for kind in kinds)
         self._words = torch.stack(
             [encode([kind.wordings[i % len(kind.wordings)] for i in range(wordings)]) for kind in kinds]

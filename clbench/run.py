@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import shutil
 import time
 import traceback
 from collections.abc import Callable
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -22,9 +22,11 @@ from clbench.fingerprint import fingerprint
 from clbench.learner import Learner, repeatable, sources
 from clbench.live import Log, require_tensorboard
 from clbench.method import describe_method
+from clbench.policy import Policy
+from clbench.pretraining import is_pretrained, pretrained_policy
 from clbench.questions import report_questions
 from clbench.record import Record, append_row, read_record, write_record
-from clbench.run_spec import EPISODE_WEIGHT, RunSpec, run_length
+from clbench.run_spec import EPISODE_WEIGHT, RunSpec, describe_scenario, run_length
 from clbench.stages import drop_stages, has_stages, keep_stage
 from clbench.strict_json import check_json
 
@@ -60,6 +62,46 @@ def execute(
     write_record(record, spec.path(records))
     run.forget()
     return record
+
+
+def evaluate_pretrained(spec: RunSpec, progress: Callable[[float], None] = lambda _: None) -> None:
+    """Evaluate the pretrained policy, with which runs like `spec` of most methods begin, for all of them.
+
+    Args:
+        spec: One of the runs.
+        progress: As `execute` calls it.
+    """
+    with repeatable(spec.device):
+        run = _Run(replace(spec, method="frozen", changes={}), Path(), progress, None, None)
+        try:
+            run.report_start()
+        finally:
+            run.evaluator.close()
+
+
+def is_reported(spec: RunSpec) -> bool:
+    """Return whether the evaluation of the pretrained policy that `spec` begins with is in the cache."""
+    scenario = spec.load()
+    if not is_pretrained(scenario, spec.seed):
+        return False
+    return is_cached(*start_report(spec, pretrained_policy(scenario, spec.seed)[0]))
+
+
+def start_report(spec: RunSpec, policy: Policy) -> tuple[Path, dict[str, Any]]:
+    """Return where the report of what a run begins with lies in the cache, and all that it depends on.
+
+    Args:
+        spec: The run.
+        policy: With what it begins.
+    """
+    scenario = spec.load()
+    inputs = {
+        "policy": hash_of_tensors(policy.state_dict()),
+        "scenario": describe_scenario(scenario),
+        "spec": [spec.seed, spec.device, spec.split, spec.perturb],
+        **sources(scenario, spec.seed),
+    }
+    return cache_folder() / "reports" / hash_of(inputs), inputs
 
 
 def pretrained_hash(folder: Path) -> str:
@@ -162,10 +204,10 @@ class _Run:
         self.record.timing["preparation"] = round(time.perf_counter() - begin, 2)
         self.record.costs["preparation_steps"] = steps
         self.record.costs["optimiser_steps"] += steps
-        self._report_start()
+        self.report_start()
         self._diagnose(0)
 
-    def _report_start(self) -> None:
+    def report_start(self) -> None:
         """Evaluate the policy before any target; the report is kept, as most methods start with the same."""
         tables = ("episodes", "answers", "policy")
         evaluated = False
@@ -177,13 +219,7 @@ class _Run:
             values = {name: getattr(self.record, name) for name in tables}
             (folder / "report.json").write_text(json.dumps(values), encoding="utf-8")
 
-        inputs = {
-            "policy": hash_of_tensors(self.learner.policy.state_dict()),
-            "scenario": self.record.scenario,
-            "spec": [self.spec.seed, self.spec.device, self.spec.split, self.spec.perturb],
-            **sources(self.scenario, self.spec.seed),
-        }
-        folder = cache_folder() / "reports" / hash_of(inputs)
+        folder, inputs = start_report(self.spec, self.learner.policy)
         cached(folder, inputs, write)
         if evaluated:
             return
@@ -296,7 +332,7 @@ class _Run:
             costs={"optimiser_steps": 0, "parameters": parameters},
             fingerprint={
                 # of each world the first task's rollout is taken: it must not depend on the order
-                **fingerprint(dataclasses.replace(self.spec, order=0).load()),
+                **fingerprint(replace(self.spec, order=0).load()),
                 "method": describe_method(type(self.learner.method)),
                 "pretrained": pretrained_hash(self.learner.pretrained_folder),
             },

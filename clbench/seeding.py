@@ -6,9 +6,12 @@ import hashlib
 import random
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import TYPE_CHECKING
 
 import numpy as np
-import torch
+
+if TYPE_CHECKING:  # it takes seconds to import, and environments do without it
+    import torch
 
 
 def derive_seed(*parts: str | int) -> int:
@@ -24,6 +27,8 @@ def numpy_generator(*parts: str | int) -> np.random.Generator:
 
 def torch_generator(*parts: str | int) -> torch.Generator:
     """Return the PyTorch generator, on the CPU, of the stream that `parts` name."""
+    import torch
+
     return torch.Generator().manual_seed(derive_seed(*parts))
 
 
@@ -33,6 +38,8 @@ def seeded(*parts: str | int) -> Iterator[None]:
 
     Our own code draws from explicit generators; a method, or a library that it uses, may not.
     """
+    import torch
+
     python, numpy_state = random.getstate(), np.random.get_state()  # noqa: NPY002 - to put it back
     seed = derive_seed(*parts)
     with torch.random.fork_rng():

@@ -333,11 +333,11 @@ def scenario_at(entry_point: str) -> Scenario:
         LookupError: There is none.
         ValueError: A word of its instructions is not in the vocabulary.
     """
-    from clbench.policy import encode  # PyTorch takes seconds to import
+    from clbench.policy.language import word_ids
 
     scenario = resolve(entry_point)
     if not isinstance(scenario, Scenario):
         raise LookupError(f"{entry_point!r} is no Scenario but a {type(scenario).__name__}.")
     for task in scenario.tasks:
-        encode(task.instructions)
+        word_ids(task.instructions)
     return scenario

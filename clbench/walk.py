@@ -10,7 +10,7 @@ from typing import Any, Literal
 import numpy as np
 from gymnasium import spaces
 
-from clbench.policy import TEXT_LENGTH, VOCABULARY_SIZE, encode
+from clbench.policy.language import TEXT_LENGTH, VOCABULARY_SIZE, word_ids
 from clbench.task import Scenario, Task
 
 InstructionFormat = Literal["text", "tokens"]
@@ -121,4 +121,4 @@ class Walk:
 
 def observed(words: str, form: InstructionFormat) -> Any:
     """Return an instruction as observations give it: text, or word ids (L,)."""
-    return encode([words])[0].numpy() if form == "tokens" else words
+    return np.array(word_ids([words])[0]) if form == "tokens" else words

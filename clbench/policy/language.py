@@ -6,9 +6,12 @@ import difflib
 from collections.abc import Sequence
 from functools import cache
 from importlib.resources import files
+from typing import TYPE_CHECKING
 
-import torch
 from tokenizers import Tokenizer, models, normalizers, pre_tokenizers
+
+if TYPE_CHECKING:  # it takes seconds to import, and environments do without it
+    from torch import Tensor
 
 TEXT_LENGTH = 12
 """Words that the policy reads at most; shorter texts are padded, so that every forward has one shape."""
@@ -43,8 +46,19 @@ def _tokenizer() -> Tokenizer:
     return tokenizer
 
 
-def encode(texts: Sequence[str]) -> torch.Tensor:
+def encode(texts: Sequence[str]) -> Tensor:
     """Return the word ids (len(texts), TEXT_LENGTH), int64, of `texts`. Case and punctuation do not count.
+
+    Raises:
+        UnknownWordError: A word is not in the vocabulary, or there are more than `TEXT_LENGTH` words.
+    """
+    import torch
+
+    return torch.tensor(word_ids(texts), dtype=torch.int64)
+
+
+def word_ids(texts: Sequence[str]) -> list[list[int]]:
+    """Return what `encode` does, as lists.
 
     Raises:
         UnknownWordError: A word is not in the vocabulary, or there are more than `TEXT_LENGTH` words.
@@ -61,9 +75,9 @@ def encode(texts: Sequence[str]) -> torch.Tensor:
         if not 0 < len(words) <= TEXT_LENGTH:
             raise UnknownWordError(f"{text!r} has {len(words)} words; the policy reads 1 to {TEXT_LENGTH}.")
         rows.append(encoding.ids)
-    return torch.tensor(rows, dtype=torch.int64)
+    return rows
 
 
 def word_id(word: str) -> int:
     """Return the id of a single word of the vocabulary."""
-    return int(encode([word])[0, 0])
+    return word_ids([word])[0][0]

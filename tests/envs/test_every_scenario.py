@@ -96,14 +96,15 @@ def test_the_data_of_all_scenarios_load_no_simulator() -> None:
 
 
 @every_scenario
-def test_an_outsiders_script_makes_it_without_an_import(scenario: Scenario) -> None:
+def test_an_outsiders_script_makes_it_without_an_import_and_without_pytorch(scenario: Scenario) -> None:
     make_environment(scenario).close()
     run(
-        "import gymnasium\n"
+        "import gymnasium, sys\n"
         f"environment = gymnasium.make('clbench:{scenario.id}')\n"
         "environment.reset(seed=0)\n"
         "environment.step(environment.action_space.sample())\n"
-        f"assert environment.unwrapped.scenario.id == '{scenario.id}'"
+        f"assert environment.unwrapped.scenario.id == '{scenario.id}'\n"
+        "assert 'torch' not in sys.modules"  # it takes seconds to import
     )
 
 
