@@ -51,10 +51,12 @@ test: .venv/installed-dev
 test-slow: .venv/installed-dev
 	$(BIN)/pytest -m slow
 
+# Besides style and types: whether the committed board and pages are those of the committed records.
 check: .venv/installed-dev
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/mypy
+	$(BIN)/pytest -m slow tests/leaderboard/test_records.py
 
 # What a wheel may do otherwise than the checkout, against a built one outside of it: its files, the parts that are
 # found by name, the commands; and all that strangers type.

@@ -149,6 +149,7 @@ def test_doctor_shows_versions_and_rendering() -> None:
     assert "rendering: egl" in result.stdout
 
 
+@pytest.mark.slow
 def test_demonstrations_are_collected_and_shown(empty_caches: Path) -> None:
     result = _clbench("demonstrations", TOY)
     assert result.returncode == 0, result.stderr
@@ -173,6 +174,7 @@ class Broken(Method):
 """
 
 
+@pytest.mark.slow
 def test_a_stranger_runs_a_class_from_the_working_directory_and_sees_it_on_the_board(tmp_path: Path) -> None:
     (tmp_path / "mine.py").write_text(METHOD)
     result = _clbench("run", TOY, "mine:Gentle", "mine:Broken", "sft", "--seeds", "1", folder=tmp_path)

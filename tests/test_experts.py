@@ -43,6 +43,7 @@ def killed_after(steps: int) -> Callable[[float, str], None]:
     return progress
 
 
+@pytest.mark.slow
 def test_a_training_that_was_killed_ends_in_the_same_bytes(empty_caches: Path) -> None:
     whole, killed = empty_caches / "whole", empty_caches / "killed"
     training.train(tiny(), whole)
@@ -60,6 +61,7 @@ def test_a_training_that_was_killed_ends_in_the_same_bytes(empty_caches: Path) -
         assert (killed / name).read_bytes() == (whole / name).read_bytes()
 
 
+@pytest.mark.slow
 def test_a_longer_training_goes_on_from_a_shorter_and_not_the_other_way_round(empty_caches: Path) -> None:
     training.train(tiny(steps=400), empty_caches)
     card = training.train(tiny(steps=600), empty_caches)

@@ -247,6 +247,7 @@ print(take.episode.length, len({picture.tobytes() for picture in take.pictures})
 """
 
 
+@pytest.mark.slow
 def test_the_fetch_world_is_drawn_where_anything_can_draw() -> None:
     try:
         choose_back_end([load_scenario("clbench/Fetch-v0").tasks[0].world])

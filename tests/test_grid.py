@@ -15,6 +15,7 @@ import pytest
 from clbench.grid import benchmark_jobs, run_jobs
 from clbench.pretraining import pretrained_policy
 from clbench.progress import Bars
+from clbench.run import evaluate_pretrained, execute
 from clbench.run_spec import RunSpec, has_record
 from clbench.task import load_scenario
 from clbench.workers import Job, Processes
@@ -146,16 +147,30 @@ def test_a_run_waits_for_what_it_is_made_from_and_nothing_else_is_made(
     scenario = load_scenario(TOY)
     skills = {f"Toy-v0 demonstrations {task.name}" for task in scenario.retained}
     targets = {f"Toy-v0 demonstrations {task.name}" for task in scenario.target}
-    policy, questions, sft, joint = (
-        f"Toy-v0 {name}" for name in ("pretraining seed 0", "questions", "sft seed 0", "joint seed 0")
+    policy, questions, report, sft, joint = (
+        f"Toy-v0 {name}"
+        for name in (
+            "pretraining seed 0",
+            "questions",
+            "evaluation of the pretrained policy seed 0",
+            "sft seed 0",
+            "joint seed 0",
+        )
     )
     found = needs("sft", "joint")
     assert found[policy] == {questions} | skills
-    assert found[sft] == {policy, questions} | targets
-    assert found[joint] == {policy, questions} | targets | skills
+    assert found[report] == {policy, questions}
+    assert found[sft] == {policy, questions, report} | targets
+    assert found[joint] == {policy, questions, report} | targets | skills
     assert set(found) == {sft, joint} | found[joint]
     pretrained_policy(scenario, 0)
+    assert needs("sft")[report] == {questions}
+    evaluate_pretrained(RunSpec(TOY, "joint", 0))
     assert needs("sft") == {sft: {questions} | targets, questions: set(), **{name: set() for name in targets}}
+    demonstrated = {path.parent.name for path in (empty_caches / "minari").rglob("data")}
+    execute(RunSpec(TOY, "sft", 0), tmp_path)
+    after = {path.parent.name for path in (empty_caches / "minari").rglob("data")}
+    assert after - demonstrated == {f"{task.name}-v0" for task in scenario.target}
 
 
 def test_one_worker_and_two_give_equal_records_and_a_stopped_grid_goes_on(

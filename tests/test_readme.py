@@ -39,6 +39,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_the_first_snippet_walks_through_the_scenario(tmp_path: Path) -> None:
     lines = _python(_blocks("python")[0], tmp_path).splitlines()
     assert lines[0].startswith("0 reach - ")
@@ -46,6 +47,7 @@ def test_the_first_snippet_walks_through_the_scenario(tmp_path: Path) -> None:
     assert lines[2].startswith("['lift', 'push_right', 'pull', 'press']")
 
 
+@pytest.mark.slow
 def test_the_second_snippet_is_a_method_that_keeps_all_answers(folder: Path) -> None:
     from clbench import read_record
 
@@ -76,6 +78,7 @@ def test_three_commands_lead_from_nothing_to_a_row_on_the_board(tmp_path: Path) 
     assert "gentle" in (tmp_path / "try/LEADERBOARD.md").read_text(encoding="utf-8")
 
 
+@pytest.mark.slow
 def test_the_third_snippet_draws_the_table(folder: Path) -> None:
     output = _console(_blocks("console")[1], folder)
     assert "my_method:HeadOnly" in output

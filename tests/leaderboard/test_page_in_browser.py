@@ -241,6 +241,7 @@ def test_on_a_phone_nothing_is_wider_than_the_screen(open_page: Callable[..., Pa
     assert page.evaluate(width) == PHONE["width"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("color_scheme", ["light", "dark"])
 @pytest.mark.parametrize("place", ["overall", "clbench/Toy-v0", "clbench/Toy-v0/l2"])
 def test_axe_finds_nothing_serious(place: str, color_scheme: str, open_page: Callable[..., Page]) -> None:

@@ -108,6 +108,7 @@ def test_aegis_sheds_little_energy_at_every_stage() -> None:
             assert 0 < told["layers_projected_mean"] <= 1
 
 
+@pytest.mark.slow
 def test_the_committed_pages_are_those_of_the_committed_records(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
