@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import functools
 import inspect
+import threading
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from queue import SimpleQueue
 from typing import Any, ClassVar, Protocol, TypeAlias, TypeVar
 
 import gymnasium
@@ -141,30 +142,57 @@ class Team:
     """
 
     def __init__(self, threads: int) -> None:
-        self._threads = threads
-        self._pool = ThreadPoolExecutor(threads - 1) if threads > 1 else None
+        self._helpers = [_Helper() for _ in range(threads - 1)]
 
     def each(self, work: Callable[[Item], None], items: Sequence[Item]) -> None:
         """Do the work on each item, in any order: each thread takes the next that is left."""
         left = iter(items)
 
-        def take(items: Iterable[Item]) -> None:
-            for item in items:
+        def take() -> None:
+            for item in left:
                 work(item)
 
-        helpers = [
-            self._pool.submit(take, left)
-            for _ in range(min(self._threads, len(items)) - 1)
-            if self._pool is not None
-        ]
-        take(left)
+        helpers = self._helpers[: len(items) - 1] if items else []
         for helper in helpers:
-            helper.result()
+            helper.asked.put(take)
+        try:
+            take()
+        finally:
+            errors = [error for helper in helpers if (error := helper.ended.get()) is not None]
+        if errors:
+            raise errors[0]
 
     def close(self) -> None:
         """End the threads."""
-        if self._pool is not None:
-            self._pool.shutdown()
+        for helper in self._helpers:
+            helper.asked.put(None)
+        self._helpers = []
+
+    def __del__(self) -> None:
+        """End the threads of a team that nobody closed."""
+        self.close()
+
+
+class _Helper:
+    """A thread that does what it is asked for, until that is None.
+
+    Two queues in C pass work on in 10 us; an executor takes 50, a fortieth of a step of Meta-World.
+    """
+
+    def __init__(self) -> None:
+        self.asked: SimpleQueue[Callable[[], None] | None] = SimpleQueue()
+        self.ended: SimpleQueue[Exception | None] = SimpleQueue()
+        threading.Thread(target=_help, args=(self.asked, self.ended), daemon=True).start()
+
+
+def _help(asked: SimpleQueue[Callable[[], None] | None], ended: SimpleQueue[Exception | None]) -> None:
+    while (work := asked.get()) is not None:
+        try:
+            work()
+        except Exception as error:
+            ended.put(error)
+        else:
+            ended.put(None)
 
 
 class PlainVectorWorld:

@@ -1,5 +1,7 @@
 import dataclasses
 import functools
+import threading
+import time
 
 import gymnasium
 import numpy as np
@@ -7,7 +9,7 @@ import pytest
 
 from clbench.task import Task, load_scenario, resolve
 from clbench.testing import ToyWorld
-from clbench.world import Lanes, PlainVectorWorld, check_perturbable, vector_world
+from clbench.world import Lanes, PlainVectorWorld, Team, check_perturbable, vector_world
 
 TOY = load_scenario("clbench.testing:clbench/Toy-v0")
 LEFT, UP = TOY.task("left"), TOY.task("up")
@@ -133,3 +135,34 @@ def test_a_task_whose_world_cannot_be_perturbed_is_named_with_the_way_out(
     assert message in str(raised.value)
     assert "Run without --perturb, or give it one, as docs/your_scenario.md shows." in str(raised.value)
     assert Lanes(1).reset([0], [3], [task]).shape == (1, 4)
+
+
+@pytest.mark.parametrize("threads", [1, 3])
+def test_a_team_does_each_piece_once_and_goes_on_after_one_that_failed(threads: int) -> None:
+    team, done = Team(threads), list[int]()
+
+    def work(item: int) -> None:
+        if item == 7:
+            raise ValueError("no seven")
+        done.append(item)
+
+    team.each(work, range(5))
+    assert sorted(done) == [0, 1, 2, 3, 4]
+    with pytest.raises(ValueError, match="no seven"):
+        team.each(work, [7, 7])
+    team.each(work, [])
+    team.each(work, [5])
+    assert sorted(done) == [0, 1, 2, 3, 4, 5]
+    team.close()
+
+
+def test_a_team_that_nobody_closed_leaves_no_thread_behind() -> None:
+    before = threading.active_count()
+    team = Team(3)
+    team.each(time.sleep, [0.01] * 3)
+    assert threading.active_count() == before + 2
+    del team
+    deadline = time.monotonic() + 10
+    while threading.active_count() > before and time.monotonic() < deadline:
+        time.sleep(0.01)
+    assert threading.active_count() == before
