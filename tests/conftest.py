@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from rich.console import Console
 
 from clbench.method import Method, Uses, load_method
@@ -39,6 +40,12 @@ def _own_caches(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
         patch.setenv("CLBENCH_CACHE", str(tmp_path_factory.mktemp("cache")))
         patch.setenv("MINARI_DATASETS_PATH", str(tmp_path_factory.mktemp("minari")))
         yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _one_core_each() -> None:
+    """Compute with one thread outside of runs too: there is a process of tests for each core."""
+    torch.set_num_threads(1)
 
 
 @pytest.fixture

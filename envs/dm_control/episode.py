@@ -42,6 +42,7 @@ class Episode:
             data = mujoco.MjData(begin.model)
             self._kept[begin] = (data, begin.body.observer(begin.model, data))
         self.data, self._observe = self._kept[begin]
+        self.control = self.data.ctrl
         begin.begin(seed, self.data)
         if perturbation:
             self._push(perturbation.start)
@@ -55,14 +56,14 @@ class Episode:
 
     def step(self, action: NDArray[np.float32]) -> Observation:
         """Move by an action in [-1, 1], of which the motors of the body take the first numbers."""
-        self.data.ctrl[:] = action[: self.start.model.nu]
+        self.control[:] = action[: len(self.control)]
         self.start.advance(self.data)
         return self._observe()
 
     def reward(self, observation: Observation) -> float:
         """Return what the step that led to `observation` (K,) was worth."""
-        return float(self.rule.reward(observation, self.data.ctrl))
+        return float(self.rule.reward(observation, self.control))
 
     def training_reward(self, observation: Observation) -> float:
         """Return what an expert that trains is told that step was worth."""
-        return float(self.rule.training_reward(observation, self.data.ctrl))
+        return float(self.rule.training_reward(observation, self.control))

@@ -44,6 +44,16 @@ class Rule:
     where the reward alone is nearly always 0; nothing else knows of it."""
     mark: tuple[float, float] | None = None
     """Where the body's mark of a target is drawn, in metres."""
+    batched: bool = False
+    """Whether rewards computed together have the bits of each computed alone. Where a power is taken they may
+    not: that of one number is C's, that of an array is a product."""
+
+    def rewards(self, observations: Observation, actions: NDArray[np.float64]) -> Rewards:
+        """Return the rewards (N,) of observations (N, K) after actions (N, A), each as if it were alone."""
+        if self.batched:
+            return self.reward(observations, actions)
+        pairs = zip(observations, actions, strict=True)
+        return np.array([self.reward(observation, action) for observation, action in pairs])
 
     def training_reward(self, observation: Observation, action: NDArray[np.float64]) -> Rewards:
         """Return what experts train on."""
@@ -119,7 +129,11 @@ def _hold_cup(place: float) -> Rule:
         return _near(_length(observation[..., :2] - np.array([place, 0.0])), 0.02, margin)
 
     return Rule(
-        "ball_in_cup", "catch", functools.partial(reward, margin=0.04), functools.partial(reward, margin=0.3)
+        "ball_in_cup",
+        "catch",
+        functools.partial(reward, margin=0.04),
+        functools.partial(reward, margin=0.3),
+        batched=True,
     )
 
 
@@ -151,7 +165,7 @@ RULES: dict[str, Rule] = {
     "cartpole_swingup": Rule("cartpole", "swingup", _balance),
     "cartpole_left": _cart(-0.8),
     "cartpole_right": _cart(0.8),
-    "ball_in_cup_catch": Rule("ball_in_cup", "catch", _catch, _catch_guide),
+    "ball_in_cup_catch": Rule("ball_in_cup", "catch", _catch, _catch_guide, batched=True),
     "ball_in_cup_left": _hold_cup(-0.15),
     "ball_in_cup_right": _hold_cup(0.15),
 }

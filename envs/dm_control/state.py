@@ -30,16 +30,16 @@ BODY = slice(2 * OBSERVATION_SIZE, SIZE)
 
 
 def padded(body: str, observation: Observation) -> State:
-    """Return the state of a body that dm_control observes as `observation` (K,).
+    """Return the state of a body that dm_control observes as `observation` (K,), or many (N, K).
 
     Raises:
         ValueError: The observation has more numbers than a state has places for.
     """
-    size = len(observation)
+    size = observation.shape[-1]
     if size > OBSERVATION_SIZE:
         raise ValueError(f"{body} is observed in {size} numbers; a state has places for {OBSERVATION_SIZE}.")
-    state = np.zeros(SIZE, np.float32)
-    state[:size] = observation
-    state[OBSERVATION_SIZE : OBSERVATION_SIZE + size] = 1.0
-    state[2 * OBSERVATION_SIZE + BODIES.index(body)] = 1.0
+    state = np.zeros((*observation.shape[:-1], SIZE), np.float32)
+    state[..., :size] = observation
+    state[..., OBSERVATION_SIZE : OBSERVATION_SIZE + size] = 1.0
+    state[..., 2 * OBSERVATION_SIZE + BODIES.index(body)] = 1.0
     return state

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Sequence
 from typing import Any
 
@@ -15,7 +16,7 @@ from clbench.world import Team, checked_actions, no_episode
 
 from .episode import Episode
 from .expert import expert_return
-from .rules import HORIZON, SUCCESS_SHARE
+from .rules import HORIZON, RULES, SUCCESS_SHARE
 from .state import ACTION_SIZE, SIZE, Observation, State, padded
 
 
@@ -25,6 +26,19 @@ class _Lane:
     def __init__(self) -> None:
         self.episode = Episode()
         self.steps, self.total, self.needed = 0, 0.0, 0.0
+
+    def count(self, reward: float) -> bool:
+        """Count a step that was worth `reward`, and return whether the episode has succeeded with it."""
+        self.steps, self.total = self.steps + 1, self.total + reward
+        return self.steps == HORIZON and self.total >= self.needed
+
+
+def _by_task(lanes: Sequence[_Lane]) -> dict[str, list[int]]:
+    """Return the places of lanes by their task."""
+    rows: defaultdict[str, list[int]] = defaultdict(list)
+    for row, lane in enumerate(lanes):
+        rows[lane.episode.task].append(row)
+    return rows
 
 
 class DMControlVectorWorld:
@@ -78,16 +92,15 @@ class DMControlVectorWorld:
             ValueError: An action has another shape than (2,), or a number in it is not finite.
         """
         actions = checked_actions(actions, self.single_action_space, "dm_control")
-        observations = self._advance([self._lane(number) for number in lanes], actions)
-        states = np.empty((len(lanes), SIZE), np.float32)
-        rewards, successes = np.empty(len(lanes)), np.empty(len(lanes), np.bool_)
-        for row, number in enumerate(lanes):
-            lane, observation = self._lane(number), observations[row]
-            rewards[row] = lane.episode.reward(observation)
-            lane.steps, lane.total = lane.steps + 1, lane.total + float(rewards[row])
-            successes[row] = lane.steps == HORIZON and lane.total >= lane.needed
-            states[row] = padded(lane.episode.rule.body, observation)
-        return states, rewards, successes
+        moved = [self._lane(number) for number in lanes]
+        observations = self._advance(moved, actions)
+        states, rewards = np.empty((len(lanes), SIZE), np.float32), np.empty(len(lanes))
+        for task, rows in _by_task(moved).items():
+            rule, observed = RULES[task], np.stack([observations[row] for row in rows])
+            controls = np.stack([moved[row].episode.control for row in rows])
+            rewards[rows], states[rows] = rule.rewards(observed, controls), padded(rule.body, observed)
+        successes = [lane.count(reward) for lane, reward in zip(moved, rewards.tolist(), strict=True)]
+        return states, rewards, np.array(successes)
 
     def picture(self, lane: int) -> tuple[mujoco.MjModel, mujoco.MjData, dict[str, Any]]:
         """Return the model of a lane's body, its physics with the target at its place, and a camera."""
