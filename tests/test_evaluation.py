@@ -23,7 +23,18 @@ def fetch_policy() -> Policy:
 
 
 def _with_episodes(**numbers: int) -> Scenario:
-    return dataclasses.replace(FETCH, budget=dataclasses.replace(FETCH.budget, **numbers))
+    """Return Fetch with other numbers of episodes, which end after 16 steps."""
+
+    def short(tasks: tuple[Task, ...]) -> tuple[Task, ...]:
+        return tuple(dataclasses.replace(task, horizon=16) for task in tasks)
+
+    return dataclasses.replace(
+        FETCH,
+        retained=short(FETCH.retained),
+        target=short(FETCH.target),
+        held_out=short(FETCH.held_out),
+        budget=dataclasses.replace(FETCH.budget, **numbers),
+    )
 
 
 def test_an_outcome_does_not_depend_on_what_else_is_evaluated(fetch_policy: Policy) -> None:

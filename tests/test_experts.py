@@ -82,6 +82,7 @@ def test_the_json_says_what_made_the_weights_and_how_they_did(empty_caches: Path
     assert round(float(again.mean()), 3) == mean
 
 
+@pytest.mark.slow
 def test_a_symmetric_task_is_trained_as_the_one_that_it_mirrors(empty_caches: Path) -> None:
     said = training.train(tiny("point_mass_left", steps=200), empty_caches)
     assert said["symmetric_to"] == "point_mass_right"

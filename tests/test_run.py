@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import random
+import shutil
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -89,7 +90,7 @@ class Adapting(Method):
 def test_the_same_run_twice_gives_equal_records(tmp_path: Path, method: str) -> None:
     paths = []
     for name in ("first", "second"):
-        spec = RunSpec(TOY, method, seed=1)
+        spec = RunSpec(TOY, method, seed=1, targets=1)
         assert execute(spec, tmp_path / name).status == "success"
         paths.append(spec.path(tmp_path / name))
     assert _lasting(paths[0]) == _lasting(paths[1])
@@ -207,12 +208,21 @@ def test_frozen_forgets_nothing_and_costs_nothing(tmp_path: Path) -> None:
     assert (record.costs["optimiser_steps"], record.costs["bytes_kept"]) == (0, 0)
 
 
+@pytest.fixture
+def reports() -> Path:
+    """Return the folder that keeps the evaluations of pretrained policies; there is none yet."""
+    kept = cache_folder() / "reports"
+    shutil.rmtree(kept, ignore_errors=True)
+    return kept
+
+
 @pytest.mark.parametrize("perturb", [False, True])
-def test_progress_adds_up_to_the_length_of_the_run(perturb: bool, tmp_path: Path, empty_caches: Path) -> None:
+def test_progress_adds_up_to_the_length_of_the_run(perturb: bool, tmp_path: Path, reports: Path) -> None:
     for _ in range(2):  # the second time the report of the pretrained policy is there already
         amounts: list[float] = []
-        execute(RunSpec(TOY, "sft", seed=0, perturb=perturb), tmp_path, amounts.append)
-        assert sum(amounts) == pytest.approx(run_length(load_scenario(TOY), perturb=perturb))
+        spec = RunSpec(TOY, "sft", seed=0, perturb=perturb, targets=1)
+        execute(spec, tmp_path, amounts.append)
+        assert sum(amounts) == pytest.approx(run_length(spec.load(), perturb=perturb))
 
 
 @pytest.mark.parametrize(
@@ -281,34 +291,33 @@ def test_the_steps_of_preparing_count(tmp_path: Path, stranger: Callable[[type[M
 
 
 def test_a_tuning_run_never_meets_a_report_episode(tmp_path: Path) -> None:
-    record = execute(RunSpec(TOY, "sft", seed=3, split="selection"), tmp_path)
+    record = execute(RunSpec(TOY, "sft", seed=3, split="selection", targets=1), tmp_path)
     assert set(record.episodes["split"]) == {"selection"}
     assert record.run["split"] == "selection"
     assert not has_record(RunSpec(TOY, "sft", seed=3), tmp_path)
-    report = execute(RunSpec(TOY, "sft", seed=3), tmp_path / "report")
+    report = execute(RunSpec(TOY, "sft", seed=3, targets=1), tmp_path / "report")
     assert record.fingerprint["pretrained"] == report.fingerprint["pretrained"]
     # the same training: what both evaluate alike ends alike
     assert record.policy["update_sparsity"] == report.policy["update_sparsity"]
 
 
-def test_the_report_of_the_pretrained_policy_is_made_once(tmp_path: Path, empty_caches: Path) -> None:
+def test_the_report_of_the_pretrained_policy_is_made_once(tmp_path: Path, reports: Path) -> None:
     first = execute(RunSpec(TOY, "sft", seed=0), tmp_path)
-    kept = empty_caches / "cache" / "reports"
-    (folder,) = kept.iterdir()
+    (folder,) = reports.iterdir()
     before = (folder / "report.json").stat().st_mtime_ns
     second = execute(RunSpec(TOY, "frozen", seed=0), tmp_path)
-    assert [path.name for path in kept.iterdir()] == [folder.name]
+    assert [path.name for path in reports.iterdir()] == [folder.name]
     assert (folder / "report.json").stat().st_mtime_ns == before
     starts = [
         [row for row in zip(*one.episodes.values(), strict=True) if row[0] == 0] for one in (first, second)
     ]
     assert starts[0] == starts[1]
     execute(RunSpec(TOY, "frozen", seed=0, perturb=True), tmp_path)
-    assert len(list(kept.iterdir())) == 2  # it has more in it
+    assert len(list(reports.iterdir())) == 2  # it has more in it
 
 
 def test_a_report_that_another_run_makes_at_the_same_time_is_taken(
-    tmp_path: Path, empty_caches: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, reports: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     first = execute(RunSpec(TOY, "frozen", seed=0), tmp_path)
     # what was looked for was not there yet; when it is to be made, it is

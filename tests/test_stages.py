@@ -132,6 +132,7 @@ def test_what_another_version_of_the_code_kept_is_replaced(kept: Path, tmp_path:
     _assert_equal(stage_policies(SPEC, tmp_path), stage_policies(SPEC, kept))
 
 
+@pytest.mark.slow
 def test_the_command_keeps_the_policies_of_a_run_that_has_a_record(
     kept: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

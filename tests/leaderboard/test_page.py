@@ -95,6 +95,7 @@ def test_a_missing_value_is_a_dash_that_says_why(records: Path) -> None:
     assert ", missing: A point of a learning curve is missing, or there is no from_scratch" in text
 
 
+@pytest.mark.slow
 def test_the_same_records_give_the_same_bytes_in_another_place_time_zone_and_locale(
     records: Path, tmp_path: Path
 ) -> None:
