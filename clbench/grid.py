@@ -62,16 +62,16 @@ def run_with_bars(jobs: Sequence[Job], workers: Workers, console: Console | None
 
 
 def _by_urgency(jobs: Sequence[Job]) -> list[Job]:
-    """Return the jobs by falling length of the work that waits for them, their own included.
+    """Return the jobs by falling time of the work that waits for them, their own included.
 
     The longest run begins first, so that no worker ends with it alone.
     """
 
     @cache
     def work(name: str) -> float:
-        return max((work(job.name) for job in jobs if name in job.needs), default=0.0) + lengths[name]
+        return max((work(job.name) for job in jobs if name in job.needs), default=0.0) + times[name]
 
-    lengths = {job.name: job.length for job in jobs}
+    times = {job.name: job.length * job.pace for job in jobs}
     return sorted(jobs, key=lambda job: -work(job.name))
 
 
@@ -93,6 +93,10 @@ def _ready(waiting: Sequence[Job], ended: set[str], free: int) -> list[Job]:
 
 
 # ---- the jobs of a benchmark -----------------------------------------------------------------------
+
+REPLAY_PACE = 0.75
+"""Of runs that replay demonstrations: they keep their skills, and an episode ends with success. On Fetch-v0 one
+takes 170 s where plain fine-tuning, which forgets, takes 232 s."""
 
 
 def collect_job(scenario: str, task: str, progress: Callable[[float], None]) -> str:
@@ -213,6 +217,7 @@ def benchmark_jobs(
                 (*needed, report) if report in reports else needed,
                 limits,
                 spec.device,
+                REPLAY_PACE if spec.build().uses.demonstrations == "throughout" else 1.0,
             )
         )
     return jobs

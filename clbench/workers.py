@@ -48,6 +48,8 @@ class Job:
     """What its process may take; anything if None."""
     device: str = "cpu"
     """Where it computes."""
+    pace: float = 1.0
+    """Time that a unit of its length takes, compared with other jobs."""
 
 
 class Event(NamedTuple):

@@ -118,9 +118,16 @@ def test_what_the_longest_work_waits_for_begins_first(bars: Bars) -> None:
     lengths = {"short run": 1.0, "long run": 9.0, "pretraining of the long run": 2.0, "middle run": 5.0}
     needs = {"long run": ("pretraining of the long run",)}
     jobs = [Job(name, "some_jobs:good", {}, length, needs.get(name, ())) for name, length in lengths.items()]
+    jobs.append(Job("run that goes fast", "some_jobs:good", {}, 8.0, pace=0.5))
     assert run_jobs(jobs, Processes(1), bars) == {}
     ended = [line.partition(":")[0] for line in _printed(bars).splitlines()]
-    assert ended == ["pretraining of the long run", "long run", "middle run", "short run"]
+    assert ended == [
+        "pretraining of the long run",
+        "long run",
+        "middle run",
+        "run that goes fast",
+        "short run",
+    ]
 
 
 def test_runs_of_two_scenarios_have_jobs_of_their_own_and_one_pretraining_for_each_seed(
