@@ -95,8 +95,8 @@ def _ready(waiting: Sequence[Job], ended: set[str], free: int) -> list[Job]:
 # ---- the jobs of a benchmark -----------------------------------------------------------------------
 
 REPLAY_PACE = 0.75
-"""Of runs that replay demonstrations: they keep their skills, and an episode ends with success. On Fetch-v0 one
-takes 170 s where plain fine-tuning, which forgets, takes 232 s."""
+"""Of runs that replay demonstrations: they keep their skills, and an episode ends with success. On Fetch-v0
+one takes 170 s where plain fine-tuning, which forgets, takes 232 s."""
 
 
 def collect_job(scenario: str, task: str, progress: Callable[[float], None]) -> str:
