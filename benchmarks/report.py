@@ -37,7 +37,11 @@ Measured once, in turns with what is there, on two cores of an AMD EPYC without 
 | no collisions of robot parts that never touched on Fetch | 6 % of the physics; nothing proves it | no |
 | `mujoco.rollout` | drops the solver's warm start: other bits | no |
 | observing Fetch's lanes while others still move | at most 5 %, as observing takes no longer | no |
+| half steps of Fetch as pieces of work for threads, or fixed shares of lanes | 1 %, and 7 % less | no |
 | Meta-World's rewards and observations in batches | 2 to 3.5 times as many steps, the same bits | yes |
+| queues in C rather than an executor between threads | 2 to 4 % of Meta-World, nothing of Fetch | yes |
+| dm_control's rewards in batches, of the body where they have the same bits | 1.4 times as many steps | yes |
+| a process of Ray's for each job | 5 s each to import everything | no |
 """
 UNITS = {
     "tasks": "tasks of Meta-World, 4 episodes of 50 steps each",
@@ -94,7 +98,10 @@ def _whole_run() -> Iterator[str]:
     runs = _read("whole_run")["runs"]
     yield "## A whole run"
     yield ""
-    yield "One thread; data and pretrained policy are in the cache."
+    yield (
+        "One thread; data and pretrained policy are in the cache, the evaluation with which runs of a seed "
+        "begin is not."
+    )
     yield ""
     parts = list(next(iter(runs.values()))["parts"])
     yield from _table(
@@ -134,7 +141,7 @@ def _workers() -> Iterator[str]:
         f"{found['runs']} runs by one worker take {_ratio(found['one_worker_to_many'])} times as long as by "
         f"{found['workers']}; by a Ray cluster of {found['workers']} workers "
         f"{_ratio(found['ray_to_many'])} times as long as by these: {seconds}. The records are the same. "
-        "Each task of Ray is a process that imports everything anew, about 5 s; whole runs take minutes."
+        "A worker of Ray keeps a process that has imported everything, and forks each job from it."
     )
     yield ""
 
