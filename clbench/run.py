@@ -84,10 +84,10 @@ def is_reported(spec: RunSpec) -> bool:
     scenario = spec.load()
     if not is_pretrained(scenario, spec.seed):
         return False
-    return is_cached(*start_report(spec, pretrained_policy(scenario, spec.seed)[0]))
+    return is_cached(*_kept_report(spec, pretrained_policy(scenario, spec.seed)[0]))
 
 
-def start_report(spec: RunSpec, policy: Policy) -> tuple[Path, dict[str, Any]]:
+def _kept_report(spec: RunSpec, policy: Policy) -> tuple[Path, dict[str, Any]]:
     """Return where the report of what a run begins with lies in the cache, and all that it depends on.
 
     Args:
@@ -219,7 +219,7 @@ class _Run:
             values = {name: getattr(self.record, name) for name in tables}
             (folder / "report.json").write_text(json.dumps(values), encoding="utf-8")
 
-        folder, inputs = start_report(self.spec, self.learner.policy)
+        folder, inputs = _kept_report(self.spec, self.learner.policy)
         cached(folder, inputs, write)
         if evaluated:
             return
