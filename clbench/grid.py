@@ -13,7 +13,7 @@ from clbench.limits import Limits
 from clbench.names import folder_name
 from clbench.progress import Bars
 from clbench.run import evaluate_pretrained, execute, is_reported
-from clbench.run_spec import EPISODE_WEIGHT, RunSpec, run_length
+from clbench.run_spec import RunSpec, end_length, run_length
 from clbench.task import Task, load_scenario
 from clbench.training import MethodError
 from clbench.workers import Job, JobError, Workers
@@ -331,9 +331,7 @@ def _report_jobs(specs: Sequence[RunSpec], needs: Sequence[tuple[str, ...]]) -> 
     for name, (spec, needed) in {_report(pair[0]): pair for pair in zip(specs, needs, strict=True)}.items():
         if is_reported(spec):
             continue
-        scenario = spec.load()
-        perturbed = len(scenario.retained) * scenario.budget.episodes("perturbed") if spec.perturb else 0
-        length = EPISODE_WEIGHT * (len(scenario.tasks) * scenario.budget.episodes(spec.split) + perturbed)
+        length = end_length(spec.load(), spec.split, spec.perturb)
         shared = (_pretraining(spec.scenario, spec.seed), _questions(spec.scenario))
         waits = tuple(other for other in needed if other in shared)
         jobs[name] = Job(name, "clbench.grid:report_job", {"spec": spec}, length, waits, device=spec.device)

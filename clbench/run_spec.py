@@ -134,13 +134,18 @@ def run_length(scenario: Scenario, split: Split = "report", perturb: bool = Fals
     budget, stages, retained = scenario.budget, len(scenario.target), len(scenario.retained)
     points = len(budget.evaluation_steps)
     scored = split == "report"
-    ends = (stages + 1) * len(scenario.tasks) * budget.episodes(split)
-    perturbed = (stages + 1) * retained * budget.episodes("perturbed") if perturb else 0
     on_the_way = stages * (points - 1) * (retained + 1)
     on_the_way *= budget.curve_episodes if scored else budget.selection_episodes
     selection = stages * points * budget.selection_episodes if scored else 0
-    episodes = ends + perturbed + on_the_way + selection
-    return stages * budget.adaptation_steps + EPISODE_WEIGHT * episodes
+    ends = (stages + 1) * end_length(scenario, split, perturb)
+    return stages * budget.adaptation_steps + ends + EPISODE_WEIGHT * (on_the_way + selection)
+
+
+def end_length(scenario: Scenario, split: Split, perturb: bool) -> float:
+    """Return how long the evaluation of all tasks takes, as at the end of a stage, in optimiser steps."""
+    budget = scenario.budget
+    perturbed = len(scenario.retained) * budget.episodes("perturbed") if perturb else 0
+    return EPISODE_WEIGHT * (len(scenario.tasks) * budget.episodes(split) + perturbed)
 
 
 def read_changes(method: str, changes: Mapping[str, Any]) -> dict[str, Any]:
