@@ -135,13 +135,15 @@ def _steps() -> Iterator[str]:
 def _workers() -> Iterator[str]:
     found = _read("workers")
     seconds = ", ".join(f"{way} {taken:.0f} s" for way, taken in found["seconds"].items())
+    *_, ray = found["seconds"]
     yield "## Workers"
     yield ""
     yield (
         f"{found['runs']} runs by one worker take {_ratio(found['one_worker_to_many'])} times as long as by "
         f"{found['workers']}; by a Ray cluster of {found['workers']} workers "
         f"{_ratio(found['ray_to_many'])} times as long as by these: {seconds}. The records are the same. "
-        "A worker of Ray keeps a process that has imported everything, and forks each job from it."
+        "A worker of Ray keeps a process that has imported everything, and forks each job from it. A cluster "
+        f"and those processes take {found['seconds_to_start'][ray]:.0f} s to start, which are not in these times."
     )
     yield ""
 

@@ -1,9 +1,9 @@
 """What a second worker brings to a grid, and what Ray costs: `python benchmarks/workers.py`.
 
 The same runs, methods that take as long as plain fine-tuning on the first target, by one worker, by one for
-each core and by a Ray cluster of this machine, in turns. What they need is in the cache before; a cluster
-starts before the clock does, as one would be there. The records of all ways must be the same, but for their
-times.
+each core and by a Ray cluster of this machine, in turns. What they need is in the cache before, and what
+starts once, a cluster and the process of each of its workers that has imported all, starts before the clock
+does; how long that took is told. The records of all ways must be the same, but for their times.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from clbench.grid import benchmark_jobs, run_with_bars
 from clbench.ray_workers import RayWorkers
 from clbench.record import read_record
 from clbench.run_spec import RunSpec
-from clbench.workers import Processes, Workers
+from clbench.workers import Job, Processes, Workers
 
 METHODS = ("sft", "l2_sp", "low_rate_sft", "constant_weight")
 
@@ -48,21 +48,25 @@ def main() -> None:
     }
     with tempfile.TemporaryDirectory() as folder:
         _seconds(specs, Path(folder), ways[f"{count} workers"])  # makes what runs need
-    rounds, generator = [], np.random.default_rng(0)
+    rounds, starts, generator = [], [], np.random.default_rng(0)
     for number in range(arguments.rounds):
-        taken, found = {}, []
+        started, taken, found = {}, {}, []
         for way in generator.permutation(list(ways)):
             with tempfile.TemporaryDirectory() as folder:
-                taken[str(way)] = _seconds(specs, Path(folder), ways[str(way)])
+                started[str(way)], taken[str(way)] = _seconds(specs, Path(folder), ways[str(way)])
                 found.append(_outcomes(specs, Path(folder)))
         assert all(outcomes == found[0] for outcomes in found), "ways differ in their records"
         print(f"round {number + 1}:", ", ".join(f"{way} {seconds:.0f} s" for way, seconds in taken.items()))
         rounds.append(taken)
+        starts.append(started)
     one, many, ray = ways
     result = {
         "runs": len(specs),
         "workers": count,
         "seconds": {way: round(float(np.median([taken[way] for taken in rounds])), 1) for way in ways},
+        "seconds_to_start": {
+            way: round(float(np.median([started[way] for started in starts])), 1) for way in ways
+        },
         "one_worker_to_many": median_ratio([taken[one] / taken[many] for taken in rounds], generator),
         "ray_to_many": median_ratio([taken[ray] / taken[many] for taken in rounds], generator),
     }
@@ -70,13 +74,20 @@ def main() -> None:
     print(json.dumps({name: result[name] for name in ("one_worker_to_many", "ray_to_many")}, indent=1))
 
 
-def _seconds(specs: list[RunSpec], records: Path, make: Callable[[], Workers]) -> float:
-    """Return how long the runs take."""
-    jobs, workers = benchmark_jobs(specs, records), make()
-    begin = time.perf_counter()
+def _seconds(specs: list[RunSpec], records: Path, make: Callable[[], Workers]) -> tuple[float, float]:
+    """Return how long workers take to be ready, and how long the runs take then."""
+    jobs, begin = benchmark_jobs(specs, records), time.perf_counter()
+    workers = make()
+    count = workers.free()
+    for number in range(count):
+        arguments = {"scenario": specs[0].scenario}  # in the cache: it takes as long as to import all
+        workers.start(Job(f"first job {number}", "clbench.grid:scenes_job", arguments, 1))
+    while workers.free() < count:
+        assert all(event.kind != "failed" for event in workers.events())
+    ready = time.perf_counter()
     failed = run_with_bars(jobs, workers, Console(file=io.StringIO()))
     assert not failed, failed
-    return time.perf_counter() - begin
+    return ready - begin, time.perf_counter() - ready
 
 
 def _outcomes(specs: list[RunSpec], records: Path) -> list[dict[str, Any]]:
