@@ -142,8 +142,8 @@ def _workers() -> Iterator[str]:
         f"{found['runs']} runs by one worker take {_ratio(found['one_worker_to_many'])} times as long as by "
         f"{found['workers']}; by a Ray cluster of {found['workers']} workers "
         f"{_ratio(found['ray_to_many'])} times as long as by these: {seconds}. The records are the same. "
-        "A worker of Ray keeps a process that has imported everything, and forks each job from it. A cluster and "
-        f"those processes take {found['seconds_to_start'][ray]:.0f} s to start, which these times leave out."
+        "A worker of Ray keeps a process that has imported everything, and forks each job from it. A cluster "
+        f"and these processes start in {found['seconds_to_start'][ray]:.0f} s, which is not in the times."
     )
     yield ""
 
