@@ -11,6 +11,7 @@ import psutil
 import pytest
 
 from clbench.grid import benchmark_jobs, run_jobs
+from clbench.limits import Limits
 from clbench.progress import Bars
 from clbench.ray_workers import RayWorkers
 from clbench.run_spec import RunSpec
@@ -40,6 +41,9 @@ def lost_once(progress, path):
 
 def lost_always(progress):
     os._exit(3)
+
+def endless(progress):
+    time.sleep(60)
 """
 
 # a cluster of its own for each test; Ray leaves a socket and a log file to the garbage collector
@@ -73,12 +77,14 @@ def test_a_job_that_fails_leaves_the_others_alone_and_one_whose_worker_is_killed
         Job("fine", "some_jobs:good", {}, 1),
         Job("lost", "some_jobs:lost_once", {"path": str(path)}, 1),
         Job("cursed", "some_jobs:lost_always", {}, 1),
+        Job("endless", "some_jobs:endless", {}, 1, limits=Limits(seconds=3)),
     ]
     killer = threading.Thread(target=_kill_first, args=(path, ancestor))
     killer.start()
     failed = run_jobs(jobs, RayWorkers("local", 2), bars)
     killer.join()
-    assert set(failed) == {"wrong", "hopeless", "cursed"}
+    assert set(failed) == {"wrong", "hopeless", "cursed", "endless"}
+    assert failed["endless"] == "stopped, because it took longer than 3 s"
     assert failed["cursed"] == (
         "its worker was lost 4 times: its process ended without a result (exit code 3)"
     )
