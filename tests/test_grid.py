@@ -183,7 +183,7 @@ def test_a_run_waits_for_what_it_is_made_from_and_nothing_else_is_made(
 def test_one_worker_and_two_give_equal_records_and_a_stopped_grid_goes_on(
     tmp_path: Path, bars: Bars, lasting_records: Callable[[Path], dict[str, Any]]
 ) -> None:
-    specs = [RunSpec(TOY, method, 0, targets=1) for method in ("frozen", "sft", "joint")]
+    specs = [RunSpec(TOY, method, 0) for method in ("frozen", "sft", "joint")]
     assert run_jobs(benchmark_jobs(specs, tmp_path / "one"), Processes(1), bars) == {}
     assert run_jobs(benchmark_jobs(specs[:1], tmp_path / "two"), Processes(2), bars) == {}
     missing = [spec for spec in specs if not has_record(spec, tmp_path / "two")]

@@ -90,7 +90,7 @@ class Adapting(Method):
 def test_the_same_run_twice_gives_equal_records(tmp_path: Path, method: str) -> None:
     paths = []
     for name in ("first", "second"):
-        spec = RunSpec(TOY, method, seed=1, targets=1)
+        spec = RunSpec(TOY, method, seed=1)
         assert execute(spec, tmp_path / name).status == "success"
         paths.append(spec.path(tmp_path / name))
     assert _lasting(paths[0]) == _lasting(paths[1])
@@ -220,9 +220,8 @@ def reports() -> Path:
 def test_progress_adds_up_to_the_length_of_the_run(perturb: bool, tmp_path: Path, reports: Path) -> None:
     for _ in range(2):  # the second time the report of the pretrained policy is there already
         amounts: list[float] = []
-        spec = RunSpec(TOY, "sft", seed=0, perturb=perturb, targets=1)
-        execute(spec, tmp_path, amounts.append)
-        assert sum(amounts) == pytest.approx(run_length(spec.load(), perturb=perturb))
+        execute(RunSpec(TOY, "sft", seed=0, perturb=perturb), tmp_path, amounts.append)
+        assert sum(amounts) == pytest.approx(run_length(load_scenario(TOY), perturb=perturb))
 
 
 @pytest.mark.parametrize(
@@ -294,7 +293,7 @@ def test_a_tuning_run_never_meets_a_report_episode(tmp_path: Path) -> None:
     record = execute(RunSpec(TOY, "sft", seed=3, split="selection", targets=1), tmp_path)
     assert set(record.episodes["split"]) == {"selection"}
     assert record.run["split"] == "selection"
-    assert not has_record(RunSpec(TOY, "sft", seed=3), tmp_path)
+    assert not has_record(RunSpec(TOY, "sft", seed=3, targets=1), tmp_path)
     report = execute(RunSpec(TOY, "sft", seed=3, targets=1), tmp_path / "report")
     assert record.fingerprint["pretrained"] == report.fingerprint["pretrained"]
     # the same training: what both evaluate alike ends alike
