@@ -329,10 +329,10 @@ def _report_jobs(specs: Sequence[RunSpec], needs: Sequence[tuple[str, ...]]) -> 
     """
     jobs = {}
     for name, (spec, needed) in {_report(pair[0]): pair for pair in zip(specs, needs, strict=True)}.items():
-        if is_reported(spec):
+        pretraining = _pretraining(spec.scenario, spec.seed)
+        if pretraining not in needed and is_reported(spec):
             continue
         length = end_length(spec.load(), spec.split, spec.perturb)
-        shared = (_pretraining(spec.scenario, spec.seed), _questions(spec.scenario))
-        waits = tuple(other for other in needed if other in shared)
+        waits = tuple(other for other in needed if other in (pretraining, _questions(spec.scenario)))
         jobs[name] = Job(name, "clbench.grid:report_job", {"spec": spec}, length, waits, device=spec.device)
     return jobs

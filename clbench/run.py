@@ -23,7 +23,7 @@ from clbench.learner import Learner, repeatable, sources
 from clbench.live import Log, require_tensorboard
 from clbench.method import describe_method
 from clbench.policy import Policy
-from clbench.pretraining import is_pretrained, pretrained_policy
+from clbench.pretraining import pretrained_policy
 from clbench.questions import report_questions
 from clbench.record import Record, append_row, read_record, write_record
 from clbench.run_spec import EPISODE_WEIGHT, RunSpec, describe_scenario, run_length
@@ -80,11 +80,9 @@ def evaluate_pretrained(spec: RunSpec, progress: Callable[[float], None] = lambd
 
 
 def is_reported(spec: RunSpec) -> bool:
-    """Return whether the evaluation of the pretrained policy that `spec` begins with is in the cache."""
-    scenario = spec.load()
-    if not is_pretrained(scenario, spec.seed):
-        return False
-    return is_cached(*_kept_report(spec, pretrained_policy(scenario, spec.seed)[0]))
+    """Return whether the evaluation of the policy that `spec` begins with is in the cache; the policy is."""
+    policy, _ = pretrained_policy(spec.load(), spec.seed)
+    return is_cached(*_kept_report(spec, policy))
 
 
 def _kept_report(spec: RunSpec, policy: Policy) -> tuple[Path, dict[str, Any]]:

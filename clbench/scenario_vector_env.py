@@ -17,7 +17,7 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from clbench.scenario_env import Observation
-from clbench.task import Scenario, Task, opened_scenario
+from clbench.task import Scenario, opened_scenario
 from clbench.walk import InstructionFormat, Start, Walk
 from clbench.world import Lanes
 
@@ -77,7 +77,6 @@ class ScenarioVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]
         self.action_space = batch_space(self.single_action_space, num_envs)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self._starts: list[Start] = []
-        self._tasks: list[Task] = []
         self._instructions: tuple[str, ...] | NDArray[np.int64] = ()
         self._told: dict[str, NDArray[Any]] = {}
         self._states = np.zeros((num_envs, *world.single_observation_space.shape), np.float32)
@@ -157,7 +156,6 @@ class ScenarioVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]
         """Put together what is said of the present episodes at each of their steps."""
         instructions = [start.observed_instruction for start in self._starts]
         self._instructions = tuple(instructions) if self.instruction == "text" else np.stack(instructions)
-        self._tasks = [start.task for start in self._starts]
         rows = [start.info(success=False) for start in self._starts]
         self._told = {
             name: np.array(
@@ -167,7 +165,8 @@ class ScenarioVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]
         }
 
     def _observation(self) -> Observation:
-        state, image = self._lanes.observe(range(self.num_envs), self._tasks, self._states)
+        tasks = [start.task for start in self._starts]
+        state, image = self._lanes.observe(range(self.num_envs), tasks, self._states)
         images = {"image": image} if image.size else {}
         return {"state": state.copy(), **images, "instruction": copy(self._instructions)}
 
