@@ -66,7 +66,7 @@ def fingerprint(scenario: Scenario) -> dict[str, Any]:
         "versions": versions(packages),
         "python": platform.python_version(),
         "commit": _commit(),
-        "hardware": {"machine": platform.machine(), "system": platform.system(), "processor": _processor()},
+        "hardware": _hardware(),
         "rollouts": {**rollouts, **frames},
     }
 
@@ -89,8 +89,20 @@ def _commit() -> dict[str, Any] | None:
     return {"id": head.stdout.strip(), "dirty": bool(changed.stdout.strip())}
 
 
+def _hardware() -> dict[str, str]:
+    """Return what may round differently: processors of one name differ in the instructions that they have."""
+    import torch  # seconds, and environments that only step need not wait for them
+
+    return {
+        "machine": platform.machine(),
+        "system": platform.system(),
+        "processor": _processor(),
+        "instructions": torch.backends.cpu.get_cpu_capability(),
+    }
+
+
 def _processor() -> str:
-    """Return the processor's model: another one may round differently."""
+    """Return the processor's model."""
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
     except OSError:

@@ -25,6 +25,7 @@ def test_a_fingerprint_names_the_simulator_of_its_own_suite_alone() -> None:
 def test_a_fingerprint_names_versions_hardware_and_every_world() -> None:
     found = fingerprint(TOY)
     assert found["versions"]["mujoco"] == version("mujoco")
-    assert found["hardware"]["machine"]
+    assert set(found["hardware"]) == {"machine", "system", "processor", "instructions"}
+    assert all(found["hardware"].values())
     assert set(found["rollouts"]) == {"clbench.testing:ToyWorld"}
     assert found["commit"] is None or len(found["commit"]["id"]) == 40

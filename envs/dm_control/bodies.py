@@ -58,10 +58,14 @@ class Start:
             self.task.initialize_episode(self.physics)
         mujoco.mj_copyData(data, self.model, self.physics.data.ptr)
 
+    @functools.cached_property
+    def _takes_whole_steps(self) -> bool:
+        return bool(self.model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4)
+
     def advance(self, data: mujoco.MjData) -> None:
         """Move `data` by one step, in dm_control's order of calls, which leaves all positions up to date."""
         substeps = self.body.substeps
-        if self.model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4:
+        if self._takes_whole_steps:
             mujoco.mj_step(self.model, data, substeps)
         else:
             mujoco.mj_step2(self.model, data)

@@ -69,7 +69,8 @@ def _tolerance(*values: Any, **options: Any) -> Rewards:
 
 
 def _length(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
-    length: NDArray[np.float64] = np.sqrt((vectors * vectors).sum(axis=-1))
+    """Return the lengths of vectors (..., K): a sum of squares need not have the bits of their norm."""
+    length: NDArray[np.float64] = np.sqrt(np.vecdot(vectors, vectors))
     return length
 
 
