@@ -17,7 +17,7 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from clbench.scenario_env import Observation
-from clbench.task import Scenario, opened_scenario
+from clbench.task import Scenario, Task, opened_scenario
 from clbench.walk import InstructionFormat, Start, Walk
 from clbench.world import Lanes
 
@@ -77,6 +77,9 @@ class ScenarioVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]
         self.action_space = batch_space(self.single_action_space, num_envs)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self._starts: list[Start] = []
+        self._tasks: list[Task] = []
+        self._everywhere = list(range(num_envs))
+        self._known = np.ones(num_envs, np.bool_)
         self._instructions: tuple[str, ...] | NDArray[np.int64] = ()
         self._told: dict[str, NDArray[Any]] = {}
         self._states = np.zeros((num_envs, *world.single_observation_space.shape), np.float32)
@@ -104,7 +107,7 @@ class ScenarioVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]
                 self._walks[number].begin()
         walks = zip(self._walks, self._generators, strict=True)
         self._starts = [walk.next(generator, options or {}) for walk, generator in walks]
-        self._begin(range(self.num_envs))
+        self._begin(self._everywhere)
         self._ended = np.zeros(self.num_envs, np.bool_)
         return self._observation(), self._info(self._ended)
 
@@ -125,6 +128,18 @@ class ScenarioVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]
         """
         if not self._starts:
             raise gymnasium.error.ResetNeeded(f"{self.scenario.id} has no episodes yet: call reset().")
+        if self._ended.any():
+            rewards, terminated = self._step_some(actions)
+        else:
+            self._states, rewards, terminated = self._lanes.step(self._everywhere, np.asarray(actions))
+            self._steps_left -= 1
+            self.steps_taken += self.num_envs
+        truncated = ~terminated & (self._steps_left <= 0)
+        self._ended = terminated | truncated
+        return self._observation(), rewards, terminated, truncated, self._info(terminated)
+
+    def _step_some(self, actions: NDArray[np.float32]) -> tuple[NDArray[np.float64], Flags]:
+        """Step where an episode goes on, begin the next one elsewhere; return rewards and successes."""
         rewards, terminated = np.zeros(self.num_envs), np.zeros(self.num_envs, np.bool_)
         beginning, going = np.flatnonzero(self._ended).tolist(), np.flatnonzero(~self._ended).tolist()
         if going:
@@ -132,13 +147,10 @@ class ScenarioVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]
             self._states[going], rewards[going], terminated[going] = outcomes
             self._steps_left[going] -= 1
             self.steps_taken += len(going)
-        if beginning:
-            for number in beginning:
-                self._starts[number] = self._walks[number].next(self._generators[number], {})
-            self._begin(beginning)
-        truncated = ~terminated & (self._steps_left <= 0)
-        self._ended = terminated | truncated
-        return self._observation(), rewards, terminated, truncated, self._info(terminated)
+        for number in beginning:
+            self._starts[number] = self._walks[number].next(self._generators[number], {})
+        self._begin(beginning)
+        return rewards, terminated
 
     def close_extras(self) -> None:
         """Close the worlds."""
@@ -154,6 +166,7 @@ class ScenarioVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]
 
     def _tell(self) -> None:
         """Put together what is said of the present episodes at each of their steps."""
+        self._tasks = [start.task for start in self._starts]
         instructions = [start.observed_instruction for start in self._starts]
         self._instructions = tuple(instructions) if self.instruction == "text" else np.stack(instructions)
         rows = [start.info(success=False) for start in self._starts]
@@ -165,8 +178,7 @@ class ScenarioVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]
         }
 
     def _observation(self) -> Observation:
-        tasks = [start.task for start in self._starts]
-        state, image = self._lanes.observe(range(self.num_envs), tasks, self._states)
+        state, image = self._lanes.observe(self._everywhere, self._tasks, self._states)
         images = {"image": image} if image.size else {}
         return {"state": state.copy(), **images, "instruction": copy(self._instructions)}
 
@@ -174,5 +186,5 @@ class ScenarioVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]
         """Return the infos as Gymnasium's vector environments do: a column of each, and where it is known."""
         info: dict[str, Any] = {}
         for name, column in {**self._told, "success": successes}.items():
-            info[name], info[f"_{name}"] = column.copy(), np.ones(self.num_envs, np.bool_)
+            info[name], info[f"_{name}"] = column.copy(), self._known.copy()
         return info

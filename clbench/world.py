@@ -123,10 +123,11 @@ def checked_actions(actions: NDArray[np.float32], space: spaces.Box, world: str)
     actions = np.asarray(actions, np.float32)
     if actions.shape[1:] != space.shape:
         raise ValueError(f"An action of the {world} world has shape {space.shape}, not {actions.shape[1:]}.")
-    finite = np.isfinite(actions).all(axis=1)
+    finite = np.isfinite(actions)
     if not finite.all():
-        raise ValueError(f"An action of the {world} world is finite, not {actions[~finite][0].tolist()}.")
-    return actions.clip(space.low, space.high)
+        wrong = actions[~finite.all(axis=1)][0]
+        raise ValueError(f"An action of the {world} world is finite, not {wrong.tolist()}.")
+    return np.minimum(np.maximum(actions, space.low), space.high)
 
 
 def no_episode(lane: int, world: str) -> gymnasium.error.ResetNeeded:
@@ -312,12 +313,12 @@ class Lanes:
         Raises:
             RenderingError: Nothing here can draw a world.
         """
-        observers, views = [self.observer(task) for task in tasks], self._views[list(lanes)]
-        if all(observer is observers[0] for observer in observers):
-            return observers[0].observe(states, views)
+        views = self._views[list(lanes)]
+        if len({(task.world, task.camera) if task.camera else None for task in tasks}) == 1:
+            return self.observer(tasks[0]).observe(states, views)
         shown = [
-            observer.observe(state[None], view[None])
-            for observer, state, view in zip(observers, states, views, strict=True)
+            self.observer(task).observe(state[None], view[None])
+            for task, state, view in zip(tasks, states, views, strict=True)
         ]
         numbers, images = zip(*shown, strict=True)
         return np.concatenate(numbers), np.concatenate(images)
@@ -350,6 +351,10 @@ class Lanes:
     def step(self, lanes: Sequence[int], actions: NDArray[np.float32]) -> Outcomes:
         """Move each of `lanes`, none twice, by its row of actions (N, A)."""
         states, rewards, successes = self._empty(lanes), np.empty(len(lanes)), np.empty(len(lanes), np.bool_)
+        if len(self._worlds) == 1:
+            (world,) = self._worlds.values()
+            states[:], rewards[:], successes[:] = world.step(lanes, actions)
+            return states, rewards, successes
         for world, rows in self._by_world(lanes):
             outcomes = world.step([lanes[row] for row in rows], actions[rows])
             states[rows], rewards[rows], successes[rows] = outcomes

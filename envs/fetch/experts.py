@@ -81,10 +81,11 @@ def _grasp(state: State) -> Action | None:
     """Return the action that takes hold of the block, or None if the gripper holds it."""
     block = state[BLOCK].astype(np.float64)
     x, y, z = (block - state[GRIPPER]).tolist()
+    apart = opening(state.tolist())
     if math.hypot(x, y) < 0.02 and abs(z) < 0.02:
-        return None if opening(state) < 0.06 else _toward(state, block, CLOSE)
-    clearance = 0.06 if opening(state) > OPEN else 0.08
-    if opening(state) < OPEN and math.hypot(x, y) < 0.04:
+        return None if apart < 0.06 else _toward(state, block, CLOSE)
+    clearance = 0.06 if apart > OPEN else 0.08
+    if apart < OPEN and math.hypot(x, y) < 0.04:
         # Fingers that are not open yet would come down on the block.
         return _toward(state, block + clearance * UP, OPEN_UP)
     return _descend(state, block, clearance, OPEN_UP)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import chain
 from typing import Any
 
 import gymnasium
@@ -15,7 +16,7 @@ from clbench.perturbation import draw_perturbation
 from clbench.task import unknown
 from clbench.world import Team, checked_actions, no_episode
 
-from .rules import RULES, Rule
+from .rules import RULES, Numbers, Rule
 from .scene import Scene, mat2euler, scene, scene_with_mass
 from .state import (
     BLOCK,
@@ -63,24 +64,34 @@ class _Lane:
     Asking MjData for a view costs 0.2 to 0.4 us each time.
     """
 
-    def __init__(self, number: int, scene: Scene) -> None:
-        self.number, self.scene = number, scene
+    def __init__(self, scene: Scene) -> None:
+        self.scene = scene
         self.data = data = mujoco.MjData(scene.model)
         self.qpos, self.qvel = data.qpos, data.qvel
-        self.gripper, self.block = data.site_xpos[scene.gripper_site], data.site_xpos[scene.block_site]
-        self.block_axes = data.site_xmat[scene.block_site]
         self.hand, self.hand_quaternion = data.xpos[scene.hand_body], data.xquat[scene.hand_body]
         self.goal, self.goal_quaternion = data.mocap_pos[0], data.mocap_quat[0]
         self.control = data.ctrl
         self.rule: Rule = next(iter(RULES.values()))
+        self.start: Numbers = []
         self.target = np.zeros(3)
-        self.start = np.zeros(SIZE, np.float32)
+        gripper, block = scene.gripper_site, scene.block_site
+        self.moving = self.hand, self.hand_quaternion, self.qpos
+        """What an action starts from."""
+        self.observed = (
+            *(data.site_xpos[gripper], data.site_xpos[block], data.site_xmat[block]),
+            *(self.target, self.qpos, self.qvel),
+        )
+        """What a state is computed from, besides the Jacobians."""
+        self.jacobians = np.zeros((3, 3, scene.model.nv))
+        """Of the gripper's and the block's place, and of the block's rotation."""
+        self.jacobian_of = tuple(self.jacobians)
 
     def __deepcopy__(self, _: dict[int, Any]) -> _Lane:
         """Return a lane whose views are of its own physics."""
-        lane = _Lane(self.number, self.scene)
+        lane = _Lane(self.scene)
         mujoco.mj_copyData(lane.data, self.scene.model, self.data)
-        lane.rule, lane.target, lane.start = self.rule, self.target, self.start
+        lane.rule, lane.start = self.rule, self.start
+        lane.target[:], lane.jacobians[:] = self.target, self.jacobians
         return lane
 
 
@@ -108,8 +119,6 @@ class FetchVectorWorld:
         self._perturbed, self._rules = perturbed, rules
         self._lanes: list[_Lane | None] = [None] * lanes
         self._team = Team(threads)
-        # of the gripper's and the block's place, and of the block's rotation
-        self._jacobians = np.zeros((lanes, 3, 3, self._scene.model.nv))
 
     def reset(self, lanes: Sequence[int], seeds: Sequence[int], tasks: Sequence[str]) -> State:
         """Start an episode in each of `lanes` and return the states (N, 28).
@@ -128,15 +137,15 @@ class FetchVectorWorld:
             generator, _ = np_random(seed)
             block = self._place_block(generator)
             lane.rule = self._rules[task]
-            lane.target = self._place_target(block, lane.rule, generator)
+            lane.target[:] = self._place_target(block, lane.rule, generator)
             self._reset_physics(lane, block)
             if perturbation:
                 self._displace(lane, perturbation.start)
             self._measure(lane)
         begun = [self._lane(number) for number in lanes]
         states = self._observe(begun)
-        for lane, state in zip(begun, states, strict=True):
-            lane.start = state.copy()
+        for lane, state in zip(begun, states.tolist(), strict=True):
+            lane.start = state
         return states
 
     def step(
@@ -154,7 +163,7 @@ class FetchVectorWorld:
         self._act(moved, actions)
         self._team.each(self._advance, moved)
         states = self._observe(moved)
-        judged = [lane.rule.judge(state, lane.start) for lane, state in zip(moved, states, strict=True)]
+        judged = [lane.rule.judge(now, lane.start) for lane, now in zip(moved, states.tolist(), strict=True)]
         rewards, successes = zip(*judged, strict=True)
         return states, np.array(rewards), np.array(successes)
 
@@ -179,7 +188,7 @@ class FetchVectorWorld:
         """Return a lane that has the physics of a scene; it is made anew if it had that of another one."""
         lane = self._lanes[number]
         if lane is None or lane.scene is not scene:
-            self._lanes[number] = lane = _Lane(number, scene)
+            self._lanes[number] = lane = _Lane(scene)
         return lane
 
     def _place_block(self, generator: np.random.Generator) -> Vectors:
@@ -220,9 +229,10 @@ class FetchVectorWorld:
 
     def _act(self, lanes: Sequence[_Lane], actions: NDArray[np.float32]) -> None:
         """Set the hands' goals and the fingers' controls, in the arithmetic of gymnasium-robotics."""
-        hands = _gather(lanes, "hand") + actions[:, :3] * np.float32(REACH)
-        quaternions = _gather(lanes, "hand_quaternion") + HAND_TURN
-        fingers = _gather(lanes, "qpos")[:, self._scene.actuators_qpos] + actions[:, 3:].astype(float)
+        now = _gather([lane.moving for lane in lanes])
+        hands = now[:, :3] + actions[:, :3] * np.float32(REACH)
+        quaternions = now[:, 3:7] + HAND_TURN
+        fingers = now[:, 7 + self._scene.actuators_qpos] + actions[:, 3:].astype(float)
         for lane, hand, quaternion, finger in zip(lanes, hands, quaternions, fingers, strict=True):
             lane.goal[:], lane.goal_quaternion[:], lane.control[:] = hand, quaternion, finger
 
@@ -234,33 +244,32 @@ class FetchVectorWorld:
     def _measure(self, lane: _Lane) -> None:
         """Compute what the velocities of gripper and block depend on."""
         scene, data = lane.scene, lane.data
-        gripper, block, rotation = self._jacobians[lane.number]
+        gripper, block, rotation = lane.jacobian_of
         mujoco.mj_jacSite(scene.model, data, gripper, None, scene.gripper_site)
         mujoco.mj_jacSite(scene.model, data, block, rotation, scene.block_site)
 
     def _observe(self, lanes: Sequence[_Lane]) -> State:
         """Return the states (N, 28): gymnasium-robotics' arithmetic in double precision, then rounded."""
-        scene, seconds = self._scene, self._scene.step_seconds
-        gripper, block = _gather(lanes, "gripper"), _gather(lanes, "block")
-        qvel = _gather(lanes, "qvel")
-        velocities = (self._jacobians[[lane.number for lane in lanes]] @ qvel[:, None, :, None])[
-            ..., 0
-        ] * seconds
+        scene, seconds, nv = self._scene, self._scene.step_seconds, self._scene.model.nv
+        now = _gather([lane.observed for lane in lanes])
+        gripper, block, axes, qpos, qvel = now[:, :3], now[:, 3:6], now[:, 6:15], now[:, 18:-nv], now[:, -nv:]
+        jacobians = np.concatenate([lane.jacobians for lane in lanes]).reshape(len(lanes), 3, 3, nv)
+        velocities = (jacobians @ qvel[:, None, :, None])[..., 0] * seconds
         gripper_velocity, block_velocity, block_spin = velocities.swapaxes(0, 1)
         states = np.empty((len(lanes), SIZE), np.float32)
         states[:, GRIPPER] = gripper
         states[:, BLOCK] = block
         states[:, BLOCK_FROM_GRIPPER] = block - gripper
-        states[:, FINGERS] = _gather(lanes, "qpos")[:, scene.fingers_qpos]
-        states[:, BLOCK_ANGLES] = mat2euler(_gather(lanes, "block_axes").reshape(-1, 3, 3))
+        states[:, FINGERS] = qpos[:, scene.fingers_qpos]
+        states[:, BLOCK_ANGLES] = mat2euler(axes.reshape(-1, 3, 3))
         states[:, BLOCK_FROM_GRIPPER_VELOCITY] = block_velocity - gripper_velocity
         states[:, BLOCK_SPIN] = block_spin
         states[:, GRIPPER_VELOCITY] = gripper_velocity
         states[:, FINGERS_VELOCITY] = qvel[:, scene.fingers_qvel] * seconds
-        states[:, TARGET] = _gather(lanes, "target")
+        states[:, TARGET] = now[:, 15:18]
         return states
 
 
-def _gather(lanes: Sequence[_Lane], name: str) -> Vectors:
-    """Return what each lane has under `name`, (N, its size)."""
-    return np.concatenate([getattr(lane, name) for lane in lanes]).reshape(len(lanes), -1)
+def _gather(parts: Sequence[Sequence[Vectors]]) -> Vectors:
+    """Return what the parts (each of one length) of N lanes hold, (N, all their lengths)."""
+    return np.concatenate([*chain.from_iterable(parts)]).reshape(len(parts), -1)

@@ -6,7 +6,7 @@ the task, and are computed in groups of episodes of one task.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TypeAlias
 
@@ -36,6 +36,8 @@ _ARM: tuple[Look, ...] = (
     ("site", "leftEndEffector", "xpos"),
 )
 """What is looked at of the robot."""
+_FINGERS = np.array([1.0, -1.0], np.float32)
+"""The share of an action's last number that each finger gets."""
 
 
 @dataclass(frozen=True)
@@ -128,6 +130,7 @@ class Batch:
     def __init__(self, groups: Sequence[Group]) -> None:
         self._groups, self.episodes = groups, [episode for group in groups for episode in group.episodes]
         self._mocaps = [episode.data.mocap_pos[0] for episode in self.episodes]
+        self._hands = np.stack(self._mocaps)
         self._controls = [episode.data.ctrl for episode in self.episodes]
         self._reach = [
             np.array([getattr(one, name) for one in self.episodes]) for name in ("mocap_low", "mocap_high")
@@ -135,24 +138,30 @@ class Batch:
         bounds = [episode.sawyer_observation_space for episode in self.episodes]
         self._bounds = [np.array([getattr(one, name) for one in bounds]) for name in ("low", "high")]
         self._goals = np.concatenate([group.goal for group in groups])
-        self._arms = [episode.look(look) for episode in self.episodes for look in _ARM]
+        self._before = np.stack([episode.before for episode in self.episodes])
         parts = [group.rule.parts for group in groups for _ in group.episodes]
-        self._views = [_Views(self.episodes, parts, number) for number in range(max(map(len, parts)))]
+        self._parts = [_Parts(self.episodes, parts, number) for number in range(max(map(len, parts)))]
+        arms = [episode.look(look) for episode in self.episodes for look in _ARM]
+        # read all at once: whatever comes after the physics finds the processor's caches full of that
+        self._views = [view for views in (arms, *(part.views for part in self._parts)) for view in views]
 
     def aim(self, actions: Numbers) -> None:
         """Set what the physics is to do in the next step, by actions (N, 4) in [-1, 1]."""
         self._actions = actions
         low, high = self._reach
-        goals = _rows(self._mocaps) + actions[:, :3] * self.episodes[0].action_scale
-        goals = np.minimum(np.maximum(goals, low), high)
-        efforts = actions[:, 3:] * np.array([1.0, -1.0], np.float32)
-        for mocap, goal, control, effort in zip(self._mocaps, goals, self._controls, efforts, strict=True):
-            mocap[:], control[:] = goal, effort
+        hands = self._hands + actions[:, :3] * self.episodes[0].action_scale
+        self._hands = np.minimum(np.maximum(hands, low), high)
+        efforts = actions[:, 3:] * _FINGERS
+        for mocap, hand, control, effort in zip(
+            self._mocaps, self._hands, self._controls, efforts, strict=True
+        ):
+            mocap[:], control[:] = hand, effort
 
     def outcome(self) -> tuple[Vector, Vector, NDArray[np.bool_]]:
         """Return observations (N, 39), rewards (N,) and successes (N,), once the physics has advanced."""
-        arm = _rows(self._arms).reshape(len(self.episodes), -1, 3)
-        observation = self._observe(arm)
+        numbers, arms = np.concatenate(self._views), len(self.episodes) * len(_ARM) * 3
+        arm = numbers[:arms].reshape(len(self.episodes), -1, 3)
+        observation = self._observe(arm, numbers[arms:])
         tcp = (arm[:, 5] + arm[:, 6]) / 2.0
         rewards, successes = np.empty(len(tcp)), np.empty(len(tcp), np.bool_)
         first = 0
@@ -166,58 +175,61 @@ class Batch:
                 first = rows.stop
         return observation, rewards, successes
 
-    def _observe(self, arm: Vector) -> Vector:
+    def _observe(self, arm: Vector, numbers: Vector) -> Vector:
+        """Return observations (N, 39), from the places of the arm (N, 7, 3) and the numbers of the parts."""
         observation = np.zeros((len(self.episodes), SIZE))
         observation[:, :3] = arm[:, 0]
         apart = norm(arm[:, 1] - arm[:, 2]) / 0.1
         observation[:, 3] = np.minimum(np.maximum(apart, 0.0), 1.0)
-        for views in self._views:
-            views.show(observation)
-        observation[:, NOW : 2 * NOW] = _rows([episode.before for episode in self.episodes])
+        for part in self._parts:
+            part.show(numbers[: part.size], observation)
+            numbers = numbers[part.size :]
+        observation[:, NOW : 2 * NOW] = self._before
         observation[:, 2 * NOW :] = self._goals
-        for episode, now in zip(self.episodes, observation[:, :NOW].copy(), strict=True):
+        self._before = observation[:, :NOW].copy()
+        for episode, now in zip(self.episodes, self._before, strict=True):
             episode.before = now
         low, high = self._bounds
         seen: Vector = np.minimum(np.maximum(observation, low), high)
         return seen
 
 
-class _Views:
-    """What observations show of their first parts, or of their second: views of it in the physics."""
+class _Parts:
+    """What observations show of their first parts, or of their second."""
+
+    views: list[Vector]
+    """All that is looked at: places (P, 3), then quaternions (Q, 4), then matrices (M, 9)."""
+    size: int
+    """How many numbers that is."""
 
     def __init__(self, episodes: Sequence[Episode], parts: Sequence[tuple[Part, ...]], number: int) -> None:
         self._place, self._rotation = _PARTS[number]
         shown = [(row, part[number]) for row, part in enumerate(parts) if len(part) > number]
         moved = [(row, part.offset) for row, part in shown if part.offset is not None]
         self._rows = [row for row, _ in shown]
-        self._places = [episodes[row].look(part.place) for row, part in shown]
         self._moved = [row for row, _ in moved]
         self._offsets = np.array([offset for _, offset in moved])
-        turned = [
-            (row, episodes[row].look(part.rotation)) for row, part in shown if part.rotation is not None
-        ]
-        self._quaternions = _split((row, view) for row, view in turned if view.size == 4)
-        self._matrices = _split((row, view) for row, view in turned if view.size == 9)
+        turned = [(row, episodes[row].look(part.rotation)) for row, part in shown if part.rotation]
+        quaternions = [(row, view) for row, view in turned if view.size == 4]
+        matrices = [(row, view) for row, view in turned if view.size == 9]
+        self._quaternions, self._matrices = [row for row, _ in quaternions], [row for row, _ in matrices]
+        self.views = [episodes[row].look(part.place) for row, part in shown]
+        self.views += [view for _, view in quaternions + matrices]
+        self._ends = 3 * len(shown), 3 * len(shown) + 4 * len(quaternions)
+        self.size = sum(view.size for view in self.views)
 
-    def show(self, observation: Vector) -> None:
-        """Write it into observations (N, 39)."""
-        observation[self._rows, self._place] = _rows(self._places)
+    def show(self, numbers: Vector, observation: Vector) -> None:
+        """Write them into observations (N, 39), from the numbers that the views hold."""
+        places, turns = self._ends
+        observation[self._rows, self._place] = numbers[:places].reshape(-1, 3)
         if self._moved:
             observation[self._moved, self._place] += self._offsets
-        rows, views = self._quaternions
-        if rows:
-            observation[rows, self._rotation] = _rows(views)
-        rows, views = self._matrices
-        if rows:
+        if self._quaternions:
+            observation[self._quaternions, self._rotation] = numbers[places:turns].reshape(-1, 4)
+        if self._matrices:
             # MuJoCo's are rotations: what is skipped is to make them so
-            turns = Rotation.from_matrix(_rows(views).reshape(-1, 3, 3), assume_valid=True)
-            observation[rows, self._rotation] = turns.as_quat()
-
-
-def _split(pairs: Iterable[tuple[int, Vector]]) -> tuple[list[int], list[Vector]]:
-    """Return the rows, and what is written into each."""
-    listed = list(pairs)
-    return [row for row, _ in listed], [view for _, view in listed]
+            rotations = Rotation.from_matrix(numbers[turns:].reshape(-1, 3, 3), assume_valid=True)
+            observation[self._matrices, self._rotation] = rotations.as_quat()
 
 
 def _rows(views: Sequence[Vector]) -> Vector:
