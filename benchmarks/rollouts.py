@@ -26,6 +26,7 @@ from typing import Any, Protocol
 import gymnasium
 import mujoco
 import numpy as np
+import walker
 from numpy.typing import NDArray
 from ratios import median_ratio
 from result_files import read_results, write_results
@@ -122,15 +123,15 @@ class DMControlEnv(gymnasium.Env[NDArray[np.float64], NDArray[np.float32]]):
         return np.concatenate([np.ravel(part) for part in moment.observation.values()])
 
 
-def _dm_control_peer() -> Env:
+def _dm_control_peer(domain: str, task: str, seconds: float) -> Env:
     os.environ["MUJOCO_GL"] = "off"
-    return DMControlEnv("ball_in_cup", "catch", 0.04)
+    return DMControlEnv(domain, task, seconds)
 
 
 def _dm_control_physics(env: Env) -> Physics:
     unwrapped: Any = env.unwrapped
-    physics = unwrapped.env.physics
-    return Physics(physics.model.ptr, physics.data.ptr, round(0.04 / physics.timestep()), _set_controls)
+    physics, seconds = unwrapped.env.physics, unwrapped.env.control_timestep()
+    return Physics(physics.model.ptr, physics.data.ptr, round(seconds / physics.timestep()), _set_controls)
 
 
 def _metaworld_peer() -> Env:
@@ -159,7 +160,18 @@ SUITES = {
         _fetch_physics,
     ),
     "dm_control": Suite(
-        "clbench/DMControl-v0", 3, "ball_in_cup catch", _dm_control_peer, _dm_control_physics
+        "clbench/DMControl-v0",
+        3,
+        "ball_in_cup catch",
+        functools.partial(_dm_control_peer, "ball_in_cup", "catch", 0.04),
+        _dm_control_physics,
+    ),
+    "dm_control, in no scenario": Suite(
+        f"walker:{walker.ID}",
+        1,
+        "walker walk",
+        functools.partial(_dm_control_peer, "walker", "walk", walker.SECONDS),
+        _dm_control_physics,
     ),
     "metaworld": Suite(
         "clbench/MetaWorld-v0", 1, "Meta-World/MT1 faucet-close-v3", _metaworld_peer, _metaworld_physics

@@ -81,9 +81,7 @@ def start(body: str, task: str) -> Start:
     Raises:
         ValueError: The body has more motors, or is observed in more numbers, than there are places for.
     """
-    with _without_dm_control_renderer():
-        domain = importlib.import_module(f"dm_control.suite.{body}")
-    environment = domain.SUITE[task]()
+    environment = environment_of(body, task)
     observed = sum(int(np.prod(spec.shape)) for spec in environment.observation_spec().values())
     motors = int(environment.action_spec().shape[0])
     if observed > OBSERVATION_SIZE:
@@ -101,6 +99,12 @@ def start_with_mass(body: str, task: str, mass: float) -> Start:
     plain = start(body, task)
     thing = int(plain.model.body(plain.body.thing).id)
     return replace(plain, model=with_mass(plain.model, [thing], mass))
+
+
+def environment_of(domain: str, task: str) -> Any:
+    """Return dm_control's own environment of a task."""
+    with _without_dm_control_renderer():
+        return importlib.import_module(f"dm_control.suite.{domain}").SUITE[task]()
 
 
 @contextlib.contextmanager
