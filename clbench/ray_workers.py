@@ -21,7 +21,14 @@ from clbench.workers import Event, Job, Processes
 RETRIES = 3
 """How often a job begins again after its worker was lost. A run goes on with its last finished stage."""
 
-_PASSED_ON = ("CLBENCH_CACHE", "MINARI_DATASETS_PATH", "MUJOCO_GL")
+_INSTRUCTIONS = (
+    "ATEN_CPU_CAPABILITY",
+    "ONEDNN_MAX_CPU_ISA",
+    "OPENBLAS_CORETYPE",
+    "NPY_DISABLE_CPU_FEATURES",
+)
+"""What decides which of its instructions a processor uses, and so the bits of what is trained."""
+_PASSED_ON = ("CLBENCH_CACHE", "MINARI_DATASETS_PATH", "MUJOCO_GL", *_INSTRUCTIONS)
 
 
 class LostProcessError(Exception):
@@ -49,10 +56,14 @@ class RayWorkers:
 
         self._ray: Any = ray
         self._count = count
-        options: dict[str, Any] = (
-            {"num_cpus": count, "include_dashboard": False} if address == "local" else {}
-        )
-        options["runtime_env"] = {"env_vars": _environment()}
+        options: dict[str, Any] = {"runtime_env": {"env_vars": _environment()}}
+        if address == "local":
+            # else they are nicer, by 15, than whatever else runs on this machine
+            options |= {
+                "_system_config": {"worker_niceness": 0},
+                "num_cpus": count,
+                "include_dashboard": False,
+            }
         try:
             ray.init(address, log_to_driver=False, logging_level=logging.ERROR, **options)
         except ConnectionError as error:

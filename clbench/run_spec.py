@@ -7,14 +7,17 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import torch
-
-from clbench.method import Method, build_method
 from clbench.record import RecordError, label_of, read_record, record_path
 from clbench.task import Scenario, Split, load_scenario
 from clbench.world import check_perturbable
+
+if TYPE_CHECKING:
+    from clbench.method import Method
+
+# PyTorch, which methods need, is imported late: that takes seconds, for which neither `--help` nor a process
+# of Ray that passes a spec on waits.
 
 EPISODE_WEIGHT = 0.3
 """What an evaluation episode takes, in optimiser steps; for the time left that a progress bar shows."""
@@ -68,6 +71,8 @@ class RunSpec:
 
     def build(self) -> Method:
         """Return a new object of the method."""
+        from clbench.method import build_method
+
         return build_method(self.method, self.changes)
 
     def describe(self) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -150,6 +155,8 @@ def end_length(scenario: Scenario, split: Split, perturb: bool) -> float:
 
 def read_changes(method: str, changes: Mapping[str, Any]) -> dict[str, Any]:
     """Return changed hyper-parameters as the method holds them: the text "0.5" may be a number."""
+    from clbench.method import build_method
+
     built = build_method(method, changes)
     return {name: getattr(built, name) for name in changes}
 
@@ -160,6 +167,8 @@ def check_device(device: str) -> None:
     Raises:
         ValueError: The name is none that PyTorch knows, or this machine has no such device.
     """
+    import torch
+
     try:
         torch.zeros(1, device=device)
     except (RuntimeError, AssertionError) as error:

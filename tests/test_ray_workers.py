@@ -1,6 +1,7 @@
 """Ray: the same records as on one machine, and nothing is lost with a worker."""
 
 import io
+import os
 import threading
 import time
 from collections.abc import Callable
@@ -44,6 +45,9 @@ def lost_always(progress):
 
 def endless(progress):
     time.sleep(60)
+
+def niceness(progress):
+    return f"nicer by {os.nice(0)}"
 """
 
 # a cluster of its own for each test; Ray leaves a socket and a log file to the garbage collector
@@ -103,6 +107,12 @@ def test_the_records_are_those_of_one_machine(
     records = lasting_records(tmp_path / "here")
     assert len(records) == 3
     assert records == lasting_records(tmp_path / "ray")
+
+
+def test_a_job_on_this_machine_gives_way_to_nothing_else(bars: Bars) -> None:
+    assert run_jobs([Job("niceness", "some_jobs:niceness", {}, 1)], RayWorkers("local", 1), bars) == {}
+    assert isinstance(bars.console.file, io.StringIO)
+    assert f"niceness: nicer by {os.nice(0)}" in bars.console.file.getvalue()
 
 
 def test_a_cluster_that_does_not_run_is_refused() -> None:

@@ -14,17 +14,15 @@ from rich.console import Console
 from rich.table import Table
 
 from clbench.arguments import at_least, checked_input, look_here
-from clbench.grid import benchmark_jobs, run_with_bars, stages_jobs
-from clbench.live import require_tensorboard
-from clbench.method import method_names
 from clbench.metrics import measure
 from clbench.record import RECORDS, TUNING, read_record
 from clbench.run_spec import RunSpec, check_device, has_record, read_changes
 from clbench.scores import Scores
-from clbench.stages import has_stages
 from clbench.statistics import expected_precision
 from clbench.task import load_scenario
 from clbench.workers import Processes, Workers
+
+# What imports PyTorch is imported where it is needed: `--help` does not wait for it.
 
 
 def run(
@@ -73,6 +71,9 @@ def run(
             made again.
         tensorboard: Log the runs for TensorBoard below this folder, while they are under way.
     """
+    from clbench.live import require_tensorboard
+    from clbench.method import method_names
+
     look_here()
     with checked_input():
         at_least(1, "--seeds", seeds)
@@ -131,6 +132,9 @@ def _run_missing(
     tensorboard: Path | None = None,
 ) -> bool:
     """Do the runs that have no record yet, keep what policies are to be kept; return whether none failed."""
+    from clbench.grid import benchmark_jobs, run_with_bars, stages_jobs
+    from clbench.stages import has_stages
+
     console = Console(stderr=True)
     with checked_input():
         missing = [spec for spec in specs if not has_record(spec, records)]
