@@ -76,7 +76,7 @@ class FetchPixelsVectorWorld(FetchVectorWorld):
         """Return the states (N, 28) with joints and things, (N, 56)."""
         for lane, state in zip(lanes, states, strict=True):
             self._states[lane, :SIZE] = state
-            self._states[lane, JOINTS] = self._lane(lane).qpos
+            self._states[lane, JOINTS] = self._lane(lane).data.qpos
         complete: State = self._states[list(lanes)]
         return complete
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from itertools import chain
 from typing import Any
 
 import gymnasium
@@ -55,6 +54,11 @@ REACH = 0.05
 HAND_TURN = np.array([1.0, 0.0, 1.0, 0.0])
 """What gymnasium-robotics adds to the hand's quaternion for its goal, which keeps the hand pointing down."""
 
+BLOCK_AXES, HAND, HAND_QUATERNION, MARKER = slice(6, 15), slice(15, 18), slice(18, 22), slice(22, 25)
+"""Where they are in what is measured, after the places of the gripper (3,) and the block (3,)."""
+JOINTS = 25
+"""Where the positions of all joints begin there, which their speeds follow."""
+
 Vectors = NDArray[np.float64]
 
 
@@ -64,34 +68,26 @@ class _Lane:
     Asking MjData for a view costs 0.2 to 0.4 us each time.
     """
 
-    def __init__(self, scene: Scene) -> None:
-        self.scene = scene
+    def __init__(self, number: int, scene: Scene) -> None:
+        self.number, self.scene = number, scene
         self.data = data = mujoco.MjData(scene.model)
-        self.qpos, self.qvel = data.qpos, data.qvel
-        self.hand, self.hand_quaternion = data.xpos[scene.hand_body], data.xquat[scene.hand_body]
         self.goal, self.goal_quaternion = data.mocap_pos[0], data.mocap_quat[0]
         self.control = data.ctrl
         self.rule: Rule = next(iter(RULES.values()))
         self.start: Numbers = []
         self.target = np.zeros(3)
-        gripper, block = scene.gripper_site, scene.block_site
-        self.moving = self.hand, self.hand_quaternion, self.qpos
-        """What an action starts from."""
-        self.observed = (
-            *(data.site_xpos[gripper], data.site_xpos[block], data.site_xmat[block]),
-            *(self.target, self.qpos, self.qvel),
-        )
-        """What a state is computed from, besides the Jacobians."""
-        self.jacobians = np.zeros((3, 3, scene.model.nv))
-        """Of the gripper's and the block's place, and of the block's rotation."""
-        self.jacobian_of = tuple(self.jacobians)
+        gripper, block, hand = scene.gripper_site, scene.block_site, scene.hand_body
+        places, axes = (data.site_xpos[gripper], data.site_xpos[block]), data.site_xmat[block]
+        self.parts = *places, axes, data.xpos[hand], data.xquat[hand], self.target, data.qpos, data.qvel
+        """What is measured: places of the gripper and the block, the block's axes, place and quaternion of
+        the hand, the target, positions and speeds of all joints."""
 
     def __deepcopy__(self, _: dict[int, Any]) -> _Lane:
         """Return a lane whose views are of its own physics."""
-        lane = _Lane(self.scene)
+        lane = _Lane(self.number, self.scene)
         mujoco.mj_copyData(lane.data, self.scene.model, self.data)
         lane.rule, lane.start = self.rule, self.start
-        lane.target[:], lane.jacobians[:] = self.target, self.jacobians
+        lane.target[:] = self.target
         return lane
 
 
@@ -119,6 +115,11 @@ class FetchVectorWorld:
         self._perturbed, self._rules = perturbed, rules
         self._lanes: list[_Lane | None] = [None] * lanes
         self._team = Team(threads)
+        model = self._scene.model
+        self._measured = np.zeros((lanes, JOINTS + model.nq + model.nv))
+        """What is measured of each lane, see `_Lane.parts`."""
+        self._jacobians = np.zeros((lanes, 3, 3, model.nv))
+        """Of the gripper's and the block's place, and of the block's rotation, in each lane."""
 
     def reset(self, lanes: Sequence[int], seeds: Sequence[int], tasks: Sequence[str]) -> State:
         """Start an episode in each of `lanes` and return the states (N, 28).
@@ -141,7 +142,6 @@ class FetchVectorWorld:
             self._reset_physics(lane, block)
             if perturbation:
                 self._displace(lane, perturbation.start)
-            self._measure(lane)
         begun = [self._lane(number) for number in lanes]
         states = self._observe(begun)
         for lane, state in zip(begun, states.tolist(), strict=True):
@@ -188,7 +188,7 @@ class FetchVectorWorld:
         """Return a lane that has the physics of a scene; it is made anew if it had that of another one."""
         lane = self._lanes[number]
         if lane is None or lane.scene is not scene:
-            self._lanes[number] = lane = _Lane(scene)
+            self._lanes[number] = lane = _Lane(number, scene)
         return lane
 
     def _place_block(self, generator: np.random.Generator) -> Vectors:
@@ -221,18 +221,20 @@ class FetchVectorWorld:
         data.qvel[:] = scene.qvel
         data.qpos[scene.block_qpos : scene.block_qpos + 2] = block
         mujoco.mj_forward(scene.model, data)
+        self._measure(lane)
 
     def _displace(self, lane: _Lane, start: tuple[float, float, float]) -> None:
         """Move the gripper by a share `start` of `START` along each axis, and let it come to rest."""
         self._act([lane], np.array([[*(START / REACH * one for one in start), 0.0]], np.float32))
         mujoco.mj_step(lane.scene.model, lane.data, nstep=SETTLE * lane.scene.substeps)
+        self._measure(lane)
 
     def _act(self, lanes: Sequence[_Lane], actions: NDArray[np.float32]) -> None:
         """Set the hands' goals and the fingers' controls, in the arithmetic of gymnasium-robotics."""
-        now = _gather([lane.moving for lane in lanes])
-        hands = now[:, :3] + actions[:, :3] * np.float32(REACH)
-        quaternions = now[:, 3:7] + HAND_TURN
-        fingers = now[:, 7 + self._scene.actuators_qpos] + actions[:, 3:].astype(float)
+        now = self._measured[[lane.number for lane in lanes]]
+        hands = now[:, HAND] + actions[:, :3] * np.float32(REACH)
+        quaternions = now[:, HAND_QUATERNION] + HAND_TURN
+        fingers = now[:, JOINTS + self._scene.actuators_qpos] + actions[:, 3:].astype(float)
         for lane, hand, quaternion, finger in zip(lanes, hands, quaternions, fingers, strict=True):
             lane.goal[:], lane.goal_quaternion[:], lane.control[:] = hand, quaternion, finger
 
@@ -242,34 +244,30 @@ class FetchVectorWorld:
         self._measure(lane)
 
     def _measure(self, lane: _Lane) -> None:
-        """Compute what the velocities of gripper and block depend on."""
-        scene, data = lane.scene, lane.data
-        gripper, block, rotation = lane.jacobian_of
-        mujoco.mj_jacSite(scene.model, data, gripper, None, scene.gripper_site)
-        mujoco.mj_jacSite(scene.model, data, block, rotation, scene.block_site)
+        """Note all that is read of a lane: a thread that has just advanced it has it in its caches."""
+        model, number = lane.scene.model, lane.number
+        np.concatenate(lane.parts, out=self._measured[number])
+        gripper, block, rotation = self._jacobians[number]
+        mujoco.mj_jacSite(model, lane.data, gripper, None, lane.scene.gripper_site)
+        mujoco.mj_jacSite(model, lane.data, block, rotation, lane.scene.block_site)
 
     def _observe(self, lanes: Sequence[_Lane]) -> State:
         """Return the states (N, 28): gymnasium-robotics' arithmetic in double precision, then rounded."""
-        scene, seconds, nv = self._scene, self._scene.step_seconds, self._scene.model.nv
-        now = _gather([lane.observed for lane in lanes])
-        gripper, block, axes, qpos, qvel = now[:, :3], now[:, 3:6], now[:, 6:15], now[:, 18:-nv], now[:, -nv:]
-        jacobians = np.concatenate([lane.jacobians for lane in lanes]).reshape(len(lanes), 3, 3, nv)
-        velocities = (jacobians @ qvel[:, None, :, None])[..., 0] * seconds
+        scene, seconds = self._scene, self._scene.step_seconds
+        numbers = [lane.number for lane in lanes]
+        now, jacobians = self._measured[numbers], self._jacobians[numbers]
+        gripper, block, speeds = now[:, :3], now[:, 3:6], now[:, JOINTS + scene.model.nq :]
+        velocities = (jacobians @ speeds[:, None, :, None])[..., 0] * seconds
         gripper_velocity, block_velocity, block_spin = velocities.swapaxes(0, 1)
         states = np.empty((len(lanes), SIZE), np.float32)
         states[:, GRIPPER] = gripper
         states[:, BLOCK] = block
         states[:, BLOCK_FROM_GRIPPER] = block - gripper
-        states[:, FINGERS] = qpos[:, scene.fingers_qpos]
-        states[:, BLOCK_ANGLES] = mat2euler(axes.reshape(-1, 3, 3))
+        states[:, FINGERS] = now[:, JOINTS + scene.fingers_qpos]
+        states[:, BLOCK_ANGLES] = mat2euler(now[:, BLOCK_AXES].reshape(-1, 3, 3))
         states[:, BLOCK_FROM_GRIPPER_VELOCITY] = block_velocity - gripper_velocity
         states[:, BLOCK_SPIN] = block_spin
         states[:, GRIPPER_VELOCITY] = gripper_velocity
-        states[:, FINGERS_VELOCITY] = qvel[:, scene.fingers_qvel] * seconds
-        states[:, TARGET] = now[:, 15:18]
+        states[:, FINGERS_VELOCITY] = speeds[:, scene.fingers_qvel] * seconds
+        states[:, TARGET] = now[:, MARKER]
         return states
-
-
-def _gather(parts: Sequence[Sequence[Vectors]]) -> Vectors:
-    """Return what the parts (each of one length) of N lanes hold, (N, all their lengths)."""
-    return np.concatenate([*chain.from_iterable(parts)]).reshape(len(parts), -1)
