@@ -27,6 +27,7 @@ from clbench.cache import cache_folder
 from clbench.demonstrations import load_demonstrations
 from clbench.policy import Policy
 from clbench.pretraining import pretrained_policy
+from clbench.questions import load_questions
 from clbench.run import execute
 from clbench.run_spec import RunSpec, run_length
 from clbench.world import Lanes
@@ -50,6 +51,7 @@ def main() -> None:
     policy, _ = pretrained_policy(scenario, spec.seed)
     for task in scenario.target:
         load_demonstrations(task, scenario, policy.config)
+    load_questions(scenario)
     with _cache_without_reports():
         found = measure(spec)
     runs = (read_results("whole_run") or {"runs": {}})["runs"]

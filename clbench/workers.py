@@ -180,7 +180,8 @@ def _context() -> Any:
     from multiprocessing import forkserver  # cannot be imported where there is none
 
     context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(["clbench.run"])
+    # the second takes a second too, and asking PyTorch for deterministic algorithms imports it
+    context.set_forkserver_preload(["clbench.run", "torch._inductor.config"])
     if threading.current_thread() is threading.main_thread():
         # what it starts ignores Ctrl-C as it does: from the first instruction, not from `_work` on
         before = signal.signal(signal.SIGINT, signal.SIG_IGN)
