@@ -100,7 +100,7 @@ def test_the_shards_of_a_command_do_each_of_its_runs_once(
         done.extend(job.name for job in jobs if job.function == "clbench.grid:run_job")
         return {}
 
-    monkeypatch.setattr("clbench.commands.runs.run_with_bars", note)
+    monkeypatch.setattr("clbench.grid.run_with_bars", note)
     runs = ["run", f"{TOY},clbench/Fetch-v0", "sft", "frozen", "lora", "--seeds", "3"]
     app(runs, result_action="return_value")
     whole, parts = sorted(done), []
