@@ -105,7 +105,7 @@ def _whole_run() -> Iterator[str]:
     yield ""
     yield (
         "One thread; data and pretrained policy are in the cache, the evaluation with which runs of a seed "
-        "begin is not."
+        "begin is not. Rows may be of different machines: compare shares, not seconds."
     )
     yield ""
     parts = list(next(iter(runs.values()))["parts"])
