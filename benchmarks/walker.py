@@ -31,7 +31,7 @@ SUBSTEPS, SECONDS = 10, 0.025
 def _start() -> Any:
     """Return how episodes begin and advance, as a `Start` of the bodies of our scenario."""
     bodies = "clbench.envs.dm_control.bodies"
-    environment = resolve(f"{bodies}:environment_of")("walker", "walk")
+    environment = resolve(f"{bodies}:original_environment")("walker", "walk")
     body = resolve(f"{bodies}:Body")("walker", SUBSTEPS, (), "torso", (), {}, _views)
     physics = environment.physics
     return resolve(f"{bodies}:Start")(body, physics, environment.task, physics.model.ptr)

@@ -112,7 +112,7 @@ def test_the_records_are_those_of_one_machine(
 def test_a_job_on_this_machine_gives_way_to_nothing_else(bars: Bars) -> None:
     assert run_jobs([Job("niceness", "some_jobs:niceness", {}, 1)], RayWorkers("local", 1), bars) == {}
     assert isinstance(bars.console.file, io.StringIO)
-    assert f"niceness: nicer by {os.nice(0)}" in bars.console.file.getvalue()
+    assert f"niceness: nicer by {os.nice(0)} (" in bars.console.file.getvalue()
 
 
 def test_a_cluster_that_does_not_run_is_refused() -> None:

@@ -81,7 +81,7 @@ def start(body: str, task: str) -> Start:
     Raises:
         ValueError: The body has more motors, or is observed in more numbers, than there are places for.
     """
-    environment = environment_of(body, task)
+    environment = original_environment(body, task)
     observed = sum(int(np.prod(spec.shape)) for spec in environment.observation_spec().values())
     motors = int(environment.action_spec().shape[0])
     if observed > OBSERVATION_SIZE:
@@ -101,7 +101,7 @@ def start_with_mass(body: str, task: str, mass: float) -> Start:
     return replace(plain, model=with_mass(plain.model, [thing], mass))
 
 
-def environment_of(domain: str, task: str) -> Any:
+def original_environment(domain: str, task: str) -> Any:
     """Return dm_control's own environment of a task."""
     with _without_dm_control_renderer():
         return importlib.import_module(f"dm_control.suite.{domain}").SUITE[task]()

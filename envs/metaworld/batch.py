@@ -130,7 +130,8 @@ class Batch:
     def __init__(self, groups: Sequence[Group]) -> None:
         self._groups, self.episodes = groups, [episode for group in groups for episode in group.episodes]
         self._mocaps = [episode.data.mocap_pos[0] for episode in self.episodes]
-        self._hands = np.stack(self._mocaps)
+        # carried from step to step, rather than read again: while a batch stands, nothing else sets them
+        self._hands, self._before = np.stack(self._mocaps), np.stack([one.before for one in self.episodes])
         self._controls = [episode.data.ctrl for episode in self.episodes]
         self._reach = [
             np.array([getattr(one, name) for one in self.episodes]) for name in ("mocap_low", "mocap_high")
@@ -138,7 +139,6 @@ class Batch:
         bounds = [episode.sawyer_observation_space for episode in self.episodes]
         self._bounds = [np.array([getattr(one, name) for one in bounds]) for name in ("low", "high")]
         self._goals = np.concatenate([group.goal for group in groups])
-        self._before = np.stack([episode.before for episode in self.episodes])
         parts = [group.rule.parts for group in groups for _ in group.episodes]
         self._parts = [_Parts(self.episodes, parts, number) for number in range(max(map(len, parts)))]
         arms = [episode.look(look) for episode in self.episodes for look in _ARM]
