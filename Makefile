@@ -20,7 +20,7 @@ records: .venv/installed
 	$(BIN)/clbench run $(SCENARIO) --all --seeds 5
 	$(BIN)/clbench leaderboard
 
-# What else docs/claims.md needs: methods with one thing changed that tells what their effect is due to.
+# What else docs/reference/claims.md needs: methods with one thing changed that tells what their effect is due to.
 CONTROLS := $(BIN)/clbench run $(SCENARIO) --seeds 3 --records leaderboard/controls
 controls: .venv/installed
 	$(CONTROLS) aegis --set.direction random
@@ -29,13 +29,13 @@ controls: .venv/installed
 	$(CONTROLS) lora --set.rank 4
 	$(CONTROLS) lora --set.rank 64
 
-# docs/claims.md, docs/methods/ and docs/scenarios/ from the records; experts are measured once.
+# docs/reference/claims.md, docs/reference/methods/ and docs/reference/scenarios/ from the records; experts are measured once.
 docs: .venv/installed
 	$(BIN)/clbench claims
 	$(BIN)/clbench method-pages
 	$(BIN)/clbench scenario-card
 
-# Speed, as ratios: benchmarks/results/, and docs/performance.md from them. It takes an hour of a quiet machine.
+# Speed, as ratios: benchmarks/results/, and docs/reference/performance.md from them. It takes an hour of a quiet machine.
 benchmark: .venv/installed-dev
 	$(BIN)/python benchmarks/rollouts.py
 	$(BIN)/python benchmarks/step_time.py

@@ -26,11 +26,13 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.progress import track
 
-from clbench.comparison import ranks
-from clbench.metrics import load_metric
-from clbench.record import RECORDS, read_record
-from clbench.scores import Array, Scores, rates_of
-from clbench.statistics import Estimate, interval
+from clbench.records.paths import RECORDS
+from clbench.records.reader import read_record
+from clbench.scoring.intervals import Estimate, interval
+from clbench.scoring.layout import Array
+from clbench.scoring.metrics import load_metric
+from clbench.scoring.ranks import ranks
+from clbench.scoring.scores import Scores, rates_of
 
 RESULTS = Path(__file__).parent / "results" / "coverage.json"
 EPISODES = 20
@@ -43,7 +45,7 @@ Outcomes = NDArray[np.bool_]
 
 
 def main() -> None:
-    """Simulate, print the tables of docs/statistics.md and write results/coverage.json."""
+    """Simulate, print the tables of docs/guide/statistics.md and write results/coverage.json."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--simulations", type=int, default=1500, help="rows for each interval")
     parser.add_argument("--boards", type=int, default=1000, help="boards for each kind of board")
@@ -282,7 +284,7 @@ Lines = dict[str, Row]
 
 
 def tables(results: Row) -> list[str]:
-    """Return the tables of docs/statistics.md: coverage, widths, false splits twice, power."""
+    """Return the tables of docs/guide/statistics.md: coverage, widths, false splits twice, power."""
     seeds = {_seeds(count): {"seeds": count} for count in (1, 2, 3, 5, 10)}
     deviations = {f"deviation {size:.2f}": {"deviation": size} for size in (0.0, 0.05, 0.1, 0.15)}
     equal: Lines = {f"{count} methods": {"kind": "equal", "methods": count} for count in (5, 10, 15)}

@@ -15,8 +15,10 @@ from typing import Any
 
 import numpy as np
 
-from clbench.record import ANSWER_COLUMNS, EPISODE_COLUMNS, POLICY_COLUMNS, Record, record_path, write_record
-from clbench.task import resolve
+from clbench.base.entry_points import resolve
+from clbench.records.paths import record_path
+from clbench.records.record import ANSWER_COLUMNS, EPISODE_COLUMNS, POLICY_COLUMNS, Record
+from clbench.records.writer import write_record
 
 GROUPS = {
     "retained": ["reach", "hover", "pick_and_place", "push", "push_left", "push_away"],
@@ -24,7 +26,7 @@ GROUPS = {
     "held_out": ["hover_target", "push_left_away"],
 }
 STEPS = (37, 75, 150, 300)
-EPISODES, ON_THE_WAY, SELECTION, KINDS, ASKED = 20, 5, 10, 14, 72
+EPISODES, ON_THE_WAY, VALIDATION, KINDS, ASKED = 20, 5, 10, 14, 72
 REFERENCES = ("sft", "joint", "from_scratch", "frozen")
 """Methods that others are compared with."""
 
@@ -36,8 +38,8 @@ def main() -> None:
         parser.add_argument(f"--{name}", type=int, default=count)
     parser.add_argument("--output", type=Path, help="where to keep the page")
     arguments = parser.parse_args()
-    read_table = resolve("clbench.leaderboard._rows:read_table")
-    page, pictures = (resolve(f"clbench.leaderboard._page:{name}") for name in ("page", "pictures"))
+    read_table = resolve("clbench.leaderboard.board.rows:read_table")
+    page, pictures = (resolve(f"clbench.leaderboard.views.page:{name}") for name in ("page", "pictures"))
     with tempfile.TemporaryDirectory() as folder:
         records = Path(folder) / "leaderboard" / "records"
         make_records(records, arguments.methods, arguments.seeds, arguments.scenarios)
@@ -79,7 +81,7 @@ def made_record(
             "method": method,
             "seed": seed,
             "device": "cpu",
-            "split": "report",
+            "split": "test",
             "settings": {},
             "changes": {},
             "uses": {"demonstrations": access, "questions": access, "reference": method in REFERENCES[1:]},
@@ -128,15 +130,15 @@ def _episodes(learns: float, keeps: float, generator: np.random.Generator) -> li
             success = int(generator.random() < known[tasks.index(task)])
             rows.append((stage, step, task, split, episode, success, float(success), 50))
 
-    evaluate(0, 0, tasks, "report", EPISODES)
+    evaluate(0, 0, tasks, "test", EPISODES)
     for stage, target in enumerate(GROUPS["target"], 1):
         for step in STEPS:
             known *= keeps ** (1 / len(STEPS))
             known[tasks.index(target)] = learns * min(1.0, step / STEPS[1])
-            evaluate(stage, step, [target], "selection", SELECTION)
+            evaluate(stage, step, [target], "validation", VALIDATION)
             if step < STEPS[-1]:
-                evaluate(stage, step, [*GROUPS["retained"], target], "report", ON_THE_WAY)
-        evaluate(stage, STEPS[-1], tasks, "report", EPISODES)
+                evaluate(stage, step, [*GROUPS["retained"], target], "test", ON_THE_WAY)
+        evaluate(stage, STEPS[-1], tasks, "test", EPISODES)
     return rows
 
 

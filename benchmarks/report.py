@@ -1,4 +1,4 @@
-"""docs/performance.md and its picture, from benchmarks/results/: `python benchmarks/report.py`."""
+"""docs/reference/performance.md and its picture, from benchmarks/results/: `python benchmarks/report.py`."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from typing import Any
 import vl_convert
 from result_files import read_results
 
-from clbench.task import resolve
+from clbench.base.entry_points import resolve
 
-DOCS = Path(__file__).parents[1] / "docs"
-grid = resolve("clbench.leaderboard._markdown:grid")
-VEGA_LITE = resolve("clbench.leaderboard._page.html:VEGA_LITE")
+DOCS = Path(__file__).parents[1] / "docs" / "reference"
+grid = resolve("clbench.leaderboard.views.markdown:grid")
+VEGA_LITE = resolve("clbench.leaderboard.views.page.html:VEGA_LITE")
 
 INTRODUCTION = """\
 # Performance

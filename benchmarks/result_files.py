@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import clbench
-from clbench.fingerprint import fingerprint
-from clbench.task import load_scenario
+from clbench.runs.fingerprint import fingerprint
+from clbench.spec.registry import load_scenario
 
 FOLDER = Path(__file__).parent / "results"
 

@@ -32,7 +32,8 @@ from ratios import median_ratio
 from result_files import read_results, write_results
 from rich.progress import track
 
-from clbench.task import load_scenario, resolve
+from clbench.base.entry_points import resolve
+from clbench.spec.registry import load_scenario
 
 Actions = NDArray[np.float32]
 Env = gymnasium.Env[Any, Any]

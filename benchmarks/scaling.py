@@ -23,13 +23,13 @@ from metaworld.env_dict import ALL_V3_ENVIRONMENTS
 from result_files import write_results
 from rich.progress import track
 
-from clbench.demonstrations import Demonstrations, load_demonstrations
-from clbench.evaluation import Evaluator
-from clbench.policy import Policy
-from clbench.pretraining import policy_config
-from clbench.seeding import torch_generator
-from clbench.task import load_scenario
-from clbench.training import deterministic, optimise
+from clbench.base.seeding import torch_generator
+from clbench.data.demonstrations import Demonstrations, load_demonstrations
+from clbench.evaluation.rollouts import Evaluator
+from clbench.learning.optimise import deterministic, optimise
+from clbench.learning.pretraining import policy_config
+from clbench.policy.policy import Policy
+from clbench.spec.registry import load_scenario
 
 FETCH, META_WORLD = "clbench/Fetch-v0", "clbench/MetaWorld-v0"
 
@@ -43,7 +43,7 @@ def evaluation_of_tasks() -> Callable[[int], float]:
     evaluator = Evaluator(scenario, seed=0)
 
     def seconds(count: int) -> float:
-        trials = [(task, "selection", number) for task in tasks[:count] for number in range(4)]
+        trials = [(task, "validation", number) for task in tasks[:count] for number in range(4)]
         begin = time.perf_counter()
         with deterministic():
             evaluator.play(policy, trials)  # type: ignore[arg-type]
@@ -61,7 +61,7 @@ def evaluation_of_episodes() -> Callable[[int], float]:
     def seconds(count: int) -> float:
         begin = time.perf_counter()
         with deterministic():
-            evaluator.play(policy, [(scenario.retained[3], "selection", number) for number in range(count)])
+            evaluator.play(policy, [(scenario.retained[3], "validation", number) for number in range(count)])
         return time.perf_counter() - begin
 
     return seconds

@@ -4,7 +4,7 @@ Methods take turns in blocks of steps, in a new order each round, so that what e
 of them alike. A ratio is that of two blocks of one round; reported are the median over rounds and a 95 %
 bootstrap interval of it. The policy, the data and the batches are those of a real run's first target.
 The limit is a bare PyTorch loop of the same model on batches that are there already: what plain fine-tuning
-takes beyond it is the price of seams, sources and checks.
+takes beyond it is the price of hooks, sources and checks.
 """
 
 from __future__ import annotations
@@ -23,15 +23,18 @@ from ratios import median_ratio
 from result_files import write_results
 from rich.progress import track
 
-from clbench.adaptation import adapt
-from clbench.demonstrations import Demonstrations, load_demonstrations
-from clbench.method import Prior, Source, Stage, build_method, method_names
-from clbench.policy import Policy
-from clbench.pretraining import pretrained_policy
-from clbench.questions import load_questions
-from clbench.seeding import seeded, torch_generator
-from clbench.task import Scenario, load_scenario
-from clbench.training import BETAS, GRADIENT_NORM, deterministic
+from clbench.base.seeding import seeded, torch_generator
+from clbench.data.demonstrations import Demonstrations, load_demonstrations
+from clbench.data.questions import load_questions
+from clbench.learning.adaptation import adapt
+from clbench.learning.method import Stage
+from clbench.learning.optimise import BETAS, GRADIENT_NORM, deterministic
+from clbench.learning.pretraining import pretrained_policy
+from clbench.learning.prior import Prior, Source
+from clbench.learning.registry import build_method, method_names
+from clbench.policy.policy import Policy
+from clbench.spec.registry import load_scenario
+from clbench.spec.scenario import Scenario
 
 BASELINE = "sft"
 LIMIT = "bare loop"

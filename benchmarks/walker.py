@@ -19,8 +19,11 @@ from gymnasium.envs.mujoco.mujoco_rendering import MujocoRenderer
 from numpy.typing import NDArray
 
 import clbench
-from clbench.task import Scenario, Task, resolve
-from clbench.world import OneLaneWorld, Outcomes, States, Team, checked_actions
+from clbench.base.entry_points import resolve
+from clbench.spec.scenario import Scenario
+from clbench.spec.task import Task
+from clbench.worlds.threads import Team
+from clbench.worlds.world import OneLaneWorld, Outcomes, States, checked_actions
 
 ID = "walker/Walker-v0"
 SUBSTEPS, SECONDS = 10, 0.025
@@ -47,7 +50,7 @@ def _views(model: mujoco.MjModel, data: mujoco.MjData) -> Any:
 class WalkerVectorWorld:
     """Walkers that are to walk: dm_control's physics, observations and rewards. None ends with success.
 
-    It is a `clbench.world.VectorWorld`; an action (6,) sets the motors for one step.
+    It is a `clbench.worlds.world.VectorWorld`; an action (6,) sets the motors for one step.
 
     Args:
         lanes: Places for episodes.

@@ -23,14 +23,14 @@ import torch
 from result_files import read_results, write_results
 from rich.progress import Progress
 
-from clbench.cache import cache_folder
-from clbench.demonstrations import load_demonstrations
-from clbench.policy import Policy
-from clbench.pretraining import pretrained_policy
-from clbench.questions import load_questions
-from clbench.run import execute
-from clbench.run_spec import RunSpec, run_length
-from clbench.world import Lanes
+from clbench.base.cache import cache_folder
+from clbench.data.demonstrations import load_demonstrations
+from clbench.data.questions import load_questions
+from clbench.learning.pretraining import pretrained_policy
+from clbench.policy.policy import Policy
+from clbench.runs.run import execute
+from clbench.runs.spec import RunSpec, run_length
+from clbench.worlds.lanes import Lanes
 
 PARTS = {
     "physics": (Lanes, ("step", "reset")),

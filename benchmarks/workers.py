@@ -23,11 +23,13 @@ from ratios import median_ratio
 from result_files import write_results
 from rich.console import Console
 
-from clbench.grid import benchmark_jobs, run_with_bars
-from clbench.ray_workers import RayWorkers
-from clbench.record import read_record
-from clbench.run_spec import RunSpec
-from clbench.workers import Job, Processes, Workers
+from clbench.jobs.job import Job, Workers
+from clbench.jobs.plan import benchmark_jobs
+from clbench.jobs.processes import Processes
+from clbench.jobs.ray import RayWorkers
+from clbench.jobs.scheduler import run_with_bars
+from clbench.records.reader import read_record
+from clbench.runs.spec import RunSpec
 
 METHODS = ("sft", "l2_sp", "low_rate_sft", "constant_weight")
 
@@ -40,7 +42,7 @@ def main() -> None:
     parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
     arguments = parser.parse_args()
     count = arguments.workers
-    specs = [RunSpec(arguments.scenario, name, 0, split="selection", targets=1) for name in METHODS]
+    specs = [RunSpec(arguments.scenario, name, 0, split="validation", targets=1) for name in METHODS]
     ways: dict[str, Callable[[], Workers]] = {
         "one worker": lambda: Processes(1),
         f"{count} workers": lambda: Processes(count),
@@ -80,7 +82,7 @@ def _seconds(specs: list[RunSpec], records: Path, make: Callable[[], Workers]) -
     workers = make()
     count, arguments = workers.free(), {"scenario": specs[0].scenario}
     for number in range(count):  # what it makes is in the cache: it takes as long as to import all
-        workers.start(Job(f"first job {number}", "clbench.grid:scenes_job", arguments, 1))
+        workers.start(Job(f"first job {number}", "clbench.jobs.work:scenes_job", arguments, 1))
     while workers.free() < count:
         assert all(event.kind in ("progress", "done") for event in workers.events())
     ready = time.perf_counter()

@@ -1,6 +1,6 @@
 """The scenarios, registered with Gymnasium by name: nothing of a simulator is imported here."""
 
-from clbench.registration import register
+from clbench.spec.registry import register
 
 register("clbench/Fetch-v0", "clbench.envs.fetch:SCENARIO")
 register("clbench/FetchPixels-v0", "clbench.envs.fetch.pixels:SCENARIO")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ._rows import column_names, read_table, values_of
+from .board.rows import column_names, read_table, values_of
 
 if TYPE_CHECKING:
     import pandas

@@ -10,27 +10,29 @@ from pathlib import Path
 from rich.console import Console
 from rich.text import Text
 
-from clbench.arguments import at_least, checked_input, look_here
-from clbench.method import build_method
-from clbench.names import folder_name
-from clbench.record import RECORDS, TUNING, record_path
-from clbench.run_spec import RunSpec
-from clbench.task import load_scenario, scenario_ids, unknown
+from clbench.base.entry_points import unknown
+from clbench.base.errors import InputError
+from clbench.cli.arguments import add_cwd_to_path, at_least, checked_input
+from clbench.learning.registry import build_method
+from clbench.records.paths import RECORDS, TUNING, record_path
+from clbench.runs.spec import RunSpec
+from clbench.spec.identifiers import folder_name, scenario_ids
+from clbench.spec.registry import load_scenario
 
-from . import _page
-from ._claims import page
-from ._claims.evidence import CONTROLS, SCENARIO, read_evidence
-from ._claims.judges import judge_all
-from ._costs import STEP_TIME
-from ._descriptions import built_in_methods
-from ._method_pages import pages, read_sources
-from ._rows import Table, read_table
-from ._scenario_cards import Card
-from ._scenario_tasks import choose_renderer, make_missing, picture_path, undrawn
-from ._submit import placement, run_submission
-from ._table import csv_text, markdown, terminal, write_if_changed
-from ._tiers import TIERS
-from ._verify import Request, run_verifications
+from .board.costs import STEP_TIME
+from .board.rows import Table, read_table
+from .board.tiers import TIERS
+from .claims import page
+from .claims.evidence import CONTROLS, SCENARIO, read_evidence
+from .claims.judges import judge_all
+from .pages.descriptions import built_in_methods
+from .pages.method_pages import pages, read_sources
+from .pages.scenario_cards import Card
+from .pages.scenario_tasks import choose_renderer, make_missing, picture_path, undrawn
+from .submission.submit import placement, run_submission
+from .submission.verify import Request, run_verifications
+from .views import page as web_page
+from .views.table import csv_text, markdown, terminal, write_if_changed
 
 WIDTH = 108
 """Least width: in a narrower one the last metrics would be cut off, and a long line only wraps."""
@@ -81,7 +83,7 @@ def submit(
         workers: Runs at once, each a process with one thread; all cores if not given.
         records: Folder of the records.
     """
-    look_here()
+    add_cwd_to_path()
     with checked_input():
         at_least(1, "--seeds", seeds)
         at_least(0, "--first-seed", first_seed)
@@ -113,7 +115,7 @@ def verify(
     """Check the records at PATHS, and write the tier that each reaches beside it.
 
     recomputed: the record is whole, is what its method and scenario say, and its metrics follow from its
-    episodes. replayed: report episodes, drawn at random, and all questions come out the same with the
+    episodes. replayed: test episodes, drawn at random, and all questions come out the same with the
     policies of its stages. retrained: the whole run does. Each tier includes those before it.
 
     Args:
@@ -127,7 +129,7 @@ def verify(
         workers: Verifications at once, each a process with one thread; all cores if not given.
         records: Folder of the records.
     """
-    look_here()
+    add_cwd_to_path()
     with checked_input():
         at_least(1, "--episodes", episodes)
         at_least(1, "--workers", workers)
@@ -146,7 +148,7 @@ def _found(paths: Sequence[Path], records: Path) -> list[Path]:
     absent = [path for path in found if not path.is_file()]
     if absent or not found:
         what = f"There is no record at {absent[0]}." if absent else "There is no record to verify."
-        raise ValueError(f"{what} Give paths, as {record_path(records, SCENARIO, 'sft', 0)}.")
+        raise InputError(f"{what} Give paths, as {record_path(records, SCENARIO, 'sft', 0)}.")
     return found
 
 
@@ -156,7 +158,7 @@ def claims(
     controls: Path = CONTROLS,
     scenario: str = SCENARIO,
     step_time: Path = STEP_TIME,
-    output: Path = Path("docs/claims.md"),
+    output: Path = Path("docs/reference/claims.md"),
 ) -> None:
     """Judge the claims of the papers by the records, and write the page that says why.
 
@@ -181,7 +183,7 @@ def method_pages(
     tuning: Path = TUNING,
     scenario: str = SCENARIO,
     step_time: Path = STEP_TIME,
-    output: Path = Path("docs/methods"),
+    output: Path = Path("docs/reference/methods"),
 ) -> None:
     """Write a page for each built-in method, from its code and its records.
 
@@ -207,7 +209,7 @@ def scenario_card(
     *scenarios: str,
     episodes: int = 100,
     records: Path = RECORDS,
-    output: Path = Path("docs/scenarios"),
+    output: Path = Path("docs/reference/scenarios"),
 ) -> None:
     """Write the card of each of SCENARIOS: its tasks with pictures, and whether it tells methods apart.
 
@@ -220,13 +222,13 @@ def scenario_card(
         records: Folder of the records.
         output: Folder of the cards.
     """
-    look_here()
+    add_cwd_to_path()
     with checked_input():
         at_least(1, "--episodes", episodes)
         board = read_table(records) if records.is_dir() else Table({}, (), ())
         names = scenarios or [name for name in scenario_ids() if name in board.scenarios]
         if not names:
-            raise ValueError(f"No scenario has records in {records}: name one, as {SCENARIO}.")
+            raise InputError(f"No scenario has records in {records}: name one, as {SCENARIO}.")
         loaded = [load_scenario(name) for name in names]
     homes = {output / folder_name(scenario.id): scenario for scenario in loaded}
     console = Console(stderr=True, soft_wrap=True)
@@ -242,12 +244,12 @@ def scenario_card(
 
 def _write_table(console: Console, table: Table, records: Path) -> None:
     """Write every form of the table beside the records."""
-    folder = Path(os.path.normpath(records / ".."))
+    folder = Path(os.path.normpath(records / "../site"))
     texts = {
         "LEADERBOARD.md": markdown(table),
         "leaderboard.csv": csv_text(table),
-        "index.html": _page.page(table),
-        **_page.pictures(table),
+        "index.html": web_page.page(table),
+        **web_page.pictures(table),
     }
     for name, text in texts.items():
         _write(console, folder / name, text)

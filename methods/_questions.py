@@ -1,7 +1,7 @@
 """Questions beside demonstrations, as much of each as in pretraining."""
 
-from clbench.method import Source
-from clbench.policy import Batch, QuestionBatch
+from clbench.learning.prior import Source
+from clbench.policy.batch import Batch, QuestionBatch
 
 
 def with_questions(

@@ -4,7 +4,9 @@ import math
 
 import torch
 
-from clbench.policy import TEXT_LENGTH, Batch, Policy
+from clbench.policy.batch import Batch
+from clbench.policy.policy import Policy
+from clbench.spec.language import TEXT_LENGTH
 
 
 def require_hidden_states(policy: Policy, method: str) -> None:

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from clbench.policy import Policy
+from clbench.policy.policy import Policy
 
 Weights = dict[str, Tensor]
 

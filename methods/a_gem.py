@@ -15,8 +15,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from clbench.method import Metadata, Method, Prior, Progress, Source, Uses
-from clbench.policy import Batch, Policy
+from clbench.learning.method import Metadata, Method, Progress
+from clbench.learning.prior import Prior, Source, Uses
+from clbench.policy.batch import Batch
+from clbench.policy.policy import Policy
 
 from ._projection import project_out
 

@@ -30,9 +30,11 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from clbench.activations import Gaussian
-from clbench.method import Metadata, Method, Prior, Progress, Stage, State, Uses
-from clbench.policy import Batch, Policy
+from clbench.learning.method import Metadata, Method, Progress, Stage, State
+from clbench.learning.prior import Prior, Uses
+from clbench.policy.activations import Gaussian
+from clbench.policy.batch import Batch
+from clbench.policy.policy import Policy
 
 from ._projection import inner, project_out, random_like
 from ._requirements import in_range, require_hidden_states

@@ -17,8 +17,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from clbench.method import Metadata, Method, Prior, Source, Stage, State, Uses
-from clbench.policy import Batch, Policy
+from clbench.learning.method import Metadata, Method, Stage, State
+from clbench.learning.prior import Prior, Source, Uses
+from clbench.policy.batch import Batch
+from clbench.policy.policy import Policy
 
 from ._requirements import blank_batch, in_range
 

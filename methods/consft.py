@@ -15,7 +15,7 @@ Details:
    factor of the loss out again, so that weights which all lie on the floor change nothing.
 
 `ConSFTCalibrated` changes the two constants that the authors tune for each task, `tau_start` and T. They were
-chosen on selection episodes of seed 100, which is not reported: docs/methods/consft.md has the sweep.
+chosen on validation episodes of seed 100, which is not reported: docs/reference/methods/consft.md has the sweep.
 """
 
 import math
@@ -26,8 +26,10 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from clbench.method import Metadata, Method, Prior, Progress, Stage
-from clbench.policy import Batch, Policy
+from clbench.learning.method import Metadata, Method, Progress, Stage
+from clbench.learning.prior import Prior
+from clbench.policy.batch import Batch
+from clbench.policy.policy import Policy
 
 from ._requirements import in_range, require_loss_per_sample
 
@@ -104,6 +106,6 @@ class ConSFTCalibrated(ConSFT):
     """Weigh each sample's loss by confidence, on the scale of this policy's losses."""
 
     tau_start: float = 1.0
-    """Chosen on selection episodes of seed 100."""
+    """Chosen on validation episodes of seed 100."""
     schedule: float = 1.0
     """Chosen likewise."""

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
-from clbench.method import Progress
+from clbench.learning.method import Progress
 
 from .consft import ConSFT
 

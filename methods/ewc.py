@@ -9,7 +9,7 @@ Details:
    anchor).
 3. The penalty is (strength / 2) sum_i F_i (theta_i - theta*_i)^2, its gradient added in its closed form.
 4. Where nothing is retained, no weight is important for the first target.
-5. `strength` was chosen on selection episodes of seed 100.
+5. `strength` was chosen on validation episodes of seed 100.
 """
 
 from dataclasses import dataclass
@@ -17,8 +17,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from clbench.method import Metadata, Method, Prior, Source, Stage, State, Uses
-from clbench.policy import Batch, Policy
+from clbench.learning.method import Metadata, Method, Stage, State
+from clbench.learning.prior import Prior, Source, Uses
+from clbench.policy.batch import Batch
+from clbench.policy.policy import Policy
 
 from ._requirements import in_range, require_loss_per_sample
 from ._weights import Weights, copy_of, packed, pull_back, unpacked

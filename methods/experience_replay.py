@@ -10,8 +10,9 @@ Details:
 
 from dataclasses import dataclass
 
-from clbench.method import Metadata, Method, Prior, Source, Uses
-from clbench.policy import Batch
+from clbench.learning.method import Metadata, Method
+from clbench.learning.prior import Prior, Source, Uses
+from clbench.policy.batch import Batch
 
 
 @dataclass

@@ -17,7 +17,7 @@ Details:
 5. The regulariser's gradient is added in its closed form, lambda |g| sign(theta - theta_meta), with sign(0) =
    0.
 6. No LoRA: the matrices are regularised in full. lambda = 1e-4 belongs to 7 billion parameters;
-   docs/methods/fast_dvla.md shows other values here.
+   docs/reference/methods/fast_dvla.md shows other values here.
 7. The vector is kept in the cache; the steps that it took count in every row.
 
 `direction="random"` is the control: a random vector with the norm of the vector in each matrix.
@@ -32,10 +32,13 @@ import torch
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
-from clbench.cache import cache_folder, cached, hash_of, hash_of_tensors, source_hash
-from clbench.method import Metadata, Method, Prior, Stage, State, Uses
-from clbench.policy import Batch, Policy, QuestionBatch
-from clbench.training import optimise
+from clbench.base.cache import cache_folder, cached, hash_of, hash_of_tensors
+from clbench.base.source import source_hash
+from clbench.learning.method import Metadata, Method, Stage, State
+from clbench.learning.optimise import optimise
+from clbench.learning.prior import Prior, Uses
+from clbench.policy.batch import Batch, QuestionBatch
+from clbench.policy.policy import Policy
 
 from ._projection import random_like
 from ._questions import with_questions
@@ -97,7 +100,7 @@ class FastDVLA(Method):
             "policy": hash_of_tensors(policy.state_dict()),
             "drawn": hash_of_tensors(columns),
             "settings": [self.auxiliary, self.steps, self.step_size],
-            "source": source_hash(__name__, "clbench.policy", "clbench.training"),
+            "source": source_hash(__name__, "clbench.policy", "clbench.learning.optimise"),
             "torch": torch.__version__,
         }
 

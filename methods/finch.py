@@ -7,7 +7,7 @@ a new target, steps are small.
 Details:
 1. The cap is the benchmark's own schedule, in the place of the paper's constant 5e-5, so that no method takes
    larger steps than plain fine-tuning; kappa is therefore a factor of that schedule.
-2. kappa was chosen on selection episodes of seed 100. The average begins with each target's first loss.
+2. kappa was chosen on validation episodes of seed 100. The average begins with each target's first loss.
 """
 
 import math
@@ -16,8 +16,9 @@ from dataclasses import dataclass
 
 from torch import Tensor, nn
 
-from clbench.method import Metadata, Method, Progress, Stage
-from clbench.policy import Batch, Policy
+from clbench.learning.method import Metadata, Method, Progress, Stage
+from clbench.policy.batch import Batch
+from clbench.policy.policy import Policy
 
 from ._requirements import in_range
 

@@ -5,8 +5,9 @@ from dataclasses import dataclass
 
 from torch import nn
 
-from clbench.method import Method, Stage, Uses
-from clbench.policy import Policy
+from clbench.learning.method import Method, Stage
+from clbench.learning.prior import Uses
+from clbench.policy.policy import Policy
 
 
 @dataclass

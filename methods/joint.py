@@ -8,8 +8,10 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
-from clbench.method import Method, Prior, Progress, Source, Uses
-from clbench.policy import Batch, Policy, QuestionBatch
+from clbench.learning.method import Method, Progress
+from clbench.learning.prior import Prior, Source, Uses
+from clbench.policy.batch import Batch, QuestionBatch
+from clbench.policy.policy import Policy
 
 
 @dataclass

@@ -12,8 +12,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from clbench.method import Metadata, Method, Prior, Progress, Source, Uses
-from clbench.policy import Batch, Policy, QuestionBatch
+from clbench.learning.method import Metadata, Method, Progress
+from clbench.learning.prior import Prior, Source, Uses
+from clbench.policy.batch import Batch, QuestionBatch
+from clbench.policy.policy import Policy
 
 from ._questions import with_questions
 from ._requirements import in_range, require_hidden_states

@@ -4,15 +4,16 @@ Details:
 1. The penalty (strength / 2) ||theta - theta*||^2 is on all weights; no layer is new here. Its gradient is
    added in its closed form.
 2. theta* is the pretrained policy for the whole sequence.
-3. `strength` was chosen on selection episodes of seed 100.
+3. `strength` was chosen on validation episodes of seed 100.
 """
 
 from dataclasses import dataclass
 
 from torch import Tensor
 
-from clbench.method import Metadata, Method, Prior, State
-from clbench.policy import Policy
+from clbench.learning.method import Metadata, Method, State
+from clbench.learning.prior import Prior
+from clbench.policy.policy import Policy
 
 from ._requirements import in_range
 from ._weights import copy_of, packed, pull_back, unpacked

@@ -7,7 +7,7 @@ Details:
 2. One adapter is trained through all targets, as in arXiv 2603.11653; the weights under it never change.
 3. `variant` chooses between "lora", "dora" (arXiv 2402.09353) and "rslora" (arXiv 2312.03732).
 4. Adapters begin as no change at all and must go further than full weights do: `speed` multiplies the step
-   size. It was chosen on selection episodes of seed 100.
+   size. It was chosen on validation episodes of seed 100.
 """
 
 from collections.abc import Iterable
@@ -15,8 +15,9 @@ from dataclasses import dataclass
 
 from torch import nn
 
-from clbench.method import Metadata, Method, Prior, Progress, Stage, State
-from clbench.policy import Policy
+from clbench.learning.method import Metadata, Method, Progress, Stage, State
+from clbench.learning.prior import Prior
+from clbench.policy.policy import Policy
 
 from ._requirements import in_range
 

@@ -5,7 +5,7 @@ The control for every method that forgets less: perhaps it only moves less.
 
 from dataclasses import dataclass
 
-from clbench.method import Method, Progress
+from clbench.learning.method import Method, Progress
 
 from ._requirements import in_range
 

@@ -6,7 +6,7 @@ Details:
    3) has it for its baseline. It is evaluated on the target's data: no prior data are used.
 2. The copy is made at the start of each target, as in LwF's own sequence; in the ConSFT paper it is the
    pretrained model, which is the same for the first target.
-3. `strength` was chosen on selection episodes of seed 100.
+3. `strength` was chosen on validation episodes of seed 100.
 """
 
 from collections.abc import Iterable
@@ -16,9 +16,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from clbench.method import Metadata, Method, Progress, Stage
-from clbench.policy import Batch, Policy
+from clbench.learning.method import Metadata, Method, Progress, Stage
+from clbench.policy.batch import Batch
 from clbench.policy.flow import mean_over_valid
+from clbench.policy.policy import Policy
 
 from ._requirements import in_range
 

@@ -5,7 +5,7 @@ The baseline that every other method is compared with: it learns the target and 
 
 from dataclasses import dataclass
 
-from clbench.method import Method
+from clbench.learning.method import Method
 
 
 @dataclass

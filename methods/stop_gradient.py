@@ -14,8 +14,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from clbench.method import Metadata, Method, Prior, Progress, Stage
-from clbench.policy import Batch, Policy
+from clbench.learning.method import Metadata, Method, Progress, Stage
+from clbench.learning.prior import Prior
+from clbench.policy.batch import Batch
+from clbench.policy.policy import Policy
 
 from ._requirements import require_hidden_states
 

@@ -5,7 +5,7 @@ theta = (1 - coefficient) theta_before + coefficient theta_after.
 
 Details:
 1. theta_before is the policy at the start of the target, so that earlier targets are kept as well as skills.
-2. One coefficient for all weights. It was chosen on selection episodes of seed 100.
+2. One coefficient for all weights. It was chosen on validation episodes of seed 100.
 3. While a target is learned the policy is not yet what the method makes of it: it is evaluated after the
    merge only, and has no learning curve.
 """
@@ -16,8 +16,8 @@ from dataclasses import dataclass
 import torch
 from torch import nn
 
-from clbench.method import Metadata, Method, Stage
-from clbench.policy import Policy
+from clbench.learning.method import Metadata, Method, Stage
+from clbench.policy.policy import Policy
 
 from ._requirements import in_range
 from ._weights import copy_of

@@ -14,20 +14,17 @@ import pytest
 import torch
 from rich.console import Console
 
-from clbench.method import Method, Uses, load_method
-from clbench.names import built_in_methods
-from clbench.progress import Bars
-from clbench.record import (
-    ANSWER_COLUMNS,
-    EPISODE_COLUMNS,
-    POLICY_COLUMNS,
-    Record,
-    record_path,
-    write_record,
-)
-from clbench.run import execute
-from clbench.run_spec import RunSpec, run_length
-from clbench.training import deterministic
+from clbench.jobs.bars import Bars
+from clbench.learning.method import Method
+from clbench.learning.optimise import deterministic
+from clbench.learning.prior import Uses
+from clbench.learning.registry import load_method
+from clbench.records.paths import record_path
+from clbench.records.record import ANSWER_COLUMNS, EPISODE_COLUMNS, POLICY_COLUMNS, Record
+from clbench.records.writer import write_record
+from clbench.runs.run import execute
+from clbench.runs.spec import RunSpec, run_length
+from clbench.spec.identifiers import built_in_methods
 
 collect_ignore = ["submission"]
 """A package of its own, which test_submission.py installs and tests."""
@@ -182,7 +179,7 @@ def _make_record(
     groups: tuple[int, int, int] | None = None,
     episodes: int = 20,
     curve_episodes: int | None = None,
-    selection_episodes: int = 10,
+    validation_episodes: int = 10,
     **run: Any,
 ) -> Record:
     """Return a record. Where a value is NaN there is no row, or None in it.
@@ -191,7 +188,7 @@ def _make_record(
         success: Success rates (stages + 1, tasks), or outcomes (stages + 1, tasks, episodes).
         curves: The same for the targets on the way, (targets, points before the end); none if None.
         retained_curves: The same for the retained skills, (targets, points before the end, retained).
-        selection: The same for the targets on selection episodes, (targets, points).
+        selection: The same for the targets on validation episodes, (targets, points).
         perturbed: The same for the retained skills in perturbed episodes at the ends, (stages + 1, retained).
         sparsity: Update sparsity, (targets, points). No policy was looked at if it and `drift` are None.
         drift: Activation drift, (targets, points).
@@ -200,8 +197,8 @@ def _make_record(
         groups: How many tasks are retained, targets and held out; by default one is held out.
         episodes: Episodes per task, where rates are given.
         curve_episodes: Episodes per task on the way, where rates are given; as many as at the end if None.
-        selection_episodes: Selection episodes, where rates are given.
-        run: What differs in `Record.run`, as method="ewc". With split="selection" all episodes are of that.
+        validation_episodes: Validation episodes, where rates are given.
+        run: What differs in `Record.run`, as method="ewc". With split="validation" all episodes are of that.
             A built-in method uses what it declares.
     """
     outcomes = _outcomes(success, 2, episodes)
@@ -213,14 +210,17 @@ def _make_record(
     method = run.get("method", "sft")
     uses = dataclasses.asdict(load_method(method).uses if method in built_in_methods() else Uses())
     names_of_run = {"scenario": "clbench/Toy-v0", "method": method, "seed": 0, "device": "cpu"}
-    run = {**names_of_run, "split": "report", "settings": {}, "changes": {}, "uses": uses, **run}
+    run = {**names_of_run, "split": "test", "settings": {}, "changes": {}, "uses": uses, **run}
     split, on_the_way = run["split"], curve_episodes or outcomes.shape[2]
     rows: list[tuple[Any, ...]] = [
         (stage, steps[-1] if stage else 0, names[task], split, episode, int(value), value, 50)
         for (stage, task, episode), value in np.ndenumerate(outcomes)
         if not np.isnan(value)
     ]
-    for values, which, number in ((curves, split, on_the_way), (selection, "selection", selection_episodes)):
+    for values, which, number in (
+        (curves, split, on_the_way),
+        (selection, "validation", validation_episodes),
+    ):
         rows += [
             (target + 1, steps[point], names[retained + target], which, episode, int(value), value, 50)
             for (target, point, episode), value in _each(values, 2, number)
@@ -246,9 +246,9 @@ def _make_record(
             "evaluation_steps": list(steps),
             "budget": {
                 "adaptation_steps": steps[-1],
-                "report_episodes": outcomes.shape[2],
+                "test_episodes": outcomes.shape[2],
                 "curve_episodes": on_the_way,
-                "selection_episodes": selection_episodes,
+                "validation_episodes": validation_episodes,
             },
         },
         episodes=_columns(EPISODE_COLUMNS, rows),

@@ -28,11 +28,11 @@ def test_importing_registers_the_scenarios_and_loads_nothing_heavy() -> None:
 
 
 def test_the_help_of_run_and_who_sends_runs_to_ray_do_not_wait_for_pytorch() -> None:
-    code = "import clbench.cli, clbench.commands.runs, clbench.ray_workers, clbench.run_spec, sys;"
+    code = "import clbench.cli.main, clbench.cli.runs, clbench.jobs.ray, clbench.runs.spec, sys;"
     assert _run(f"{code} print('torch' in sys.modules)") == "False"
 
 
 def test_nothing_leaks_to_the_top_level() -> None:
-    code = "import clbench.cli, clbench.methods.sft, clbench.envs.fetch, clbench.leaderboard, sys;"
+    code = "import clbench.cli.main, clbench.methods.sft, clbench.envs.fetch, clbench.leaderboard, sys;"
     code += "print({'envs', 'methods', 'leaderboard'} & set(sys.modules))"
     assert _run(code) == "set()"

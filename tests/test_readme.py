@@ -82,9 +82,9 @@ def test_three_commands_lead_from_nothing_to_a_row_on_the_board(tmp_path: Path) 
 def test_the_third_snippet_draws_the_table(folder: Path) -> None:
     output = _console(_blocks("console")[1], folder)
     assert "my_method:HeadOnly" in output
-    written = (folder / "leaderboard" / "LEADERBOARD.md").read_bytes()
+    written = (folder / "leaderboard" / "site" / "LEADERBOARD.md").read_bytes()
     _console(_blocks("console")[1], folder)
-    assert (folder / "leaderboard" / "LEADERBOARD.md").read_bytes() == written
+    assert (folder / "leaderboard" / "site" / "LEADERBOARD.md").read_bytes() == written
     assert "HeadOnly" in _python(_blocks("python")[2], folder)
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from clbench.record import read_record
+from clbench.records.reader import read_record
 
 SOURCE = Path(__file__).parent / "submission"
 TOY = "clbench.testing:clbench/Toy-v0"

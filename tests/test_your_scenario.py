@@ -1,4 +1,4 @@
-"""The worked example of `docs/your_scenario.md`, run as it stands by a stranger."""
+"""The worked example of `docs/guide/your_scenario.md`, run as it stands by a stranger."""
 
 import os
 import re
@@ -9,10 +9,10 @@ from pathlib import Path
 
 import pytest
 
-from clbench.record import read_record
-from clbench.scores import Scores
+from clbench.records.reader import read_record
+from clbench.scoring.scores import Scores
 
-PAGE = Path(__file__).parents[1] / "docs" / "your_scenario.md"
+PAGE = Path(__file__).parents[1] / "docs" / "guide" / "your_scenario.md"
 
 
 def _blocks(language: str) -> list[str]:
@@ -62,8 +62,8 @@ def test_its_world_is_perturbed_as_the_page_says(tmp_path: Path) -> None:
 
 LOOK_AT_IT = """
 import mypackage
-from clbench.perturbation import draw_perturbation
-from clbench.world import check_perturbable
+from clbench.worlds.perturbation import draw_perturbation
+from clbench.worlds.lanes import check_perturbable
 
 check_perturbable(mypackage.SCENARIO.retained)
 plain, disturbed = mypackage.Table(), mypackage.Table(perturbed=True)

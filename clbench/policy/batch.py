@@ -59,7 +59,7 @@ class Batch(_Rows):
     action: Tensor
     """The expert's next actions as the world takes them, (B, H, A)."""
     valid: Tensor
-    """Which of them count, (B, H): not those after the episode's end or after a disturbance."""
+    """Which of them count, (B, H): not those after the episode's end or after action noise."""
     draw: Tensor
     """Uniform draws in [0, 1) for the action head, (B,)."""
     noise: Tensor

@@ -13,14 +13,15 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
+from clbench.base.errors import ClbenchError
+from clbench.base.strict_json import read_json
 from clbench.policy.policy import Policy, PolicyConfig
-from clbench.strict_json import read_json
 
 LARGEST = 65_536
 """Of every size in a `PolicyConfig`."""
 
 
-class CheckpointError(ValueError):
+class CheckpointError(ClbenchError, ValueError):
     """A file is not a checkpoint that can be read."""
 
 

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from clbench.policy.backbone import Backbone
 from clbench.policy.batch import Batch, QuestionBatch
 from clbench.policy.flow import FlowHead
-from clbench.policy.language import TEXT_LENGTH, VOCABULARY_SIZE
+from clbench.spec.language import TEXT_LENGTH, VOCABULARY_SIZE
 
 
 @dataclass(frozen=True)

@@ -7,6 +7,8 @@ from typing import cast
 
 from torch import Tensor, nn
 
+from clbench.base.errors import InputError
+
 PATCH = 16
 """Pixels along the side of a patch, of which 64 x 64 pixels have 16."""
 TOKENS = 4
@@ -31,7 +33,7 @@ class Vision(nn.Module):
     def __init__(self, image_size: int, width: int) -> None:
         super().__init__()
         if image_size % PATCH:
-            raise ValueError(f"image_size must be a multiple of {PATCH}, not {image_size}.")
+            raise InputError(f"image_size must be a multiple of {PATCH}, not {image_size}.")
         self.image_size, self.width = image_size, width
         self.tokens = TOKENS
         channels = (3, width // 6, width // 3, width // 2, width // 2)
@@ -57,7 +59,7 @@ class Vision(nn.Module):
         size = (self.image_size, self.image_size, 3)
         if image is None or tuple(image.shape[1:]) != size:
             found = "none" if image is None else tuple(image.shape[1:])
-            raise ValueError(f"The policy sees an image of {size}, not {found}: hand over `batch.image`.")
+            raise InputError(f"The policy sees an image of {size}, not {found}: hand over `batch.image`.")
         pixels = image.permute(0, 3, 1, 2).float() / 127.5 - 1.0
         tokens = cast(Tensor, self.out(self.convolutions(pixels).flatten(1)))
         return tokens.view(len(image), self.tokens, self.width)

@@ -1,4 +1,4 @@
-"""The public contract of a method, checked on the toy in seconds; `docs/contract.md` has it in words.
+"""The public contract of a method, checked on the toy in seconds; `docs/guide/contract.md` has it in words.
 
     def test_my_method() -> None:
         check_method(MyMethod)
@@ -24,15 +24,16 @@ from typing import Any, get_args
 
 from torch import Tensor
 
-from clbench.evaluation import Evaluator
-from clbench.learner import repeatable
-from clbench.method import Access, Metadata, Method, Uses
-from clbench.policy import Policy
-from clbench.seeding import seeded
+from clbench.base.seeding import seeded
+from clbench.evaluation.rollouts import Evaluator
+from clbench.learning.method import Metadata, Method
+from clbench.learning.prior import Access, Uses
+from clbench.learning.trainer import repeatable
+from clbench.policy.policy import Policy
 from clbench.testing.error import ContractError
 from clbench.testing.global_state import GENERATORS, same, watched
 from clbench.testing.toy import TOY
-from clbench.testing.toy_run import SEAMS, ToyRun, toy_learner
+from clbench.testing.toy_run import HOOKS, ToyRun, toy_trainer
 
 TARGETS, STEPS = 2, 2
 """Length of the runs in which only what happens matters, and not what is learned."""
@@ -136,7 +137,7 @@ class Subject:
 
 
 def declaration(subject: Subject) -> None:
-    """A documented dataclass of its own, whose seams are those of the loop."""
+    """A documented dataclass of its own, whose hooks are those of the loop."""
     cls = subject.cls
     if not (isinstance(cls, type) and issubclass(cls, Method)):
         raise _breach(declaration, "a subclass of clbench.Method", repr(cls), "the class")
@@ -168,21 +169,21 @@ def _check_declared(cls: type[Method]) -> None:
 
 
 def _check_signatures(cls: type[Method]) -> None:
-    """Check that the loop can call every seam, and that none is misspelt."""
+    """Check that the loop can call every hook, and that none is misspelt."""
     for name, value in vars(cls).items():
-        if callable(value) and name not in SEAMS and not name.startswith("_"):
-            near = difflib.get_close_matches(name, SEAMS, n=1, cutoff=0.85)
+        if callable(value) and name not in HOOKS and not name.startswith("_"):
+            near = difflib.get_close_matches(name, HOOKS, n=1, cutoff=0.85)
             if near:
-                expected = f"seams that the loop calls; did you mean {near[0]}()? Helpers begin with _"
+                expected = f"hooks that the loop calls; did you mean {near[0]}()? Helpers begin with _"
                 raise _breach(declaration, expected, f"{name}() is never called", f"{name}()")
-    for seam in SEAMS:
-        given, taken = (inspect.signature(getattr(one, seam)) for one in (Method, cls))
+    for hook in HOOKS:
+        given, taken = (inspect.signature(getattr(one, hook)) for one in (Method, cls))
         try:
             taken.bind(*given.parameters)
         except TypeError as error:
-            expected = f"{seam}({', '.join(given.parameters)})"
-            found = f"{seam}({', '.join(taken.parameters)})"
-            raise _breach(declaration, expected, found, f"{seam}()") from error
+            expected = f"{hook}({', '.join(given.parameters)})"
+            found = f"{hook}({', '.join(taken.parameters)})"
+            raise _breach(declaration, expected, found, f"{hook}()") from error
 
 
 def constructor(subject: Subject) -> None:
@@ -200,7 +201,7 @@ def _check_fields(cls: type[Method]) -> None:
     fields = dataclasses.fields(cls)  # type: ignore[arg-type]
     for field in fields:
         if not field.init:
-            expected = "every field to be a hyper-parameter; what is learned is set by the seams"
+            expected = "every field to be a hyper-parameter; what is learned is set by the hooks"
             raise _misbuilt(expected, f"{field.name} has init=False")
         if field.default is field.default_factory is dataclasses.MISSING:
             raise _misbuilt("a default for every hyper-parameter", f"{field.name} has none")
@@ -211,7 +212,7 @@ def _check_fields(cls: type[Method]) -> None:
         raise _misbuilt("an object of the defaults to be made", words) from error
     more = sorted(vars(method).keys() - {field.name for field in fields})
     if more:
-        expected = "only hyper-parameters to be stored; what is learned is set by the seams"
+        expected = "only hyper-parameters to be stored; what is learned is set by the hooks"
         raise _misbuilt(expected, f"it sets {', '.join(more)}")
     for field in fields:
         value = getattr(method, field.name)
@@ -249,35 +250,35 @@ def _misbuilt(expected: str, found: str) -> ContractError:
     return _breach(constructor, expected, found, "the fields, __init__ and __post_init__")
 
 
-def sound_seams(subject: Subject) -> None:
-    """Seams that return what the loop can go on with, and at most a batch of the target in a step."""
+def sound_hooks(subject: Subject) -> None:
+    """Hooks that return what the loop can go on with, and at most a batch of the target in a step."""
     size, drawn = TOY.budget.batch_size, subject.first.target_rows
     if drawn > size:
         expected = (
             f"at most target.batch_size = {size} samples of the target in a step: the budget of all methods"
         )
-        raise _breach(sound_seams, expected, f"{drawn} samples", "batch()")
+        raise _breach(sound_hooks, expected, f"{drawn} samples", "batch()")
 
 
 def declared_data(subject: Subject) -> None:
     """Prior data that `uses` declares, and all of it: divisions are made of these declarations."""
     for name in PRIOR:
         access: Access = getattr(subject.cls.uses, name)
-        if access == "never" or _drawn_as(access, subject.first.seams_that_draw(name)):
+        if access == "never" or _drawn_as(access, subject.first.hooks_that_draw(name)):
             continue
-        seams = subject.longer.seams_that_draw(name)  # it may draw at few steps
-        if not _drawn_as(access, seams):
+        hooks = subject.longer.hooks_that_draw(name)  # it may draw at few steps
+        if not _drawn_as(access, hooks):
             expected = f"prior {name} to be drawn as `uses` declares, {access!r}"
             alone, never = (
                 "drawn in prepare() alone; declare 'prepare'",
                 "never drawn; leave them out of `uses`",
             )
-            raise _breach(declared_data, expected, f"they are {alone if seams else never}", "uses")
+            raise _breach(declared_data, expected, f"they are {alone if hooks else never}", "uses")
 
 
-def _drawn_as(access: Access, seams: set[str]) -> bool:
-    """Return whether data that are drawn in `seams` are declared as they should be."""
-    return bool(seams if access == "prepare" else seams - {"prepare"})
+def _drawn_as(access: Access, hooks: set[str]) -> bool:
+    """Return whether data that are drawn in `hooks` are declared as they should be."""
+    return bool(hooks if access == "prepare" else hooks - {"prepare"})
 
 
 def same_numbers(subject: Subject) -> None:
@@ -287,9 +288,9 @@ def same_numbers(subject: Subject) -> None:
         raise _breach(
             same_numbers,
             "two runs with one seed to be equal: draw from the sources, from the global generators, which "
-            "are seeded for each seam, or from a generator that is seeded with stage.seed",
+            "are seeded for each hook, or from a generator that is seeded with stage.seed",
             difference,
-            "every seam that draws, measures time, or iterates over a set",
+            "every hook that draws, measures time, or iterates over a set",
         )
 
 
@@ -307,27 +308,27 @@ def state(subject: Subject) -> None:
 
 def global_state(subject: Subject) -> None:
     """Nothing that is left behind: settings of the process stay as they were, files are written nowhere."""
-    for seam, change in subject.second.changes:
+    for hook, change in subject.second.changes:
         expected = "the process to be left as it was, and files to be written in clbench's cache alone"
-        raise _breach(global_state, expected, f"after {seam}() {change}", f"{seam}()")
+        raise _breach(global_state, expected, f"after {hook}() {change}", f"{hook}()")
 
 
 def seeding(subject: Subject) -> None:
     """Random generators that are left to the run: with another seed it draws otherwise."""
     first, other = subject.first.generators, subject.longer.generators
-    for seam in [seam for seam in first if seam in other]:
+    for hook in [hook for hook in first if hook in other]:
         for name in GENERATORS:
-            if same(first[seam][name], other[seam][name]):
+            if same(first[hook][name], other[hook][name]):
                 expected = "the global generators to be as the run's seed left them: draw, but do not seed"
-                found = f"after {seam}() {name} stands alike in runs of two seeds"
-                raise _breach(seeding, expected, found, f"{seam}()")
+                found = f"after {hook}() {name} stands alike in runs of two seeds"
+                raise _breach(seeding, expected, found, f"{hook}()")
 
 
 def learning(subject: Subject) -> None:
     """A target that is learned: guides excepted, the policy acts better than one that was left alone."""
     if subject.cls.uses.reference:
         return
-    before, after = _frozen_return(), _mean_return(subject.longer.learner.policy)
+    before, after = _frozen_return(), _mean_return(subject.longer.trainer.policy)
     if not after - before >= LEAST_GAIN:
         raise _breach(
             learning,
@@ -341,7 +342,7 @@ def learning(subject: Subject) -> None:
 CLAUSES = (
     declaration,
     constructor,
-    sound_seams,
+    sound_hooks,
     declared_data,
     same_numbers,
     global_state,
@@ -381,11 +382,11 @@ def _difference(one: ToyRun, other: ToyRun) -> str | None:
 
 @functools.cache
 def _frozen_return() -> float:
-    return _mean_return(toy_learner().policy)
+    return _mean_return(toy_trainer().policy)
 
 
 def _mean_return(policy: Policy) -> float:
-    """Return the mean return of the policy on the toy's first target, over its selection episodes."""
+    """Return the mean return of the policy on the toy's first target, over its validation episodes."""
     evaluator = Evaluator(TOY, 0)
     policy.eval()
     with repeatable("cpu"):

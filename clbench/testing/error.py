@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-PAGE = "docs/contract.md"
+PAGE = "docs/guide/contract.md"
 """The contract in words, a heading for each clause."""
 
 
@@ -10,7 +10,7 @@ class ContractError(AssertionError):
     """A method breaks the public contract.
 
     Args:
-        clause: What it breaks, as "same numbers": a heading of `docs/contract.md`.
+        clause: What it breaks, as "same numbers": a heading of `docs/guide/contract.md`.
         expected: What would have been right.
         found: What there is instead.
         look: Where in the method's class to look, as "loss()".

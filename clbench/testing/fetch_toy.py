@@ -6,8 +6,9 @@ It walks the whole way from a class to a row; its scores mean nothing. Ask for i
 
 import dataclasses
 
-from clbench.registration import register
-from clbench.task import Budget, Task, load_scenario
+from clbench.spec.budget import Budget
+from clbench.spec.registry import load_scenario, register
+from clbench.spec.task import Task
 
 _FETCH = load_scenario("clbench/Fetch-v0")
 
@@ -27,15 +28,15 @@ FETCH_TOY = dataclasses.replace(
     budget=Budget(
         demonstrations=4,
         question_episodes=36,
-        report_questions=60,
+        test_questions=60,
         pretraining_steps=40,
         adaptation_steps=16,
         batch_size=16,
         policy_width=32,
         policy_layers=2,
         evaluation_points=2,
-        selection_episodes=2,
-        report_episodes=3,
+        validation_episodes=2,
+        test_episodes=3,
         curve_episodes=2,
     ),
 )

@@ -16,8 +16,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from clbench.cache import cache_folder
-from clbench.policy import Policy
+from clbench.base.cache import cache_folder
+from clbench.policy.policy import Policy
 
 _Setting = tuple[Callable[[], Any], Callable[[Any], object]]
 

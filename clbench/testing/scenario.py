@@ -16,13 +16,16 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from clbench.demonstrations import demonstrate
-from clbench.names import check_plain, check_scenario_id
-from clbench.policy import encode
-from clbench.questions import QuestionKind
-from clbench.seeding import derive_seed
-from clbench.task import Scenario, Task, resolve
-from clbench.world import Lanes, World
+from clbench.base.entry_points import resolve
+from clbench.base.seeding import derive_seed
+from clbench.data.demonstrations import demonstrate
+from clbench.data.questions import QuestionKind
+from clbench.spec.identifiers import check_plain, check_scenario_id
+from clbench.spec.language import encode
+from clbench.spec.scenario import Scenario
+from clbench.spec.task import Task
+from clbench.worlds.lanes import Lanes
+from clbench.worlds.world import World
 
 STILL = 3
 """Episodes in which nothing is done; a task that is done in all of them needs no skill."""
@@ -40,11 +43,11 @@ def check_scenario(scenario: Scenario, *, episodes: int = 10, success: float = 0
     success and nothing else; observations are in their space and rewards are numbers; the initial state
     depends on the seed, and an episode on nothing but the seed and the actions, whatever ran before, in a new
     world, and side by side in a vector world. Of each question: words of the vocabulary, and answers that all
-    occur in the experts' disturbed episodes.
+    occur in the experts' noisy episodes.
 
     Args:
         scenario: What to check.
-        episodes: Of the expert on each task, and as many disturbed ones for the questions.
+        episodes: Of the expert on each task, and as many noisy ones for the questions.
         success: Share of them in which the expert must succeed.
 
     Raises:

@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import dataclasses
 
-from clbench.registration import register
-from clbench.task import Task
+from clbench.spec.registry import register
+from clbench.spec.task import Task
 from clbench.testing.toy import TOY
 
 

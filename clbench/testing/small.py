@@ -1,14 +1,15 @@
-"""What tests of a method's seams begin with: a small policy's sizes, and sources of the toy's data."""
+"""What tests of a method's hooks begin with: a small policy's sizes, and sources of the toy's data."""
 
 from __future__ import annotations
 
 import torch
 
-from clbench.demonstrations import Demonstrations, collect
-from clbench.method import Source
-from clbench.policy import Batch, PolicyConfig, QuestionBatch
-from clbench.questions import Questions
-from clbench.task import resolve
+from clbench.base.entry_points import resolve
+from clbench.data.demonstrations import Demonstrations, collect
+from clbench.data.questions import Questions
+from clbench.learning.prior import Source
+from clbench.policy.batch import Batch, QuestionBatch
+from clbench.policy.policy import PolicyConfig
 from clbench.testing.toy import TOY
 
 SMALL = PolicyConfig(state_size=4, action_size=2, width=32, layers=2)

@@ -10,9 +10,12 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from clbench.perturbation import draw_perturbation
-from clbench.questions import QuestionKind
-from clbench.task import Budget, Scenario, Task, unknown
+from clbench.base.entry_points import unknown
+from clbench.data.questions import QuestionKind
+from clbench.spec.budget import Budget
+from clbench.spec.scenario import Scenario
+from clbench.spec.task import Task
+from clbench.worlds.perturbation import draw_perturbation
 
 State = NDArray[np.float32]
 Action = NDArray[np.float32]
@@ -116,7 +119,7 @@ TOY = Scenario(
     budget=Budget(
         demonstrations=10,
         question_episodes=40,
-        report_questions=100,
+        test_questions=100,
         pretraining_steps=150,
         pretraining_learning_rate=2e-3,
         adaptation_steps=60,
@@ -125,8 +128,8 @@ TOY = Scenario(
         policy_width=32,
         policy_layers=1,
         evaluation_points=3,
-        selection_episodes=4,
-        report_episodes=6,
+        validation_episodes=4,
+        test_episodes=6,
         curve_episodes=3,
     ),
 )

@@ -6,7 +6,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from clbench.camera import Images, States, Views
+from clbench.worlds.camera import Images, States, Views
 
 REACH = 2.5
 """How far from the middle the picture reaches, in the units of the toy."""

@@ -1,4 +1,4 @@
-"""A run of a method on the toy, without evaluation and with an eye on every seam."""
+"""A run of a method on the toy, without evaluation and with an eye on every hook."""
 
 from __future__ import annotations
 
@@ -15,16 +15,17 @@ from typing import Any
 
 from torch import Tensor, nn
 
-from clbench.learner import Learner, repeatable
-from clbench.method import Method, Prior, Source, Stage, UndeclaredAccessError
-from clbench.policy import CheckpointError
-from clbench.seeding import seeded
+from clbench.base.seeding import seeded
+from clbench.learning.method import Method, Stage
+from clbench.learning.optimise import MethodError
+from clbench.learning.prior import Prior, Source, UndeclaredAccessError
+from clbench.learning.trainer import Trainer, repeatable
+from clbench.policy.checkpoint import CheckpointError
 from clbench.testing.error import ContractError
 from clbench.testing.global_state import GENERATORS, read, watched
 from clbench.testing.toy import TOY
-from clbench.training import MethodError
 
-SEAMS = (
+HOOKS = (
     "prepare",
     "start_task",
     "batch",
@@ -39,10 +40,10 @@ SEAMS = (
 """Of `Method`."""
 
 IN_A_STEP = ("batch", "loss", "gradients", "learning_rate")
-"""Seams of one optimiser step, in their order."""
+"""Hooks of one optimiser step, in their order."""
 
 UNSEEDED = ("state", "diagnostics")
-"""Seams that may not draw at random."""
+"""Hooks that may not draw at random."""
 
 SOUND = {
     "start_task": "an iterable of the policy's parameters, or of optimiser groups of them",
@@ -51,15 +52,15 @@ SOUND = {
     "learning_rate": "a finite float from 0",
     "end_task": "a policy of finite weights",
 }
-"""What the loop needs of a seam, in words."""
+"""What the loop needs of a hook, in words."""
 
 _numbers = itertools.count()
 
 
 @functools.cache
-def toy_learner() -> Learner:
-    """Return a learner of the toy that is not to be used itself: to read its data takes a second."""
-    return Learner(TOY, Method, 0, "cpu")
+def toy_trainer() -> Trainer:
+    """Return a trainer of the toy that is not to be used itself: to read its data takes a second."""
+    return Trainer(TOY, Method, 0, "cpu")
 
 
 class ToyRun:
@@ -74,52 +75,52 @@ class ToyRun:
             run, or goes on with the old object.
 
     Raises:
-        ContractError: A seam does what the loop cannot go on with.
+        ContractError: A hook does what the loop cannot go on with.
     """
 
     def __init__(
         self, build: Callable[[], Method], targets: int, steps: int, seed: int = 0, resumed: bool = True
     ) -> None:
         self.draws: set[tuple[str, str]] = set()
-        """Where samples were drawn: the source, and the seam."""
+        """Where samples were drawn: the source, and the hook."""
         self.target_rows = 0
         """Most samples of the target that were drawn in one step."""
         self.changes: dict[tuple[str, str], None] = {}
-        """What each seam left changed behind it."""
+        """What each hook left changed behind it."""
         self.outcomes: dict[tuple[str, str], Any] = {}
         """All that came of it, by stage and name: weights, state, diagnostics."""
         self.generators: dict[str, dict[str, Any]] = {}
-        """The global random generators after the first call of each seam for which a run seeds them."""
-        self._build, self._seam, self._running, self._step_rows = build, "prepare", False, 0
-        learner = copy.copy(toy_learner())
+        """The global random generators after the first call of each hook for which a run seeds them."""
+        self._build, self._hook, self._running, self._step_rows = build, "prepare", False, 0
+        trainer = copy.copy(toy_trainer())
         budget = dataclasses.replace(TOY.budget, adaptation_steps=steps)
-        learner.scenario = dataclasses.replace(TOY, target=TOY.target[:targets], budget=budget)
-        learner.policy, learner.seed = copy.deepcopy(learner.policy), seed
-        learner.new_method = self._watched_method
-        self.learner = learner
+        trainer.scenario = dataclasses.replace(TOY, target=TOY.target[:targets], budget=budget)
+        trainer.policy, trainer.seed = copy.deepcopy(trainer.policy), seed
+        trainer.new_method = self._watched_method
+        self.trainer = trainer
         # no two begin with the same global generators: what depends on them differs
         with repeatable("cpu"), seeded("toy run", next(_numbers)), tempfile.TemporaryDirectory() as folder:
-            learner.method = self._watched_method()
+            trainer.method = self._watched_method()
             self._go(Path(folder), resumed)
 
     def _go(self, folder: Path, resumed: bool) -> None:
-        for number in range(len(self.learner.scenario.target) + 1):
+        for number in range(len(self.trainer.scenario.target) + 1):
             with self._named_faults():
                 if number:
-                    self.learner.learn(number, lambda _: None)
+                    self.trainer.learn(number, lambda _: None)
                 else:
-                    self.outcomes["prepare", "steps"] = self.learner.prepare()
-                stage = self.learner.where
-                self._keep(stage, "diagnostics", self.learner.method.diagnostics())
-                self.learner.save(folder, number)
-                for name, value in self.learner.policy.state_dict().items():
+                    self.outcomes["prepare", "steps"] = self.trainer.prepare()
+                stage = self.trainer.where
+                self._keep(stage, "diagnostics", self.trainer.method.diagnostics())
+                self.trainer.save(folder, number)
+                for name, value in self.trainer.policy.state_dict().items():
                     self._keep(stage, name, value)
                 if resumed:
-                    self.learner.load(folder, number)
+                    self.trainer.load(folder, number)
 
-    def seams_that_draw(self, source: str) -> set[str]:
-        """Return the seams in which samples of a source are drawn."""
-        return {seam for one, seam in self.draws if one == source}
+    def hooks_that_draw(self, source: str) -> set[str]:
+        """Return the hooks in which samples of a source are drawn."""
+        return {hook for one, hook in self.draws if one == source}
 
     def _keep(self, stage: str, name: str, value: Any) -> None:
         value = value.detach().clone() if isinstance(value, Tensor) else copy.deepcopy(value)
@@ -127,7 +128,7 @@ class ToyRun:
 
     @contextmanager
     def _named_faults(self) -> Iterator[None]:
-        """Turn what goes wrong inside, but in no seam, into a fault of the last seam."""
+        """Turn what goes wrong inside, but in no hook, into a fault of the last hook."""
         try:
             yield
         except CheckpointError as error:
@@ -141,50 +142,50 @@ class ToyRun:
             raise
         except Exception as error:
             found = str(error) if isinstance(error, MethodError) else f"{type(error).__name__}: {error}"
-            expected = SOUND.get(self._seam, f"{self._seam}() to go through")
-            raise ContractError("sound seams", expected, found, f"{self._seam}()") from error
+            expected = SOUND.get(self._hook, f"{self._hook}() to go through")
+            raise ContractError("sound hooks", expected, found, f"{self._hook}()") from error
 
-    # ---- the seams ---------------------------------------------------------------------------------
+    # ---- the hooks ---------------------------------------------------------------------------------
 
     def _watched_method(self) -> Method:
         method = self._build()
         self.uses = method.uses
-        for seam in SEAMS:
-            # an attribute of the object goes before the seam of its class, also where the class is frozen
-            object.__setattr__(method, seam, functools.partial(self._call, seam, getattr(method, seam)))
+        for hook in HOOKS:
+            # an attribute of the object goes before the hook of its class, also where the class is frozen
+            object.__setattr__(method, hook, functools.partial(self._call, hook, getattr(method, hook)))
         return method
 
-    def _call(self, seam: str, function: Callable[..., Any], *arguments: Any, **named: Any) -> Any:
-        if self._running:  # the method calls a seam of its own
+    def _call(self, hook: str, function: Callable[..., Any], *arguments: Any, **named: Any) -> Any:
+        if self._running:  # the method calls a hook of its own
             return function(*arguments, **named)
-        self._seam, self._running = seam, True
-        self._step_rows = 0 if seam == "batch" else self._step_rows
+        self._hook, self._running = hook, True
+        self._step_rows = 0 if hook == "batch" else self._step_rows
         changes: list[str] = []
         try:
-            with watched(changes, generators=seam in UNSEEDED):
+            with watched(changes, generators=hook in UNSEEDED):
                 result = function(*map(self._counted, arguments), **named)
         except Exception as error:
-            raise self._fault(seam, error) from error
+            raise self._fault(hook, error) from error
         finally:
             self._running = False
-            self.changes.update(dict.fromkeys((seam, change) for change in changes))
-        if seam not in (*UNSEEDED, "load_state"):
-            self.generators.setdefault(seam, read(GENERATORS))
-        check = getattr(self, f"_checked_{seam}", None)
+            self.changes.update(dict.fromkeys((hook, change) for change in changes))
+        if hook not in (*UNSEEDED, "load_state"):
+            self.generators.setdefault(hook, read(GENERATORS))
+        check = getattr(self, f"_checked_{hook}", None)
         return check(result) if check else result
 
-    def _fault(self, seam: str, error: Exception) -> ContractError:
-        """Return the breach that an error in a seam is."""
-        clause, look = "sound seams", f"{seam}()"
-        expected, found = f"{seam}() to go through", f"{type(error).__name__}: {error}"
+    def _fault(self, hook: str, error: Exception) -> ContractError:
+        """Return the breach that an error in a hook is."""
+        clause, look = "sound hooks", f"{hook}()"
+        expected, found = f"{hook}() to go through", f"{type(error).__name__}: {error}"
         if isinstance(error, UndeclaredAccessError):
             clause, found = "declared data", str(error)
-            expected = f"{seam}() to draw from what it is handed, and of prior data from what `uses` declares"
-        elif isinstance(error, AttributeError) and error.obj is self.learner.method and seam != "prepare":
+            expected = f"{hook}() to draw from what it is handed, and of prior data from what `uses` declares"
+        elif isinstance(error, AttributeError) and error.obj is self.trainer.method and hook != "prepare":
             clause, look = "state", "state() and load_state()"
-            found = f"{seam}() finds no attribute {error.name!r}"
+            found = f"{hook}() finds no attribute {error.name!r}"
             expected = "every stage to begin with a new object that has what load_state() sets, and no more"
-        elif seam in ("state", "load_state"):
+        elif hook in ("state", "load_state"):
             clause = "state"
         return ContractError(clause, expected, found, look)
 
@@ -213,7 +214,7 @@ class ToyRun:
     def _checked_gradients(self, result: Any) -> Any:
         if all(parameter.grad is None for parameter in self._trained):
             found = "no parameter that start_task() returned has a gradient"
-            raise ContractError("sound seams", SOUND["gradients"], found, "gradients()")
+            raise ContractError("sound hooks", SOUND["gradients"], found, "gradients()")
         return result
 
     def _checked_state(self, state: Any) -> Any:
@@ -224,7 +225,7 @@ class ToyRun:
                 raise _bad_state("names that are text", repr(name))
             if not (value is None or isinstance(value, Tensor | str | float | int)):
                 raise _bad_state("tensors and plain values", f"a {type(value).__name__}, {name!r}")
-            self._keep(self.learner.where, f"state {name!r}", value)
+            self._keep(self.trainer.where, f"state {name!r}", value)
         return state
 
     def _checked_diagnostics(self, diagnostics: Any) -> Any:
@@ -239,7 +240,7 @@ class ToyRun:
     # ---- what the method is handed -----------------------------------------------------------------
 
     def _counted(self, argument: Any) -> Any:
-        """Return an argument of a seam, its sources counted."""
+        """Return an argument of a hook, its sources counted."""
         if isinstance(argument, Stage):
             counted = {"target": self._counted(argument.target), "prior": self._counted(argument.prior)}
             return dataclasses.replace(argument, **counted)
@@ -253,8 +254,8 @@ class ToyRun:
 
     def _counter(self, source: str) -> Callable[[int], None]:
         def count(samples: int) -> None:
-            self.draws.add((source, self._seam))
-            if source == "target" and self._seam in IN_A_STEP:
+            self.draws.add((source, self._hook))
+            if source == "target" and self._hook in IN_A_STEP:
                 self._step_rows += samples
                 self.target_rows = max(self.target_rows, self._step_rows)
 
@@ -292,8 +293,8 @@ class CountedSource(Source[Any]):
         self._source.close()
 
 
-def _unsound(seam: str, expected: str, found: str) -> ContractError:
-    return ContractError("sound seams", f"{seam}() to return {expected}", found, f"{seam}()")
+def _unsound(hook: str, expected: str, found: str) -> ContractError:
+    return ContractError("sound hooks", f"{hook}() to return {expected}", found, f"{hook}()")
 
 
 def _bad_state(expected: str, found: str) -> ContractError:

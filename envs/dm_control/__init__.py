@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from clbench.task import Budget, Scenario, Task
+from clbench.spec.budget import Budget
+from clbench.spec.scenario import Scenario
+from clbench.spec.task import Task
 
 from .rules import HORIZON
 
@@ -17,8 +19,8 @@ def _task(name: str, *instructions: str) -> Task:
         horizon=HORIZON,
         world="clbench.envs.dm_control.world:DMControlWorld",
         expert="clbench.envs.dm_control.expert:expert",
-        # three disturbances in 100 steps: with ten few episodes reach the return that counts as success
-        disturbance=0.03,
+        # three times in 100 steps: with ten, few episodes reach the return that counts as success
+        action_noise=0.03,
         packages=("dm-control",),
     )
 

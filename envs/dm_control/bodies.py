@@ -13,7 +13,8 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from clbench.perturbation import with_mass
+from clbench.base.errors import InputError
+from clbench.worlds.perturbation import with_mass
 
 from .state import ACTION_SIZE, OBSERVATION_SIZE, Observation
 
@@ -85,11 +86,11 @@ def start(body: str, task: str) -> Start:
     observed = sum(int(np.prod(spec.shape)) for spec in environment.observation_spec().values())
     motors = int(environment.action_spec().shape[0])
     if observed > OBSERVATION_SIZE:
-        raise ValueError(
+        raise InputError(
             f"{body} is observed in {observed} numbers; a state has places for {OBSERVATION_SIZE}."
         )
     if motors > ACTION_SIZE:
-        raise ValueError(f"{body} has {motors} motors; an action has places for {ACTION_SIZE}.")
+        raise InputError(f"{body} has {motors} motors; an action has places for {ACTION_SIZE}.")
     return Start(BODY_OF[body], environment.physics, environment.task, environment.physics.model.ptr)
 
 

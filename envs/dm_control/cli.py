@@ -6,10 +6,10 @@ from pathlib import Path
 
 from rich.console import Console
 
-from clbench.arguments import at_least, checked_input
-from clbench.extras import require
-from clbench.progress import Bars
-from clbench.task import unknown
+from clbench.base.dependencies import require
+from clbench.base.entry_points import unknown
+from clbench.cli.arguments import at_least, checked_input
+from clbench.jobs.bars import Bars
 
 from .expert import FOLDER
 from .rules import HORIZON, RULES

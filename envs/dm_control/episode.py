@@ -8,8 +8,8 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from clbench.perturbation import Perturbation
-from clbench.task import unknown
+from clbench.base.entry_points import unknown
+from clbench.worlds.perturbation import Perturbation
 
 from .bodies import Start, start, start_with_mass
 from .rules import RULES, Rule

@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 from safetensors import SafetensorError
 from safetensors.numpy import load, save
 
-from clbench.strict_json import StrictJSONError, read_json
-from clbench.task import unknown
+from clbench.base.entry_points import unknown
+from clbench.base.errors import ClbenchError, InputError
+from clbench.base.strict_json import StrictJSONError, read_json
 
 from .rules import RULES
 from .state import ACTION_SIZE, Observation, State
@@ -27,7 +28,7 @@ Layer = tuple[NDArray[np.float32], NDArray[np.float32]]
 """Weights (out, in) and biases (out,)."""
 
 
-class ExpertError(LookupError):
+class ExpertError(ClbenchError):
     """The files of an expert cannot be used; the message says why, and how to get others."""
 
 
@@ -103,9 +104,9 @@ def read_expert(folder: Path, task: str) -> tuple[Expert, float]:
         said = read_json(card)
         content = weights.read_bytes()
         if said["task"] != task:
-            raise ValueError(f"is that of the task {said['task']!r}")
+            raise InputError(f"is that of the task {said['task']!r}")
         if hashlib.sha256(content).hexdigest() != said["sha256"]:
-            raise ValueError("has another hash than its JSON says")
+            raise InputError("has another hash than its JSON says")
         layers = _layers(load(content), tuple(said["sizes"]))
         mean = float(said["return"])
     except (OSError, KeyError, TypeError, ValueError, SafetensorError, StrictJSONError) as error:
@@ -124,7 +125,7 @@ def _layers(tensors: dict[str, NDArray[np.float32]], sizes: Sequence[int]) -> tu
         expected |= {f"{number}.weight": (height, width), f"{number}.bias": (height,)}
     found = {name: values.shape for name, values in tensors.items()}
     if found != expected or any(values.dtype != np.float32 for values in tensors.values()):
-        raise ValueError(f"has tensors {found} where float32 of {expected} are expected")
+        raise InputError(f"has tensors {found} where float32 of {expected} are expected")
     if not all(np.isfinite(values).all() for values in tensors.values()):
-        raise ValueError("holds values that are not finite")
+        raise InputError("holds values that are not finite")
     return tuple((tensors[f"{number}.weight"], tensors[f"{number}.bias"]) for number in range(len(sizes) - 1))

@@ -10,7 +10,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from clbench.questions import Answers, QuestionKind, Truths, which
+from clbench.data.questions import Answers, QuestionKind, Truths, which
 
 from .state import BODIES, BODY, State
 

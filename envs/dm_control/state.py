@@ -13,6 +13,8 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from clbench.base.errors import InputError
+
 State: TypeAlias = NDArray[np.float32]
 """One state (19,), or many (N, 19)."""
 Observation: TypeAlias = NDArray[np.float64]
@@ -37,7 +39,7 @@ def padded(body: str, observation: Observation) -> State:
     """
     size = observation.shape[-1]
     if size > OBSERVATION_SIZE:
-        raise ValueError(f"{body} is observed in {size} numbers; a state has places for {OBSERVATION_SIZE}.")
+        raise InputError(f"{body} is observed in {size} numbers; a state has places for {OBSERVATION_SIZE}.")
     state = np.zeros((*observation.shape[:-1], SIZE), np.float32)
     state[..., :size] = observation
     state[..., OBSERVATION_SIZE : OBSERVATION_SIZE + size] = 1.0

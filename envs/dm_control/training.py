@@ -21,9 +21,11 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
-from clbench.cache import cache_folder, hash_of, source_hash
-from clbench.extras import versions
-from clbench.seeding import derive_seed, seeded
+from clbench.base.cache import cache_folder, hash_of
+from clbench.base.dependencies import versions
+from clbench.base.errors import InputError
+from clbench.base.seeding import SPLIT_LABELS, derive_seed, seeded
+from clbench.base.source import source_hash
 
 from .episode import Episode
 from .expert import Expert, ExpertError
@@ -31,9 +33,9 @@ from .rules import HORIZON, SUCCESS_SHARE
 from .sac import WrittenOutSAC
 from .symmetry import SYMMETRIES
 
-REPORT_EPISODES = 100
+TEST_EPISODES = 100
 """Episodes that the mean return and the success of an expert are measured on."""
-SELECTION_EPISODES = 10
+VALIDATION_EPISODES = 10
 """Other episodes, after each segment: the actor that does best on them is kept, of equals the latest."""
 ROUND = 8
 """Decisions between gradient steps, which are taken by half as many at once."""
@@ -78,7 +80,7 @@ class Settings:
     def __post_init__(self) -> None:
         whole = self.steps % self.segment == self.segment % HORIZON == self.segment % ROUND == 0
         if not whole or not 0 < self.steps <= REPLAY_SIZE:
-            raise ValueError(
+            raise InputError(
                 f"An expert is trained for a multiple of {self.segment:,} steps, at most {REPLAY_SIZE:,}, "
                 f"not {self.steps:,}; episodes have {HORIZON}."
             )
@@ -122,7 +124,7 @@ def returns(expert: Expert, task: str, purpose: str, episodes: int) -> NDArray[n
     """Return what an expert's episodes (N,) return; the initial states follow from `purpose` and number."""
     episode, sums = Episode(), np.zeros(episodes)
     for number in range(episodes):
-        observation = episode.reset(task, derive_seed("expert", task, purpose, number))
+        observation = episode.reset(task, derive_seed("expert", task, SPLIT_LABELS[purpose], number))
         for _ in range(HORIZON):
             observation = episode.step(expert.act(observation))
             sums[number] += episode.reward(observation)
@@ -139,7 +141,9 @@ def checkpoint_path(settings: Settings) -> Path:
     """Return where the checkpoint of a training lies, or will lie; a longer training goes on from it."""
     inputs = {
         **{name: value for name, value in asdict(settings).items() if name != "steps"},
-        "source": source_hash(__name__, *(f"{__package__}.{part}" for part in SOURCES), "clbench.seeding"),
+        "source": source_hash(
+            __name__, *(f"{__package__}.{part}" for part in SOURCES), "clbench.base.seeding"
+        ),
         "versions": versions(PACKAGES),
     }
     name = f"{settings.task}-seed-{settings.seed}-{hash_of(inputs)}.safetensors"
@@ -153,7 +157,7 @@ class _Best:
     actor: dict[str, Tensor]
     value: float
     curve: list[list[float]]
-    """After how many steps the actor returned how much, on average of the selection episodes."""
+    """After how many steps the actor returned how much, on average of the validation episodes."""
 
 
 def train(
@@ -206,7 +210,7 @@ def _train(settings: Settings, progress: Callable[[float, str], None]) -> _Best:
             learner.action_space.seed(derive_seed("explore", settings.seed, learner.num_timesteps))
             learner.learn(settings.segment, reset_num_timesteps=False)
         value = float(
-            returns(_expert(_actor(learner, world)), settings.task, "selection", SELECTION_EPISODES).mean()
+            returns(_expert(_actor(learner, world)), settings.task, "validation", VALIDATION_EPISODES).mean()
         )
         best.curve.append([learner.num_timesteps, round(value, 3)])
         if value >= best.value:
@@ -317,7 +321,7 @@ def _read_checkpoint(learner: WrittenOutSAC, path: Path) -> _Best:
 def _ship(settings: Settings, expert: Expert, curve: list[list[float]], folder: Path) -> dict[str, Any]:
     """Measure an expert, write its files, and return what the JSON says."""
     task = settings.task
-    sums = returns(expert, task, "report", REPORT_EPISODES)
+    sums = returns(expert, task, "test", TEST_EPISODES)
     content = expert.to_bytes()
     symmetry = SYMMETRIES.get(task)
     card = {
@@ -327,7 +331,7 @@ def _ship(settings: Settings, expert: Expert, curve: list[list[float]], folder: 
         "return": round(float(sums.mean()), 3),
         "lowest_return": round(float(sums.min()), 3),
         "success": float((sums >= SUCCESS_SHARE * sums.mean()).mean()),
-        "episodes": REPORT_EPISODES,
+        "episodes": TEST_EPISODES,
         "settings": asdict(settings),
         "curve": curve,
         "sizes": [expert.layers[0][0].shape[1], *(len(bias) for _, bias in expert.layers)],

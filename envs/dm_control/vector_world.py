@@ -11,8 +11,9 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from clbench.perturbation import draw_perturbation
-from clbench.world import Team, checked_actions, no_episode
+from clbench.worlds.perturbation import draw_perturbation
+from clbench.worlds.threads import Team
+from clbench.worlds.world import checked_actions, no_episode
 
 from .episode import Episode
 from .expert import expert_return
@@ -46,7 +47,7 @@ class DMControlVectorWorld:
 
     An action (2,) in [-1, 1] sets the motors for one step of 0.04 s, of the point mass 0.16 s; where a body
     has one motor, the second number is ignored. An episode succeeds at its last step, the 100th, if its
-    return is at least 0.8 of the mean return of the expert's episodes. It is a `clbench.world.VectorWorld`.
+    return is at least 0.8 of the mean return of the expert's episodes. It is a `clbench.worlds.world.VectorWorld`.
 
     Args:
         lanes: Places for episodes. A lane takes its memory when it first has a body.

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from clbench.task import Scenario, Task
+from clbench.spec.scenario import Scenario
+from clbench.spec.task import Task
 
 __all__ = ["SCENARIO"]
 

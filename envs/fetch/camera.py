@@ -12,7 +12,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from clbench.camera import Views
+from clbench.worlds.camera import Views
 
 from .scene import scene_file
 from .state import (
@@ -49,7 +49,7 @@ LOOK_AT = (1.34, 0.75, 0.42)
 VIEW = {"azimuth": 180.0, "elevation": -65.0, "distance": 0.60}
 """From the front, high up: the width of the table is that of the picture, and a pixel is a centimetre."""
 
-DISTURBANCE = {"azimuth": 5.0, "elevation": 5.0, "distance": 0.04}
+PERTURBATION = {"azimuth": 5.0, "elevation": 5.0, "distance": 0.04}
 """How far a perturbed view is displaced at most, in degrees and metres, as after a touch of the camera: what
 lies on the table moves by up to 3 of the 64 pixels, which are centimetres there."""
 LIGHT = 0.4
@@ -111,7 +111,7 @@ class FetchCamera:
     def _disturb(self, view: Views) -> None:
         """Put the camera in its place and light the scene, both displaced by the shares of a view (4,)."""
         for (name, value), share in zip(VIEW.items(), view, strict=False):
-            setattr(self._view, name, value + DISTURBANCE[name] * float(share))
+            setattr(self._view, name, value + PERTURBATION[name] * float(share))
         for light, plain in zip(self._lights, self._plain_lights, strict=True):
             light[:] = plain * (1.0 + LIGHT * float(view[-1]))
 

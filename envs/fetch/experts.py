@@ -10,7 +10,7 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from clbench.task import unknown
+from clbench.base.entry_points import unknown
 
 from .rules import HOVER_HEIGHT, OPEN, opening
 from .state import BLOCK, GRIPPER, REST_HEIGHT, TARGET, State

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from clbench.questions import QuestionKind
+from clbench.data.questions import QuestionKind
 
 from .camera import COLOURS, THINGS
 from .questions import QUESTIONS

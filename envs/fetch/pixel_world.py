@@ -10,7 +10,7 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from clbench.camera import VIEW_SIZE
+from clbench.worlds.camera import VIEW_SIZE
 
 from .camera import COLOURS, JOINTS, PIXEL_SIZE, THINGS, FetchCamera
 from .rules import RULES

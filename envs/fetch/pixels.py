@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 
-from clbench.task import Budget, Scenario, Task
+from clbench.spec.budget import Budget
+from clbench.spec.scenario import Scenario
+from clbench.spec.task import Task
 
 from . import SCENARIO as FETCH
 

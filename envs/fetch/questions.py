@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from clbench.questions import Answers, QuestionKind, sign, which
+from clbench.data.questions import Answers, QuestionKind, sign, which
 
 from .state import (
     BLOCK,

@@ -12,7 +12,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from clbench.perturbation import with_mass
+from clbench.worlds.perturbation import with_mass
 
 # Else each worker prints a notice about Adroit's hand, which is not used here.
 with contextlib.redirect_stderr(io.StringIO()):

@@ -11,9 +11,10 @@ import numpy as np
 from gymnasium.utils.seeding import np_random
 from numpy.typing import NDArray
 
-from clbench.perturbation import draw_perturbation
-from clbench.task import unknown
-from clbench.world import Team, checked_actions, no_episode
+from clbench.base.entry_points import unknown
+from clbench.worlds.perturbation import draw_perturbation
+from clbench.worlds.threads import Team
+from clbench.worlds.world import checked_actions, no_episode
 
 from .rules import RULES, Numbers, Rule
 from .scene import Scene, mat2euler, scene, scene_with_mass
@@ -96,7 +97,7 @@ class FetchVectorWorld:
 
     An action (4,) in [-1, 1] moves the gripper by up to 5 cm along x, y and z, of which the arm makes about
     3 cm a step, and opens (+1) or closes (-1) the fingers. The reward is that of `Rule.judge`. An episode
-    ends with success only; whoever uses the world counts its steps. It is a `clbench.world.VectorWorld`.
+    ends with success only; whoever uses the world counts its steps. It is a `clbench.worlds.world.VectorWorld`.
 
     Args:
         lanes: Places for episodes. A lane takes its memory when it is first reset.

@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import dataclasses
 
-from clbench.task import Budget, Scenario, Task
+from clbench.spec.budget import Budget
+from clbench.spec.scenario import Scenario
+from clbench.spec.task import Task
 
 __all__ = ["CONTINUAL_WORLD", "SCENARIO"]
 
@@ -234,14 +236,14 @@ CONTINUAL_WORLD = Scenario(
     ),
     budget=Budget(
         demonstrations=100,
-        perturbation=0.25,
+        noisy_demonstrations=0.25,
         pretraining_steps=1500,
         adaptation_steps=700,
         learning_rate=2e-3,
         policy_width=64,
         policy_layers=2,
         evaluation_points=2,
-        report_episodes=10,
+        test_episodes=10,
     ),
 )
 """Ten tasks to learn in order, and none to keep but those: CW10 of Wolczyk et al. 2021 (arXiv 2105.10919)."""

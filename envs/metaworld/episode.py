@@ -14,8 +14,8 @@ from metaworld.env_dict import ALL_V3_ENVIRONMENTS
 from metaworld.sawyer_xyz_env import SawyerXYZEnv
 from numpy.typing import NDArray
 
-from clbench.perturbation import with_mass
-from clbench.task import unknown
+from clbench.base.entry_points import unknown
+from clbench.worlds.perturbation import with_mass
 
 from .state import State
 

@@ -14,7 +14,7 @@ import numpy as np
 from metaworld.policies import ENV_POLICY_MAP
 from numpy.typing import NDArray
 
-from clbench.task import unknown
+from clbench.base.entry_points import unknown
 
 from .state import GOAL, HAND, OBJECT, OPENING, State
 

@@ -6,6 +6,8 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from clbench.base.errors import InputError
+
 from .batch import Group, Part, Rule, Verdict
 from .rewards import Floats, Mixed, Vector, between, hamacher, near, norm
 
@@ -70,7 +72,7 @@ def _checked(margin: Vector) -> Vector:
         ValueError: It is negative, for which Meta-World has no reward.
     """
     if (margin < 0).any():
-        raise ValueError("The hand begins so near to a thing that Meta-World has no reward for reaching it.")
+        raise InputError("The hand begins so near to a thing that Meta-World has no reward for reaching it.")
     return margin
 
 

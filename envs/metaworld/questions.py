@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from clbench.questions import Answers, QuestionKind, sign, which
+from clbench.data.questions import Answers, QuestionKind, sign, which
 
 from .state import GOAL, HAND, HAND_BEFORE, OBJECT, OBJECT_BEFORE, OPENING, State
 

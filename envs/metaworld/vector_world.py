@@ -12,8 +12,9 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from clbench.perturbation import draw_perturbation
-from clbench.world import Team, checked_actions, no_episode
+from clbench.worlds.perturbation import draw_perturbation
+from clbench.worlds.threads import Team
+from clbench.worlds.world import checked_actions, no_episode
 
 from .batch import Batch, Group
 from .episode import Episode, new_episode
@@ -67,7 +68,7 @@ class MetaWorldVectorWorld:
     An action (4,) in [-1, 1] moves the hand by up to 1 cm along x, y and z, and closes (+1) or opens (-1) the
     fingers; a step takes 0.0125 s. The state is Meta-World's observation with the goal in it, the reward its
     own from 0 to 10. An episode ends with success only; whoever uses the world counts its steps. It is a
-    `clbench.world.VectorWorld`.
+    `clbench.worlds.world.VectorWorld`.
 
     Args:
         lanes: Places for episodes. A task's scene is compiled when it is first reset to.

@@ -7,7 +7,7 @@ import numpy as np
 from gymnasium.envs.mujoco.mujoco_rendering import MujocoRenderer
 from numpy.typing import NDArray
 
-from clbench.world import OneLaneWorld
+from clbench.worlds.world import OneLaneWorld
 
 from .vector_world import MetaWorldVectorWorld
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import TypeAlias
 
-from clbench.task import unknown
+from clbench.base.entry_points import unknown
 
 Place: TypeAlias = tuple[float, float]
 Cell: TypeAlias = tuple[int, int]

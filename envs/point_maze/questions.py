@@ -7,7 +7,7 @@ import functools
 import numpy as np
 from numpy.typing import NDArray
 
-from clbench.questions import Answers, QuestionKind, sign, which
+from clbench.data.questions import Answers, QuestionKind, sign, which
 
 from .mazes import MAZES
 from .state import COLOUR, PLACE, ROOM_AHEAD, VELOCITY, State

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import mujoco
 
-from clbench.perturbation import with_mass
+from clbench.worlds.perturbation import with_mass
 
 from .mazes import MAZES, SIZE, Cell, centre
 

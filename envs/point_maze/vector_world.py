@@ -11,8 +11,8 @@ import numpy as np
 from gymnasium.utils.seeding import np_random
 from numpy.typing import NDArray
 
-from clbench.perturbation import Perturbation, draw_perturbation
-from clbench.world import checked_actions, no_episode
+from clbench.worlds.perturbation import Perturbation, draw_perturbation
+from clbench.worlds.world import checked_actions, no_episode
 
 from .mazes import MAZES, ROOMS, Goal, Place, centre, goal_of
 from .scene import SUBSTEPS, TARGET, scene, scene_with_mass
@@ -81,7 +81,7 @@ class PointMazeVectorWorld:
 
     An action (2,) in [-1, 1] pushes the ball to the right and upwards for 0.1 s, by up to 24 m/s^2. The
     reward is minus the metres to go by the shortest way, and `SUCCESS_BONUS` more on success. An episode
-    ends with success only; whoever uses the world counts its steps. It is a `clbench.world.VectorWorld`.
+    ends with success only; whoever uses the world counts its steps. It is a `clbench.worlds.world.VectorWorld`.
 
     Args:
         lanes: Places for episodes. A lane takes its memory when it is reset into another maze than before.

@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from clbench.world import OneLaneWorld
+from clbench.worlds.world import OneLaneWorld
 
 from .mazes import GOALS
 from .scene import camera

@@ -10,11 +10,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from clbench.demonstrations import demonstrate
-from clbench.perturbation import draw_perturbation
-from clbench.policy import word_id
-from clbench.task import Task, load_scenario, resolve
-from clbench.world import World, vector_world
+from clbench.base.entry_points import resolve
+from clbench.data.demonstrations import demonstrate
+from clbench.spec.language import word_id
+from clbench.spec.registry import load_scenario
+from clbench.spec.task import Task
+from clbench.worlds.lanes import vector_world
+from clbench.worlds.perturbation import draw_perturbation
+from clbench.worlds.world import World
 
 SCENARIO = load_scenario("clbench:clbench/DMControl-v0")
 bodies, experts, questions, rules, state, symmetry = (
@@ -152,7 +155,7 @@ def test_every_expert_does_its_task(task: Task) -> None:
     assert card["success"] >= 0.9
     assert card["episodes"] == 100
     plain = world()
-    successes = [demonstrate(plain, task, seed, disturb=False).success for seed in range(5)]
+    successes = [demonstrate(plain, task, seed, noisy=False).success for seed in range(5)]
     assert sum(successes) >= 4
 
 
@@ -216,7 +219,7 @@ def test_questions_are_answered_in_known_words_and_only_where_they_apply() -> No
     plain = world()
     rows = {}
     for task in SCENARIO.retained:
-        rows[task.name] = demonstrate(plain, task, 0, disturb=True).state
+        rows[task.name] = demonstrate(plain, task, 0, noisy=True).state
     for kind in questions.QUESTIONS:
         assert all(word_id(word) > 0 for word in kind.answers)
         given = {name: set(kind.answer(states).tolist()) for name, states in rows.items()}
@@ -253,7 +256,7 @@ def test_the_world_is_drawn_with_the_target_of_its_task() -> None:
 
 
 def _draws() -> bool:
-    from clbench.rendering import RenderingError, choose_back_end
+    from clbench.worlds.gl_backend import RenderingError, choose_back_end
 
     try:
         choose_back_end([SCENARIO.tasks[0].world])

@@ -16,11 +16,16 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 from numpy.typing import NDArray
 
-from clbench.policy import encode
-from clbench.rendering import RenderingError
-from clbench.scenario_env import ScenarioEnv
-from clbench.task import Scenario, Task, registered_scenario, resolve, scenario_ids
-from clbench.world import Lanes, World, check_perturbable, vector_world
+from clbench.base.entry_points import resolve
+from clbench.spec.identifiers import scenario_ids
+from clbench.spec.language import encode
+from clbench.spec.registry import registered_scenario
+from clbench.spec.scenario import Scenario
+from clbench.spec.task import Task
+from clbench.worlds.gl_backend import RenderingError
+from clbench.worlds.lanes import Lanes, check_perturbable, vector_world
+from clbench.worlds.scenario_env import ScenarioEnv
+from clbench.worlds.world import World
 
 BUILT_IN = [
     scenario_id
@@ -89,8 +94,8 @@ def run(program: str) -> None:
 
 def test_the_data_of_all_scenarios_load_no_simulator() -> None:
     run(
-        "import clbench.task, sys\n"
-        f"for name in {BUILT_IN}: clbench.task.registered_scenario(name)\n"
+        "import clbench.spec.task, sys\n"
+        f"for name in {BUILT_IN}: clbench.spec.registry.registered_scenario(name)\n"
         "assert not {'mujoco', 'gymnasium_robotics', 'dm_control', 'metaworld'} & set(sys.modules)"
     )
 

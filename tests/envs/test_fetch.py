@@ -9,7 +9,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from clbench.task import Task, load_scenario, resolve
+from clbench.base.entry_points import resolve
+from clbench.spec.registry import load_scenario
+from clbench.spec.task import Task
 
 SCENARIO = load_scenario("clbench:clbench/Fetch-v0")
 NAMES = [task.name for task in SCENARIO.tasks]

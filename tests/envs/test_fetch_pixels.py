@@ -7,12 +7,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from clbench.demonstrations import demonstrate
-from clbench.observer import Observer
-from clbench.policy import encode
-from clbench.rendering import RenderingError
-from clbench.scenario_env import ScenarioEnv
-from clbench.task import Task, load_scenario, resolve
+from clbench.base.entry_points import resolve
+from clbench.data.demonstrations import demonstrate
+from clbench.spec.language import encode
+from clbench.spec.registry import load_scenario
+from clbench.spec.task import Task
+from clbench.worlds.gl_backend import RenderingError
+from clbench.worlds.observation import Observer
+from clbench.worlds.scenario_env import ScenarioEnv
 
 SCENARIO = load_scenario("clbench:clbench/FetchPixels-v0")
 FETCH = load_scenario("clbench:clbench/Fetch-v0")
@@ -84,7 +86,7 @@ def test_an_episode_is_bit_for_bit_that_of_fetch() -> None:
 
 @pytest.mark.parametrize("task", SCENARIO.tasks, ids=lambda task: task.name)
 def test_experts_act_on_what_policies_do_not_see(task: Task) -> None:
-    assert all(demonstrate(World(), task, seed, disturb=False).success for seed in range(3))
+    assert all(demonstrate(World(), task, seed, noisy=False).success for seed in range(3))
 
 
 def test_things_lie_apart_in_two_colours_and_follow_from_the_seed() -> None:

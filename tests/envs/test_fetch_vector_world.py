@@ -7,9 +7,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from clbench.perturbation import draw_perturbation
-from clbench.task import load_scenario, resolve
-from clbench.world import VectorWorld, vector_world
+from clbench.base.entry_points import resolve
+from clbench.spec.registry import load_scenario
+from clbench.worlds.lanes import vector_world
+from clbench.worlds.perturbation import draw_perturbation
+from clbench.worlds.world import VectorWorld
 
 SCENARIO = load_scenario("clbench:clbench/Fetch-v0")
 NAMES = [task.name for task in SCENARIO.tasks]

@@ -12,10 +12,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from clbench import cli
-from clbench.commands.film import film
-from clbench.commands.runs import run, tune
-from clbench.task import Task, load_scenario, resolve
+from clbench.base.entry_points import resolve
+from clbench.cli import main as cli
+from clbench.cli.film import film
+from clbench.cli.runs import run, tune
+from clbench.spec.registry import load_scenario
+from clbench.spec.task import Task
 
 SCENARIOS = {name: load_scenario(f"clbench:clbench/{name}-v0") for name in ("MetaWorld", "MetaWorldCW")}
 SCENARIO = SCENARIOS["MetaWorld"]

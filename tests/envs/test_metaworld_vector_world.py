@@ -9,9 +9,11 @@ import pytest
 from metaworld.env_dict import ALL_V3_ENVIRONMENTS
 from numpy.typing import NDArray
 
-from clbench.perturbation import draw_perturbation
-from clbench.task import load_scenario, resolve
-from clbench.world import VectorWorld, vector_world
+from clbench.base.entry_points import resolve
+from clbench.spec.registry import load_scenario
+from clbench.worlds.lanes import vector_world
+from clbench.worlds.perturbation import draw_perturbation
+from clbench.worlds.world import VectorWorld
 
 SCENARIOS = [load_scenario(f"clbench:clbench/{name}-v0") for name in ("MetaWorld", "MetaWorldCW")]
 TASKS = {task.name: task for one in SCENARIOS for task in one.tasks}

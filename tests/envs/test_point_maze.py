@@ -17,11 +17,13 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from clbench.perturbation import draw_perturbation
-from clbench.policy import word_id
-from clbench.questions import load_questions, report_questions
-from clbench.task import Task, load_scenario, resolve
-from clbench.world import vector_world
+from clbench.base.entry_points import resolve
+from clbench.data.questions import load_questions, scored_questions
+from clbench.spec.language import word_id
+from clbench.spec.registry import load_scenario
+from clbench.spec.task import Task
+from clbench.worlds.lanes import vector_world
+from clbench.worlds.perturbation import draw_perturbation
 
 mazes = importlib.import_module("clbench.envs.point_maze.mazes")
 scene = resolve("clbench.envs.point_maze.scene:scene")
@@ -277,7 +279,7 @@ def test_questions_are_answered_as_one_sees_it(kind: str, expected: str | None, 
 def test_questions_have_balanced_answers_for_training_and_report() -> None:
     few = dataclasses.replace(SCENARIO, budget=dataclasses.replace(SCENARIO.budget, question_episodes=48))
     for questions in load_questions(few):
-        kind, batch = report_questions(questions, 1600)
+        kind, batch = scored_questions(questions, 1600)
         assert torch.bincount(kind).tolist() == [100] * 16
         for index, entry in enumerate(questions.kinds):
             for answer in entry.answers:

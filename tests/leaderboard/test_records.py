@@ -8,9 +8,9 @@ from typing import Any
 
 import pytest
 
-from clbench.method import load_method, method_names
-from clbench.record import read_record
-from clbench.scores import Scores
+from clbench.learning.registry import load_method, method_names
+from clbench.records.reader import read_record
+from clbench.scoring.scores import Scores
 
 RECORDS = Path(__file__).parents[2] / "leaderboard" / "records"
 
@@ -76,7 +76,7 @@ def test_every_built_in_method_has_a_row(board: Any) -> None:
 
 @pytest.mark.parametrize("scenario", sorted(path.name for path in RECORDS.glob("*")))
 def test_every_scenario_on_the_board_is_known_to_tell_methods_apart(scenario: str) -> None:
-    card = (RECORDS.parents[1] / "docs" / "scenarios" / f"{scenario}.md").read_text()
+    card = (RECORDS.parents[1] / "docs" / "reference" / "scenarios" / f"{scenario}.md").read_text()
     bars = card.partition("| bar |")[2].partition("\n\n")[0].splitlines()[2:]
     assert len(bars) >= 3
     assert all(bar.endswith("| holds |") for bar in bars), bars
@@ -117,14 +117,20 @@ def test_the_committed_pages_are_those_of_the_committed_records(
     monkeypatch.chdir(checkout)
     cli.claims(output=tmp_path / "claims.md")
     cli.method_pages(output=tmp_path / "methods")
-    shutil.copytree(checkout / "docs" / "scenarios", tmp_path / "scenarios")  # pictures and measured experts
+    shutil.copytree(
+        checkout / "docs" / "reference" / "scenarios", tmp_path / "scenarios"
+    )  # pictures and measured experts
     cli.scenario_card(output=tmp_path / "scenarios")
     for made in sorted(tmp_path.rglob("*.md")):
         page = made.relative_to(tmp_path)
-        assert made.read_text() == (checkout / "docs" / page).read_text(), f"{page}: run `make docs`"
+        assert made.read_text() == (checkout / "docs" / "reference" / page).read_text(), (
+            f"{page}: run `make docs`"
+        )
     shutil.copytree(RECORDS, tmp_path / "board" / "records")
     shutil.copytree(checkout / "benchmarks" / "results", tmp_path / "benchmarks" / "results")
     cli.show(records=tmp_path / "board" / "records")
     for name in ("LEADERBOARD.md", "leaderboard.csv", "index.html", "pareto.svg", "pareto-dark.svg"):
-        made = tmp_path / "board" / name
-        assert made.read_bytes() == (RECORDS.parent / name).read_bytes(), f"{name}: run `clbench leaderboard`"
+        made = tmp_path / "board" / "site" / name
+        assert made.read_bytes() == (RECORDS.parent / "site" / name).read_bytes(), (
+            f"{name}: run `clbench leaderboard`"
+        )

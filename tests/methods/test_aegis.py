@@ -11,11 +11,14 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from clbench.activations import Gaussian
-from clbench.adaptation import adapt
-from clbench.method import Prior, Progress, Stage, build_method
-from clbench.policy import Batch, Policy, PolicyConfig
-from clbench.task import Budget
+from clbench.learning.adaptation import adapt
+from clbench.learning.method import Progress, Stage
+from clbench.learning.prior import Prior
+from clbench.learning.registry import build_method
+from clbench.policy.activations import Gaussian
+from clbench.policy.batch import Batch
+from clbench.policy.policy import Policy, PolicyConfig
+from clbench.spec.budget import Budget
 from clbench.testing import TOY
 from clbench.testing.small import SMALL, toy_questions, toy_source
 

@@ -6,8 +6,11 @@ import pytest
 import torch
 from torch import Tensor
 
-from clbench.method import Prior, Stage, build_method
-from clbench.policy import Batch, Policy
+from clbench.learning.method import Stage
+from clbench.learning.prior import Prior
+from clbench.learning.registry import build_method
+from clbench.policy.batch import Batch
+from clbench.policy.policy import Policy
 from clbench.testing import TOY
 from clbench.testing.small import SMALL, toy_source
 

@@ -9,14 +9,17 @@ import pytest
 import torch
 from torch import Tensor
 
-from clbench.adaptation import adapt
-from clbench.method import Prior, Progress, Stage, build_method
-from clbench.policy import Batch, Policy
-from clbench.seeding import seeded
-from clbench.task import Budget
+from clbench.base.seeding import seeded
+from clbench.learning.adaptation import adapt
+from clbench.learning.method import Progress, Stage
+from clbench.learning.optimise import MethodError, optimise
+from clbench.learning.prior import Prior
+from clbench.learning.registry import build_method
+from clbench.policy.batch import Batch
+from clbench.policy.policy import Policy
+from clbench.spec.budget import Budget
 from clbench.testing import TOY
 from clbench.testing.small import SMALL, toy_source
-from clbench.training import MethodError, optimise
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 UNEVEN = {"kappa": 1.0, "tau_start": 1.0, "omega_min": 0.2}
@@ -70,7 +73,7 @@ def _gradient(policy: Policy, loss: Tensor) -> Tensor:
 
 
 def _set_gradient(method: Any, policy: Policy, batch: Batch, progress: Progress) -> Tensor:
-    """Return the gradient that the method's seams set."""
+    """Return the gradient that the method's hooks set."""
     policy.zero_grad()
     method.gradients(policy, method.loss(policy, batch, progress))
     weights = policy.parameters()

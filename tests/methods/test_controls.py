@@ -11,13 +11,16 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from clbench.adaptation import adapt
-from clbench.method import Method, Prior, Progress, Stage, build_method
-from clbench.policy import Batch, Policy
-from clbench.task import Budget
+from clbench.learning.adaptation import adapt
+from clbench.learning.method import Method, Progress, Stage
+from clbench.learning.optimise import learning_rate_factor
+from clbench.learning.prior import Prior
+from clbench.learning.registry import build_method
+from clbench.policy.batch import Batch
+from clbench.policy.policy import Policy
+from clbench.spec.budget import Budget
 from clbench.testing import TOY
 from clbench.testing.small import SMALL, toy_questions, toy_source
-from clbench.training import learning_rate_factor
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 NOW = Progress(0, 100)
@@ -47,7 +50,7 @@ def _gradients(policy: Policy, loss: Tensor) -> dict[str, Tensor]:
 
 
 def _set_by(method: Method, policy: Policy, batch: Any) -> dict[str, Tensor]:
-    """Return the gradients that the method's seams set, zeros where there is none."""
+    """Return the gradients that the method's hooks set, zeros where there is none."""
     policy.zero_grad()
     method.gradients(policy, method.loss(policy, batch, NOW))
     return {
@@ -107,7 +110,11 @@ def test_the_teacher_of_lwf_does_not_learn() -> None:
 
 
 def test_the_gradient_of_lwf_is_that_of_both_terms() -> None:
-    method, policy, batch = build_method("lwf", {"strength": 0.7}), Policy(SMALL), toy_source("up").sample(8)
+    method, policy, batch = (
+        build_method("lwf", {"strength": 0.7}),
+        Policy(SMALL),
+        toy_source("up").sample(8),
+    )
     method.start_task(policy, _stage())
     teacher = deepcopy(policy)
     _adapt(policy, build_method("sft", {}), steps=10)

@@ -6,10 +6,13 @@ import pytest
 import torch
 from torch import Tensor
 
-from clbench.adaptation import adapt
-from clbench.method import Prior, Progress, Source, Stage, build_method
-from clbench.policy import Batch, Policy
-from clbench.task import Budget
+from clbench.learning.adaptation import adapt
+from clbench.learning.method import Progress, Stage
+from clbench.learning.prior import Prior, Source
+from clbench.learning.registry import build_method
+from clbench.policy.batch import Batch
+from clbench.policy.policy import Policy
+from clbench.spec.budget import Budget
 from clbench.testing import TOY
 from clbench.testing.small import SMALL, toy_source
 
@@ -56,7 +59,7 @@ def _check_close(found: Weights, expected: Weights) -> None:
 
 
 def _set(method: Any, policy: Policy, batch: Batch) -> list[Tensor | None]:
-    """Return the gradients that the method's seams set."""
+    """Return the gradients that the method's hooks set."""
     policy.zero_grad()
     method.gradients(policy, method.loss(policy, batch, Progress(0, 10)))
     return [weight.grad for weight in policy.parameters()]

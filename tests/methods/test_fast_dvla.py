@@ -9,11 +9,13 @@ import pytest
 import torch
 from torch import Tensor
 
-from clbench.method import Prior, Progress, Stage, build_method, load_method
-from clbench.policy import Policy
+from clbench.learning.method import Progress, Stage
+from clbench.learning.optimise import optimise
+from clbench.learning.prior import Prior
+from clbench.learning.registry import build_method, load_method
+from clbench.policy.policy import Policy
 from clbench.testing import TOY
 from clbench.testing.small import SMALL, toy_questions, toy_source
-from clbench.training import optimise
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 FEW = {"steps": 6, "step_size": 1e-3}

@@ -10,10 +10,13 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from clbench.adaptation import adapt
-from clbench.method import Prior, Progress, Stage, build_method
-from clbench.policy import Policy, load_policy, save_policy
-from clbench.task import Budget
+from clbench.learning.adaptation import adapt
+from clbench.learning.method import Progress, Stage
+from clbench.learning.prior import Prior
+from clbench.learning.registry import build_method
+from clbench.policy.checkpoint import load_policy, save_policy
+from clbench.policy.policy import Policy
+from clbench.spec.budget import Budget
 from clbench.testing import TOY
 from clbench.testing.small import SMALL, toy_source
 

@@ -12,24 +12,16 @@ import pytest
 from torch import nn
 
 import clbench.testing
-from clbench.method import (
-    Access,
-    Method,
-    Prior,
-    Source,
-    Stage,
-    UndeclaredAccessError,
-    Uses,
-    build_method,
-    load_method,
-    method_names,
-)
-from clbench.metrics import METRICS, measure
-from clbench.policy import Batch, Policy
-from clbench.record import Record
-from clbench.run import execute
-from clbench.run_spec import RunSpec
-from clbench.scores import Scores
+from clbench.learning.method import Method, Stage
+from clbench.learning.prior import Access, Prior, Source, UndeclaredAccessError, Uses
+from clbench.learning.registry import build_method, load_method, method_names
+from clbench.policy.batch import Batch
+from clbench.policy.policy import Policy
+from clbench.records.record import Record
+from clbench.runs.run import execute
+from clbench.runs.spec import RunSpec
+from clbench.scoring.metrics import METRICS, measure
+from clbench.scoring.scores import Scores
 from clbench.testing import check_method
 
 TOY = "clbench.testing:clbench/Toy-v0"
@@ -103,10 +95,10 @@ def short_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., 
         clbench.testing.TOY.budget,
         adaptation_steps=2,
         evaluation_points=1,
-        selection_episodes=1,
-        report_episodes=2,
+        validation_episodes=1,
+        test_episodes=2,
         curve_episodes=1,
-        report_questions=20,
+        test_questions=20,
     )
     monkeypatch.setattr(clbench.testing, "TOY", dataclasses.replace(clbench.testing.TOY, budget=budget))
     return lambda method, **changes: execute(RunSpec(TOY, method, 0, changes), tmp_path)
@@ -146,18 +138,18 @@ def test_a_run_says_what_it_uses_and_costs_and_has_every_metric(
 
 @pytest.mark.parametrize("declared", ["never", "prepare", "throughout"])
 @pytest.mark.parametrize("kind", ["demonstrations", "questions"])
-def test_prior_data_can_be_touched_in_the_seams_that_are_declared_and_in_no_other(
+def test_prior_data_can_be_touched_in_the_hooks_that_are_declared_and_in_no_other(
     kind: str, declared: Access, short_run: Callable[..., Record], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     touched, refused = set(), set()
     declaration: dict[str, Any] = {kind: declared}
 
-    def touch(seam: str, prior: Prior) -> None:
+    def touch(hook: str, prior: Prior) -> None:
         try:
             getattr(prior, kind).sample(1)
-            touched.add(seam)
+            touched.add(hook)
         except UndeclaredAccessError:
-            refused.add(seam)
+            refused.add(hook)
 
     @dataclasses.dataclass
     class Curious(Method):
@@ -182,9 +174,9 @@ def test_prior_data_can_be_touched_in_the_seams_that_are_declared_and_in_no_othe
     monkeypatch.setitem(sys.modules, "stranger", module)
     record = short_run("stranger:Curious")
     assert record.error is None
-    seams = {"prepare", "start_task", "batch", "end_task"}
-    allowed = {"never": set(), "prepare": {"prepare"}, "throughout": seams}[declared]
-    assert (touched, refused) == (allowed, seams - allowed)
+    hooks = {"prepare", "start_task", "batch", "end_task"}
+    allowed = {"never": set(), "prepare": {"prepare"}, "throughout": hooks}[declared]
+    assert (touched, refused) == (allowed, hooks - allowed)
     never = {"demonstrations": "never", "questions": "never", "reference": False}
     assert record.run["uses"] == {**never, **declaration}
     assert (record.costs["bytes_kept"] > 0) == (declared == "throughout")

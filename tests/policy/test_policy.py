@@ -11,16 +11,10 @@ from safetensors.torch import load, save_file
 from scipy import stats
 from torch import Tensor
 
-from clbench.policy import (
-    Batch,
-    CheckpointError,
-    Policy,
-    PolicyConfig,
-    QuestionBatch,
-    load_policy,
-    save_policy,
-)
-from clbench.training import deterministic
+from clbench.learning.optimise import deterministic
+from clbench.policy.batch import Batch, QuestionBatch
+from clbench.policy.checkpoint import CheckpointError, load_policy, save_policy
+from clbench.policy.policy import Policy, PolicyConfig
 
 CONFIG = PolicyConfig(state_size=5, action_size=3, width=32, layers=2)
 

@@ -9,8 +9,9 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 import torch
-from clbench import Batch, Metadata, Method, Policy, Progress, Stage
 from torch import Tensor, nn
+
+from clbench import Batch, Metadata, Method, Policy, Progress, Stage
 
 
 @dataclass

@@ -1,0 +1,32 @@
+from .data.questions import QuestionKind as QuestionKind
+from .evaluation.rollouts import Episode as Episode
+from .evaluation.rollouts import Evaluator as Evaluator
+from .learning.method import Metadata as Metadata
+from .learning.method import Method as Method
+from .learning.method import Progress as Progress
+from .learning.method import Stage as Stage
+from .learning.prior import Prior as Prior
+from .learning.prior import Source as Source
+from .learning.prior import Uses as Uses
+from .learning.registry import load_method as load_method
+from .learning.registry import method_names as method_names
+from .policy.batch import Batch as Batch
+from .policy.batch import QuestionBatch as QuestionBatch
+from .policy.policy import Policy as Policy
+from .policy.policy import PolicyConfig as PolicyConfig
+from .records.reader import read_record as read_record
+from .records.record import Record as Record
+from .runs.agents import evaluate_agent as evaluate_agent
+from .runs.agents import next_stage as next_stage
+from .runs.run import execute as execute
+from .runs.spec import RunSpec as RunSpec
+from .spec.budget import Budget as Budget
+from .spec.identifiers import scenario_ids as scenario_ids
+from .spec.registry import load_scenario as load_scenario
+from .spec.registry import register as register
+from .spec.scenario import Scenario as Scenario
+from .spec.task import Task as Task
+from .worlds.scenario_env import ScenarioEnv as ScenarioEnv
+
+__all__: list[str]
+__version__: str

@@ -1,0 +1,46 @@
+"""Entry points: objects named as "module:attribute"."""
+
+from __future__ import annotations
+
+import difflib
+import importlib
+from collections.abc import Iterable
+from typing import Any
+
+from clbench.base.errors import UnknownNameError
+
+
+def resolve(name: str) -> Any:
+    """Return the object that `name`, "module:attribute", names.
+
+    Raises:
+        LookupError: There is no such module, or it has no such attribute; the nearest one is named.
+    """
+    module, _, attribute = name.partition(":")
+    found = import_module(module, name)
+    if not hasattr(found, attribute):
+        near = difflib.get_close_matches(attribute, dir(found), n=1)
+        hint = f" Did you mean {near[0]!r}?" if near else ""
+        raise UnknownNameError(f"No entry point {name!r}: module {module!r} has no {attribute!r}.{hint}")
+    return getattr(found, attribute)
+
+
+def import_module(module: str, needed_for: str) -> Any:
+    """Return a module.
+
+    Raises:
+        LookupError: It, or one that it imports, is not there.
+    """
+    try:
+        return importlib.import_module(module)
+    except (ModuleNotFoundError, ValueError) as error:  # ValueError: the name is empty
+        missing = getattr(error, "name", None) or module
+        raise UnknownNameError(f"No module {missing!r} can be imported for {needed_for!r}.") from error
+
+
+def unknown(kind: str, name: str, known: Iterable[str]) -> UnknownNameError:
+    """Return the error for a name that is not among the `known` ones, with the nearest of them."""
+    known = sorted(known)
+    near = difflib.get_close_matches(name, known, n=1)
+    hint = f" Did you mean {near[0]!r}?" if near else ""
+    return UnknownNameError(f"No {kind} is called {name!r}.{hint} Known: {', '.join(known)}.")

@@ -1,0 +1,27 @@
+"""Errors that clbench explains.
+
+The command line shows the message of a `ClbenchError` in one line. Any other exception is a bug, and shows its
+traceback. Each class also derives from the built-in exception that a caller would expect.
+"""
+
+from __future__ import annotations
+
+
+class ClbenchError(Exception):
+    """An error whose message says all that a user needs: what is wrong, and what was expected."""
+
+
+class InputError(ClbenchError, ValueError):
+    """A value is out of range, of another form, or contradicts another value."""
+
+
+class UnknownNameError(ClbenchError, LookupError):
+    """Nothing has this name; the message names the nearest one."""
+
+
+class MissingPackageError(ClbenchError, LookupError):
+    """A package is not installed; the message says how to get it."""
+
+
+class WrongTypeError(ClbenchError, TypeError):
+    """An object is not of the type that was expected."""

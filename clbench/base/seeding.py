@@ -1,0 +1,57 @@
+"""Seeds by name: every random stream of a run follows from what it is for, never from what ran before."""
+
+from __future__ import annotations
+
+import hashlib
+import random
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:  # it takes seconds to import, and environments do without it
+    import torch
+
+
+def derive_seed(*parts: str | int) -> int:
+    """Return the 31-bit seed that `parts`, as `("episode", 0, "push", 3)`, name."""
+    digest = hashlib.sha256("\x1f".join(map(str, parts)).encode()).digest()
+    return int.from_bytes(digest[:4], "big") >> 1  # 31 bits: the widest that every library's seed takes
+
+
+def numpy_generator(*parts: str | int) -> np.random.Generator:
+    """Return the NumPy generator of the stream that `parts` name."""
+    return np.random.default_rng(derive_seed(*parts))
+
+
+def torch_generator(*parts: str | int) -> torch.Generator:
+    """Return the PyTorch generator, on the CPU, of the stream that `parts` name."""
+    import torch
+
+    return torch.Generator().manual_seed(derive_seed(*parts))
+
+
+@contextmanager
+def seeded(*parts: str | int) -> Iterator[None]:
+    """Seed the global generators of Python, NumPy and PyTorch inside, and put them back after.
+
+    Our own code draws from explicit generators; a method, or a library that it uses, may not.
+    """
+    import torch
+
+    python, numpy_state = random.getstate(), np.random.get_state()  # noqa: NPY002 - to put it back
+    seed = derive_seed(*parts)
+    with torch.random.fork_rng():
+        random.seed(seed)
+        np.random.seed(seed)  # noqa: NPY002
+        torch.manual_seed(seed)
+        try:
+            yield
+        finally:
+            random.setstate(python)
+            np.random.set_state(numpy_state)  # noqa: NPY002
+
+
+SPLIT_LABELS = {"train": "train", "validation": "selection", "test": "report"}
+"""What seeds call the splits. These words are older than the names and must stay: others draw other episodes."""

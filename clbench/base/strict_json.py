@@ -1,0 +1,149 @@
+"""JSON that a stranger wrote: read within limits, and refused by what is wrong with it."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import stat
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+from clbench.base.errors import ClbenchError, InputError
+
+MOST_BYTES = 8 * 2**20
+"""Size of a file. A record of Fetch-v0 has 0.1 MB; 8 MB of brackets take 0.3 GB of memory and 3 s."""
+
+DEEPEST = 16
+"""Lists and objects inside each other. Records have 5."""
+
+LONGEST_TEXT = 100_000
+"""Characters of a text. Tracebacks are the longest."""
+
+LONGEST_NAME = 200
+"""Characters of the name of an entry."""
+
+LARGEST = 2**64
+"""What whole numbers stay below, seeds of 64 bits included."""
+
+_SCALARS = {str, int, float, bool, type(None)}
+
+_PLAINLY = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
+"""No link is followed, and a pipe that nobody writes to is not waited for."""
+
+
+class StrictJSONError(ClbenchError, ValueError):
+    """A file is not JSON within the limits."""
+
+
+def quoted(text: str) -> str:
+    """Return a stranger's text as Python writes it, cut to 60 characters."""
+    return repr(text) if len(text) <= 60 else f"{text[:60]!r}..."
+
+
+def read_json(path: Path) -> Any:
+    """Return the JSON in the regular file at `path`.
+
+    Raises:
+        StrictJSONError: It is no regular file, too large, not UTF-8 or not JSON; a name is there twice in one
+            object; something is nested too deep, too long or too large, or is no finite number.
+    """
+    try:
+        content = _read(path)
+    except OSError as error:
+        raise StrictJSONError(f"cannot be read ({error.strerror}).") from error
+    try:
+        value = json.loads(content.decode("utf-8"), parse_constant=_no_number, object_pairs_hook=_unique)
+    except (ValueError, RecursionError) as error:
+        raise StrictJSONError(f"cannot be read as JSON ({error}).") from error
+    check_json(value)
+    return value
+
+
+def _read(path: Path) -> bytes:
+    if path.is_symlink():
+        raise StrictJSONError("is a symbolic link, which is not followed.")
+    with open(path, "rb", opener=lambda name, flags: os.open(name, flags | _PLAINLY)) as file:
+        status = os.fstat(file.fileno())
+        if not stat.S_ISREG(status.st_mode):
+            raise StrictJSONError("is no regular file.")
+        if status.st_size > MOST_BYTES:
+            raise StrictJSONError(f"has {status.st_size:,} bytes, more than {MOST_BYTES:,}.")
+        content = file.read(MOST_BYTES + 1)
+    if len(content) != status.st_size:
+        raise StrictJSONError("changed its size while it was read.")
+    return content
+
+
+def _no_number(name: str) -> Any:
+    """Refuse NaN and infinities, which Python reads although JSON has none."""
+    raise InputError(f"{name} is no number")
+
+
+def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """Refuse a name that is there twice: readers would differ in which one they take."""
+    values = dict(pairs)
+    if len(values) != len(pairs):
+        ((name, _),) = Counter(name for name, _ in pairs).most_common(1)
+        raise InputError(f"the name {quoted(name)} is there twice in one object")
+    return values
+
+
+def check_json(value: Any, where: str = "it") -> None:
+    """Refuse a value that is no JSON within the limits.
+
+    Args:
+        value: What `json` may have read.
+        where: What it is called. The entries of an object are called by their names.
+
+    Raises:
+        StrictJSONError: It is not.
+    """
+    if isinstance(value, dict):
+        for name, entry in value.items():
+            _check_name(where, name)
+            _check(name, entry, 1)
+    else:
+        _check(where, value, 0)
+
+
+def _check(where: str, value: Any, depth: int) -> None:
+    kind = type(value)
+    if kind in _SCALARS:
+        _check_scalar(where, value)
+        return
+    if kind not in (list, dict):
+        raise StrictJSONError(f"{where}: {kind.__name__} is no type of JSON.")
+    if depth == DEEPEST:
+        raise StrictJSONError(f"{where}: nested more than {DEEPEST} deep.")
+    if kind is dict:
+        for name, entry in value.items():
+            _check_name(where, name)
+            _check(where, entry, depth + 1)
+    # the columns of a record are long and have few different values
+    elif set(map(type, value)) <= _SCALARS:
+        for entry in set(value):
+            _check_scalar(where, entry)
+    else:
+        for entry in value:
+            _check(where, entry, depth + 1)
+
+
+def _check_name(where: str, name: Any) -> None:
+    if not isinstance(name, str):
+        raise StrictJSONError(f"{where}: the name of an entry must be a text, not {name!r}.")
+    if len(name) > LONGEST_NAME:
+        raise StrictJSONError(
+            f"{where}: a name of {len(name):,} characters: {quoted(name)}; {LONGEST_NAME} are the most."
+        )
+
+
+def _check_scalar(where: str, value: Any) -> None:
+    kind = type(value)
+    if kind is float and not math.isfinite(value):
+        raise StrictJSONError(f"{where}: a number that is not finite.")
+    if kind is int and abs(value) >= LARGEST:
+        raise StrictJSONError(f"{where}: a whole number of {value.bit_length()} bits; 64 are the most.")
+    if kind is str and len(value) > LONGEST_TEXT:
+        raise StrictJSONError(f"{where}: a text of {len(value):,} characters; {LONGEST_TEXT:,} are the most.")

@@ -1,0 +1,47 @@
+"""method_template: what it does, in one line, and the paper that it is from.
+
+The rule in full, if the line above is not all of it.
+
+Details:
+1. Where you differ from the paper, or where it leaves something open: number each.
+2. `share` was chosen with `clbench tune`, which looks at validation episodes alone.
+"""
+
+from dataclasses import dataclass
+
+from torch import Tensor
+
+from clbench import Batch, Metadata, Method, Policy, Progress, Uses
+
+
+@dataclass
+class MethodTemplate(Method):
+    """Leave the samples with the highest losses out of each step."""
+
+    # Fields are hyper-parameters; the constructor stores them or refuses them.
+    share: float = 0.9
+    """Share of the batch that is trained on."""
+
+    # The prior data that it may touch: "never", "prepare" (before the first target)
+    # or "throughout". It competes with methods that use the same.
+    uses = Uses(demonstrations="never", questions="never")
+    metadata = Metadata(
+        authors="Your name",
+        link="https://example.org",
+        licence="MIT",
+        version="0.1",
+    )
+
+    def __post_init__(self) -> None:
+        if not 0 < self.share <= 1:
+            raise ValueError(f"share must be above 0 and at most 1, not {self.share}.")
+
+    # Override what differs from plain fine-tuning; this hook is an example. The others
+    # are prepare, start_task, batch, gradients, learning_rate, end_task, diagnostics,
+    # and state with load_state: every stage begins with a new object of the class.
+    # help(clbench.Method) says what each of them is given and returns.
+    def loss(self, policy: Policy, batch: Batch, progress: Progress) -> Tensor:
+        """Return the mean of the lowest losses."""
+        losses = policy.action_loss(batch)  # (B,): one for each sample
+        count = max(1, round(self.share * len(losses)))
+        return losses.topk(count, largest=False).values.mean()

@@ -1,1 +1,0 @@
-"""Commands that are longer than a screen; `clbench.cli` names them."""

@@ -1,0 +1,310 @@
+"""Demonstrations: the expert's episodes, kept as Minari datasets, read as batches of action chunks."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from clbench.base.cache import cached
+from clbench.base.dependencies import versions
+from clbench.base.entry_points import resolve
+from clbench.base.seeding import derive_seed, numpy_generator
+from clbench.base.source import source_hash
+from clbench.data.access import check_demonstrations
+from clbench.policy.batch import Batch
+from clbench.policy.policy import PolicyConfig
+from clbench.spec.budget import Budget
+from clbench.spec.language import encode
+from clbench.spec.scenario import Scenario
+from clbench.spec.task import Task, packages_of
+from clbench.worlds.observation import observed
+from clbench.worlds.world import World
+
+SIMULATORS = ("gymnasium", "mujoco", "numpy")
+"""Packages whose version can change a trajectory in any suite; a task names those of its own suite."""
+
+
+@dataclass(frozen=True)
+class Demonstration:
+    """One episode of T steps."""
+
+    state: NDArray[np.float32]
+    """Observations, (T + 1, S)."""
+    executed: NDArray[np.float32]
+    """Actions that were executed, (T, A)."""
+    expert: NDArray[np.float32]
+    """What the expert would do in each state, (T + 1, A)."""
+    noisy: NDArray[np.bool_]
+    """Where the executed action was not the expert's, (T + 1,); the last is False."""
+    reward: NDArray[np.float64]
+    """Rewards, (T,)."""
+    success: bool
+    """Whether the episode ended in success."""
+
+
+def demonstrate(world: World, task: Task, seed: int, noisy: bool) -> Demonstration:
+    """Run the expert through one episode of `task`.
+
+    Args:
+        world: An environment of the task's world.
+        task: What to do.
+        seed: Seed of the initial state and of the action noise.
+        noisy: Whether, as often as the task says, 3 to 6 random actions replace the expert's,
+            so that the episode shows how to recover.
+    """
+    expert = resolve(task.expert)(task.name)
+    generator = np.random.default_rng([seed, 1])
+    low, high = _action_bounds(world)
+    state, _ = world.reset(seed=seed, options={"task": task.name})
+    states, executed, labels, random, rewards = [state], [], [expert(state)], [], []
+    success, remaining = False, 0
+    for _ in range(task.horizon):
+        if noisy and remaining == 0 and generator.random() < task.action_noise:
+            remaining = int(generator.integers(3, 7))
+        action = generator.uniform(low, high).astype(np.float32) if remaining else labels[-1]
+        random.append(remaining > 0)
+        remaining = max(0, remaining - 1)
+        state, reward, terminated, _, _ = world.step(action)
+        states.append(state)
+        executed.append(action)
+        labels.append(expert(state))
+        rewards.append(float(reward))
+        if terminated:
+            success = True
+            break
+    return Demonstration(
+        np.array(states, np.float32),
+        np.array(executed, np.float32),
+        np.clip(np.array(labels, np.float32), low, high),
+        np.array([*random, False]),
+        np.array(rewards),
+        success,
+    )
+
+
+def simulator_versions(tasks: Iterable[Task]) -> dict[str, str]:
+    """Return the versions of all packages that can change a trajectory of one of the tasks."""
+    packages = {*SIMULATORS, *(package for task in tasks for package in task.packages)}
+    return versions(packages)
+
+
+def _action_bounds(world: World) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    assert isinstance(world.action_space, gymnasium.spaces.Box)
+    return world.action_space.low, world.action_space.high
+
+
+def collect(
+    task: Task, budget: Budget, progress: Callable[[float], None] = lambda _: None
+) -> list[Demonstration]:
+    """Return the successful expert episodes that a budget asks for; failed attempts are repeated.
+
+    Raises:
+        RuntimeError: The expert fails more often than it succeeds.
+    """
+    world: World = resolve(task.world)()
+    kept: list[Demonstration] = []
+    for attempt in range(2 * budget.demonstrations):
+        seed = derive_seed("demonstration", task.dataset_id, attempt)
+        noisy = bool(numpy_generator("disturb", seed).random() < budget.noisy_demonstrations)
+        episode = demonstrate(world, task, seed, noisy)
+        if episode.success:
+            kept.append(episode)
+            progress(1)
+        if len(kept) == budget.demonstrations:
+            world.close()
+            return kept
+    raise RuntimeError(
+        f"The expert of {task.name!r} succeeded {len(kept)} times in {2 * budget.demonstrations} attempts; "
+        f"{budget.demonstrations} demonstrations are needed. Mend {task.expert} or the success rule."
+    )
+
+
+def dataset_folder(task: Task, budget: Budget, progress: Callable[[float], None] = lambda _: None) -> Path:
+    """Return the folder of the task's Minari dataset, which is collected on first use.
+
+    It lies where Minari keeps its datasets, so that `minari.load_dataset(task.dataset_id)` finds it.
+    """
+    from minari.storage.datasets_root_dir import get_dataset_path
+
+    inputs = {
+        "task": dataclasses.asdict(task),
+        "demonstrations": budget.demonstrations,
+        "noisy_demonstrations": budget.noisy_demonstrations,
+        "source": source_hash(
+            __name__, "clbench.base.seeding", "clbench.worlds.lanes", *packages_of([task], "world", "expert")
+        ),
+        "versions": simulator_versions([task]),
+    }
+    folder = get_dataset_path(task.dataset_id)
+    _declare_namespaces(folder, task.dataset_id)
+    return cached(
+        folder, inputs, lambda partial: _write(partial / "data", task, collect(task, budget, progress))
+    )
+
+
+def _declare_namespaces(folder: Path, dataset_id: str) -> None:
+    """Write the namespace files that Minari's own listing looks for."""
+    parts = dataset_id.split("/")[:-1]
+    for depth in range(1, len(parts) + 1):
+        namespace = folder.parents[len(parts) - depth]
+        namespace.mkdir(parents=True, exist_ok=True)
+        path = namespace / "namespace_metadata.json"
+        if not path.exists():
+            path.write_text(json.dumps({"description": "Expert demonstrations of clbench"}), encoding="utf-8")
+
+
+def _write(folder: Path, task: Task, episodes: Sequence[Demonstration]) -> None:
+    """Write episodes as a Minari dataset; actions are the executed ones, the expert's stand in the infos."""
+    from minari.data_collector import EpisodeBuffer
+    from minari.dataset.minari_storage import MinariStorage
+
+    world: World = resolve(task.world)()
+    storage = MinariStorage.new(folder, world.observation_space, world.action_space)
+    world.close()
+    buffers = []
+    for number, episode in enumerate(episodes):
+        last = np.arange(len(episode.executed)) == len(episode.executed) - 1
+        buffers.append(
+            EpisodeBuffer(
+                id=number,
+                observations=list(episode.state),
+                actions=list(episode.executed),
+                rewards=list(episode.reward),
+                terminations=list(last & episode.success),
+                truncations=list(last & (not episode.success)),
+                infos={"expert_action": list(episode.expert), "noisy": list(episode.noisy)},
+            )
+        )
+    storage.update_metadata(
+        {
+            "dataset_id": task.dataset_id,
+            "minari_version": version("minari"),
+            "algorithm_name": f"expert {task.expert}",
+            "description": f"{task.instructions[0]} (horizon {task.horizon})",
+        }
+    )
+    storage.update_episodes(buffers)
+
+
+def read_dataset(folder: Path) -> list[Demonstration]:
+    """Return the episodes of the Minari dataset in `folder`."""
+    from minari.dataset.minari_storage import MinariStorage
+
+    storage = MinariStorage.read(folder / "data")
+    return [_demonstration(episode) for episode in storage.get_episodes(range(storage.total_episodes))]
+
+
+def _demonstration(episode: dict[str, Any]) -> Demonstration:
+    return Demonstration(
+        np.asarray(episode["observations"], np.float32),
+        np.asarray(episode["actions"], np.float32),
+        np.asarray(episode["infos"]["expert_action"], np.float32),
+        np.asarray(episode["infos"]["noisy"], np.bool_),
+        np.asarray(episode["rewards"], np.float64),
+        bool(episode["terminations"][-1]),
+    )
+
+
+@dataclass(frozen=True)
+class Demonstrations:
+    """Demonstrations of one or more tasks as tensors: one row for each of N moments."""
+
+    scenes: Tensor
+    """The states of the world, (N, W); no method gets them."""
+    state: Tensor
+    """What a policy is shown of them as numbers, (N, S)."""
+    image: Tensor
+    """What it is shown as a picture, uint8 (N, size, size, 3); the size is 0 if it sees none."""
+    action: Tensor
+    """The expert's next H actions, (N, H, A)."""
+    valid: Tensor
+    """Which of these count, (N, H): not those after the end, nor those after action noise."""
+    words: Tensor
+    """Word ids of the instructions, (tasks, wordings, L)."""
+    rows: Tensor
+    """First row of each task and the number of its rows, (tasks, 2): rows of a task stand together."""
+
+    @classmethod
+    def of_task(cls, task: Task, episodes: Sequence[Demonstration], chunk: int) -> Demonstrations:
+        """Return the episodes of one task, cut into chunks of `chunk` actions.
+
+        Raises:
+            RenderingError: The task has a camera, and nothing here can draw.
+        """
+        pieces = [_chunks(episode, chunk) for episode in episodes]
+        action, valid = (torch.from_numpy(np.concatenate(column)) for column in zip(*pieces, strict=True))
+        scenes = np.concatenate([episode.state[:-1] for episode in episodes])
+        state, image = map(torch.from_numpy, observed(task, scenes))
+        rows = torch.tensor([[0, len(state)]])
+        return cls(
+            torch.from_numpy(scenes), state, image, action, valid, encode(task.instructions)[None], rows
+        )
+
+    @classmethod
+    def cat(cls, parts: Sequence[Demonstrations]) -> Demonstrations:
+        """Return the tasks of all parts together."""
+        wordings = max(part.words.shape[1] for part in parts)
+        words = [part.words[:, torch.arange(wordings) % part.words.shape[1]] for part in parts]
+        starts = np.cumsum([0, *(len(part.state) for part in parts)])
+        rows = [part.rows + torch.tensor([int(start), 0]) for part, start in zip(parts, starts, strict=False)]
+        scenes, state, image, action, valid = (
+            torch.cat([getattr(part, name) for part in parts])
+            for name in ("scenes", "state", "image", "action", "valid")
+        )
+        return cls(scenes, state, image, action, valid, torch.cat(words), torch.cat(rows))
+
+    def __len__(self) -> int:
+        """Return the number of moments."""
+        return len(self.state)
+
+    @property
+    def bytes(self) -> int:
+        """Memory that the data takes, without the scenes, of which nothing is learned."""
+        return sum(value.nbytes for name, value in vars(self).items() if name != "scenes")
+
+    def sample(self, count: int, generator: torch.Generator) -> Batch:
+        """Return `count` samples: a task at random, then a moment and a wording of it."""
+        task = torch.randint(len(self.rows), (count,), generator=generator)
+        first, length = self.rows[task].unbind(1)
+        row = first + (torch.rand(count, generator=generator) * length).long()
+        wording = torch.randint(self.words.shape[1], (count,), generator=generator)
+        action = self.action[row]
+        return Batch(
+            self.state[row],
+            self.words[task, wording],
+            action,
+            self.valid[row],
+            torch.rand(count, generator=generator),
+            torch.randn(action.shape, generator=generator),
+            self.image[row],
+        )
+
+
+def _chunks(episode: Demonstration, chunk: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return chunks (T, chunk, A) and which of their steps count (T, chunk)."""
+    steps = len(episode.executed)
+    index = np.arange(steps)[:, None] + np.arange(chunk)
+    inside = index < steps
+    index = np.minimum(index, steps - 1)
+    # what follows action noise answers a state that the chunk's own actions would not have led to
+    earlier = np.cumsum(episode.noisy[index], axis=1) - episode.noisy[index]
+    valid = (inside & (earlier == 0)).astype(np.float32)
+    return episode.expert[index], valid
+
+
+def load_demonstrations(task: Task, scenario: Scenario, config: PolicyConfig) -> Demonstrations:
+    """Return the demonstrations of `task`, collected on first use, as chunks that fit a policy."""
+    check_demonstrations(task.name)
+    episodes = read_dataset(dataset_folder(task, scenario.budget))
+    return Demonstrations.of_task(task, episodes, config.chunk)

@@ -1,0 +1,195 @@
+"""Questions about a scene with one right answer, made from the simulator's state.
+
+They stand for the knowledge of a vision-language model: what a policy knew before it was fine-tuned.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TypeAlias
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from safetensors.torch import load_file, save_file
+from torch import Tensor
+
+from clbench.base.cache import cache_folder, cached, hash_of
+from clbench.base.entry_points import resolve
+from clbench.base.errors import InputError
+from clbench.base.seeding import SPLIT_LABELS, derive_seed, torch_generator
+from clbench.base.source import source_hash
+from clbench.data.access import check_questions
+from clbench.data.demonstrations import demonstrate, simulator_versions
+from clbench.policy.batch import QuestionBatch
+from clbench.spec.language import encode, word_id
+from clbench.spec.scenario import Scenario
+from clbench.spec.task import packages_of
+from clbench.worlds.camera import Images, States
+from clbench.worlds.observation import observed
+from clbench.worlds.world import World
+
+Truths: TypeAlias = NDArray[np.bool_]
+"""Whether something holds in each of the states (N,)."""
+Answers: TypeAlias = NDArray[np.int64]
+"""The index of the right answer in each of the states (N,), or -1 where it is too close to tell."""
+
+
+def which(*truths: Truths) -> Answers:
+    """Return the index of the first of the truths that holds, -1 where none does."""
+    return np.select(truths, range(len(truths)), default=-1).astype(np.int64)
+
+
+def sign(difference: NDArray[np.float32], margin: float) -> Answers:
+    """Return 0 where the difference (N,) is above the margin, 1 where it is below minus that, else -1."""
+    return which(difference > margin, difference < -margin)
+
+
+@dataclass(frozen=True)
+class QuestionKind:
+    """One thing that can be asked about a state, in several wordings."""
+
+    name: str
+    """Name of the kind, as "block_left_of_gripper"."""
+    wordings: tuple[str, ...]
+    """The question in words; each means the same."""
+    answers: tuple[str, ...]
+    """The possible answers, each one word of the vocabulary."""
+    answer: Callable[[NDArray[np.float32]], Answers]
+    """Maps states (N, S) to answers (N,)."""
+
+
+def scenes_folder(scenario: Scenario, progress: Callable[[float], None] = lambda _: None) -> Path:
+    """Return the folder of the states that questions are asked about; they are collected on first use.
+
+    The states come from noisy expert episodes of the scenario's `scene_tasks`, and are split by episode
+    into `train` and `report`.
+    """
+    tasks = scenario.scene_tasks
+    inputs = {
+        "scenario": scenario.id,
+        "tasks": [dataclasses.asdict(task) for task in tasks],
+        "episodes": scenario.budget.question_episodes,
+        "source": source_hash(
+            "clbench.data.demonstrations",
+            "clbench.base.seeding",
+            "clbench.worlds.lanes",
+            __name__,
+            *packages_of(tasks, "world", "expert"),
+        ),
+        "versions": simulator_versions(tasks),
+    }
+    folder = cache_folder() / "scenes" / hash_of(inputs)
+
+    def make(partial: Path) -> None:
+        save_file(_scenes(scenario, progress), partial / "scenes.safetensors")
+
+    return cached(folder, inputs, make)
+
+
+def _scenes(scenario: Scenario, progress: Callable[[float], None]) -> dict[str, Tensor]:
+    worlds: dict[str, World] = {}
+    scenes = {}
+    count = scenario.budget.question_episodes
+    for split, episodes in (("train", count), ("test", max(1, count // 4))):
+        states = []
+        for number in range(episodes):
+            task = scenario.scene_tasks[number % len(scenario.scene_tasks)]
+            if task.world not in worlds:
+                worlds[task.world] = resolve(task.world)()
+            seed = derive_seed("scene", scenario.id, SPLIT_LABELS[split], number)
+            states.append(demonstrate(worlds[task.world], task, seed, noisy=True).state)
+            progress(1)
+        scenes[split] = torch.from_numpy(np.concatenate(states))
+    for world in worlds.values():
+        world.close()
+    return scenes
+
+
+class Questions:
+    """Questions about a set of states, drawn so that every kind, and every answer of a kind, is as frequent.
+
+    Args:
+        kinds: What is asked.
+        scenes: States (N, S) to ask about.
+        shown: What a policy is shown of them: numbers (N, P) and pictures. The states themselves if None.
+
+    Raises:
+        ValueError: A kind has an answer that no state gives.
+    """
+
+    def __init__(
+        self, kinds: tuple[QuestionKind, ...], scenes: Tensor, shown: tuple[States, Images] | None = None
+    ) -> None:
+        self.kinds = kinds
+        self.scenes = scenes
+        self.state, self.image = scenes, torch.zeros(len(scenes), 0, 0, 3, dtype=torch.uint8)
+        if shown is not None:
+            self.state, self.image = map(torch.from_numpy, shown)
+        wordings = max(len(kind.wordings) for kind in kinds)
+        self._words = torch.stack(
+            [encode([kind.wordings[i % len(kind.wordings)] for i in range(wordings)]) for kind in kinds]
+        )
+        cells = [self._cells(kind) for kind in kinds]
+        self._answers = torch.tensor([len(kind.answers) for kind in kinds])
+        self._first_cell = self._answers.cumsum(0) - self._answers
+        self._answer_ids = torch.tensor([word_id(answer) for kind in kinds for answer in kind.answers])
+        sizes = torch.tensor([len(rows) for kind_cells in cells for rows in kind_cells])
+        self._cell_sizes, self._cell_starts = sizes, sizes.cumsum(0) - sizes
+        self._rows = torch.cat([rows for kind_cells in cells for rows in kind_cells])
+
+    def _cells(self, kind: QuestionKind) -> list[Tensor]:
+        """Return, for each answer of a kind, the rows of the states that give it."""
+        answers = torch.from_numpy(kind.answer(self.scenes.numpy()))
+        cells = [torch.nonzero(answers == index)[:, 0] for index in range(len(kind.answers))]
+        for answer, rows in zip(kind.answers, cells, strict=True):
+            if not len(rows):
+                raise InputError(f"No state answers {answer!r} to {kind.name!r}: {kind.wordings[0]!r}.")
+        return cells
+
+    def __len__(self) -> int:
+        """Return the number of states that are asked about."""
+        return len(self.scenes)
+
+    @property
+    def bytes(self) -> int:
+        """Memory that the states and the lists of questions take."""
+        return self.state.nbytes + self.image.nbytes + self._rows.nbytes + self._words.nbytes
+
+    def sample(self, count: int, generator: torch.Generator) -> QuestionBatch:
+        """Return `count` questions: a kind at random, then one of its answers, a state and a wording."""
+        return self.ask(torch.randint(len(self.kinds), (count,), generator=generator), generator)
+
+    def ask(self, kind: Tensor, generator: torch.Generator) -> QuestionBatch:
+        """Return one question for each index (count,) of a kind."""
+        draws = torch.rand(3, len(kind), generator=generator)
+        cell = self._first_cell[kind] + (draws[0] * self._answers[kind]).long()
+        row = self._rows[self._cell_starts[cell] + (draws[1] * self._cell_sizes[cell]).long()]
+        wording = (draws[2] * self._words.shape[1]).long()
+        words, answers = self._words[kind, wording], self._answer_ids[cell]
+        return QuestionBatch(self.state[row], words, answers, self.image[row])
+
+
+def load_questions(scenario: Scenario) -> tuple[Questions, Questions]:
+    """Return the training and the test questions of a scenario.
+
+    Raises:
+        RenderingError: It has a camera, and nothing here can draw.
+    """
+    check_questions()
+    kinds = resolve(scenario.questions)
+    scenes = load_file(scenes_folder(scenario) / "scenes.safetensors")
+    first = scenario.scene_tasks[0]
+    train, report = (
+        Questions(kinds, scenes[split], observed(first, scenes[split].numpy())) for split in ("train", "test")
+    )
+    return train, report
+
+
+def scored_questions(questions: Questions, count: int) -> tuple[Tensor, QuestionBatch]:
+    """Return the kinds (count,) and the questions of every report: the same for all methods and seeds."""
+    kind = torch.arange(count) % len(questions.kinds)
+    return kind, questions.ask(kind, torch_generator("report questions"))

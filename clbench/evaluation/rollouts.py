@@ -1,0 +1,248 @@
+"""Evaluation: rollouts of many episodes in lock-step, and answers to questions.
+
+An episode's outcome depends on nothing but the policy, the task, its number and the run's seed. Every forward
+has one shape, `LANES` rows of which the unused are padding: a matrix product may round differently for
+another number of rows.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from clbench.base.seeding import SPLIT_LABELS, derive_seed, torch_generator
+from clbench.data.access import check_episodes
+from clbench.data.questions import QuestionKind
+from clbench.policy.batch import QuestionBatch
+from clbench.policy.policy import Policy
+from clbench.spec.language import encode
+from clbench.spec.protocol import Split
+from clbench.spec.scenario import Scenario
+from clbench.spec.task import Task
+from clbench.worlds.lanes import Lanes
+
+Trial = tuple[Task, Split, int]
+"""One episode to run: its task, its split and its number."""
+
+Watch = Callable[[Trial, NDArray[np.float32]], None]
+"""Called with a trial and an action (A,) that is taken in it."""
+
+LANES = 40
+"""Episodes that are stepped together, and rows of every forward."""
+
+
+@dataclass(frozen=True)
+class Episode:
+    """What came of one evaluation episode."""
+
+    task: str
+    """Name of the task."""
+    split: Split
+    """What its outcome may be used for."""
+    number: int
+    """Which of the initial states of its task and split it had."""
+    success: bool
+    """Whether the success rule held before the horizon."""
+    total_reward: float
+    """Sum of the dense rewards."""
+    length: int
+    """Steps taken."""
+
+
+@dataclass
+class _Lane:
+    """One episode on its way."""
+
+    number: int
+    """Which of the lanes it runs in."""
+    trial: Trial
+    words: torch.Tensor
+    noise: torch.Tensor
+    """Draws for every forward of the episode, (forwards, H, A)."""
+    state: NDArray[np.float32]
+    total_reward: float = 0.0
+    length: int = 0
+    success: bool = False
+
+    @property
+    def ended(self) -> bool:
+        """Whether the episode is over."""
+        return self.success or self.length == self.trial[0].horizon
+
+    @property
+    def episode(self) -> Episode:
+        """What came of it."""
+        task, split, number = self.trial
+        return Episode(task.name, split, number, self.success, self.total_reward, self.length)
+
+
+class Evaluator:
+    """Runs episodes of a scenario; its worlds are made when first needed and used again.
+
+    Args:
+        scenario: Where the tasks come from.
+        seed: Of the run: it chooses the initial states, the same for all methods.
+        threads: Threads that may step the worlds; no outcome depends on it.
+    """
+
+    def __init__(self, scenario: Scenario, seed: int, threads: int = 1) -> None:
+        self.scenario = scenario
+        self.seed = seed
+        self._lanes = Lanes(LANES, threads)
+
+    def close(self) -> None:
+        """Close all worlds."""
+        self._lanes.close()
+
+    def evaluate(
+        self,
+        policy: Policy,
+        tasks: Iterable[Task],
+        split: Split = "validation",
+        progress: Callable[[float], None] = lambda _: None,
+    ) -> list[Episode]:
+        """Return the outcome of every episode of `split` on each of the tasks, in order of task and number.
+
+        Args:
+            policy: What acts.
+            tasks: What it is asked to do.
+            split: Which episodes. Choose on "validation"; the others are for scores alone.
+            progress: Called with the number of episodes that have ended since its last call.
+        """
+        numbers = range(self.scenario.budget.episodes(split))
+        return self.play(policy, [(task, split, number) for task in tasks for number in numbers], progress)
+
+    def play(
+        self,
+        policy: Policy,
+        trials: Sequence[Trial],
+        progress: Callable[[float], None] = lambda _: None,
+        watch: Watch = lambda _, __: None,
+    ) -> list[Episode]:
+        """Return the outcome of each of `trials`, in their order; none may be there twice.
+
+        Args:
+            policy: What acts.
+            trials: Which episodes: task, split and number.
+            progress: Called with the number of episodes that have ended since its last call.
+            watch: Called with every action: the plain world, reset as `start_of` says, repeats the episode
+                unless it is perturbed.
+        """
+        check_episodes((task.name, split) for task, split, _ in trials)
+        queue = list(reversed(trials))
+        ended: dict[tuple[str, Split, int], Episode] = {}
+        live: list[_Lane] = []
+        idle = list(range(LANES))
+        while queue or live:
+            starting = [(idle.pop(), queue.pop()) for _ in range(min(len(idle), len(queue)))]
+            live += self._start(policy, starting)
+            self._execute(live, self._act(policy, live), watch)
+            for lane in [lane for lane in live if lane.ended]:
+                episode = lane.episode
+                ended[episode.task, episode.split, episode.number] = episode
+                live.remove(lane)
+                idle.append(lane.number)
+                progress(1)
+        return [ended[task.name, split, number] for task, split, number in trials]
+
+    def _start(self, policy: Policy, starting: Sequence[tuple[int, Trial]]) -> list[_Lane]:
+        """Begin each trial in the lane that stands beside it."""
+        if not starting:
+            return []
+        tasks = [task for _, (task, _, _) in starting]
+        starts = [start_of(trial, self.seed) for _, trial in starting]
+        states = self._lanes.reset(
+            [lane for lane, _ in starting],
+            [seed for seed, _ in starts],
+            tasks,
+            [split == "perturbed" for _, (_, split, _) in starting],
+        )
+        lanes = []
+        for (lane, trial), (seed, instruction), state in zip(starting, starts, states, strict=True):
+            words = encode([instruction])[0]
+            forwards = -(-trial[0].horizon // policy.config.executed)
+            shape = (forwards, policy.config.chunk, policy.config.action_size)
+            noise = torch.randn(shape, generator=torch_generator("noise", seed))
+            lanes.append(_Lane(lane, trial, words, noise, state))
+        return lanes
+
+    def _act(self, policy: Policy, live: Sequence[_Lane]) -> NDArray[np.float32]:
+        """Return the actions to execute, (len(live), executed, A)."""
+        config = policy.config
+        state = torch.zeros(LANES, config.state_size)
+        words = torch.ones(LANES, len(live[0].words), dtype=torch.int64)
+        noise = torch.zeros(LANES, config.chunk, config.action_size)
+        image = torch.zeros(LANES, config.image_size, config.image_size, 3, dtype=torch.uint8)
+        for row, lane in enumerate(live):
+            words[row] = lane.words
+            noise[row] = lane.noise[lane.length // config.executed]
+        shown = self._lanes.observe(
+            [lane.number for lane in live],
+            [lane.trial[0] for lane in live],
+            np.stack([lane.state for lane in live]),
+        )
+        state[: len(live)], image[: len(live)] = map(torch.from_numpy, shown)
+        device = policy.state_mean.device
+        chunks = policy.act(state.to(device), words.to(device), noise.to(device), image.to(device))
+        actions: NDArray[np.float32] = chunks[: len(live), : config.executed].cpu().numpy()
+        # a diverged policy acts in NaN: it stands still and fails rather than stop the run
+        return np.nan_to_num(actions).clip(-1.0, 1.0)
+
+    def _execute(self, live: Sequence[_Lane], chunks: NDArray[np.float32], watch: Watch) -> None:
+        """Step the lanes through their chunks (len(live), executed, A), each until its episode ends."""
+        for step in range(chunks.shape[1]):
+            rows = [row for row, lane in enumerate(live) if not lane.ended]
+            if not rows:
+                return
+            for row in rows:
+                watch(live[row].trial, chunks[row, step])
+            outcomes = self._lanes.step([live[row].number for row in rows], chunks[rows, step])
+            for row, state, reward, success in zip(rows, *outcomes, strict=True):
+                lane = live[row]
+                lane.state, lane.length = state, lane.length + 1
+                lane.total_reward += float(reward)
+                lane.success = bool(success)
+
+
+def start_of(trial: Trial, seed: int) -> tuple[int, str]:
+    """Return what a trial starts with in a run of `seed`: the seed of its initial state, its instruction.
+
+    A perturbed episode starts with what the test episode of its number does.
+    """
+    task, split, number = trial
+    instruction = task.instructions[number % len(task.instructions)]
+    label = SPLIT_LABELS["test" if split == "perturbed" else split]
+    return derive_seed("episode", seed, task.name, label, number), instruction
+
+
+@torch.inference_mode()
+def answer(
+    policy: Policy, kinds: Sequence[QuestionKind], kind: torch.Tensor, questions: QuestionBatch
+) -> list[tuple[str, int, int]]:
+    """Return, for each kind of question, its name, how often it was asked, and how often answered rightly.
+
+    Args:
+        policy: What answers, by the likeliest word of the whole vocabulary.
+        kinds: The kinds that there are.
+        kind: Index of each question's kind, (B,).
+        questions: The questions, B of them.
+    """
+    right = []
+    device = policy.state_mean.device
+    for start in range(0, len(questions), LANES):
+        rows = slice(start, start + LANES)
+        padding = LANES - len(questions.state[rows])
+        state = torch.nn.functional.pad(questions.state[rows], (0, 0, 0, padding))
+        words = torch.nn.functional.pad(questions.words[rows], (0, 0, 0, padding), value=1)
+        image = torch.nn.functional.pad(questions.image[rows], (0, 0, 0, 0, 0, 0, 0, padding))
+        word = policy.answer_logits(state.to(device), words.to(device), image.to(device)).argmax(dim=1).cpu()
+        right.append(word[: LANES - padding] == questions.answer[rows])
+    correct = torch.cat(right)
+    return [
+        (entry.name, int((kind == index).sum()), int(correct[kind == index].sum()))
+        for index, entry in enumerate(kinds)
+    ]

@@ -1,0 +1,202 @@
+"""Workers: processes of this machine, each of which does one job with one thread."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import sys
+import threading
+import time
+import traceback
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from multiprocessing.connection import Connection, wait
+from multiprocessing.process import BaseProcess
+from typing import Any, Literal
+
+from clbench.base.entry_points import resolve
+from clbench.jobs.job import Event, Job, JobError
+from clbench.spec.limits import end
+
+SEND_SECONDS = 0.2
+"""How often a worker tells how far it is, at most."""
+
+_LOOK_SECONDS = 0.5
+_LEAVE_SECONDS = 5.0
+
+
+@dataclass
+class _Worker:
+    job: Job
+    process: BaseProcess
+    connection: Connection
+    started: float = field(default_factory=time.monotonic)
+    looked: float = field(default_factory=time.monotonic)
+    broken: str | None = None
+    """Why its process was ended, if it was beyond a limit."""
+
+
+class Processes:
+    """Workers of this machine.
+
+    Args:
+        count: How many jobs are under way at once; one for each core if None.
+    """
+
+    def __init__(self, count: int | None = None) -> None:
+        self._count = count or os.cpu_count() or 1
+        self._running: dict[Connection, _Worker] = {}
+
+    def free(self) -> int:
+        """Return how many more jobs can be under way."""
+        return self._count - len(self._running)
+
+    def start(self, job: Job) -> None:
+        """Begin a job in a process of its own."""
+        with _undisturbed():
+            worker = _start(job)
+            self._running[worker.connection] = worker
+
+    def events(self) -> Iterator[Event]:
+        """Give what was told since the last call; wait for it, but no longer than a second."""
+        self._hold_to_limits()
+        for connection in wait(list(self._running), timeout=1.0):
+            assert isinstance(connection, Connection)
+            worker = self._running[connection]
+            event = Event(worker.job, *_receive(worker))
+            if event.kind != "progress":
+                del self._running[connection]
+                _leave(worker.process)
+            yield event
+
+    def close(self) -> None:
+        """End all processes."""
+        for worker in self._running.values():
+            worker.process.terminate()
+            worker.process.join()
+        self._running.clear()
+
+    def _hold_to_limits(self) -> None:
+        """End the processes that are beyond their limits."""
+        for worker in self._running.values():
+            limits, now = worker.job.limits, time.monotonic()
+            if limits is None or worker.broken or now - worker.looked < _LOOK_SECONDS:
+                continue
+            worker.looked = now
+            assert worker.process.pid is not None
+            worker.broken = limits.exceeded(worker.process.pid, now - worker.started)
+            if worker.broken:
+                end(worker.process.pid)
+
+
+def _leave(process: BaseProcess) -> None:
+    """Wait until a process that has told how it ended is gone; what a thread of it still does is cut off."""
+    process.join(_LEAVE_SECONDS)
+    if process.is_alive():
+        assert process.pid is not None
+        end(process.pid)
+        process.join()
+
+
+@contextmanager
+def _undisturbed() -> Iterator[None]:
+    """Hold Ctrl-C and SIGTERM back inside: a start that is cut short leaves half a process behind."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    held: list[int] = []
+    stops = (signal.SIGINT, signal.SIGTERM)
+    before = {stop: signal.signal(stop, lambda number, _: held.append(number)) for stop in stops}
+    try:
+        yield
+    finally:
+        for stop, handler in before.items():
+            signal.signal(stop, handler)
+        for number in held[:1]:
+            signal.raise_signal(number)
+
+
+def _context() -> Any:
+    """Return how processes are started: from one that has imported all once (50 ms), or anew (2 s)."""
+    if "forkserver" not in multiprocessing.get_all_start_methods():
+        return multiprocessing.get_context("spawn")
+    from multiprocessing import forkserver  # cannot be imported where there is none
+
+    context = multiprocessing.get_context("forkserver")
+    # the second takes a second too, and asking PyTorch for deterministic algorithms imports it
+    context.set_forkserver_preload(["clbench.runs.run", "torch._inductor.config"])
+    if threading.current_thread() is threading.main_thread():
+        # what it starts ignores Ctrl-C as it does: from the first instruction, not from `_work` on
+        before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+        forkserver.ensure_running()
+        signal.signal(signal.SIGINT, before)
+    return context
+
+
+def _start(job: Job) -> _Worker:
+    context = _context()
+    ours, theirs = context.Pipe(duplex=False)
+    process = context.Process(
+        target=_work, args=(theirs, job.function, job.arguments, dict(os.environ)), daemon=True
+    )
+    process.start()
+    theirs.close()  # so that the end of the process is the end of the stream
+    return _Worker(job, process, ours)
+
+
+def _receive(worker: _Worker) -> tuple[Any, Any]:
+    try:
+        kind, value = worker.connection.recv()
+    except EOFError:
+        worker.process.join()
+        if worker.broken:
+            return "failed", f"stopped, because {worker.broken}"
+        return "lost", f"its process ended without a result (exit code {worker.process.exitcode})"
+    return kind, value
+
+
+def _work(
+    connection: Connection, function: str, arguments: dict[str, Any], environment: dict[str, str]
+) -> None:
+    """Do one job in this process and send what comes of it."""
+    os.environ.update(environment)  # the process that this one was forked from may have an older one
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the parent, which ends its workers
+
+    def send(amount: float) -> None:
+        try:
+            connection.send(("progress", amount))
+        except OSError:  # nobody listens any more: stop as if killed, so that the run can be resumed
+            sys.exit(1)
+
+    connection.send(_do_job(function, arguments, send))
+
+
+def _do_job(
+    function: str, arguments: dict[str, Any], send: Callable[[float], None]
+) -> tuple[Literal["done", "failed"], str]:
+    """Do one job in this process, and return how it ended and what came of it.
+
+    Args:
+        function: Entry point of the job.
+        arguments: By name.
+        send: Called now and then with how much was done since its last call.
+    """
+    owed, sent = 0.0, time.monotonic()
+
+    def progress(amount: float) -> None:
+        nonlocal owed, sent
+        owed += amount
+        if time.monotonic() - sent >= SEND_SECONDS:
+            send(owed)
+            owed, sent = 0.0, time.monotonic()
+
+    try:
+        text = resolve(function)(**arguments, progress=progress)
+        send(owed)
+    except JobError as error:
+        return "failed", str(error)
+    except Exception as error:
+        return "failed", f"{type(error).__name__}: {error}\n{traceback.format_exc()}"
+    return "done", text

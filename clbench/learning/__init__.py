@@ -1,0 +1,1 @@
+"""Learning: the method hooks, the optimiser loop, and pretraining."""

@@ -1,0 +1,73 @@
+"""Adaptation: a method fine-tunes the policy on one target."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from clbench.learning.method import Method, Progress, Stage
+from clbench.learning.optimise import MethodError, optimise
+from clbench.policy.policy import Policy
+from clbench.spec.budget import Budget
+
+
+@dataclass(frozen=True)
+class Step:
+    """One optimiser step of a stage."""
+
+    done: int
+    """How many steps of the stage are done with it."""
+    loss: Tensor | None
+    """What was descended, a scalar; None if the method trains nothing."""
+    learning_rate: float | None
+    """The step size that was taken, of the last optimiser group; None if the method trains nothing."""
+
+
+def adapt(
+    policy: Policy,
+    method: Method,
+    stage: Stage,
+    budget: Budget,
+    after: Callable[[Step], None] = lambda _: None,
+) -> int:
+    """Let `method` fine-tune the policy on one target, in place, and return the optimiser steps done.
+
+    Args:
+        policy: What is trained.
+        method: How.
+        stage: Which target, with the data that the method may touch.
+        budget: Step size.
+        after: Called after each step.
+    """
+    parameters = method.start_task(policy, stage)
+    loss: Tensor | None = None
+    learning_rate: float | None = None
+
+    def loss_at(step: int) -> Tensor:
+        nonlocal loss
+        batch = method.batch(stage.target, stage.prior)
+        loss = method.loss(policy, batch, Progress(step, stage.steps))
+        return loss
+
+    def rate(scheduled: float, step: int) -> float:
+        nonlocal learning_rate
+        learning_rate = method.learning_rate(scheduled, Progress(step, stage.steps))
+        return learning_rate
+
+    steps = optimise(
+        parameters,
+        budget.learning_rate,
+        stage.steps,
+        loss_at,
+        lambda loss: method.gradients(policy, loss),
+        lambda done: after(Step(done, loss, learning_rate)),
+        rate,
+    )
+    method.end_task(policy, stage)
+    for name, parameter in policy.named_parameters():
+        if not torch.isfinite(parameter).all():
+            raise MethodError(f"The parameter {name} is not finite after {stage.task.name!r}.")
+    return steps

@@ -1,0 +1,193 @@
+"""Pretraining: the policy that every method of a seed starts from, made once and kept in the cache."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from torch import Tensor
+
+from clbench.base.cache import cache_folder, cached, hash_of, is_cached
+from clbench.base.dependencies import versions
+from clbench.base.entry_points import resolve
+from clbench.base.seeding import derive_seed, torch_generator
+from clbench.base.source import package_of, source_hash
+from clbench.data.demonstrations import Demonstrations, load_demonstrations, simulator_versions
+from clbench.data.questions import Questions, load_questions
+from clbench.learning.optimise import deterministic, optimise
+from clbench.learning.vision_pretraining import STEPS_SHARE, pictures_of, pretrain_vision
+from clbench.policy.checkpoint import load_policy, save_policy
+from clbench.policy.policy import Policy, PolicyConfig
+from clbench.policy.vision import Vision
+from clbench.spec.scenario import Scenario
+from clbench.spec.task import packages_of
+from clbench.worlds.camera import load_camera
+from clbench.worlds.observation import Observer, frame_hash
+
+SHIPPED = Path(__file__).parents[1] / "pretrained"
+"""Where the policies lie that ship with the package."""
+
+AFTER_PRETRAINING = (
+    "adaptation_steps",
+    "learning_rate",
+    "evaluation_points",
+    "validation_episodes",
+    "test_episodes",
+    "curve_episodes",
+    "test_questions",
+)
+"""Fields of the budget that a pretrained policy does not depend on."""
+
+
+def pretraining_inputs(scenario: Scenario, seed: int) -> dict[str, Any]:
+    """Return all that a pretrained policy depends on."""
+    tasks = scenario.retained + scenario.scenes
+    suites = {*packages_of(tasks, "world", "expert", "camera"), package_of(scenario.questions)}
+    budget = dataclasses.asdict(scenario.budget)
+    parts = (
+        *("policy", "demonstrations", "questions", "camera", "observer", "drawing"),
+        *("vision_pretraining", "seeding", "training", "world"),
+    )
+    core = (*(f"clbench.{part}" for part in parts), __name__)
+    installed = {**simulator_versions(tasks), **versions(("torch", "tokenizers"))}
+    return {
+        "retained": [dataclasses.asdict(task) for task in scenario.retained],
+        "scenes": [dataclasses.asdict(task) for task in scenario.scenes],
+        "budget": {name: value for name, value in budget.items() if name not in AFTER_PRETRAINING},
+        "seed": seed,
+        "frame": frame_hash(scenario.scene_tasks[0]),
+        "source": source_hash(*core, *sorted(suites)),
+        # a label, as +cpu of torch, names what else a build can do: policies are pretrained without it
+        "versions": {name: version.partition("+")[0] for name, version in installed.items()},
+    }
+
+
+def shipped_folder(scenario: Scenario, seed: int) -> Path:
+    """Return where the pretrained policy lies if it ships."""
+    return SHIPPED / f"{scenario.id.replace('/', '--')}-seed-{seed}"
+
+
+def pretrained_folder(scenario: Scenario, seed: int) -> Path:
+    """Return where the pretrained policy lies, or will lie: in the cache, unless the same one ships."""
+    return _folder(scenario, seed, pretraining_inputs(scenario, seed))
+
+
+def is_pretrained(scenario: Scenario, seed: int) -> bool:
+    """Return whether the pretrained policy ships or is in the cache."""
+    inputs = pretraining_inputs(scenario, seed)
+    return is_cached(_folder(scenario, seed, inputs), inputs)
+
+
+def _folder(scenario: Scenario, seed: int, inputs: Mapping[str, Any]) -> Path:
+    shipped = shipped_folder(scenario, seed)
+    if is_cached(shipped, inputs):
+        return shipped
+    return cache_folder() / "pretrained" / f"{shipped.name}-{hash_of(inputs)}"
+
+
+def pretrained_policy(
+    scenario: Scenario, seed: int, progress: Callable[[float], None] = lambda _: None
+) -> tuple[Policy, Path]:
+    """Return the policy pretrained on the retained tasks and the questions, and the folder it lies in.
+
+    Where no tasks are retained it is pretrained on the questions alone: its states are normalised by what is
+    asked about, its actions are not, and its action head is as it was drawn.
+
+    It is trained on first use, and shared by all methods.
+
+    Args:
+        scenario: What to learn.
+        seed: Of the weights and of every draw.
+        progress: Called with the number of steps done since its last call.
+    """
+    inputs = pretraining_inputs(scenario, seed)
+    folder = cached(
+        _folder(scenario, seed, inputs),
+        inputs,
+        lambda partial: save_policy(_pretrain(scenario, seed, progress), partial),
+    )
+    return load_policy(folder), folder
+
+
+def vision_steps(scenario: Scenario) -> int:
+    """Return how many optimiser steps the eyes are pretrained for, before the policy; 0 if it has none."""
+    seen = scenario.scene_tasks[0].camera is not None
+    return round(STEPS_SHARE * scenario.budget.pretraining_steps) if seen else 0
+
+
+def policy_config(scenario: Scenario) -> PolicyConfig:
+    """Return the sizes of a policy for the scenario's worlds."""
+    first = scenario.tasks[0]
+    world = resolve(first.world)()
+    observer = Observer(first.world, first.camera)
+    config = PolicyConfig(
+        state_size=observer.spaces(world.observation_space)["state"].shape[0],
+        action_size=world.action_space.shape[0],
+        image_size=observer.image_size,
+        width=scenario.budget.policy_width,
+        layers=scenario.budget.policy_layers,
+    )
+    world.close()
+    return config
+
+
+def _pretrain(scenario: Scenario, seed: int, progress: Callable[[float], None]) -> Policy:
+    config, budget = policy_config(scenario), scenario.budget
+    questions, _ = load_questions(scenario)
+    policy = Policy(config, seed=derive_seed("weights", seed))
+    parts = [load_demonstrations(task, scenario, config) for task in scenario.retained]
+    demonstrations = Demonstrations.cat(parts) if parts else None
+    if demonstrations is not None:
+        policy.normalise_like(demonstrations.state, demonstrations.action[:, 0])
+    else:
+        policy.normalise_like(questions.state)
+    if policy.backbone.vision is not None:
+        _open_eyes(
+            policy.backbone.vision,
+            scenario,
+            seed,
+            [questions, demonstrations] if demonstrations else [questions],
+            progress,
+        )
+    generator = torch_generator("pretraining", seed)
+
+    def loss_at(step: int) -> Tensor:
+        if demonstrations is None:
+            return policy.answer_loss(questions.sample(budget.batch_size // 2, generator)).mean()
+        batch = demonstrations.sample(budget.batch_size, generator)
+        asked = questions.sample(budget.batch_size // 2, generator)
+        return policy.action_loss(batch).mean() + policy.answer_loss(asked).mean()
+
+    with deterministic():
+        optimise(
+            policy.parameters(),
+            budget.pretraining_learning_rate,
+            budget.pretraining_steps,
+            loss_at,
+            after=lambda _: progress(1),
+        )
+    return policy
+
+
+def _open_eyes(
+    vision: Vision,
+    scenario: Scenario,
+    seed: int,
+    data: Sequence[Questions | Demonstrations],
+    progress: Callable[[float], None],
+) -> None:
+    """Pretrain the eyes on the pictures of all data."""
+    entry_point = scenario.scene_tasks[0].camera
+    assert entry_point is not None
+    kinds = resolve(scenario.questions)
+    with deterministic():
+        pretrain_vision(
+            vision,
+            pictures_of([(part.scenes, part.image) for part in data], load_camera(entry_point), kinds),
+            kinds,
+            vision_steps(scenario),
+            torch_generator("vision", seed),
+            lambda _: progress(1),
+        )

@@ -1,0 +1,119 @@
+"""The registry of methods: installed names and module:Class."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import difflib
+import importlib
+from collections.abc import Callable, Mapping
+from types import NoneType, UnionType
+from typing import Any, Union, get_args, get_origin, get_type_hints
+
+from clbench.base.errors import InputError, UnknownNameError, WrongTypeError
+from clbench.base.source import package_of, source_hash
+from clbench.learning.method import Method
+from clbench.spec.identifiers import built_in_methods, installed_methods
+
+
+def method_names() -> list[str]:
+    """Return the names of the installed methods, sorted; nothing is imported."""
+    return sorted(installed_methods())
+
+
+def load_method(spec: str) -> type[Method]:
+    """Return the method class that `spec` names: an installed name, or "module:Class".
+
+    Raises:
+        LookupError: Nothing is installed or can be imported under this name; the nearest one is named.
+        TypeError: What is found is no method.
+    """
+    if ":" in spec:
+        cls = _import_method(spec)
+    elif spec in (installed := built_in_methods()) or spec in (installed := installed_methods()):
+        cls = _guarded(spec, installed[spec].load)
+    else:
+        near = difflib.get_close_matches(spec, installed, n=1)
+        hint = f" Did you mean {near[0]!r}?" if near else ""
+        names = ", ".join(sorted(installed)) or "none; run `pip install -e .` in the checkout"
+        raise UnknownNameError(
+            f"No method is called {spec!r}.{hint} Installed: {names}. Or give module:Class."
+        )
+    if not (isinstance(cls, type) and issubclass(cls, Method)):
+        raise WrongTypeError(f"{spec!r} is not a subclass of clbench.Method.")
+    if not dataclasses.is_dataclass(cls):
+        raise WrongTypeError(f"{spec!r} is not a dataclass: decorate it with @dataclasses.dataclass.")
+    return cls
+
+
+def describe_method(cls: type[Method]) -> dict[str, Any]:
+    """Return a method's metadata, and as `source` the hash of the package or the module that it lies in."""
+    return {**dataclasses.asdict(cls.metadata), "source": source_hash(package_of(cls.__module__))}
+
+
+def _guarded(spec: str, load: Callable[[], Any]) -> Any:
+    """Return what `load` returns; whatever goes wrong in a stranger's module is told in one line."""
+    try:
+        return load()
+    except ModuleNotFoundError as error:
+        raise UnknownNameError(
+            f"No module {error.name!r} can be imported for the method {spec!r}."
+        ) from error
+    except Exception as error:
+        raise UnknownNameError(f"{spec!r} cannot be imported: {type(error).__name__}: {error}") from error
+
+
+def _import_method(spec: str) -> Any:
+    name, _, attribute = spec.partition(":")
+    module = _guarded(spec, lambda: importlib.import_module(name))
+    if not hasattr(module, attribute):
+        near = difflib.get_close_matches(attribute, dir(module), n=1)
+        hint = f" Did you mean {near[0]!r}?" if near else ""
+        raise UnknownNameError(f"Module {name!r} has no {attribute!r}.{hint}")
+    return getattr(module, attribute)
+
+
+def build_method(spec: str, changes: Mapping[str, Any]) -> Method:
+    """Return the method that `spec` names, with `changes` to its hyper-parameters.
+
+    Args:
+        spec: As for `load_method`.
+        changes: Values by field name; strings, as the command line gives them, become the field's own type.
+
+    Raises:
+        LookupError: The method has no such hyper-parameter; the nearest one is named.
+        ValueError: A value cannot be read as the field's type, or the method refuses it.
+    """
+    cls = load_method(spec)
+    hints = get_type_hints(cls)
+    fields = [field.name for field in dataclasses.fields(cls)]  # type: ignore[arg-type]
+    values = {}
+    for name, value in changes.items():
+        if name not in fields:
+            near = difflib.get_close_matches(name, fields, n=1)
+            hint = f" Did you mean {near[0]!r}?" if near else ""
+            raise UnknownNameError(
+                f"{spec} has no hyper-parameter {name!r}.{hint} It has: {', '.join(fields) or 'none'}."
+            )
+        values[name] = _read(name, value, hints[name]) if isinstance(value, str) else value
+    try:
+        return cls(**values)
+    except Exception as error:
+        raise InputError(f"{spec} refuses its hyper-parameters: {error}") from error
+
+
+def _read(name: str, text: str, hint: Any) -> Any:
+    """Return `text` as a value of the type `hint`: str, int, float, bool, or one of these or None."""
+    kinds = get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)
+    if text.lower() == "none" and NoneType in kinds:
+        return None
+    for kind in (bool, int, float, str):
+        if kind not in kinds:
+            continue
+        if kind is bool and text.lower() in ("true", "false"):
+            return text.lower() == "true"
+        if kind is not bool:
+            with contextlib.suppress(ValueError):
+                return kind(text)
+    words = " or ".join(getattr(kind, "__name__", str(kind)).replace("NoneType", "none") for kind in kinds)
+    raise InputError(f"{name} must be {words.replace('bool', 'true or false')}, not {text!r}.")

@@ -1,0 +1,176 @@
+"""The trainer: the policy and the method of a run on their way from stage to stage, without evaluation."""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+import json
+import os
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save_file
+
+from clbench.base.seeding import derive_seed, seeded, torch_generator
+from clbench.base.source import source_hash
+from clbench.base.strict_json import check_json, read_json
+from clbench.data.access import check_policy, hooks, outside
+from clbench.data.demonstrations import Demonstrations, load_demonstrations
+from clbench.data.questions import load_questions
+from clbench.learning.adaptation import Step, adapt
+from clbench.learning.method import Method, Stage, State
+from clbench.learning.optimise import deterministic
+from clbench.learning.pretraining import pretrained_policy, pretraining_inputs
+from clbench.learning.prior import Access, Nothing, Prior, Source
+from clbench.policy.checkpoint import CheckpointError, load_policy, save_policy
+from clbench.policy.policy import Policy
+from clbench.spec.scenario import Scenario
+from clbench.spec.task import Task, packages_of
+
+STAGE_FILES = ("policy.safetensors", "policy.json", "method.safetensors", "method.json")
+"""What a stage leaves: the policy, and the state of the method that the next stage begins with."""
+
+
+class Trainer:
+    """The policy and the method of a run, and the data that they learn from.
+
+    Each stage begins with what the last one saved: a policy from its checkpoint and a new object of the
+    method that was given its state. Whoever stopped after a stage therefore goes on as one who did not.
+
+    Args:
+        scenario: With the targets that are learned.
+        new_method: Returns a new object of the method.
+        seed: Of the run.
+        device: Where the policy is computed.
+    """
+
+    def __init__(self, scenario: Scenario, new_method: Callable[[], Method], seed: int, device: str) -> None:
+        self.scenario, self.seed, self.device = scenario, seed, device
+        self.new_method = new_method
+        self.method = new_method()
+        self.where = "start"
+        """The hook, or the stage, that is under way."""
+        pretrained, self.pretrained_folder = pretrained_policy(scenario, seed)
+        self.pretrained = pretrained.to(device)
+        self.policy = copy.deepcopy(self.pretrained)
+        self._demonstrations: dict[str, Demonstrations] = {}
+        self.questions, self.report_questions = load_questions(scenario)
+
+    def prepare(self) -> int:
+        """Let the method prepare for the sequence, and return the optimiser steps that it took."""
+        self.where = "prepare"
+        prior = self.prior(0, ("prepare", "throughout"))
+        with seeded("method", self.seed, 0), hooks(self._known(0)):
+            steps = self.method.prepare(self.policy, prior) or 0
+        prior.close()
+        check_policy(self.policy, self.pretrained)
+        return steps
+
+    def learn(self, number: int, after: Callable[[Step], None]) -> int:
+        """Adapt to target `number`, from 1, and return the optimiser steps done.
+
+        Args:
+            number: Which target.
+            after: Called after each step.
+        """
+        budget, task = self.scenario.budget, self.scenario.target[number - 1]
+        self.where = f"stage {number} ({task.name})"
+        target = self._source("target", number, self._demonstrations_of(task))
+        prior = self.prior(number, ("throughout",))
+        method_seed = derive_seed("method", self.seed, number)
+        stage = Stage(number, task, method_seed, budget.adaptation_steps, target, prior)
+
+        def report(step: Step) -> None:
+            with outside():
+                after(step)
+
+        with seeded("method", self.seed, number), hooks(self._known(number)):
+            steps = adapt(self.policy, self.method, stage, budget, report)
+        target.close()
+        prior.close()
+        check_policy(self.policy, self.pretrained)
+        return steps
+
+    def _known(self, number: int) -> list[str]:
+        """Return the names of the tasks that the hooks of stage `number` may know."""
+        return [task.name for task in self.scenario.retained + self.scenario.target[:number]]
+
+    def prior(self, number: int, when: tuple[Access, ...]) -> Prior:
+        """Return the prior data that the method declares for the hooks of stage `number`."""
+        sources = {}
+        if self.method.uses.demonstrations in when:
+            before = self.scenario.retained + self.scenario.target[: max(0, number - 1)]
+            parts = [self._demonstrations_of(task) for task in before]
+            demonstrations = Demonstrations.cat(parts) if parts else Nothing()
+            sources["demonstrations"] = self._source("prior demonstrations", number, demonstrations)
+        if self.method.uses.questions in when:
+            sources["questions"] = self._source("prior questions", number, self.questions)
+        return Prior(sources)
+
+    def _demonstrations_of(self, task: Task) -> Demonstrations:
+        """Return the demonstrations of a task; most methods never see those of the retained skills."""
+        if task.name not in self._demonstrations:
+            self._demonstrations[task.name] = load_demonstrations(task, self.scenario, self.policy.config)
+        return self._demonstrations[task.name]
+
+    def _source(self, name: str, number: int, data: Any) -> Source[Any]:
+        """Return data with its own random stream: what one source draws does not move another's draws."""
+        generator = torch_generator(name, self.seed, number)
+        return Source(data, generator, self.scenario.budget.batch_size, self.device)
+
+    def save(self, folder: Path, number: int) -> None:
+        """Write what stage `number` leaves, `STAGE_FILES`, to `folder`."""
+        self.where = f"state() after stage {number}"
+        save_policy(self.policy, folder)
+        state = self.method.state()
+        tensors = {name: value for name, value in state.items() if isinstance(value, torch.Tensor)}
+        copies = {name: value.detach().clone().contiguous() for name, value in tensors.items()}
+        save_file(copies, folder / "method.safetensors")
+        values = {name: value for name, value in state.items() if name not in tensors}
+        text = json.dumps(values)
+        check_json(json.loads(text))  # what would be refused when it is read is refused here, by its name
+        (folder / "method.json").write_text(text, encoding="utf-8")
+
+    def load(self, folder: Path, number: int) -> None:
+        """Take the policy and the method as stage `number` left them in `folder`."""
+        self.where = f"load_state() after stage {number}"
+        self.method = self.new_method()
+        with seeded("method", self.seed, number):  # adapters are drawn before they are filled
+            self.policy = load_stage(folder, self.method, self.device)
+
+
+def load_stage(folder: Path, method: Method, device: str) -> Policy:
+    """Return the policy that a stage left in `folder`, and give `method` the state that it left there.
+
+    Raises:
+        CheckpointError: A file is missing or torn, or is not what a stage leaves.
+    """
+    try:
+        state: State = {**read_json(folder / "method.json")}
+        state.update(load_file(folder / "method.safetensors", device=device))
+    except (OSError, ValueError, TypeError, SafetensorError) as error:
+        raise CheckpointError(f"{folder}: cannot be read as the state of a method ({error}).") from error
+    return load_policy(folder, lambda policy: method.load_state(policy, state)).to(device)
+
+
+def sources(scenario: Scenario, seed: int, *modules: str) -> dict[str, Any]:
+    """Return the code and data that any result of a run depends on, `modules` besides, as JSON."""
+    return {
+        "pretraining": pretraining_inputs(scenario, seed),
+        "tasks": [dataclasses.asdict(task) for task in scenario.tasks],
+        "source": source_hash("clbench", *modules, *packages_of(scenario.tasks, "world", "expert", "camera")),
+    }
+
+
+@contextmanager
+def repeatable(device: str) -> Iterator[None]:
+    """Make computations on `device` repeat themselves bit for bit inside."""
+    if device != "cpu":
+        # without it cuBLAS may choose another kernel each time, and PyTorch refuses to be deterministic
+        os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")
+    with deterministic():
+        yield

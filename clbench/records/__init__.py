@@ -1,0 +1,1 @@
+"""Records: the file that each run leaves, and how it is read, written and named."""

@@ -1,0 +1,135 @@
+"""The record: the one file that a run leaves, written once and never edited.
+
+A record holds every evaluation episode, every answer count, and how far the policy moved. Whatever can be computed
+from these is not stored.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+from clbench.spec.protocol import Protocol, Split
+
+SCHEMA = 3
+"""Version of the file format. A reader refuses a newer one, and converts older ones (`clbench.records.history`)."""
+
+EPISODE_COLUMNS = ("stage", "step", "task", "split", "episode", "success", "return", "length")
+"""`stage` and `step` are the evaluation point: see `clbench.spec.protocol.Point`. `episode` numbers the initial
+state inside its task and split. `clbench.spec.protocol.Protocol.episodes` says which episodes each point has."""
+
+ANSWER_COLUMNS = ("stage", "step", "kind", "asked", "correct")
+"""One row for each evaluation point and kind of question; an agent that learned online is asked 0."""
+
+POLICY_COLUMNS = ("stage", "step", "update_sparsity", "activation_drift")
+"""One row for each evaluation point: how far the policy is from the pretrained one.
+
+`update_sparsity` is the share of its parameters whose relative change is below 1e-3. `activation_drift` is the
+squared 2-Wasserstein distance between its hidden states on the questions and those of the pretrained policy, mean
+over layers. Each may be None.
+"""
+
+
+@dataclass
+class RunInfo:
+    """What was run. Two runs with equal `RunInfo` and `ScenarioInfo` are the same run."""
+
+    scenario: str
+    """Gymnasium id of the scenario."""
+    method: str
+    """Name of the method, or "module:Class"."""
+    seed: int
+    """Seed of the run."""
+    device: str
+    """Device on which the policy was computed."""
+    split: str
+    """The split that is scored: "test", or "validation" for a tuning run."""
+    settings: dict[str, Any]
+    """All hyper-parameters by name."""
+    changes: dict[str, Any]
+    """The hyper-parameters that differ from the method's defaults."""
+    uses: dict[str, Any]
+    """The prior data that the method may touch; `online` is true for an agent that learned by trial."""
+    order: int = 0
+    """Order in which the targets were learned; 0 is the published one. See `clbench.spec.scenario.target_order`."""
+    perturb: bool = False
+    """Whether the retained skills also met perturbed episodes."""
+
+
+@dataclass
+class ScenarioInfo:
+    """The scenario of a run, in full."""
+
+    id: str
+    """Gymnasium id."""
+    retained: list[str]
+    """Names of the retained skills."""
+    target: list[str]
+    """Names of the targets, in the order in which they were learned."""
+    held_out: list[str]
+    """Names of the tasks that are never trained."""
+    evaluation_steps: list[int]
+    """Steps of a stage after which the policy was evaluated; the last one is the end of the stage."""
+    budget: dict[str, Any]
+    """Fields of `clbench.Budget` by name."""
+
+    def protocol(self, run: RunInfo) -> Protocol:
+        """Return the evaluation protocol of a run on this scenario."""
+        split: Split = "validation" if run.split == "validation" else "test"
+        counts = (self.budget[name] for name in ("validation_episodes", "test_episodes", "curve_episodes"))
+        names = (tuple(self.retained), tuple(self.target), tuple(self.held_out))
+        return Protocol(*names, tuple(self.evaluation_steps), *counts, split=split, perturb=run.perturb)
+
+
+@dataclass
+class Costs:
+    """What a run cost. A cost that is not known is None: a failed run need not have all of them."""
+
+    optimiser_steps: int | None = None
+    """Optimiser steps, those of the preparation included."""
+    parameters: int | None = None
+    """Parameters of the pretrained policy, or of an agent's network."""
+    preparation_steps: int | None = None
+    """Optimiser steps before the first target."""
+    parameters_added: int | None = None
+    """Parameters that the final policy has more than the pretrained one; negative if it has fewer."""
+    bytes_kept: int | None = None
+    """Bytes of prior data and of method state that are kept to the end."""
+    environment_steps: int | None = None
+    """Environment steps of an agent that learned online."""
+
+
+@dataclass
+class Record:
+    """What one run did, and the outcome. The order of the fields is part of the file format."""
+
+    status: Literal["success", "failed"]
+    """Whether the run completed."""
+    run: RunInfo
+    """What was run."""
+    scenario: ScenarioInfo
+    """The scenario in full."""
+    episodes: dict[str, list[Any]] = field(default_factory=lambda: {name: [] for name in EPISODE_COLUMNS})
+    """Evaluation episodes as columns of equal length, see `EPISODE_COLUMNS`."""
+    answers: dict[str, list[Any]] = field(default_factory=lambda: {name: [] for name in ANSWER_COLUMNS})
+    """Answers to test questions (in a tuning run: to training questions), see `ANSWER_COLUMNS`."""
+    policy: dict[str, list[Any]] = field(default_factory=lambda: {name: [] for name in POLICY_COLUMNS})
+    """Changes of the policy, see `POLICY_COLUMNS`."""
+    costs: Costs = field(default_factory=Costs)
+    """What the run cost."""
+    diagnostics: dict[str, Any] = field(default_factory=dict)
+    """What the method reports about itself, by stage."""
+    fingerprint: dict[str, Any] = field(default_factory=dict)
+    """Commit, package versions, hardware, `rollouts` (a hash for each world), `method` (authors, version, hash of the
+    source), and the hash of the pretrained policy."""
+    timing: dict[str, Any] = field(default_factory=dict)
+    """Dates and seconds: all that may differ between two equal runs."""
+    error: dict[str, str] | None = None
+    """For a failed run: `where` (the hook and stage), `type`, `message`, `traceback`."""
+
+
+def append_row(columns: dict[str, list[Any]], row: Iterable[Any]) -> None:
+    """Append a row to columns of a record."""
+    for column, value in zip(columns.values(), row, strict=True):
+        column.append(value)

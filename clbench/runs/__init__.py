@@ -1,0 +1,1 @@
+"""Runs: one scenario, one method and one seed, from the pretrained policy to a record."""

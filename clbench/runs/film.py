@@ -1,0 +1,324 @@
+"""Films: the same episode side by side, as the policy of each stage of a run does it.
+
+A film shows validation episodes, never those of the report. The policies act as they do in evaluation: what is
+drawn repeats the actions that an `Evaluator` saw, so a film ends as the recorded episode does.
+"""
+
+from __future__ import annotations
+
+import functools
+import os
+from collections import defaultdict
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, ImageColor, ImageDraw, ImageFont
+
+from clbench.base.dependencies import require
+from clbench.base.entry_points import resolve
+from clbench.base.errors import InputError
+from clbench.evaluation.rollouts import Episode, Evaluator, Trial, start_of
+from clbench.learning.optimise import deterministic
+from clbench.policy.policy import Policy
+from clbench.runs.spec import RunSpec
+from clbench.spec.scenario import Scenario
+from clbench.spec.task import Task
+from clbench.worlds.world import World
+
+FORMATS = (".gif", ".mp4")
+
+FASTEST = 50
+"""Frames in a second: a GIF counts in hundredths of a second, and browsers slow down what is faster."""
+
+FILMS = Path("films")
+"""Where films lie, seen from the working directory."""
+
+HOLD_SECONDS = 2.0
+"""How long the end of a film stands still."""
+
+PAPER, INK, FAINT = "#ffffff", "#1a1a1a", "#5c5c5c"
+SUCCESS, FAILURE = "#00694d", "#b34700"
+"""Bluish green and vermilion, which the colour-blind tell apart, dark enough for white letters on them."""
+
+GAP, BORDER, LINE = 8, 4, 18
+"""Pixels between panels, around a picture whose episode has ended, and of a line of text."""
+
+
+@dataclass(frozen=True)
+class Take:
+    """One episode on film."""
+
+    pictures: list[Image.Image]
+    """Of the initial state and of the state after each step."""
+    episode: Episode
+    """What came of it."""
+
+
+def check_format(path: Path) -> None:
+    """Refuse what no film can be written as.
+
+    Raises:
+        LookupError: MP4 needs a package that is not installed.
+        ValueError: The name of the file ends neither in .gif nor in .mp4.
+    """
+    if path.suffix not in FORMATS:
+        raise InputError(f"A film is a {' or '.join(FORMATS)} file, not {path.name!r}.")
+    if path.suffix == ".mp4":
+        require("imageio_ffmpeg", "film", "An MP4")
+
+
+def shoot(
+    scenario: Scenario,
+    seed: int,
+    policies: Sequence[Policy],
+    trials: Sequence[Trial],
+    width: int,
+    progress: Callable[[float], None] = lambda _: None,
+) -> list[list[Take]]:
+    """Return the takes: for each trial, one with each policy.
+
+    Args:
+        scenario: Where the tasks come from.
+        seed: Of the run: it chooses the initial states.
+        policies: What acts.
+        trials: Which episodes.
+        width: Of a picture, in pixels.
+        progress: Called with the number of takes made since its last call.
+
+    Raises:
+        RuntimeError: A world does not repeat an episode.
+    """
+    evaluator = Evaluator(scenario, seed)
+    worlds: dict[str, World] = {}
+    takes: list[list[Take]] = [[] for _ in trials]
+    for policy in policies:
+        with deterministic():
+            episodes, actions = _act(evaluator, policy, trials)
+        for column, trial, episode in zip(takes, trials, episodes, strict=True):
+            entry_point = trial[0].world
+            if entry_point not in worlds:
+                worlds[entry_point] = resolve(entry_point)(render_mode="rgb_array")
+            pictures, success = _repeat(worlds[entry_point], trial, seed, actions[trial], width)
+            if success != episode.success:
+                raise RuntimeError(f"{entry_point} does not repeat an episode of {trial[0].name!r}.")
+            column.append(Take(pictures, episode))
+            progress(1)
+    evaluator.close()
+    for world in worlds.values():
+        world.close()
+    return takes
+
+
+def _act(
+    evaluator: Evaluator, policy: Policy, trials: Sequence[Trial]
+) -> tuple[list[Episode], dict[Trial, list[NDArray[np.float32]]]]:
+    """Return what comes of the trials, and the actions taken in each."""
+    actions: dict[Trial, list[NDArray[np.float32]]] = defaultdict(list)
+    episodes = evaluator.play(policy.eval(), trials, watch=lambda trial, act: actions[trial].append(act))
+    return episodes, actions
+
+
+def _repeat(
+    world: World, trial: Trial, seed: int, actions: Sequence[NDArray[np.float32]], width: int
+) -> tuple[list[Image.Image], bool]:
+    """Return the pictures of an episode whose actions are known, and whether it is a success."""
+    task = trial[0]
+    world.reset(seed=start_of(trial, seed)[0], options={"task": task.name})
+    pictures, success = [picture(world, width)], False
+    for action in actions:
+        _, _, success, _, _ = world.step(action)
+        pictures.append(picture(world, width))
+    return pictures, success
+
+
+def picture(world: World, width: int) -> Image.Image:
+    """Return what a world shows, `width` pixels wide. Small pictures keep their hard edges."""
+    picture = Image.fromarray(np.asarray(world.render()))
+    size = (width, round(picture.height * width / picture.width))
+    larger = width > picture.width
+    return picture.resize(size, Image.Resampling.NEAREST if larger else Image.Resampling.LANCZOS)
+
+
+@dataclass(frozen=True)
+class Film:
+    """Takes side by side: a row for each episode, a column for each policy.
+
+    All begin together. One that has ended stands still, in a frame and above a word that say how it ended.
+    """
+
+    title: str
+    """What it shows."""
+    rows: Sequence[str]
+    """What each episode is about."""
+    columns: Sequence[str]
+    """Which policy it is."""
+    takes: Sequence[Sequence[Take]]
+    """Of each row, one for each column."""
+
+    def __len__(self) -> int:
+        """Return how many different frames there are."""
+        return max(len(take.pictures) for row in self.takes for take in row)
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height in pixels; even, as MP4 wants them."""
+        across, down = self._corner(len(self.rows), len(self.columns))
+        down -= LINE
+        return across + across % 2, down + down % 2
+
+    def _corner(self, row: int, column: int) -> tuple[int, int]:
+        """Return the top left corner of a panel: a line with the policy, the picture, a line with its end."""
+        sizes = [take.pictures[0].size for takes in self.takes for take in takes]
+        width, height = (max(side) for side in zip(*sizes, strict=True))
+        return GAP + column * (width + GAP), 2 * GAP + 2 * LINE + row * (3 * LINE + height + GAP)
+
+    @functools.cached_property
+    def _sheet(self) -> Image.Image:
+        """All that stands still."""
+        sheet = Image.new("RGB", self.size, PAPER)
+        draw = ImageDraw.Draw(sheet)
+        panel = self.takes[0][0].pictures[0].width
+        _write(draw, (GAP, GAP), self.title, self.size[0] - 2 * GAP, INK)
+        for row, caption in enumerate(self.rows):
+            left, top = self._corner(row, 0)
+            _write(draw, (left, top - LINE), caption, self.size[0] - 2 * GAP, INK)
+            for column, name in enumerate(self.columns):
+                _write(draw, self._corner(row, column), name, panel, FAINT)
+        return sheet
+
+    def frame(self, time: int) -> Image.Image:
+        """Return what is seen after `time` steps."""
+        frame = self._sheet.copy()
+        draw = ImageDraw.Draw(frame)
+        for row, takes in enumerate(self.takes):
+            for column, take in enumerate(takes):
+                left, top = self._corner(row, column)
+                picture = take.pictures[min(time, take.episode.length)]
+                top += LINE
+                frame.paste(picture, (left, top))
+                below = top + picture.height
+                if time < take.episode.length:
+                    _write(draw, (left, below), f"step {time}", picture.width, FAINT)
+                    continue
+                word, colour = ("success", SUCCESS) if take.episode.success else ("failure", FAILURE)
+                right = left + picture.width - 1
+                draw.rectangle((left, top, right, below - 1), outline=colour, width=BORDER)
+                draw.rectangle((left, below, right, below + LINE - 1), fill=colour)
+                words = f"{word}, {take.episode.length} steps"
+                _write(draw, (left + BORDER, below), words, picture.width - BORDER, PAPER)
+        return frame
+
+    def save(self, path: Path, fps: int) -> None:
+        """Write the film, in one step, as the GIF or MP4 that the name of the file says.
+
+        Args:
+            path: Where to.
+            fps: Steps shown in a second.
+
+        Raises:
+            LookupError: MP4 needs a package that is not installed.
+            ValueError: The name ends otherwise.
+        """
+        check_format(path)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        partial = path.with_name(f".{path.stem}.{os.getpid()}.partial{path.suffix}")
+        try:
+            (self._save_gif if path.suffix == ".gif" else self._save_mp4)(partial, fps)
+            os.replace(partial, path)
+        finally:
+            partial.unlink(missing_ok=True)
+
+    def _save_gif(self, path: Path, fps: int) -> None:
+        palette = self._palette()
+        frames = (
+            self.frame(time).quantize(palette=palette, dither=Image.Dither.NONE) for time in range(len(self))
+        )
+        milliseconds = [round(100 / fps) * 10] * (len(self) - 1) + [round(1000 * HOLD_SECONDS)]
+        next(frames).save(path, save_all=True, append_images=frames, duration=milliseconds, loop=0)
+
+    def _palette(self) -> Image.Image:
+        """Return 256 colours for all frames, so that what stands still does not flicker."""
+        samples = [self.frame(time) for time in (0, len(self) // 2, len(self) - 1)]
+        width, height = self.size
+        stack = Image.new("RGB", (width, 3 * height), PAPER)
+        for number, sample in enumerate(samples):
+            stack.paste(sample, (0, number * height))
+        ours = np.array([ImageColor.getrgb(colour) for colour in (PAPER, INK, FAINT, SUCCESS, FAILURE)])
+        found = np.reshape(stack.quantize(256 - len(ours)).getpalette() or [], (-1, 3))
+        # Pillow looks for the nearest colour in steps of 4: a near one would be taken for ours
+        far = np.abs(found[:, None] - ours).max(axis=2).min(axis=1) > 8
+        palette = Image.new("P", (1, 1))
+        palette.putpalette([int(channel) for channel in np.concatenate([ours, found[far]]).ravel()])
+        return palette
+
+    def _save_mp4(self, path: Path, fps: int) -> None:
+        from imageio_ffmpeg import write_frames
+
+        # one thread and no name of the encoder in the file: the same film is the same bytes
+        exact = ["-threads", "1", "-fflags", "+bitexact", "-flags:v", "+bitexact", "-crf", "23"]
+        writer = write_frames(path, self.size, fps=fps, macro_block_size=2, output_params=exact)
+        writer.send(None)
+        for time in range(len(self) + round(HOLD_SECONDS * fps)):
+            writer.send(self.frame(min(time, len(self) - 1)).tobytes())
+        writer.close()
+
+
+def _write(draw: ImageDraw.ImageDraw, place: tuple[int, int], text: str, width: int, colour: str) -> None:
+    """Write a line of text that begins at `place`; what does not fit in `width` pixels is cut off."""
+    font = _font()
+    if draw.textlength(text, font) > width:
+        while text and draw.textlength(f"{text}...", font) > width:
+            text = text[:-1]
+        text = f"{text.rstrip()}..."
+    draw.text((place[0], place[1] + LINE // 2), text, fill=colour, font=font, anchor="lm")
+
+
+def film_run(
+    spec: RunSpec,
+    policies: Mapping[int, Policy],
+    tasks: Sequence[Task],
+    number: int,
+    width: int,
+    progress: Callable[[float], None] = lambda _: None,
+) -> Film:
+    """Return the film of a run.
+
+    Args:
+        spec: The run.
+        policies: By the number of their stage, in the order of the columns.
+        tasks: What they are asked to do.
+        number: Which validation episode.
+        width: Of a picture, in pixels.
+        progress: Called with the number of takes made since its last call.
+    """
+    scenario = spec.load()
+    trials: list[Trial] = [(task, "validation", number) for task in tasks]
+    rows = [
+        f"{task.name} ({scenario.group(task.name).replace('_', ' ')}): {start_of(trial, spec.seed)[1]}"
+        for task, trial in zip(tasks, trials, strict=True)
+    ]
+    stages = ["before any target", *(f"after {task.name}" for task in scenario.target)]
+    title = f"{scenario.id}, {spec.label}, seed {spec.seed}, validation episode {number}"
+    takes = shoot(scenario, spec.seed, list(policies.values()), trials, width, progress)
+    return Film(title, rows, [f"stage {stage}, {stages[stage]}" for stage in policies], takes)
+
+
+def steps_per_second(task: Task) -> int:
+    """Return how many steps of a task's world are a second, as the world says, but at most `FASTEST`.
+
+    It is 25 if the world does not say.
+    """
+    world = resolve(task.world)()
+    rate = world.metadata.get("render_fps", 25)
+    world.close()
+    return min(int(rate), FASTEST)
+
+
+@functools.cache
+def _font() -> Any:
+    """Return the letters that come with Pillow, so that films look alike on all machines."""
+    return ImageFont.load_default(LINE - 5)

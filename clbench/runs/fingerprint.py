@@ -1,0 +1,113 @@
+"""The fingerprint: what a score was measured with, down to the bits of the simulator."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import platform
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+
+from clbench.base.dependencies import versions
+from clbench.base.entry_points import resolve
+from clbench.spec.scenario import Scenario
+from clbench.spec.task import Task
+from clbench.worlds.observation import frame_hash
+
+PACKAGES = (
+    "clbench",
+    "gymnasium",
+    "minari",
+    "mujoco",
+    "numpy",
+    "peft",
+    "tokenizers",
+    "torch",
+)
+"""Whose versions every record names, beside the packages of its scenario's tasks."""
+
+_ROLLOUT_STEPS = 50
+
+
+def rollout_hash(world: str, task: str) -> str:
+    """Return the hash of a fixed open-loop rollout of a world: it differs where the simulator does.
+
+    Args:
+        world: Entry point of the environment.
+        task: Name of the task that chooses the initial state.
+    """
+    environment = resolve(world)()
+    assert isinstance(environment.action_space, gymnasium.spaces.Box)
+    generator = np.random.default_rng(0)
+    low, high = environment.action_space.low, environment.action_space.high
+    state, _ = environment.reset(seed=0, options={"task": task})
+    digest = hashlib.sha256(np.asarray(state, np.float32).tobytes())
+    for _ in range(_ROLLOUT_STEPS):
+        state, *_ = environment.step(generator.uniform(low, high).astype(np.float32))
+        digest.update(np.asarray(state, np.float32).tobytes())
+    environment.close()
+    return digest.hexdigest()[:16]
+
+
+def fingerprint(scenario: Scenario) -> dict[str, Any]:
+    """Return versions, commit, hardware and the hashes of every world of the scenario.
+
+    Beside the rollout of a world stands, under the name of the camera if there is one, the hash of a picture.
+    """
+    packages = {*PACKAGES, *(package for task in scenario.tasks for package in task.packages)}
+    worlds: dict[str, Task] = {}
+    for task in scenario.tasks:
+        worlds.setdefault(task.world, task)
+    rollouts = {world: rollout_hash(world, task.name) for world, task in worlds.items()}
+    frames = {task.camera: frame_hash(task) for task in worlds.values() if task.camera is not None}
+    return {
+        "versions": versions(packages),
+        "python": platform.python_version(),
+        "commit": _commit(),
+        "hardware": _hardware(),
+        "rollouts": {**rollouts, **frames},
+    }
+
+
+def _commit() -> dict[str, Any] | None:
+    """Return the commit of the checkout that this file lies in and whether it was changed, or None."""
+    folder = Path(__file__).resolve().parents[1]
+    if not (folder.parent / ".git").exists():
+        return None
+    try:
+        git = ["git", "-C", os.fspath(folder.parent)]
+        head = subprocess.run([*git, "rev-parse", "HEAD"], capture_output=True, text=True, check=True)
+        # records and the table are what runs make: they do not change what the next run computes
+        code = ["clbench", "envs", "methods", "pyproject.toml", "constraints.txt"]
+        changed = subprocess.run(
+            [*git, "status", "--porcelain", "--", *code], capture_output=True, text=True, check=True
+        )
+    except (OSError, subprocess.CalledProcessError):
+        return None
+    return {"id": head.stdout.strip(), "dirty": bool(changed.stdout.strip())}
+
+
+def _hardware() -> dict[str, str]:
+    """Return what may round differently: processors of one name differ in the instructions that they have."""
+    import torch  # seconds, and environments that only step need not wait for them
+
+    return {
+        "machine": platform.machine(),
+        "system": platform.system(),
+        "processor": _processor(),
+        "instructions": torch.backends.cpu.get_cpu_capability(),
+    }
+
+
+def _processor() -> str:
+    """Return the processor's model."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        return platform.processor()
+    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.processor()

@@ -1,0 +1,1 @@
+"""Scoring: from records to metrics, intervals and ranks. It needs neither PyTorch nor a simulator."""

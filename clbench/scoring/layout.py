@@ -1,0 +1,49 @@
+"""The layout of score arrays: what their axes stand for."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clbench.spec.scenario import Group
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Layout:
+    """What the axes of a run's scores stand for. Runs can be put together if their layouts are equal."""
+
+    retained: tuple[str, ...]
+    """Names of the skills that are pretrained and never trained again."""
+    target: tuple[str, ...]
+    """Names of the tasks that are learned, in order."""
+    held_out: tuple[str, ...]
+    """Names of the tasks that are never trained."""
+    episodes: tuple[int, ...]
+    """Numbers of the scored episodes at the end of a stage, rising."""
+    curve_episodes: tuple[int, ...]
+    """Numbers of those that are run at the points before the end too, rising."""
+    validation_episodes: tuple[int, ...]
+    """Numbers of the validation episodes on a stage's target, rising."""
+    steps: tuple[int, ...]
+    """Steps of a stage after which it is evaluated, rising, all above 0; the last one is its end."""
+    kinds: tuple[str, ...]
+    """Kinds of questions, sorted."""
+
+    @property
+    def tasks(self) -> tuple[str, ...]:
+        """The columns of every score table: retained, then target, then held out."""
+        return self.retained + self.target + self.held_out
+
+    def columns(self, group: Group) -> slice:
+        """Return the task columns of `group`."""
+        before = {"retained": (), "target": self.retained, "held_out": self.retained + self.target}[group]
+        return slice(len(before), len(before) + len(getattr(self, group)))
+
+
+def average(values: Array) -> Array:
+    """Return the mean along the last axis, NaN where there is nothing to average."""
+    return values.mean(axis=-1) if values.shape[-1] else np.full(values.shape[:-1], np.nan)

@@ -1,0 +1,105 @@
+"""The registry of metrics: named, versioned functions from the success rates of runs to one number.
+
+A new metric is one function with the decorator `metric`; intervals, tables and tests then find it. The metrics
+of the leaderboard are in `clbench.scoring.ours`, definitions of other papers in `clbench.scoring.published`;
+`clbench.scoring.metrics` loads both.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from clbench.scoring.layout import Array
+from clbench.scoring.rates import Rates
+
+Function = Callable[[Rates], Array]
+
+
+@dataclass(frozen=True)
+class Metric:
+    """A named, versioned definition of one number. A changed definition is a new version."""
+
+    name: str
+    """Name of its function and of its column everywhere."""
+    function: Function
+    """Maps rates with batch axes (...) to values (...), NaN where something is missing."""
+    description: str
+    """What it tells, in one sentence."""
+    formula: str
+    """How it is computed, in words and in the letters of this module's docstring."""
+    source: str
+    """Paper or convention that it comes from."""
+    low: float
+    """Least possible value."""
+    high: float
+    """Greatest possible value."""
+    higher_is_better: bool | None
+    """None if it says nothing of better or worse."""
+    units: str
+    """What is counted."""
+    missing: str
+    """When it has no value, in one sentence."""
+    references: tuple[str, ...]
+    """Methods without whose records, of the same seeds, it has no value."""
+    compares_itself: bool
+    """Whether a reference method has a value too, by comparison with itself."""
+    pooled: bool
+    """Whether seeds are averaged before it is computed; if not, it is the mean of the seeds' values."""
+    version: int
+    """Number of the definition."""
+
+    def over_runs(self, rates: Rates) -> Array:
+        """Return the value (...) over the runs of `rates`, whose last batch axis is the run: (..., runs)."""
+        if any(name not in rates.references for name in self.references):
+            return np.full(rates.success.shape[:-3], np.nan)
+        if self.pooled:
+            return self.function(rates.mean_over_runs())
+        return np.asarray(self.function(rates).mean(axis=-1))
+
+
+REGISTRY: dict[str, Metric] = {}
+"""Metrics by name, in the order of their definition: those whose module was imported."""
+
+
+def metric(
+    *,
+    formula: str,
+    source: str,
+    missing: str,
+    low: float = 0.0,
+    high: float = 1.0,
+    higher_is_better: bool | None = True,
+    units: str = "success rate",
+    references: tuple[str, ...] = (),
+    compares_itself: bool = False,
+    pooled: bool = False,
+    version: int = 0,
+) -> Callable[[Function], Function]:
+    """Return a decorator that enters a function as a metric: its name, and its docstring's first line.
+
+    The arguments are the fields of `Metric`.
+    """
+
+    def enter(function: Function) -> Function:
+        REGISTRY[function.__name__] = Metric(
+            name=function.__name__,
+            function=function,
+            description=(function.__doc__ or "").partition("\n")[0],
+            formula=formula,
+            source=source,
+            low=low,
+            high=high,
+            higher_is_better=higher_is_better,
+            units=units,
+            missing=missing,
+            references=references,
+            compares_itself=compares_itself,
+            pooled=pooled,
+            version=version,
+        )
+        return function
+
+    return enter

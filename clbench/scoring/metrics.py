@@ -1,0 +1,41 @@
+"""All metrics by name, and their values for a run."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+from clbench.base.entry_points import unknown
+from clbench.scoring import ours, published
+from clbench.scoring.metric import REGISTRY, Metric
+from clbench.scoring.scores import Scores, rates_of
+
+# An imported module enters its metrics into the registry: first ours, then those that others published.
+MODULES = (ours, published)
+
+METRICS: Mapping[str, Metric] = REGISTRY
+"""All metrics by name, in the order of the table."""
+
+
+def load_metric(name: str) -> Metric:
+    """Return the metric called `name`.
+
+    Raises:
+        LookupError: No metric has this name; the nearest one is named.
+    """
+    if name not in METRICS:
+        raise unknown("metric", name, METRICS)
+    return METRICS[name]
+
+
+def measure(name: str, scores: Scores, references: Mapping[str, Scores] | None = None) -> float | None:
+    """Return the value of the metric `name` for one run, None where something that it needs is missing.
+
+    Args:
+        name: Name of the metric.
+        scores: The run.
+        references: Runs of reference methods with the same scenario and seed, by the method's name.
+    """
+    rates = rates_of([scores], {key: [run] for key, run in (references or {}).items()})
+    value = float(load_metric(name).over_runs(rates))
+    return value if math.isfinite(value) else None

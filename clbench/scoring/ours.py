@@ -1,0 +1,238 @@
+"""The metrics of the leaderboard.
+
+In the formulas R[l][s] is the success rate on task s at the end of stage l, stage 0 is the pretrained policy,
+target k is learned in stage k, and K is the last stage.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from clbench.scoring.layout import Array, average
+from clbench.scoring.metric import metric
+from clbench.scoring.rates import Rates
+
+MATCHED_SHARE = 0.9
+"""Share of plain fine-tuning's final success on a target from which on a method has adapted as well as it."""
+
+
+@metric(
+    formula="mean of R[K][s] over the retained skills and the targets",
+    source="GEM, arXiv 1706.08840 (ACC)",
+    missing="A success after the last target on a retained skill or a target is missing.",
+)
+def final_average(rates: Rates) -> Array:
+    """Success after the last target on everything that was ever trained."""
+    return average(np.concatenate([rates.retained[..., -1, :], rates.target[..., -1, :]], axis=-1))
+
+
+@metric(
+    formula="mean of R[k][k] over the targets k",
+    source="the diagonal of the matrix of arXiv 1706.08840",
+    missing="The success on a target right after it was learned is missing.",
+)
+def adaptation(rates: Rates) -> Array:
+    """Success on each target right after it was learned."""
+    return average(rates.learned)
+
+
+@metric(
+    formula="mean of R[K][s] over the retained skills s",
+    source="clbench",
+    missing="The success on a retained skill after the last target is missing.",
+)
+def retention(rates: Rates) -> Array:
+    """Success on the retained skills after the last target."""
+    return average(rates.retained[..., -1, :])
+
+
+@metric(
+    formula="mean over the retained skills s of the success on s after the last target in perturbed episodes",
+    source="clbench",
+    missing="The run did not meet perturbed episodes, as with `clbench run --perturb`.",
+)
+def perturbed_retention(rates: Rates) -> Array:
+    """Success on the retained skills after the last target, with start poses, masses and views disturbed.
+
+    The episodes are those of `retention`, number by number: what this is lower by is lost to the disturbance.
+    How much of that was lost before any target, the success of the pretrained policy says.
+    """
+    return average(rates.perturbed[..., -1, :])
+
+
+@metric(
+    formula="mean over the stages k of the success on the retained skills at the first evaluation point of "
+    f"stage k at which the success on target k is at least {MATCHED_SHARE:g} of that of sft at the end of "
+    "its stage k; the point is chosen on validation episodes, the success at it is from test episodes",
+    source="the protocol of ConSFT, arXiv 2605.08879, Sec. 5.1: comparison at comparable target success",
+    references=("sft",),
+    compares_itself=True,
+    missing="A target is never learned as well as by sft, a rate up to that point is missing, "
+    "or there is no sft.",
+)
+def retention_at_matched_adaptation(rates: Rates) -> Array:
+    """Success on the retained skills at the point where the target is learned about as well as by sft.
+
+    It tells a method that forgets less from one that merely learns less, or later. Conventions:
+
+    1. The value is missing if the target of any stage is never learned that well.
+    2. sft is compared with itself: what it still knew when it first came near its final success.
+    3. The stages before are not matched: each begins with the policy that the full stage before left.
+    """
+    points = matched_points(rates)
+    kept = average(rates.retained_curves)
+    chosen = np.nan_to_num(points).astype(np.int64)[..., None]
+    values = np.take_along_axis(kept, chosen, axis=-1)[..., 0]
+    return average(np.where(np.isnan(points), np.nan, values))
+
+
+def matched_points(rates: Rates) -> Array:
+    """Return the evaluation point of each stage at which its target is first learned about as well as by sft.
+
+    It is the first at which the success on the validation episodes reaches `MATCHED_SHARE` of what sft has on
+    them at the end of the stage. Test episodes, of which scores are made, have no part in the choice.
+
+    Args:
+        rates: Success rates with the reference sft.
+
+    Returns:
+        Indices into `Layout.steps`, (..., targets); NaN where none reaches it, or where it cannot be told.
+    """
+    if "sft" not in rates.references:
+        return np.full(rates.validation.shape[:-1], np.nan)
+    goal = MATCHED_SHARE * rates.references["sft"].validation[..., -1:]
+    # Rates are quotients of whole numbers: equal ones may differ in the last bit.
+    reached = rates.validation >= goal - 1e-9
+    # A missing rate may have been the first to reach it: no later one is known to be the first.
+    first = np.argmax(reached | np.isnan(rates.validation), axis=-1)
+    found = np.take_along_axis(reached, first[..., None], axis=-1)[..., 0]
+    return np.where(found, first, np.nan)
+
+
+@metric(
+    formula="mean over the retained skills and all targets but the last of the highest R[l][s], from where s "
+    "is known (stage 0 for skills, stage k for target k) to stage K-1, minus R[K][s]",
+    source="Chaudhry et al. 2018, arXiv 1801.10112; the retained skills counted in",
+    low=-1.0,
+    higher_is_better=False,
+    missing="A success that it needs is missing, or nothing is known before the last stage.",
+)
+def forgetting(rates: Rates) -> Array:
+    """Drop from the best success before the last stage to the success after it.
+
+    The highest of several noisy rates is too high by a part of their noise, so that a policy that does not
+    change at all has a small positive value with few episodes. `backward_transfer` has no such bias.
+    """
+    # The last target has no stage between learning it and the end.
+    known = np.concatenate([rates.retained, rates.target[..., :-1]], axis=-1)
+    learned_in = np.array([0] * rates.retained.shape[-1] + list(range(1, rates.target.shape[-1])))
+    if not known.shape[-1] or known.shape[-2] == 1:
+        return np.full(known.shape[:-2], np.nan)
+    seen = np.arange(known.shape[-2] - 1)[:, None] >= learned_in
+    best = np.where(seen, known[..., :-1, :], -np.inf).max(axis=-2)
+    return average(best - known[..., -1, :])
+
+
+@metric(
+    formula="mean of R[K][k] - R[k][k] over all targets k but the last",
+    source="GEM, arXiv 1706.08840 (BWT)",
+    low=-1.0,
+    missing="There are fewer than two targets, or a success on an earlier one is missing.",
+)
+def backward_transfer(rates: Rates) -> Array:
+    """Change of the success on earlier targets by learning the later ones."""
+    return average(rates.target[..., -1, :-1] - rates.learned[..., :-1])
+
+
+@metric(
+    formula="mean over the targets of (A - B) / (1 - B); A is the area under the learning curve divided by "
+    "the stage's steps, B the same for a policy that learns the target from scratch; the curve starts with "
+    "R[k-1][k], the one from scratch with 0",
+    source="Continual World, arXiv 2105.10919 (FT)",
+    low=-math.inf,
+    units="share of the area that learning from scratch leaves",
+    references=("from_scratch",),
+    pooled=True,
+    missing="A point of a learning curve is missing, or there is no from_scratch of the same seeds.",
+)
+def forward_transfer(rates: Rates) -> Array:
+    """How much faster targets are learned than from scratch.
+
+    Conventions, where the source leaves room:
+
+    1. Trapezoid rule through the evaluation points and a point at step 0. A stage starts with the policy of
+       the stage before, so that its point at step 0 is R[k-1][k]: what the policy can do at once is transfer.
+    2. The policy from scratch starts untrained, and nobody evaluates that one: its success at step 0 is taken
+       as 0. For manipulation this is true to a few in a thousand; where it is not, the value is too high by
+       at most half the first interval's share of the stage times the untrained policy's success. To begin
+       both curves at the first common point instead would leave out the very part where transfer shows.
+    3. Curves are averaged over seeds before the ratio, as in the source's code.
+    4. The value is capped by 1 and not bounded below. Point 2 keeps the divisor above 0.
+    """
+    starts = np.diagonal(rates.target[..., :-1, :], axis1=-2, axis2=-1)
+    area = _area(rates.layout.steps, rates.learning_curves, starts)
+    curves_from_scratch = rates.references["from_scratch"].learning_curves
+    area_from_scratch = _area(rates.layout.steps, curves_from_scratch, np.zeros_like(starts))
+    return average((area - area_from_scratch) / (1 - area_from_scratch))
+
+
+def _area(steps: tuple[int, ...], curves: Array, starts: Array) -> Array:
+    """Return the area (..., targets) under the curves (..., targets, points), divided by the last step."""
+    heights = np.concatenate([starts[..., None], curves], axis=-1)
+    return np.asarray(np.trapezoid(heights, np.array([0, *steps]) / steps[-1], axis=-1))
+
+
+@metric(
+    formula="right answers divided by questions, of all kinds together, at the end of stage K",
+    source="clbench",
+    units="share of right answers",
+    missing="No question was asked after the last target.",
+)
+def question_retention(rates: Rates) -> Array:
+    """Share of the questions about the scene that are answered rightly after the last target."""
+    asked, correct = (rates.asked[..., -1, :].sum(axis=-1), rates.correct[..., -1, :].sum(axis=-1))
+    return np.where(asked > 0, correct / np.maximum(asked, 1), np.nan)
+
+
+@metric(
+    formula="mean of R[K][s] over the held-out tasks s",
+    source="arXiv 2603.11653 (ZS)",
+    missing="There are no held-out tasks, or the success on one after the last target is missing.",
+)
+def zero_shot(rates: Rates) -> Array:
+    """Success after the last target on tasks that were never trained."""
+    return average(rates.held_out[..., -1, :])
+
+
+@metric(
+    formula="share of the parameters p with |p - q| / (|q| + 1e-8) < 1e-3 at the end of stage K; q is the "
+    "pretrained value of p",
+    source="ConSFT, arXiv 2605.08879, Eq. 8",
+    higher_is_better=None,
+    units="share of parameters",
+    missing="It was not measured after the last target, as where a method changes the set of the parameters.",
+)
+def update_sparsity(rates: Rates) -> Array:
+    """Share of the parameters that are after the last target nearly what they were after pretraining."""
+    return _at_the_end(rates.update_sparsity)
+
+
+@metric(
+    formula="squared 2-Wasserstein distance between the hidden states of the policy on the test questions "
+    "and those of the pretrained policy, mean over layers, at the end of stage K",
+    source="AEGIS, arXiv 2604.16067, where it is the penalty",
+    high=math.inf,
+    higher_is_better=False,
+    units="squared distance",
+    missing="It was not measured after the last target.",
+)
+def activation_drift(rates: Rates) -> Array:
+    """How far the hidden states have moved after the last target from where pretraining left them."""
+    return _at_the_end(rates.activation_drift)
+
+
+def _at_the_end(values: Array) -> Array:
+    """Return the last of values (..., targets, points), NaN without targets."""
+    return values[..., -1, -1] if values.shape[-2] else np.full(values.shape[:-2], np.nan)

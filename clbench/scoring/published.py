@@ -1,0 +1,394 @@
+"""Definitions of other benchmarks, papers and libraries, as metrics beside ours.
+
+One word has many meanings in this field; here each has the name of whose it is. As published they are over
+the sequence of learned tasks: the targets, without the retained skills and the held-out tasks. The letters
+are those of `clbench.scoring.metric`: R[l][k] is the success on target k at the end of stage l, K is the last stage.
+What lies between the ends of the stages is known of the current target alone, so that earlier and later
+targets count at the ends only.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from clbench.scoring.layout import Array, average
+from clbench.scoring.metric import metric
+from clbench.scoring.rates import Rates
+
+ALL_TARGETS = "There are no targets, or a success on one at the end of a stage that it needs is missing."
+TWO_TARGETS = "There are fewer than two targets, or a success on one at the end of a stage is missing."
+
+
+def _matrix(rates: Rates) -> Array:
+    """Return R[l][k] for the stages l from 1 and the targets k, (..., targets, targets)."""
+    return rates.target[..., 1:, :]
+
+
+def _later(rates: Rates) -> Array:
+    """Return 1 where stage l comes after that of target k, else 0: (targets, targets)."""
+    return np.tri(len(rates.layout.target), k=-1)
+
+
+def _drops(rates: Rates) -> Array:
+    """Return R[k][k] - R[l][k], (..., targets, targets)."""
+    return rates.learned[..., None, :] - _matrix(rates)
+
+
+def _weighted(values: Array, weights: Array) -> Array:
+    """Return the sum of values (..., n, n) times weights (n, n), NaN if all weights are 0."""
+    if not weights.any():
+        return np.full(values.shape[:-2], np.nan)
+    return np.asarray((np.where(weights > 0, values, 0.0) * weights).sum(axis=(-2, -1)))
+
+
+def _mean(values: Array, chosen: Array) -> Array:
+    """Return the mean of values (..., n, n) where chosen (n, n) is 1, NaN if it is nowhere."""
+    return _weighted(values, chosen / max(chosen.sum(), 1.0))
+
+
+def _starts(rates: Rates) -> Array:
+    """Return R[k-1][k], (..., targets)."""
+    return np.diagonal(rates.target[..., :-1, :], axis1=-2, axis2=-1)
+
+
+# ---- matrix of the ends of the stages ----------------------------------------------------------------------
+
+
+@metric(
+    formula="mean over the targets k of R[K][k]",
+    source="Continual World, arXiv 2105.10919 (P), whose code averages the last five evaluations; "
+    "GEM, arXiv 1706.08840 (ACC)",
+    missing="There are no targets, or the success on one after the last of them is missing.",
+)
+def performance_continual_world(rates: Rates) -> Array:
+    """Success after the last target on all targets."""
+    return average(rates.target[..., -1, :])
+
+
+@metric(
+    formula="mean over the stages l from 1 of the mean over the targets k up to l of R[l][k]",
+    source="iCaRL, arXiv 1611.07725 (average incremental accuracy)",
+    missing=ALL_TARGETS,
+)
+def average_incremental_accuracy(rates: Rates) -> Array:
+    """Success on the targets learned so far, averaged over the stages."""
+    count = len(rates.layout.target)
+    known = np.tri(count)
+    weights = known / np.maximum(known.sum(axis=1, keepdims=True), 1) / max(count, 1)
+    return _weighted(_matrix(rates), weights)
+
+
+@metric(
+    formula="mean over all targets k but the last of the highest R[l][k] of the stages l from 1 to K-1, "
+    "minus R[K][k]",
+    source="Chaudhry et al. 2018, arXiv 1801.10112 (F)",
+    missing=TWO_TARGETS,
+    low=-1.0,
+    higher_is_better=False,
+)
+def forgetting_chaudhry(rates: Rates) -> Array:
+    """Drop from the best success on a target at any earlier stage, before it was learned too."""
+    matrix = _matrix(rates)
+    if matrix.shape[-1] < 2:
+        return np.full(matrix.shape[:-2], np.nan)
+    return average(matrix[..., :-1, :-1].max(axis=-2) - matrix[..., -1, :-1])
+
+
+@metric(
+    formula="mean over all targets k but the last of the highest R[l][k] of the stages l from k to K, minus "
+    "R[K][k]",
+    source="Mammoth, utils/metrics.py at 07bd157 (forgetting)",
+    missing=TWO_TARGETS,
+    higher_is_better=False,
+)
+def forgetting_mammoth(rates: Rates) -> Array:
+    """Drop from the best success on a target since it was learned, the last one included: never below 0."""
+    matrix = _matrix(rates)
+    if matrix.shape[-1] < 2:
+        return np.full(matrix.shape[:-2], np.nan)
+    best = np.where(np.tri(matrix.shape[-1]) > 0, matrix, -np.inf).max(axis=-2)
+    return average((best - matrix[..., -1, :])[..., :-1])
+
+
+@metric(
+    formula="mean over all targets k but the last of R[k][k] - R[K][k]",
+    source="Avalanche 0.6.0 (stream forgetting); also F of COOM and NBT of arXiv 2603.11653",
+    missing=TWO_TARGETS,
+    low=-1.0,
+    higher_is_better=False,
+)
+def forgetting_avalanche(rates: Rates) -> Array:
+    """Drop from the success right after a target was learned: backward transfer with the other sign."""
+    return average(_drops(rates)[..., -1, :-1] if len(rates.layout.target) > 1 else rates.learned[..., :0])
+
+
+@metric(
+    formula="mean over all targets k, the last included, of R[k][k] - R[K][k]",
+    source="Continual World, arXiv 2105.10919 (F), whose code averages five evaluations for both terms",
+    missing=TWO_TARGETS,
+    low=-1.0,
+    higher_is_better=False,
+)
+def forgetting_continual_world(rates: Rates) -> Array:
+    """Drop from the success right after a target was learned; the last target's, always 0, counts too."""
+    if len(rates.layout.target) < 2:
+        return average(rates.learned[..., :0])
+    return average(_drops(rates)[..., -1, :])
+
+
+@metric(
+    formula="mean over the targets k of J[k][k] - R[k][k]; J is R of joint",
+    source="Chaudhry et al. 2018, arXiv 1801.10112 (I), the mean over the tasks",
+    missing="There is no joint of the same seeds, or the success on a target right after it is missing.",
+    low=-1.0,
+    higher_is_better=False,
+    references=("joint",),
+)
+def intransigence(rates: Rates) -> Array:
+    """How much worse targets are learned than by training on everything met so far."""
+    return average(rates.references["joint"].learned - rates.learned)
+
+
+@metric(
+    formula="mean of R[l][k] over the stages l from 1 and the targets k up to l",
+    source="Diaz-Rodriguez et al. 2018, arXiv 1810.13166 (A)",
+    missing=ALL_TARGETS,
+)
+def accuracy_diaz_rodriguez(rates: Rates) -> Array:
+    """Success on the targets learned so far, over all pairs of a stage and a target."""
+    return _mean(_matrix(rates), np.tri(len(rates.layout.target)))
+
+
+def _backward_transfer(rates: Rates) -> Array:
+    return _mean(-_drops(rates), _later(rates))
+
+
+@metric(
+    formula="mean of R[l][k] - R[k][k] over the targets k and the stages l after k",
+    source="Diaz-Rodriguez et al. 2018, arXiv 1810.13166 (BWT)",
+    missing=TWO_TARGETS,
+    low=-1.0,
+)
+def backward_transfer_diaz_rodriguez(rates: Rates) -> Array:
+    """Change of the success on earlier targets, over all later stages and not the last alone."""
+    return _backward_transfer(rates)
+
+
+@metric(
+    formula="1 - |min(B, 0)|; B is backward_transfer_diaz_rodriguez",
+    source="Diaz-Rodriguez et al. 2018, arXiv 1810.13166 (REM)",
+    missing=TWO_TARGETS,
+)
+def remembering_diaz_rodriguez(rates: Rates) -> Array:
+    """What the negative part of backward transfer leaves of 1."""
+    return 1 - np.abs(np.minimum(_backward_transfer(rates), 0))
+
+
+@metric(
+    formula="max(B, 0); B is backward_transfer_diaz_rodriguez",
+    source="Diaz-Rodriguez et al. 2018, arXiv 1810.13166 (BWT+)",
+    missing=TWO_TARGETS,
+)
+def positive_backward_transfer_diaz_rodriguez(rates: Rates) -> Array:
+    """The positive part of backward transfer."""
+    return np.maximum(_backward_transfer(rates), 0)
+
+
+@metric(
+    formula="mean of R[l][k] over the stages l from 1 and the targets k after l",
+    source="Diaz-Rodriguez et al. 2018, arXiv 1810.13166 (FWT)",
+    missing=TWO_TARGETS,
+)
+def forward_transfer_diaz_rodriguez(rates: Rates) -> Array:
+    """Success on targets that are still to come, with nothing subtracted."""
+    return _mean(_matrix(rates), _later(rates).T)
+
+
+@metric(
+    formula="mean over all targets k but the last of the lowest R[l][k] of the stages l after k",
+    source="De Lange et al. 2023, arXiv 2205.13452 (min-ACC), with an evaluation at the end of each stage",
+    missing=TWO_TARGETS,
+)
+def minimum_accuracy(rates: Rates) -> Array:
+    """The lowest success on a target at the end of any later stage."""
+    return average(_lowest(rates))
+
+
+def _lowest(rates: Rates) -> Array:
+    """Return the lowest success on each target but the last after it was learned, (..., targets - 1)."""
+    if len(rates.layout.target) < 2:
+        return rates.learned[..., :0]
+    return np.asarray(np.where(_later(rates) > 0, _matrix(rates), np.inf)[..., :-1].min(axis=-2))
+
+
+@metric(
+    formula="R[K][K] / K + (1 - 1 / K) minimum_accuracy",
+    source="De Lange et al. 2023, arXiv 2205.13452 (WC-ACC), with an evaluation at the end of each stage",
+    missing=TWO_TARGETS,
+)
+def worst_case_accuracy(rates: Rates) -> Array:
+    """Success on the last target, and the lowest on each earlier one since it was learned."""
+    lowest = _lowest(rates)
+    if not lowest.shape[-1]:
+        return average(lowest)
+    return average(np.concatenate([lowest, rates.learned[..., -1:]], axis=-1))
+
+
+@metric(
+    formula="mean over the targets k and the stages l after k of (R[l-1][k] - R[l][k]) / M[k]; M[k] is the "
+    "highest R[l][k] of all stages l from 0",
+    source="CORA, arXiv 2110.10067 (isolated forgetting), without its factor 10",
+    missing="There are fewer than two targets, a success on one is missing, or one never has any success.",
+    low=-1.0,
+    higher_is_better=False,
+    units="share of the highest success",
+)
+def isolated_forgetting_cora(rates: Rates) -> Array:
+    """What each later target costs an earlier one, as a share of the highest success.
+
+    The highest is that of the one run at the ends of the stages; CORA's code takes it from every evaluation
+    of all runs together.
+    """
+    return _mean(-_isolated(rates), _later(rates))
+
+
+@metric(
+    formula="mean over the targets k and the stages l before k, from 1, of (R[l][k] - R[l-1][k]) / M[k]; "
+    "M[k] is the highest R[l][k] of all stages l from 0",
+    source="CORA, arXiv 2110.10067 (isolated zero-shot forward transfer), without its factor 10",
+    missing="There are fewer than two targets, a success on one is missing, or one never has any success.",
+    low=-1.0,
+    units="share of the highest success",
+)
+def isolated_zero_shot_transfer_cora(rates: Rates) -> Array:
+    """What each target gives a later one, as a share of the highest success.
+
+    The highest is that of the one run at the ends of the stages, as in `isolated_forgetting_cora`. The policy
+    before the first target is the pretrained one, CORA's is untrained.
+    """
+    return _mean(_isolated(rates), _later(rates).T)
+
+
+def _isolated(rates: Rates) -> Array:
+    """Return the change of each target's success in each stage as a share of the highest, (..., n, n)."""
+    highest = rates.target.max(axis=-2, keepdims=True)
+    changes = np.diff(rates.target, axis=-2)
+    return np.asarray(changes / np.where(highest > 0, highest, np.nan))
+
+
+# ---- LIBERO and what is called NBT -------------------------------------------------------------------------
+
+
+@metric(
+    formula="mean over the targets k of the mean over the evaluation points of stage k of the success on "
+    "target k, R[k-1][k] before the first step included",
+    source="LIBERO, arXiv 2306.03310 (FWT)",
+    missing="There are no targets, or a point of a learning curve is missing.",
+)
+def forward_transfer_libero(rates: Rates) -> Array:
+    """Success on the target while it is learned, compared with nothing.
+
+    LIBERO's points are equally spaced, ours those of the scenario. It goes on from the best checkpoint of a
+    stage, by the very episodes that it reports, and holds the curve there; here a stage ends with its
+    last step.
+    """
+    return average(_own_curves(rates))
+
+
+def _own_curves(rates: Rates) -> Array:
+    """Return the mean success on target k over the points of stage k, (..., targets)."""
+    return average(np.concatenate([_starts(rates)[..., None], rates.learning_curves], axis=-1))
+
+
+@metric(
+    formula="sum over all targets k but the last of the mean over the stages l after k of R[k][k] - R[l][k], "
+    "divided by K",
+    source="LIBERO, arXiv 2306.03310 (NBT), without its choice of checkpoints; "
+    "LifeLong-RFT, arXiv 2602.10503",
+    missing=TWO_TARGETS,
+    low=-1.0,
+    higher_is_better=False,
+)
+def negative_backward_transfer_libero(rates: Rates) -> Array:
+    """Drop of the success on earlier targets over all later stages; the last target counts as 0."""
+    return _weighted(_drops(rates), _over_later(rates) / max(len(rates.layout.target), 1))
+
+
+@metric(
+    formula="mean over all targets k but the last of the mean over the stages l after k of R[k][k] - R[l][k]",
+    source="CLARE, arXiv 2601.09512 (NBT)",
+    missing=TWO_TARGETS,
+    low=-1.0,
+    higher_is_better=False,
+)
+def negative_backward_transfer_clare(rates: Rates) -> Array:
+    """Drop of the success on earlier targets over all later stages; the last target does not count."""
+    return _weighted(_drops(rates), _over_later(rates) / max(len(rates.layout.target) - 1, 1))
+
+
+def _over_later(rates: Rates) -> Array:
+    """Return weights of the stages after k that add up to 1 for each target k but the last, (n, n)."""
+    later = _later(rates)
+    return np.asarray(later / np.maximum(later.sum(axis=0), 1))
+
+
+@metric(
+    formula="mean over all targets k but the last of max(0, R[k][k] - R[K][k])",
+    source="ARFM (NBT), as our survey of the peers has it",
+    missing=TWO_TARGETS,
+    higher_is_better=False,
+)
+def negative_backward_transfer_arfm(rates: Rates) -> Array:
+    """Drop of the success on earlier targets after the last one; a gain counts as 0."""
+    if len(rates.layout.target) < 2:
+        return average(rates.learned[..., :0])
+    return average(np.maximum(_drops(rates)[..., -1, :-1], 0))
+
+
+@metric(
+    formula="mean over the targets k of (F[k] + the sum of R[l][k] over the stages l after k) / (K - k + 1); "
+    "F[k] is the part of target k in forward_transfer_libero",
+    source="LIBERO, arXiv 2306.03310 (AUC)",
+    missing="There are no targets, or a success on one while or after it is learned is missing.",
+)
+def area_under_curve_libero(rates: Rates) -> Array:
+    """Success on a target from when it is learned to the end, compared with nothing.
+
+    The points and the checkpoint differ from LIBERO's as in `forward_transfer_libero`.
+    """
+    later = _later(rates)
+    known = np.where(later > 0, _matrix(rates), 0).sum(axis=-2)
+    return average((_own_curves(rates) + known) / (later.sum(axis=0) + 1))
+
+
+# ---- other tasks -------------------------------------------------------------------------------------------
+
+
+@metric(
+    formula="mean over the held-out tasks s of R[K][s] - R[0][s]",
+    source="clbench; the change of ZS of arXiv 2603.11653",
+    missing="There are no held-out tasks or no targets, or a success on a held-out task is missing.",
+    low=-1.0,
+)
+def zero_shot_change(rates: Rates) -> Array:
+    """What learning the targets gave, or took, on tasks that were never trained."""
+    change = rates.held_out[..., -1, :] - rates.held_out[..., 0, :]
+    return average(change if rates.layout.target else change[..., :0])
+
+
+@metric(
+    formula="mean over the retained skills of the lowest success at any evaluation point of any stage from 1",
+    source="clbench; min-ACC of De Lange et al. 2023, arXiv 2205.13452, with the retained skills as the "
+    "earlier tasks",
+    missing="There are no retained skills or no targets, or they were not evaluated at every point.",
+)
+def minimum_retention(rates: Rates) -> Array:
+    """The lowest success on a retained skill at any evaluation point, on the way included.
+
+    The lowest of several noisy rates is too low by a part of their noise, all the more since fewer episodes
+    are run on the way.
+    """
+    curves = rates.retained_curves
+    if not len(rates.layout.target):
+        return average(rates.retained[..., 0, :0])
+    return average(curves.min(axis=(-3, -2)))

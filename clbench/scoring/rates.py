@@ -1,0 +1,115 @@
+"""Success rates, the input of every metric."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from clbench.base.errors import InputError
+from clbench.scoring.layout import Array, Layout
+
+# ---- rates -------------------------------------------------------------------------------------------------
+
+
+_ARRAYS = (
+    "success",
+    "curves",
+    "perturbed",
+    "validation",
+    "asked",
+    "correct",
+    "answer_curves",
+    "update_sparsity",
+    "activation_drift",
+)
+"""Fields of `Rates` that are arrays."""
+
+
+@dataclass(frozen=True, eq=False)
+class Rates:
+    """Success rates, the input of every metric: arrays with any batch axes in front, NaN where missing."""
+
+    layout: Layout
+    """What the axes stand for."""
+    success: Array
+    """Success rate at the end of each stage, (..., stages + 1, tasks)."""
+    curves: Array
+    """Success rate at the points of each stage, (..., targets, points, tasks); the last one is its end."""
+    perturbed: Array
+    """Success rate on the retained skills in perturbed episodes, (..., stages + 1, retained)."""
+    validation: Array
+    """Success rate on target k over validation episodes at the points of stage k, (..., targets, points)."""
+    asked: Array
+    """Questions asked at the end of each stage, (..., stages + 1, kinds)."""
+    correct: Array
+    """Questions answered rightly, (..., stages + 1, kinds)."""
+    answer_curves: Array
+    """Share of all questions answered rightly at the points of each stage, (..., targets, points)."""
+    update_sparsity: Array
+    """Share of the parameters that have hardly changed since pretraining, (..., targets, points)."""
+    activation_drift: Array
+    """Distance of the hidden states from those of the pretrained policy, (..., targets, points)."""
+    references: Mapping[str, Rates] = field(default_factory=dict)
+    """Rates of reference methods with the same seeds, by the method's name."""
+
+    @property
+    def retained(self) -> Array:
+        """Success rate on the retained skills, (..., stages + 1, retained)."""
+        return self.success[..., self.layout.columns("retained")]
+
+    @property
+    def target(self) -> Array:
+        """Success rate on the targets, (..., stages + 1, targets)."""
+        return self.success[..., self.layout.columns("target")]
+
+    @property
+    def held_out(self) -> Array:
+        """Success rate on the held-out tasks, (..., stages + 1, held out)."""
+        return self.success[..., self.layout.columns("held_out")]
+
+    @property
+    def learned(self) -> Array:
+        """Success rate on target k at the end of stage k, (..., targets)."""
+        return np.diagonal(self.target[..., 1:, :], axis1=-2, axis2=-1)
+
+    @property
+    def learning_curves(self) -> Array:
+        """Success rate on target k at the points of stage k, (..., targets, points)."""
+        curves = self.curves[..., self.layout.columns("target")]
+        return np.swapaxes(np.diagonal(curves, axis1=-3, axis2=-1), -1, -2)
+
+    @property
+    def retained_curves(self) -> Array:
+        """Success rate on the retained skills at each point, (..., targets, points, retained)."""
+        return self.curves[..., self.layout.columns("retained")]
+
+    def each(self, change: Callable[[Array], Array]) -> Rates:
+        """Return rates whose arrays, those of the references included, went through `change`."""
+        changed: dict[str, Any] = {name: change(getattr(self, name)) for name in _ARRAYS}
+        references = {name: rates.each(change) for name, rates in self.references.items()}
+        return replace(self, references=references, **changed)
+
+    def mean_over_runs(self) -> Rates:
+        """Return rates averaged over the last batch axis, that of the runs: (..., runs) becomes (...)."""
+        # counted from the front: behind the batch axes some arrays have two axes and some have three
+        axis = self.success.ndim - 3
+        return self.each(lambda array: np.mean(array, axis=axis))
+
+
+def combine(rates: Sequence[Rates], join: Callable[[Sequence[Array]], Array]) -> Rates:
+    """Return rates whose arrays are those of `rates`, put together by `join`; references stay behind.
+
+    Raises:
+        ValueError: The layouts differ.
+    """
+    _check_same(part.layout for part in rates)
+    joined: dict[str, Any] = {name: join([getattr(part, name) for part in rates]) for name in _ARRAYS}
+    return Rates(rates[0].layout, **joined)
+
+
+def _check_same(layouts: Iterable[Layout]) -> None:
+    if len(set(layouts)) != 1:
+        raise InputError("Runs with different tasks, episodes, evaluation points or questions do not mix.")

@@ -1,0 +1,1 @@
+"""Specifications as data: tasks, scenarios, budgets and the evaluation protocol."""

@@ -1,0 +1,144 @@
+"""Names that strangers choose: what they may look like, and that none is taken for one of ours.
+
+A name becomes a folder and a cell of a table. It is made of ASCII letters, digits and underscores, with
+single dashes and dots between them where these are allowed: it cannot leave its folder, hide in a listing, or
+be written with the letters of another alphabet.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+from functools import cache
+from importlib.metadata import EntryPoint, entry_points
+
+from clbench.base.errors import InputError
+from clbench.base.strict_json import quoted
+
+LONGEST = 100
+"""Characters of a name."""
+
+LONGEST_LABEL = 200
+"""Characters of a method with its changed settings: file systems allow 255."""
+
+_IDENTIFIER = r"[A-Za-z_]\w*"
+_WORD = r"[A-Za-z0-9]\w*(?:[.-]\w+)*"
+_SCENARIO = re.compile(rf"[A-Za-z]\w*(?:-\w+)*/{_WORD}-v\d{{1,4}}", re.ASCII)
+_METHOD = re.compile(
+    rf"(?:{_WORD}/)?[A-Za-z]\w*(?:-\w+)*|{_IDENTIFIER}(?:\.{_IDENTIFIER})*:{_IDENTIFIER}", re.ASCII
+)
+_CHANGES = re.compile(rf"(?:\+{_IDENTIFIER}=[\w .,()\[\]'+-]*[\w)\]'])*", re.ASCII)
+_PLAIN = re.compile(r"\w+(?:[.-]\w+)*", re.ASCII)
+
+_RESERVED = {"con", "prn", "aux", "nul", *(f"{port}{n}" for port in ("com", "lpt") for n in range(10))}
+"""Devices of Windows, whatever follows a dot."""
+
+_ALIKE = str.maketrans("01i", "oll")
+
+
+def installed_methods() -> dict[str, EntryPoint]:
+    """Map names to entry points: ours as they are, those of other packages as "package/name"."""
+    found = {}
+    for entry in entry_points(group="clbench.methods"):
+        package = entry.dist.name if entry.dist is not None else "unknown"
+        found[entry.name if package == "clbench" else f"{package}/{entry.name}"] = entry
+    return found
+
+
+@cache
+def built_in_methods() -> dict[str, EntryPoint]:
+    """Return the methods that are part of clbench by name; nothing is imported."""
+    return {name: entry for name, entry in installed_methods().items() if "/" not in name}
+
+
+def check_scenario_id(scenario: str) -> None:
+    """Refuse what cannot be the id of a scenario.
+
+    Raises:
+        ValueError: It is not of the form "namespace/Name-v0", or looks like another that is registered.
+    """
+    if len(scenario) > LONGEST or not _SCENARIO.fullmatch(scenario):
+        raise InputError(
+            f"{quoted(scenario)} cannot be the id of a scenario: it must be of the form namespace/Name-v0."
+        )
+    _check_reserved(scenario.rpartition("/")[2])
+    _check_alike("scenario", scenario, scenario_ids())
+    _check_not_ours("scenario", scenario, scenario.partition("/")[0])
+
+
+def check_method_name(method: str) -> None:
+    """Refuse what cannot be the name of a method.
+
+    Raises:
+        ValueError: It is neither a name, "package/name" nor "module:Class", or looks like a built-in.
+    """
+    if len(method) > LONGEST or not _METHOD.fullmatch(method):
+        raise InputError(
+            f"{quoted(method)} cannot be the name of a method: it must be package/name or module:Class."
+        )
+    _check_reserved(method)
+    _check_alike("method", method, built_in_methods())
+    package = re.split("[/.:]", method)[0]
+    if package != method:
+        _check_not_ours("method", method, package)
+        if package == "clbench":
+            raise InputError(f"{quoted(method)} is no name of a method of clbench: these have one word.")
+
+
+def check_label(label: str) -> None:
+    """Refuse what cannot be a method with its changed settings, as "lora+rank=4".
+
+    Raises:
+        ValueError: It is not, it is too long for the name of a folder, or the method's name is refused.
+    """
+    method, plus, changes = label.partition("+")
+    check_method_name(method)
+    if len(label) > LONGEST_LABEL or not _CHANGES.fullmatch(plus + changes):
+        raise InputError(
+            f"{quoted(label)} cannot be the name of a folder: settings may have letters, digits, spaces and "
+            f".,()[]'+-, and all of it {LONGEST_LABEL} characters."
+        )
+
+
+def check_plain(kind: str, name: str) -> None:
+    """Refuse the name of a `kind` of thing, as of a task, that is more than letters, digits, _, - and dots.
+
+    Raises:
+        ValueError: It is.
+    """
+    if len(name) > LONGEST or not _PLAIN.fullmatch(name):
+        raise InputError(f"{quoted(name)} cannot be the name of a {kind}: letters, digits, _, - and . only.")
+
+
+def folder_name(name: str) -> str:
+    """Return a checked scenario id or label as the name of a folder; no two have the same."""
+    return name.removeprefix("clbench/").replace("/", "--").replace(":", ".")
+
+
+def _check_reserved(name: str) -> None:
+    if re.split("[.:]", name)[0].casefold() in _RESERVED:
+        raise InputError(f"{quoted(name)} is the name of a device on Windows.")
+
+
+def _check_alike(kind: str, name: str, ours: Iterable[str]) -> None:
+    """Refuse a name that is read as one of `ours` and is another."""
+    for other in ours:
+        if name != other and _folded(name) == _folded(other):
+            raise InputError(f"{quoted(name)} can be taken for the {kind} {other!r}.")
+
+
+def _check_not_ours(kind: str, name: str, package: str) -> None:
+    if package != "clbench" and _folded(package) == "clbench":
+        raise InputError(f"{quoted(name)} can be taken for a {kind} of clbench.")
+
+
+def _folded(name: str) -> str:
+    """Return a name without what is easily overlooked: case, punctuation, 0 for o, 1 and i for l."""
+    return "".join(filter(str.isalnum, name.casefold())).translate(_ALIKE)
+
+
+def scenario_ids() -> list[str]:
+    """Return the Gymnasium ids of all registered scenarios, sorted."""
+    import gymnasium
+
+    return sorted(name for name, spec in gymnasium.registry.items() if "scenario" in (spec.kwargs or {}))

@@ -1,0 +1,107 @@
+"""Registration: a scenario gets its Gymnasium id, by name alone: nothing of it is imported."""
+
+from __future__ import annotations
+
+import gymnasium
+from gymnasium.envs import registration
+
+from clbench.base.entry_points import import_module, resolve, unknown
+from clbench.base.errors import InputError, UnknownNameError
+from clbench.spec.identifiers import check_scenario_id, scenario_ids
+from clbench.spec.scenario import Scenario
+
+
+def register(scenario_id: str, entry_point: str) -> None:
+    """Register a scenario with Gymnasium, as one environment and as many side by side.
+
+    It is imported, and its parts are checked, when it is first used.
+
+    Args:
+        scenario_id: Of the form "namespace/Name-v0": a changed scenario is a new version.
+        entry_point: Where the `Scenario` is, as "module:attribute".
+
+    Raises:
+        ValueError: The id is of another form, can be taken for another scenario, is registered already for
+            another one, or is in our namespace; or the entry point is of another form.
+    """
+    check_scenario_id(scenario_id)
+    module, colon, attribute = entry_point.partition(":")
+    if not (colon and attribute.isidentifier() and all(map(str.isidentifier, module.split(".")))):
+        raise InputError(f"{entry_point!r} must be the place of a scenario, as 'package.module:SCENARIO'.")
+    if scenario_id.startswith("clbench/") and module.partition(".")[0] != "clbench":
+        raise InputError(f"{scenario_id!r} is in the namespace of clbench: choose your own.")
+    kwargs = {"scenario": entry_point}
+    known = gymnasium.registry.get(scenario_id)
+    if known is not None and known.kwargs != kwargs:
+        raise InputError(f"{scenario_id!r} is registered already, and not for {entry_point!r}.")
+    if known is None:
+        registration.register(
+            id=scenario_id,
+            entry_point="clbench.worlds.scenario_env:ScenarioEnv",
+            vector_entry_point="clbench.worlds.scenario_vector_env:ScenarioVectorEnv",
+            kwargs=kwargs,
+        )
+
+
+def load_scenario(scenario_id: str) -> Scenario:
+    """Return the scenario registered with Gymnasium under this id, ready to be used.
+
+    Raises:
+        LookupError: Nothing is registered under this id, what is registered is no scenario, or a package that
+            its tasks need is not installed; the message says how to get it.
+    """
+    scenario = registered_scenario(scenario_id)
+    scenario.require_packages()
+    return scenario
+
+
+def registered_scenario(scenario_id: str) -> Scenario:
+    """Return the scenario registered with Gymnasium under this id, as data: its packages may be missing.
+
+    Args:
+        scenario_id: Gymnasium id; "module:id" imports `module` first.
+
+    Raises:
+        LookupError: Nothing is registered under this id, or what is registered is no scenario.
+    """
+    import gymnasium
+
+    module, _, name = scenario_id.rpartition(":")
+    if module:
+        import_module(module, scenario_id)
+    if name not in gymnasium.registry or "scenario" not in (gymnasium.registry[name].kwargs or {}):
+        raise unknown("scenario", name, scenario_ids())
+    entry_point = gymnasium.registry[name].kwargs["scenario"]
+    scenario = scenario_at(entry_point)
+    if scenario.id != name:
+        raise UnknownNameError(f"{entry_point!r} is registered as {name!r}, but its id is {scenario.id!r}.")
+    return scenario
+
+
+def opened_scenario(scenario: Scenario | str, order: int = 0) -> Scenario:
+    """Return a scenario, or the one at an entry point, in an order of its targets and ready to be used.
+
+    Raises:
+        LookupError: There is none, or a package that its tasks need is not installed.
+        ValueError: There is no such order, or a word of the instructions is not in the vocabulary.
+    """
+    published = scenario_at(scenario) if isinstance(scenario, str) else scenario
+    published.require_packages()
+    return published.in_order(order)
+
+
+def scenario_at(entry_point: str) -> Scenario:
+    """Return the scenario at "module:attribute".
+
+    Raises:
+        LookupError: There is none.
+        ValueError: A word of its instructions is not in the vocabulary.
+    """
+    from clbench.spec.language import word_ids
+
+    scenario = resolve(entry_point)
+    if not isinstance(scenario, Scenario):
+        raise UnknownNameError(f"{entry_point!r} is no Scenario but a {type(scenario).__name__}.")
+    for task in scenario.tasks:
+        word_ids(task.instructions)
+    return scenario

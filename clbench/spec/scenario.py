@@ -1,0 +1,129 @@
+"""Scenarios: a sequence of tasks with its budget, as data."""
+
+from __future__ import annotations
+
+import math
+import random
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Literal
+
+from clbench.base.dependencies import require_packages
+from clbench.base.entry_points import unknown
+from clbench.base.errors import InputError
+from clbench.spec.budget import Budget
+from clbench.spec.limits import Limits
+from clbench.spec.task import Task
+
+Group = Literal["retained", "target", "held_out"]
+
+MOST_ORDERS = 99
+"""Orders of the targets besides the published one, where there are as many: a number in a stranger's record
+must not keep a reader busy."""
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """A named, versioned sequence of tasks with its budget: skills to keep, then tasks to learn in order."""
+
+    id: str
+    """Gymnasium id, as "clbench/Fetch-v0"."""
+    description: str
+    """One sentence for lists."""
+    retained: tuple[Task, ...]
+    """Skills that the policy is pretrained on and that are never trained again; there may be none."""
+    target: tuple[Task, ...]
+    """Tasks that are learned, in this order."""
+    held_out: tuple[Task, ...]
+    """Tasks that are never trained."""
+    questions: str
+    """Entry point of a tuple of `QuestionKind`: what can be asked about a state."""
+    scenes: tuple[Task, ...] = ()
+    """Tasks whose expert episodes' states the questions ask about, where these are not the retained ones."""
+    budget: Budget = field(default_factory=Budget)
+    """What every method gets."""
+    limits: Limits = field(default_factory=Limits)
+    """What the process of a submitted run may take."""
+
+    def __post_init__(self) -> None:
+        names = [task.name for task in self.tasks]
+        for name in names:
+            if names.count(name) > 1:
+                raise InputError(f"{self.id}: two tasks are called {name!r}.")
+        cameras = {task.camera or "none" for task in self.tasks + self.scenes}
+        if len(cameras) > 1:
+            raise InputError(f"{self.id}: all tasks must have the same camera, not {sorted(cameras)}.")
+
+    @cached_property
+    def tasks(self) -> tuple[Task, ...]:
+        """All tasks: retained, then target, then held out. Columns of every score table follow this order."""
+        return self.retained + self.target + self.held_out
+
+    @property
+    def scene_tasks(self) -> tuple[Task, ...]:
+        """The tasks whose expert episodes' states the questions ask about."""
+        return self.scenes or self.retained
+
+    def require_packages(self) -> None:
+        """Refuse to go on without the packages of its tasks.
+
+        Raises:
+            LookupError: One is not installed; the message says how to get it.
+        """
+        require_packages({package for task in self.tasks for package in task.packages}, self.id)
+
+    def in_order(self, order: int) -> Scenario:
+        """Return the scenario with its targets in another order, see `target_order`; 0 is the published one.
+
+        All else is the same: pretrained policy, demonstrations, questions and the episodes' initial states.
+
+        Raises:
+            ValueError: There is no such order.
+        """
+        try:
+            places = target_order(len(self.target), order)
+        except ValueError as error:
+            raise InputError(f"{self.id}: {error}") from error
+        return replace(self, target=tuple(self.target[place] for place in places)) if order else self
+
+    def group(self, task: str) -> Group:
+        """Return which part of the scenario the task belongs to."""
+        for group in ("retained", "target", "held_out"):
+            if any(task == member.name for member in getattr(self, group)):
+                return group
+        raise self._unknown(task)
+
+    def task(self, name: str) -> Task:
+        """Return the task called `name`.
+
+        Raises:
+            LookupError: No task has this name; the nearest one is named.
+        """
+        for task in self.tasks:
+            if task.name == name:
+                return task
+        raise self._unknown(name)
+
+    def _unknown(self, name: str) -> LookupError:
+        return unknown(f"task of {self.id}", name, (task.name for task in self.tasks))
+
+
+def target_order(count: int, order: int) -> tuple[int, ...]:
+    """Return which of `count` targets, by their published places from 0, is learned in each stage.
+
+    Order 0 is the published one. The others are different permutations, drawn at random once and for all.
+
+    Raises:
+        ValueError: There is no such order.
+    """
+    # the factorial of a stranger's list of targets may have millions of digits; that of 5 exceeds the limit
+    last = min(math.factorial(min(count, 5)) - 1, MOST_ORDERS)
+    if not 0 <= order <= last:
+        orders = f"orders 0 to {last}" if last else "order 0 alone"
+        raise InputError(f"{count} targets have {orders}, not {order}.")
+    generator = random.Random(0)  # of all generators, its random() is the one that may never change
+    found = {tuple(range(count)): None}
+    while len(found) <= order:
+        draws = [generator.random() for _ in range(count)]
+        found[tuple(sorted(range(count), key=draws.__getitem__))] = None
+    return list(found)[order]

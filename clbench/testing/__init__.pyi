@@ -1,0 +1,10 @@
+from .contract import Check as Check
+from .contract import check_method as check_method
+from .contract import method_checks as method_checks
+from .error import ContractError as ContractError
+from .scenario import ScenarioError as ScenarioError
+from .scenario import check_scenario as check_scenario
+from .toy import TOY as TOY
+from .toy import TOY_QUESTIONS as TOY_QUESTIONS
+from .toy import ToyWorld as ToyWorld
+from .toy import toy_expert as toy_expert

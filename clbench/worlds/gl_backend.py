@@ -1,0 +1,99 @@
+"""Rendering: which back end of MuJoCo draws here, without a screen."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Iterable
+
+from clbench.base.errors import ClbenchError
+
+DEBIAN_PACKAGES = {"egl": "libegl1 libgl1-mesa-dri", "osmesa": "libosmesa6"}
+"""What makes each headless back end of MuJoCo work on Debian and Ubuntu."""
+
+_BACK_ENDS = tuple(DEBIAN_PACKAGES) if sys.platform == "linux" else ("glfw",)
+"""What is tried, in this order. EGL draws a Fetch world in 0.03 s on one core, OSMesa in 0.14 s."""
+
+_DRAW = """
+import sys
+from clbench.spec.task import resolve
+world = resolve(sys.argv[1])(render_mode="rgb_array")
+world.reset(seed=0)
+world.render().shape
+world.close()
+"""
+
+_MAKE_CONTEXT = "import mujoco; mujoco.GLContext(8, 8).make_current()"
+
+
+class RenderingError(ClbenchError):
+    """Nothing here can draw a world."""
+
+
+def rendering_fault(back_end: str, world: str | None = None) -> str | None:
+    """Return why a back end cannot draw, or None if it can.
+
+    It is tried in a process of its own, as a failure may kill it.
+
+    Args:
+        back_end: What the variable `MUJOCO_GL` is set to.
+        world: Entry point of an environment; if None, MuJoCo only makes ready to draw.
+    """
+    command = [sys.executable, "-c", *((_MAKE_CONTEXT,) if world is None else (_DRAW, world))]
+    try:
+        result = subprocess.run(
+            command, env=environment_of(back_end), capture_output=True, text=True, timeout=120, check=False
+        )
+    except subprocess.TimeoutExpired:
+        return "no answer in two minutes"
+    if result.returncode == 0:
+        return None
+    # what is said after the error comes from half-made objects that are taken down
+    lines = result.stderr.partition("Exception ignored")[0].strip().splitlines()
+    return lines[-1] if lines else f"exit code {result.returncode}"
+
+
+def environment_of(back_end: str) -> dict[str, str]:
+    """Return the variables of a process that draws with a back end, and finds what this one can import."""
+    path = os.pathsep.join(entry for entry in sys.path if entry)
+    return {**os.environ, "MUJOCO_GL": back_end, "PYTHONPATH": path}
+
+
+def choose_back_end(worlds: Iterable[str]) -> str:
+    """Set `MUJOCO_GL` to the first back end that draws all worlds, and return it.
+
+    It must happen before MuJoCo is imported.
+
+    Args:
+        worlds: Entry points of environments.
+
+    Raises:
+        RenderingError: None of them does; the message says what to install.
+    """
+    back_end = working_back_end(worlds, os.environ.get("MUJOCO_GL"))
+    os.environ["MUJOCO_GL"] = back_end
+    return back_end
+
+
+def working_back_end(worlds: Iterable[str], chosen: str | None) -> str:
+    """Return the first back end that draws all worlds: EGL or OSMesa, GLFW where there is no Linux.
+
+    Args:
+        worlds: Entry points of environments.
+        chosen: What the user has set `MUJOCO_GL` to, if he has: it is obeyed.
+
+    Raises:
+        RenderingError: None of them does; the message says what to install.
+    """
+    faults = []
+    for back_end in (chosen,) if chosen else _BACK_ENDS:
+        found = [fault for world in sorted(set(worlds)) if (fault := rendering_fault(back_end, world))]
+        if not found:
+            return back_end
+        faults.append(f"{back_end} ({found[0]})")
+    message = f"The worlds cannot be drawn with {' or '.join(faults)}."
+    if chosen:
+        raise RenderingError(f"{message} MUJOCO_GL is set to {chosen}: unset it, and what works is chosen.")
+    commands = " or ".join(f"apt-get install {packages}" for packages in DEBIAN_PACKAGES.values())
+    raise RenderingError(f"{message} On Debian and Ubuntu: {commands}")

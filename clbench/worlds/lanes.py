@@ -1,0 +1,217 @@
+"""Worlds: one episode in a Gymnasium environment, or many side by side in the lanes of a vector world."""
+
+from __future__ import annotations
+
+import functools
+import inspect
+from collections.abc import Callable, Iterable, Iterator, Sequence
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from clbench.base.entry_points import resolve
+from clbench.base.errors import InputError
+from clbench.spec.task import Task
+from clbench.worlds.camera import VIEW_SIZE, Images
+from clbench.worlds.observation import Observer
+from clbench.worlds.perturbation import draw_perturbation
+from clbench.worlds.world import Outcomes, States, VectorWorld, World
+
+
+class PlainVectorWorld:
+    """The vector world of a suite that has no own: a plain world in each lane, one stepped after the other.
+
+    Args:
+        make: Makes a world.
+        lanes: Places for episodes; a world is made when its lane is first reset.
+    """
+
+    def __init__(self, make: Callable[[], World], lanes: int) -> None:
+        first = make()
+        assert isinstance(first.observation_space, spaces.Box)
+        assert isinstance(first.action_space, spaces.Box)
+        self.single_observation_space, self.single_action_space = (
+            first.observation_space,
+            first.action_space,
+        )
+        self._make = make
+        self._worlds: list[World | None] = [first, *[None] * (lanes - 1)]
+
+    def reset(self, lanes: Sequence[int], seeds: Sequence[int], tasks: Sequence[str]) -> States:
+        """Start an episode of a task in each of `lanes`, and return the states."""
+        states = []
+        for lane, seed, task in zip(lanes, seeds, tasks, strict=True):
+            world = self._worlds[lane] or self._make()
+            self._worlds[lane] = world
+            states.append(world.reset(seed=seed, options={"task": task})[0])
+        return np.stack(states)
+
+    def step(self, lanes: Sequence[int], actions: NDArray[np.float32]) -> Outcomes:
+        """Move each of `lanes`, none twice, by its row of actions (N, A)."""
+        outcomes = []
+        for lane, action in zip(lanes, actions, strict=True):
+            world = self._worlds[lane]
+            if world is None:
+                raise gymnasium.error.ResetNeeded(f"Lane {lane} has no episode: reset it.")
+            outcomes.append(world.step(action)[:3])
+        states, rewards, successes = zip(*outcomes, strict=True)
+        return np.stack(states), np.array(rewards, np.float64), np.array(successes, np.bool_)
+
+    def close(self) -> None:
+        """Close all worlds."""
+        for world in self._worlds:
+            if world is not None:
+                world.close()
+
+
+def vector_world(entry_point: str, lanes: int, threads: int = 1, perturbed: bool = False) -> VectorWorld:
+    """Return a vector world of the world that `entry_point` names: the suite's own if it has one.
+
+    Args:
+        entry_point: Of the world.
+        lanes: Places for episodes.
+        threads: Threads that a suite's own vector world may use.
+        perturbed: Whether its episodes are perturbed, which not every world's can be: `check_perturbable`.
+    """
+    world = resolve(entry_point)
+    disturbed = {"perturbed": True} if perturbed else {}
+    own: Callable[..., VectorWorld] | None = getattr(world, "vector_world", None)
+    if own is None:
+        return PlainVectorWorld(functools.partial(world, **disturbed), lanes)
+    return own(lanes, threads, **disturbed)
+
+
+def check_perturbable(tasks: Iterable[Task]) -> None:
+    """Refuse tasks whose worlds cannot be perturbed.
+
+    Raises:
+        ValueError: The world of a task takes no `perturbed`; the message says what to do.
+    """
+    for task in tasks:
+        world = resolve(task.world)
+        own = getattr(world, "vector_world", None)
+        if "perturbed" not in inspect.signature(own or world).parameters:
+            what = f"the vector world of {task.world}" if own else task.world
+            raise InputError(
+                f"The task {task.name!r} cannot be perturbed: {what} takes no argument `perturbed`. Run "
+                "without --perturb, or give it one, as docs/guide/your_scenario.md shows."
+            )
+
+
+class Lanes:
+    """Places for episodes of any tasks: each runs in the vector world of its task.
+
+    Args:
+        count: How many; they are numbered from 0.
+        threads: Threads that a suite's own vector world may use.
+    """
+
+    def __init__(self, count: int, threads: int = 1) -> None:
+        self._count, self._threads = count, threads
+        self._worlds: dict[tuple[str, bool], VectorWorld] = {}
+        self._observers: dict[tuple[str, str] | None, Observer] = {}
+        self._home: list[VectorWorld | None] = [None] * count
+        self._views = np.zeros((count, VIEW_SIZE), np.float32)
+
+    def world(self, task: Task, perturbed: bool = False) -> VectorWorld:
+        """Return the vector world of a task, or its perturbed twin; it is made when first needed."""
+        key = task.world, perturbed
+        if key not in self._worlds:
+            self._worlds[key] = vector_world(task.world, self._count, self._threads, perturbed)
+        return self._worlds[key]
+
+    def observer(self, task: Task) -> Observer:
+        """Return what shows the states of a task to a policy; it is made when first needed."""
+        key = None if task.camera is None else (task.world, task.camera)
+        if key not in self._observers:
+            self._observers[key] = Observer(task.world, task.camera)
+        return self._observers[key]
+
+    def observe(self, lanes: Sequence[int], tasks: Sequence[Task], states: States) -> tuple[States, Images]:
+        """Return what a policy is shown of the states (N, S) of `lanes`: numbers (N, P) and pictures.
+
+        Args:
+            lanes: Whose states they are; in a perturbed episode camera and light are disturbed.
+            tasks: What each of them does.
+            states: What is shown.
+
+        Raises:
+            RenderingError: Nothing here can draw a world.
+        """
+        views = self._views[list(lanes)]
+        if len({(task.world, task.camera) if task.camera else None for task in tasks}) == 1:
+            return self.observer(tasks[0]).observe(states, views)
+        shown = [
+            self.observer(task).observe(state[None], view[None])
+            for task, state, view in zip(tasks, states, views, strict=True)
+        ]
+        numbers, images = zip(*shown, strict=True)
+        return np.concatenate(numbers), np.concatenate(images)
+
+    def reset(
+        self,
+        lanes: Sequence[int],
+        seeds: Sequence[int],
+        tasks: Sequence[Task],
+        perturbed: Sequence[bool] | None = None,
+    ) -> States:
+        """Start an episode of a task in each of `lanes`, and return the states (N, S).
+
+        Args:
+            lanes: Where to.
+            seeds: Of the initial states.
+            tasks: What to do.
+            perturbed: Which of the episodes are perturbed; none is if None.
+        """
+        disturbed = perturbed or [False] * len(tasks)
+        for lane, seed, task, is_disturbed in zip(lanes, seeds, tasks, disturbed, strict=True):
+            self._home[lane] = self.world(task, is_disturbed)
+            self._views[lane] = draw_perturbation(seed).view if is_disturbed else 0.0
+        states = self._empty(lanes)
+        for world, rows in self._by_world(lanes):
+            names = [tasks[row].name for row in rows]
+            states[rows] = world.reset([lanes[row] for row in rows], [seeds[row] for row in rows], names)
+        return states
+
+    def step(self, lanes: Sequence[int], actions: NDArray[np.float32]) -> Outcomes:
+        """Move each of `lanes`, none twice, by its row of actions (N, A)."""
+        states, rewards, successes = (
+            self._empty(lanes),
+            np.empty(len(lanes)),
+            np.empty(len(lanes), np.bool_),
+        )
+        if len(self._worlds) == 1:
+            (world,) = self._worlds.values()
+            states[:], rewards[:], successes[:] = world.step(lanes, actions)
+            return states, rewards, successes
+        for world, rows in self._by_world(lanes):
+            outcomes = world.step([lanes[row] for row in rows], actions[rows])
+            states[rows], rewards[rows], successes[rows] = outcomes
+        return states, rewards, successes
+
+    def close(self) -> None:
+        """Close all worlds."""
+        for world in self._worlds.values():
+            world.close()
+        for observer in self._observers.values():
+            observer.close()
+        self._worlds.clear()
+        self._observers.clear()
+        self._home = [None] * self._count
+
+    def _empty(self, lanes: Sequence[int]) -> States:
+        """Return memory for the states of `lanes`, all of which have an episode."""
+        homes = [self._home[lane] for lane in lanes]
+        if None in homes:
+            raise gymnasium.error.ResetNeeded(f"Lane {lanes[homes.index(None)]} has no episode: reset it.")
+        assert homes[0] is not None
+        return np.empty((len(lanes), *homes[0].single_observation_space.shape), np.float32)
+
+    def _by_world(self, lanes: Sequence[int]) -> Iterator[tuple[VectorWorld, list[int]]]:
+        """Return each world with the rows of `lanes` that are in it."""
+        for world in self._worlds.values():
+            rows = [row for row, lane in enumerate(lanes) if self._home[lane] is world]
+            if rows:
+                yield world, rows

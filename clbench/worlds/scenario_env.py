@@ -1,0 +1,139 @@
+"""The Gymnasium environment of a scenario: it schedules through the sequence of tasks."""
+
+from __future__ import annotations
+
+import time
+from copy import copy
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from clbench.base.entry_points import resolve
+from clbench.spec.registry import opened_scenario
+from clbench.spec.scenario import Scenario
+from clbench.spec.task import Task
+from clbench.worlds.observation import Observer
+from clbench.worlds.schedule import InstructionFormat, Schedule, Start
+from clbench.worlds.world import World
+
+Observation = dict[str, Any]
+
+
+class ScenarioEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
+    """A sequence of tasks as one environment.
+
+    `reset()` begins the next episode of the schedule: `episodes_per_stage` episodes of stage 0, in which the
+    retained tasks take turns, if there are any, then as many of each target task; the last target goes on for
+    ever.
+    `reset(seed=...)` begins the schedule anew. `reset(options={"stage": k})` goes on from the start of a stage,
+    and `reset(options={"task": name})` chooses any task for one episode.
+
+    Observation: a dictionary of `state`, float32 (S,), as the task's world gives it, and `instruction`, text,
+    or with `instruction="tokens"` the word ids, int64 (L,), for agents that want numbers. Where the task has
+    a camera, `state` is what it leaves of the numbers, and `image`, uint8 (N, N, 3), what it sees.
+    Reward: the task's dense reward. An episode is terminated by success and truncated at the task's horizon.
+    Info: `task`, `stage`, `instruction`, `success`.
+
+    Args:
+        scenario: The sequence, or its entry point "module:attribute".
+        instruction: How the observation gives the instruction.
+        episodes_per_stage: Episodes after which `reset()` goes on to the next stage.
+        stage: The stage to stay in, for an agent that is trained stage by stage; all of them if None.
+        order: In which order the targets come, as `Scenario.in_order` says; 0 is the published one.
+        render_mode: "rgb_array" or None; handed to the worlds.
+
+    Raises:
+        LookupError: A package that the tasks need is not installed; the message says how to get it.
+    """
+
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 25}  # noqa: RUF012
+
+    def __init__(
+        self,
+        scenario: Scenario | str,
+        instruction: InstructionFormat = "text",
+        episodes_per_stage: int = 100,
+        stage: int | None = None,
+        order: int = 0,
+        render_mode: str | None = None,
+    ) -> None:
+        self.scenario = opened_scenario(scenario, order)
+        self.render_mode = render_mode
+        self.instruction: InstructionFormat = instruction
+        self.stage, self.order = stage, order
+        self.steps_taken = 0
+        """Steps since it was made."""
+        self.begun_at: float | None = None
+        """When the first episode began, by `time.perf_counter`."""
+        self._schedule = Schedule(self.scenario, episodes_per_stage, instruction, stage)
+        self._worlds: dict[str, World] = {}
+        self._observers: dict[str, Observer] = {}
+        self._begun: Start | None = None
+        self._steps = 0
+        task = self.scenario.tasks[0]
+        world = self._world(task)
+        assert isinstance(world.observation_space, spaces.Box)
+        self.action_space = world.action_space
+        shown = self._observers[task.world].spaces(world.observation_space)
+        self.observation_space = spaces.Dict({**shown, "instruction": self._schedule.instruction_space})
+
+    def _world(self, task: Task) -> World:
+        """Return the world of a task; each is made when first needed."""
+        if task.world not in self._worlds:
+            self._worlds[task.world] = resolve(task.world)(render_mode=self.render_mode)
+            self._observers[task.world] = Observer(task.world, task.camera)
+        return self._worlds[task.world]
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observation, dict[str, Any]]:
+        """Begin an episode; see the class for what `seed` and `options` choose.
+
+        Raises:
+            LookupError: The scenario has no such task.
+            ValueError: It has no such stage, or an option is unknown.
+        """
+        super().reset(seed=seed)
+        self.begun_at = self.begun_at or time.perf_counter()
+        if seed is not None:
+            self._schedule.begin()
+        self._begun = start = self._schedule.next(self.np_random, options or {})
+        self._steps = 0
+        state, _ = self._world(start.task).reset(seed=start.seed, options={"task": start.task.name})
+        return self._observation(state), start.info(False)
+
+    @property
+    def _start(self) -> Start:
+        """How the current episode began."""
+        if self._begun is None:
+            raise gymnasium.error.ResetNeeded(f"{self.scenario.id} has no episode yet: call reset().")
+        return self._begun
+
+    def step(self, action: NDArray[np.float32]) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+        """Take one step of the current task."""
+        state, reward, terminated, _, _ = self._world(self._start.task).step(action)
+        self._steps += 1
+        self.steps_taken += 1
+        truncated = not terminated and self._steps >= self._start.task.horizon
+        return self._observation(state), float(reward), terminated, truncated, self._start.info(terminated)
+
+    def _observation(self, state: NDArray[np.float32]) -> Observation:
+        shown, images = self._observers[self._start.task.world].observe(state[None])
+        image = {"image": images[0]} if images.size else {}
+        return {"state": shown[0], **image, "instruction": copy(self._start.observed_instruction)}
+
+    def render(self) -> Any:
+        """Return what the current world renders."""
+        return self._world(self._start.task).render()
+
+    def close(self) -> None:
+        """Close all worlds."""
+        for world in self._worlds.values():
+            world.close()
+        for observer in self._observers.values():
+            observer.close()
+        self._worlds.clear()
+        self._observers.clear()

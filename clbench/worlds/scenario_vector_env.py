@@ -1,0 +1,195 @@
+"""Many environments of a scenario side by side: what `gymnasium.make_vec` makes."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Sequence
+from copy import copy
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+from gymnasium.utils.seeding import np_random
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+from numpy.typing import NDArray
+
+from clbench.base.errors import InputError
+from clbench.spec.registry import opened_scenario
+from clbench.spec.scenario import Scenario
+from clbench.spec.task import Task
+from clbench.worlds.lanes import Lanes
+from clbench.worlds.scenario_env import Observation
+from clbench.worlds.schedule import InstructionFormat, Schedule, Start
+
+Flags = NDArray[np.bool_]
+Outcome = tuple[Observation, NDArray[np.float64], Flags, Flags, dict[str, Any]]
+
+
+class ScenarioVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]]):
+    """As many `ScenarioEnv` as asked for, each on its own schedule, stepped together by the suite's vector world.
+
+    It does bit for bit what a `gymnasium.vector.SyncVectorEnv` of them does: an environment whose episode has
+    ended begins the next one at the next step, which takes no notice of its action.
+
+    Args:
+        scenario: The sequence, or its entry point "module:attribute".
+        num_envs: How many environments.
+        instruction: How the observations give the instruction, "text" or "tokens".
+        episodes_per_stage: Episodes after which an environment goes on to the next stage.
+        stage: The stage to stay in, for an agent that is trained stage by stage; all of them if None.
+        order: In which order the targets come, as `Scenario.in_order` says; 0 is the published one.
+        threads: Threads that step the worlds, by default one for each core. Results do not depend on it.
+
+    Raises:
+        LookupError: A package that the tasks need is not installed; the message says how to get it.
+    """
+
+    metadata: dict[str, Any] = {"render_modes": [], "autoreset_mode": AutoresetMode.NEXT_STEP}  # noqa: RUF012
+
+    def __init__(
+        self,
+        scenario: Scenario | str,
+        num_envs: int = 1,
+        instruction: InstructionFormat = "text",
+        episodes_per_stage: int = 100,
+        stage: int | None = None,
+        order: int = 0,
+        threads: int | None = None,
+    ) -> None:
+        self.scenario = opened_scenario(scenario, order)
+        self.num_envs = num_envs
+        self.instruction: InstructionFormat = instruction
+        self.stage, self.order = stage, order
+        self.steps_taken = 0
+        """Steps since it was made, of all environments together."""
+        self.begun_at: float | None = None
+        """When the first episodes began, by `time.perf_counter`."""
+        self._schedules = [
+            Schedule(self.scenario, episodes_per_stage, instruction, stage) for _ in range(num_envs)
+        ]
+        self._generators: list[np.random.Generator] = [np_random()[0] for _ in range(num_envs)]
+        self._lanes = Lanes(num_envs, threads or os.cpu_count() or 1)
+        first = self.scenario.tasks[0]
+        world = self._lanes.world(first)
+        shown = self._lanes.observer(first).spaces(world.single_observation_space)
+        self.single_action_space = world.single_action_space
+        self.single_observation_space = spaces.Dict(
+            {**shown, "instruction": self._schedules[0].instruction_space}
+        )
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self._starts: list[Start] = []
+        self._tasks: list[Task] = []
+        self._everywhere = list(range(num_envs))
+        self._known = np.ones(num_envs, np.bool_)
+        self._instructions: tuple[str, ...] | NDArray[np.int64] = ()
+        self._told: dict[str, NDArray[Any]] = {}
+        self._states = np.zeros((num_envs, *world.single_observation_space.shape), np.float32)
+        self._steps_left = np.zeros(num_envs, np.int64)
+        self._ended = np.zeros(num_envs, np.bool_)
+
+    def reset(
+        self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observation, dict[str, Any]]:
+        """Begin an episode in every environment.
+
+        Args:
+            seed: A number, from which on the environments' seeds count up, or a seed or None for each.
+            options: As `ScenarioEnv` takes them, for all.
+
+        Raises:
+            LookupError: The scenario has no such task.
+            ValueError: It has no such stage, an option is unknown, or there are more or fewer seeds.
+        """
+        self.begun_at = self.begun_at or time.perf_counter()
+        seeds = self._seeds(seed)
+        for number, own in enumerate(seeds):
+            if own is not None:
+                self._generators[number], _ = np_random(own)
+                self._schedules[number].begin()
+        schedules = zip(self._schedules, self._generators, strict=True)
+        self._starts = [schedule.next(generator, options or {}) for schedule, generator in schedules]
+        self._begin(self._everywhere)
+        self._ended = np.zeros(self.num_envs, np.bool_)
+        return self._observation(), self._info(self._ended)
+
+    def _seeds(self, seed: int | Sequence[int | None] | None) -> Sequence[int | None]:
+        if seed is None:
+            return [None] * self.num_envs
+        if isinstance(seed, int):
+            return range(seed, seed + self.num_envs)
+        if len(seed) != self.num_envs:
+            raise InputError(f"{self.num_envs} environments need as many seeds, not {len(seed)}.")
+        return seed
+
+    def step(self, actions: NDArray[np.float32]) -> Outcome:
+        """Take one step in every environment; where the last one ended an episode, begin the next instead.
+
+        Raises:
+            ResetNeeded: There was no `reset` yet.
+        """
+        if not self._starts:
+            raise gymnasium.error.ResetNeeded(f"{self.scenario.id} has no episodes yet: call reset().")
+        if self._ended.any():
+            rewards, terminated = self._step_some(actions)
+        else:
+            self._states, rewards, terminated = self._lanes.step(self._everywhere, np.asarray(actions))
+            self._steps_left -= 1
+            self.steps_taken += self.num_envs
+        truncated = ~terminated & (self._steps_left <= 0)
+        self._ended = terminated | truncated
+        return self._observation(), rewards, terminated, truncated, self._info(terminated)
+
+    def _step_some(self, actions: NDArray[np.float32]) -> tuple[NDArray[np.float64], Flags]:
+        """Step where an episode goes on, begin the next one elsewhere; return rewards and successes."""
+        rewards, terminated = np.zeros(self.num_envs), np.zeros(self.num_envs, np.bool_)
+        beginning, going = np.flatnonzero(self._ended).tolist(), np.flatnonzero(~self._ended).tolist()
+        if going:
+            outcomes = self._lanes.step(going, np.asarray(actions)[going])
+            self._states[going], rewards[going], terminated[going] = outcomes
+            self._steps_left[going] -= 1
+            self.steps_taken += len(going)
+        for number in beginning:
+            self._starts[number] = self._schedules[number].next(self._generators[number], {})
+        self._begin(beginning)
+        return rewards, terminated
+
+    def close_extras(self) -> None:
+        """Close the worlds."""
+        self._lanes.close()
+
+    def _begin(self, numbers: Sequence[int]) -> None:
+        """Put the environments `numbers` at their starts."""
+        starts = [self._starts[number] for number in numbers]
+        tasks = [start.task for start in starts]
+        self._states[numbers] = self._lanes.reset(numbers, [start.seed for start in starts], tasks)
+        self._steps_left[numbers] = [task.horizon for task in tasks]
+        self._tell()
+
+    def _tell(self) -> None:
+        """Put together what is said of the present episodes at each of their steps."""
+        self._tasks = [start.task for start in self._starts]
+        instructions = [start.observed_instruction for start in self._starts]
+        self._instructions = tuple(instructions) if self.instruction == "text" else np.stack(instructions)
+        rows = [start.info(success=False) for start in self._starts]
+        self._told = {
+            name: np.array(
+                [row[name] for row in rows], dtype=object if isinstance(value, str) else type(value)
+            )
+            for name, value in rows[0].items()
+        }
+
+    def _observation(self) -> Observation:
+        state, image = self._lanes.observe(self._everywhere, self._tasks, self._states)
+        images = {"image": image} if image.size else {}
+        return {"state": state.copy(), **images, "instruction": copy(self._instructions)}
+
+    def _info(self, successes: Flags) -> dict[str, Any]:
+        """Return the infos as Gymnasium's vector environments do: a column of each, and where it is known."""
+        info: dict[str, Any] = {}
+        for name, column in {**self._told, "success": successes}.items():
+            info[name], info[f"_{name}"] = column.copy(), self._known.copy()
+        return info

@@ -1,0 +1,126 @@
+"""The schedule: which episode of a scenario comes next."""
+
+from __future__ import annotations
+
+import string
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from gymnasium import spaces
+
+from clbench.base.errors import InputError
+from clbench.spec.language import TEXT_LENGTH, VOCABULARY_SIZE, word_ids
+from clbench.spec.scenario import Scenario
+from clbench.spec.task import Task
+
+InstructionFormat = Literal["text", "tokens"]
+
+
+@dataclass(frozen=True)
+class Start:
+    """How an episode begins."""
+
+    task: Task
+    stage: int
+    """The stage that trains the task; 0 for retained and held-out tasks."""
+    instruction: str
+    """One of the task's wordings."""
+    observed_instruction: Any
+    """The same as the observation gives it: text, or word ids (L,)."""
+    seed: int
+    """Of the world."""
+
+    def info(self, success: bool) -> dict[str, Any]:
+        """Return what `step` and `reset` tell besides."""
+        return {
+            "task": self.task.name,
+            "stage": self.stage,
+            "instruction": self.instruction,
+            "success": success,
+        }
+
+
+class Schedule:
+    """The way of one environment through the stages of a scenario, as `ScenarioEnv` tells.
+
+    Args:
+        scenario: The sequence.
+        episodes_per_stage: Episodes after which the next stage begins.
+        instruction: How observations give the instruction.
+        stage: The stage that it never leaves; it goes through all of them if None.
+    """
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        episodes_per_stage: int,
+        instruction: InstructionFormat,
+        stage: int | None = None,
+    ) -> None:
+        if instruction not in ("text", "tokens"):
+            raise InputError(f'instruction must be "text" or "tokens", not {instruction!r}.')
+        if episodes_per_stage < 1:
+            raise InputError(f"episodes_per_stage must be at least 1, not {episodes_per_stage}.")
+        self._scenario, self._episodes_per_stage, self._format = scenario, episodes_per_stage, instruction
+        self._stage, self._episode = stage, -1
+        self._first = 0 if scenario.retained else 1
+        if stage is not None:
+            self._check_stage(stage)
+
+    @property
+    def instruction_space(self) -> spaces.Space[Any]:
+        """Of the observation's instruction."""
+        if self._format == "tokens":
+            return spaces.Box(0, VOCABULARY_SIZE - 1, (TEXT_LENGTH,), np.int64)
+        longest = max(len(words) for task in self._scenario.tasks for words in task.instructions)
+        return spaces.Text(max_length=longest, charset=string.ascii_lowercase + " ")
+
+    def begin(self) -> None:
+        """Go back to the first episode."""
+        self._episode = -1
+
+    def next(self, generator: np.random.Generator, options: Mapping[str, Any]) -> Start:
+        """Return the next episode, or the one that `options` choose.
+
+        Raises:
+            LookupError: The scenario has no such task.
+            ValueError: It has no such stage, or an option is unknown.
+        """
+        if set(options) - {"task", "stage"}:
+            raise InputError(f'Options of reset are "task" and "stage", not {sorted(options)}.')
+        task, stage = self._choose(options)
+        words = task.instructions[int(generator.integers(len(task.instructions)))]
+        return Start(task, stage, words, observed(words, self._format), int(generator.integers(2**31)))
+
+    def _choose(self, options: Mapping[str, Any]) -> tuple[Task, int]:
+        """Return task and stage of the next episode."""
+        scenario = self._scenario
+        if "task" in options:
+            task = scenario.task(options["task"])
+            return task, scenario.target.index(task) + 1 if task in scenario.target else 0
+        if "stage" in options:
+            self._check_stage(options["stage"])
+            self._episode = (options["stage"] - self._first) * self._episodes_per_stage
+        else:
+            self._episode += 1
+        stage = min(self._first + self._episode // self._episodes_per_stage, len(scenario.target))
+        stage = stage if self._stage is None else self._stage
+        retained = scenario.retained
+        return scenario.target[stage - 1] if stage else retained[self._episode % len(retained)], stage
+
+    def _check_stage(self, stage: Any) -> None:
+        """Refuse a stage that the scenario does not have, or that this schedule never comes to."""
+        last = len(self._scenario.target)
+        if stage not in range(self._first, last + 1):
+            raise InputError(f"{self._scenario.id} has stages {self._first} to {last}, not {stage!r}.")
+        if self._stage not in (None, stage):
+            raise InputError(
+                f"This environment stays in stage {self._stage}: make another for stage {stage}."
+            )
+
+
+def observed(words: str, form: InstructionFormat) -> Any:
+    """Return an instruction as observations give it: text, or word ids (L,)."""
+    return np.array(word_ids([words])[0]) if form == "tokens" else words

@@ -1,0 +1,96 @@
+"""Stable-Baselines3's SAC learns a scenario by trial, stage by stage, and leaves a record for the board.
+
+    python docs/guide/online_sac.py clbench/Fetch-v0 --seeds 3
+
+It is the plainest of baselines: SAC with its default settings goes on with each task where the last one left
+it, and its replay buffer is emptied at each stage, so that nothing but its weights remembers. Words are names
+and no amounts: their ids go through an embedding. A seed that has a record is skipped, one that was stopped
+begins anew.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import gymnasium
+import torch
+from gymnasium import spaces
+from stable_baselines3 import SAC
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+
+import clbench
+from clbench.records.paths import RECORDS
+from clbench.scoring.scores import Scores
+
+
+class StateAndWords(BaseFeaturesExtractor):
+    """The state, and the mean of the learned vectors of the instruction's words."""
+
+    def __init__(self, space: spaces.Dict, width: int = 16) -> None:
+        state, words = space["state"], space["instruction"]
+        assert isinstance(state, spaces.Box)
+        assert isinstance(words, spaces.Box)
+        super().__init__(space, state.shape[0] + width)
+        self.words = torch.nn.Embedding(int(words.high.max()) + 1, width, padding_idx=0)
+
+    def forward(self, observations: dict[str, torch.Tensor]) -> torch.Tensor:
+        """Return the features (B, S + width)."""
+        ids = observations["instruction"].long()
+        words = self.words(ids).sum(dim=1) / (ids > 0).sum(dim=1, keepdim=True)
+        return torch.cat([observations["state"], words], dim=1)
+
+
+def learn(scenario: str, seed: int, steps: int, records: Path) -> None:
+    """Train one agent through all stages, and evaluate it after each."""
+    targets = len(clbench.load_scenario(scenario).target)
+    if clbench.next_stage(scenario, method="sac", seed=seed, records=records) > targets:
+        print(f"seed {seed} has a record already")
+        return
+    settings = {"steps_per_stage": steps, "replay_buffer": "emptied at each stage", "words": "embedded"}
+    agent: SAC | None = None
+    for stage in range(targets + 1):
+        env = gymnasium.make(scenario, instruction="tokens", stage=stage)
+        if agent is None:
+            features = {"features_extractor_class": StateAndWords}
+            agent = SAC(
+                "MultiInputPolicy",
+                env,
+                seed=100 * seed,
+                policy_kwargs=features,
+                buffer_size=steps,
+                device="cpu",
+            )
+        agent.set_env(env)
+        agent.set_random_seed(100 * seed + stage)
+        assert agent.replay_buffer is not None
+        agent.replay_buffer.reset()
+        agent.learn(steps)
+        record = clbench.evaluate_agent(
+            agent, env, method="sac", seed=seed, settings=settings, records=records
+        )
+        env.close()
+        success = Scores.from_record(record).success[stage].mean(axis=-1)
+        tasks = Scores.from_record(record).layout.tasks
+        told = ", ".join(f"{task} {rate:.2f}" for task, rate in zip(tasks, success, strict=True))
+        print(f"seed {seed}, stage {stage}: {told}", flush=True)
+
+
+def main() -> None:
+    """Train the agents that have no record yet, one after the other."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("scenario", help="Gymnasium id of the scenario, as clbench/Fetch-v0")
+    parser.add_argument("--seeds", type=int, default=3, help="how many seeds")
+    parser.add_argument("--first-seed", type=int, default=0, help="the first of them")
+    parser.add_argument("--steps", type=int, default=6000, help="environment steps of a stage")
+    parser.add_argument("--records", type=Path, default=RECORDS, help="folder of the records")
+    wanted = parser.parse_args()
+    torch.set_num_threads(1)  # small networks: more threads gain nothing, and may add up in another order
+    for seed in range(wanted.first_seed, wanted.first_seed + wanted.seeds):
+        learn(wanted.scenario, seed, wanted.steps, wanted.records)
+
+
+if __name__ == "__main__":
+    main()

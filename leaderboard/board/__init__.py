@@ -1,0 +1,1 @@
+"""The board: which records may be compared, and the rows that they make."""

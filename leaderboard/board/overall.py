@@ -1,0 +1,70 @@
+"""The table over scenarios: for each method that has a row in all of them, the mean of its values."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+from clbench.scoring.intervals import Estimate
+from clbench.scoring.metrics import METRICS
+
+from .rows import RANKED_BY, Row
+from .runs import DIVISIONS
+
+
+@dataclass(frozen=True)
+class OverallRow:
+    """One method over all scenarios."""
+
+    method: str
+    """Name or "module:Class"."""
+    division: str
+    """One of `DIVISIONS`."""
+    ranks: tuple[int | None, ...]
+    """Its rank in each scenario, by the scenario's id."""
+    estimates: Mapping[str, Estimate]
+    """Mean over scenarios and interval of every metric."""
+
+
+def overall(rows: Iterable[Row]) -> tuple[OverallRow, ...]:
+    """Return a row for each method that has one in every scenario, by division and falling final average.
+
+    There is none if there is only one scenario.
+    """
+    by_method: dict[tuple[str, str], dict[str, Row]] = {}
+    for row in rows:
+        by_method.setdefault((row.division, row.method), {})[row.scenario] = row
+    scenarios = {scenario for found in by_method.values() for scenario in found}
+    if len(scenarios) < 2:
+        return ()
+    whole = [_overall_row(found) for found in by_method.values() if set(found) == scenarios]
+    return tuple(sorted(whole, key=_place))
+
+
+def _place(row: OverallRow) -> tuple[int, float, str]:
+    value = row.estimates[RANKED_BY].value
+    return DIVISIONS.index(row.division), math.inf if value is None else -value, row.method
+
+
+def _overall_row(found: Mapping[str, Row]) -> OverallRow:
+    rows = [row for _, row in sorted(found.items())]
+    estimates = {name: mean_estimate([row.estimates[name] for row in rows]) for name in METRICS}
+    return OverallRow(rows[0].method, rows[0].division, tuple(row.rank for row in rows), estimates)
+
+
+def mean_estimate(parts: Sequence[Estimate]) -> Estimate:
+    """Return the mean of independent estimates; a missing one leaves none.
+
+    The interval is recovered from those of the parts, whose distances from their values add up in squares:
+    Zou and Donner 2008, doi 10.1002/sim.3095 (MOVER). Scenarios share neither policies nor episodes.
+    """
+    values = [one.value for one in parts if one.value is not None]
+    if not values or len(values) < len(parts):
+        return Estimate(None, None, None)
+    mean = math.fsum(values) / len(values)
+    low = [one.value - one.low for one in parts if one.value is not None and one.low is not None]
+    high = [one.high - one.value for one in parts if one.value is not None and one.high is not None]
+    if len(low) < len(parts) or len(high) < len(parts):
+        return Estimate(mean, None, None)
+    return Estimate(mean, mean - math.hypot(*low) / len(parts), mean + math.hypot(*high) / len(parts))

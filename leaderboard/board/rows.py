@@ -1,0 +1,185 @@
+"""Rows: what the leaderboard says of each method, in the order that it shows them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from itertools import groupby
+from pathlib import Path
+from typing import Any
+
+from clbench.scoring.intervals import Estimate, Runs, estimate, row_generator
+from clbench.scoring.metrics import METRICS
+from clbench.scoring.ranks import tie_groups
+
+from .costs import COSTS, costs_of, read_step_times, step_time_of
+from .orders import Orders, orders_of
+from .runs import ALIKE, DIVISIONS, NotShown, Run, Sifted, no_row, read_run, read_runs
+from .tiers import TIERS
+
+RANKED_BY = "final_average"
+"""Metric that rows are sorted and ranked by."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """One method on one scenario."""
+
+    scenario: str
+    """Gymnasium id."""
+    method: str
+    """Name or "module:Class"."""
+    division: str
+    """One of `DIVISIONS`."""
+    rank: int | None
+    """Place inside its scenario and division, shared by rows that cannot be told apart. None for a reference,
+    which does not compete, and for a row without a final average."""
+    runs: tuple[Run, ...]
+    """Its runs by rising seed, with the targets in the published order: all but `orders` is of these."""
+    tier: str
+    """The least of `TIERS` that its runs have: how far anyone but the submitter has checked them."""
+    estimates: Mapping[str, Estimate]
+    """Value and interval of every metric."""
+    costs: Mapping[str, float | None]
+    """Mean over seeds by column of the table."""
+    orders: Orders
+    """What came of it with the targets in this and in other orders."""
+
+    @property
+    def seeds(self) -> tuple[int, ...]:
+        """Seeds of its runs."""
+        return tuple(run.seed for run in self.runs)
+
+    @property
+    def scores(self) -> Runs:
+        """Scores of its runs by seed."""
+        return _scores(self.runs)
+
+
+@dataclass(frozen=True)
+class Table:
+    """All that the leaderboard shows."""
+
+    scenarios: Mapping[str, Mapping[str, Any]]
+    """What the rows of each scenario have in common: `Record.scenario`."""
+    rows: tuple[Row, ...]
+    """By scenario, division and falling final average."""
+    not_shown: tuple[NotShown, ...]
+    """By path."""
+
+
+def read_table(records: Path) -> Table:
+    """Return the table of the records anywhere below the folder `records`.
+
+    Raises:
+        FileNotFoundError: There is no such folder.
+    """
+    if not records.is_dir():
+        raise FileNotFoundError(f"There is no folder of records at {records}.")
+    runs, not_shown = read_runs(records, read_run, ALIKE)
+    runs, alone = _beside_rows(runs)
+    times = read_step_times(step_time_of(records))
+    rows: list[Row] = []
+    for _, members in groupby(sorted(runs, key=lambda run: run.scenario), key=lambda run: run.scenario):
+        rows += _scenario_rows(list(members), times)
+    return Table(
+        scenarios={run.scenario: run.published for run in runs},
+        rows=tuple(rows),
+        not_shown=tuple(sorted([*not_shown, *alone], key=lambda entry: entry.path)),
+    )
+
+
+def _beside_rows(runs: list[Run]) -> Sifted:
+    """Keep the runs of methods that have a row: one with the targets in the published order."""
+    with_row = {(run.scenario, run.method) for run in runs if not run.order}
+    kept = [run for run in runs if (run.scenario, run.method) in with_row]
+    alone = [run for run in runs if (run.scenario, run.method) not in with_row]
+    reason = "its method has no run with the targets in the published order, of which rows are made."
+    return kept, [no_row(run.path, reason) for run in alone]
+
+
+def _scenario_rows(runs: list[Run], times: Mapping[str, Estimate]) -> list[Row]:
+    """Return the rows of the runs of one scenario, by division and falling final average."""
+    by_method: dict[str, list[Run]] = {}
+    for run in sorted(runs, key=lambda run: run.seed):
+        if not run.order:
+            by_method.setdefault(run.method, []).append(run)
+    rows = []
+    for division in DIVISIONS:
+        members = {method: runs for method, runs in by_method.items() if runs[0].division == division}
+        estimates = {method: _estimates(method, by_method) for method in members}
+        competing = {method: _scores(runs) for method, runs in members.items() if division != "reference"}
+        ranks = tie_groups(RANKED_BY, competing)
+        order = sorted(members, key=lambda method: (_falling(estimates[method][RANKED_BY]), method))
+        for method in order:
+            costs = costs_of(members[method], by_method.get("sft", []), times)
+            scenario = members[method][0].scenario
+            rows.append(
+                Row(
+                    scenario,
+                    method,
+                    division,
+                    ranks.get(method),
+                    tuple(members[method]),
+                    min((run.tier for run in members[method]), key=TIERS.index),
+                    estimates[method],
+                    costs,
+                    orders_of(run for run in runs if run.method == method),
+                )
+            )
+    return rows
+
+
+def _falling(one: Estimate) -> float:
+    return math.inf if one.value is None else -one.value
+
+
+def _estimates(method: str, by_method: Mapping[str, list[Run]]) -> dict[str, Estimate]:
+    """Return every metric of a method, compared with the references among the methods of its scenario."""
+    never_itself = {
+        name for metric in METRICS.values() if not metric.compares_itself for name in metric.references
+    }
+    # A reference is compared with itself only where that means something.
+    references = {
+        name: _scores(runs) for name, runs in by_method.items() if name != method or name not in never_itself
+    }
+    runs = by_method[method]
+    generator = row_generator(runs[0].scenario, method)
+    return estimate(METRICS, _scores(runs), generator, references=references)
+
+
+def _scores(runs: Iterable[Run]) -> Runs:
+    return {run.seed: run.scores for run in runs}
+
+
+def rank_mates(row: Row, rows: Iterable[Row]) -> tuple[int, list[str]]:
+    """Return how many of `rows` are in the division of `row`, and the methods that share its rank there."""
+    division = [other for other in rows if other.division == row.division]
+    return len(division), [other.method for other in division if other.rank == row.rank and other is not row]
+
+
+def column_names() -> list[str]:
+    """Return the columns of the CSV file and of the data frame."""
+    ends = ("", "_low", "_high")
+    metrics = (name + end for name in METRICS for end in ends)
+    return [
+        "scenario",
+        "method",
+        "division",
+        "rank",
+        "tier",
+        "seeds",
+        *metrics,
+        "relative_cost",
+        *COSTS,
+        "order_sensitivity",
+    ]
+
+
+def values_of(row: Row) -> list[str | float | None]:
+    """Return the values of `row` in the order of `column_names`."""
+    estimates = (row.estimates[name] for name in METRICS)
+    numbers = [number for one in estimates for number in (one.value, one.low, one.high)]
+    place = [row.scenario, row.method, row.division, row.rank, row.tier, len(row.seeds)]
+    return [*place, *numbers, *row.costs.values(), row.orders.sensitivity]

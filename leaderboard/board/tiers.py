@@ -1,0 +1,32 @@
+"""Tiers: how far a record was checked, and by whom.
+
+A record itself is never touched. `clbench verify` writes what it found into a file beside it, which holds for
+the bytes that it saw: the tier of a record that was changed afterwards is lost.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+
+from clbench.base.strict_json import read_json
+
+TIERS = ("self-reported", "recomputed", "replayed", "retrained")
+"""What was done to believe a record: nothing; its metrics were computed again from its episodes; some of its
+episodes were run again; the whole run was."""
+
+
+def verification_path(record: Path) -> Path:
+    """Return where the verification of the record at `record` lies."""
+    return record.with_suffix(".verified")
+
+
+def tier_of(record: Path) -> str:
+    """Return the tier of the record at `record`, "self-reported" if no verification holds for its bytes."""
+    try:
+        values = read_json(verification_path(record))
+        if values["record"] == hashlib.sha256(record.read_bytes()).hexdigest() and values["tier"] in TIERS:
+            return str(values["tier"])
+    except (OSError, ValueError, KeyError, TypeError):
+        pass
+    return TIERS[0]

@@ -1,0 +1,312 @@
+"""Evidence: the runs of a scenario, those with changed settings included, and figures that compare them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from clbench.scoring.intervals import Estimate, bootstrap, interval, row_generator
+from clbench.scoring.layout import Array, average
+from clbench.scoring.metrics import load_metric
+from clbench.scoring.ours import matched_points
+from clbench.scoring.rates import Rates
+from clbench.scoring.scores import Scores, rates_of
+
+from ..board.costs import read_step_times
+from ..board.runs import (
+    ALIKE,
+    NotShown,
+    Run,
+    Sift,
+    Sifted,
+    differences,
+    is_number,
+    no_row,
+    read_run,
+    read_runs,
+)
+from ..views.table import title_of
+
+SCENARIO = "clbench/Fetch-v0"
+CONTROLS = Path("leaderboard/controls")
+"""Where things lie, seen from the working directory. Pages name these, wherever they were read from."""
+
+LEAST_SEEDS = 2
+"""With one seed an interval says nothing of other seeds: it is shown, but decides nothing."""
+
+NO_ESTIMATE = Estimate(None, None, None)
+
+Of = Mapping[str, Rates]
+"""Rates by label of the method: the same seeds and the same draws of them, batch axes (..., runs)."""
+Quantity = Callable[[Of], Array]
+"""What is measured: rates with batch axes (..., runs) become values (...)."""
+Table = Callable[[Rates], Array]
+"""What a policy is at the points of each stage: rates (...) become values (..., targets, points)."""
+
+
+@dataclass(frozen=True)
+class Figure:
+    """One measured number."""
+
+    what: str
+    """What was measured, and of which methods."""
+    methods: tuple[str, ...]
+    """Labels of the methods: the one it is about, then what that is compared with, then references."""
+    estimate: Estimate
+    """The number with its interval."""
+    seeds: tuple[int, ...] = ()
+    """Seeds that it is from; none if it is no matter of seeds."""
+    missing: tuple[str, ...] = ()
+    """Labels that there are no runs of, or "step time"."""
+    note: str = ""
+    """What restricts it."""
+    form: str = ".2f"
+    """How the number is written."""
+
+    @property
+    def value(self) -> float:
+        """The number, NaN if it is missing: no comparison with it is true."""
+        return math.nan if self.estimate.value is None else self.estimate.value
+
+    @property
+    def low(self) -> float:
+        """Lower end of the interval, NaN if there is none that counts."""
+        return self._end(self.estimate.low)
+
+    @property
+    def high(self) -> float:
+        """Upper end of the interval, NaN if there is none that counts."""
+        return self._end(self.estimate.high)
+
+    def _end(self, end: float | None) -> float:
+        return math.nan if end is None or 0 < len(self.seeds) < LEAST_SEEDS else end
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """All runs of one scenario that may be compared, and what each step of a method takes."""
+
+    scenario: str
+    """Gymnasium id."""
+    runs: Mapping[str, Mapping[int, Run]]
+    """By label of the method, as "lora" and "lora+rank=4", and by seed."""
+    step_times: Mapping[str, Estimate]
+    """Median time of a step divided by that of sft, by method."""
+    not_used: tuple[NotShown, ...]
+    """Records that stand for nothing here."""
+
+    # ---- figures of scores -------------------------------------------------------------------------
+
+    def figure(
+        self,
+        what: str,
+        quantity: Quantity,
+        *methods: str,
+        seeds: Sequence[int] | None = None,
+        span: tuple[float, float] = (-math.inf, math.inf),
+        **rest: Any,
+    ) -> Figure:
+        """Return `quantity` with its interval, from the seeds that all methods have.
+
+        Args:
+            what: Name of the figure.
+            quantity: What is measured.
+            methods: Labels of all methods that it looks at, the one that it is about first.
+            seeds: Those to take of the common ones; all if None.
+            span: Least and greatest possible value.
+            rest: Further fields of the figure.
+        """
+        methods = tuple(dict.fromkeys(methods))
+        missing = tuple(label for label in methods if label not in self.runs)
+        common = self.common_seeds(methods) if seeds is None else tuple(seeds)
+        found = NO_ESTIMATE
+        if common and not missing:
+            generator = row_generator(self.scenario, what)
+            found = bootstrap(quantity, self._scores(methods, common), generator, span=span)
+        if not missing and not common:
+            rest.setdefault("note", "no seed that all of them have")
+        elif not missing and found.value is None:
+            rest.setdefault("note", "not measured in these records")
+        elif not missing and len(common) < LEAST_SEEDS:
+            rest.setdefault("note", "one seed: the interval says nothing of others and decides nothing")
+        return Figure(what, methods, found, common, missing, **rest)
+
+    def _scores(self, methods: Iterable[str], seeds: Iterable[int]) -> dict[str, list[Scores]]:
+        return {label: [self.runs[label][seed].scores for seed in seeds] for label in methods}
+
+    def common_seeds(self, methods: Iterable[str]) -> tuple[int, ...]:
+        """Return the seeds that all methods have a run of."""
+        seeds = [set(self.runs.get(label, {})) for label in methods]
+        return tuple(sorted(set.intersection(*seeds))) if seeds else ()
+
+    def rates(self, methods: Iterable[str], seeds: Iterable[int]) -> Of:
+        """Return the rates of the runs as they are, batch axes (runs,)."""
+        return {label: rates_of(runs, {}) for label, runs in self._scores(methods, seeds).items()}
+
+    def metric(self, name: str, method: str, **rest: Any) -> Figure:
+        """Return a metric of one method."""
+        metric = load_metric(name)
+        what, span = f"{title_of(name)} of {method}", (metric.low, metric.high)
+        return self.figure(what, measured(name, method), method, *metric.references, span=span, **rest)
+
+    def difference(self, name: str, method: str, other: str, **rest: Any) -> Figure:
+        """Return a metric of one method minus that of another."""
+        one, two = measured(name, method), measured(name, other)
+        metric = load_metric(name)
+        methods, reach = (method, other, *metric.references), metric.high - metric.low
+        what = f"{title_of(name)}, {method} - {other}"
+        return self.figure(what, lambda of: one(of) - two(of), *methods, span=(-reach, reach), **rest)
+
+    def matched_difference(self, name: str, table: Table, method: str, other: str, **rest: Any) -> Figure:
+        """Return the difference of two methods where each has learned the target about as well as sft.
+
+        The mean is over the stages in which both do, for each seed, then over the seeds that have any.
+
+        Args:
+            name: What the table holds.
+            table: What is compared.
+            method: The one that it is about.
+            other: What it is compared with.
+            rest: Further fields of the figure.
+        """
+        methods = tuple(dict.fromkeys((method, other, "sft")))
+
+        def stages(of: Of) -> Array:
+            return at_matched_points(table, of, method) - at_matched_points(table, of, other)
+
+        seeds = self.common_seeds(methods)
+        if seeds:
+            reached = np.asarray(np.isfinite(stages(self.rates(methods, seeds))))
+            if not reached.all():
+                counts = f"{reached.sum()} of {reached.size} stages"
+                rest["note"] = f"over the {counts} in which both learn as well as sft"
+            seeds = tuple(np.array(seeds)[reached.any(axis=-1)].tolist())
+        what = f"{name} at matched adaptation, {method} - {other}"
+        return self.figure(what, lambda of: average(_mean(stages(of))), *methods, seeds=seeds, **rest)
+
+    # ---- figures of costs and diagnostics ----------------------------------------------------------
+
+    def cost(self, name: str, method: str, what: str, form: str = ",.0f") -> Figure:
+        """Return the mean of a cost over seeds."""
+        return self._mean_of(method, what, lambda run: [run.record.costs.get(name)], form)
+
+    def diagnostic(self, name: str, method: str, what: str, form: str = ".2f") -> Figure:
+        """Return the mean of a diagnostic over stages and seeds, with its interval over seeds."""
+
+        def values(run: Run) -> list[Any]:
+            stages = run.record.diagnostics.values()
+            return [stage[name] for stage in stages if isinstance(stage, dict) and name in stage]
+
+        return self._mean_of(method, what, values, form)
+
+    def share_of_preparation(self, method: str) -> Figure:
+        """Return the share of a run's optimiser steps that its preparation took, mean over seeds."""
+
+        def share(run: Run) -> Sequence[Any]:
+            steps, taken = (run.record.costs.get(name) for name in ("optimiser_steps", "preparation_steps"))
+            return [taken / steps] if is_number(taken) and is_number(steps) and steps else []
+
+        return self._mean_of(method, f"share of the optimiser steps that prepare {method}", share, ".1%")
+
+    def _mean_of(self, method: str, what: str, values: Callable[[Run], Sequence[Any]], form: str) -> Figure:
+        runs = self.runs.get(method, {})
+        missing = () if runs else (method,)
+        means = [number_mean(values(run)) for run in runs.values()]
+        if not means or not np.isfinite(means).all():
+            note = "" if missing else "not in these records"
+            return Figure(what, (method,), NO_ESTIMATE, tuple(runs), missing, note, form)
+        without_one = [number_mean(means[:place] + means[place + 1 :]) for place in range(len(means))]
+        estimate = interval(number_mean(means), np.array(without_one if len(means) > 1 else []))
+        return Figure(what, (method,), estimate, tuple(runs), (), "", form)
+
+    def step_time(self, method: str) -> Figure:
+        """Return how much longer a step of the method takes than one of sft."""
+        found = self.step_times.get(method)
+        missing = () if found else ("step time",)
+        what = f"time of a step of {method} divided by sft's"
+        return Figure(what, (method, "sft"), found or NO_ESTIMATE, (), missing)
+
+
+def number_mean(values: Sequence[Any]) -> float:
+    """Return the mean of `values`, NaN if there is none or one is no number that can be."""
+    if not values or not all(is_number(value) for value in values):
+        return math.nan
+    return math.fsum(values) / len(values)
+
+
+# ---- quantities --------------------------------------------------------------------------------------------
+
+
+def measured(name: str, method: str) -> Quantity:
+    """Return the quantity that is a metric of `method`, whose references are the methods beside it."""
+    metric = load_metric(name)
+    return lambda of: metric.over_runs(replace(of[method], references=of))
+
+
+def at_matched_points(table: Table, of: Of, method: str) -> Array:
+    """Return the values (..., targets) where each target is first learned about as well as by sft."""
+    rates = replace(of[method], references=of)
+    points = matched_points(rates)
+    chosen = np.nan_to_num(points).astype(np.int64)[..., None]
+    values = np.take_along_axis(table(rates), chosen, axis=-1)[..., 0]
+    return np.where(np.isnan(points), np.nan, values)
+
+
+def _mean(values: Array) -> Array:
+    """Return the mean along the last axis of what is not NaN, NaN where nothing is."""
+    known = np.isfinite(values)
+    counts = known.sum(axis=-1)
+    total = np.where(known, values, 0.0).sum(axis=-1)
+    return np.where(counts > 0, total / np.maximum(counts, 1), np.nan)
+
+
+# ---- reading -----------------------------------------------------------------------------------------------
+
+
+def read_evidence(scenario: str, records: Path, controls: Path, step_time: Path) -> Evidence:
+    """Return what there is; folders and files that are not there hold nothing."""
+    scored, refused = read_runs(records, read_run, ALIKE)
+    changed, refused_controls = read_runs(controls, partial(read_run, changed=True), (_like(scored), *ALIKE))
+    runs: dict[str, dict[int, Run]] = {}
+    for run in (*scored, *changed):
+        if run.scenario == scenario and run.scores.layout.target and not run.order:
+            runs.setdefault(run.method, {})[run.seed] = run
+    not_used = [("records", entry) for entry in refused] + [("controls", entry) for entry in refused_controls]
+    return Evidence(
+        scenario,
+        {label: dict(sorted(seeds.items())) for label, seeds in sorted(runs.items())},
+        read_step_times(step_time),
+        tuple(NotShown(f"{name}/{entry.path}", entry.reason) for name, entry in not_used),
+    )
+
+
+def _like(scored: Sequence[Run]) -> Sift:
+    """Return what keeps the runs that were made and evaluated as those of the board were."""
+    examples = {run.scenario: run for run in scored}
+
+    def traits(run: Run) -> dict[str, Any]:
+        return {
+            **vars(run.scores.layout),
+            **run.published,
+            "rollouts": run.record.fingerprint.get("rollouts"),
+        }
+
+    def sift(runs: list[Run]) -> Sifted:
+        kept, refused = [], []
+        for run in runs:
+            example = examples.get(run.scenario, run)
+            fields = differences(traits(run), traits(example))
+            if fields:
+                reason = f"it cannot be compared with the board: {', '.join(fields)} differ."
+                refused.append(no_row(run.path, reason))
+            else:
+                kept.append(run)
+        return kept, refused
+
+    return sift

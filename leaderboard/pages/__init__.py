@@ -1,0 +1,1 @@
+"""Reference pages written from code and records: one for each method and one for each scenario."""

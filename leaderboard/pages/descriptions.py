@@ -1,0 +1,162 @@
+"""What the code says of a method: its docstrings, its hyper-parameters, the prior data it may touch."""
+
+from __future__ import annotations
+
+import ast
+import dataclasses
+import inspect
+import re
+import sys
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from itertools import groupby, pairwise
+from typing import Any
+
+from clbench.learning.method import Method
+from clbench.learning.registry import load_method, method_names
+
+from ..board.runs import division_of
+
+_ITEM = re.compile(r"\d+\. +(.*)")
+
+
+@dataclass(frozen=True)
+class HyperParameter:
+    """A field of a method's dataclass."""
+
+    name: str
+    """Of the field."""
+    default: str
+    """As Python writes it."""
+    meaning: str
+    """The docstring under it; where a subclass has one of its own, after that of its base."""
+
+
+@dataclass(frozen=True)
+class Text:
+    """The parts of a module's docstring."""
+
+    idea: str
+    """Its first line."""
+    rule: tuple[str, ...]
+    """Paragraphs before the line "Details:", and what follows the list after it."""
+    details: tuple[str, ...]
+    """Items of that list."""
+
+
+@dataclass(frozen=True)
+class Description:
+    """All that a page says of a method without a record."""
+
+    name: str
+    """As it is installed."""
+    cls: type[Method]
+    """Its class."""
+    text: Text
+    """Of its module."""
+    hyper_parameters: tuple[HyperParameter, ...]
+    """In the order of the fields."""
+
+    @property
+    def summary(self) -> str:
+        """First line of the class's docstring."""
+        return (self.cls.__doc__ or "").strip().partition("\n")[0]
+
+    @property
+    def division(self) -> str:
+        """What it competes with."""
+        return division_of(dataclasses.asdict(self.cls.uses))
+
+    @property
+    def defaults(self) -> dict[str, Any]:
+        """Its hyper-parameters by name."""
+        return dataclasses.asdict(self.cls())  # type: ignore[call-overload, no-any-return]
+
+    def hook(self, name: str) -> list[str]:
+        """Return the paragraphs on what a hook returns, none if the method does not override it."""
+        function = getattr(self.cls, name)
+        if function is getattr(Method, name):
+            return []
+        text = inspect.cleandoc(function.__doc__ or "").removeprefix("Return ")
+        return paragraphs((text[:1].upper() + text[1:]).splitlines())
+
+
+def built_in_methods() -> list[Description]:
+    """Return the descriptions of the installed methods that are ours, by name."""
+    return [describe(name, load_method(name)) for name in method_names() if "/" not in name]
+
+
+def describe(name: str, cls: type[Method]) -> Description:
+    """Return the description of a method's class."""
+    text = read_docstring(sys.modules[cls.__module__].__doc__ or "")
+    return Description(name, cls, text, tuple(_hyper_parameters(cls)))
+
+
+def read_docstring(docstring: str) -> Text:
+    """Return the parts of a module's docstring."""
+    idea, *lines = inspect.cleandoc(docstring).splitlines() or [""]
+    end = lines.index("Details:") if "Details:" in lines else len(lines)
+    details: list[str] = []
+    after: list[str] = []
+    for line in lines[end + 1 :]:
+        item = _ITEM.match(line)
+        if after or not (item or not line or line.startswith(" ")):
+            after.append(line)
+        elif item:
+            details.append(item[1])
+        elif line and details:
+            details[-1] += f" {line.strip()}"
+    return Text(idea, (*paragraphs(lines[:end]), *paragraphs(after)), tuple(details))
+
+
+def paragraphs(lines: Iterable[str]) -> list[str]:
+    """Return the paragraphs that blank lines part, each on one line."""
+    groups = groupby(lines, key=lambda line: bool(line.strip()))
+    return [" ".join(line.strip() for line in group) for filled, group in groups if filled]
+
+
+def _hyper_parameters(cls: type[Method]) -> list[HyperParameter]:
+    meanings: dict[str, list[str]] = {}
+    for base in reversed(cls.__mro__):
+        if issubclass(base, Method) and base is not Method:
+            for name, meaning in field_docstrings(base).items():
+                meanings.setdefault(name, []).append(meaning)
+    return [
+        HyperParameter(field.name, _default(field), " ".join(meanings.get(field.name, [])))
+        for field in dataclasses.fields(cls)  # type: ignore[arg-type]
+    ]
+
+
+def field_docstrings(cls: type) -> dict[str, str]:
+    """Return the texts that stand under the fields of a class, by field; Python itself forgets them."""
+    tree = ast.parse(inspect.getsource(sys.modules[cls.__module__]))
+    bodies = [
+        node.body for node in ast.walk(tree) if isinstance(node, ast.ClassDef) and node.name == cls.__name__
+    ]
+    return {
+        field.target.id: " ".join(inspect.cleandoc(text).split())
+        for body in bodies
+        for field, below in pairwise(body)
+        if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name)
+        if (text := _text_of(below)) is not None
+    }
+
+
+def _text_of(node: ast.stmt) -> str | None:
+    """Return the text that a statement consists of, if it does."""
+    if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant):
+        return node.value.value if isinstance(node.value.value, str) else None
+    return None
+
+
+def _default(field: dataclasses.Field[Any]) -> str:
+    if field.default is not dataclasses.MISSING:
+        return repr(field.default)
+    if field.default_factory is not dataclasses.MISSING:
+        return repr(field.default_factory())
+    return "must be given"
+
+
+def of_one_module(descriptions: Sequence[Description], one: Description) -> list[Description]:
+    """Return the methods that share their docstring with `one`, itself included."""
+    return [other for other in descriptions if other.cls.__module__ == one.cls.__module__]

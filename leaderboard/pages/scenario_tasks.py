@@ -1,0 +1,153 @@
+"""What a scenario's card shows of its tasks: how often experts succeed, and a picture of each.
+
+Both are made once and kept beside the card, until a task has another version.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+
+from clbench.base.errors import ClbenchError
+from clbench.base.dependencies import require
+from clbench.base.entry_points import resolve
+from clbench.base.seeding import derive_seed
+from clbench.data.demonstrations import demonstrate
+from clbench.data.expert_rates import measure
+from clbench.jobs.bars import Bars
+from clbench.spec.scenario import Scenario
+from clbench.spec.task import Task
+from clbench.worlds.gl_backend import choose_back_end
+from clbench.worlds.world import World
+
+from ..views.table import write_if_changed
+
+EXPERTS = "experts.json"
+"""What was measured of the experts, in the folder of the card."""
+
+WIDTH = 240
+"""Pixels across a picture."""
+
+QUALITY = 80
+"""Of a picture: one of Fetch takes 6 kB."""
+
+Progress = Callable[[float], None]
+
+
+@dataclass(frozen=True)
+class Experts:
+    """How often experts succeeded."""
+
+    episodes: int
+    """Of each task."""
+    successes: Mapping[str, int]
+    """By task."""
+
+
+def picture_path(folder: Path, task: Task) -> Path:
+    """Return where the picture of a task lies."""
+    return folder / f"{task.name}.webp"
+
+
+def undrawn(scenario: Scenario, folder: Path) -> list[Task]:
+    """Return the tasks without a picture in the folder of the card, or with that of another version."""
+    kept = _read(folder)
+    return [
+        task
+        for task in scenario.tasks
+        if not picture_path(folder, task).is_file()
+        or kept.get(task.name, {}).get("version", task.version) != task.version
+    ]
+
+
+def choose_renderer(tasks: Sequence[Task]) -> str | None:
+    """Choose what draws `tasks`, and return why nothing can, or None. MuJoCo must not be imported before."""
+    try:
+        if tasks:
+            require("PIL", "film", "A picture")
+            choose_back_end(task.world for task in tasks)
+    except ClbenchError as error:
+        return str(error.args[0])
+    return None
+
+
+def make_missing(
+    scenario: Scenario, folder: Path, episodes: int, *, drawing: bool, console: Console
+) -> Experts:
+    """Measure the experts and draw the pictures that the folder of the card does not have yet.
+
+    Args:
+        scenario: Where the tasks come from.
+        folder: Of the card.
+        episodes: How many of each task. They are used for nothing else, and the same each time.
+        drawing: Whether pictures can be drawn.
+        console: Where progress is shown.
+    """
+    kept, bare = _read(folder), undrawn(scenario, folder) if drawing else []
+    asked = {task.name: {"version": task.version, "episodes": episodes} for task in scenario.tasks}
+    stale = [
+        task for task in scenario.tasks if not asked[task.name].items() <= kept.get(task.name, {}).items()
+    ]
+    folder.mkdir(parents=True, exist_ok=True)
+    with Bars(len(stale) * episodes + len(bare), console) as bars:
+        bars.start(scenario.id, len(stale) * episodes + len(bare))
+        _draw(bare, folder, lambda done: bars.advance(scenario.id, done))
+        for row in measure(scenario, stale, episodes, lambda done: bars.advance(scenario.id, done)):
+            kept[row.task] = {**asked[row.task], "successes": round(row.success * episodes)}
+        bars.finish(scenario.id, f"{len(stale)} experts measured, {len(bare)} pictures drawn")
+    found = {task.name: kept[task.name] for task in scenario.tasks}
+    lines = (f"{json.dumps(name)}: {json.dumps(entry)}" for name, entry in found.items())
+    write_if_changed(folder / EXPERTS, "{\n" + ",\n".join(lines) + "\n}\n")
+    return Experts(episodes, {name: entry["successes"] for name, entry in found.items()})
+
+
+def _draw(tasks: Sequence[Task], folder: Path, progress: Progress) -> None:
+    """Draw each task when its expert is halfway through an episode that is the same each time."""
+    if not tasks:
+        return
+    from clbench.runs.film import picture  # Pillow is an extra
+
+    with _worlds(render_mode="rgb_array") as world:
+        for task in tasks:
+            seed = derive_seed("picture", task.suite, task.name)
+            actions = demonstrate(world(task), task, seed, noisy=False).executed
+            world(task).reset(seed=seed, options={"task": task.name})
+            for action in actions[: len(actions) // 2]:
+                world(task).step(action)
+            content = io.BytesIO()
+            picture(world(task), WIDTH).save(content, "WEBP", quality=QUALITY, method=6)
+            picture_path(folder, task).write_bytes(content.getvalue())
+            progress(1)
+
+
+@contextmanager
+def _worlds(**options: Any) -> Iterator[Callable[[Task], World]]:
+    """Give a function that returns the world of a task; each is made when needed, and closed in the end."""
+    made: dict[str, World] = {}
+
+    def world(task: Task) -> World:
+        if task.world not in made:
+            made[task.world] = resolve(task.world)(**options)
+        return made[task.world]
+
+    try:
+        yield world
+    finally:
+        for one in made.values():
+            one.close()
+
+
+def _read(folder: Path) -> dict[str, dict[str, int]]:
+    """Return what was measured, nothing where it is not there or torn: it is measured again."""
+    try:
+        values = json.loads((folder / EXPERTS).read_text(encoding="utf-8"))
+        return {name: {**entry} for name, entry in values.items()}
+    except (OSError, ValueError, AttributeError, TypeError):
+        return {}

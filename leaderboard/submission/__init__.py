@@ -1,0 +1,1 @@
+"""Submission and verification of records."""

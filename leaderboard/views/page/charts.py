@@ -1,0 +1,326 @@
+"""The charts as Vega-Lite: the plane of retention and adaptation, and the curves along a run.
+
+Colours are names of `PALETTE`, written as CSS variables: a chart follows the theme of the page without being
+drawn again. In a picture they are replaced by the colours of one theme.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from ...board.rows import Row
+from ...board.runs import DIVISIONS
+from ..table import interval
+from .labels import LONGEST, Mark, place
+
+PALETTE: Mapping[str, tuple[str, str]] = {
+    "paper": ("#ffffff", "#14171b"),
+    "raised": ("#f5f7f9", "#1c2127"),
+    "ink": ("#1a1f26", "#e7eaee"),
+    "muted": ("#566170", "#a3adb9"),
+    "line": ("#d9dfe6", "#343b45"),
+    "edge": ("#8b96a3", "#6d7885"),
+    "accent": ("#0a58a8", "#7fb8f5"),
+    "mark-0": ("#0072b2", "#56b4e9"),
+    "mark-1": ("#d55e00", "#e69f00"),
+    "mark-2": ("#00805d", "#2bc49a"),
+    "mark-3": ("#a0527f", "#cc79a7"),
+    "mark-4": ("#6b7480", "#9aa4b0"),
+}
+"""Colours in the light and in the dark theme. Those of marks are of Okabe and Ito, which the colour-blind
+tell apart, or near them where the contrast to the paper was below 3."""
+
+SHAPES = ("circle", "square", "triangle-up", "cross", "diamond")
+"""Of the marks of a division, by its place in `DIVISIONS`: colour is never the only sign."""
+
+FONT = "Liberation Sans, Arial, Helvetica, sans-serif"
+"""Of pictures: the first comes with the converter, so that a text is as wide on every machine."""
+
+SYSTEM_FONT = "system-ui, sans-serif"
+"""Of the page."""
+
+Spec = dict[str, Any]
+"""A specification of Vega-Lite."""
+
+
+def colour(name: str) -> str:
+    return f"var(--{name})"
+
+
+def in_theme(svg: str, dark: bool) -> str:
+    """Return a picture with the colours of one theme in place of their names."""
+    for name, colours in PALETTE.items():
+        svg = svg.replace(colour(name), colours[dark])
+    return svg
+
+
+def _config(font: str) -> Spec:
+    return {
+        "font": font,
+        "background": None,
+        "axis": {
+            "labelColor": colour("muted"),
+            "titleColor": colour("ink"),
+            "titleFontWeight": "normal",
+            "titleFontSize": 12,
+            "labelFontSize": 11,
+            "titlePadding": 8,
+            "gridColor": colour("line"),
+            "domainColor": colour("line"),
+            "tickColor": colour("line"),
+        },
+        "legend": {
+            "labelColor": colour("ink"),
+            "labelFontSize": 12,
+            "orient": "top",
+            "title": None,
+            "symbolSize": 90,
+            "symbolOpacity": 1,
+        },
+        "view": {"stroke": None},
+    }
+
+
+def _spec(layers: Sequence[Spec], font: str, **rest: Any) -> Spec:
+    return {
+        "$schema": "https://vega.github.io/schema/vega-lite/v6.json",
+        "config": _config(font),
+        "layer": list(layers),
+        **rest,
+    }
+
+
+def _axis(name: str, title: str, **rest: Any) -> Spec:
+    """Return the encoding of a place on an axis from 0 to 1, unless `rest` says otherwise."""
+    axis = {"values": [0, 0.25, 0.5, 0.75, 1], "format": ".2~f"}
+    return {"field": name, "type": "quantitative", "title": title, "axis": axis, **rest}
+
+
+def rounded(value: float | None) -> float | None:
+    """Return a number as a chart needs it. Rounded twice, so that the last bit of a sum does not show."""
+    known = finite(value)
+    return None if known is None else round(round(known, 9), 3) + 0.0
+
+
+def finite(value: float | None) -> float | None:
+    """Return a number, None where it is missing."""
+    return float(value) if value is not None and math.isfinite(value) else None
+
+
+# ---- the plane ---------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Size:
+    """Pixels that the plane takes; axes, legend and the labels on the right come on top."""
+
+    width: int
+    height: int
+    columns: int
+    """Of the legend."""
+    titles: tuple[str, str]
+    """Of the axes."""
+
+
+WIDE = Size(
+    620,
+    400,
+    4,
+    (
+        "adaptation: success on each target right after it was learned",
+        "retention: success on the old skills at the end",
+    ),
+)
+"""For a desktop."""
+
+NARROW = Size(205, 320, 2, ("adaptation", "retention"))
+"""For a phone."""
+
+LOW, HIGH = -0.02, 1.02
+"""Ends of either axis: a mark at 0 or 1 is whole."""
+
+
+def plane(
+    rows: Sequence[Row], size: Size, anchors: Mapping[str, str] | None = None, font: str = SYSTEM_FONT
+) -> Spec:
+    """Return the plane of retention and adaptation with the Pareto front of each division.
+
+    Args:
+        rows: Those of one scenario.
+        size: Of the plane.
+        anchors: Where a mark leads, by method.
+        font: Of all texts.
+    """
+    points = [_point(row, (anchors or {}).get(row.method, "")) for row in rows if _is_in_plane(row)]
+    fronts = {
+        division: _front([one for one in points if one["division"] == division])
+        for division in DIVISIONS[:-1]
+    }
+    corners = [
+        {"x": x, "y": y, "division": division, "order": order}
+        for division, front in fronts.items()
+        for order, (x, y) in enumerate(front)
+    ]
+    x, y = (
+        _axis(name, title, scale={"domain": [LOW, HIGH]})
+        for name, title in zip("xy", size.titles, strict=True)
+    )
+    found = {one["division"] for one in points}
+    marks = [(name, colour(f"mark-{n}"), SHAPES[n]) for n, name in enumerate(DIVISIONS) if name in found]
+    names, hues, shapes = ([entry[part] for entry in marks] for part in range(3))
+    hue = {"field": "division", "type": "nominal", "scale": {"domain": names, "range": hues}}
+    hue |= {"legend": {"columns": size.columns}}
+    shape = hue | {"scale": {"domain": names, "range": shapes}}
+    across = {"x": x | {"field": "x_low"}, "x2": {"field": "x_high"}, "y": y, "color": hue}
+    upright = {"x": x, "y": y | {"field": "y_low"}, "y2": {"field": "y_high"}, "color": hue}
+    tooltip = [{"field": name} for name in ("method", "division", "adaptation", "retention")]
+    mark = {
+        "type": "point",
+        "filled": True,
+        "size": 85,
+        "opacity": 1,
+        "stroke": colour("paper"),
+        "strokeWidth": 1,
+    }
+    front = {"type": "line", "strokeWidth": 1.5, "strokeDash": [4, 3], "opacity": 0.8}
+    layers = [
+        _layer(corners, front, x=x, y=y, color=hue, order={"field": "order"}),
+        _layer(points, {"type": "rule", "opacity": 0.4}, **across),
+        _layer(points, {"type": "rule", "opacity": 0.4}, **upright),
+        *_labels(points, {y for corners in fronts.values() for _, y in corners}, size),
+        _layer(points, mark, x=x, y=y, color=hue, shape=shape, tooltip=tooltip),
+    ]
+    return _spec(layers, font, width=size.width, height=size.height)
+
+
+def _layer(values: Sequence[Mapping[str, Any]], mark: Spec, **encoding: Any) -> Spec:
+    return {"data": {"values": list(values)}, "mark": mark, "encoding": encoding}
+
+
+def _is_in_plane(row: Row) -> bool:
+    return row.estimates["adaptation"].value is not None and row.estimates["retention"].value is not None
+
+
+def _point(row: Row, anchor: str) -> dict[str, Any]:
+    point: dict[str, Any] = {"method": row.method, "division": row.division, "anchor": anchor}
+    for axis, name in (("x", "adaptation"), ("y", "retention")):
+        one = row.estimates[name]
+        point[axis] = rounded(one.value)
+        point[f"{axis}_low"] = rounded(one.value if one.low is None else one.low)
+        point[f"{axis}_high"] = rounded(one.value if one.high is None else one.high)
+        point[name] = interval(one)
+    return point
+
+
+def _front(points: Sequence[Mapping[str, Any]]) -> list[tuple[float, float]]:
+    """Return the corners of the line below and left of which a point is worse in both than another."""
+    best: list[tuple[float, float]] = []
+    for x, y in sorted(((one["x"], one["y"]) for one in points), reverse=True):
+        if not best or y > best[-1][1]:
+            best.append((x, y))
+    if not best:
+        return []
+    corners = [(best[0][0], 0.0)]
+    for (x, y), (next_x, _) in zip(best, [*best[1:], (0.0, 0.0)], strict=True):
+        corners += [(x, y), (next_x, y)]
+    return corners[::-1]
+
+
+def _labels(points: Sequence[Mapping[str, Any]], lines: Iterable[float], size: Size) -> list[Spec]:
+    """Return the layers of the labels and of the lines that lead to those on the right."""
+
+    def across(value: float) -> float:
+        return (value - LOW) / (HIGH - LOW) * size.width
+
+    def down(value: float) -> float:
+        return (HIGH - value) / (HIGH - LOW) * size.height
+
+    marks = [
+        Mark(
+            str(one["method"]),
+            across(one["x"]),
+            down(one["y"]),
+            *(across(one[name]) for name in ("x_low", "x_high")),
+            *(down(one[name]) for name in ("y_high", "y_low")),
+        )
+        for one in points
+    ]
+    labels = place(marks, [down(line) for line in lines], size.width, size.height)
+    leaders = [
+        {"x": _pixel(one.mark.x), "y": _pixel(one.mark.y), "to": _pixel(one.y)} for one in labels if one.mark
+    ]
+    # In pixels, since some lie beside the plane.
+    x, y = ({"field": name, "type": "quantitative", "scale": None, "axis": None} for name in "xy")
+    rule = {"type": "rule", "color": colour("line")}
+    layers = [_layer(leaders, rule, x=x, y=y, x2={"value": size.width + 10}, y2={"field": "to"})]
+    for align in ("left", "right"):
+        texts = [
+            {"method": one.name, "x": _pixel(one.x), "y": _pixel(one.y)}
+            for one in labels
+            if one.align == align
+        ]
+        mark = {"type": "text", "align": align, "baseline": "middle", "fontSize": 11, "limit": LONGEST}
+        text = {"field": "method", "type": "nominal"}
+        layers.append(_layer(texts, mark | {"color": colour("ink")}, x=x, y=y, text=text))
+    return layers
+
+
+def _pixel(value: float) -> float:
+    return round(value, 1) + 0.0
+
+
+# ---- along a run -------------------------------------------------------------------------------------------
+
+SERIES = ("old skills", "target of the stage", "old skills under sft")
+"""What the lines of the chart of a run are: the last one stands beside the others for comparison."""
+
+
+def along_a_run(targets: Sequence[str], steps: int) -> Spec:
+    """Return the chart of a run without its points, which the page fills in for each row.
+
+    The points are the named data `points`: `x` (steps since the first stage), `y` with `low` and `high`, one
+    of `SERIES`, and the `stage`, by which the curves of a target are told from the next one's; the parameter
+    `shown` lists the series that there are.
+
+    Args:
+        targets: Names of the tasks that are learned, in order.
+        steps: Of a stage.
+    """
+    stages = [
+        {"begin": number * steps, "end": (number + 1) * steps, "name": f"{number + 1} {name}"}
+        for number, name in enumerate(targets)
+    ]
+    count = max(len(targets), 1)
+    x = _axis(
+        "x",
+        "optimiser steps, stage after stage",
+        scale={"domain": [0, count * steps], "nice": False},
+        axis={"values": [number * steps for number in range(count + 1)], "grid": False},
+    )
+    y = _axis("y", "success", scale={"domain": [0, 1]})
+    hues = [colour(f"mark-{number}") for number in (0, 1, 4)]
+    series = {"field": "series", "type": "nominal", "scale": {"domain": list(SERIES), "range": hues}}
+    series |= {"legend": {"columns": {"expr": "width < 400 ? 1 : 3"}, "values": {"expr": "shown"}}}
+    beside = {"test": {"field": "series", "equal": SERIES[-1]}, "value": [3, 3]}
+    dashes = {"condition": beside, "value": [1, 0]}
+    name = {"type": "text", "align": "left", "baseline": "bottom", "dx": 3, "dy": -4, "fontSize": 11}
+    name |= {"color": colour("muted"), "limit": {"expr": f"width / {count} - 5"}}
+    begin = x | {"field": "begin"}
+    lines: Spec = {"x": x, "y": y, "color": series, "detail": {"field": "stage"}}
+    area = lines | {"y": y | {"field": "low"}, "y2": {"field": "high"}}
+    tooltip = [{"field": field} for field in ("series", "steps", "success")]
+    layers = [
+        _layer(stages[1::2], {"type": "rect", "color": colour("raised")}, x=begin, x2={"field": "end"}),
+        _layer(stages, name, x=begin, y={"value": 0}, text={"field": "name", "type": "nominal"}),
+        _points({"type": "area", "opacity": 0.15}, **area),
+        _points({"type": "line", "strokeWidth": 2}, **lines, strokeDash=dashes),
+        _points({"type": "point", "filled": True, "size": 30, "opacity": 1}, **lines, tooltip=tooltip),
+    ]
+    return _spec(layers, SYSTEM_FONT, width="container", height=230)
+
+
+def _points(mark: Spec, **encoding: Any) -> Spec:
+    return {"data": {"name": "points"}, "mark": mark, "encoding": encoding}

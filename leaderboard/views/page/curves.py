@@ -1,0 +1,62 @@
+"""Curves along a run with their intervals: how targets are learned while the old skills are forgotten."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from functools import cache
+
+import numpy as np
+
+from clbench.scoring.intervals import Estimate, draw_episodes, interval
+from clbench.scoring.layout import Array, average
+from clbench.scoring.rates import Rates
+from clbench.scoring.scores import Scores
+
+REPLICATES = 300
+"""Draws behind an interval of episodes: with 2000 its ends move by less than a line is wide."""
+
+Curve = Callable[[Rates], Array]
+"""Maps rates with batch axes (...) to the points of a curve, (..., points)."""
+
+
+def retained_curve(rates: Rates) -> Array:
+    """Return the mean success on the retained skills, before the first step and at every point."""
+    points = average(rates.retained_curves)
+    before = average(rates.retained[..., :1, :])
+    return np.concatenate([before, points.reshape(*points.shape[:-2], -1)], axis=-1)
+
+
+def target_curves(rates: Rates) -> Array:
+    """Return the success on target k before the first step of stage k and at its points."""
+    before = np.diagonal(rates.target[..., :-1, :], axis1=-2, axis2=-1)
+    points = np.concatenate([before[..., None], rates.learning_curves], axis=-1)
+    return points.reshape(*points.shape[:-2], -1)
+
+
+def estimated(
+    curves: Mapping[str, Curve], runs: Sequence[Scores], generator: np.random.Generator
+) -> dict[str, list[Estimate]]:
+    """Return every point of `curves`, averaged over `runs`, with its interval as in `clbench.scoring.intervals`.
+
+    Where an interval is of episodes, all points of all curves get the same ones.
+    """
+
+    @cache
+    def with_other_episodes() -> list[Rates]:
+        layout = runs[0].layout
+        shape, episodes = (REPLICATES, len(layout.tasks)), len(layout.episodes)
+        return [run.rates(draw_episodes(shape, episodes, generator)) for run in runs]
+
+    found = {}
+    for name, curve in curves.items():
+        each = np.stack([curve(run.rates()) for run in runs])
+        drawn = cache(lambda curve=curve: np.mean([curve(rates) for rates in with_other_episodes()], axis=0))
+        found[name] = [_estimate(values, point, drawn) for point, values in enumerate(each.T)]
+    return found
+
+
+def _estimate(values: Array, point: int, drawn: Callable[[], Array]) -> Estimate:
+    """Return a point of a curve, given its value for each run and all points with other episodes."""
+    count = len(values)
+    others = (values.sum() - values) / (count - 1) if count > 1 else np.zeros(0)
+    return interval(float(values.mean()), others, lambda: drawn()[:, point], (0.0, 1.0))

@@ -1,0 +1,115 @@
+"""Rank under each definition: whether it depends on whose forgetting, or whose transfer, is meant."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+
+from clbench.scoring.intervals import Estimate
+from clbench.scoring.metric import Metric
+from clbench.scoring.metrics import METRICS
+
+from ...board.rows import Row
+from ..table import title_of
+
+FAMILIES: Mapping[str, tuple[str, ...]] = {
+    "forgetting": ("forgetting", "backward_transfer", "remembering"),
+    "transfer": ("forward_transfer", "zero_shot"),
+    "final average": ("average", "accuracy", "performance", "area_under_curve"),
+}
+"""What definitions are about, and the words in their names that tell it; the first that fits counts."""
+
+EQUAL = 1e-9
+"""Values nearer than this are equal: rates are quotients of whole numbers, whose last bit may differ."""
+
+
+@dataclass(frozen=True)
+class Family:
+    """Definitions of one thing, side by side."""
+
+    name: str
+    """Key of `FAMILIES`."""
+    metrics: tuple[Metric, ...]
+    """Those of which any row has a value."""
+    ranks: Mapping[str, tuple[int | None, ...]]
+    """Rank of each method under each of them, by method; equal values share one, None without a value."""
+    depends: frozenset[str]
+    """Methods whose place depends on the definition and not on chance: two definitions put them and another
+    one in opposite orders, and under neither do the intervals overlap."""
+    disagreement: str
+    """Which two definitions disagree most, in a sentence."""
+
+
+def families(rows: Sequence[Row]) -> list[Family]:
+    """Return the families of definitions with the ranks of `rows`, which stand for one scenario."""
+    found = []
+    for name in FAMILIES:
+        metrics = [metric for metric in METRICS.values() if _family_of(metric) == name]
+        metrics = [one for one in metrics if any(row.estimates[one.name].value is not None for row in rows)]
+        if len(metrics) < 2 or len(rows) < 2:
+            continue
+        by_metric = [_ranks(metric, rows) for metric in metrics]
+        ranks = {row.method: tuple(ranks[row.method] for ranks in by_metric) for row in rows}
+        found.append(Family(name, tuple(metrics), ranks, *_disagreements(metrics, rows)))
+    return found
+
+
+def _family_of(metric: Metric) -> str | None:
+    """Return what a metric is a definition of, None if of nothing that others define too."""
+    if metric.higher_is_better is None:
+        return None
+    fits = (name for name, words in FAMILIES.items() if any(word in metric.name for word in words))
+    return next(fits, None)
+
+
+def _better(metric: Metric, one: Estimate, other: Estimate) -> int:
+    """Return 1 if `one` is better than `other`, -1 if worse, 0 if equal or missing."""
+    if one.value is None or other.value is None or abs(one.value - other.value) <= EQUAL:
+        return 0
+    return 1 if (one.value > other.value) == metric.higher_is_better else -1
+
+
+def _ranks(metric: Metric, rows: Sequence[Row]) -> dict[str, int | None]:
+    """Return the rank of each method: one more than there are better ones."""
+    values = {row.method: row.estimates[metric.name] for row in rows}
+    return {
+        method: None
+        if own.value is None
+        else 1 + sum(_better(metric, other, own) > 0 for other in values.values())
+        for method, own in values.items()
+    }
+
+
+def _disagreements(metrics: Iterable[Metric], rows: Sequence[Row]) -> tuple[frozenset[str], str]:
+    """Return the methods whose rank depends on the definition, and which two definitions disagree most."""
+    pairs = list(combinations(rows, 2))
+    depends: set[str] = set()
+    worst, clear, names = 0, 0, ("", "")
+    for first, second in combinations(metrics, 2):
+        opposed = [
+            pair
+            for pair in pairs
+            if _better(first, *_values(first, pair)) * _better(second, *_values(second, pair)) < 0
+        ]
+        apart = [pair for pair in opposed if all(_apart(*_values(one, pair)) for one in (first, second))]
+        depends.update(row.method for pair in apart for row in pair)
+        if len(opposed) > worst:
+            worst, clear, names = len(opposed), len(apart), (first.name, second.name)
+    if not worst:
+        return frozenset(), "All of them put the methods in the same order."
+    return frozenset(depends), (
+        f"“{title_of(names[0])}” and “{title_of(names[1])}” disagree most. They put {worst} of {len(pairs)} "
+        f"pairs of methods in opposite orders, {clear} of these with intervals that overlap under neither."
+    )
+
+
+def _values(metric: Metric, pair: tuple[Row, Row]) -> tuple[Estimate, Estimate]:
+    return pair[0].estimates[metric.name], pair[1].estimates[metric.name]
+
+
+def _apart(one: Estimate, other: Estimate) -> bool:
+    """Return whether two intervals do not overlap."""
+    if one.low is None or one.high is None or other.low is None or other.high is None:
+        return False
+    return one.low > other.high or other.low > one.high

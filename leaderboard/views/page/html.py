@@ -1,0 +1,188 @@
+"""The page as HTML, and the pictures as SVG: the same table gives the same bytes."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import json
+from collections.abc import Sequence
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import vl_convert
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
+from markupsafe import Markup
+
+from ...board.overall import overall
+from ...board.rows import Row, Table
+from ...board.tiers import TIERS
+from ..table import title_of
+from .charts import FONT, NARROW, PALETTE, SERIES, SHAPES, WIDE, along_a_run, colour, in_theme, plane
+from .view import OTHERS, SHADES, ScenarioView, columns, grouped, number, scenarios
+
+FOLDER = Path(__file__).parent
+"""Where the templates, the style and the script are."""
+
+GROUPS = {"retained": "old skills, to be kept", "target": "new tasks, in order", "held out": "never trained"}
+"""Titles of the groups of tasks."""
+
+TIER_RULES = (
+    "Nobody but the submitter has checked the runs.",
+    "The metrics were computed again from the episodes.",
+    "Some of the episodes were run again.",
+    "The whole runs were done again.",
+)
+"""What was done to believe the rows of each tier."""
+
+VEGA_LITE = "6.4"
+"""Version that charts are written for."""
+
+CIVIDIS = (
+    "#00204d",
+    "#00336f",
+    "#39486b",
+    "#575c6d",
+    "#707173",
+    "#8a8779",
+    "#a69d75",
+    "#c4b56c",
+    "#e4cf5b",
+    "#ffea46",
+)
+"""Colours of a success from 0 to 1: Nuñez et al. 2018, doi 10.1371/journal.pone.0199239, alike for the
+colour-blind and rising in lightness, so that numbers on them are read in either theme."""
+
+
+def page(table: Table) -> str:
+    """Return the page."""
+    views = scenarios(table)
+    scripts = [_library(), _source("page.js")]
+    style = _source("style.css") + _colours()
+    averages = overall(table.rows)
+    return (
+        _templates()
+        .get_template("page.html")
+        .render(
+            policy=_policy(scripts, style),
+            style=Markup(style),
+            scripts=[Markup(script) for script in scripts],
+            data=Markup(_embedded(_data(views))),
+            scenarios=views,
+            overall=grouped(averages, [row.division for row in averages]),
+            overall_columns=columns(averages),
+            not_shown=table.not_shown,
+        )
+    )
+
+
+def pictures(table: Table) -> dict[str, str]:
+    """Return the pictures by file name: the plane of the scenario with the most methods, light and dark."""
+    by_scenario: dict[str, list[Row]] = {}
+    for row in table.rows:
+        by_scenario.setdefault(row.scenario, []).append(row)
+    rows = max(by_scenario.values(), key=len, default=[])
+    spec = plane(rows, WIDE, font=FONT)
+    spec["config"]["background"] = colour("paper")
+    svg = vl_convert.vegalite_to_svg(spec, vl_version=VEGA_LITE) + "\n"
+    return {"pareto.svg": in_theme(svg, dark=False), "pareto-dark.svg": in_theme(svg, dark=True)}
+
+
+@cache
+def _templates() -> Environment:
+    """Return the templates, which escape whatever they are given."""
+    templates = Environment(
+        loader=FileSystemLoader(FOLDER / "templates"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    templates.globals.update(
+        shapes=SHAPES,
+        group_titles=GROUPS,
+        tiers=TIERS,
+        tier_rules=TIER_RULES,
+        title_of=title_of,
+        number_of=number,
+        shade_of_rank=_shade_of_rank,
+    )
+    return templates
+
+
+def _shade_of_rank(rank: int, count: int) -> int:
+    """Return the colour of a rank: that of a success of 1 for the first of `count`, of 0 for the last."""
+    return SHADES - (rank - 1) * SHADES // max(count - 1, 1)
+
+
+@cache
+def _library() -> str:
+    """Return what draws the charts: it takes seconds to put together."""
+    return vl_convert.javascript_bundle("window.vegaEmbed = vegaEmbed;", VEGA_LITE)
+
+
+def _source(name: str) -> str:
+    return (FOLDER / name).read_text(encoding="utf-8")
+
+
+def _policy(scripts: Sequence[str], style: str) -> str:
+    """Return a content security policy that allows these scripts and this style and nothing else."""
+    sources = " ".join(map(_hash, scripts))
+    others = "default-src 'none'; base-uri 'none'; form-action 'none'"
+    return f"{others}; script-src {sources}; style-src {_hash(style)}"
+
+
+def _hash(text: str) -> str:
+    digest = hashlib.sha256(text.encode("utf-8")).digest()
+    return f"'sha256-{base64.b64encode(digest).decode('ascii')}'"
+
+
+def _colours() -> str:
+    """Return the colours of both themes, and those of the shades."""
+    names = (f"--{name}:light-dark({light},{dark})" for name, (light, dark) in PALETTE.items())
+    shades = (f".s{number}{{{_shade(number / SHADES)}}}" for number in range(SHADES + 1))
+    return f":root{{{';'.join(names)}}}\n" + "\n".join(shades) + "\n"
+
+
+def _shade(share: float) -> str:
+    """Return the colours of a cell: of black and white the one that is read better."""
+    place = min(share * (len(CIVIDIS) - 1), len(CIVIDIS) - 1.000001)
+    low, high = (_rgb(CIVIDIS[int(place) + step]) for step in (0, 1))
+    mixed = [round(a + (b - a) * (place % 1)) for a, b in zip(low, high, strict=True)]
+    linear = [(c / 255 / 12.92) if c <= 10 else ((c / 255 + 0.055) / 1.055) ** 2.4 for c in mixed]
+    luminance = 0.2126 * linear[0] + 0.7152 * linear[1] + 0.0722 * linear[2]
+    ink = "#000" if (luminance + 0.05) ** 2 > 1.05 * 0.05 else "#fff"
+    return f"background:#{bytes(mixed).hex()};color:{ink}"
+
+
+def _rgb(colour: str) -> tuple[int, ...]:
+    return tuple(bytes.fromhex(colour[1:]))
+
+
+def _data(views: Sequence[ScenarioView]) -> dict[str, Any]:
+    """Return what the charts are drawn from."""
+    return {
+        "rows": {view.anchor: {**view.data, "scenario": one.id} for one in views for view in one.rows},
+        "scenarios": {one.id: _scenario_data(one) for one in views},
+        "series": SERIES,
+        "metrics": [[title_of(one.name), one.description, one.missing] for one in OTHERS],
+    }
+
+
+def _scenario_data(one: ScenarioView) -> dict[str, Any]:
+    rows = [view.row for view in one.rows]
+    anchors = {view.row.method: view.anchor for view in one.rows}
+    return {
+        "sft": anchors.get("sft"),
+        "steps": one.steps,
+        "targets": one.tasks["target"],
+        "run": along_a_run(one.tasks["target"], one.steps[-1]),
+        "wide": plane(rows, WIDE, anchors),
+        "narrow": plane(rows, NARROW, anchors),
+    }
+
+
+def _embedded(values: Any) -> str:
+    """Return JSON that cannot end the element it stands in, whatever a stranger wrote."""
+    text = json.dumps(values, sort_keys=True, separators=(",", ":"), allow_nan=False)
+    return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")

@@ -1,0 +1,70 @@
+import logging
+from pathlib import Path
+
+import pytest
+
+from clbench.base.cache import cached, is_cached
+
+INPUTS = {"seed": 0}
+
+
+def _make(text: str, calls: list[str]) -> object:
+    def make(folder: Path) -> None:
+        calls.append(text)
+        (folder / "value.txt").write_text(text)
+
+    return make
+
+
+def _value(folder: Path, inputs: dict[str, int], text: str, calls: list[str]) -> str:
+    return (cached(folder, inputs, _make(text, calls)) / "value.txt").read_text()  # type: ignore[arg-type]
+
+
+def test_what_was_made_is_used_again(tmp_path: Path) -> None:
+    calls: list[str] = []
+    assert _value(tmp_path / "x", INPUTS, "first", calls) == "first"
+    assert _value(tmp_path / "x", INPUTS, "second", calls) == "first"
+    assert calls == ["first"]
+
+
+@pytest.mark.parametrize(
+    ("damage", "fault"),
+    [
+        (lambda folder: (folder / "value.txt").write_text("firs"), "torn"),
+        (lambda folder: (folder / "value.txt").unlink(), "torn"),
+        (lambda folder: (folder / "stranger.txt").write_text("?"), "torn"),
+        (lambda folder: (folder / "clbench.json").unlink(), "torn or foreign"),
+        (lambda folder: (folder / "clbench.json").write_text("{"), "torn or foreign"),
+        (lambda folder: (folder / "clbench.json").write_text("[]"), "torn or foreign"),
+    ],
+)
+def test_a_torn_or_foreign_folder_is_named_and_made_again(
+    tmp_path: Path, damage: object, fault: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    calls: list[str] = []
+    folder = tmp_path / "x"
+    _value(folder, INPUTS, "first", calls)
+    damage(folder)  # type: ignore[operator]
+    assert not is_cached(folder, INPUTS)
+    with caplog.at_level(logging.WARNING):
+        assert _value(folder, INPUTS, "second", calls) == "second"
+    assert str(folder) in caplog.text
+    assert fault in caplog.text
+    assert [path.name for path in tmp_path.iterdir()] == ["x"]
+
+
+def test_what_other_inputs_made_is_made_again(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    calls: list[str] = []
+    _value(tmp_path / "x", INPUTS, "first", calls)
+    assert _value(tmp_path / "x", {"seed": 1}, "second", calls) == "second"
+    assert "was made from other inputs" in caplog.text
+
+
+def test_a_maker_that_fails_leaves_nothing_behind(tmp_path: Path) -> None:
+    def make(folder: Path) -> None:
+        (folder / "value.txt").write_text("half")
+        raise OSError("disk full")
+
+    with pytest.raises(OSError, match="disk full"):
+        cached(tmp_path / "x", INPUTS, make)
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,211 @@
+"""The command line as people type it; what only a process shows, in one of its own."""
+
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+
+from clbench.cli.main import app
+from clbench.jobs.job import Job
+
+TOY = "clbench.testing:clbench/Toy-v0"
+
+
+def _clbench(*arguments: str, folder: Path | None = None) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "clbench", *arguments]
+    return subprocess.run(command, capture_output=True, text=True, cwd=folder, timeout=200, check=False)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (
+            ["run", "clbench/Fecth-v0", "sft"],
+            "No scenario is called 'clbench/Fecth-v0'. Did you mean 'clbench/Fetch-v0'",
+        ),
+        (["run", "clbench/Fetch-v0", "stf"], "No method is called 'stf'. Did you mean 'sft'?"),
+        (["run", "clbench/Fetch-v0"], "Name at least one method"),
+        (
+            ["run", "clbench/Fetch-v0", "sft", "--sedes", "3"],
+            "Unknown option: --sedes. Did you mean --seeds?",
+        ),
+        (["run", "clbench/Fetch-v0", "sft", "--seeds", "0"], "--seeds must be at least 1, not 0"),
+        (["run", "clbench/Fetch-v0", "sft", "--seeds", "many"], "--seeds"),
+        (["run", "clbench/Fetch-v0", "sft", "--workers", "0"], "--workers must be at least 1, not 0"),
+        (["run", "clbench/Fetch-v0", "sft", "--set.rate", "1"], "sft has no hyper-parameter 'rate'"),
+        (
+            ["run", "clbench/Fetch-v0", "experience_replay", "--set.replay", "x"],
+            "replay must be float, not 'x'",
+        ),
+        (
+            ["run", "clbench/Fetch-v0", "experience_replay", "--set.replay", "7"],
+            "replay must be from 0 to 1, not 7.0",
+        ),
+        (["run", "clbench/Fetch-v0", "sft", "--device", "gpu"], "The device 'gpu' cannot be used"),
+        (["run", "clbench/Fetch-v0,clbench/PointMase-v0", "sft"], "Did you mean 'clbench/PointMaze-v0'?"),
+        (["run", "clbench/Fetch-v0", "sft", "--shard", "0/8"], "--shard must be i/n with i from 1 to n"),
+        (["run", "clbench/Fetch-v0", "sft", "--shard", "9/8"], "--shard must be i/n with i from 1 to n"),
+        (["run", "clbench/Fetch-v0", "sft", "--shard", "half"], "as 2/8, not 'half'"),
+        (["demonstrations", "clbench/Fetch"], "Did you mean 'clbench/Fetch-v0'"),
+        (
+            ["tune", "clbench/Fetch-v0", "consft", "--values.kapa", "1,2"],
+            "consft has no hyper-parameter 'kapa'. Did you mean 'kappa'?",
+        ),
+        (
+            ["tune", "clbench/Fetch-v0", "consft", "--values.omega_min", "0.1,2"],
+            "omega_min must be from 0 to 1, not 2.0",
+        ),
+        (["metrics", "forgeting"], "No metric is called 'forgeting'. Did you mean 'forgetting'?"),
+        (["leaderbord"], "leaderbord"),
+        (["experts", "train", "cartpole_lft"], "Did you mean 'cartpole_left'?"),
+        (["experts", "train", "cartpole_left", "--steps", "1500"], "for a multiple of 1,000 steps"),
+        (["experts", "measure", "clbench/Fetch"], "Did you mean 'clbench/Fetch-v0'"),
+        (["experts", "measure", "clbench/Fetch-v0", "pusch"], "Did you mean 'push'?"),
+    ],
+)
+def test_bad_input_ends_with_exit_code_2_and_the_nearest_right_name(
+    arguments: list[str],
+    message: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)  # and take back what the command puts there
+    with pytest.raises(SystemExit) as ended:
+        app(arguments)
+    told = "".join(capsys.readouterr())
+    assert ended.value.code == 2
+    assert " ".join(message.split()) in " ".join(told.replace("│", " ").split())
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_wrong_name_ends_the_process_without_a_traceback(tmp_path: Path) -> None:
+    result = _clbench("run", "clbench/Fecth-v0", "sft", folder=tmp_path)
+    assert (result.returncode, result.stdout) == (2, "")
+    assert result.stderr.startswith("error: No scenario is called ")
+    assert "Traceback" not in result.stderr
+
+
+def test_the_shards_of_a_command_do_each_of_its_runs_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    done: list[str] = []
+
+    def note(jobs: Sequence[Job], *_: object) -> dict[str, str]:
+        done.extend(job.name for job in jobs if job.function == "clbench.jobs.work:run_job")
+        return {}
+
+    monkeypatch.setattr("clbench.jobs.scheduler.run_with_bars", note)
+    runs = ["run", f"{TOY},clbench/Fetch-v0", "sft", "frozen", "lora", "--seeds", "3"]
+    app(runs, result_action="return_value")
+    whole, parts = sorted(done), []
+    for part in range(1, 6):
+        done.clear()
+        app([*runs, "--shard", f"{part}/5"], result_action="return_value")
+        parts.append(list(done))
+    assert len(whole) == 18
+    assert sorted(name for part in parts for name in part) == whole
+    assert {len(part) for part in parts} == {3, 4}
+
+
+def test_help_names_every_command() -> None:
+    output = _clbench("--help").stdout
+    commands = (
+        "list",
+        "run",
+        "tune",
+        "film",
+        "metrics",
+        "leaderboard",
+        "claims",
+        "method-pages",
+        "demonstrations",
+        "doctor",
+    )
+    assert all(name in output for name in commands)
+
+
+def test_list_shows_scenarios_and_methods() -> None:
+    output = _clbench("list").stdout
+    assert "clbench/Fetch-v0" in output
+    assert "experience_replay" in output
+
+
+def test_metrics_shows_all_and_everything_about_one() -> None:
+    assert "positive_backward_transfer_diaz_rodriguez" in _clbench("metrics").stdout
+    output = _clbench("metrics", "worst_case_accuracy").stdout
+    assert "Formula: R[K][K] / K + (1 - 1 / K) minimum_accuracy\n" in output
+
+
+def test_doctor_shows_versions_and_rendering() -> None:
+    result = _clbench("doctor")
+    assert result.returncode == 0
+    assert "mujoco" in result.stdout
+    assert "rendering: egl" in result.stdout
+
+
+@pytest.mark.slow
+def test_demonstrations_are_collected_and_shown(empty_caches: Path) -> None:
+    result = _clbench("demonstrations", TOY)
+    assert result.returncode == 0, result.stderr
+    assert "clbench/toy/left-v0" in result.stdout
+    assert "demonstrations left: 10 episodes" in result.stderr
+
+
+METHOD = """
+from dataclasses import dataclass
+from clbench import Method
+
+@dataclass
+class Gentle(Method):
+    strength: float = 0.5
+    def loss(self, policy, batch, progress):
+        return self.strength * policy.action_loss(batch).mean()
+
+@dataclass
+class Broken(Method):
+    def loss(self, policy, batch, progress):
+        raise ValueError("no idea")
+"""
+
+
+@pytest.mark.slow
+def test_a_stranger_runs_a_class_from_the_working_directory_and_sees_it_on_the_board(tmp_path: Path) -> None:
+    (tmp_path / "mine.py").write_text(METHOD)
+    result = _clbench("run", TOY, "mine:Gentle", "mine:Broken", "sft", "--seeds", "1", folder=tmp_path)
+    assert result.returncode == 1  # the broken one; the others went on
+    assert "mine:Broken seed 0: failed in stage 1 (right): ValueError: no idea" in result.stderr
+    assert "Traceback" not in result.stderr  # it stands in the record
+    assert "1 failed: Toy-v0 mine:Broken seed 0" in result.stderr
+    records = sorted(path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*.json"))
+    assert records == [
+        f"leaderboard/records/Toy-v0/{name}/seed-0.json" for name in ("mine.Broken", "mine.Gentle", "sft")
+    ]
+    again = _clbench("run", TOY, "mine:Gentle", "sft", "--seeds", "1", folder=tmp_path)
+    assert again.returncode == 0
+    assert "2 of 2 runs have a record already" in again.stderr
+    board = _clbench("leaderboard", folder=tmp_path)
+    assert board.returncode == 0, board.stderr
+    assert "mine:Gentle" in board.stdout
+    text = (tmp_path / "leaderboard" / "site" / "LEADERBOARD.md").read_text()
+    assert "mine:Gentle" in text
+    assert "no idea" in text  # why the failed run is not a row
+
+
+@pytest.mark.slow
+def test_tune_compares_settings_without_a_look_at_what_is_reported(tmp_path: Path) -> None:
+    arguments = ("tune", TOY, "low_rate_sft", "--values.speed", "0.2,1", "--seed", "3")
+    result = _clbench(*arguments, folder=tmp_path)
+    assert result.returncode == 0, result.stderr
+    rows = [line.split() for line in result.stdout.splitlines() if "low_rate_sft" in line or " sft" in line]
+    assert [row[1] for row in rows] == ["sft", "low_rate_sft+speed=0.2", "low_rate_sft+speed=1.0"]
+    assert rows[0][3:] == rows[2][3:]  # at full speed it is plain fine-tuning
+    paths = list((tmp_path / "leaderboard" / "tuning").rglob("seed-3.json"))
+    assert len(paths) == 3
+    assert not any('"test"' in path.read_text().partition('"answers"')[0] for path in paths)
+    assert "3 of 3 runs have a record already" in _clbench(*arguments, folder=tmp_path).stderr

@@ -1,0 +1,128 @@
+"""`clbench new-method`: two files that work as they are, and names that are refused with the reason."""
+
+import re
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from clbench.cli.new_method import class_name, write_method
+from clbench.learning.registry import load_method
+from clbench.runs.run import execute
+from clbench.runs.spec import RunSpec
+from clbench.testing import check_method
+
+
+def _python(*arguments: str, folder: Path) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", *arguments]
+    return subprocess.run(command, capture_output=True, text=True, cwd=folder, timeout=300, check=False)
+
+
+@pytest.fixture
+def fresh(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
+    """Write a new method and return the name of its module, which can be imported."""
+    name = "freshly_written"
+    write_method(name, tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    yield name
+    sys.modules.pop(name, None)
+
+
+def test_a_fresh_template_keeps_the_contract(fresh: str) -> None:
+    cls = load_method(f"{fresh}:FreshlyWritten")
+    check_method(cls)
+    assert cls.metadata.licence == "MIT"
+
+
+@pytest.mark.usefixtures("fresh")
+@pytest.mark.parametrize("command", [("check", "--select=A,B,E,F,I,N,RUF,UP,W"), ("format", "--check")])
+def test_a_fresh_template_is_linted_and_formatted_by_ruffs_own_settings(
+    command: tuple[str, ...], tmp_path: Path
+) -> None:
+    result = _python("ruff", command[0], "--isolated", "freshly_written.py", *command[1:], folder=tmp_path)
+    assert result.returncode == 0, result.stdout + result.stderr
+
+
+def test_the_command_says_what_to_do_next(tmp_path: Path) -> None:
+    result = _python("clbench", "new-method", "freshly_written", folder=tmp_path)
+    assert result.stdout.splitlines() == [
+        "Wrote freshly_written.py and test_freshly_written.py. Make the method yours, then:",
+        "  python -m pytest test_freshly_written.py",
+        "  clbench submit freshly_written:FreshlyWritten",
+    ]
+    tested = _python("pytest", "--collect-only", "-q", "test_freshly_written.py", folder=tmp_path)
+    assert "test_freshly_written_keeps_the_contract" in tested.stdout
+
+
+def test_a_fresh_template_runs(fresh: str, tmp_path: Path) -> None:
+    spec = RunSpec("clbench.testing:clbench/Toy-v0", f"{fresh}:FreshlyWritten", 0)
+    record = execute(spec, tmp_path / "records")
+    assert (record.status, record.run["settings"]) == ("success", {"share": 0.9})
+
+
+def test_another_folder_is_named_in_what_to_do_next(tmp_path: Path) -> None:
+    (tmp_path / "mine").mkdir()
+    result = _python("clbench", "new-method", "freshly_written", "--folder", "mine", folder=tmp_path)
+    assert result.stdout.splitlines()[1] == "  cd mine"
+    assert sorted(path.name for path in (tmp_path / "mine").iterdir()) == [
+        "freshly_written.py",
+        "test_freshly_written.py",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("", "'' cannot be the name of a module"),
+        ("MyMethod", "Did you mean 'my_method'?"),
+        ("my-method", "a letter first. Did you mean 'my_method'?"),
+        ("2fast", "Did you mean 'fast'?"),
+        ("_mine", "Did you mean 'mine'?"),
+        ("méthode", "cannot be the name of a module"),
+        ("../mine", "Did you mean 'mine'?"),
+        ("mine.py", "Did you mean 'mine_py'?"),
+        ("m" * 51, "at most 50 small letters"),
+        ("lambda", "'lambda' is a word of Python"),
+        ("sft", "'sft' is a built-in method. Did you mean 'my_sft'?"),
+        ("s_f_t", "'s_f_t' can be taken for the method 'sft'"),
+        ("nul", "the name of a device on Windows"),
+        ("torch", "There is a module 'torch' already. Did you mean 'torch_method'?"),
+    ],
+)
+def test_a_name_that_cannot_be_is_refused_with_the_reason_and_nothing_is_written(
+    name: str, message: str, tmp_path: Path
+) -> None:
+    with pytest.raises(ValueError, match=re.escape(message)):
+        write_method(name, tmp_path)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("there", ["mine.py", "test_mine.py"])
+def test_no_file_is_overwritten_and_none_is_left_alone(there: str, tmp_path: Path) -> None:
+    (tmp_path / there).write_text("mine", encoding="utf-8")
+    with pytest.raises(ValueError, match=rf"{there} cannot be written: File exists."):
+        write_method("mine", tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == [there]
+    assert (tmp_path / there).read_text(encoding="utf-8") == "mine"
+
+
+def test_a_link_is_not_followed(tmp_path: Path) -> None:
+    (tmp_path / "mine.py").symlink_to(tmp_path / "elsewhere.py")
+    with pytest.raises(ValueError, match="File exists"):
+        write_method("mine", tmp_path)
+    assert not (tmp_path / "elsewhere.py").exists()
+
+
+def test_a_bad_name_or_folder_ends_the_command_with_one_line(tmp_path: Path) -> None:
+    for arguments in (("sft",), ("mine", "--folder", "nowhere")):
+        result = _python("clbench", "new-method", *arguments, folder=tmp_path)
+        assert result.returncode == 2
+        assert len(result.stderr.splitlines()) == 1
+        assert result.stderr.startswith("error: ")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_class_is_named_after_the_module() -> None:
+    assert [class_name(name) for name in ("ewc", "my_method", "a__b2")] == ["Ewc", "MyMethod", "AB2"]

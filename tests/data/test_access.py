@@ -1,0 +1,123 @@
+"""Leaks: a method that knows what its stage must not know is found, and said what it was."""
+
+from pathlib import Path
+
+import pytest
+
+from clbench.runs.run import execute
+from clbench.runs.spec import RunSpec
+
+TOY = "clbench.testing:clbench/Toy-v0"
+
+METHODS = '''
+import dataclasses
+
+from clbench.data.demonstrations import load_demonstrations
+from clbench.evaluation.rollouts import Evaluator
+from clbench.learning.method import Method
+from clbench.data.questions import load_questions
+from clbench.testing import TOY
+
+
+@dataclasses.dataclass
+class Ahead(Method):
+    """It looks at the demonstrations of the next target."""
+
+    def start_task(self, policy, stage):
+        following = TOY.target[stage.number % len(TOY.target)]
+        load_demonstrations(following, TOY, policy.config)
+        return policy.parameters()
+
+
+@dataclasses.dataclass
+class Chooser(Method):
+    """It chooses its checkpoint on test episodes."""
+
+    split = "test"
+    task = 0
+
+    def end_task(self, policy, stage):
+        evaluator = Evaluator(TOY, 0)
+        try:
+            evaluator.play(policy, [(TOY.target[self.task], self.split, 0)])
+        finally:
+            evaluator.close()
+
+
+@dataclasses.dataclass
+class RobustChooser(Chooser):
+    """It chooses its checkpoint on perturbed episodes, which are those of the report."""
+
+    split = "perturbed"
+
+
+@dataclasses.dataclass
+class EarlyChooser(Chooser):
+    """It tunes on validation episodes of a target that comes later."""
+
+    split = "validation"
+    task = 1
+
+
+@dataclasses.dataclass
+class FairChooser(Chooser):
+    """It looks at validation episodes of what it has learned, as it may."""
+
+    split = "validation"
+
+
+@dataclasses.dataclass
+class Asker(Method):
+    """It reads the questions of the report."""
+
+    def prepare(self, policy, prior):
+        load_questions(TOY)
+
+
+@dataclasses.dataclass
+class Normaliser(Method):
+    """It takes the normalisation from the target."""
+
+    def start_task(self, policy, stage):
+        batch = stage.target.sample(64)
+        policy.normalise_like(batch.state, batch.action[:, 0])
+        return policy.parameters()
+
+
+@dataclasses.dataclass
+class Talker(Method):
+    """It makes room for the words of later tasks."""
+
+    def prepare(self, policy, prior):
+        policy.config = dataclasses.replace(policy.config, vocabulary_size=policy.config.vocabulary_size + 9)
+'''
+
+
+@pytest.fixture(autouse=True)
+def _methods(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "leaky.py").write_text(METHODS, encoding="utf-8")
+    monkeypatch.syspath_prepend(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("method", "message"),
+    [
+        ("Ahead", "reads demonstrations of down, which its stage must not know yet"),
+        ("Chooser", "runs test episodes of right: nothing may be chosen on them"),
+        ("RobustChooser", "runs perturbed episodes of right: nothing may be chosen on them"),
+        ("EarlyChooser", "runs episodes of down, which its stage must not know yet"),
+        ("Asker", "loads questions by itself, those of the report too"),
+        ("Normaliser", "changes state_mean: the normalisation comes from the retained skills alone"),
+        ("Talker", "changes the vocabulary or a size of the policy"),
+    ],
+)
+def test_a_planted_leak_ends_the_run_and_is_named(method: str, message: str, tmp_path: Path) -> None:
+    record = execute(RunSpec(TOY, f"leaky:{method}", 0), tmp_path)
+    assert record.status == "failed"
+    assert record.error is not None
+    assert record.error["type"] == "LeakError"
+    assert message in record.error["message"]
+
+
+def test_what_a_stage_may_know_it_may_use(tmp_path: Path) -> None:
+    assert execute(RunSpec(TOY, "leaky:FairChooser", 0, targets=1), tmp_path).status == "success"

@@ -1,0 +1,132 @@
+import dataclasses
+import logging
+from pathlib import Path
+
+import minari
+import numpy as np
+import pytest
+import torch
+
+from clbench.base.entry_points import resolve
+from clbench.data.demonstrations import (
+    Demonstration,
+    Demonstrations,
+    collect,
+    dataset_folder,
+    demonstrate,
+    read_dataset,
+)
+from clbench.spec.budget import Budget
+from clbench.spec.language import encode
+from clbench.spec.registry import load_scenario
+from clbench.spec.task import Task
+
+TOY = load_scenario("clbench.testing:clbench/Toy-v0")
+TASK = TOY.task("left")
+BUDGET = dataclasses.replace(TOY.budget, demonstrations=5)
+
+
+def _same(first: list[Demonstration], second: list[Demonstration]) -> bool:
+    return all(
+        np.array_equal(a, b)
+        for one, other in zip(first, second, strict=True)
+        for a, b in zip(dataclasses.astuple(one), dataclasses.astuple(other), strict=True)
+    )
+
+
+def test_demonstrations_are_made_once_and_come_back_as_they_were(empty_caches: Path) -> None:
+    folder = dataset_folder(TASK, BUDGET)
+    assert folder == empty_caches / "minari" / "clbench" / "toy" / "left-v0"
+    written = (folder / "data" / "main_data.hdf5").stat().st_mtime_ns
+    assert dataset_folder(TASK, BUDGET) == folder
+    assert (folder / "data" / "main_data.hdf5").stat().st_mtime_ns == written
+    assert _same(read_dataset(folder), collect(TASK, BUDGET))
+
+
+def test_others_read_them_with_minari(empty_caches: Path) -> None:
+    dataset_folder(TASK, BUDGET)
+    assert list(minari.list_local_datasets()) == ["clbench/toy/left-v0"]
+    dataset = minari.load_dataset("clbench/toy/left-v0")
+    assert dataset.total_episodes == 5
+    episode = dataset[0]
+    assert episode.observations.shape[0] == len(episode.actions) + 1 == len(episode.infos["expert_action"])
+    assert episode.terminations[-1]
+
+
+def test_a_torn_dataset_is_named_and_made_again(empty_caches: Path, caplog: pytest.LogCaptureFixture) -> None:
+    folder = dataset_folder(TASK, BUDGET)
+    before = read_dataset(folder)
+    data = folder / "data" / "main_data.hdf5"
+    data.write_bytes(data.read_bytes()[: data.stat().st_size // 2])
+    with caplog.at_level(logging.WARNING):
+        assert _same(read_dataset(dataset_folder(TASK, BUDGET)), before)
+    assert f"{folder} is torn" in caplog.text
+
+
+def test_every_kept_episode_succeeds_and_about_half_are_noisy() -> None:
+    episodes = collect(load_scenario("clbench/Fetch-v0").task("lift"), Budget(demonstrations=20))
+    assert len(episodes) == 20
+    assert all(episode.success for episode in episodes)
+    assert 3 <= sum(bool(episode.noisy.any()) for episode in episodes) <= 15
+
+
+def test_the_recorded_actions_replay_to_the_recorded_states_bit_for_bit() -> None:
+    task = load_scenario("clbench/Fetch-v0").task("push_left")
+    world = resolve(task.world)()
+    episode = demonstrate(world, task, seed=7, noisy=True)
+    state, _ = world.reset(seed=7, options={"task": task.name})
+    states = [state] + [world.step(action)[0] for action in episode.executed]
+    assert np.array_equal(np.array(states), episode.state)
+
+
+def test_an_expert_that_mostly_fails_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    lazy = dataclasses.replace(TASK, expert="clbench.testing:lazy_expert")
+    monkeypatch.setattr(
+        "clbench.testing.lazy_expert", lambda _: lambda state: np.zeros(2, np.float32), raising=False
+    )
+    with pytest.raises(RuntimeError, match=r"The expert of 'left' succeeded 0 times in 10 attempts"):
+        collect(lazy, BUDGET)
+
+
+def _episode(noisy: list[bool]) -> Demonstration:
+    """Return an episode whose state and expert action at step t are both t."""
+    steps = len(noisy)
+    counting = np.arange(steps + 1, dtype=np.float32)[:, None]
+    return Demonstration(
+        counting, counting[:-1] + 100, counting, np.array([*noisy, False]), np.zeros(steps), True
+    )
+
+
+def test_chunks_hold_the_experts_next_actions_up_to_the_end() -> None:
+    data = Demonstrations.of_task(TASK, [_episode([False] * 4)], chunk=3)
+    assert data.state[:, 0].tolist() == [0, 1, 2, 3]
+    assert data.action[:, :, 0].tolist() == [[0, 1, 2], [1, 2, 3], [2, 3, 3], [3, 3, 3]]
+    assert data.valid.tolist() == [[1, 1, 1], [1, 1, 1], [1, 1, 0], [1, 0, 0]]
+
+
+def test_what_follows_action_noise_inside_a_chunk_does_not_count() -> None:
+    data = Demonstrations.of_task(TASK, [_episode([False, True, True, False, False])], chunk=3)
+    # the first noisy step still shows what the expert would have done there; what comes after does not
+    assert data.valid.tolist() == [[1, 1, 0], [1, 0, 0], [1, 0, 0], [1, 1, 0], [1, 0, 0]]
+
+
+def _constant_task(name: str, steps: int) -> Demonstrations:
+    words = ("go left", "move to the left") if name == "left" else ("go up",)
+    task = Task(name, "toy", words, 12, "", "")
+    return Demonstrations.of_task(task, [_episode([False] * steps)], chunk=2)
+
+
+def test_samples_draw_tasks_evenly_with_their_own_words() -> None:
+    data = Demonstrations.cat([_constant_task("left", 50), _constant_task("up", 5)])
+    batch = data.sample(2000, torch.Generator().manual_seed(0))
+    up = (batch.words == encode(["go up"])).all(dim=1)
+    assert 900 < int(up.sum()) < 1100
+    assert float(batch.state[up].max()) == 4
+    wordings = {tuple(row) for row in batch.words[~up].tolist()}
+    assert wordings == {tuple(row) for row in encode(["go left", "move to the left"]).tolist()}
+
+
+def test_the_same_generator_draws_the_same_sample() -> None:
+    data = _constant_task("left", 50)
+    first, second = (data.sample(8, torch.Generator().manual_seed(3)) for _ in range(2))
+    assert all(a.equal(b) for a, b in zip(vars(first).values(), vars(second).values(), strict=True))

@@ -1,0 +1,64 @@
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+
+from clbench.data.questions import QuestionKind, Questions, load_questions, scored_questions, sign, which
+from clbench.spec.language import word_id
+from clbench.spec.registry import load_scenario
+
+TOY = load_scenario("clbench.testing:clbench/Toy-v0")
+FETCH = load_scenario("clbench/Fetch-v0")
+
+
+def test_an_answer_is_the_first_truth_that_holds_and_none_where_it_is_too_close_to_tell() -> None:
+    first, second = np.array([True, False, True, False]), np.array([False, True, True, False])
+    assert which(first, second).tolist() == [0, 1, 0, -1]
+    assert sign(np.array([0.3, -0.3, 0.2, -0.2, 0.1], np.float32), 0.25).tolist() == [0, 1, -1, -1, -1]
+
+
+def test_every_kind_and_every_answer_of_it_is_as_frequent_and_right() -> None:
+    train, _ = load_questions(TOY)
+    batch = train.sample(4000, torch.Generator().manual_seed(0))
+    counts = {
+        answer: int((batch.answer == word_id(answer)).sum()) for answer in ("left", "right", "below", "above")
+    }
+    assert all(900 < count < 1100 for count in counts.values()), counts
+    right = batch.answer == word_id("right")
+    left = batch.answer == word_id("left")
+    assert (batch.state[right, 0] > batch.state[right, 2]).all()
+    assert (batch.state[left, 0] < batch.state[left, 2]).all()
+
+
+def test_report_questions_ask_about_other_episodes_than_training() -> None:
+    train, report = load_questions(TOY)
+    markers = [{tuple(row) for row in questions.scenes[:, 2:].tolist()} for questions in (train, report)]
+    assert len(markers[0]) == 40
+    assert len(markers[1]) == 10
+    assert not markers[0] & markers[1]
+
+
+def test_every_report_asks_the_same_questions_as_many_of_each_kind() -> None:
+    _, report = load_questions(TOY)
+    (kind, first), (_, second) = scored_questions(report, 50), scored_questions(report, 50)
+    assert first.state.equal(second.state)
+    assert torch.bincount(kind).tolist() == [25, 25]
+
+
+def test_an_answer_that_no_state_gives_is_named() -> None:
+    kind = QuestionKind(
+        "place", ("where is it",), ("left", "right"), lambda states: np.zeros(len(states), np.int64)
+    )
+    with pytest.raises(ValueError, match="No state answers 'right' to 'place': 'where is it'"):
+        Questions((kind,), torch.zeros(5, 4))
+
+
+def test_fetch_questions_have_balanced_answers_for_training_and_report() -> None:
+    few = dataclasses.replace(FETCH, budget=dataclasses.replace(FETCH.budget, question_episodes=48))
+    for questions in load_questions(few):
+        kind, batch = scored_questions(questions, 1400)
+        for index, entry in enumerate(questions.kinds):
+            for answer in entry.answers:
+                share = float((batch.answer[kind == index] == word_id(answer)).float().mean())
+                assert share == pytest.approx(1 / len(entry.answers), abs=0.2)

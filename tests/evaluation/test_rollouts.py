@@ -1,0 +1,169 @@
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+
+from clbench.base.entry_points import resolve
+from clbench.base.seeding import derive_seed, torch_generator
+from clbench.data.questions import load_questions, scored_questions
+from clbench.evaluation.rollouts import LANES, Episode, Evaluator, Trial, answer, start_of
+from clbench.learning.optimise import deterministic
+from clbench.learning.pretraining import policy_config, pretrained_policy
+from clbench.policy.policy import Policy
+from clbench.spec.language import encode
+from clbench.spec.registry import load_scenario
+from clbench.spec.scenario import Scenario
+from clbench.spec.task import Task
+
+TOY = load_scenario("clbench.testing:clbench/Toy-v0")
+FETCH = load_scenario("clbench/Fetch-v0")
+
+
+@pytest.fixture(scope="module")
+def fetch_policy() -> Policy:
+    """A policy for Fetch that was never trained: it waves the arm about."""
+    return Policy(policy_config(FETCH), seed=3).eval()
+
+
+def _with_episodes(**numbers: int) -> Scenario:
+    """Return Fetch with other numbers of episodes, which end after 16 steps."""
+
+    def short(tasks: tuple[Task, ...]) -> tuple[Task, ...]:
+        return tuple(dataclasses.replace(task, horizon=16) for task in tasks)
+
+    return dataclasses.replace(
+        FETCH,
+        retained=short(FETCH.retained),
+        target=short(FETCH.target),
+        held_out=short(FETCH.held_out),
+        budget=dataclasses.replace(FETCH.budget, **numbers),
+    )
+
+
+def test_an_outcome_does_not_depend_on_what_else_is_evaluated(fetch_policy: Policy) -> None:
+    scenario = _with_episodes(validation_episodes=4)
+    evaluator = Evaluator(scenario, seed=0)
+    with deterministic():
+        together = evaluator.evaluate(fetch_policy, scenario.tasks)  # 48 episodes: more than lanes
+        alone = Evaluator(scenario, seed=0).evaluate(fetch_policy, [scenario.tasks[5]])
+        again = evaluator.evaluate(fetch_policy, reversed(scenario.tasks))
+    assert len(together) > LANES
+    assert alone == together[20:24]
+    assert again == [episode for start in range(44, -4, -4) for episode in together[start : start + 4]]
+
+
+def _played_alone(policy: Policy, task: Task, number: int, seed: int) -> Episode:
+    """Run one validation episode in the plain world, with nothing else in the forward."""
+    config, world = policy.config, resolve(task.world)()
+    start = derive_seed("episode", seed, task.name, "selection", number)
+    state, _ = world.reset(seed=start, options={"task": task.name})
+    words = torch.ones(LANES, 12, dtype=torch.int64)
+    words[0] = encode([task.instructions[number % len(task.instructions)]])[0]
+    forwards = -(-task.horizon // config.executed)
+    draws = torch.randn(forwards, config.chunk, config.action_size, generator=torch_generator("noise", start))
+    states, noise = torch.zeros(LANES, config.state_size), torch.zeros(LANES, *draws.shape[1:])
+    total_reward = 0.0
+    for step in range(task.horizon):
+        if step % config.executed == 0:
+            states[0], noise[0] = torch.from_numpy(state), draws[step // config.executed]
+            chunk = policy.act(states, words, noise)[0].clamp(-1.0, 1.0).numpy()
+        state, reward, success, _, _ = world.step(chunk[step % config.executed])
+        total_reward += reward
+        if success:
+            break
+    return Episode(task.name, "validation", number, success, total_reward, step + 1)
+
+
+def test_an_outcome_is_bit_for_bit_that_of_the_plain_world(fetch_policy: Policy) -> None:
+    trained, _ = pretrained_policy(TOY, 0)
+    cases = [(FETCH, fetch_policy, ["push", "pull"]), (TOY, trained, ["left", "right", "up_left"])]
+    for scenario, policy, names in cases:
+        trials: list[Trial] = [
+            (scenario.task(name), "validation", number) for name in names for number in (0, 3)
+        ]
+        with deterministic():
+            alone = [_played_alone(policy, task, number, seed=4) for task, _, number in trials]
+            for threads in (1, 2):
+                assert Evaluator(scenario, seed=4, threads=threads).play(policy, trials) == alone
+
+
+def test_rows_of_a_forward_do_not_depend_on_their_place_or_their_neighbours(fetch_policy: Policy) -> None:
+    generator = torch.Generator().manual_seed(0)
+    config = fetch_policy.config
+    state = torch.randn(LANES, config.state_size, generator=generator)
+    words = torch.randint(0, 300, (LANES, 12), generator=generator)
+    noise = torch.randn(LANES, config.chunk, config.action_size, generator=generator)
+    order = torch.randperm(LANES, generator=generator)
+    with deterministic():
+        straight = fetch_policy.act(state, words, noise)
+        shuffled = fetch_policy.act(state[order], words[order], noise[order])
+        assert shuffled.equal(straight[order])
+        state[7:], noise[7:] = 0, 0
+        assert fetch_policy.act(state, words, noise)[:7].equal(straight[:7])
+
+
+def test_selection_and_report_episodes_and_seeds_have_different_initial_states(fetch_policy: Policy) -> None:
+    task = FETCH.task("reach")
+    scenario = _with_episodes(validation_episodes=2, test_episodes=3, curve_episodes=1)
+    runs = [
+        [episode.total_reward for episode in Evaluator(scenario, seed).evaluate(fetch_policy, [task], split)]  # type: ignore[arg-type]
+        for seed, split in ((0, "validation"), (0, "test"), (1, "test"))
+    ]
+    assert [len(run) for run in runs] == [2, 3, 3]
+    values = [value for run in runs for value in run]
+    assert len(set(values)) == len(values)
+
+
+def test_a_perturbed_episode_begins_with_the_seed_and_the_words_of_the_report_episode() -> None:
+    task = FETCH.task("push")
+    for number in range(3):
+        assert start_of((task, "perturbed", number), 5) == start_of((task, "test", number), 5)
+    assert FETCH.budget.episodes("perturbed") == FETCH.budget.test_episodes
+
+
+def test_perturbed_outcomes_do_not_depend_on_what_else_is_evaluated_nor_change_it(
+    fetch_policy: Policy,
+) -> None:
+    tasks = [FETCH.task("push"), FETCH.task("reach")]
+    plain: list[Trial] = [(task, "test", number) for task in tasks for number in range(3)]
+    perturbed: list[Trial] = [(task, "perturbed", number) for task, _, number in plain]
+    with deterministic():
+        alone = (
+            Evaluator(FETCH, 0).play(fetch_policy, plain),
+            Evaluator(FETCH, 0).play(fetch_policy, perturbed),
+        )
+        evaluator = Evaluator(FETCH, 0, threads=2)
+        together = evaluator.play(fetch_policy, [*perturbed[::-1], *plain])
+        again = evaluator.play(fetch_policy, perturbed)
+    assert together == [*alone[1][::-1], *alone[0]]
+    assert again == alone[1]
+    assert all(one.total_reward != other.total_reward for one, other in zip(*alone, strict=True))
+
+
+def test_a_pretrained_toy_policy_does_its_skills_and_not_the_targets() -> None:
+    policy, _ = pretrained_policy(TOY, 0)
+    with deterministic():
+        episodes = Evaluator(TOY, 0).evaluate(policy, TOY.tasks)
+    rates = {task.name: np.mean([e.success for e in episodes if e.task == task.name]) for task in TOY.tasks}
+    assert rates["left"] == rates["up"] == 1.0
+    assert rates["right"] == rates["down"] == 0.0
+
+
+def test_a_policy_that_acts_in_nan_fails_its_episodes_and_stops_nothing(fetch_policy: Policy) -> None:
+    broken = Policy(fetch_policy.config)
+    next(broken.head.parameters()).data.fill_(float("nan"))
+    episodes = Evaluator(_with_episodes(validation_episodes=2), 0).evaluate(broken, [FETCH.task("lift")])
+    assert not any(episode.success for episode in episodes)
+    assert {episode.length for episode in episodes} == {FETCH.task("lift").horizon}
+
+
+def test_answers_are_counted_by_kind() -> None:
+    policy, _ = pretrained_policy(TOY, 0)
+    _, report = load_questions(TOY)
+    kind, questions = scored_questions(report, 90)
+    counts = answer(policy, report.kinds, kind, questions)
+    assert [(name, asked) for name, asked, _ in counts] == [("side", 45), ("height", 45)]
+    assert sum(correct for _, _, correct in counts) > 75
+    swapped = dataclasses.replace(questions, answer=questions.answer.roll(1))
+    assert sum(c for _, _, c in answer(policy, report.kinds, kind, swapped)) < 75

@@ -1,0 +1,43 @@
+import io
+
+from rich.console import Console
+
+from clbench.jobs.bars import LINE_SECONDS, Bars
+
+
+def test_without_a_terminal_a_line_is_printed_now_and_then() -> None:
+    now = 0.0
+    file = io.StringIO()
+    bars = Bars(100, Console(file=file, width=100), clock=lambda: now)
+    with bars:
+        bars.start("pretraining [seed 0]", 100)
+        for _ in range(50):
+            now += LINE_SECONDS / 10
+            bars.advance("pretraining [seed 0]", 1)
+        bars.finish("pretraining [seed 0]", "done")
+    lines = file.getvalue().splitlines()
+    # 50 steps of 3 s: a line every 30 s; after half of the work in 150 s another 150 s are left
+    assert len(lines) == 6
+    assert lines[4] == " 50%, about 2:30 left: pretraining [seed 0]"
+    assert lines[5] == "pretraining [seed 0]: done"
+
+
+def test_before_anything_is_done_no_time_left_is_made_up() -> None:
+    now = 0.0
+    file = io.StringIO()
+    with Bars(100, Console(file=file, width=100), clock=lambda: now) as bars:
+        bars.start("a", 100)
+        now += 2 * LINE_SECONDS
+        bars.advance("a", 0)
+    assert file.getvalue() == "  0%: a\n"
+
+
+def test_on_a_terminal_there_are_bars_with_the_time_left() -> None:
+    file = io.StringIO()
+    with Bars(100, Console(file=file, width=100, force_terminal=True)) as bars:
+        bars.start("sft seed 0", 100)
+        bars.advance("sft seed 0", 40)
+    text = file.getvalue()
+    assert "sft seed 0" in text
+    assert "40%" in text
+    assert "left" in text

@@ -1,0 +1,122 @@
+"""Ray: the same records as on one machine, and nothing is lost with a worker."""
+
+import io
+import os
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import psutil
+import pytest
+
+from clbench.jobs.bars import Bars
+from clbench.jobs.job import Job
+from clbench.jobs.plan import benchmark_jobs
+from clbench.jobs.processes import Processes
+from clbench.jobs.ray import RayWorkers
+from clbench.jobs.scheduler import run_jobs
+from clbench.runs.spec import RunSpec
+from clbench.spec.limits import Limits
+
+TOY = "clbench.testing:clbench/Toy-v0"
+
+JOBS = """
+import os, time
+from pathlib import Path
+
+def good(progress):
+    progress(1)
+    return "went well"
+
+def bad(progress):
+    raise ValueError("went wrong")
+
+def lost_once(progress, path):
+    attempts = Path(path)
+    with attempts.open("a") as file:
+        file.write(f"{os.getpid()}\\n")
+    while len(attempts.read_text().split()) == 1:
+        time.sleep(0.1)
+        progress(0)
+    return "went well in the end"
+
+def lost_always(progress):
+    os._exit(3)
+
+def endless(progress):
+    time.sleep(60)
+
+def niceness(progress):
+    return f"nicer by {os.nice(0)}"
+"""
+
+# a cluster of its own for each test; Ray leaves a socket and a log file to the garbage collector
+pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore::ResourceWarning")]
+
+
+@pytest.fixture(autouse=True)
+def _jobs_module(write_module: Callable[[str, str], None]) -> None:
+    write_module("some_jobs", JOBS)
+
+
+def _kill_first(path: Path, ancestor: int) -> None:
+    """Kill the process whose id is the first in a file, or one that it comes from, as soon as it is there."""
+    deadline = time.monotonic() + 100
+    while time.monotonic() < deadline:
+        if path.exists() and path.read_text().strip():
+            process = psutil.Process(int(path.read_text().split()[0]))
+            [process, *process.parents()][ancestor].kill()
+            return
+        time.sleep(0.05)
+
+
+@pytest.mark.parametrize("ancestor", [0, 2], ids=["process", "worker"])
+def test_a_job_that_fails_leaves_the_others_alone_and_one_whose_worker_is_killed_is_done_again(
+    ancestor: int, tmp_path: Path, bars: Bars
+) -> None:
+    path = tmp_path / "attempts"
+    jobs = [
+        Job("wrong", "some_jobs:bad", {}, 1),
+        Job("hopeless", "some_jobs:good", {}, 1, ("wrong",)),
+        Job("fine", "some_jobs:good", {}, 1),
+        Job("lost", "some_jobs:lost_once", {"path": str(path)}, 1),
+        Job("cursed", "some_jobs:lost_always", {}, 1),
+        Job("endless", "some_jobs:endless", {}, 1, limits=Limits(seconds=3)),
+    ]
+    killer = threading.Thread(target=_kill_first, args=(path, ancestor))
+    killer.start()
+    failed = run_jobs(jobs, RayWorkers("local", 2), bars)
+    killer.join()
+    assert set(failed) == {"wrong", "hopeless", "cursed", "endless"}
+    assert failed["endless"] == "stopped, because it took longer than 3 s"
+    assert failed["cursed"] == (
+        "its worker was lost 4 times: its process ended without a result (exit code 3)"
+    )
+    assert "ValueError: went wrong" in failed["wrong"]
+    assert len(path.read_text().split()) == 2
+    assert isinstance(bars.console.file, io.StringIO)
+    assert "lost: went well in the end" in bars.console.file.getvalue()
+
+
+def test_the_records_are_those_of_one_machine(
+    tmp_path: Path, bars: Bars, lasting_records: Callable[[Path], dict[str, Any]]
+) -> None:
+    specs = [RunSpec(TOY, method, 0) for method in ("sft", "frozen", "experience_replay")]
+    assert run_jobs(benchmark_jobs(specs, tmp_path / "here"), Processes(2), bars) == {}
+    assert run_jobs(benchmark_jobs(specs, tmp_path / "ray"), RayWorkers("local", 2), bars) == {}
+    records = lasting_records(tmp_path / "here")
+    assert len(records) == 3
+    assert records == lasting_records(tmp_path / "ray")
+
+
+def test_a_job_on_this_machine_gives_way_to_nothing_else(bars: Bars) -> None:
+    assert run_jobs([Job("niceness", "some_jobs:niceness", {}, 1)], RayWorkers("local", 1), bars) == {}
+    assert isinstance(bars.console.file, io.StringIO)
+    assert f"niceness: nicer by {os.nice(0)} (" in bars.console.file.getvalue()
+
+
+def test_a_cluster_that_does_not_run_is_refused() -> None:
+    with pytest.raises(LookupError, match="No Ray cluster answers at 'auto'; --ray local starts one"):
+        RayWorkers("auto")

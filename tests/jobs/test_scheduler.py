@@ -1,0 +1,240 @@
+"""The grid: processes that work, fail, die and are stopped."""
+
+import io
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from clbench.jobs.bars import Bars
+from clbench.jobs.job import Job
+from clbench.jobs.plan import benchmark_jobs
+from clbench.jobs.processes import Processes
+from clbench.jobs.scheduler import run_jobs
+from clbench.learning.pretraining import pretrained_policy
+from clbench.runs.run import evaluate_pretrained, execute
+from clbench.runs.spec import RunSpec, has_record
+from clbench.spec.registry import load_scenario
+
+TOY = "clbench.testing:clbench/Toy-v0"
+
+JOBS = """
+import os, signal, threading, time
+from pathlib import Path
+
+def good(progress, path=None):
+    progress(1)
+    if path: Path(path).write_text("done")
+    return "went well"
+
+def bad(progress):
+    raise ValueError("went wrong")
+
+def killed(progress):
+    os.kill(os.getpid(), signal.SIGKILL)
+
+def leaves_a_thread(progress):
+    threading.Thread(target=time.sleep, args=(60,)).start()
+    return "went well"
+
+def slow(progress, path):
+    Path(path).write_text(str(os.getpid()))
+    time.sleep(60)
+"""
+
+
+@pytest.fixture(autouse=True)
+def _jobs_module(write_module: Callable[[str, str], None]) -> None:
+    write_module("some_jobs", JOBS)
+
+
+def _job(name: str, function: str, *needs: str, **arguments: Any) -> Job:
+    return Job(name, f"some_jobs:{function}", arguments, 1, needs)
+
+
+def _printed(bars: Bars) -> str:
+    assert isinstance(bars.console.file, io.StringIO)
+    return bars.console.file.getvalue()
+
+
+def test_a_job_starts_after_what_it_needs(tmp_path: Path, bars: Bars) -> None:
+    jobs = [
+        _job("second", "good", "first", path=str(tmp_path / "2")),
+        _job("first", "good", path=str(tmp_path / "1")),
+    ]
+    assert run_jobs(jobs, Processes(2), bars) == {}
+    assert (tmp_path / "1").stat().st_mtime_ns < (tmp_path / "2").stat().st_mtime_ns
+    assert "first: went well" in _printed(bars)
+
+
+def test_a_job_that_fails_or_is_killed_does_not_stop_the_others(bars: Bars) -> None:
+    jobs = [
+        _job("wrong", "bad"),
+        _job("dead", "killed"),
+        _job("hopeless", "good", "dead"),
+        _job("worse", "good", "hopeless"),
+        _job("fine", "good"),
+    ]
+    failed = run_jobs(jobs, Processes(2), bars)
+    assert set(failed) == {"wrong", "dead", "hopeless", "worse"}
+    assert "ValueError: went wrong" in failed["wrong"]
+    assert "exit code -9" in failed["dead"]
+    assert failed["hopeless"] == "left out, because dead failed"
+    assert "fine: went well" in _printed(bars)
+
+
+def test_a_job_that_leaves_a_thread_behind_is_over_when_it_says_so(
+    bars: Bars, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("clbench.jobs.processes._LEAVE_SECONDS", 0.2)
+    begin = time.monotonic()
+    assert run_jobs([_job("loose", "leaves_a_thread"), _job("next", "good")], Processes(1), bars) == {}
+    assert time.monotonic() - begin < 50
+    assert "next: went well" in _printed(bars)
+
+
+def test_stopping_the_grid_ends_its_processes(
+    tmp_path: Path, bars: Bars, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "pid"
+
+    def interrupt(*_: Any, **__: Any) -> list[Any]:
+        while not path.exists() or not path.read_text():
+            time.sleep(0.05)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("clbench.jobs.processes.wait", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        run_jobs([_job("slow", "slow", path=str(path))], Processes(1), bars)
+    with pytest.raises(ProcessLookupError):
+        os.kill(int(path.read_text()), 0)
+
+
+def test_what_the_longest_work_waits_for_begins_first(bars: Bars) -> None:
+    lengths = {"short run": 1.0, "long run": 9.0, "pretraining of the long run": 2.0, "middle run": 5.0}
+    needs = {"long run": ("pretraining of the long run",)}
+    jobs = [Job(name, "some_jobs:good", {}, length, needs.get(name, ())) for name, length in lengths.items()]
+    jobs.append(Job("run that goes fast", "some_jobs:good", {}, 8.0, pace=0.5))
+    assert run_jobs(jobs, Processes(1), bars) == {}
+    ended = [line.partition(":")[0] for line in _printed(bars).splitlines()]
+    assert ended == [
+        "pretraining of the long run",
+        "long run",
+        "middle run",
+        "run that goes fast",
+        "short run",
+    ]
+
+
+def test_runs_of_two_scenarios_have_jobs_of_their_own_and_one_pretraining_for_each_seed(
+    tmp_path: Path, empty_caches: Path
+) -> None:
+    scenarios = ("clbench/Fetch-v0", TOY)
+    specs = [RunSpec(name, method, 1) for name in scenarios for method in ("sft", "frozen")]
+    jobs = benchmark_jobs(specs, tmp_path)
+    names = [job.name for job in jobs]
+    assert len(set(names)) == len(names)
+    assert [name for name in names if "pretraining" in name] == [
+        "Fetch-v0 pretraining seed 1",
+        "Toy-v0 pretraining seed 1",
+    ]
+
+
+def test_a_run_waits_for_what_it_is_made_from_and_nothing_else_is_made(
+    tmp_path: Path, empty_caches: Path
+) -> None:
+    def needs(*methods: str) -> dict[str, set[str]]:
+        jobs = benchmark_jobs([RunSpec(TOY, method, 0) for method in methods], tmp_path)
+        return {job.name: set(job.needs) for job in jobs}
+
+    scenario = load_scenario(TOY)
+    skills = {f"Toy-v0 demonstrations {task.name}" for task in scenario.retained}
+    targets = {f"Toy-v0 demonstrations {task.name}" for task in scenario.target}
+    policy, questions, report, sft, joint = (
+        f"Toy-v0 {name}"
+        for name in (
+            "pretraining seed 0",
+            "questions",
+            "evaluation of the pretrained policy seed 0",
+            "sft seed 0",
+            "joint seed 0",
+        )
+    )
+    found = needs("sft", "joint")
+    assert found[policy] == {questions} | skills
+    assert found[report] == {policy, questions}
+    assert found[sft] == {policy, questions, report} | targets
+    assert found[joint] == {policy, questions, report} | targets | skills
+    assert set(found) == {sft, joint} | found[joint]
+    pretrained_policy(scenario, 0)
+    assert needs("sft")[report] == {questions}
+    evaluate_pretrained(RunSpec(TOY, "joint", 0))
+    assert needs("sft") == {sft: {questions} | targets, questions: set(), **{name: set() for name in targets}}
+    demonstrated = {path.parent.name for path in (empty_caches / "minari").rglob("data")}
+    execute(RunSpec(TOY, "sft", 0), tmp_path)  # reads those of the skills never, so makes none
+    after = {path.parent.name for path in (empty_caches / "minari").rglob("data")}
+    assert after - demonstrated == {f"{task.name}-v0" for task in scenario.target}
+
+
+def test_one_worker_and_two_give_equal_records_and_a_stopped_grid_goes_on(
+    tmp_path: Path, bars: Bars, lasting_records: Callable[[Path], dict[str, Any]]
+) -> None:
+    specs = [RunSpec(TOY, method, 0) for method in ("frozen", "sft", "joint")]
+    assert run_jobs(benchmark_jobs(specs, tmp_path / "one"), Processes(1), bars) == {}
+    assert run_jobs(benchmark_jobs(specs[:1], tmp_path / "two"), Processes(2), bars) == {}
+    missing = [spec for spec in specs if not has_record(spec, tmp_path / "two")]
+    assert missing == specs[1:]
+    assert run_jobs(benchmark_jobs(missing, tmp_path / "two"), Processes(2), bars) == {}
+    records = lasting_records(tmp_path / "one")
+    assert len(records) == 3
+    assert records == lasting_records(tmp_path / "two")
+
+
+def _is_gone(group: int) -> bool:
+    """Return whether no process of a group is left, within 10 seconds."""
+    for _ in range(100):
+        try:
+            os.killpg(group, 0)
+        except ProcessLookupError:
+            return True
+        time.sleep(0.1)
+    return False
+
+
+@pytest.mark.parametrize(
+    ("send", "stop", "code", "said"),
+    [
+        pytest.param(os.killpg, signal.SIGINT, 130, "Finished records are kept", id="ctrl-c"),
+        pytest.param(os.kill, signal.SIGTERM, 143, "", id="scheduler", marks=pytest.mark.slow),
+    ],
+)
+def test_stopping_the_command_ends_its_workers_and_keeps_finished_records(
+    tmp_path: Path,
+    lasting_records: Callable[[Path], dict[str, Any]],
+    send: Callable[[int, int], None],
+    stop: int,
+    code: int,
+    said: str,
+) -> None:
+    command = [sys.executable, "-m", "clbench", "run", TOY, "frozen", "sft", "joint", "--seeds", "1"]
+    command += ["--workers", "1", "--records", str(tmp_path / "records")]
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, start_new_session=True)
+    first = tmp_path / "records" / "Toy-v0" / "frozen" / "seed-0.json"
+    deadline = time.monotonic() + 100
+    while not first.exists() and time.monotonic() < deadline:
+        time.sleep(0.1)
+    send(process.pid, stop)
+    _, output = process.communicate(timeout=60)
+    assert process.returncode == code
+    assert said in output
+    assert "Traceback" not in output
+    assert _is_gone(process.pid)
+    records = lasting_records(tmp_path / "records")
+    assert "Toy-v0/frozen/seed-0.json" in records
+    assert len(records) < 3

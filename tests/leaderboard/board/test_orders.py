@@ -1,0 +1,165 @@
+"""Orders of the targets: runs in others stand beside the row, and tell how much depends on the order."""
+
+import importlib
+import json
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas
+import pytest
+
+from clbench.base.entry_points import resolve
+from clbench.records.paths import record_path
+from clbench.records.record import Record
+from clbench.records.writer import write_record
+from clbench.spec.scenario import target_order
+
+SCENARIO = "clbench/Toy-v0"
+TARGETS = ["target_0", "target_1", "target_2"]
+
+
+@pytest.fixture
+def add(make_record: Callable[..., Record], tmp_path: Path) -> Callable[..., Path]:
+    """Return a function that adds the record of a run with a final average, and returns its path."""
+
+    def add(final: float, order: int = 0, seed: int = 0, method: str = "sft") -> Path:
+        matrix = np.full((4, 6), final)
+        record = make_record(matrix, groups=(2, 3, 1), method=method, seed=seed)
+        if order:
+            record.run["order"] = order
+            record.scenario["target"] = [TARGETS[place] for place in target_order(3, order)]
+        path = record_path(tmp_path / "leaderboard" / "records", SCENARIO, method, seed, order)
+        write_record(record, path)
+        return path
+
+    return add
+
+
+@pytest.fixture
+def records(tmp_path: Path) -> Path:
+    return tmp_path / "leaderboard" / "records"
+
+
+def load(records: Path) -> pandas.DataFrame:
+    frame = importlib.import_module("clbench.leaderboard").load(records)
+    assert isinstance(frame, pandas.DataFrame)
+    return frame
+
+
+def test_order_sensitivity_is_the_range_of_the_final_average_over_the_seeds_that_all_orders_have(
+    add: Callable[..., Path], records: Path
+) -> None:
+    for seed, final in enumerate((0.5, 0.7, 1.0)):
+        add(final, seed=seed)
+    for seed, final in enumerate((0.4, 0.5)):
+        add(final, order=1, seed=seed)
+        add(final + 0.3, order=2, seed=seed)
+    add(0.0, order=2, seed=7)
+    (row,) = load(records).itertuples()
+    assert row.seeds == 3
+    assert row.final_average == pytest.approx(2.2 / 3)  # of the published order alone
+    assert row.order_sensitivity == pytest.approx(0.75 - 0.45)
+
+
+@pytest.mark.parametrize("orders", [[0], [0, 1]])
+def test_with_fewer_than_three_orders_there_is_no_order_sensitivity(
+    orders: list[int], add: Callable[..., Path], records: Path
+) -> None:
+    for order in orders:
+        add(0.5, order=order)
+    assert math.isnan(load(records).order_sensitivity[0])
+
+
+def test_without_a_seed_that_all_orders_have_there_is_no_order_sensitivity(
+    add: Callable[..., Path], records: Path
+) -> None:
+    for order in range(3):
+        add(0.5, order=order, seed=order)
+    assert math.isnan(load(records).order_sensitivity[0])
+
+
+def test_other_orders_change_nothing_else_of_a_row(add: Callable[..., Path], records: Path) -> None:
+    add(0.5)
+    add(0.6, method="lwf")
+    before = load(records)
+    for order in (1, 2, 3):
+        add(0.9, order=order)
+    after = load(records)
+    dropped = "order_sensitivity"
+    pandas.testing.assert_frame_equal(after.drop(columns=dropped), before.drop(columns=dropped))
+    assert after.set_index("method").order_sensitivity.notna().to_dict() == {"sft": True, "lwf": False}
+
+
+def show(records: Path) -> str:
+    """Return the page, without the breaks of its lines."""
+    resolve("clbench.leaderboard.cli:show")(records=records)
+    return " ".join((records.parent / "site" / "index.html").read_text(encoding="utf-8").split())
+
+
+def test_the_page_and_the_csv_show_every_order_and_the_range(add: Callable[..., Path], records: Path) -> None:
+    for order, final in enumerate((0.5, 0.7, 0.6)):
+        add(final, order=order)
+    page = show(records)
+    names = ", ".join(TARGETS[place] for place in target_order(3, 1))
+    assert f'<th scope="row">1</th><td>{names}</td><td class="numeric">0.70</td>' in page
+    assert "Order sensitivity: 0.20, the greatest less the least." in page
+    head, line = (records.parent / "site" / "leaderboard.csv").read_text(encoding="utf-8").splitlines()
+    assert dict(zip(head.split(","), line.split(","), strict=True))["order_sensitivity"] == "0.2000"
+
+
+def test_a_method_that_was_run_in_other_orders_alone_has_no_row_and_it_is_said_why(
+    add: Callable[..., Path], records: Path
+) -> None:
+    add(0.5)
+    add(0.5, order=1, method="ewc")
+    assert list(load(records).method) == ["sft"]
+    show(records)
+    board = (records.parent / "site" / "LEADERBOARD.md").read_text(encoding="utf-8").replace("\\", "")
+    assert "ewc/seed-0-order-1.json: its method has no run with the targets in the published order" in board
+
+
+def edit(path: Path, part: str, **values: Any) -> None:
+    record = json.loads(path.read_text(encoding="utf-8"))
+    record[part].update(values)
+    path.write_text(json.dumps(record), encoding="utf-8")
+
+
+@pytest.mark.parametrize(
+    ("part", "values", "reason"),
+    [
+        ("run", {"order": 2}, "it is the record of Toy-v0/sft/seed-0-order-2.json"),
+        ("run", {"order": 6}, "3 targets have orders 0 to 5, not 6"),
+        ("run", {"order": 10**12}, "3 targets have orders 0 to 5"),
+        ("scenario", {"target": TARGETS}, "its scenario is not that of most records: target differ."),
+        ("scenario", {"budget": {"curve_episodes": 20}}, "its scenario is not that of most records: budget"),
+    ],
+)
+def test_a_record_that_is_not_of_its_order_is_not_counted(
+    part: str, values: dict[str, Any], reason: str, add: Callable[..., Path], records: Path
+) -> None:
+    add(0.5)
+    add(0.5, seed=1)
+    path = add(0.5, order=1)
+    edit(path, part, **values)
+    if "targets have" in reason:
+        path.rename(path.with_name(f"seed-0-order-{values['order']}.json"))
+    assert len(load(records)) == 1
+    show(records)
+    assert reason in (records.parent / "site" / "LEADERBOARD.md").read_text(encoding="utf-8").replace(
+        "\\", ""
+    )
+
+
+def test_claims_are_judged_in_the_published_order_alone(
+    add: Callable[..., Path], records: Path, tmp_path: Path
+) -> None:
+    claims = resolve("clbench.leaderboard.cli:claims")
+    folders = {"controls": tmp_path / "none", "step_time": tmp_path / "none.json", "scenario": SCENARIO}
+    add(0.5)
+    claims(records=records, output=tmp_path / "before.md", **folders)
+    add(0.9, order=1)
+    claims(records=records, output=tmp_path / "after.md", **folders)
+    assert (tmp_path / "after.md").read_bytes() == (tmp_path / "before.md").read_bytes()

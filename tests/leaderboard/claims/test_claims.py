@@ -1,0 +1,444 @@
+"""The page of the claims: every verdict follows from records by its rule, and nothing makes it fail."""
+
+import json
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from clbench.base.entry_points import resolve
+from clbench.records.paths import record_path
+from clbench.records.record import Record
+from clbench.records.writer import write_record
+
+SCENARIO = "clbench/Toy-v0"
+IDS = [*(f"C{number}" for number in range(1, 9)), *(f"A{number}" for number in range(1, 8))]
+IDS += [f"F{number}" for number in range(1, 6)]
+
+
+class Bench:
+    """Folders of records, and the page that comes of them."""
+
+    def __init__(self, folder: Path, make_record: Callable[..., Record]) -> None:
+        self.folder = folder
+        self.make_record = make_record
+
+    def add(
+        self,
+        label: str,
+        *,
+        seeds: int = 3,
+        kept: float = 0.2,
+        at_points: float | None = None,
+        learned: float = 1.0,
+        earlier: float = 1.0,
+        curve: float = 0.5,
+        chosen: tuple[float, float] = (1.0, 1.0),
+        right: tuple[int, int] = (500, 400),
+        sparsity: Any = 0.5,
+        drift: Any = 1.0,
+        costs: dict[str, Any] | None = None,
+        diagnostics: dict[str, Any] | None = None,
+        edit: Callable[[Record], None] | None = None,
+    ) -> None:
+        """Add the records of a method, or of changed settings of one.
+
+        Args:
+            label: As "lora" or "lora+rank=4".
+            seeds: How many.
+            kept: Success on the two skills at the end; it is 1 before.
+            at_points: The same at the points before a stage's end, that of the end if None.
+            learned: Success on a target right after it was learned.
+            earlier: Success on the first target at the end.
+            curve: Success on a target on the way.
+            chosen: Success on the validation episodes of the targets, at all points.
+            right: Questions of 500 answered rightly at the start and at the end.
+            sparsity: Update sparsity at all points, a number or one for each seed.
+            drift: Activation drift, likewise.
+            costs: What differs in `Record.costs`.
+            diagnostics: `Record.diagnostics`.
+            edit: Changes each record before it is written.
+        """
+        method, *changes = label.split("+")
+        changed = dict(change.split("=") for change in changes)
+        for seed in range(seeds):
+            on_the_way = kept if at_points is None else at_points
+            record = self.make_record(
+                [[1, 1, 0, 0, 0], [1, kept, learned, 0, 0], [kept, kept, earlier, learned, 0]],
+                groups=(2, 2, 1),
+                steps=(50, 100),
+                curves=np.full((2, 1), curve),
+                retained_curves=np.full((2, 1, 2), on_the_way),
+                validation=np.repeat(np.array(chosen)[:, None], 2, axis=1),
+                sparsity=np.full((2, 2), np.broadcast_to(sparsity, seeds)[seed]),
+                drift=np.full((2, 2), np.broadcast_to(drift, seeds)[seed]),
+                answers={
+                    (0, "left"): (500, right[0]),
+                    (1, "left"): (500, right[1]),
+                    (2, "left"): (500, right[1]),
+                },
+                method=method,
+                seed=seed,
+                changes=changed,
+                settings=changed,
+            )
+            record.costs.update(costs or {})
+            record.diagnostics.update(diagnostics or {})
+            if edit:
+                edit(record)
+            write_record(record, record_path(self.folder / self.kind(label), SCENARIO, label, seed))
+
+    def kind(self, label: str) -> str:
+        return "controls" if "+" in label else "records"
+
+    def step_times(self, **ratios: float) -> None:
+        """Leave what the speed benchmark leaves."""
+        entries = {
+            method: {"median_ratio": ratio, "low": ratio - 0.01, "high": ratio + 0.01}
+            for method, ratio in ratios.items()
+        }
+        (self.folder / "step_time.json").write_text(json.dumps({"ratios": entries}), encoding="utf-8")
+
+    def page(self) -> str:
+        """Return the page."""
+        output = self.folder / "docs" / "claims.md"
+        resolve("clbench.leaderboard.cli:claims")(
+            records=self.folder / "records",
+            controls=self.folder / "controls",
+            step_time=self.folder / "step_time.json",
+            scenario=SCENARIO,
+            output=output,
+        )
+        return output.read_text(encoding="utf-8")
+
+
+@pytest.fixture
+def bench(tmp_path: Path, make_record: Callable[..., Record]) -> Bench:
+    return Bench(tmp_path, make_record)
+
+
+def verdicts(page: str) -> dict[str, str]:
+    """Return the verdicts in the table at the top."""
+    return {
+        line.split("]")[0][3:]: line.split(" | ")[2] for line in page.splitlines() if line.startswith("| [")
+    }
+
+
+def section(page: str, identifier: str) -> str:
+    """Return what the page says of a claim, without the backslashes of Markdown."""
+    found = re.search(rf"^### {identifier}\n(.*?)(?=^#|\Z)", page, re.MULTILINE | re.DOTALL)
+    assert found
+    return found[1].replace("\\", "")
+
+
+Given = dict[str, dict[str, Any]]
+
+CASES: list[tuple[str, str, Given]] = [
+    ("C1", "holds", {"sft": {"kept": 0.2}}),
+    ("C1", "does not hold", {"sft": {"kept": 1.0}}),
+    ("C1", "cannot be told", {"sft": {"kept": 0.95}}),
+    ("C2", "holds", {"sft": {}, "consft": {"kept": 0.8}, "consft_calibrated": {}}),
+    ("C2", "does not hold", {"sft": {}, "consft": {}, "consft_calibrated": {}}),
+    ("C2", "cannot be told", {"sft": {}, "consft": {"kept": 0.4}, "consft_calibrated": {}}),
+    ("C2", "cannot be told", {"sft": {}, "consft": {}}),
+    (
+        "C3",
+        "holds",
+        {
+            "sft": {},
+            "consft": {"kept": 1.0},
+            "consft_calibrated": {},
+            "experience_replay": {"kept": 1.0},
+            "buffered_replay": {"kept": 1.0},
+        },
+    ),
+    (
+        "C3",
+        "does not hold",
+        {
+            "sft": {},
+            "consft": {},
+            "consft_calibrated": {},
+            "experience_replay": {"kept": 1.0},
+            "buffered_replay": {},
+        },
+    ),
+    ("C4", "holds", {"sft": {"sparsity": 0.3}, "consft": {"sparsity": (0.45, 0.5, 0.55)}}),
+    ("C4", "does not hold", {"sft": {"sparsity": 0.3}, "consft": {"sparsity": 0.3}}),
+    ("C4", "cannot be told", {"sft": {"sparsity": 0.5}, "consft": {"sparsity": (0.4, 0.5, 0.6)}}),
+    ("C4", "cannot be told", {"sft": {"sparsity": 0.3, "seeds": 1}, "consft": {"sparsity": 0.9, "seeds": 1}}),
+    ("C6", "does not hold", {"sft": {}, "consft": {"costs": {"bytes_kept": 8}}}),
+    ("C6", "cannot be told", {"sft": {}, "consft": {}}),
+    ("C7", "holds", {"consft": {"earlier": 0.5}, "consft_calibrated": {}}),
+    ("C7", "does not hold", {"consft": {"earlier": 0.5}, "consft_calibrated": {"earlier": 0.4}}),
+    ("A1", "holds", {"sft": {"right": (500, 400)}}),
+    ("A1", "does not hold", {"sft": {"right": (500, 500)}}),
+    ("A1", "cannot be told", {"sft": {"right": (490, 485)}}),
+    ("A2", "holds", {"sft": {}, "stop_gradient": {"right": (490, 490), "learned": 0.5}}),
+    ("A2", "does not hold", {"sft": {}, "stop_gradient": {"right": (490, 490)}}),
+    ("A2", "does not hold", {"sft": {}, "stop_gradient": {"right": (490, 300), "learned": 0.5}}),
+    ("A2", "cannot be told", {"stop_gradient": {"right": (490, 490), "learned": 0.5}}),
+    ("A3", "holds", {"frozen": {"kept": 1.0}, "lora": {}, "lora+rank=4": {}}),
+    ("A3", "does not hold", {"frozen": {}, "lora": {"right": (500, 500)}, "lora+rank=4": {"kept": 0.1}}),
+    ("A3", "cannot be told", {"lora": {}}),
+    ("A4", "holds", {"frozen": {"right": (500, 500)}, "aegis": {"right": (500, 500)}}),
+    ("A4", "does not hold", {"frozen": {"right": (500, 500)}, "aegis": {"right": (500, 450)}}),
+    ("A4", "cannot be told", {"frozen": {"right": (500, 490)}, "aegis": {"right": (500, 486)}}),
+    ("A5", "holds", {"aegis": {"diagnostics": {"1": {"energy_shed_mean": 0.006}}}}),
+    ("A5", "does not hold", {"aegis": {"diagnostics": {"1": {"energy_shed_mean": 0.06}}}}),
+    ("A5", "cannot be told", {"aegis": {"diagnostics": {"1": {"energy_shed_mean": "little"}}}}),
+    ("A6", "holds", {"sft": {"drift": (8, 9, 10)}, "aegis": {"drift": 1.0}}),
+    ("A6", "does not hold", {"sft": {"drift": (8, 9, 10)}, "aegis": {"drift": 7.0}}),
+    ("A6", "cannot be told", {"sft": {"drift": 0.0}, "aegis": {"drift": 1.0}}),
+    ("F1", "holds", {"from_scratch": {}, "sft": {}, "co_training": {"curve": 0.9}}),
+    ("F1", "does not hold", {"from_scratch": {}, "sft": {}, "co_training": {"curve": 0.2}}),
+    ("F1", "cannot be told", {"sft": {}, "co_training": {"curve": 0.9}}),
+    (
+        "F2",
+        "holds",
+        {"from_scratch": {}, "sft": {}, "fast_dvla": {"curve": 0.9}, "fast_dvla+direction=random": {}},
+    ),
+    (
+        "F2",
+        "does not hold",
+        {
+            "from_scratch": {},
+            "sft": {},
+            "fast_dvla": {"curve": 0.9},
+            "fast_dvla+direction=random": {"curve": 0.9},
+        },
+    ),
+    ("F2", "cannot be told", {"from_scratch": {}, "sft": {}, "fast_dvla": {"curve": 0.9}}),
+    (
+        "F3",
+        "holds",
+        {"from_scratch": {}, "fast_dvla": {}, "fast_dvla+orthogonal=0.0": {"learned": 0.6, "curve": 0.5}},
+    ),
+    (
+        "F3",
+        "does not hold",
+        {"from_scratch": {}, "fast_dvla": {}, "fast_dvla+orthogonal=0.0": {"curve": 0.9}},
+    ),
+    ("F5", "holds", {"from_scratch": {}, "fast_dvla": {"curve": 0.9}, "fast_dvla+direction=random": {}}),
+    ("F5", "does not hold", {"from_scratch": {}, "fast_dvla": {}, "fast_dvla+direction=random": {}}),
+]
+
+
+@pytest.mark.parametrize(
+    ("identifier", "verdict", "given"),
+    CASES,
+    ids=[f"{identifier}-{verdict}-{number}" for number, (identifier, verdict, _) in enumerate(CASES)],
+)
+def test_a_verdict_follows_from_the_records_by_the_rule(
+    identifier: str, verdict: str, given: Given, bench: Bench
+) -> None:
+    for label, values in given.items():
+        bench.add(label, **values)
+    assert verdicts(bench.page())[identifier] == verdict
+
+
+@pytest.mark.parametrize(
+    ("identifier", "method", "limit"),
+    [("C6", "consft", 1.05), ("A7", "aegis", 1.6), ("F4", "fast_dvla", 1.05)],
+)
+def test_claims_of_costs_are_judged_by_the_time_of_a_step(
+    identifier: str, method: str, limit: float, bench: Bench
+) -> None:
+    bench.add("sft")
+    bench.add(method, costs={"optimiser_steps": 400, "preparation_steps": 40})
+    assert verdicts(bench.page())[identifier] == "cannot be told"
+    bench.step_times(**{method: limit})
+    assert verdicts(bench.page())[identifier] == "holds"
+    bench.step_times(**{method: limit + 0.01})
+    page = bench.page()
+    assert verdicts(page)[identifier] == "does not hold"
+    assert f"| {limit + 0.01:.2f} [{limit:.2f}, {limit + 0.02:.2f}] |" in section(page, identifier)
+
+
+@pytest.mark.parametrize(
+    "content", ["", "[]", "{", '{"ratios": 3}', '{"ratios": {"aegis": {"median_ratio": NaN}}}']
+)
+def test_a_torn_file_of_step_times_counts_as_missing(content: str, bench: Bench) -> None:
+    (bench.folder / "step_time.json").write_text(content, encoding="utf-8")
+    assert verdicts(bench.page())["A7"] == "cannot be told"
+
+
+def test_without_any_record_every_claim_says_which_command_is_missing(bench: Bench) -> None:
+    page = bench.page()
+    assert list(verdicts(page)) == IDS
+    assert {one for identifier, one in verdicts(page).items() if identifier != "C5"} == {"cannot be told"}
+    for identifier in IDS:
+        assert "clbench run" in section(page, identifier)
+    assert f"`clbench run {SCENARIO} aegis frozen sft`" in section(page, "A4")
+    assert f"`clbench run {SCENARIO} aegis --set.direction random --records leaderboard/controls`" in section(
+        page, "A4"
+    )
+    assert "Later work." in section(page, "F6")
+
+
+def test_every_claim_has_its_paper_rule_and_the_papers_figure(bench: Bench) -> None:
+    page = bench.page()
+    for identifier in IDS:
+        assert "- Rule: " in section(page, identifier)
+        assert "- In the paper: " in section(page, identifier)
+    for arxiv in ("2605.08879", "2604.16067", "2603.25661", "2605.10903"):
+        assert f"[arXiv {arxiv}](https://arxiv.org/abs/{arxiv})" in page
+
+
+def test_the_bound_of_a_step_names_a_test_that_exists(bench: Bench) -> None:
+    told = section(bench.page(), "C5")
+    names = re.findall(r"`(test_\w+)` of `(tests/[\w/]+\.py)`", told)
+    assert names
+    for test, path in names:
+        assert f"def {test}(" in (Path(__file__).parents[3] / path).read_text(encoding="utf-8")
+
+
+def test_a_claim_says_for_which_variant_it_holds(bench: Bench) -> None:
+    bench.add("sft")
+    bench.add("consft")
+    bench.add("consft_calibrated", kept=0.9)
+    assert "It holds for consft_calibrated." in section(bench.page(), "C2")
+
+
+def test_a_control_that_does_the_same_is_said_to_explain_the_gain(bench: Bench) -> None:
+    bench.add("sft")
+    for method in ("consft", "consft_calibrated", "constant_weight"):
+        bench.add(method, kept=0.9)
+    for method in ("low_rate_sft", "finch"):
+        bench.add(method)
+    told = section(bench.page(), "C2")
+    assert "constant_weight does the same as consft: the gain is not from weighing samples." in told
+    assert "low_rate_sft does not reach consft: that does not explain it." in told
+
+
+def test_without_a_gain_no_control_is_said_to_explain_it(bench: Bench) -> None:
+    for method in ("sft", "consft", "consft_calibrated", "constant_weight"):
+        bench.add(method)
+    told = section(bench.page(), "C2")
+    assert "consft has no certain gain over sft that constant_weight could explain." in told
+
+
+def test_methods_are_matched_over_the_stages_in_which_both_learn_as_well_as_sft(bench: Bench) -> None:
+    bench.add("sft")
+    bench.add("consft", kept=0.9, chosen=(1.0, 0.2))
+    bench.add("consft_calibrated", kept=0.9, chosen=(0.2, 0.2))
+    page = bench.page()
+    row, other = (
+        next(line for line in section(page, "C2").splitlines() if f", {method} - sft" in line)
+        for method in ("consft", "consft_calibrated")
+    )
+    assert "0.70 [" in row
+    assert "over the 3 of 6 stages in which both learn as well as sft" in row
+    assert "| - | - | over the 0 of 6 stages" in other
+
+
+def test_a_seed_that_one_of_two_methods_lacks_is_left_out(bench: Bench) -> None:
+    bench.add("sft", seeds=3)
+    bench.add("stop_gradient", seeds=2, right=(490, 490))
+    row = next(line for line in section(bench.page(), "A2").splitlines() if "adaptation, stop" in line)
+    assert "| 0, 1 |" in row
+
+
+def test_one_seed_is_shown_and_decides_nothing(bench: Bench) -> None:
+    bench.add("sft", seeds=1)
+    page = bench.page()
+    assert verdicts(page)["C1"] == "cannot be told"
+    assert re.search(r"\| 0\.80 \[0\.\d+, 0\.\d+\] \| 0 \| one seed", section(page, "C1"))
+
+
+def test_the_curve_of_the_answers_is_shown_over_the_steps(bench: Bench) -> None:
+    bench.add("sft")
+    told = section(bench.page(), "A1")
+    for step in (50, 100):
+        assert f"question accuracy, pretrained - sft after {step} steps of the first target" in told
+
+
+def test_a_control_that_was_not_evaluated_like_the_board_is_left_out_with_its_reason(bench: Bench) -> None:
+    bench.add("frozen", right=(500, 500))
+    bench.add("aegis", right=(500, 500))
+    bench.add(
+        "aegis+direction=random", edit=lambda record: record.scenario["budget"].update(adaptation_steps=9)
+    )
+    page = bench.page()
+    assert "--set.direction random" in section(page, "A4")
+    assert (
+        "controls/Toy-v0/aegis+direction=random/seed-0.json" in section(page, "A4") or "budget differ" in page
+    )
+
+
+def test_records_among_the_controls_that_changed_nothing_are_left_out(bench: Bench) -> None:
+    bench.add("sft")
+    (bench.folder / "records").rename(bench.folder / "controls")
+    page = bench.page()
+    assert verdicts(page)["C1"] == "cannot be told"
+    assert "no setting was changed" in page
+
+
+def test_words_of_strangers_stay_on_their_line_and_are_no_markup(bench: Bench) -> None:
+    hostile = "x | [bold]y[/bold]\n## z <b> ``` \x1b[31m https://x.example"
+
+    def fail(record: Record) -> None:
+        record.status = "failed"
+        record.error = {"where": "loss", "type": "ValueError", "message": hostile, "traceback": ""}
+
+    def rename(record: Record) -> None:
+        record.run["method"] = hostile
+
+    bench.add("consft", edit=fail)
+    bench.add("lora+rank=4", edit=rename)
+    bench.add("lora+rank=64", edit=fail)
+    page = bench.page()
+    assert "\n## z" not in page
+    assert "\x1b" not in page
+    assert "<b>" not in page.replace("\\<", "")
+    assert "https://x" not in page
+    assert verdicts(page)["A3"] == "cannot be told"
+
+
+def test_any_damage_to_a_record_leaves_a_page(bench: Bench) -> None:
+    bench.add("sft")
+    damages: tuple[Any, ...] = (None, -1, "x", [None], {"x": []})
+    path = record_path(bench.folder / "records", SCENARIO, "sft", 0)
+    whole = json.loads(path.read_text(encoding="utf-8"))
+    for number, name in enumerate(whole):
+        for damage in damages:
+            text = json.dumps({**whole, name: damage})
+            place = record_path(bench.folder / "controls", SCENARIO, f"sft+x={number}", 0)
+            place.parent.mkdir(parents=True, exist_ok=True)
+            place.write_text(text, encoding="utf-8")
+            place.with_name(f"{damage!r}.json").write_text(text, encoding="utf-8")
+    assert list(verdicts(bench.page())) == IDS
+
+
+def test_the_same_records_give_the_same_bytes_and_no_place_or_date(
+    bench: Bench, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bench.add("sft")
+    bench.add("consft", kept=0.6)
+    first = bench.page()
+    printed = capsys.readouterr().out
+    assert bench.page() == first
+    assert capsys.readouterr().out == printed
+    assert str(bench.folder) not in first
+    assert not re.search(r"\b20\d\d-\d\d", first)
+    assert (
+        len({line.count("|") - line.count("\\|") for line in first.splitlines() if line.startswith("| [")})
+        == 1
+    )
+
+
+def test_the_terminal_has_id_verdict_and_figure(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
+    bench.add("sft")
+    bench.page()
+    lines = [line.split() for line in capsys.readouterr().out.splitlines()]
+    assert ["C1", "holds", "0.80"] in [line[:3] for line in lines]
+    assert [line[0] for line in lines if line and line[0] in IDS] == IDS
+
+
+def test_the_command_is_part_of_the_command_line() -> None:
+    app = resolve("clbench.cli.main:app")
+    assert app["claims"] is not None
+    assert app["method-pages"] is not None

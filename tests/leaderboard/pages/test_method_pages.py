@@ -1,0 +1,302 @@
+"""The pages of the methods: everything from the code and the records, the same headings each."""
+
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from clbench.base.entry_points import resolve
+from clbench.learning.method import Method
+from clbench.learning.prior import Uses
+from clbench.learning.registry import load_method, method_names
+from clbench.records.paths import record_path
+from clbench.records.record import Record
+from clbench.records.writer import write_record
+
+SCENARIO = "clbench/Toy-v0"
+HEADINGS = [
+    "Idea",
+    "Paper",
+    "Rule",
+    "Stored",
+    "Implementation details",
+    "Hyper-parameters",
+    "Diagnostics",
+    "Results here",
+    "Command",
+]
+BUILT_IN = [name for name in method_names() if "/" not in name]
+
+
+class Bench:
+    """Folders of records, and the pages that come of them."""
+
+    def __init__(self, folder: Path, make_record: Callable[..., Record]) -> None:
+        self.folder = folder
+        self.make_record = make_record
+
+    def add(
+        self, label: str, kept: float = 0.2, seed: int = 0, kind: str = "records", **values: Any
+    ) -> Record:
+        """Add a record of a method, or of changed settings of one, and return it."""
+        method, *changes = label.split("+")
+        changed = {name: float(value) for name, value in (change.split("=") for change in changes)}
+        selection = kind == "tuning"
+        fields = {"diagnostics": {}, "costs": {}, **values}
+        record = self.make_record(
+            [[1, 1, 0, 0, 0], [1, kept, 1, 0, 0], [kept, kept, 1, 1, 0]],
+            groups=(2, 2, 1),
+            steps=(50, 100),
+            curves=np.full((2, 1), 0.5),
+            retained_curves=np.full((2, 1, 2), kept),
+            validation=None if selection else np.ones((2, 2)),
+            answers={(stage, "left"): (100, 90) for stage in range(3)},
+            method=method,
+            seed=seed,
+            changes=changed,
+            settings={**fields.pop("settings", {}), **changed},
+            split="validation" if selection else "test",
+        )
+        record.costs.update(fields["costs"])
+        record.diagnostics.update(fields["diagnostics"])
+        write_record(record, record_path(self.folder / kind, SCENARIO, label, seed))
+        return record
+
+    def pages(self) -> dict[str, str]:
+        """Return the pages by the name of the method."""
+        output = self.folder / "docs" / "methods"
+        resolve("clbench.leaderboard.cli:method_pages")(
+            records=self.folder / "records",
+            controls=self.folder / "controls",
+            tuning=self.folder / "tuning",
+            step_time=self.folder / "step_time.json",
+            scenario=SCENARIO,
+            output=output,
+        )
+        return {path.stem: path.read_text(encoding="utf-8") for path in output.iterdir()}
+
+
+@pytest.fixture
+def bench(tmp_path: Path, make_record: Callable[..., Record]) -> Bench:
+    return Bench(tmp_path, make_record)
+
+
+def part(page: str, heading: str) -> str:
+    """Return what stands under a heading, without the backslashes of Markdown."""
+    found = re.search(rf"^## {heading}\n(.*?)(?=^## |\Z)", page, re.MULTILINE | re.DOTALL)
+    assert found
+    return found[1].replace("\\", "").strip()
+
+
+def test_every_installed_method_has_a_page_with_all_headings_in_order(bench: Bench) -> None:
+    pages = bench.pages()
+    assert sorted(pages) == sorted([*BUILT_IN, "README"])
+    for name in BUILT_IN:
+        assert re.findall(r"^## (.+)$", pages[name], re.MULTILINE) == HEADINGS
+        for heading in HEADINGS:
+            assert part(pages[name], heading)
+        assert f"clbench run {SCENARIO} {name}" in part(pages[name], "Command")
+        assert "There are no records of it yet" in part(pages[name], "Results here")
+
+
+def test_the_list_has_every_method_once_under_its_division(bench: Bench) -> None:
+    contents = bench.pages()["README"]
+    links = re.findall(r"^- \[.+\]\((\w+)\.md\): .+", contents, re.MULTILINE)
+    assert sorted(links) == BUILT_IN
+    for name, division in (("sft", "Prior-data-free"), ("aegis", "Prior questions"), ("joint", "Reference")):
+        assert f"({name}.md)" in part(contents, division)
+
+
+def test_every_hyper_parameter_has_its_default_and_its_meaning(bench: Bench) -> None:
+    pages = bench.pages()
+    for name in BUILT_IN:
+        text = part(pages[name], "Hyper-parameters")
+        for field in load_method(name).__dataclass_fields__.values():  # type: ignore[attr-defined]
+            assert re.search(rf"\| `{field.name}` \| `{re.escape(repr(field.default))}` \| \w", text)
+        assert text == "None." or text.startswith("| name | default | meaning |")
+
+
+def test_a_docstring_is_taken_apart_into_idea_rule_and_details(bench: Bench) -> None:
+    page = bench.pages()["aegis"]
+    link = "[arXiv 2604.16067](https://arxiv.org/abs/2604.16067)"
+    assert part(page, "Idea").startswith("AEGIS: the backbone's gradient may not lead away")
+    assert link in part(page, "Idea")
+    assert part(page, "Paper") == f"{link}."
+    assert part(page, "Rule").startswith("Before training, questions are read")
+    assert '`direction="random"` is the control' in part(page, "Rule").splitlines()[-1]
+    details = part(page, "Implementation details").splitlines()
+    assert [line.partition(".")[0] for line in details] == [
+        str(number) for number in range(1, len(details) + 1)
+    ]
+    assert "Details:" not in page
+
+
+def test_a_paper_that_is_named_over_a_line_break_is_a_link(bench: Bench) -> None:
+    assert "In the details: [arXiv 2604.16067]" in part(bench.pages()["lora"], "Paper")
+
+
+def test_a_subclass_takes_the_docstring_and_has_its_own_defaults(bench: Bench) -> None:
+    pages = bench.pages()
+    for heading in ("Rule", "Implementation details", "Paper"):
+        assert part(pages["consft_calibrated"], heading) == part(pages["consft"], heading)
+    default = load_method("consft_calibrated").__dataclass_fields__["tau_start"].default  # type: ignore[attr-defined]
+    row = f"| `tau_start` | `{default}` | Temperature at the start (Table 5). Chosen on validation episodes"
+    assert row in part(pages["consft_calibrated"], "Hyper-parameters")
+    assert "`kappa`" in part(pages["consft_calibrated"], "Hyper-parameters")
+
+
+def test_what_is_stored_comes_from_the_declaration_and_the_records(bench: Bench) -> None:
+    for seed in range(2):
+        bench.add("ewc", seed=seed, costs={"bytes_kept": 8000, "parameters_added": 12})
+    stored = part(bench.pages()["ewc"], "Stored")
+    assert "It reads prior demonstrations before the first target only." in stored
+    assert "It never touches prior questions." in stored
+    assert "Division: prior demonstrations." in stored
+    assert "Bytes kept: 8,000." in stored
+    assert "Parameters added: 12." in stored
+
+
+def test_the_row_of_the_board_stands_beside_those_of_three_others(bench: Bench) -> None:
+    for method in ("consft", "sft", "experience_replay", "frozen"):
+        for seed in range(2):
+            bench.add(method, kept={"consft": 0.6, "sft": 0.2}.get(method, 1.0), seed=seed)
+    results = part(bench.pages()["consft"], "Results here")
+    assert "|  | consft | sft | experience_replay | frozen |" in results
+    row = next(line for line in results.splitlines() if line.startswith("| retention |"))
+    assert [re.sub(r" \[.*?\]", "", cell) for cell in row.strip("| ").split(" | ")] == [
+        "retention",
+        "0.60",
+        "0.20",
+        "1.00",
+        "1.00",
+    ]
+    assert "| seeds | 2 | 2 | 2 | 2 |" in results
+
+
+def test_the_claims_on_a_method_are_linked_with_their_verdicts(bench: Bench) -> None:
+    for seed in range(2):
+        bench.add("sft", seed=seed)
+    pages = bench.pages()
+    assert "- [C1](../claims.md#c1), holds: Fine-tuning without constraint" in part(
+        pages["sft"], "Results here"
+    )
+    for identifier in ("C2", "C5", "C8"):
+        assert f"[{identifier}](../claims.md#{identifier.lower()})" in part(pages["consft"], "Results here")
+    told = part(pages["low_rate_sft"], "Results here")
+    assert "[C2]" in told
+    assert "It stands beside." in next(line for line in told.splitlines() if "[C2]" in line)
+    assert "### Claims" not in pages["lwf"]
+
+
+def test_scalar_diagnostics_are_averaged_over_stages_and_seeds(bench: Bench) -> None:
+    for seed, shed in enumerate((0.019, 0.02, 0.021)):
+        stages = {str(stage): {"energy_shed_mean": shed, "anchor_distance": [1.0]} for stage in (1, 2)}
+        bench.add("aegis", seed=seed, diagnostics={"0": "none", **stages})
+    told = part(bench.pages()["aegis"], "Diagnostics")
+    assert told.startswith("What was projected")
+    assert "| energy_shed_mean | 0.02 [0.01752, 0.02248] |" in told
+    assert "| anchor_distance" not in told
+
+
+def test_settings_that_were_tried_are_compared_on_validation_episodes(bench: Bench) -> None:
+    bench.add("sft", kind="tuning", seed=100)
+    defaults = {"tau_end": 5.0, "kappa": 25.0, "decay": 0.8, "curvature": 3.5, "omega_min": 0.001}
+    calibrated = load_method("consft_calibrated")()
+    chosen = f"schedule={calibrated.schedule}+tau_start={calibrated.tau_start}"  # type: ignore[attr-defined]
+    for label, kept in (
+        ("schedule=1.0+tau_start=20.0", 0.6),
+        (chosen, 0.4),
+        ("schedule=1.0+tau_start=0.5", 0.3),
+    ):
+        bench.add(f"consft+{label}", kept=kept, kind="tuning", seed=100, settings=defaults)
+    pages = bench.pages()
+    for name in ("consft", "consft_calibrated"):
+        tried = part(pages[name], "Results here").partition("### Settings tried")[2]
+        rows = [line for line in tried.splitlines() if line.startswith("| s")]
+        assert rows[0] == (
+            "| settings | seed | targets | adaptation | retention | matched retention | question retention |"
+        )
+        assert rows[1] == "| sft, as it is | 100 | 2 | 1.00 | 0.20 | 0.40 | 0.90 |"
+        assert [row.split(" | ")[4] for row in rows[2:]] == ["0.30", "0.40", "0.60"]  # by rising tau_start
+        assert "(consft_calibrated)" in rows[3]
+    command = part(pages["consft"], "Command")
+    assert f"clbench tune {SCENARIO} consft --values.schedule 1.0 --values.tau_start 0.5," in command
+    assert command.splitlines()[-2].endswith(" --targets 2")
+    assert "Settings tried" not in pages["ewc"]
+    assert "clbench tune" not in pages["consft_calibrated"]
+
+
+def test_records_of_the_board_are_not_settings_that_were_tried(bench: Bench) -> None:
+    bench.add("ewc+strength=2.0", kind="controls")
+    (bench.folder / "controls").rename(bench.folder / "tuning")
+    assert "Settings tried" not in bench.pages()["ewc"]
+
+
+def test_words_of_strangers_in_records_are_no_markup(bench: Bench) -> None:
+    hostile = "x | y\n## z <b> ```"
+    record = bench.add("aegis", diagnostics={"1": {hostile: 0.5}})
+    record.run.update(changes={hostile: hostile}, split="validation")
+    record.episodes["split"] = ["validation" for _ in record.episodes["split"]]
+    for name in record.episodes:
+        record.episodes[name] = record.episodes[name][:5]
+    write_record(record, bench.folder / "tuning" / "strange.json")
+    page = bench.pages()["aegis"]
+    assert re.findall(r"^## (.+)$", page, re.MULTILINE) == HEADINGS
+    assert "<b>" not in page.replace("\\<", "").partition("```console")[0]
+    assert len(re.findall("^```", page, re.MULTILINE)) == 2
+
+
+def test_the_same_content_gives_the_same_bytes_and_no_place_or_date(bench: Bench) -> None:
+    for method in ("sft", "consft", "aegis"):
+        bench.add(method)
+    bench.add("sft", kind="tuning", seed=100)
+    bench.add("consft+tau_start=0.5", kind="tuning", seed=100)
+    first = bench.pages()
+    assert bench.pages() == first
+    for page in first.values():
+        assert str(bench.folder) not in page
+        assert not re.search(r"\b20\d\d-\d\d-\d\d", page)
+
+
+@dataclass
+class Toy(Method):
+    """A method of this file."""
+
+    first: float = 1.0
+    """Of the two
+    fields."""
+    second: str = "x|y"
+
+    uses = Uses(demonstrations="throughout")
+
+
+@pytest.mark.parametrize(
+    ("docstring", "idea", "rule", "details"),
+    [
+        ("Idea.", "Idea.", (), ()),
+        ("Idea.\n\nOne\nline.\n\nTwo.", "Idea.", ("One line.", "Two."), ()),
+        ("Idea.\n\nRule.\nDetails:\n1. One\n   more.\n2. Two.", "Idea.", ("Rule.",), ("One more.", "Two.")),
+        ("Idea.\n\nDetails:\n1. One.\n\n2. Two.\n\nEnd\nof it.", "Idea.", ("End of it.",), ("One.", "Two.")),
+        ("", "", (), ()),
+    ],
+)
+def test_docstrings_of_any_shape_are_read(
+    docstring: str, idea: str, rule: tuple[str, ...], details: tuple[str, ...]
+) -> None:
+    text = resolve("clbench.leaderboard.pages.descriptions:read_docstring")(docstring)
+    assert (text.idea, text.rule, text.details) == (idea, rule, details)
+
+
+def test_fields_are_read_with_the_texts_under_them() -> None:
+    described = resolve("clbench.leaderboard.pages.descriptions:describe")("toy", Toy)
+    assert [(one.name, one.default, one.meaning) for one in described.hyper_parameters] == [
+        ("first", "1.0", "Of the two fields."),
+        ("second", "'x|y'", ""),
+    ]
+    assert described.division == "prior demonstrations"
+    assert described.summary == "A method of this file."
+    assert described.hook("diagnostics") == []

@@ -1,0 +1,290 @@
+"""Cards of scenarios: from the code, the records and what lies beside them; what is missing is said."""
+
+import dataclasses
+import json
+import re
+from collections.abc import Callable, Iterable
+from itertools import chain
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+from scipy import stats
+
+from clbench.base.entry_points import resolve
+from clbench.records.record import Record
+from clbench.records.writer import write_record
+from clbench.runs.spec import RunSpec
+from clbench.testing import TOY
+
+GROUPS = ("retained", "target", "held_out")
+ONLINE = {"demonstrations": "never", "questions": "never", "reference": False, "online": True}
+NAMES = [task.name for task in TOY.tasks]
+KEEPS = [[1, 1, 0, 0, 0], [1, 1, 1, 0, 0], [1, 1, 1, 1, 0]]
+FORGETS = [[1, 1, 0, 0, 0], [0, 0, 1, 0, 0], [0, 0, 0, 1, 0]]
+STAYS = [[1, 1, 0, 0, 0]] * 3
+SCRATCH = [[0, 0, 0, 0, 0], [0, 0, 1, 0, 0], [0, 0, 0, 1, 0]]
+
+
+class Bench:
+    """A folder of records of the toy, and the card that comes of them."""
+
+    def __init__(self, folder: Path, make_record: Callable[..., Record]) -> None:
+        self.records, self.output, self.make_record = folder / "records", folder / "cards", make_record
+
+    def add(
+        self,
+        method: str,
+        success: Any,
+        seeds: Iterable[int] = range(3),
+        order: int = 0,
+        online: bool = False,
+    ) -> None:
+        """Add records of a method that has a success rate on each task after each stage."""
+        for seed in seeds:
+            asked = {(stage, "side"): (100, 90) for stage in range(3)}
+            record = self.make_record(success, groups=(2, 2, 1), method=method, seed=seed, answers=asked)
+            made = chain.from_iterable(record.scenario[group] for group in GROUPS)
+            names = dict(zip(made, NAMES, strict=True))
+            record.episodes["task"] = [names[name] for name in record.episodes["task"]]
+            spec = RunSpec("clbench.testing:clbench/Toy-v0", method, seed, order=order)
+            record.run, record.scenario = spec.describe()
+            if online:
+                record.run["uses"] = ONLINE
+            steps = dict(zip((100, 200, 300, 400), (7, 15, 30, 60), strict=True))
+            for table in (record.episodes, record.answers):
+                table["step"] = [steps.get(step, step) for step in table["step"]]
+            write_record(record, spec.path(self.records))
+
+    def add_all(self) -> None:
+        self.add("sft", FORGETS)
+        self.add("joint", KEEPS)
+        self.add("frozen", STAYS)
+        self.add("from_scratch", SCRATCH)
+
+    def card(self, *scenarios: str, **options: Any) -> str:
+        """Return the card, without the backslashes of Markdown."""
+        options = {"episodes": 3, "records": self.records, "output": self.output, **options}
+        resolve("clbench.leaderboard.cli:scenario_card")(*(scenarios or (TOY.id,)), **options)
+        return (self.output / "Toy-v0.md").read_text(encoding="utf-8").replace("\\", "")
+
+
+@pytest.fixture
+def bench(tmp_path: Path, make_record: Callable[..., Record], monkeypatch: pytest.MonkeyPatch) -> Bench:
+    """Return a bench where something draws; that MuJoCo does is tried elsewhere, as it takes seconds."""
+    monkeypatch.setenv("MUJOCO_GL", "egl")  # what is chosen goes with the test
+    monkeypatch.setattr("clbench.worlds.gl_backend.rendering_fault", lambda *_: None)
+    return Bench(tmp_path, make_record)
+
+
+def part(card: str, heading: str) -> str:
+    """Return what stands under a heading."""
+    found = re.search(rf"^## {heading}\n(.*?)(?=^## |\Z)", card, re.MULTILINE | re.DOTALL)
+    assert found
+    return found[1].strip()
+
+
+def bars(card: str) -> dict[str, list[str]]:
+    """Return the cells of each bar by its words."""
+    rows = part(card, "Whether it tells methods apart").partition("| bar |")[2].splitlines()[2:]
+    cells = [row.strip("| ").split(" | ") for row in rows if row.startswith("|")]
+    return {words: rest for words, *rest in cells}
+
+
+def test_every_task_has_its_group_picture_instructions_and_measured_expert(bench: Bench) -> None:
+    tasks = part(bench.card(), "Tasks")
+    assert re.findall(r"^\| (\w+) \| !\[", tasks, re.MULTILINE) == NAMES
+    assert re.findall(r"^### (\w+)", tasks, re.MULTILINE) == ["Retained", "Targets", "Held"]
+    assert "| left | ![left](Toy-v0/left.webp) | go left<br>move to the left | 1.00 | 12 |" in tasks
+    kept = json.loads((bench.output / "Toy-v0" / "experts.json").read_text(encoding="utf-8"))
+    assert kept["left"] == {"version": 0, "episodes": 3, "successes": 3}
+    pictures = [np.asarray(Image.open(bench.output / "Toy-v0" / f"{name}.webp")) for name in NAMES]
+    assert {picture.shape for picture in pictures} == {(240, 240, 3)}
+    assert all(picture.max() > 200 for picture in pictures)  # the white point
+    assert sum(path.stat().st_size for path in (bench.output / "Toy-v0").iterdir()) < 500_000
+
+
+def test_budget_and_questions_are_those_of_the_code(bench: Bench) -> None:
+    card = bench.card()
+    assert "| `pretraining_learning_rate` | Peak step size of pretraining. | 0.002 |" in part(card, "Budget")
+    assert "evaluated after 15, 30, 60 steps" in part(card, "Budget")
+    assert "| side | on which side of the target is it | left, right |" in part(card, "Questions")
+
+
+def test_a_scenario_that_tells_methods_apart_holds_all_bars(bench: Bench) -> None:
+    bench.add_all()
+    found = bars(bench.card())
+    assert list(found) == [
+        "pretrained policy on the retained skills",
+        "adaptation of sft",
+        "retention of sft",
+        "best final average, of frozen, less that of joint",
+        "adaptation of frozen",
+    ]
+    assert {verdict for *_, verdict in found.values()} == {"holds"}
+    assert found["retention of sft"] == ["at most 0.50", "0.00 [0.00, 0.00]", "holds"]
+
+
+@pytest.mark.parametrize(
+    ("method", "success", "words"),
+    [
+        ("sft", [[1, 0.5, 0, 0, 0], *FORGETS[1:]], "pretrained policy on the retained skills"),
+        ("sft", [*FORGETS[:2], [0, 0, 0, 0.5, 0]], "adaptation of sft"),
+        ("sft", [*FORGETS[:2], [1, 0.5, 0, 1, 0]], "retention of sft"),
+        ("joint", [*KEEPS[:2], [0.5, 0, 0.5, 0, 0]], "best final average, of frozen, less that of joint"),
+        ("frozen", [*STAYS[:2], [1, 1, 0, 0.7, 0]], "adaptation of frozen"),
+    ],
+)
+def test_a_bar_that_is_missed_is_said_not_to_hold(
+    method: str, success: Any, words: str, bench: Bench
+) -> None:
+    bench.add_all()
+    bench.add(method, success)
+    found = bars(bench.card())
+    assert {bar for bar, cells in found.items() if cells[-1] == "does not hold"} == {words}
+
+
+def test_where_nothing_is_retained_fine_tuning_must_forget_the_earlier_targets(
+    bench: Bench, tmp_path: Path
+) -> None:
+    bare = dataclasses.replace(TOY, retained=(), held_out=TOY.retained)
+    table = resolve("clbench.leaderboard.board.rows:Table")({}, (), ())
+    experts = resolve("clbench.leaderboard.pages.scenario_tasks:Experts")(10, dict.fromkeys(NAMES, 9))
+    card = resolve("clbench.leaderboard.pages.scenario_cards:Card")(bare, table, experts, frozenset()).page()
+    assert list(bars(card))[:2] == ["adaptation of sft", "forgetting of earlier targets by sft"]
+    assert "at least 0.40" in bars(card)["forgetting of earlier targets by sft"]
+    assert "### Retained skills" in card
+    assert "None." in part(card, "Tasks")
+
+
+def test_missing_records_are_named_with_the_command_that_makes_them(bench: Bench) -> None:
+    bench.add("sft", FORGETS)
+    bench.add("frozen", STAYS)
+    card = bench.card()
+    told = (
+        "Missing: records of joint, from_scratch. `clbench run clbench/Toy-v0 joint from_scratch` makes them."
+    )
+    assert told in card
+    assert bars(card)["best final average less that of joint"] == ["at most 0.07", "-", "-"]
+
+
+def test_without_any_record_the_card_says_so_and_invents_nothing(bench: Bench) -> None:
+    card = bench.card()
+    assert "`clbench run clbench/Toy-v0 sft joint frozen from_scratch` makes them." in card
+    assert {tuple(cells[1:]) for cells in bars(card).values()} == {("-", "-")}
+    assert part(card, "How small a difference it resolves").startswith(
+        "Unknown: it takes 3 seeds of two methods"
+    )
+    assert part(card, "Order of the targets").startswith("No order but the published one was run.")
+
+
+def test_what_is_resolved_is_half_of_the_interval_of_a_difference_at_the_measured_spread(
+    bench: Bench,
+) -> None:
+    for method, kept in (("sft", (0.2, 0.4, 0.3)), ("lwf", (0.5, 0.5, 0.6))):
+        for seed, rate in enumerate(kept):
+            bench.add(method, [*FORGETS[:2], [rate, rate, 0, 1, 0]], [seed])
+    bench.add("joint", KEEPS)  # a reference does not compete,
+    for seed in range(3):  # nor what learned by trial
+        bench.add("ewc", [*FORGETS[:2], [0, seed / 2, 0, 1, 0]], [seed], online=True)
+    table = part(bench.card(), "How small a difference it resolves")
+    row = next(line for line in table.splitlines() if line.startswith("| retention |"))
+    found = [float(cell) for cell in row.strip("| ").split(" | ")[1:]]
+    deviation = np.std([0.3, 0.1, 0.3], ddof=1)
+    half_widths = [stats.t.ppf(0.975, n - 1) * deviation / np.sqrt(n) for n in (3, 5, 10)]
+    assert found == pytest.approx([deviation, *half_widths], abs=6e-4)
+    assert "- prior-data-free: 2 methods, " in table
+
+
+def test_what_was_run_in_other_orders_stands_beside_the_published_one(bench: Bench) -> None:
+    bench.add("sft", FORGETS)
+    bench.add("sft", KEEPS, [0, 1], order=1)
+    told = part(bench.card(), "Order of the targets")
+    assert "| sft | 0: 0.25, 1: 1.00 | 0, 1 | - |" in told  # two targets have two orders: no range
+
+
+def test_where_nothing_draws_the_card_says_so_and_keeps_the_pictures_that_are_there(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bench.card()
+    lost, kept = (bench.output / "Toy-v0" / f"{name}.webp" for name in ("left", "up"))
+    before = kept.read_bytes()
+    lost.unlink()
+    monkeypatch.setattr("clbench.worlds.gl_backend.rendering_fault", lambda *_: "no display")
+    card = bench.card()
+    assert "Without a picture: left. Nothing could draw where this card was made." in card
+    assert "| left | - | go left" in card
+    assert "![up](Toy-v0/up.webp)" in card
+    assert kept.read_bytes() == before
+    assert "No pictures are drawn; those that are there are kept." in " ".join(
+        capsys.readouterr().err.split()
+    )
+
+
+def test_a_card_that_is_made_again_has_the_same_bytes_and_nothing_is_measured_twice(
+    bench: Bench, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bench.add_all()
+    bench.card()
+    files = {path: path.read_bytes() for path in bench.output.rglob("*") if path.is_file()}
+    assert "5 experts measured, 5 pictures drawn" in capsys.readouterr().err
+    bench.card()
+    assert "0 experts measured, 0 pictures drawn" in capsys.readouterr().err
+    assert {path: path.read_bytes() for path in files} == files
+    (bench.output / "Toy-v0" / "experts.json").write_text("[torn")
+    (bench.output / "Toy-v0" / "up.webp").unlink()
+    bench.card()
+    assert "5 experts measured, 1 pictures drawn" in capsys.readouterr().err
+    assert {path: path.read_bytes() for path in files} == files
+    bench.card(episodes=4)
+    assert "5 experts measured, 0 pictures drawn" in capsys.readouterr().err
+
+
+def test_records_of_another_version_of_the_scenario_are_told_from_it(bench: Bench) -> None:
+    bench.add_all()
+    assert "another version" not in bench.card()
+    for path in bench.records.rglob("*.json"):
+        values = json.loads(path.read_text(encoding="utf-8"))
+        values["scenario"]["budget"]["batch_size"] = 8
+        path.write_text(json.dumps(values), encoding="utf-8")
+    assert "The records are of another version of this scenario: budget differ." in bench.card()
+
+
+def test_words_of_strangers_are_no_markup(bench: Bench) -> None:
+    bench.add("sft", FORGETS)
+    for path in bench.records.rglob("*.json"):
+        values = json.loads(path.read_text(encoding="utf-8"))
+        values["fingerprint"]["versions"] = {"<b>x": "1 | 2\n## y", "z": ["<b>"]}
+        path.write_text(json.dumps(values), encoding="utf-8")
+    bench.card()
+    text = (bench.output / "Toy-v0.md").read_text(encoding="utf-8")
+    assert "<b>" not in text.replace("\\<", "")
+    assert "## y" not in re.findall("^## .*", text, re.MULTILINE)
+
+
+def test_without_a_name_the_scenarios_with_records_have_cards(bench: Bench) -> None:
+    with pytest.raises(SystemExit) as stopped:
+        resolve("clbench.leaderboard.cli:scenario_card")(records=bench.records, output=bench.output)
+    assert stopped.value.code == 2
+    bench.add("sft", FORGETS)
+    resolve("clbench.leaderboard.cli:scenario_card")(records=bench.records, output=bench.output, episodes=1)
+    assert sorted(path.name for path in bench.output.iterdir()) == ["Toy-v0", "Toy-v0.md"]
+
+
+@pytest.mark.parametrize(
+    ("scenario", "options", "reason"),
+    [
+        ("clbench/Toi-v0", {}, "Did you mean 'clbench/Toy-v0'?"),
+        (TOY.id, {"episodes": 0}, "--episodes must be at least 1, not 0"),
+    ],
+)
+def test_a_wrong_word_is_named(
+    scenario: str, options: dict[str, Any], reason: str, bench: Bench, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as stopped:
+        bench.card(scenario, **options)
+    assert stopped.value.code == 2
+    assert reason in " ".join(capsys.readouterr().err.split())
+    assert not bench.output.exists()

@@ -1,0 +1,120 @@
+"""Submitting: a class is checked, run within limits and put on the board; what goes wrong is said."""
+
+import importlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from clbench.records.paths import record_path
+from clbench.records.reader import read_record
+from clbench.records.record import Record
+from clbench.records.writer import write_record
+
+MODULE = """
+import dataclasses, time
+import clbench
+from clbench.spec.limits import Limits
+from clbench.testing import TOY
+from gymnasium.envs.registration import register
+
+hurried = dataclasses.replace(TOY, id="clbench/Hurried-v0", limits=Limits(seconds=4.0))
+kwargs = {"scenario": f"{__name__}:hurried"}
+register(id=hurried.id, entry_point="clbench.worlds.scenario_env:ScenarioEnv", kwargs=kwargs)
+
+@dataclasses.dataclass
+class Mine(clbench.Method):
+    '''Plain fine-tuning, under another name.'''
+
+class Größe(Mine):
+    '''Its name is not one of a row.'''
+
+@dataclasses.dataclass
+class Broken(clbench.Method):
+    '''Its loss is not a scalar.'''
+    def loss(self, policy, batch, progress):
+        return policy.action_loss(batch)
+
+@dataclasses.dataclass
+class Sleeper(clbench.Method):
+    '''It never ends.'''
+    def prepare(self, policy, prior):
+        time.sleep(600)
+"""
+
+
+@pytest.fixture(autouse=True)
+def _module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "submitted.py").write_text(MODULE, encoding="utf-8")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+
+
+def submit(method: str, scenario: str = "clbench.testing:clbench/Toy-v0", **rest: Any) -> None:
+    command = importlib.import_module("clbench.leaderboard.cli").submit
+    command(method, scenario=scenario, **{"seeds": 1, "workers": 1, "records": Path("board/records"), **rest})
+
+
+def test_a_sound_class_gets_a_row_a_rank_and_its_ties(
+    make_record: Callable[..., Record], capsys: pytest.CaptureFixture[str]
+) -> None:
+    submit("submitted:Mine")
+    printed = capsys.readouterr()
+    assert "the method keeps the contract" in printed.err
+    assert "Rank 1 of 1 in the division prior-data-free." in printed.out
+    assert "Metrics that compare with sft need records of it" in printed.out
+    path = record_path(Path("board/records"), "clbench/Toy-v0", "submitted:Mine", 0)
+    record = read_record(path)
+    assert record.status == "success"
+    assert "submitted:Mine" in Path("board/LEADERBOARD.md").read_text(encoding="utf-8")
+    # the same run under another name: nobody can tell the two rows apart
+    record.run["method"] = "another:Twin"
+    write_record(record, record_path(Path("board/records"), "clbench/Toy-v0", "another:Twin", 0))
+    before = path.read_bytes()
+    submit("submitted:Mine")
+    printed = capsys.readouterr()
+    assert "All runs have a record already." in printed.err
+    assert "Rank 1 of 2" in printed.out
+    assert "which it shares with another:Twin" in printed.out
+    assert path.read_bytes() == before
+
+
+def test_a_class_that_breaks_the_contract_is_not_run(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as stopped:
+        submit("submitted:Broken")
+    assert stopped.value.code == 1
+    printed = capsys.readouterr().err
+    assert "breaks the contract" in printed
+    assert "loss()" in printed
+    assert not Path("board").exists()
+
+
+def test_a_method_that_goes_beyond_the_limits_of_its_scenario_is_stopped(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    with pytest.raises(SystemExit) as stopped:
+        submit("submitted:Sleeper", "submitted:clbench/Hurried-v0")
+    assert stopped.value.code == 1
+    assert "stopped, because it took longer than 4 s" in capsys.readouterr().err
+    assert not Path("board").exists()
+
+
+@pytest.mark.parametrize(
+    ("method", "rest", "reason"),
+    [
+        ("submitted:Mind", {}, "Did you mean 'Mine'?"),
+        ("submited:Mine", {}, "No module 'submited' can be imported"),
+        ("submitted:Größe", {}, "'submitted:Größe' cannot be the name of a method"),
+        ("submitted:Mine", {"seeds": 0}, "--seeds must be at least 1"),
+        ("submitted:Mine", {"scenario": "clbench/Fetsch-v0"}, "Did you mean 'clbench/Fetch-v0'?"),
+    ],
+)
+def test_a_wrong_word_is_named(
+    method: str, rest: dict[str, Any], reason: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as stopped:
+        submit(method, **rest)
+    assert stopped.value.code == 2
+    assert reason in " ".join(capsys.readouterr().err.split())
+    assert not Path("board").exists()

@@ -1,0 +1,307 @@
+"""Verification: each tier is earned by an honest record, denied to a forged one, and says why."""
+
+import importlib
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from clbench.records.paths import record_path
+from clbench.records.reader import read_record
+from clbench.runs.run import execute
+from clbench.runs.spec import RunSpec
+from clbench.testing import ToyWorld
+
+verification = importlib.import_module("clbench.leaderboard.submission.verify")
+tiers = importlib.import_module("clbench.leaderboard.board.tiers")
+
+TOY = "clbench.testing:clbench/Toy-v0"
+ALL = 10**6
+"""More episodes than a toy run has."""
+
+Edit = Callable[[dict[str, Any]], None]
+
+
+@pytest.fixture(scope="module")
+def honest(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a folder with the record of one run, and the policies that it kept."""
+    folder = tmp_path_factory.mktemp("honest")
+    execute(RunSpec(TOY, "sft", 0), folder / "records", checkpoints=folder / "checkpoints")
+    return folder
+
+
+@pytest.fixture
+def mine(honest: Path, tmp_path: Path) -> Path:
+    """Return the path of a copy of that record in a folder of its own."""
+    shutil.copytree(honest / "records", tmp_path / "records")
+    (path,) = (tmp_path / "records").rglob("*.json")
+    return path
+
+
+def verify(path: Path, tier: str, honest: Path | None = None, **rest: Any) -> list[Any]:
+    """Return the checks of a verification, with the kept policies if their folder is given."""
+    checkpoints = honest / "checkpoints" if honest else None
+    request = verification.Request(
+        **{
+            "tier": tier,
+            "episodes": ALL,
+            "seed": 0,
+            "method": None,
+            "scenario": TOY,
+            "checkpoints": checkpoints,
+            **rest,
+        }
+    )
+    records = next(folder for folder in path.parents if folder.name == "records")
+    checks: list[Any] = verification.verify(path, records, request)
+    return checks
+
+
+def failures(checks: list[Any]) -> str:
+    return "\n".join(f"{check.name}: {check.found}" for check in checks if not check.passed)
+
+
+def edit(path: Path, change: Edit) -> None:
+    values = json.loads(path.read_text(encoding="utf-8"))
+    change(values)
+    path.write_text(json.dumps(values), encoding="utf-8")
+
+
+@pytest.mark.parametrize("tier", ["recomputed", "replayed", "retrained"])
+def test_an_honest_record_earns_every_tier_and_is_not_touched(tier: str, mine: Path, honest: Path) -> None:
+    before = mine.read_bytes()
+    assert tiers.tier_of(mine) == "self-reported"
+    checks = verify(mine, tier, honest)
+    assert failures(checks) == ""
+    assert tiers.tier_of(mine) == tier
+    assert mine.read_bytes() == before
+    told = json.loads(tiers.verification_path(mine).read_text(encoding="utf-8"))
+    assert told["verifier"]["versions"]["torch"]
+    assert [check["name"] for check in told["checks"]] == [check.name for check in checks]
+
+
+def test_a_run_in_another_order_of_the_targets_is_verified_in_that_order(tmp_path: Path) -> None:
+    spec = RunSpec(TOY, "frozen", 0, order=1)
+    execute(spec, tmp_path / "records")
+    path = spec.path(tmp_path / "records")
+    assert failures(verify(path, "retrained")) == ""
+    assert tiers.tier_of(path) == "retrained"
+    edit(path, lambda values: values["scenario"]["target"].reverse())
+    assert "scenario.target differ from what is installed" in failures(verify(path, "recomputed"))
+
+
+def test_perturbed_episodes_are_replayed_like_those_of_the_report(tmp_path: Path) -> None:
+    spec = RunSpec(TOY, "frozen", 0, perturb=True)
+    execute(spec, tmp_path / "records")
+    path = spec.path(tmp_path / "records")
+    checks = verify(path, "retrained")
+    assert failures(checks) == ""
+    assert any(check.found.startswith("126 of 126 run again") for check in checks)  # 90 and 36
+    edit(path, lambda values: flip_perturbed(values))
+    assert "left perturbed episode " in failures(verify(path, "replayed"))
+    assert tiers.tier_of(path) == "recomputed"
+
+
+def flip_perturbed(values: dict[str, Any]) -> None:
+    """Turn a failure in a perturbed episode into a success, or make a success take a step less."""
+    episodes = values["episodes"]
+    row = episodes["split"].index("perturbed")
+    episodes["length"][row] -= episodes["success"][row]
+    episodes["success"][row] = 1
+
+
+def test_a_record_that_claims_perturbed_episodes_of_a_world_without_is_denied(
+    mine: Path, honest: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def claim(values: dict[str, Any]) -> None:
+        values["run"]["perturb"] = True
+        rows = list(zip(*values["episodes"].values(), strict=True))
+        ends = [row for row in rows if row[1] in (0, 60) and row[3] == "test" and row[2] in ("left", "up")]
+        for row in ends:
+            for column, value in zip(values["episodes"].values(), row, strict=True):
+                column.append("perturbed" if value == "test" else value)
+
+    edit(mine, claim)
+    assert "episodes: " in failures(verify(mine, "replayed", honest))
+    steady = lambda render_mode=None: ToyWorld(render_mode)  # noqa: E731 - a world that takes no `perturbed`
+    monkeypatch.setattr("clbench.testing.ToyWorld", steady)
+    assert "what was run: The task 'left' cannot be perturbed" in failures(verify(mine, "replayed", honest))
+
+
+def test_a_record_can_be_replayed_from_policies_that_are_made_again(mine: Path) -> None:
+    checks = verify(mine, "replayed", episodes=20)
+    assert failures(checks) == ""
+    assert any(check.found.startswith("20 of ") for check in checks)
+    assert any(check.found == "made again" for check in checks)
+
+
+def test_the_table_shows_the_least_tier_of_a_row(mine: Path, honest: Path) -> None:
+    verify(mine, "replayed", honest)
+    records = next(folder for folder in mine.parents if folder.name == "records")
+    load = importlib.import_module("clbench.leaderboard").load
+    assert list(load(records).tier) == ["replayed"]
+    other = mine.with_name("seed-1.json")
+    shutil.copy(mine, other)
+    edit(other, lambda values: values["run"].update(seed=1))
+    assert list(load(records).tier) == ["self-reported"]
+
+
+def flip(values: dict[str, Any], success: int, step: int | None = None) -> None:
+    """Turn the first episode with this outcome into its opposite, at this step of a stage if one is given."""
+    episodes = values["episodes"]
+    rows = [
+        row
+        for row, outcome in enumerate(episodes["success"])
+        if outcome == success and episodes["split"][row] == "test" and step in (None, episodes["step"][row])
+    ]
+    episodes["success"][rows[0]] = 1 - success
+
+
+def more_right_answers(values: dict[str, Any]) -> None:
+    answers = values["answers"]
+    last = len(answers["correct"]) - 1
+    answers["correct"][last] = (answers["correct"][last] + 1) % (answers["asked"][last] + 1)
+
+
+FORGERIES = [
+    ("recomputed", "ends of episodes: failed before the horizon", lambda values: flip(values, 1)),
+    (
+        "recomputed",
+        "simulator: the rollouts of",
+        lambda values: values["fingerprint"]["rollouts"].update({"clbench.testing:ToyWorld": "0"}),
+    ),
+    (
+        "recomputed",
+        "what was run: scenario.budget",
+        lambda values: values["scenario"]["budget"].update(adaptation_steps=61),
+    ),
+    (
+        "recomputed",
+        "record: run: uses are not those of ",
+        lambda values: values["run"]["uses"].update(demonstrations="throughout"),
+    ),
+    (
+        "recomputed",
+        "record: run: settings are not those of ",
+        lambda values: values["run"]["settings"].update(strength=1.0),
+    ),
+    ("recomputed", "and must lie there", lambda values: values["run"].update(seed=7)),
+    ("recomputed", "record: ", lambda values: values["episodes"]["success"].pop()),
+    ("replayed", "episodes: 1 of ", lambda values: flip(values, 0, 60)),
+    ("replayed", "answers: other counts", more_right_answers),
+]
+
+
+@pytest.mark.parametrize(("tier", "reason", "change"), FORGERIES)
+def test_a_forged_record_is_denied_the_tier_and_what_is_wrong_is_named(
+    tier: str, reason: str, change: Edit, mine: Path, honest: Path
+) -> None:
+    edit(mine, change)
+    checks = verify(mine, tier, honest)
+    assert reason in failures(checks)
+    below = tiers.TIERS[tiers.TIERS.index(tier) - 1]
+    assert tiers.tier_of(mine) == below
+
+
+def test_what_only_the_whole_run_can_tell_is_found_by_doing_it_again(mine: Path, honest: Path) -> None:
+    edit(mine, lambda values: flip(values, 0, 30))  # on the way: no policy of that moment is kept
+    edit(mine, lambda values: values["costs"].update(bytes_kept=1))
+    edit(mine, lambda values: values["diagnostics"].update({"1": {"energy": 0.5}}))
+    found = failures(verify(mine, "retrained", honest))
+    parts = "episodes (success), costs (bytes_kept), diagnostics (1)"
+    assert found == f"whole run: done again, {parts} came out otherwise"
+    assert tiers.tier_of(mine) == "replayed"
+
+
+def test_the_episodes_of_another_seed_are_found(mine: Path, honest: Path) -> None:
+    other = mine.with_name("seed-1.json")
+    shutil.move(mine, other)
+    edit(other, lambda values: values["run"].update(seed=1))
+    found = failures(verify(other, "replayed"))
+    assert "pretraining does not give the same policy here" in found
+
+
+def test_a_tier_is_lost_with_the_first_changed_byte(mine: Path, honest: Path) -> None:
+    verify(mine, "recomputed", honest)
+    mine.write_bytes(mine.read_bytes() + b"\n")
+    assert tiers.tier_of(mine) == "self-reported"
+
+
+def test_the_verification_of_another_record_counts_for_nothing(mine: Path, honest: Path) -> None:
+    verify(mine, "recomputed", honest)
+    other = mine.with_name("seed-1.json")
+    other.write_bytes(mine.read_bytes().replace(b'"seed": 0', b'"seed": 1'))
+    shutil.copy(tiers.verification_path(mine), tiers.verification_path(other))
+    assert tiers.tier_of(other) == "self-reported"
+
+
+@pytest.mark.parametrize(
+    "content", ["", "[]", '{"tier": "retrained"}', '{"tier": "best", "record": "0"}', "[" * 9999]
+)
+def test_a_torn_verification_counts_for_nothing(content: str, mine: Path) -> None:
+    tiers.verification_path(mine).write_text(content, encoding="utf-8")
+    assert tiers.tier_of(mine) == "self-reported"
+
+
+def test_a_failed_check_takes_an_earlier_tier_back(mine: Path, honest: Path) -> None:
+    verify(mine, "recomputed", honest)
+    edit(mine, lambda values: flip(values, 1))
+    verify(mine, "recomputed", honest)
+    assert not tiers.verification_path(mine).exists()
+
+
+def test_what_a_record_names_is_not_imported_unless_the_verifier_says_so(
+    mine: Path, honest: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    trace = f"import pathlib\npathlib.Path({str(tmp_path / 'ran')!r}).touch()\n"
+    (tmp_path / "stranger.py").write_text(f"{trace}class Mine: pass\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    record = read_record(mine)
+    place = record_path(mine.parents[2], "clbench/Toy-v0", "stranger:Mine", 0)
+    place.parent.mkdir()
+    run = {**record.run, "method": "stranger:Mine"}
+    values = {**json.loads(mine.read_text(encoding="utf-8")), "run": run}
+    place.write_text(json.dumps(values), encoding="utf-8")
+    checks = verify(place, "replayed", honest)
+    assert "stranger:Mine is not installed: name it with --method" in failures(checks)
+    assert tiers.tier_of(place) == "recomputed"
+    assert not (tmp_path / "ran").exists()
+    verify(place, "replayed", honest, method="stranger:Mine")
+    assert (tmp_path / "ran").exists()
+
+
+def test_the_command_says_what_was_looked_at(
+    mine: Path, honest: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = importlib.import_module("clbench.leaderboard.cli").verify
+    records = next(folder for folder in mine.parents if folder.name == "records")
+    command(mine, tier="recomputed", scenario=TOY, records=records, workers=1)
+    assert "recomputed" in capsys.readouterr().out
+    edit(mine, lambda values: flip(values, 1))
+    with pytest.raises(SystemExit) as stopped:
+        command(mine.parent, tier="recomputed", scenario=TOY, records=records, workers=1)
+    assert stopped.value.code == 1
+    assert "NOT ends of episodes" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "reason"),
+    [
+        ({"tier": "replay"}, "Did you mean 'replayed'?"),
+        ({"episodes": 0}, "--episodes must be at least 1"),
+        ({"paths": ["nowhere.json"]}, "There is no record at nowhere.json"),
+        ({"paths": []}, "There is no record to verify"),
+    ],
+)
+def test_a_wrong_word_on_the_command_line_is_named(
+    arguments: dict[str, Any], reason: str, mine: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = importlib.import_module("clbench.leaderboard.cli").verify
+    paths = arguments.pop("paths", [mine])
+    with pytest.raises(SystemExit) as stopped:
+        command(*map(Path, paths), **arguments)
+    assert stopped.value.code == 2
+    assert reason in capsys.readouterr().err

@@ -1,0 +1,259 @@
+"""The page: all that is behind the numbers, in one file, the same bytes from the same records."""
+
+import dataclasses
+import os
+import re
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import html5lib
+import numpy as np
+import pytest
+
+from clbench.base.entry_points import resolve
+from clbench.records.paths import record_path
+from clbench.records.record import Record
+from clbench.records.writer import write_record
+
+page = resolve("clbench.leaderboard.views.page:page")
+pictures = resolve("clbench.leaderboard.views.page:pictures")
+read_table = resolve("clbench.leaderboard.board.rows:read_table")
+
+HOSTILE = "</script><img src=x onerror=alert(1)>'\"&{{ 1 }}"
+ADDRESS = re.compile(r"https?://[^\s\"'<>`)]+")
+
+
+@pytest.fixture
+def records(add: Callable[..., Path], matrix: Any, tmp_path: Path) -> Path:
+    """Return a folder with the records of two methods."""
+    for seed in range(2):
+        add("sft", seed)
+        add("better", seed, np.clip(matrix + 0.3, 0, 1))
+    return tmp_path / "leaderboard" / "records"
+
+
+def parsed(text: str) -> ElementTree.Element:
+    """Return the document of a page that has no error."""
+    parser = html5lib.HTMLParser(strict=True, namespaceHTMLElements=False)
+    document: ElementTree.Element = parser.parse(text)
+    return document
+
+
+def words(element: ElementTree.Element) -> str:
+    """Return the text of an element, its parts one space apart."""
+    return " ".join(" ".join(element.itertext()).split())
+
+
+def by_id(document: ElementTree.Element, name: str) -> ElementTree.Element:
+    (found,) = (one for one in document.iter() if one.get("id") == name)
+    return found
+
+
+def without_library(text: str) -> str:
+    """Return a page without the scripts."""
+    return re.sub(r"<script>.*?</script>", "", text, flags=re.DOTALL)
+
+
+def test_the_page_is_valid_and_has_a_row_and_a_section_for_each_method(records: Path) -> None:
+    document = parsed(page(read_table(records)))
+    section = by_id(document, "clbench/Toy-v0")
+    links = [one.get("href") for one in section.iterfind(".//table/tbody/tr/th/a")]
+    assert links[:2] == ["#clbench/Toy-v0/better", "#clbench/Toy-v0/sft"]
+    for method in ("better", "sft"):
+        own = words(by_id(document, f"clbench/Toy-v0/{method}"))
+        assert f"clbench run clbench/Toy-v0 {method} --seeds 2" in own
+        assert "after target_1" in own
+        assert "self-reported" in own
+    assert "after target_1 0.50 0.40 0.30 0.80 0.10" in words(by_id(document, "clbench/Toy-v0/sft"))
+
+
+def test_perturbed_retention_has_a_column_only_where_a_row_has_it(
+    add: Callable[..., Path], records: Path
+) -> None:
+    plain = page(read_table(records))
+    assert "perturbed retention" not in plain
+    for seed in range(2):
+        add("sft", seed, perturbed=[[0.9, 0.8], [0.5, 0.7], [0.4, 0.2]])
+    document = parsed(page(read_table(records)))
+    section = by_id(document, "clbench/Toy-v0")
+    heads = [words(one) for one in section.iterfind(".//table/thead/tr/th")]
+    assert heads[heads.index("retention") + 1] == "perturbed retention"
+    assert ", missing: The run did not meet perturbed episodes" in words(section)
+    assert "perturbed retention 0.30 [" in words(by_id(document, "clbench/Toy-v0/sft"))
+    assert "clbench run clbench/Toy-v0 sft --seeds 2 --perturb" in words(
+        by_id(document, "clbench/Toy-v0/sft")
+    )
+    better = words(by_id(document, "clbench/Toy-v0/better"))
+    assert "perturbed retention" not in better
+    assert "--perturb" not in better
+
+
+def test_a_missing_value_is_a_dash_that_says_why(records: Path) -> None:
+    text = words(by_id(parsed(page(read_table(records))), "clbench/Toy-v0"))
+    assert ", missing: A point of a learning curve is missing, or there is no from_scratch" in text
+
+
+@pytest.mark.slow
+def test_the_same_records_give_the_same_bytes_in_another_place_time_zone_and_locale(
+    records: Path, tmp_path: Path
+) -> None:
+    resolve("clbench.leaderboard.cli:show")(records=records)
+    names = ["index.html", "pareto.svg", "pareto-dark.svg"]
+    here = [(records.parent / "site" / name).read_bytes() for name in names]
+    elsewhere = tmp_path / "elsewhere"
+    (elsewhere / "leaderboard").mkdir(parents=True)
+    (records.parent / "records").rename(elsewhere / "leaderboard" / "records")
+    environment = {**os.environ, "TZ": "Asia/Tokyo", "LC_ALL": "C", "LANG": "de_DE", "PYTHONHASHSEED": "7"}
+    command = [sys.executable, "-m", "clbench", "leaderboard"]
+    subprocess.run(command, cwd=elsewhere, env=environment, check=True, capture_output=True)
+    assert [(elsewhere / "leaderboard" / "site" / name).read_bytes() for name in names] == here
+
+
+def test_what_strangers_wrote_is_text(add: Callable[..., Path], records: Path) -> None:
+    def edit(record: Record) -> None:
+        record.run["settings"] = {HOSTILE: HOSTILE}
+        record.diagnostics = {"1": {HOSTILE: HOSTILE, "x": [1.0, 2.0]}, HOSTILE: {"y": [HOSTILE]}}
+        record.fingerprint.update(hardware={"processor": HOSTILE}, commit=HOSTILE, python=[{HOSTILE: 1}])
+
+    def fail(record: Record) -> None:
+        record.status = "failed"
+        record.error = {"where": "loss", "type": "E", "message": HOSTILE, "traceback": ""}
+
+    add("hostile", 0, edit=edit, scenario="clbench/Hostile-v0")
+    add("failed", 0, edit=fail)
+    (records / "<img src=x onerror=alert(2)>.json").write_text("{", encoding="utf-8")
+    text = page(read_table(records))
+    document = parsed(text)
+    assert not list(document.iter("img"))
+    assert len(list(document.iter("script"))) == 3
+    assert not [name for one in document.iter() for name in one.attrib if name.startswith("on")]
+    shown = words(document)
+    assert shown.count(HOSTILE) >= 8
+    assert "<img src=x onerror=alert(2)>.json" in shown
+
+
+def test_a_command_can_be_pasted_whatever_its_record_says(add: Callable[..., Path], records: Path) -> None:
+    def edit(record: Record) -> None:
+        record.run["device"] = "cpu; touch /tmp/gone"
+        record.fingerprint["commit"] = {"id": "; touch /tmp/gone", "dirty": True}
+
+    add("careless", 3, edit=edit)
+    text = words(by_id(parsed(page(read_table(records))), "clbench/Toy-v0/careless"))
+    assert (
+        "clbench run clbench/Toy-v0 careless --seeds 1 --first-seed 3 --device 'cpu; touch /tmp/gone'" in text
+    )
+    assert "git checkout" not in text
+
+
+def test_seeds_of_several_commits_are_made_again_from_each(add: Callable[..., Path], records: Path) -> None:
+    for seed, commit in ((0, "a"), (1, "b"), (2, "b"), (5, "b")):
+        add(
+            "old",
+            seed,
+            edit=lambda record, commit=commit: record.fingerprint.update(commit={"id": commit * 40}),
+        )
+    text = words(by_id(parsed(page(read_table(records))), "clbench/Toy-v0/old"))
+    install, run = "pip install -c constraints.txt -e .", "clbench run clbench/Toy-v0 old --seeds"
+    first = f"git checkout {'a' * 40} {install} {run} 1"
+    assert f"{first} git checkout {'b' * 40} {install} {run} 2 --first-seed 1 {run} 1 --first-seed 5" in text
+
+
+def test_the_page_asks_no_address_and_allows_no_script_but_its_own(records: Path) -> None:
+    text = page(read_table(records))
+    document = parsed(text)
+    (policy,) = (one.get("content", "") for one in document.iter("meta") if one.get("http-equiv"))
+    assert policy.startswith("default-src 'none';")
+    assert "unsafe" not in policy
+    assert not [one for one in document.iter() if one.get("style") or one.get("src")]
+    rest = without_library(text)
+    links = {one.get("href", "") for one in document.iter("a")}
+    links = {link for link in links if not link.startswith("#")}
+    assert all(link.startswith("https://arxiv.org/abs/") for link in links)
+    namespaces = {"https://vega.github.io/schema/vega-lite/v6.json"}
+    assert set(ADDRESS.findall(rest)) <= links | namespaces
+
+
+def test_files_that_make_no_row_are_listed_with_their_reason(records: Path) -> None:
+    (records / "torn.json").write_text("{", encoding="utf-8")
+    text = words(by_id(parsed(page(read_table(records))), "not-shown"))
+    assert "torn.json cannot be read as JSON" in text
+    assert "What to do" in text
+
+
+def test_definitions_that_rank_in_opposite_orders_are_named(add: Callable[..., Path], records: Path) -> None:
+    # one forgets the skills alone, one the targets alone: they are told apart by who counts what
+    for seed in range(2):
+        add("skills", seed, [[1, 1, 0, 0, 0], [0, 0, 1, 0, 0], [0, 0, 1, 1, 0]], scenario="clbench/Two-v0")
+        add("targets", seed, [[1, 1, 0, 0, 0], [1, 1, 1, 0, 0], [1, 1, 0, 1, 0]], scenario="clbench/Two-v0")
+    document = parsed(page(read_table(records)))
+    text = words(by_id(document, "clbench/Two-v0"))
+    assert "“forgetting” and “backward transfer” disagree most. They put 1 of 1 pairs of methods" in text
+    (table,) = (
+        one for one in by_id(document, "clbench/Two-v0").iter("table") if one.get("class") == "definitions"
+    )
+    ranks = {words(row[0]): [words(cell) for cell in row[1:3]] for row in table.find("tbody") or []}
+    assert ranks == {
+        "skills": ["2 , depends on the definition", "1"],
+        "targets": ["1 , depends on the definition", "2"],
+    }
+
+
+def test_without_rows_there_is_a_page_that_says_why(tmp_path: Path) -> None:
+    (tmp_path / "torn.json").write_text("{", encoding="utf-8")
+    table = read_table(tmp_path)
+    text = words(parsed(page(table)))
+    assert "There is no row yet" in text
+    assert "torn.json" in text
+    assert set(pictures(table)) == {"pareto.svg", "pareto-dark.svg"}
+
+
+def test_the_pictures_show_every_method_in_both_themes(records: Path) -> None:
+    drawn = pictures(read_table(records))
+    for picture in drawn.values():
+        texts = [
+            "".join(one.itertext())
+            for one in ElementTree.fromstring(picture).iter()
+            if one.tag.endswith("text")
+        ]
+        assert {"sft", "better", "prior-data-free"} <= set(texts)
+        assert "var(" not in picture
+        assert "<script" not in picture
+    assert drawn["pareto.svg"] != drawn["pareto-dark.svg"]
+
+
+def test_15_methods_with_5_seeds_on_4_scenarios_are_less_than_3_megabytes(
+    make_record: Callable[..., Record], tmp_path: Path
+) -> None:
+    generator = np.random.default_rng(0)
+    for seed in range(5):
+        record = make_record(
+            generator.integers(2, size=(5, 12, 20)).astype(float),
+            curves=generator.random((4, 3)),
+            retained_curves=generator.random((4, 3, 6)),
+            validation=generator.random((4, 4)),
+            answers={(stage, f"kind_{kind}"): (72, 60) for stage in range(5) for kind in range(14)},
+            groups=(6, 4, 2),
+            curve_episodes=5,
+            method="method",
+            seed=seed,
+        )
+        told = {"distance": generator.random(11).tolist(), **{f"share_{n}": n / 7 for n in range(3)}}
+        record.diagnostics = {str(stage): told for stage in range(1, 5)}
+        record.fingerprint["versions"] = {f"package-{number}": "1.22.333" for number in range(9)}
+        write_record(record, record_path(tmp_path, "clbench/Toy-v0", "method", seed))
+    table = read_table(tmp_path)
+    (row,), (scenario,) = table.rows, table.scenarios.values()
+    names = [f"clbench/Scenario{number}-v0" for number in range(4)]
+    rows = [
+        dataclasses.replace(row, scenario=name, method=f"method_{number:02}")
+        for name in names
+        for number in range(15)
+    ]
+    large = dataclasses.replace(table, rows=tuple(rows), scenarios=dict.fromkeys(names, scenario))
+    text = page(large)
+    assert text.count('class="row"') == 60
+    assert len(text.encode()) < 3_000_000

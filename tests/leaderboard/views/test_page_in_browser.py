@@ -1,0 +1,281 @@
+"""The page in a browser, opened from disk: what a reader does by mouse, by keys, on a phone, in the dark."""
+
+import re
+import shutil
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+from axe_playwright_python.sync_playwright import Axe
+from playwright.sync_api import Browser, Locator, Page, Request, expect, sync_playwright
+
+from clbench.base.entry_points import resolve
+from clbench.records.paths import record_path
+from clbench.records.record import Record
+from clbench.records.writer import write_record
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
+HOSTILE = "</script><img src=x onerror=alert(1)>"
+REPLAY = {"demonstrations": "throughout", "questions": "never", "reference": False}
+MATRIX = np.array([[1.0, 0.8, 0.1, 0.0, 0.2], [0.6, 0.9, 0.9, 0.2, 0.3], [0.5, 0.4, 0.3, 0.8, 0.1]])
+DESKTOP, PHONE = {"width": 1280, "height": 860}, {"width": 390, "height": 844}
+
+pytestmark = pytest.mark.skipif(not CHROMIUM, reason="there is no chromium: apt-get install chromium")
+
+
+@pytest.fixture(scope="module")
+def address(make_record: Callable[..., Record], tmp_path_factory: pytest.TempPathFactory) -> str:
+    """The address of a page with two scenarios, and strange names on it."""
+    records = tmp_path_factory.mktemp("board") / "records"
+
+    def add(method: str, seed: int, change: float, scenario: str = "clbench/Toy-v0", **run: Any) -> None:
+        record = make_record(
+            np.clip(MATRIX + change, 0, 1),
+            method=method,
+            seed=seed,
+            episodes=10,
+            curves=np.full((2, 3), 0.4),
+            retained_curves=np.full((2, 3, 2), 0.7),
+            scenario=scenario,
+            **run,
+        )
+        record.diagnostics = {str(stage): {HOSTILE: HOSTILE, "share": 0.1, "way": [1, 3]} for stage in (1, 2)}
+        record.fingerprint["hardware"] = {"processor": HOSTILE}
+        write_record(record, record_path(records, scenario, method, seed))
+
+    for seed in range(2):
+        for number, method in enumerate(("sft", "l2", "other", "x_with_a_name_that_is_longer_than_a_phone")):
+            add(method, seed, number / 10)
+        add("replay", seed, 0.2, uses=REPLAY)
+        add("sft", seed, seed / 5, scenario="clbench/Other-v0")
+    (records / f"{HOSTILE.replace('/', '')}.json").write_text("{", encoding="utf-8")
+    (records / "torn.json").write_text("{", encoding="utf-8")
+    page = resolve("clbench.leaderboard.views.page:page")(
+        resolve("clbench.leaderboard.board.rows:read_table")(records)
+    )
+    path = records.parent / "index.html"
+    path.write_text(page, encoding="utf-8")
+    return path.as_uri()
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    with sync_playwright() as playwright:
+        # A container has no user namespaces and little shared memory.
+        started = playwright.chromium.launch(
+            executable_path=CHROMIUM, args=["--no-sandbox", "--disable-dev-shm-usage"]
+        )
+        yield started
+        started.close()
+
+
+@pytest.fixture
+def open_page(browser: Browser, address: str) -> Iterator[Callable[..., Page]]:
+    """Return a function that opens the page; it must ask no network, and no script of it may fail."""
+    troubles: list[str] = []
+
+    def check(request: Request) -> None:
+        if request.url.partition("#")[0] != address:
+            troubles.append(request.url)
+
+    def open_page(place: str = "", **context: Any) -> Page:
+        made = browser.new_context(**{"viewport": DESKTOP, "reduced_motion": "reduce", **context})
+        page = made.new_page()
+        page.set_default_timeout(20_000)
+        page.on("console", lambda message: troubles.append(f"{message.type}: {message.text}"))
+        page.on("pageerror", lambda error: troubles.append(str(error)))
+        page.on("dialog", lambda dialog: troubles.append(f"dialog: {dialog.message}"))
+        page.on("request", check)
+        page.goto(f"{address}#{place}")
+        return page
+
+    yield open_page
+    for context in browser.contexts:
+        context.close()
+    assert not troubles
+
+
+def names(page: Page, scenario: str = "clbench/Toy-v0") -> list[str]:
+    """Return the methods of a table from top to bottom."""
+    return page.locator(
+        f"[id='{scenario}'] .board tbody tr:not(.division-head):visible .name"
+    ).all_inner_texts()
+
+
+def head(page: Page, title: str) -> Locator:
+    return page.locator("[id='clbench/Toy-v0'] .board thead th").filter(
+        has=page.get_by_role("button", name=re.compile(f"^{title}"))
+    )
+
+
+def row(page: Page) -> Locator:
+    return page.locator("dialog[open]")
+
+
+def test_it_opens_from_disk_and_draws_its_charts(open_page: Callable[..., Page]) -> None:
+    page = open_page("clbench/Toy-v0")
+    expect(page.locator("figure[data-plane]:visible svg")).to_have_count(1)
+    expect(page.locator("figure[data-plane]:visible")).to_contain_text("other")
+    assert page.title() == "clbench leaderboard"
+
+
+def test_a_click_on_a_head_sorts_and_a_second_one_the_other_way(open_page: Callable[..., Page]) -> None:
+    page = open_page("clbench/Toy-v0")
+    assert names(page) == ["x_with_a_name_that_is_longer_than_a_phone", "other", "l2", "sft", "replay"]
+    expect(head(page, "final average")).to_have_attribute("aria-sort", "descending")
+    button = head(page, "method").get_by_role("button")
+    button.click()
+    assert names(page) == ["l2", "other", "sft", "x_with_a_name_that_is_longer_than_a_phone", "replay"]
+    expect(head(page, "method")).to_have_attribute("aria-sort", "ascending")
+    expect(head(page, "final average")).to_have_attribute("aria-sort", "none")
+    button.press("Enter")
+    assert names(page)[0] == "x_with_a_name_that_is_longer_than_a_phone"
+    # lower is better first, and what is missing last either way
+    head(page, "forgetting").get_by_role("button").click()
+    expect(head(page, "forgetting")).to_have_attribute("aria-sort", "ascending")
+
+
+def test_divisions_are_sorted_apart_until_the_reader_wants_one_list(open_page: Callable[..., Page]) -> None:
+    page = open_page("clbench/Toy-v0")
+    page.get_by_label("sort inside divisions").locator("visible=true").uncheck()
+    assert names(page) == ["x_with_a_name_that_is_longer_than_a_phone", "other", "replay", "l2", "sft"]
+    expect(page.locator(".division-head:visible")).to_have_count(0)
+    expect(page.locator("td.division:visible")).to_have_count(5)
+
+
+def test_filters_hide_rows_and_say_how_many_are_left(open_page: Callable[..., Page]) -> None:
+    page = open_page("clbench/Toy-v0")
+    form = page.locator("[id='clbench/Toy-v0'] form")
+    form.get_by_label("Method").fill("O")
+    assert names(page) == ["x_with_a_name_that_is_longer_than_a_phone", "other"]
+    expect(form.get_by_role("status")).to_have_text("2 of 5 methods")
+    form.get_by_label("Method").fill("")
+    form.get_by_label("prior-data-free").uncheck()
+    assert names(page) == ["replay"]
+    expect(page.locator(".division-head:visible")).to_have_count(1)
+    form.get_by_label("Tier").select_option("retrained")
+    expect(form.get_by_role("status")).to_have_text("0 of 5 methods")
+
+
+def test_enter_opens_a_row_and_escape_leads_back_to_it(open_page: Callable[..., Page]) -> None:
+    page = open_page("clbench/Toy-v0")
+    link = page.locator("[id='clbench/Toy-v0'] .board").get_by_role("link", name="l2")
+    link.focus()
+    page.keyboard.press("Enter")
+    expect(row(page)).to_contain_text("clbench run clbench/Toy-v0 l2 --seeds 2")
+    expect(row(page).locator("figure svg")).to_have_count(1)
+    expect(page).to_have_url(re.compile("#clbench/Toy-v0/l2$"))
+    page.keyboard.press("Escape")
+    expect(row(page)).to_have_count(0)
+    expect(page).to_have_url(re.compile("#clbench/Toy-v0$"))
+    expect(link).to_be_focused()
+
+
+def test_an_address_opens_a_row_and_the_way_back_closes_it(open_page: Callable[..., Page]) -> None:
+    page = open_page("clbench/Other-v0/sft")
+    expect(row(page).get_by_role("heading", level=2)).to_have_text("sft")
+    row(page).get_by_role("link", name="Close").click()
+    expect(row(page)).to_have_count(0)
+    expect(page.locator("[id='clbench/Other-v0']")).to_be_visible()
+    expect(page.locator("[id='clbench/Toy-v0']")).to_be_hidden()
+    page.locator("[id='clbench/Other-v0'] .board tbody tr").nth(1).locator("td").nth(3).click()
+    expect(row(page)).to_have_count(1)
+    page.go_back()
+    expect(row(page)).to_have_count(0)
+
+
+def test_a_row_has_each_seed_its_curves_and_every_definition(open_page: Callable[..., Page]) -> None:
+    page = open_page("clbench/Other-v0/sft")
+    learned = row(page).locator(".matrix .learned").last
+    expect(learned).to_have_text("0.90")
+    row(page).get_by_role("button", name="seed 1").click()
+    expect(learned).to_have_text("1.00")
+    row(page).get_by_role("button", name="seed 0").click()
+    expect(learned).to_have_text("0.80")
+    row(page).get_by_role("button", name="seed 1").click()
+    expect(row(page).get_by_role("button", name="seed 1")).to_have_attribute("aria-pressed", "true")
+    row(page).get_by_text("The curves as a table").click()
+    curves = row(page).get_by_role("region", name="The curves")
+    expect(curves.locator("tbody tr").nth(1)).to_contain_text("target_0")
+    expect(curves.locator("tbody tr").nth(1)).to_contain_text("0.70 [")
+    row(page).get_by_text("All other metrics and definitions").click()
+    expect(row(page)).to_contain_text("forgetting mammoth")
+
+
+def test_the_keys_lead_through_the_page_and_show_where_they_are(open_page: Callable[..., Page]) -> None:
+    page = open_page()
+    page.keyboard.press("Tab")
+    expect(page.get_by_role("link", name="Skip to the tables")).to_be_focused()
+    page.keyboard.press("Enter")
+    expect(page.locator("main")).to_be_focused()
+    page = open_page("clbench/Toy-v0")
+    met = []
+    for _ in range(26):
+        page.keyboard.press("Tab")
+        what, ring, width = page.evaluate("""() => {
+            const one = document.activeElement, style = getComputedStyle(one);
+            return [one.name || one.textContent.trim(), style.outlineStyle, style.outlineWidth];
+        }""")
+        assert ring == "solid"
+        assert width == "2px"
+        met.append(what)
+    order = ["text", "division", "tier", "grouped", "rank", "method", "final average", "other", "replay"]
+    assert [met.index(one) for one in order] == sorted(met.index(one) for one in order)
+
+
+def test_it_is_dark_where_the_system_is_and_where_the_reader_wants_it(open_page: Callable[..., Page]) -> None:
+    paper = "getComputedStyle(document.body).backgroundColor"
+    page = open_page(color_scheme="dark")
+    assert page.evaluate(paper) == "rgb(20, 23, 27)"
+    page.get_by_role("button", name="Light theme").click()
+    assert page.evaluate(paper) == "rgb(255, 255, 255)"
+    page.get_by_role("button", name="Dark theme").click()
+    assert page.evaluate(paper) == "rgb(20, 23, 27)"
+
+
+def test_on_a_phone_nothing_is_wider_than_the_screen(open_page: Callable[..., Page]) -> None:
+    page = open_page("clbench/Toy-v0", viewport=PHONE)
+    width = "document.documentElement.scrollWidth"
+    expect(page.locator("figure[data-plane]:visible svg")).to_have_count(1)
+    assert page.evaluate(width) == PHONE["width"]
+    page.goto(f"{page.url.split('#')[0]}#clbench/Toy-v0/x_with_a_name_that_is_longer_than_a_phone")
+    expect(row(page).locator("figure svg")).to_have_count(1)
+    assert row(page).evaluate("e => e.scrollWidth") == PHONE["width"]
+    assert page.evaluate(width) == PHONE["width"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("color_scheme", ["light", "dark"])
+@pytest.mark.parametrize("place", ["overall", "clbench/Toy-v0", "clbench/Toy-v0/l2"])
+def test_axe_finds_nothing_serious(place: str, color_scheme: str, open_page: Callable[..., Page]) -> None:
+    page = open_page(place, color_scheme=color_scheme, viewport=PHONE if color_scheme == "dark" else DESKTOP)
+    if place != "overall":
+        expect(page.locator("figure:visible svg").first).to_be_visible()
+    page.locator("details").evaluate_all("all => all.forEach((one) => { one.open = true; })")
+    found = Axe().run(page).response["violations"]
+    serious = [
+        (one["id"], one["nodes"][0]["html"][:200])
+        for one in found
+        if one["impact"] in ("serious", "critical")
+    ]
+    assert not serious
+
+
+def test_what_strangers_wrote_is_shown_as_they_wrote_it(open_page: Callable[..., Page]) -> None:
+    page = open_page("clbench/Toy-v0/sft")
+    expect(row(page)).to_contain_text(HOSTILE)
+    assert page.locator("img").count() == 0
+    files = page.locator("#not-shown")
+    expect(files.locator("tbody tr")).to_have_count(2)
+    row(page).get_by_role("link", name="Close").click()
+    files.get_by_label("Path or reason").fill("onerror")
+    expect(files.locator("tbody tr:visible")).to_have_count(1)
+    expect(files.get_by_role("status")).to_have_text("1 of 2 files")
+
+
+def test_without_scripts_the_tables_and_rows_are_there(open_page: Callable[..., Page]) -> None:
+    page = open_page("clbench/Toy-v0/l2", java_script_enabled=False)
+    expect(page.get_by_text("clbench run clbench/Toy-v0 l2 --seeds 2")).to_be_visible()
+    expect(page.locator(".board")).to_have_count(3)
+    expect(page.get_by_role("button", name="Dark theme")).to_be_hidden()

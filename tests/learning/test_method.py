@@ -1,0 +1,160 @@
+import dataclasses
+import sys
+import types
+from pathlib import Path
+
+import pytest
+import torch
+
+from clbench.data.demonstrations import Demonstrations
+from clbench.learning.method import Metadata, Method
+from clbench.learning.prior import Prior, Source, UndeclaredAccessError
+from clbench.learning.registry import build_method, describe_method, load_method, method_names
+
+
+@pytest.fixture
+def module(monkeypatch: pytest.MonkeyPatch) -> types.ModuleType:
+    """A module of a stranger, as `stranger`."""
+    module = types.ModuleType("stranger")
+    monkeypatch.setitem(sys.modules, "stranger", module)
+
+    @dataclasses.dataclass
+    class Acme(Method):
+        strength: float = 0.5
+        rounds: int = 3
+        gentle: bool = False
+
+    class Plain(Method):
+        pass
+
+    module.Acme, module.Plain, module.Number = Acme, Plain, 3  # type: ignore[attr-defined]
+    return module
+
+
+def test_the_built_in_methods_are_found_as_any_submitted_one() -> None:
+    assert {"experience_replay", "from_scratch", "frozen", "joint", "sft"} <= set(method_names())
+
+
+@pytest.mark.parametrize("name", method_names())
+def test_an_installed_method_loads_and_is_built_from_its_defaults(name: str) -> None:
+    method = build_method(name, {})
+    assert isinstance(method, Method)
+    assert type(method).__doc__
+    assert all(field.default is not dataclasses.MISSING for field in dataclasses.fields(method))  # type: ignore[arg-type]
+
+
+def test_a_method_is_found_as_module_and_class(module: types.ModuleType) -> None:
+    assert load_method("stranger:Acme") is module.Acme
+
+
+@pytest.mark.parametrize(
+    ("spec", "error", "message"),
+    [
+        ("stf", LookupError, r"No method is called 'stf'. Did you mean 'sft'\?"),
+        ("stranger:Acmee", LookupError, r"Module 'stranger' has no 'Acmee'. Did you mean 'Acme'\?"),
+        ("no_such_module:Acme", LookupError, "No module 'no_such_module' can be imported"),
+        ("stranger:Number", TypeError, "'stranger:Number' is not a subclass of clbench.Method"),
+        ("stranger:Plain", TypeError, "'stranger:Plain' is not a dataclass"),
+    ],
+)
+@pytest.mark.usefixtures("module")
+def test_what_is_no_method_is_refused_by_name(spec: str, error: type[Exception], message: str) -> None:
+    with pytest.raises(error, match=message):
+        load_method(spec)
+
+
+@pytest.mark.usefixtures("module")
+def test_changes_from_the_command_line_take_the_fields_own_types() -> None:
+    method = build_method("stranger:Acme", {"strength": "0.25", "rounds": "7", "gentle": "true"})
+    assert dataclasses.asdict(method) == {"strength": 0.25, "rounds": 7, "gentle": True}  # type: ignore[call-overload]
+
+
+@pytest.mark.parametrize(
+    ("changes", "error", "message"),
+    [
+        ({"strenght": "1"}, LookupError, r"has no hyper-parameter 'strenght'. Did you mean 'strength'\?"),
+        ({"rounds": "many"}, ValueError, "rounds must be int, not 'many'"),
+        ({"gentle": "perhaps"}, ValueError, "gentle must be true or false, not 'perhaps'"),
+    ],
+)
+@pytest.mark.usefixtures("module")
+def test_a_wrong_change_is_refused_by_name(
+    changes: dict[str, str], error: type[Exception], message: str
+) -> None:
+    with pytest.raises(error, match=message):
+        build_method("stranger:Acme", changes)
+
+
+@pytest.mark.parametrize("name", ["demonstrations", "questions"])
+def test_undeclared_prior_data_cannot_be_touched(name: str) -> None:
+    with pytest.raises(UndeclaredAccessError, match=f"touches prior {name} that it does not declare"):
+        getattr(Prior({}), name)
+
+
+def test_declared_prior_data_counts_in_bytes() -> None:
+    data = Demonstrations(*(torch.zeros(4, 2) for _ in range(7)))
+    prior = Prior({"demonstrations": Source(data, torch.Generator(), 8)})
+    assert prior.bytes == 6 * 4 * 2 * 4
+    prior.close()
+    with pytest.raises(UndeclaredAccessError, match="after the hooks that it was handed to"):
+        prior.demonstrations.sample(1)
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        {},
+        {
+            "authors": "Ada Lovelace, Élie Cartan",
+            "licence": "Apache-2.0 WITH LLVM-exception",
+            "version": "1.0rc1",
+        },
+        {"link": "https://arxiv.org/abs/2605.08879"},
+        {"link": "http://example.org:8080/a/b?c=d&e=%20#f"},
+    ],
+)
+def test_metadata_may_be_left_out_or_be_of_its_kind(values: dict[str, str]) -> None:
+    assert {name: value for name, value in vars(Metadata(**values)).items() if value} == values
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("authors", ""),
+        ("authors", " "),
+        ("authors", "A" * 201),
+        ("authors", "Ada\nLovelace"),
+        ("authors", "Ada\u202eLovelace"),
+        ("authors", 3),
+        ("link", "javascript:alert(1)"),
+        ("link", "ftp://example.org"),
+        ("link", "https://"),
+        ("link", "https://user@example.org"),
+        ("link", "https://example.org/a b"),
+        ("link", 'https://example.org/"onclick'),
+        ("link", "https://example.org/" + "a" * 400),
+        ("licence", "MIT; drop"),
+        ("licence", ""),
+        ("version", "1 0"),
+        ("version", "v" * 51),
+    ],
+)
+def test_metadata_of_another_kind_are_refused_by_name(name: str, value: object) -> None:
+    with pytest.raises(ValueError, match=f"{name} in the metadata must be "):
+        Metadata(**{name: value})  # type: ignore[arg-type]
+
+
+def test_a_method_is_described_with_the_hash_of_its_code(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert describe_method(load_method("consft"))["link"] == "https://arxiv.org/abs/2605.08879"
+    text = "import dataclasses, clbench\n@dataclasses.dataclass\nclass Mine(clbench.Method): ...\n"
+    monkeypatch.syspath_prepend(tmp_path)
+    hashes = []
+    for ending in ("", "# changed\n"):
+        (tmp_path / "described.py").write_text(text + ending)
+        found = describe_method(load_method("described:Mine"))
+        assert {**found, "source": ""} == {**vars(Metadata()), "source": ""}
+        hashes.append(found["source"])
+    del sys.modules["described"]
+    assert len(set(hashes)) == 2

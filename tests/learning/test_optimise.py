@@ -1,0 +1,102 @@
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor, nn
+
+from clbench.learning.optimise import MethodError, deterministic, learning_rate_factor, optimise
+
+
+def test_the_step_size_warms_up_and_falls_by_a_cosine_to_a_tenth() -> None:
+    factors = [learning_rate_factor(step, 400) for step in range(400)]
+    assert factors[:20] == pytest.approx(np.arange(1, 21) / 20)
+    assert max(factors) == 1.0
+    # by hand at three quarters of the way down
+    assert factors[20 + 285] == pytest.approx(0.1 + 0.45 * (1 + math.cos(0.75 * math.pi)))
+    assert factors[-1] == pytest.approx(0.1, abs=1e-3)
+
+
+def test_a_first_adamw_step_moves_every_weight_by_the_step_size() -> None:
+    weight = nn.Parameter(torch.tensor([1.0, -2.0]))
+    steps = optimise([weight], 0.1, 1, lambda _: (weight * torch.tensor([3.0, -0.5])).sum(), Tensor.backward)
+    assert steps == 1
+    # Adam's first step is the sign of the gradient; one step is all warm-up, so the factor is 1
+    assert weight.tolist() == pytest.approx([0.9, -1.9])
+
+
+def test_gradients_are_clipped_after_the_method_set_them() -> None:
+    weight = nn.Parameter(torch.zeros(4))
+    seen: list[float] = []
+
+    def after(_: int) -> None:
+        assert weight.grad is not None
+        seen.append(float(weight.grad.norm()))
+
+    def gradients(loss: Tensor) -> None:
+        loss.backward()  # type: ignore[no-untyped-call]
+        assert weight.grad is not None
+        weight.grad.mul_(1000)
+
+    optimise([weight], 0.1, 1, lambda _: (weight + 1).square().sum(), gradients, after)
+    assert seen == pytest.approx([1.0])
+
+
+def test_a_group_may_have_a_step_size_of_its_own() -> None:
+    slow, fast = nn.Parameter(torch.zeros(1)), nn.Parameter(torch.zeros(1))
+    groups: list[dict[str, Any]] = [{"params": [slow], "lr": 0.01}, {"params": [fast]}]
+    optimise(groups, 0.1, 1, lambda _: (slow + fast - 1).square().sum(), Tensor.backward)
+    assert slow.item() == pytest.approx(0.01)
+    assert fast.item() == pytest.approx(0.1)
+
+
+def test_without_parameters_no_step_is_done_but_the_points_are_passed() -> None:
+    seen: list[int] = []
+    assert optimise([], 0.1, 3, lambda _: torch.tensor(float("nan")), Tensor.backward, seen.append) == 0
+    assert seen == [1, 2, 3]
+
+
+@pytest.mark.parametrize(
+    ("loss", "message"),
+    [
+        (lambda weight: weight.sum() * float("nan"), "step 0: loss is nan, not finite"),
+        (lambda weight: weight.sum() * float("inf") + 1, "step 0: loss is (inf|nan), not finite"),
+        (lambda weight: weight * 2, r"step 0: loss must be a scalar, shape \(\), not \(2,\)"),
+        (lambda weight: 0.5, "step 0: loss must be a tensor, not float"),
+        (lambda weight: weight.sum().detach(), "step 0: loss has no gradient"),
+    ],
+)
+def test_a_loss_that_cannot_be_descended_stops_the_run_and_says_where(loss: object, message: str) -> None:
+    weight = nn.Parameter(torch.ones(2))
+    with pytest.raises(MethodError, match=message):
+        optimise([weight], 0.1, 1, lambda _: loss(weight), Tensor.backward)  # type: ignore[operator]
+    assert weight.tolist() == [1.0, 1.0]
+
+
+def test_the_deterministic_block_puts_the_threads_back() -> None:
+    before = torch.get_num_threads(), torch.are_deterministic_algorithms_enabled()
+    with deterministic():
+        assert torch.get_num_threads() == 1
+        assert torch.are_deterministic_algorithms_enabled()
+    assert (torch.get_num_threads(), torch.are_deterministic_algorithms_enabled()) == before
+
+
+def test_the_step_size_may_be_changed_at_every_step_once_the_gradient_is_known() -> None:
+    weight = nn.Parameter(torch.zeros(1))
+    seen: list[tuple[float, int, bool]] = []
+
+    def rate(scheduled: float, step: int) -> float:
+        seen.append((scheduled, step, weight.grad is not None))
+        return 0.5 * scheduled
+
+    optimise([weight], 0.1, 2, lambda _: (weight - 1).square().sum(), rate=rate)
+    assert seen == [(0.1, 0, True), (pytest.approx(0.1), 1, True)]
+    assert weight.item() == pytest.approx(0.1, rel=1e-2)  # two Adam steps of half of 0.1
+
+
+@pytest.mark.parametrize("rate", [-0.1, float("nan"), float("inf"), "0.1"])
+def test_a_step_size_that_is_none_is_refused(rate: Any) -> None:
+    weight = nn.Parameter(torch.zeros(1))
+    with pytest.raises(MethodError, match="step 0: the step size must be a number from 0"):
+        optimise([weight], 0.1, 1, lambda _: (weight - 1).square().sum(), rate=lambda *_: rate)

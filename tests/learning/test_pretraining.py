@@ -1,0 +1,54 @@
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+
+from clbench import load_scenario
+from clbench.base.cache import cache_folder
+from clbench.learning.pretraining import (
+    SHIPPED,
+    is_pretrained,
+    pretrained_folder,
+    pretraining_inputs,
+    shipped_folder,
+)
+
+FETCH = load_scenario("clbench/Fetch-v0")
+SHIPS = shipped_folder(FETCH, 0)
+
+
+def _made_from(folder: Path) -> dict[str, object]:
+    found = json.loads((folder / "clbench.json").read_text(encoding="utf-8"))["made_from"]
+    assert isinstance(found, dict)
+    return found
+
+
+def test_the_policies_that_ship_are_those_that_this_source_makes() -> None:
+    shipped = sorted(SHIPPED.glob("*/clbench.json"))
+    assert [path.parent for path in shipped] == [SHIPS]
+    made_from, present = _made_from(SHIPS), json.loads(json.dumps(pretraining_inputs(FETCH, 0)))
+    if made_from["versions"] != present["versions"]:
+        pytest.skip(f"it was made with {made_from['versions']}, here are {present['versions']}")
+    assert made_from == present, "make it again: python -m clbench.pretrained clbench/Fetch-v0"
+    assert pretrained_folder(FETCH, 0) == SHIPS
+    assert is_pretrained(FETCH, 0)
+
+
+def test_the_committed_records_of_its_seed_started_from_the_policy_that_ships() -> None:
+    files = json.loads((SHIPS / "clbench.json").read_text(encoding="utf-8"))["files"]
+    records = Path(__file__).parents[2] / "leaderboard" / "records" / "Fetch-v0"
+    record = json.loads((records / "sft" / "seed-0.json").read_text(encoding="utf-8"))
+    assert files["policy.safetensors"].startswith(record["fingerprint"]["pretrained"])
+
+
+def test_other_seeds_are_pretrained_in_the_cache() -> None:
+    assert pretrained_folder(FETCH, 1).parent == cache_folder() / "pretrained"
+
+
+def test_a_torn_policy_that_ships_is_not_used(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    torn = Path(shutil.copytree(SHIPS, tmp_path / SHIPS.name))
+    weights = torn / "policy.safetensors"
+    weights.write_bytes(weights.read_bytes()[:-1])
+    monkeypatch.setattr("clbench.learning.pretraining.SHIPPED", tmp_path)
+    assert pretrained_folder(FETCH, 0).parent == cache_folder() / "pretrained"

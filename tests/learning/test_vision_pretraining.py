@@ -1,0 +1,108 @@
+"""Eyes that learn to tell what pictures show, before a policy learns to act."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from clbench.base.seeding import torch_generator
+from clbench.data.questions import Questions, load_questions
+from clbench.learning.pretraining import policy_config, pretrained_policy, vision_steps
+from clbench.learning.vision_pretraining import Pictures, pictures_of, pretrain_vision
+from clbench.policy.vision import Vision
+from clbench.testing import TOY
+from clbench.testing.seen_toy import SEEN_TOY
+from clbench.testing.toy_camera import ToyCamera
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+
+@pytest.fixture(scope="module")
+def questions() -> tuple[Questions, Questions]:
+    """What is asked about pictures of the toy, for training and for reports."""
+    return load_questions(SEEN_TOY)
+
+
+def _eyes() -> Vision:
+    config = policy_config(SEEN_TOY)
+    with torch.random.fork_rng():
+        torch.manual_seed(3)
+        return Vision(config.image_size, config.width)
+
+
+def _pictures(questions: Questions) -> list[Pictures]:
+    return pictures_of([(questions.scenes, questions.image)], ToyCamera, questions.kinds)
+
+
+def _pretrained(questions: Questions, steps: int) -> Vision:
+    eyes = _eyes()
+    generator = torch_generator("vision", 0)
+    pretrain_vision(eyes, _pictures(questions), questions.kinds, steps, generator)
+    return eyes
+
+
+@torch.no_grad()
+def _error(eyes: Vision, train: Questions, report: Questions) -> float:
+    """Return how far off a least-squares fit on the tokens places what new pictures show."""
+
+    def inputs(part: Questions) -> Tensor:
+        return torch.nn.functional.pad(eyes(part.image).flatten(1), (0, 1), value=1.0).double()
+
+    fit = np.linalg.lstsq(inputs(train).numpy(), train.scenes[:, :4].double().numpy(), rcond=1e-6)[0]
+    told = inputs(report).numpy() @ fit
+    return float(np.abs(told - report.scenes[:, :4].numpy()).mean())
+
+
+def test_eyes_learn_to_place_what_a_picture_shows(questions: tuple[Questions, Questions]) -> None:
+    train, report = questions
+    assert _error(_pretrained(train, 150), train, report) < 0.6 * _error(_eyes(), train, report)
+
+
+def test_the_same_generator_gives_the_same_eyes(questions: tuple[Questions, Questions]) -> None:
+    first, second = (_pretrained(questions[0], 5).state_dict() for _ in range(2))
+    assert all(torch.equal(first[name], second[name]) for name in first)
+
+
+def test_numbers_are_of_about_one_and_answers_those_of_the_questions(
+    questions: tuple[Questions, Questions],
+) -> None:
+    train, report = questions
+    sets = [(part.scenes, part.image) for part in (train, report)]
+    pictures = pictures_of(sets, ToyCamera, train.kinds)
+    numbers = torch.cat([one.numbers for one in pictures])
+    low, middle, high = numbers.quantile(torch.tensor([0.25, 0.5, 0.75]), dim=0)
+    torch.testing.assert_close(middle, torch.zeros(4), atol=0.01, rtol=0)
+    torch.testing.assert_close(high - low, torch.full((4,), 1.35), atol=0.01, rtol=0)
+    for column, kind in enumerate(train.kinds):
+        assert pictures[1].answers[:, column].tolist() == kind.answer(report.scenes.numpy()).tolist()
+
+
+def test_what_is_far_off_does_not_outweigh_the_rest(questions: tuple[Questions, Questions]) -> None:
+    train = questions[0]
+    scenes = train.scenes.clone()
+    scenes[0, 0] = 1000.0
+    (pictures,) = pictures_of([(scenes, train.image)], ToyCamera, train.kinds)
+    assert pictures.numbers.abs().max() == 5.0
+
+
+def test_a_question_that_no_picture_of_a_step_answers_does_no_harm(
+    questions: tuple[Questions, Questions],
+) -> None:
+    (pictures,) = _pictures(questions[0])
+    silent = Pictures(pictures.image, pictures.numbers, torch.full_like(pictures.answers, -1))
+    eyes = _eyes()
+    pretrain_vision(eyes, [silent], questions[0].kinds, 3, torch_generator("vision", 0))
+    assert all(torch.isfinite(parameter).all() for parameter in eyes.parameters())
+
+
+@pytest.mark.usefixtures("empty_caches")
+def test_progress_counts_the_steps_of_the_eyes_too() -> None:
+    scenario = dataclasses.replace(
+        SEEN_TOY, budget=dataclasses.replace(SEEN_TOY.budget, demonstrations=4, pretraining_steps=8)
+    )
+    done: list[float] = []
+    pretrained_policy(scenario, 0, done.append)
+    assert sum(done) == 8 + vision_steps(scenario) == 10
+    assert vision_steps(TOY) == 0

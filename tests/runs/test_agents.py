@@ -1,0 +1,475 @@
+"""Agents that learn by trial: what they are asked, the record that they leave, and its row on the board."""
+
+import importlib
+import json
+import os
+import re
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+
+from clbench.base.entry_points import resolve
+from clbench.records.reader import read_record
+from clbench.runs.agents import evaluate_agent, next_stage
+from clbench.scoring.metrics import measure
+from clbench.scoring.scores import Scores
+from clbench.spec.registry import load_scenario
+from clbench.worlds.scenario_env import Observation, ScenarioEnv
+from clbench.worlds.scenario_vector_env import ScenarioVectorEnv
+
+DOCS = Path(__file__).parents[2] / "docs" / "guide"
+ID = "clbench.testing:clbench/Toy-v0"
+TOY = load_scenario(ID)
+EXPERTS = {words: resolve(task.expert)(task.name) for task in TOY.tasks for words in task.instructions}
+
+
+class Knowing:
+    """An agent that does what experts do, told which instructions it knows."""
+
+    def __init__(self, *tasks: str) -> None:
+        self.words = {words for name in tasks for words in TOY.task(name).instructions}
+
+    def predict(self, observation: Observation, *, deterministic: bool) -> tuple[Any, Any]:
+        assert deterministic
+        words = observation["instruction"]
+        action = EXPERTS[words](observation["state"]) if words in self.words else np.zeros(2)
+        return action, None
+
+
+def stage_env(stage: int, **options: Any) -> gymnasium.Env[Any, Any]:
+    return gymnasium.make(ID, stage=stage, **options)
+
+
+class Looking:
+    """An agent that keeps what it was shown."""
+
+    def __init__(self) -> None:
+        self.shown: list[Observation] = []
+
+    def predict(self, observation: Observation, *, deterministic: bool) -> tuple[Any, Any]:
+        self.shown.append(observation)
+        return np.zeros(2), None
+
+
+def trained(stage: int, steps: int) -> gymnasium.Env[Any, Any]:
+    """Return the environment of a stage in which so many steps were taken."""
+    env = stage_env(stage)
+    env.reset(seed=0)
+    for _ in range(steps):
+        if any(env.step(np.zeros(2, np.float32))[2:4]):
+            env.reset()
+    return env
+
+
+@pytest.fixture
+def evaluate(tmp_path: Path, empty_caches: Path) -> Callable[..., Any]:
+    """Return `evaluate_agent` for the method me/knows, with records and caches of the test's own."""
+
+    def evaluate(agent: Any, env: Any, **options: Any) -> Any:
+        return evaluate_agent(
+            agent, env, **{"method": "me/knows", "records": tmp_path / "records", **options}
+        )
+
+    return evaluate
+
+
+LEARNED = (("left", "up"), ("up", "right"), ("up", "right", "down"))
+"""What an agent knows after each stage: it forgets "left" when it learns "right"."""
+
+
+def test_an_agent_is_shown_what_the_environment_shows_and_nothing_else(evaluate: Callable[..., Any]) -> None:
+    env = gymnasium.make("clbench.testing.seen_toy:clbench/SeenToy-v0", stage=0)
+    agent = Looking()
+    evaluate(agent, env)
+    assert all(env.observation_space.contains(shown) for shown in agent.shown)
+    assert any(shown["image"].any() for shown in agent.shown)
+
+
+def test_an_agent_leaves_a_record_of_what_it_knew_after_each_stage(
+    evaluate: Callable[..., Any], tmp_path: Path
+) -> None:
+    for stage, known in enumerate(LEARNED):
+        record = evaluate(Knowing(*known), trained(stage, 10 * (stage + 1)), settings={"speed": 3})
+    path = tmp_path / "records" / "Toy-v0" / "me--knows" / "seed-0.json"
+    assert read_record(path) == record
+    scores = Scores.from_record(record)
+    expected = [[name in known for name in scores.layout.tasks] for known in LEARNED]
+    assert np.array_equal(scores.success.mean(axis=-1), np.array(expected, float))
+    values = {
+        name: measure(name, scores) for name in ("adaptation", "retention", "final_average", "forgetting")
+    }
+    assert values == {
+        "adaptation": 1.0,
+        "retention": 0.5,
+        "final_average": 0.75,
+        "forgetting": pytest.approx(1 / 3),
+    }
+    for missing in ("question_retention", "retention_at_matched_adaptation", "activation_drift"):
+        assert measure(missing, scores, {"sft": scores}) is None
+    assert record.costs == {"environment_steps": 60}
+    assert record.diagnostics["1"] == {"environment_steps": 20}
+    assert record.run["settings"] == {"speed": 3}
+    assert record.fingerprint["method"]["class"].endswith(":Knowing")
+    assert [one["training"] is not None for one in record.timing["stages"]] == [True] * 3
+
+
+def test_it_meets_the_initial_states_that_every_method_meets(
+    evaluate: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from clbench.evaluation.rollouts import Evaluator
+    from clbench.learning.pretraining import policy_config
+    from clbench.policy.policy import Policy
+    from clbench.worlds.lanes import Lanes
+
+    seen: list[tuple[list[int], list[str]]] = []
+    reset = Lanes.reset
+
+    def watched(self: Lanes, lanes: Any, seeds: Any, tasks: Any, *perturbed: Any) -> Any:
+        seen.append((list(seeds), [task.name for task in tasks]))
+        return reset(self, lanes, seeds, tasks, *perturbed)
+
+    monkeypatch.setattr(Lanes, "reset", watched)
+    record = evaluate(Knowing(), stage_env(0), seed=5)
+    starts = {(name, seed) for seeds, names in seen for seed, name in zip(seeds, names, strict=True)}
+    assert len(starts) == len(record.episodes["task"]) == 5 * TOY.budget.test_episodes
+    seen.clear()
+    policy = Policy(policy_config(TOY), seed=0).eval()
+    Evaluator(TOY, 5).evaluate(policy, TOY.tasks, "test")
+    assert {(name, seed) for seeds, names in seen for seed, name in zip(seeds, names, strict=True)} == starts
+
+
+def test_a_function_is_an_agent_and_sees_what_its_environment_gives(evaluate: Callable[..., Any]) -> None:
+    env = stage_env(0, instruction="tokens")
+    seen: list[bool] = []
+
+    def act(observation: Observation) -> list[float]:
+        seen.append(env.observation_space.contains(observation))
+        return [-1, 0]
+
+    record = evaluate(act, env)
+    assert all(seen)
+    rates = Scores.from_record(record).success[0].mean(axis=-1)
+    assert dict(zip(Scores.from_record(record).layout.tasks, rates, strict=True))["left"] == 1.0
+
+
+def test_an_agent_with_a_memory_gets_it_back_and_none_at_the_beginning(evaluate: Callable[..., Any]) -> None:
+    class Counting:
+        longest = 0
+
+        def predict(
+            self, observation: Any, state: Any = None, deterministic: bool = False
+        ) -> tuple[Any, Any]:
+            count = 0 if state is None else state
+            self.longest = max(self.longest, count)
+            return np.zeros(2), count + 1
+
+    agent = Counting()
+    evaluate(agent, stage_env(0))
+    assert agent.longest == TOY.tasks[0].horizon - 1
+
+
+def test_an_agent_that_returns_nan_fails_its_episodes(evaluate: Callable[..., Any]) -> None:
+    record = evaluate(lambda _: [float("nan")] * 2, stage_env(0))
+    assert not any(record.episodes["success"])
+    assert set(record.episodes["length"]) == {12}
+
+
+def test_what_an_agent_draws_leaves_no_trace_and_repeats_itself(evaluate: Callable[..., Any]) -> None:
+    agent = lambda _: np.random.uniform(-1, 1, 2)  # noqa: E731, NPY002 - as agents of other libraries draw
+    np.random.seed(3)  # noqa: NPY002
+    one = evaluate(agent, stage_env(0)).episodes
+    drawn = np.random.uniform()  # noqa: NPY002
+    np.random.seed(3)  # noqa: NPY002
+    assert drawn == np.random.uniform()  # noqa: NPY002
+    assert evaluate(agent, stage_env(0)).episodes == one
+
+
+def test_steps_that_were_taken_elsewhere_are_told_and_unknown_ones_are_missing(
+    evaluate: Callable[..., Any],
+) -> None:
+    assert evaluate(Knowing(), stage_env(0), steps=500).costs["environment_steps"] == 500
+    record = evaluate(Knowing(), stage_env(0))
+    assert "environment_steps" not in record.costs
+    assert record.diagnostics["0"] == {"environment_steps": None}
+    assert record.timing["seconds"] is None
+
+
+def test_many_environments_side_by_side_count_their_steps_together(evaluate: Callable[..., Any]) -> None:
+    env = gymnasium.make_vec(ID, num_envs=3, stage=2)
+    _, info = env.reset(seed=0)
+    assert list(info["task"]) == ["down"] * 3
+    for _ in range(4):
+        env.step(np.zeros((3, 2), np.float32))
+    assert isinstance(env.unwrapped, ScenarioVectorEnv)
+    assert env.unwrapped.steps_taken == 12
+    env = gymnasium.make_vec(ID, num_envs=3, stage=0)
+    assert evaluate(Knowing(), env).run["scenario"] == TOY.id
+
+
+@pytest.mark.parametrize(
+    ("agent", "error", "message"),
+    [
+        (lambda _: [1.0, 2.0, 3.0], ValueError, r"action has the shape \(3,\), not \(2,\)"),
+        (lambda _: [[1.0, 2.0]], ValueError, r"action has the shape \(1, 2\), not \(2,\)"),
+        (lambda _: None, ValueError, r"action has the shape \(\), not \(2,\)"),
+        (lambda _: {"arm": 1}, ValueError, "must be 2 numbers, not a dict"),
+        (lambda _: "left", ValueError, "must be 2 numbers, not a str"),
+        (3, TypeError, "A int is no agent"),
+    ],
+)
+def test_what_cannot_act_is_refused_and_the_stage_can_be_evaluated_again(
+    agent: Any, error: type[Exception], message: str, evaluate: Callable[..., Any]
+) -> None:
+    with pytest.raises(error, match=message):
+        evaluate(agent, stage_env(0))
+    evaluate(Knowing(), stage_env(0))
+
+
+def test_a_prediction_without_a_state_is_refused(evaluate: Callable[..., Any]) -> None:
+    class Plain:
+        def predict(self, observation: Any, deterministic: bool) -> Any:
+            return np.zeros(2)
+
+    with pytest.raises(ValueError, match=r"must return \(action, state\)"):
+        evaluate(Plain(), stage_env(0))
+
+
+def test_stages_have_their_turn_once(evaluate: Callable[..., Any]) -> None:
+    with pytest.raises(ValueError, match="Stage 0 of me/knows, seed 0, on clbench/Toy-v0 comes first, not 1"):
+        evaluate(Knowing(), stage_env(1))
+    evaluate(Knowing(), stage_env(0))
+    evaluate(Knowing(), stage_env(1))
+    with pytest.raises(ValueError, match=r"Stage 2 of .* comes next, not 1: it was evaluated up to stage 1"):
+        evaluate(Knowing(), stage_env(1))
+    with pytest.raises(ValueError, match=r"settings of .* are \{'speed': 4\}, but were \{\} in stage 0"):
+        evaluate(Knowing(), stage_env(2), settings={"speed": 4})
+
+
+def test_a_finished_record_is_never_edited(evaluate: Callable[..., Any]) -> None:
+    for stage in range(3):
+        evaluate(Knowing(), stage_env(stage))
+    for stage in (0, 2):
+        with pytest.raises(ValueError, match=r"has a record already, .*seed-0\.json, which is never edited"):
+            evaluate(Knowing(), stage_env(stage))
+    evaluate(Knowing(), stage_env(0), seed=1)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"method": "sft"}, "'sft' is a method of clbench: give the agent a name of its own, as 'me/sft'"),
+        ({"method": "SFT"}, "can be taken for the method 'sft'"),
+        ({"method": "../sac"}, "cannot be the name of a method"),
+        ({"steps": -1}, "steps must be a whole number from 0, not -1"),
+        ({"seed": -1}, "seed must be a whole number from 0, not -1"),
+        ({"settings": {"speed": float("nan")}}, "settings cannot be in a record"),
+        ({"settings": {"net": object()}}, "settings cannot be in a record"),
+    ],
+)
+def test_names_seeds_and_settings_that_cannot_be_are_refused(
+    options: dict[str, Any], message: str, evaluate: Callable[..., Any]
+) -> None:
+    with pytest.raises(ValueError, match=message):
+        evaluate(Knowing(), stage_env(0), **options)
+
+
+def test_targets_in_another_order_are_refused(evaluate: Callable[..., Any]) -> None:
+    with pytest.raises(ValueError, match="in order 1: agents are scored in order 0"):
+        evaluate(Knowing(), gymnasium.make("clbench/Toy-v0", stage=0, order=1))
+
+
+def test_an_environment_without_a_scenario_or_a_stage_is_refused(evaluate: Callable[..., Any]) -> None:
+    with pytest.raises(TypeError, match="is not of a scenario"):
+        evaluate(Knowing(), gymnasium.make("CartPole-v1"))
+    with pytest.raises(ValueError, match=r"goes through all stages: .*'clbench/Toy-v0', stage=0\)"):
+        evaluate(Knowing(), gymnasium.make(ID))
+
+
+@pytest.mark.parametrize("stage", [-1, 3, "1"])
+def test_an_environment_of_a_stage_that_is_not_there_is_refused(stage: Any) -> None:
+    with pytest.raises(ValueError, match=f"clbench/Toy-v0 has stages 0 to 2, not {stage!r}"):
+        ScenarioEnv(TOY, stage=stage)
+
+
+def test_an_environment_of_a_stage_never_leaves_it() -> None:
+    env = ScenarioEnv(TOY, stage=0, episodes_per_stage=1)
+    assert [env.reset()[1]["task"] for _ in range(4)] == ["left", "up", "left", "up"]
+    with pytest.raises(ValueError, match="stays in stage 0: make another for stage 1"):
+        env.reset(options={"stage": 1})
+    env = ScenarioEnv(TOY, stage=2)
+    assert env.reset(seed=0)[1]["task"] == env.reset()[1]["task"] == "down"
+
+
+KILLED = """
+import os, sys, gymnasium, clbench
+for stage in range(clbench.next_stage("{id}", method="me/still", records="records"), 3):
+    if stage == {last}:
+        os._exit(9)
+    env = gymnasium.make("{id}", stage=stage)
+    clbench.evaluate_agent(lambda _: [0, 0], env, method="me/still", steps=stage, records="records")
+"""
+
+
+def test_a_killed_program_goes_on_with_the_stage_that_it_was_in(empty_caches: Path) -> None:
+    environment = {**os.environ, "CLBENCH_CACHE": str(empty_caches / "cache")}
+
+    def run(last: int) -> int:
+        command = [sys.executable, "-c", KILLED.format(id=ID, last=last)]
+        return subprocess.run(command, cwd=empty_caches, env=environment, check=False).returncode
+
+    records = empty_caches / "records"
+    assert run(last=2) == 9
+    assert not records.exists()
+    assert next_stage(ID, method="me/still", records=records) == 2
+    assert next_stage(ID, method="me/still", seed=1, records=records) == 0
+    assert run(last=9) == 0
+    assert next_stage(ID, method="me/still", records=records) == 3
+    record = read_record(records / "Toy-v0/me--still/seed-0.json")
+    assert record.costs == {"environment_steps": 3}
+    assert not list((empty_caches / "cache" / "online").iterdir())
+
+
+# ---- on the board ------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def board(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder of a board that has a run of sft and one of an agent."""
+    from clbench.runs.run import execute
+    from clbench.runs.spec import RunSpec
+
+    folder = tmp_path_factory.mktemp("board")
+    execute(RunSpec(ID, "sft", 0), folder / "records")
+    for stage, known in enumerate(LEARNED):
+        evaluate_agent(Knowing(*known), trained(stage, 7), method="me/knows", records=folder / "records")
+    return folder
+
+
+def test_it_has_a_division_of_its_own_and_takes_no_part_in_others(board: Path) -> None:
+    table = importlib.import_module("clbench.leaderboard").load(board / "records").set_index("method")
+    assert dict(table["division"]) == {"sft": "prior-data-free", "me/knows": "online"}
+    assert list(table["rank"]) == [1, 1]
+    row = table.loc["me/knows"]
+    assert (row["retention"], row["environment_steps"], row["tier"]) == (0.5, 21, "self-reported")
+    for missing in (
+        "question_retention",
+        "forward_transfer",
+        "steps",
+        "bytes_kept",
+        "relative_cost",
+        "parameters",
+    ):
+        assert np.isnan(row[missing]), missing
+
+
+def test_the_page_marks_it_and_names_no_command_that_does_not_make_it(
+    board: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    importlib.import_module("clbench.leaderboard.cli").show(records=board / "records")
+    lines = [" ".join(line.split()) for line in capsys.readouterr().out.splitlines()]
+    assert lines[lines.index("online") + 1].startswith("1 me/knows 1 0.75")
+    page = (board / "site" / "index.html").read_text(encoding="utf-8")
+    assert "# me/knows: a program of its own, docs/guide/online.md" in page
+    assert "clbench run clbench/Toy-v0 me/knows" not in page
+    assert "| 1 | me/knows | online |" in (board / "site" / "LEADERBOARD.md").read_text(encoding="utf-8")
+
+
+def test_its_record_is_recomputed_and_cannot_be_replayed(board: Path) -> None:
+    verify = importlib.import_module("clbench.leaderboard.submission.verify")
+    path = board / "records/Toy-v0/me--knows/seed-0.json"
+    request = verify.Request("replayed", 10, 0, None, ID, None)
+    *passed, last = verify.verify(path, board / "records", request)
+    assert all(check.passed for check in passed)
+    assert (last.passed, last.found) == (
+        False,
+        "an agent that learned online leaves none: it is recomputed at best",
+    )
+    assert importlib.import_module("clbench.leaderboard.board.tiers").tier_of(path) == "recomputed"
+
+
+@pytest.mark.parametrize(
+    "uses",
+    [
+        {"demonstrations": "never", "questions": "never", "reference": False, "online": False},
+        {"demonstrations": "throughout", "questions": "never", "reference": False, "online": True},
+        {"online": True},
+    ],
+)
+def test_a_record_that_claims_to_be_online_and_more_is_refused(
+    uses: dict[str, Any], board: Path, tmp_path: Path
+) -> None:
+    values = json.loads((board / "records/Toy-v0/me--knows/seed-0.json").read_text(encoding="utf-8"))
+    values["run"]["uses"] = uses
+    path = tmp_path / "Toy-v0/me--knows/seed-0.json"
+    path.parent.mkdir(parents=True)
+    path.write_text(json.dumps(values), encoding="utf-8")
+    table = importlib.import_module("clbench.leaderboard.board.rows").read_table(tmp_path)
+    assert not table.rows
+    assert table.not_shown[0].reason == "run: uses of an agent that learned online must be of nothing else."
+
+
+# ---- the page ----------------------------------------------------------------------------------------------
+
+
+def _blocks(language: str) -> list[str]:
+    text = (DOCS / "online.md").read_text(encoding="utf-8")
+    return re.findall(rf"```{language}\n(.*?)```", text, flags=re.DOTALL)
+
+
+SHOW_FLAT = """
+class Shown:
+    def predict(self, observation, deterministic):
+        print(observation.shape)
+
+Flat(Shown(), env).predict(env.reset()[0], deterministic=True)
+"""
+
+
+def _output(command: list[str], folder: Path) -> str:
+    """Return what a program prints; threads would only get in each other's way here."""
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    done = subprocess.run(command, cwd=folder, env=environment, check=False, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+@pytest.mark.slow
+def test_the_page_s_own_lines_make_a_row(tmp_path: Path) -> None:
+    learning, flat = _blocks("python")
+    small = learning.replace("clbench/Fetch-v0", ID).replace("range(5)", "range(3)").replace("5_000", "120")
+    command = [sys.executable, "-c", small + flat + SHOW_FLAT]
+    told = _output(command, tmp_path)
+    assert told == "(16,)\n"
+    record = read_record(tmp_path / "leaderboard/records/Toy-v0/me--sac/seed-0.json")
+    assert record.costs["environment_steps"] == 360
+    assert record.costs["parameters"] > 0
+    assert record.fingerprint["method"]["class"] == "stable_baselines3.sac.sac:SAC"
+    assert record.run["device"] == "cpu"
+    (shown,) = _blocks("console")
+    command = [sys.executable, "-m", *shown.split()]
+    told = _output(command, tmp_path)
+    assert "me/sac" in told
+
+
+@pytest.mark.slow
+def test_the_program_of_the_page_makes_a_record_of_each_seed_and_skips_those_it_has(tmp_path: Path) -> None:
+    (line,) = _blocks("shell")
+    python, script, scenario, *seeds = line.split()
+    assert (python, script, scenario, seeds) == (
+        "python",
+        "docs/guide/online_sac.py",
+        "clbench/Fetch-v0",
+        ["--seeds", "3"],
+    )
+    command = [sys.executable, str(DOCS.parent / script), ID, "--seeds", "1", "--steps", "110"]
+    for expected in ("seed 0, stage 2: left ", "seed 0 has a record already"):
+        told = _output(command, tmp_path)
+        assert expected in told
+    record = read_record(tmp_path / "leaderboard/records/Toy-v0/sac/seed-0.json")
+    assert record.costs["environment_steps"] == 330

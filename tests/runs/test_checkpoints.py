@@ -1,0 +1,199 @@
+"""The policies of all stages: kept by a run, or made again; they are the same to the last bit."""
+
+import dataclasses
+import logging
+import random
+import shutil
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from clbench.cli.runs import run
+from clbench.learning.method import Method, Stage, State
+from clbench.learning.optimise import MethodError
+from clbench.policy.checkpoint import CheckpointError
+from clbench.policy.policy import Policy
+from clbench.runs.checkpoints import find_stages, has_stages, keep_stages, load_stages, stage_policies
+from clbench.runs.run import execute
+from clbench.runs.spec import RunSpec
+
+TOY = "clbench.testing:clbench/Toy-v0"
+SPEC = RunSpec(TOY, "lora", seed=0)
+
+
+@dataclasses.dataclass
+class Restless(Method):
+    """A method that adds a parameter to the policy, keeps a state, and draws from the global generators."""
+
+    def prepare(self, policy: Policy, prior: Any) -> None:
+        policy.register_parameter("scale", torch.nn.Parameter(torch.rand(3)))
+        self.steps = 0
+
+    def load_state(self, policy: Policy, state: State) -> None:
+        policy.register_parameter("scale", torch.nn.Parameter(torch.zeros(3)))
+        assert isinstance(state["steps"], int)
+        self.steps = state["steps"]
+
+    def state(self) -> State:
+        return {"steps": self.steps}
+
+    def loss(self, policy: Policy, batch: Any, progress: Any) -> Tensor:
+        self.steps += 1
+        noise = torch.rand(()) + random.random() + float(np.random.rand()) + self.steps  # noqa: NPY002
+        return (
+            policy.action_loss(batch).mean() * noise + (policy.get_parameter("scale") * torch.rand(3)).sum()
+        )
+
+
+@dataclasses.dataclass
+class Stumbling(Method):
+    """A method that fails in the first stage."""
+
+    def end_task(self, policy: Policy, stage: Stage) -> None:
+        raise RuntimeError(f"cannot merge {stage.task.name}")
+
+
+@pytest.fixture(scope="module")
+def kept(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder in which a run of LoRA kept its policies."""
+    folder = tmp_path_factory.mktemp("kept")
+    assert execute(SPEC, folder / "records", checkpoints=folder / "policies").status == "success"
+    return folder / "policies"
+
+
+def _tensors(policies: list[Policy]) -> list[dict[str, Tensor]]:
+    return [policy.state_dict() for policy in policies]
+
+
+def _assert_equal(first: list[Policy], second: list[Policy]) -> None:
+    assert len(first) == len(second)
+    for one, other in zip(_tensors(first), _tensors(second), strict=True):
+        assert one.keys() == other.keys()
+        assert all(value.equal(other[name]) for name, value in one.items())
+
+
+def test_a_run_keeps_a_folder_for_each_stage(kept: Path) -> None:
+    files = {"policy.safetensors", "policy.json", "method.safetensors", "method.json", "clbench.json"}
+    folders = sorted((kept / "Toy-v0" / "lora" / "seed-0").iterdir())
+    assert [folder.name for folder in folders] == ["stage-0", "stage-1", "stage-2"]
+    assert all({path.name for path in folder.iterdir()} == files for folder in folders)
+
+
+def test_kept_policies_are_those_that_are_made_again(kept: Path) -> None:
+    amounts: list[float] = []
+    again = stage_policies(SPEC, progress=amounts.append)
+    _assert_equal(stage_policies(SPEC, kept), again)
+    assert len(again) == 3
+    assert sum(amounts) == 2 * 60
+    words = "backbone.words.weight"  # under the adapters: it never changes
+    changed = [name for name in again[0].state_dict() if "lora_" in name]
+    first, _, last = _tensors(again)
+    assert changed
+    assert first[words].equal(last[words])
+    assert not any(first[name].equal(last[name]) for name in changed)
+
+
+def test_policies_of_a_run_of_the_same_settings_that_is_evaluated_otherwise_count(kept: Path) -> None:
+    assert has_stages(dataclasses.replace(SPEC, split="validation"), kept)
+    assert has_stages(dataclasses.replace(SPEC, perturb=True), kept)
+    assert not has_stages(dataclasses.replace(SPEC, seed=1), kept)
+    assert not has_stages(dataclasses.replace(SPEC, targets=1), kept)
+    assert not has_stages(dataclasses.replace(SPEC, changes={"rank": 4}), kept)
+
+
+def test_a_method_that_draws_from_global_generators_makes_the_same_policies_again(
+    tmp_path: Path, stranger: Callable[[type[Method]], str]
+) -> None:
+    spec = RunSpec(TOY, stranger(Restless), seed=0, targets=1)
+    execute(spec, tmp_path / "records", checkpoints=tmp_path)
+    _assert_equal(stage_policies(spec, tmp_path), stage_policies(spec))
+
+
+def test_a_run_that_was_killed_keeps_all_stages_in_the_end(
+    tmp_path: Path, execute_and_kill: Callable[..., None]
+) -> None:
+    spec = RunSpec(TOY, "sft", seed=0)
+    execute_and_kill(spec, tmp_path, 0.75, checkpoints=tmp_path)
+    assert not has_stages(spec, tmp_path)
+    assert execute(spec, tmp_path, checkpoints=tmp_path).timing["resumed_after"] == 1
+    _assert_equal(stage_policies(spec, tmp_path), stage_policies(spec))
+
+
+def test_what_another_version_of_the_code_kept_is_replaced(kept: Path, tmp_path: Path) -> None:
+    stale = tmp_path / "Toy-v0" / "lora" / "seed-0" / "stage-2"
+    stale.mkdir(parents=True)
+    (stale / "policy.safetensors").write_bytes(b"stale")
+    keep_stages(SPEC, tmp_path)
+    _assert_equal(stage_policies(SPEC, tmp_path), stage_policies(SPEC, kept))
+
+
+@pytest.mark.slow
+def test_the_command_keeps_the_policies_of_a_run_that_has_a_record(
+    kept: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(sys, "path", sys.path.copy())  # the command adds to it
+    records = kept.parent / "records"
+    run(TOY, "lora", seeds=1, records=records, checkpoints=tmp_path, workers=1)
+    assert "0 runs and the policies of 1 in" in capsys.readouterr().err
+    _assert_equal(stage_policies(SPEC, tmp_path), stage_policies(SPEC, kept))
+    run(TOY, "lora", seeds=1, records=records, checkpoints=tmp_path, workers=1)
+    assert "policies" not in capsys.readouterr().err  # they are there now
+
+
+def test_a_torn_policy_is_not_taken_and_the_log_says_so(
+    kept: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    keep_stages(SPEC, tmp_path)
+    path = tmp_path / "Toy-v0" / "lora" / "seed-0" / "stage-1" / "policy.safetensors"
+    path.write_bytes(path.read_bytes()[:-4] + bytes(4))
+    assert not has_stages(SPEC, tmp_path)
+    assert has_stages(SPEC, tmp_path, last=0)
+    with caplog.at_level(logging.WARNING, "clbench"):
+        assert find_stages(SPEC, tmp_path) == find_stages(SPEC)
+    assert "does not hold the policies of all stages of lora, seed 0" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ('{"scale": 1, "scale": 2}', "the name 'scale' is there twice"),
+        (f'{{"scale": {"[" * 99}{"]" * 99}}}', "scale: nested more than 16 deep"),
+        ('{"scale": NaN}', "NaN is no number"),
+        ("[1]", "cannot be read as the state of a method"),
+    ],
+)
+def test_a_state_that_a_stranger_wrote_is_read_within_limits_and_refused_by_name(
+    kept: Path, tmp_path: Path, text: str, reason: str
+) -> None:
+    folder = shutil.copytree(kept / "Toy-v0" / "lora" / "seed-0", tmp_path / "stages")
+    (folder / "stage-1" / "method.json").write_text(text)
+    with pytest.raises(CheckpointError, match=reason) as refused:
+        load_stages(SPEC, folder)
+    assert str(folder / "stage-1") in str(refused.value)
+
+
+@dataclasses.dataclass
+class Boundless(Method):
+    """A method whose state no file can hold."""
+
+    def state(self) -> State:
+        return {"best": float("inf")}
+
+
+def test_a_state_that_could_not_be_read_again_is_refused_when_it_is_kept(
+    stranger: Callable[[type[Method]], str],
+) -> None:
+    message = r"failed in state\(\) after stage 0: .*best: a number that is not finite"
+    with pytest.raises(MethodError, match=message):
+        stage_policies(RunSpec(TOY, stranger(Boundless), seed=0))
+
+
+def test_a_method_that_fails_says_where(stranger: Callable[[type[Method]], str]) -> None:
+    with pytest.raises(MethodError, match=r"failed in stage 1 \(right\): RuntimeError: cannot merge right"):
+        stage_policies(RunSpec(TOY, stranger(Stumbling), seed=0))

@@ -1,0 +1,265 @@
+"""Films: they end as the recorded episodes do, and say so in colour and in words."""
+
+import dataclasses
+import os
+import subprocess
+import sys
+import types
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image, ImageDraw
+
+from clbench.cli.film import film
+from clbench.evaluation.rollouts import Episode, Trial
+from clbench.records.record import Record
+from clbench.runs.checkpoints import stage_policies
+from clbench.runs.film import FAILURE, FASTEST, SUCCESS, Film, Take, film_run, shoot, steps_per_second
+from clbench.runs.run import execute
+from clbench.runs.spec import RunSpec
+from clbench.spec.registry import load_scenario
+from clbench.testing import ToyWorld
+from clbench.worlds.gl_backend import RenderingError, choose_back_end
+
+TOY = "clbench.testing:clbench/Toy-v0"
+SPEC = RunSpec(TOY, "sft", seed=0, split="validation")
+SCENARIO = load_scenario(TOY)
+COLUMNS = ("stage", "step", "task", "split", "episode", "success", "length")
+
+
+@pytest.fixture(autouse=True)
+def _own_process_state(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Take back what a command sets in its process."""
+    monkeypatch.setenv("MUJOCO_GL", os.environ.get("MUJOCO_GL", ""))
+    monkeypatch.setattr(sys, "path", sys.path.copy())
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> tuple[Record, Path]:
+    """A run that is evaluated on validation episodes: its record, and the folder of the kept policies."""
+    folder = tmp_path_factory.mktemp("recorded")
+    return execute(SPEC, folder / "records", checkpoints=folder), folder
+
+
+@pytest.fixture
+def drawn() -> Film:
+    """A film without a policy: a success after two steps beside a failure after four."""
+    pictures = [Image.fromarray(np.full((100, 140, 3), shade, np.uint8)) for shade in (40, 80, 120, 160, 200)]
+    good = Take(pictures[:3], Episode("reach", "validation", 0, True, 1.0, 2))
+    bad = Take(pictures, Episode("reach", "validation", 0, False, -1.0, 4))
+    return Film(
+        "a film", ["reach: go there"], ["stage 0, before any target", "stage 1, after push"], [[good, bad]]
+    )
+
+
+def _colours(frame: Image.Image) -> set[str]:
+    """Return the colours that take at least a line of a frame."""
+    counts = frame.getcolors(frame.width * frame.height)
+    assert counts is not None
+    return {"#{:02x}{:02x}{:02x}".format(*colour) for count, colour in counts if count > 100}  # type: ignore[misc]
+
+
+def test_an_episode_that_has_ended_stands_still_in_the_colour_of_its_end(drawn: Film) -> None:
+    assert len(drawn) == 5
+    seen = [_colours(drawn.frame(time)) for time in range(5)]
+    assert [SUCCESS in colours for colours in seen] == [False, False, True, True, True]
+    assert [FAILURE in colours for colours in seen] == [False, False, False, False, True]
+    shades = [{f"#{shade:02x}{shade:02x}{shade:02x}" for shade in (120, shade)} for shade in (120, 160, 200)]
+    assert all(shown <= colours for shown, colours in zip(shades, seen[2:], strict=True))
+
+
+@pytest.fixture
+def written(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """The lines of text that are drawn."""
+    lines: list[str] = []
+    draw = ImageDraw.ImageDraw.text
+
+    def note(self: ImageDraw.ImageDraw, place: Any, text: Any, *rest: Any, **options: Any) -> None:
+        lines.append(text)
+        draw(self, place, text, *rest, **options)
+
+    monkeypatch.setattr(ImageDraw.ImageDraw, "text", note)
+    return lines
+
+
+def test_captions_and_ends_are_told_in_words(drawn: Film, written: list[str]) -> None:
+    drawn.frame(1)
+    assert written[:2] == ["a film", "reach: go there"]
+    assert written[-2:] == ["step 1", "step 1"]
+    drawn.frame(2)
+    assert written[-2:] == ["success, 2 steps", "step 2"]
+    drawn.frame(4)
+    assert written[-2:] == ["success, 2 steps", "failure, 4 steps"]
+
+
+def test_what_does_not_fit_is_cut_off(drawn: Film, written: list[str]) -> None:
+    Film("word " * 100, drawn.rows, drawn.columns, drawn.takes).frame(0)
+    assert written[0].startswith("word word")
+    assert written[0].endswith("...")
+    assert len(written[0]) < 60
+
+
+def test_a_gif_has_every_step_and_holds_its_end(drawn: Film, tmp_path: Path) -> None:
+    for name in ("one.gif", "two.gif"):
+        drawn.save(tmp_path / "films" / name, 20)
+    one, two = ((tmp_path / "films" / name).read_bytes() for name in ("one.gif", "two.gif"))
+    assert one == two
+    assert len(list((tmp_path / "films").iterdir())) == 2
+    with Image.open(tmp_path / "films" / "one.gif") as gif:
+        assert (gif.size, gif.n_frames, gif.info["loop"]) == (drawn.size, 5, 0)  # type: ignore[attr-defined]
+        durations = []
+        for number in range(5):
+            gif.seek(number)
+            durations.append(gif.info["duration"])
+        assert {SUCCESS, FAILURE} <= _colours(gif.convert("RGB"))
+    assert durations == [50, 50, 50, 50, 2000]
+
+
+@pytest.mark.skipif(find_spec("imageio_ffmpeg") is None, reason="the extra film is not installed")
+def test_an_mp4_has_every_step_and_holds_its_end(drawn: Film, tmp_path: Path) -> None:
+    from imageio_ffmpeg import count_frames_and_secs, read_frames
+
+    for name in ("one.mp4", "two.mp4"):
+        drawn.save(tmp_path / name, 20)
+    assert (tmp_path / "one.mp4").read_bytes() == (tmp_path / "two.mp4").read_bytes()
+    assert count_frames_and_secs(tmp_path / "one.mp4")[0] == 5 + 2 * 20
+    frames = read_frames(tmp_path / "one.mp4")
+    assert next(frames)["size"] == drawn.size
+    first = np.frombuffer(next(frames), np.uint8).reshape(*reversed(drawn.size), 3)
+    assert np.abs(first.astype(np.int16) - np.asarray(drawn.frame(0), np.int16)).mean() < 4
+    frames.close()
+
+
+def test_a_film_ends_as_the_recorded_episodes_do(recorded: tuple[Record, Path]) -> None:
+    record, folder = recorded
+    policies = stage_policies(SPEC, folder)
+    tasks = [*SCENARIO.retained, *SCENARIO.target]
+    ends = {0: 0, 1: 60, 2: 60}
+    rows = set(zip(*(record.episodes[name] for name in COLUMNS), strict=True))
+    outcomes = set()
+    for number in (0, 3):
+        made = film_run(SPEC, dict(enumerate(policies)), tasks, number, 96)
+        for task, takes in zip(tasks, made.takes, strict=True):
+            for stage, take in enumerate(takes):
+                episode = take.episode
+                outcomes.add(episode.success)
+                row = (
+                    stage,
+                    ends[stage],
+                    task.name,
+                    "validation",
+                    number,
+                    int(episode.success),
+                    episode.length,
+                )
+                assert row in rows
+                assert len(take.pictures) == episode.length + 1
+    assert outcomes == {True, False}
+    assert made.columns == ["stage 0, before any target", "stage 1, after right", "stage 2, after down"]
+    assert made.rows[1:3] == ["up (retained): move up", "right (target): move to the right"]
+
+
+def test_all_columns_of_a_row_begin_alike(recorded: tuple[Record, Path]) -> None:
+    policies = stage_policies(SPEC, recorded[1])
+    trials: list[Trial] = [(SCENARIO.task("left"), "validation", 1), (SCENARIO.task("down"), "validation", 1)]
+    takes = shoot(SCENARIO, 0, policies, trials, 32)
+    starts = [[np.asarray(take.pictures[0]) for take in row] for row in takes]
+    assert all(np.array_equal(row[0], other) for row in starts for other in row)
+    assert not np.array_equal(starts[0][0], starts[1][0])
+
+
+class Unsteady(ToyWorld):
+    """A world that does something else whenever it is drawn."""
+
+    def step(self, action: Any) -> Any:
+        return super().step(action if self.render_mode is None else 0 * action)
+
+
+def test_a_world_that_does_not_repeat_itself_is_no_film(
+    recorded: tuple[Record, Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    module = types.ModuleType("stranger")
+    module.__dict__["Unsteady"] = Unsteady
+    monkeypatch.setitem(sys.modules, "stranger", module)
+    task = dataclasses.replace(SCENARIO.task("left"), world="stranger:Unsteady")
+    policies = stage_policies(SPEC, recorded[1])[:1]
+    with pytest.raises(RuntimeError, match="stranger:Unsteady does not repeat an episode of 'left'"):
+        shoot(SCENARIO, 0, policies, [(task, "validation", 0)], 32)
+
+
+def test_the_command_writes_the_film_that_it_is_asked_for(
+    recorded: tuple[Record, Path], tmp_path: Path
+) -> None:
+    path = tmp_path / "toy.gif"
+    film(
+        TOY, "sft", tasks="left,down", stages="0,2", episode=1, size=96, output=path, checkpoints=recorded[1]
+    )
+    with Image.open(path) as gif:
+        assert gif.size == (2 * (96 + 8) + 8, 18 + 16 + 2 * (96 + 3 * 18 + 8))
+        assert gif.info["duration"] == 100  # ten steps in a second, as the world says
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"tasks": "left,doun"}, "No task of clbench/Toy-v0 is called 'doun'. Did you mean 'down'?"),
+        ({"stages": "0,3"}, "--stages has numbers from 0 to 2, not 0,3."),
+        ({"stages": "last"}, "--stages has numbers from 0 to 2, not last."),
+        ({"episode": 4}, "--episode has numbers from 0 to 3, not 4."),
+        ({"size": 20}, "--size must be at least 96, not 20."),
+        ({"fps": 60}, "--fps must be from 1 to 50, not 60."),
+        ({"output": Path("toy.avi")}, "A film is a .gif or .mp4 file, not 'toy.avi'."),
+        ({"changes": {"rate": "1"}}, "sft has no hyper-parameter 'rate'"),
+    ],
+)
+def test_bad_input_ends_with_exit_code_2_before_any_work(
+    options: dict[str, Any], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as left:
+        film(TOY, "sft", **options)
+    assert left.value.code == 2
+    assert message in capsys.readouterr().err
+
+
+def test_an_mp4_without_its_package_names_it(
+    drawn: Film, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("clbench.base.dependencies.find_spec", lambda name: None)
+    with pytest.raises(LookupError, match=r"needs the package imageio_ffmpeg: pip install 'clbench\[film\]'"):
+        drawn.save(tmp_path / "film.mp4", 10)
+
+
+FETCH = """
+import sys
+from pathlib import Path
+from clbench.runs.film import shoot
+from clbench.policy import Policy
+from clbench.learning.pretraining import policy_config
+from clbench.spec.task import load_scenario
+
+scenario = load_scenario("clbench/Fetch-v0")
+policy = Policy(policy_config(scenario), seed=3)
+((take,),) = shoot(scenario, 0, [policy], [(scenario.task("push"), "validation", 0)], 96)
+print(take.episode.length, len({picture.tobytes() for picture in take.pictures}), *take.pictures[0].size)
+"""
+
+
+@pytest.mark.slow
+def test_the_fetch_world_is_drawn_where_anything_can_draw() -> None:
+    try:
+        choose_back_end([load_scenario("clbench/Fetch-v0").tasks[0].world])
+    except RenderingError as error:
+        pytest.skip(str(error))
+    result = subprocess.run([sys.executable, "-c", FETCH], capture_output=True, text=True, check=True)
+    length, different, width, height = map(int, result.stdout.split())
+    assert length == 60  # the policy was never trained
+    assert different == 61  # and it moves the arm all the time
+    assert (width, height) == (96, 96)
+
+
+def test_a_film_shows_no_more_steps_in_a_second_than_a_gif_can() -> None:
+    assert steps_per_second(load_scenario("clbench/Fetch-v0").target[0]) == 25
+    assert steps_per_second(load_scenario("clbench/MetaWorld-v0").target[0]) == FASTEST == 50

@@ -1,0 +1,31 @@
+import subprocess
+import sys
+from importlib.metadata import version
+
+from clbench.runs.fingerprint import fingerprint, rollout_hash
+from clbench.spec.registry import load_scenario
+
+TOY = load_scenario("clbench.testing:clbench/Toy-v0")
+FETCH = load_scenario("clbench/Fetch-v0")
+
+
+def test_a_rollout_hash_is_the_same_in_another_process_and_differs_between_tasks() -> None:
+    world = FETCH.task("lift").world
+    code = f"from clbench.runs.fingerprint import rollout_hash; print(rollout_hash({world!r}, 'lift'))"
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert rollout_hash(world, "lift") == result.stdout.strip()
+    assert rollout_hash(world, "lift") != rollout_hash(world, "reach")
+
+
+def test_a_fingerprint_names_the_simulator_of_its_own_suite_alone() -> None:
+    assert fingerprint(FETCH)["versions"]["gymnasium-robotics"] == version("gymnasium-robotics")
+    assert "gymnasium-robotics" not in fingerprint(TOY)["versions"]
+
+
+def test_a_fingerprint_names_versions_hardware_and_every_world() -> None:
+    found = fingerprint(TOY)
+    assert found["versions"]["mujoco"] == version("mujoco")
+    assert set(found["hardware"]) == {"machine", "system", "processor", "instructions"}
+    assert all(found["hardware"].values())
+    assert set(found["rollouts"]) == {"clbench.testing:ToyWorld"}
+    assert found["commit"] is None or len(found["commit"]["id"]) == 40

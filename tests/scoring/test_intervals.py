@@ -1,0 +1,486 @@
+"""Intervals against simulations, against SciPy, against closed forms and against what must be exact."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from clbench.scoring.intervals import (
+    Estimate,
+    bootstrap,
+    episodes_needed,
+    estimate,
+    expected_precision,
+    half_width,
+    interval,
+    paired_difference,
+    row_generator,
+    student_quantile,
+    studentised_range_quantile,
+)
+from clbench.scoring.layout import Layout
+from clbench.scoring.metrics import METRICS, load_metric, measure
+from clbench.scoring.scores import Scores
+from clbench.testing import TOY
+
+NOTHING = Estimate(None, None, None)
+
+
+def layout(retained: int, episodes: int, targets: int = 1, held_out: int = 0, points: int = 1) -> Layout:
+    return Layout(
+        retained=tuple(f"skill_{number}" for number in range(retained)),
+        target=tuple(f"target_{number}" for number in range(targets)),
+        held_out=tuple(f"unseen_{number}" for number in range(held_out)),
+        episodes=tuple(range(episodes)),
+        curve_episodes=tuple(range((episodes + 1) // 2)),
+        validation_episodes=tuple(range(10)),
+        steps=tuple(100 * (number + 1) for number in range(points)),
+        kinds=("left", "above"),
+    )
+
+
+def scores(final: Any, correct: int = 50) -> Scores:
+    """Return a run whose outcomes on the skills after its only target are `final`, (skills, episodes)."""
+    final = np.asarray(final, dtype=float)
+    success = np.ones((2, len(final) + 1, final.shape[1]))
+    success[1, : len(final)] = final
+    return whole_run(layout(*final.shape), success, correct=np.full((2, 2), float(correct)))
+
+
+def whole_run(shape: Layout, success: Any, **arrays: Any) -> Scores:
+    """Return a run with the outcomes `success` at the ends; of `arrays` those given, the others missing."""
+    targets, points = len(shape.target), len(shape.steps)
+    counts = np.full((targets + 1, len(shape.kinds)), 100.0)
+    on_the_way = np.full((targets, points - 1, len(shape.tasks), len(shape.curve_episodes)), np.nan)
+    curves = ("validation", "answer_curves", "update_sparsity", "activation_drift")
+    missing = {name: np.full((targets, points), np.nan) for name in curves}
+    perturbed = np.full((targets + 1, len(shape.retained), len(shape.episodes)), np.nan)
+    given = {
+        "perturbed": perturbed,
+        "on_the_way": on_the_way,
+        "asked": counts,
+        "correct": counts / 2,
+        **missing,
+        **arrays,
+    }
+    return Scores(shape, success, **given)
+
+
+def random_run(generator: np.random.Generator, shape: Layout) -> Scores:
+    """Return a run of coin flips; plain fine-tuning's final success is reached somewhere in each stage."""
+    targets, points, tasks = len(shape.target), len(shape.steps), len(shape.tasks)
+    on_the_way = (targets, points - 1, tasks, len(shape.curve_episodes))
+    perturbed = (targets + 1, len(shape.retained), len(shape.episodes))
+    selection = generator.random((targets, points))
+    selection[:, -1] = 1.0
+    return whole_run(
+        shape,
+        success=generator.integers(0, 2, (targets + 1, tasks, len(shape.episodes))).astype(float),
+        on_the_way=generator.integers(0, 2, on_the_way).astype(float),
+        perturbed=generator.integers(0, 2, perturbed).astype(float),
+        validation=selection,
+        correct=generator.integers(0, 101, (targets + 1, 2)).astype(float),
+        answer_curves=generator.random((targets, points)),
+        update_sparsity=generator.random((targets, points)),
+        activation_drift=generator.random((targets, points)),
+    )
+
+
+def width(one: Estimate) -> float:
+    assert one.low is not None
+    assert one.high is not None
+    return one.high - one.low
+
+
+def test_the_value_is_the_mean_of_the_seeds_values() -> None:
+    generator = np.random.default_rng(0)
+    shape = layout(3, 5, targets=3, held_out=2, points=2)
+    runs = {seed: random_run(generator, shape) for seed in range(3)}
+    estimates = estimate(METRICS, runs, generator, replicates=10)
+    for name in {name for name, metric in METRICS.items() if not metric.references}:
+        values = [measure(name, run) for run in runs.values()]
+        assert estimates[name].value == pytest.approx(np.mean(np.array(values, dtype=float)))
+
+
+def test_forward_transfer_averages_curves_over_seeds_before_the_ratio() -> None:
+    shape = layout(1, 1)
+    curves = {"run": [0.0, 1.0], "from_scratch": [1.0, 0.0]}
+    runs = {
+        name: {
+            seed: whole_run(shape, np.array([[[0.0], [0.0]], [[0.0], [value]]]))
+            for seed, value in enumerate(values)
+        }
+        for name, values in curves.items()
+    }
+    got = estimate(["forward_transfer"], runs["run"], np.random.default_rng(0), references=runs)
+    assert got["forward_transfer"].value == pytest.approx(0.0)  # seed by seed: the mean of -1 and 0.5
+
+
+def test_the_same_row_has_the_same_numbers_whatever_else_is_asked() -> None:
+    generator = np.random.default_rng(0)
+    shape = layout(3, 5, targets=3, held_out=2, points=2)
+    runs, others = ({seed: random_run(generator, shape) for seed in range(3)} for _ in range(2))
+    first = estimate(METRICS, runs, row_generator("clbench/Toy-v0", "sft"), references={"other": others})
+    again = estimate(["retention"], runs, row_generator("clbench/Toy-v0", "sft"))
+    backwards = estimate(
+        METRICS, dict(sorted(runs.items(), reverse=True)), row_generator("clbench/Toy-v0", "sft")
+    )
+    assert first["retention"] == again["retention"]
+    assert first == backwards
+
+
+def test_rows_have_generators_of_their_own() -> None:
+    names = [("a", "b"), ("a", "c"), ("b", "b"), ("ab", ""), ("", "ab"), ("\ud800", "b")]
+    draws = {row_generator(*pair).integers(2**62) for pair in names}
+    assert len(draws) == len(names)
+
+
+def test_with_one_seed_and_task_the_interval_is_that_of_scipy() -> None:
+    outcomes = np.random.default_rng(0).random(40) < 0.7
+    got = estimate(["retention"], {0: scores([outcomes])}, np.random.default_rng(1), replicates=20_000)
+    expected = stats.bootstrap(
+        (outcomes.astype(float),),
+        np.mean,
+        method="percentile",
+        n_resamples=20_000,
+        rng=np.random.default_rng(2),
+    ).confidence_interval
+    assert got["retention"].low == pytest.approx(expected.low, abs=0.026)  # one episode is 0.025
+    assert got["retention"].high == pytest.approx(expected.high, abs=0.026)
+
+
+def test_answers_vary_like_binomials() -> None:
+    got = estimate(
+        ["question_retention"], {0: scores([[1, 0]], 80)}, np.random.default_rng(0), replicates=20_000
+    )["question_retention"]
+    low, high = stats.binom(200, 0.8).interval(0.95) / np.array(200)
+    assert got.value == 0.8
+    assert got.low == pytest.approx(low, abs=0.006)  # one answer is 0.005
+    assert got.high == pytest.approx(high, abs=0.006)
+
+
+def test_seeds_are_drawn_as_whole_runs() -> None:
+    # Two seeds, one good at everything and one at nothing. Drawn apart, six tasks would hide it.
+    runs = {0: scores(np.ones((6, 20))), 1: scores(np.zeros((6, 20)))}
+    got = estimate(["retention"], runs, np.random.default_rng(0))["retention"]
+    assert (got.value, got.low, got.high) == (0.5, 0.0, 1.0)
+
+
+def test_the_episodes_of_a_run_are_the_same_at_all_stages() -> None:
+    # Which episodes succeed varies, but each succeeds at both stages or at neither: nothing was forgotten.
+    final = np.random.default_rng(0).random((4, 20)) < 0.5
+    run = scores(final)
+    run.success[0] = run.success[1]
+    got = estimate(["retention", "forgetting"], {0: run}, np.random.default_rng(0))
+    assert got["forgetting"] == Estimate(0.0, 0.0, 0.0)
+    assert width(got["retention"]) > 0.1
+
+
+def test_more_episodes_make_a_narrower_interval() -> None:
+    generator = np.random.default_rng(0)
+    few, many = (
+        estimate(["retention"], {0: scores(generator.random((3, episodes)) < 0.5)}, generator)["retention"]
+        for episodes in (10, 160)
+    )
+    assert width(many) == pytest.approx(width(few) / 4, rel=0.35)
+
+
+def rate_of_seeds(rates: Any, tasks: int, episodes: int, generator: np.random.Generator) -> dict[int, Scores]:
+    """Return a run for each of the success rates of the seeds."""
+    return {seed: scores(generator.random((tasks, episodes)) < rate) for seed, rate in enumerate(rates)}
+
+
+@pytest.mark.parametrize(("seeds", "spread"), [(1, 0.0), (3, 0.05), (5, 0.1)])
+def test_intervals_hold_the_truth_about_as_often_as_they_say(seeds: int, spread: float) -> None:
+    generator = np.random.default_rng(0)
+    held = 0
+    for _ in range(300):
+        runs = rate_of_seeds(0.6 + spread * generator.standard_normal(seeds), 6, 20, generator)
+        got = estimate(["retention"], runs, generator, replicates=300)["retention"]
+        assert got.low is not None
+        assert got.high is not None
+        held += got.low <= 0.6 <= got.high
+    assert 0.92 <= held / 300 <= 0.98  # 0.95 within two and a half standard errors
+
+
+def test_with_several_seeds_the_interval_of_an_unbounded_quantity_is_that_of_students_t() -> None:
+    values = np.array([0.3, 1.7, 0.9, 4.0])
+    without_one = (values.sum() - values) / 3
+    expected = stats.t.interval(0.95, 3, loc=values.mean(), scale=stats.sem(values))
+    got = interval(float(values.mean()), without_one)
+    assert (got.low, got.high) == pytest.approx(expected, rel=1e-4)
+
+
+def test_the_interval_of_a_rate_is_students_on_the_scale_of_the_arcsine_of_the_root() -> None:
+    # Retentions 0.4, 0.5 and 0.9: without one of them 0.7, 0.65 and 0.45.
+    runs = {0: scores([[1] * 4 + [0] * 6]), 1: scores([[1] * 5 + [0] * 5]), 2: scores([[1] * 9 + [0]])}
+    angles = [np.arcsin(np.sqrt(rate)) for rate in (0.7, 0.65, 0.45)]
+    error = np.sqrt(2 / 3 * sum((angle - np.mean(angles)) ** 2 for angle in angles))
+    centre, reach = np.arcsin(np.sqrt(0.6)), stats.t.ppf(0.975, 2) * error
+    assert centre + reach < np.pi / 2
+    got = estimate(["retention"], runs, np.random.default_rng(0))["retention"]
+    assert got.value == pytest.approx(0.6)
+    assert got.low == pytest.approx(np.sin(max(centre - reach, 0)) ** 2, rel=1e-3)
+    assert got.high == pytest.approx(np.sin(centre + reach) ** 2, rel=1e-3)
+
+
+def test_the_interval_of_pooled_curves_is_that_of_the_jackknife() -> None:
+    generator, shape = np.random.default_rng(3), layout(1, 10, targets=2, points=3)
+    runs, scratch = ({seed: random_run(generator, shape) for seed in range(4)} for _ in range(2))
+
+    def transfer(seeds: list[int]) -> float:
+        some, references = ({seed: them[seed] for seed in seeds} for them in (runs, scratch))
+        one = estimate(["forward_transfer"], some, generator, references={"from_scratch": references})
+        return one["forward_transfer"].value or np.nan
+
+    without_one = np.array([transfer([one for one in range(4) if one != seed]) for seed in range(4)])
+    error = np.sqrt(3 / 4 * ((without_one - without_one.mean()) ** 2).sum())
+    value = transfer([0, 1, 2, 3])
+    got = estimate(["forward_transfer"], runs, generator, references={"from_scratch": scratch})
+    reach = stats.t.ppf(0.975, 3) * error
+    assert got["forward_transfer"].low == pytest.approx(value - reach, rel=1e-3)
+    assert got["forward_transfer"].high == pytest.approx(min(value + reach, 1.0), rel=1e-3)
+
+
+def test_intervals_stay_in_the_range_of_their_metric_and_hold_their_value() -> None:
+    generator, shape = np.random.default_rng(0), layout(2, 3, targets=2, held_out=1, points=2)
+    for seeds in (1, 2, 3):
+        for _ in range(5):
+            runs = {seed: random_run(generator, shape) for seed in range(seeds)}
+            references = dict.fromkeys(("from_scratch", "joint", "sft"), runs)
+            for name, one in estimate(METRICS, runs, generator, references=references, replicates=50).items():
+                if one.value is not None and one.low is not None and one.high is not None:
+                    assert METRICS[name].low <= one.low <= one.value <= one.high <= METRICS[name].high
+
+
+def test_seeds_that_agree_exactly_have_an_interval_of_episodes() -> None:
+    half = scores(np.tile([1, 0], (4, 10)))
+    got, alone = (
+        estimate(["retention"], dict.fromkeys(range(seeds), half), np.random.default_rng(0))["retention"]
+        for seeds in (4, 1)
+    )
+    assert got.value == 0.5
+    assert width(got) == pytest.approx(2 * 1.96 * 0.5 / np.sqrt(4 * 4 * 20), rel=0.15)
+    assert width(alone) == pytest.approx(2 * width(got), rel=0.15)
+
+
+def test_what_is_known_exactly_has_no_width() -> None:
+    # A frozen policy meets the same episodes at all stages: whatever it can do, it forgets nothing.
+    generator, shape = np.random.default_rng(0), layout(3, 10, targets=2)
+    frozen = {}
+    for seed in range(3):
+        outcomes = (generator.random((1, 5, 10)) < 0.5).astype(float)
+        frozen[seed] = whole_run(shape, np.repeat(outcomes, 3, axis=0))
+    for runs in (frozen, {0: frozen[0]}):
+        got = estimate(["forgetting", "backward_transfer", "retention"], runs, generator)
+        assert got["forgetting"] == got["backward_transfer"] == Estimate(0.0, 0.0, 0.0)
+        assert width(got["retention"]) > 0
+
+
+def test_if_all_outcomes_are_equal_the_interval_has_no_width() -> None:
+    runs = {seed: scores(np.ones((6, 20))) for seed in range(3)}
+    got = estimate(["retention"], runs, np.random.default_rng(0))["retention"]
+    assert got == Estimate(1.0, 1.0, 1.0)
+
+
+def test_a_quantity_without_value_for_some_seeds_has_no_interval() -> None:
+    assert interval(1.0, np.array([1.0, np.nan])) == Estimate(1.0, None, None)
+    assert interval(np.nan, np.array([1.0, 2.0])) == NOTHING
+    assert interval(1.0, np.zeros(0)) == Estimate(1.0, None, None)
+    assert interval(1.0, np.zeros(0), lambda: np.array([1.0, np.nan])) == Estimate(1.0, None, None)
+
+
+@pytest.mark.parametrize("degrees", [1, 2, 3, 4, 9, 50, 10**6])
+def test_students_quantile_is_that_of_scipy(degrees: int) -> None:
+    assert student_quantile(degrees) == pytest.approx(stats.t.ppf(0.975, degrees), rel=1e-4)
+
+
+@pytest.mark.parametrize(("count", "degrees"), [(2, 1), (3, 2), (5, 8), (15, 28), (15, 10**6), (60, 4)])
+def test_the_quantile_of_the_studentised_range_is_that_of_scipy(count: int, degrees: int) -> None:
+    expected = stats.studentized_range.ppf(0.95, count, min(degrees, 10**5))
+    assert studentised_range_quantile(count, degrees) == pytest.approx(expected, rel=1e-4)
+
+
+def test_the_width_to_expect_with_one_seed_is_that_of_a_binomial() -> None:
+    expected = 1.96 * np.sqrt(0.25 / 120)
+    assert half_width(1, 20, 6) == pytest.approx(expected, rel=0.01)
+    assert half_width(1, 20, 6, seed_deviation=0.3) == half_width(1, 20, 6)
+
+
+@pytest.mark.parametrize(("seeds", "deviation"), [(3, 0.05), (5, 0.0), (5, 0.1)])
+def test_the_width_to_expect_is_that_of_simulated_rows(seeds: int, deviation: float) -> None:
+    generator = np.random.default_rng(0)
+    rates = 0.5 + deviation * generator.standard_normal((100, seeds))
+    widths = [
+        width(estimate(["retention"], rate_of_seeds(row, 6, 20, generator), generator)["retention"])
+        for row in rates
+    ]
+    root_mean_square = np.sqrt(np.mean(np.square(widths))) / 2
+    assert half_width(seeds, 20, 6, seed_deviation=deviation) == pytest.approx(root_mean_square, rel=0.1)
+
+
+def test_the_episodes_needed_are_the_fewest_that_are_enough() -> None:
+    for seeds, tasks, wished in ((1, 6, 0.05), (5, 6, 0.08), (10, 4, 0.05), (10, 10, 0.04), (30, 1, 0.1)):
+        needed = episodes_needed(wished, seeds, tasks)
+        assert needed is not None
+        assert half_width(seeds, needed, tasks) <= wished + 1e-9
+        assert needed == 1 or half_width(seeds, needed - 1, tasks) > wished
+    assert episodes_needed(half_width(5, 20, 6), 5, 6) == 20
+
+
+def test_no_number_of_episodes_makes_up_for_seeds_that_differ() -> None:
+    # Three seeds of a standard deviation of 0.05 alone: 4.30 * 0.05 / sqrt(3) is 0.12.
+    assert episodes_needed(0.12, 3, 6) is None
+    assert episodes_needed(0.13, 3, 6) is not None
+    assert episodes_needed(0.01, 3, 6, seed_deviation=0.0) is not None
+
+
+def test_a_scenario_has_a_sentence_on_the_intervals_to_expect() -> None:
+    three, one = (expected_precision(TOY, seeds) for seeds in (3, 1))
+    episodes = TOY.budget.test_episodes
+    widths = [half_width(3, episodes, count) for count in (len(TOY.retained), len(TOY.target))]
+    assert three.startswith(f"3 seeds x {episodes} episodes: ")
+    assert f"± {widths[0]:.2f} for retention, ± {widths[1]:.2f} for adaptation, ± " in three
+    assert one.startswith("1 seed x ")
+    assert "this seed alone" in one
+
+
+def test_a_metric_without_value_has_no_interval() -> None:
+    estimates = estimate(METRICS, {0: scores([[1, 0]])}, np.random.default_rng(0))
+    assert estimates["zero_shot"] == estimates["forward_transfer"] == NOTHING
+    assert estimate(["retention"], {}, np.random.default_rng(0)) == {"retention": NOTHING}
+
+
+def test_a_reference_that_lacks_a_seed_is_missing() -> None:
+    runs = {seed: scores([[1, 0]]) for seed in range(2)}
+    short = {"from_scratch": {0: runs[0]}}
+    got = estimate(["forward_transfer"], runs, np.random.default_rng(0), references=short)
+    assert got["forward_transfer"] == NOTHING
+
+
+def test_an_unknown_metric_is_a_lookup_error() -> None:
+    with pytest.raises(LookupError, match="zero_shot"):
+        estimate(["zero_shots"], {}, np.random.default_rng(0))
+
+
+def test_a_method_does_not_differ_from_itself() -> None:
+    generator = np.random.default_rng(0)
+    runs = {seed: scores(generator.random((4, 20)) < 0.5) for seed in range(3)}
+    assert paired_difference("retention", runs, runs, generator) == Estimate(0.0, 0.0, 0.0)
+
+
+@pytest.mark.parametrize("seeds", [1, 8])
+def test_pairing_makes_the_interval_of_a_difference_narrower(seeds: int) -> None:
+    generator = np.random.default_rng(0)
+    luck = generator.random((seeds, 4, 20))
+    runs, others = ({seed: scores(luck[seed] < rate) for seed in range(seeds)} for rate in (0.6, 0.5))
+    difference = paired_difference("retention", runs, others, generator)
+    alone = [estimate(["retention"], them, generator)["retention"] for them in (runs, others)]
+    assert difference.value == pytest.approx((alone[0].value or 0) - (alone[1].value or 0))
+    assert width(difference) < 0.7 * np.hypot(width(alone[0]), width(alone[1]))
+
+
+def test_with_one_seed_and_task_the_paired_interval_is_that_of_scipy() -> None:
+    generator = np.random.default_rng(0)
+    luck = generator.random(40)
+    ours, theirs = luck < 0.8, (luck + 0.3 * generator.random(40)) < 0.6
+    got = paired_difference(
+        "retention", {0: scores([ours])}, {0: scores([theirs])}, generator, replicates=20_000
+    )
+    expected = stats.bootstrap(
+        (ours.astype(float), theirs.astype(float)),
+        lambda first, second, axis: first.mean(axis) - second.mean(axis),
+        paired=True,
+        method="percentile",
+        n_resamples=20_000,
+        rng=np.random.default_rng(2),
+    ).confidence_interval
+    assert got.low == pytest.approx(expected.low, abs=0.026)
+    assert got.high == pytest.approx(expected.high, abs=0.026)
+
+
+def test_a_difference_can_need_a_reference() -> None:
+    generator = np.random.default_rng(0)
+    shape = layout(2, 10, targets=2, points=2)
+    runs, others, scratch = ({seed: random_run(generator, shape) for seed in range(3)} for _ in range(3))
+    references = {"from_scratch": scratch}
+    difference = paired_difference("forward_transfer", runs, others, generator, references=references)
+    values = [
+        estimate(["forward_transfer"], them, generator, references=references)["forward_transfer"].value
+        for them in (runs, others)
+    ]
+    assert difference.value == pytest.approx((values[0] or 0) - (values[1] or 0))
+    assert width(difference) > 0
+    assert paired_difference("forward_transfer", runs, others, generator) == NOTHING
+
+
+def test_the_matched_points_of_each_seed_are_its_own() -> None:
+    # The first seed reaches the goal at the first point, the second at the last: there they know all.
+    shape = layout(1, 4, points=2)
+    sft = {seed: random_run(np.random.default_rng(seed), shape) for seed in range(2)}
+    runs = {}
+    for seed, selection in enumerate(([[1.0, 1.0]], [[0.0, 1.0]])):
+        on_the_way = np.full((1, 1, 2, 2), 1.0 - seed)
+        success = np.full((2, 2, 4), float(seed))
+        runs[seed] = whole_run(shape, success, on_the_way=on_the_way, validation=np.array(selection))
+    got = estimate(
+        ["retention_at_matched_adaptation"], runs, np.random.default_rng(0), references={"sft": sft}
+    )
+    assert got["retention_at_matched_adaptation"] == Estimate(1.0, 1.0, 1.0)
+
+
+def test_matched_retention_has_no_value_if_one_seed_has_none() -> None:
+    generator = np.random.default_rng(0)
+    shape = layout(2, 10, targets=2, points=3)
+    sft, runs = ({seed: random_run(generator, shape) for seed in range(3)} for _ in range(2))
+    name = "retention_at_matched_adaptation"
+    whole = estimate([name], runs, generator, references={"sft": sft})[name]
+    assert width(whole) > 0
+    runs[1].validation[1] = 0.5
+    assert estimate([name], runs, generator, references={"sft": sft})[name] == NOTHING
+
+
+def test_matched_retention_of_plain_fine_tuning_differs_from_itself_by_nothing() -> None:
+    generator = np.random.default_rng(0)
+    sft = {seed: random_run(generator, layout(2, 10, targets=2, points=3)) for seed in range(3)}
+    got = paired_difference("retention_at_matched_adaptation", sft, sft, generator, references={"sft": sft})
+    assert got == Estimate(0.0, 0.0, 0.0)
+
+
+def test_only_seeds_that_both_have_are_compared() -> None:
+    good, bad = scores(np.ones((2, 5))), scores(np.zeros((2, 5)))
+    difference = paired_difference(
+        "retention", {0: good, 1: bad}, {0: bad, 2: good}, np.random.default_rng(0)
+    )
+    assert difference == Estimate(1.0, 1.0, 1.0)
+    assert paired_difference("retention", {0: good}, {1: bad}, np.random.default_rng(0)) == NOTHING
+
+
+def test_methods_that_met_different_episodes_are_not_compared() -> None:
+    runs, others = {0: scores(np.ones((2, 5)))}, {0: scores(np.ones((2, 6)))}
+    with pytest.raises(ValueError, match="same tasks, episodes"):
+        paired_difference("retention", runs, others, np.random.default_rng(0))
+
+
+def test_every_metric_has_an_interval() -> None:
+    generator = np.random.default_rng(0)
+    shape = layout(5, 20, targets=4, held_out=3, points=4)
+    runs, scratch = ({seed: random_run(generator, shape) for seed in range(3)} for _ in range(2))
+    references = dict.fromkeys(("from_scratch", "joint", "sft"), scratch)
+    estimates = estimate(METRICS, runs, generator, references=references)
+    assert all(one.low is not None for one in estimates.values())
+
+
+def test_a_bootstrap_of_any_quantity_gives_a_difference_of_metrics_its_interval() -> None:
+    generator, shape = np.random.default_rng(5), layout(3, 8, targets=2, points=3)
+    ours, theirs = ([random_run(generator, shape) for _ in range(3)] for _ in range(2))
+    retention = load_metric("retention").over_runs
+    got = bootstrap(
+        lambda rates: retention(rates["ours"]) - retention(rates["theirs"]),
+        {"ours": ours, "theirs": theirs},
+        np.random.default_rng(1),
+        span=(-1, 1),
+    )
+    runs, others = dict(enumerate(ours)), dict(enumerate(theirs))
+    assert got == paired_difference("retention", runs, others, np.random.default_rng(1))

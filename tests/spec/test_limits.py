@@ -1,0 +1,99 @@
+"""Limits: a process that takes too much is ended, said why, and the others go on."""
+
+import os
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import psutil
+import pytest
+
+from clbench.jobs.bars import Bars
+from clbench.jobs.job import Job
+from clbench.jobs.processes import Processes
+from clbench.jobs.scheduler import run_jobs
+from clbench.spec.limits import Limits
+
+Done = Callable[..., dict[str, str]]
+
+JOBS = """
+import os, subprocess, sys, time
+
+def short(progress):
+    return "went well"
+
+def long(progress):
+    time.sleep(60)
+
+def large(progress):
+    memory = b"x" * 800_000_000
+    time.sleep(60)
+
+def writer(progress, path):
+    with open(path, "wb") as file:
+        while True:
+            file.write(bytes(1_000_000))
+            file.seek(0)
+            time.sleep(0.01)
+
+def parent(progress, path):
+    child = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"])
+    open(path, "w").write(str(child.pid))
+    time.sleep(60)
+"""
+
+
+@pytest.fixture(autouse=True)
+def _jobs_module(write_module: Callable[[str, str], None]) -> None:
+    write_module("limited_jobs", JOBS)
+
+
+@pytest.fixture
+def done(bars: Bars) -> Done:
+    """Return a function that does jobs, each its function and limits, and returns what went wrong."""
+
+    def done(*jobs: tuple[str, Limits | None], **arguments: Any) -> dict[str, str]:
+        made = [
+            Job(
+                name, f"limited_jobs:{name}", arguments if name in ("writer", "parent") else {}, 1, (), limits
+            )
+            for name, limits in jobs
+        ]
+        return run_jobs(made, Processes(2), bars)
+
+    return done
+
+
+def test_a_job_that_takes_too_long_is_stopped_and_the_others_are_not(
+    done: Done,
+) -> None:
+    failed = done(("long", Limits(seconds=1.0)), ("short", Limits(seconds=60.0)))
+    assert failed == {"long": "stopped, because it took longer than 1 s"}
+
+
+def test_a_job_that_takes_too_much_memory_is_stopped(done: Done) -> None:
+    (message,) = done(("large", Limits(memory=600_000_000))).values()
+    assert message.startswith("stopped, because it took ")
+    assert message.endswith("GB of memory, more than 0.6 GB")
+
+
+def test_a_job_that_writes_too_much_is_stopped(tmp_path: Path, done: Done) -> None:
+    limits = Limits(written=20_000_000)
+    (message,) = done(("writer", limits), path=os.fspath(tmp_path / "file")).values()
+    assert message.startswith("stopped, because it wrote 0.")
+    assert message.endswith("GB, more than 0.0 GB")
+
+
+def test_what_a_stopped_job_started_is_stopped_too(tmp_path: Path, done: Done) -> None:
+    path = tmp_path / "child"
+    done(("parent", Limits(seconds=2.0)), path=os.fspath(path))
+    child = int(path.read_text())
+    deadline = time.monotonic() + 10
+    while psutil.pid_exists(child) and psutil.Process(child).status() != psutil.STATUS_ZOMBIE:
+        assert time.monotonic() < deadline
+        time.sleep(0.1)
+
+
+def test_a_process_that_is_gone_is_beyond_no_limit() -> None:
+    assert Limits().exceeded(2**22 - 1, 1.0) is None

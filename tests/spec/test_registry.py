@@ -1,0 +1,127 @@
+"""A scenario of a stranger: what registers it, and what is said of one that cannot be."""
+
+import dataclasses
+import sys
+import types
+from collections.abc import Iterator
+from typing import Any
+
+import gymnasium
+import pytest
+
+from clbench.spec.registry import load_scenario, register, scenario_at
+from clbench.spec.scenario import Scenario
+from clbench.testing import TOY
+
+MINE = dataclasses.replace(TOY, id="me/Mine-v0")
+
+
+@pytest.fixture(autouse=True)
+def module() -> Iterator[types.ModuleType]:
+    """A stranger's module, and a registry that forgets what a test registers."""
+    module = types.ModuleType("strangers_module")
+    vars(module).update(MINE=MINE, MORE=(MINE,), task=MINE.target[0])
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(sys.modules, module.__name__, module)
+        patch.setattr("gymnasium.envs.registration.registry", dict(gymnasium.registry))
+        patch.setattr("gymnasium.registry", gymnasium.envs.registration.registry)
+        yield module
+
+
+def test_one_call_makes_a_scenario_and_its_environments() -> None:
+    register("me/Mine-v0", "strangers_module:MINE")
+    assert load_scenario("me/Mine-v0") is MINE
+    assert gymnasium.make("me/Mine-v0").unwrapped.scenario is MINE  # type: ignore[attr-defined]
+    many = gymnasium.make_vec("me/Mine-v0", num_envs=2)
+    assert type(many.unwrapped).__name__ == "ScenarioVectorEnv"
+    register("me/Mine-v0", "strangers_module:MINE")  # a module may be imported again
+
+
+def test_nothing_is_imported_before_it_is_used() -> None:
+    register("me/Later-v0", "no_such_module:SCENARIO")
+    with pytest.raises(
+        LookupError, match="No module 'no_such_module' can be imported for 'no_such_module:SCE"
+    ):
+        load_scenario("me/Later-v0")
+    with pytest.raises(LookupError, match="No module 'no_such_module' can be imported"):
+        gymnasium.make("me/Later-v0")
+
+
+@pytest.mark.parametrize(
+    ("name", "entry_point", "message"),
+    [
+        ("Mine-v0", "strangers_module:MINE", "must be of the form namespace/Name-v0"),
+        ("me/Mine", "strangers_module:MINE", "must be of the form namespace/Name-v0"),
+        ("me/../x-v0", "strangers_module:MINE", "must be of the form namespace/Name-v0"),
+        ("c1bench/Mine-v0", "strangers_module:MINE", "can be taken for a scenario of clbench"),
+        ("clbench/fetch-v0", "strangers_module:MINE", "can be taken for the scenario 'clbench/Fetch-v0'"),
+        ("clbench/Mine-v0", "strangers_module:MINE", "in the namespace of clbench: choose your own"),
+        (
+            "clbench/Fetch-v0",
+            "clbench.testing:TOY",
+            "is registered already, and not for 'clbench.testing:TOY'",
+        ),
+        ("me/Mine-v0", "strangers_module", "must be the place of a scenario, as 'package.module:SCENARIO'"),
+        ("me/Mine-v0", "strangers_module.MINE:", "must be the place of a scenario"),
+        ("me/Mine-v0", ":MINE", "must be the place of a scenario"),
+    ],
+)
+def test_what_cannot_be_registered_is_refused_by_name(name: str, entry_point: str, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        register(name, entry_point)
+
+
+@pytest.mark.parametrize(
+    ("entry_point", "message"),
+    [
+        ("strangers_module:MINNE", "No entry point 'strangers_module:MINNE': .* Did you mean 'MINE'"),
+        ("strangers_module:MORE", "'strangers_module:MORE' is no Scenario but a tuple"),
+    ],
+)
+def test_a_place_without_a_scenario_is_named_when_it_is_used(entry_point: str, message: str) -> None:
+    register("me/Other-v0", entry_point)
+    with pytest.raises(LookupError, match=message):
+        load_scenario("me/Other-v0")
+
+
+def test_an_id_that_the_scenario_does_not_have_is_named() -> None:
+    register("me/Other-v0", "strangers_module:MINE")
+    with pytest.raises(LookupError, match="registered as 'me/Other-v0', but its id is 'me/Mine-v0'"):
+        load_scenario("me/Other-v0")
+
+
+def test_a_word_outside_the_vocabulary_is_named_with_the_nearest(module: types.ModuleType) -> None:
+    strange = dataclasses.replace(MINE.target[0], name="odd", instructions=("go wright",))
+    vars(module).update(ODD=dataclasses.replace(MINE, target=(strange,)))
+    with pytest.raises(
+        ValueError, match=r"'wright' in 'go wright' is not in the vocabulary\. Did you mean 'right'"
+    ):
+        scenario_at("strangers_module:ODD")
+
+
+@pytest.mark.parametrize(
+    ("changes", "error", "message"),
+    [
+        ({"horizon": 0}, ValueError, "horizon of the task right must be at least 1 step, not 0"),
+        ({"instructions": ()}, ValueError, "task right needs an instruction"),
+        ({"instructions": ("go right", " ")}, ValueError, "none of them may be empty"),
+        ({"instructions": "go right"}, TypeError, "must be a tuple of texts, not one text"),
+        ({"name": "../right"}, ValueError, "cannot be the name of a task"),
+    ],
+)
+def test_a_task_that_cannot_be_is_refused_where_it_is_built(
+    changes: dict[str, Any], error: type[Exception], message: str
+) -> None:
+    with pytest.raises(error, match=message):
+        dataclasses.replace(TOY.target[0], **changes)
+
+
+def test_two_tasks_of_one_name_are_refused_where_the_scenario_is_built() -> None:
+    with pytest.raises(ValueError, match="me/Mine-v0: two tasks are called 'left'"):
+        Scenario("me/Mine-v0", "", TOY.retained, TOY.target, TOY.retained[:1], TOY.questions)
+
+
+def test_tasks_that_are_seen_differently_are_refused_where_the_scenario_is_built() -> None:
+    seen = tuple(dataclasses.replace(task, camera="mine:Camera") for task in TOY.target)
+    with pytest.raises(ValueError, match=r"the same camera, not \['mine:Camera', 'none'\]"):
+        Scenario("me/Mine-v0", "", TOY.retained, seen, (), TOY.questions)

@@ -1,0 +1,695 @@
+"""The contract: faults that were planted are found, each by its own message; sound methods pass."""
+
+import dataclasses
+import os
+import pickle
+import random
+import sys
+import time
+import warnings
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor, nn
+
+from clbench.learning.method import Method, Progress, Stage, State
+from clbench.learning.prior import Prior, Source, Uses
+from clbench.learning.registry import load_method
+from clbench.policy.batch import Batch
+from clbench.policy.policy import Policy
+from clbench.testing import Check, ContractError, check_method, method_checks
+from clbench.testing.toy_run import HOOKS, ToyRun
+
+# mypy: disable-error-code="arg-type, assignment, attr-defined, dict-item, override"
+# The faults are such that a type checker finds many of them.
+
+CONTRACT = Path(__file__).parents[2] / "docs" / "guide" / "contract.md"
+
+
+# ---- faults of the class -----------------------------------------------------------------------------------
+
+
+class Plain(Method):
+    """Is no dataclass."""
+
+
+@dataclasses.dataclass
+class Silent(Method):  # noqa: D101 - the fault
+    rate: float = 0.5
+
+
+@dataclasses.dataclass
+class Annotated(Method):
+    """Makes its declaration a hyper-parameter."""
+
+    uses: Uses = Uses(questions="prepare")  # noqa: RUF009 - the fault
+
+
+@dataclasses.dataclass
+class Undeclared(Method):
+    """Declares by a word."""
+
+    uses = "questions"
+
+
+@dataclasses.dataclass
+class Misdeclared(Method):
+    """Declares a time that there is not."""
+
+    uses = Uses(questions="always")
+
+
+@dataclasses.dataclass
+class Misspelt(Method):
+    """Misspells a hook."""
+
+    def gradient(self, policy: Policy, loss: Tensor) -> None:
+        loss.backward()  # type: ignore[no-untyped-call]
+
+
+@dataclasses.dataclass
+class Forgetful(Method):
+    """Leaves out an argument of a hook."""
+
+    def loss(self, policy: Policy, batch: Batch) -> Tensor:
+        return policy.action_loss(batch).mean()
+
+
+@dataclasses.dataclass
+class Demanding(Method):
+    """Has a hyper-parameter without a default."""
+
+    rate: float
+
+
+@dataclasses.dataclass
+class Prepared(Method):
+    """Sets what it learns in the constructor."""
+
+    def __post_init__(self) -> None:
+        self.buffer: list[Tensor] = []
+
+
+@dataclasses.dataclass
+class Rounding(Method):
+    """Changes what it is given."""
+
+    rate: float = 0.5
+
+    def __post_init__(self) -> None:
+        self.rate = round(self.rate)
+
+
+@dataclasses.dataclass
+class Loaded(Method):
+    """Has a tensor as hyper-parameter."""
+
+    weights: Tensor = dataclasses.field(default_factory=lambda: torch.zeros(2))
+
+
+@dataclasses.dataclass(eq=False)
+class Unequal(Method):
+    """Has objects that differ."""
+
+
+@dataclasses.dataclass
+class Learned(Method):
+    """Has a field for what it learns."""
+
+    anchor: float = dataclasses.field(default=0.0, init=False)
+
+
+@dataclasses.dataclass
+class Seeded(Method):
+    """Seeds in the constructor."""
+
+    def __post_init__(self) -> None:
+        torch.manual_seed(0)
+
+
+@dataclasses.dataclass
+class Picky(Method):
+    """Refuses its own defaults."""
+
+    def __post_init__(self) -> None:
+        raise ValueError("never")
+
+
+# ---- faults of a hook --------------------------------------------------------------------------------------
+
+
+@dataclasses.dataclass
+class Counts(Method):
+    """Returns a share of steps."""
+
+    def prepare(self, policy: Policy, prior: Prior) -> float:
+        return 0.5
+
+
+@dataclasses.dataclass
+class Idle(Method):
+    """Trains nothing and competes."""
+
+    def start_task(self, policy: Policy, stage: Stage) -> Iterable[nn.Parameter]:
+        return ()
+
+
+@dataclasses.dataclass
+class Nameless(Method):
+    """Returns names and no parameters."""
+
+    def start_task(self, policy: Policy, stage: Stage) -> list[str]:
+        return [name for name, _ in policy.named_parameters()]
+
+
+@dataclasses.dataclass
+class Freezes(Method):
+    """Freezes what it wants to train."""
+
+    def start_task(self, policy: Policy, stage: Stage) -> Iterable[nn.Parameter]:
+        return policy.requires_grad_(False).parameters()
+
+
+@dataclasses.dataclass
+class Greedy(Method):
+    """Takes two batches in a step."""
+
+    def batch(self, target: Source[Batch], prior: Prior) -> Batch:
+        return target.sample(2 * target.batch_size)
+
+
+@dataclasses.dataclass
+class PerSample(Method):
+    """Takes no mean."""
+
+    def loss(self, policy: Policy, batch: Batch, progress: Progress) -> Tensor:
+        return policy.action_loss(batch)
+
+
+@dataclasses.dataclass
+class Diverges(Method):
+    """Has a loss that is no number."""
+
+    def loss(self, policy: Policy, batch: Batch, progress: Progress) -> Tensor:
+        return policy.action_loss(batch).mean() * float("nan")
+
+
+@dataclasses.dataclass
+class Detached(Method):
+    """Has a loss without a gradient."""
+
+    def loss(self, policy: Policy, batch: Batch, progress: Progress) -> Tensor:
+        return policy.action_loss(batch).mean().detach()
+
+
+@dataclasses.dataclass
+class NoGradients(Method):
+    """Forgets to go backward."""
+
+    def gradients(self, policy: Policy, loss: Tensor) -> None:
+        pass
+
+
+@dataclasses.dataclass
+class Whole(Method):
+    """Has a whole number as step size."""
+
+    def learning_rate(self, scheduled: float, progress: Progress) -> int:
+        return 1
+
+
+@dataclasses.dataclass
+class Poisons(Method):
+    """Leaves weights that are no numbers."""
+
+    def end_task(self, policy: Policy, stage: Stage) -> None:
+        policy.state_dict()["head.position"].fill_(float("nan"))
+
+
+@dataclasses.dataclass
+class Breaks(Method):
+    """Raises an error."""
+
+    def end_task(self, policy: Policy, stage: Stage) -> None:
+        raise RuntimeError(f"cannot merge {stage.task.name}")
+
+
+@dataclasses.dataclass
+class Boasts(Method):
+    """Tells what JSON does not have."""
+
+    def diagnostics(self) -> dict[str, Any]:
+        return {"gain": float("inf")}
+
+
+# ---- faults of data ----------------------------------------------------------------------------------------
+
+
+@dataclasses.dataclass
+class Sneaks(Method):
+    """Replays without a declaration."""
+
+    def batch(self, target: Source[Batch], prior: Prior) -> Batch:
+        return prior.demonstrations.sample(4)
+
+
+@dataclasses.dataclass
+class Lingers(Method):
+    """Replays what it declares for the preparation alone."""
+
+    uses = Uses(demonstrations="prepare")
+
+    def prepare(self, policy: Policy, prior: Prior) -> None:
+        prior.demonstrations.sample(1)
+
+    def batch(self, target: Source[Batch], prior: Prior) -> Batch:
+        return prior.demonstrations.sample(4)
+
+
+@dataclasses.dataclass
+class Hoards(Method):
+    """Goes on drawing from the first target."""
+
+    kept: ClassVar[list[Source[Batch]]] = []
+
+    def batch(self, target: Source[Batch], prior: Prior) -> Batch:
+        self.kept.append(target)
+        return self.kept[0].sample(4)
+
+
+@dataclasses.dataclass
+class Modest(Method):
+    """Declares what it does not use."""
+
+    uses = Uses(questions="throughout")
+
+
+@dataclasses.dataclass
+class Early(Method):
+    """Declares more than it uses."""
+
+    uses = Uses(demonstrations="throughout")
+
+    def prepare(self, policy: Policy, prior: Prior) -> None:
+        prior.demonstrations.sample(8)
+
+
+# ---- faults of repetition and state ------------------------------------------------------------------------
+
+
+@dataclasses.dataclass
+class Timed(Method):
+    """Weighs by the clock."""
+
+    def loss(self, policy: Policy, batch: Batch, progress: Progress) -> Tensor:
+        return policy.action_loss(batch).mean() * (1 + time.perf_counter() % 1)
+
+
+@dataclasses.dataclass
+class Remembers(Method):
+    """Counts in its class."""
+
+    runs: ClassVar[list[int]] = []
+
+    def prepare(self, policy: Policy, prior: Prior) -> None:
+        self.runs.append(1)
+
+    def diagnostics(self) -> dict[str, Any]:
+        return {"runs": len(self.runs)}
+
+
+@dataclasses.dataclass
+class Reseeds(Method):
+    """Seeds before it draws."""
+
+    def batch(self, target: Source[Batch], prior: Prior) -> Batch:
+        np.random.seed(0)  # noqa: NPY002 - the fault
+        return target.sample(target.batch_size)
+
+
+@dataclasses.dataclass
+class Anchored(Method):
+    """Keeps the anchor in the object alone."""
+
+    def prepare(self, policy: Policy, prior: Prior) -> None:
+        self.anchor = policy.state_mean.clone()
+
+    def loss(self, policy: Policy, batch: Batch, progress: Progress) -> Tensor:
+        return policy.action_loss(batch).mean() + self.anchor.sum()
+
+
+@dataclasses.dataclass
+class Restarts(Method):
+    """Begins to count anew without a word."""
+
+    def gradients(self, policy: Policy, loss: Tensor) -> None:
+        self.count = getattr(self, "count", 0) + 1
+        loss.backward()  # type: ignore[no-untyped-call]
+        for parameter in policy.parameters():
+            if parameter.grad is not None:
+                parameter.grad.mul_(0.1**self.count)
+
+
+@dataclasses.dataclass
+class Structured(Method):
+    """Has a list as state."""
+
+    def state(self) -> State:
+        return {"losses": [0.5]}
+
+
+@dataclasses.dataclass
+class OneWay(Method):
+    """Cannot take back its state."""
+
+    def state(self) -> State:
+        return {"count": 1}
+
+
+@dataclasses.dataclass
+class Grows(Method):
+    """Adds a parameter and never again."""
+
+    def prepare(self, policy: Policy, prior: Prior) -> None:
+        policy.register_parameter("scale", nn.Parameter(torch.ones(3)))
+
+
+@dataclasses.dataclass
+class Draws(Method):
+    """Draws while it tells."""
+
+    def diagnostics(self) -> dict[str, Any]:
+        return {"luck": bool(random.random() < 2)}
+
+
+# ---- faults that stay in the process -----------------------------------------------------------------------
+
+
+@dataclasses.dataclass
+class Threads(Method):
+    """Takes more threads."""
+
+    def prepare(self, policy: Policy, prior: Prior) -> None:
+        torch.set_num_threads(2)
+
+
+@dataclasses.dataclass
+class Doubles(Method):
+    """Changes the default dtype."""
+
+    def prepare(self, policy: Policy, prior: Prior) -> None:
+        torch.set_default_dtype(torch.float64)
+
+
+@dataclasses.dataclass
+class Blind(Method):
+    """Turns gradients off."""
+
+    def end_task(self, policy: Policy, stage: Stage) -> None:
+        torch.set_grad_enabled(False)
+
+
+@dataclasses.dataclass
+class Careless(Method):
+    """Allows what does not repeat itself."""
+
+    def start_task(self, policy: Policy, stage: Stage) -> Iterable[nn.Parameter]:
+        torch.use_deterministic_algorithms(False)
+        return policy.parameters()
+
+
+@dataclasses.dataclass
+class Exports(Method):
+    """Sets a variable of the environment."""
+
+    def prepare(self, policy: Policy, prior: Prior) -> None:
+        os.environ["LIVELY"] = "1"
+
+
+@dataclasses.dataclass
+class Moves(Method):
+    """Changes the working directory."""
+
+    def prepare(self, policy: Policy, prior: Prior) -> None:
+        os.chdir("/")
+
+
+@dataclasses.dataclass
+class Paths(Method):
+    """Changes where modules are looked for."""
+
+    def prepare(self, policy: Policy, prior: Prior) -> None:
+        sys.path.append("/nowhere")
+
+
+@dataclasses.dataclass
+class Quiet(Method):
+    """Silences warnings."""
+
+    def prepare(self, policy: Policy, prior: Prior) -> None:
+        warnings.simplefilter("ignore")
+
+
+@dataclasses.dataclass
+class Writes(Method):
+    """Writes a file."""
+
+    def end_task(self, policy: Policy, stage: Stage) -> None:
+        Path("losses.txt").write_text("0.5")
+
+
+@dataclasses.dataclass
+class Patches(Method):
+    """Changes what all policies are."""
+
+    def prepare(self, policy: Policy, prior: Prior) -> None:
+        setattr(Policy, "predict", Policy.act)  # noqa: B010 - mypy minds an assignment
+
+
+# ---- faults of learning ------------------------------------------------------------------------------------
+
+
+@dataclasses.dataclass
+class Standstill(Method):
+    """Takes steps of length 0."""
+
+    def learning_rate(self, scheduled: float, progress: Progress) -> float:
+        return 0.0
+
+
+@dataclasses.dataclass
+class Backwards(Method):
+    """Ascends."""
+
+    def loss(self, policy: Policy, batch: Batch, progress: Progress) -> Tensor:
+        return -policy.action_loss(batch).mean()
+
+
+FAULTS: list[tuple[Any, str, str, str]] = [
+    (3, "declaration", "a subclass of clbench.Method", "found:    3"),
+    (Plain, "declaration", "a dataclass", "Plain is not decorated"),
+    (Silent, "declaration", "a docstring of the class", "none"),
+    (Annotated, "declaration", "without an annotation", "uses is a field of the dataclass"),
+    (Undeclared, "declaration", "uses to be a Uses", "'questions'"),
+    (Misdeclared, "declaration", "uses.questions to be one of never, prepare, throughout", "'always'"),
+    (Misspelt, "declaration", "did you mean gradients()?", "gradient() is never called"),
+    (Forgetful, "declaration", "loss(self, policy, batch, progress)", "loss(self, policy, batch)"),
+    (Demanding, "constructor", "a default for every hyper-parameter", "rate has none"),
+    (Prepared, "constructor", "only hyper-parameters to be stored", "it sets buffer"),
+    (Rounding, "constructor", "to be kept as they are given", "rate=0.5 becomes 0"),
+    (Loaded, "constructor", "numbers, truth values, text", "weights is a Tensor"),
+    (Unequal, "constructor", "equal objects from equal arguments", "two objects of the defaults differ"),
+    (Learned, "constructor", "every field to be a hyper-parameter", "anchor has init=False"),
+    (Seeded, "constructor", "nothing to be done but storing", "torch's random generator was moved or set"),
+    (Picky, "constructor", "an object of the defaults to be made", "ValueError: never"),
+    (Counts, "sound hooks", "the optimiser steps that it took, or None", "0.5"),
+    (Idle, "sound hooks", "only a guide, `uses = Uses(reference=True)`, may train none", "none"),
+    (Nameless, "sound hooks", "an iterable of the policy's parameters", "a str among them"),
+    (Freezes, "sound hooks", "parameters that require a gradient", "one that does not"),
+    (Greedy, "sound hooks", "at most target.batch_size = 16 samples of the target in a step", "32 samples"),
+    (PerSample, "sound hooks", "a finite scalar tensor", "loss must be a scalar, shape (), not (16,)"),
+    (Diverges, "sound hooks", "a finite scalar tensor", "loss is nan, not finite"),
+    (Detached, "sound hooks", "tensor that has a gradient", "loss has no gradient; was it detached?"),
+    (NoGradients, "sound hooks", "finite gradients of the trained parameters", "no parameter"),
+    (Whole, "sound hooks", "a finite float from 0", "the step size must be a number from 0, not 1"),
+    (Poisons, "sound hooks", "a policy of finite weights", "head.position is not finite after 'right'"),
+    (Breaks, "sound hooks", "end_task() to go through", "RuntimeError: cannot merge right"),
+    (Boasts, "sound hooks", "what JSON can hold", "not JSON compliant"),
+    (Sneaks, "declared data", "what `uses` declares", "prior demonstrations that it does not declare"),
+    (Lingers, "declared data", "what `uses` declares", "does not declare for this hook"),
+    (Hoards, "declared data", "to draw from what it is handed", "after the hooks that it was handed to"),
+    (Modest, "declared data", "prior questions to be drawn", "they are never drawn; leave them out"),
+    (Early, "declared data", "prior demonstrations to be drawn", "in prepare() alone; declare 'prepare'"),
+    (Timed, "same numbers", "two runs with one seed to be equal", "differs in stage 1 (right) by up to"),
+    (Remembers, "same numbers", "two runs with one seed to be equal", "diagnostics differs in prepare"),
+    (Reseeds, "seeding", "draw, but do not seed", "after batch() numpy.random stands alike"),
+    (Anchored, "state", "a new object that has what load_state() sets", "no attribute 'anchor'"),
+    (Restarts, "state", "state() to return all that later stages need", "differs in stage 2 (down)"),
+    (Structured, "state", "tensors and plain values", "a list, 'losses'"),
+    (OneWay, "state", "load_state() to go through", "returns a state() but has no load_state()"),
+    (Grows, "state", "load_state() to add to a plain policy what prepare() added", "scale"),
+    (Draws, "global state", "as it was", "after diagnostics() Python's random generator was moved"),
+    (Threads, "global state", "as it was", "after prepare() torch.get_num_threads() is 2, was 1"),
+    (Doubles, "global state", "as it was", "torch.get_default_dtype() is torch.float64"),
+    (Blind, "global state", "as it was", "after end_task() torch.is_grad_enabled() is False"),
+    (Careless, "global state", "as it was", "are_deterministic_algorithms_enabled() is False"),
+    (Exports, "global state", "as it was", "os.environ differs in LIVELY"),
+    (Moves, "global state", "as it was", "os.getcwd() is /"),
+    (Paths, "global state", "as it was", "sys.path differs in /nowhere"),
+    (Quiet, "global state", "as it was", "warnings.filters differs in"),
+    (Writes, "global state", "in clbench's cache alone", "losses.txt is written"),
+    (Patches, "global state", "as it was", "the class clbench.Policy differs in predict"),
+    (Standstill, "learning", "a mean return of -", "before"),
+    (Backwards, "learning", "only a guide, `uses = Uses(reference=True)`, may learn nothing", "before"),
+]
+
+
+@pytest.mark.parametrize(("cls", "clause", "expected", "found"), FAULTS)
+def test_a_planted_fault_is_found_by_its_own_message(
+    cls: Any, clause: str, expected: str, found: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ContractError) as caught:
+        check_method(cls)
+    error = caught.value
+    assert error.clause == clause
+    assert expected in f"expected: {error.expected}"
+    assert found in f"found:    {error.found}"
+
+
+def test_no_two_faults_have_the_same_message() -> None:
+    assert len({(expected, found) for _, _, expected, found in FAULTS}) == len(FAULTS)
+
+
+def test_a_message_says_what_was_expected_what_was_found_and_where_to_look() -> None:
+    with pytest.raises(ContractError) as caught:
+        check_method(Forgetful)
+    assert str(caught.value).splitlines() == [
+        "The method breaks the contract: declaration.",
+        "  expected: loss(self, policy, batch, progress)",
+        "  found:    loss(self, policy, batch)",
+        "  look at:  loss(); docs/guide/contract.md#declaration",
+    ]
+
+
+def test_an_error_survives_the_way_from_another_process() -> None:
+    error = ContractError("state", "one", "two", "three")
+    assert str(pickle.loads(pickle.dumps(error))) == str(error)
+
+
+def test_the_page_of_the_contract_has_a_heading_for_each_clause_in_order() -> None:
+    lines = CONTRACT.read_text(encoding="utf-8").splitlines()
+    headings = [line.removeprefix("## ") for line in lines if line.startswith("## ")]
+    assert headings == [str(check).replace("_", " ").capitalize() for check in method_checks(Method)]
+
+
+def test_what_a_faulty_method_leaves_behind_is_put_back(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+
+    def process() -> list[Any]:
+        torch_settings = (torch.get_num_threads(), torch.get_default_dtype(), torch.is_grad_enabled())
+        generators = (random.getstate(), str(np.random.get_state()), torch.get_rng_state().tolist())  # noqa: NPY002
+        return [*torch_settings, *generators, dict(os.environ), Path.cwd(), list(sys.path), Policy.predict]
+
+    before = process()
+    for cls in (Seeded, Threads, Doubles, Exports, Moves, Patches, Draws):
+        with pytest.raises(ContractError):
+            check_method(cls)
+    assert process() == before
+
+
+@dataclasses.dataclass(frozen=True)
+class Sound(Method):
+    """Draws from every generator, keeps a state, and uses all that it declares."""
+
+    share: float = 0.5
+    words: str = "a text"
+
+    uses = Uses(demonstrations="prepare", questions="throughout")
+
+    def prepare(self, policy: Policy, prior: Prior) -> int:
+        object.__setattr__(self, "anchor", prior.demonstrations.sample(4).state.mean(dim=0))
+        return 1
+
+    def batch(self, target: Source[Batch], prior: Prior) -> Any:
+        return target.sample(round(self.share * target.batch_size)), prior.questions.sample(2)
+
+    def loss(self, policy: Policy, batch: Any, progress: Progress) -> Tensor:
+        demonstrations, questions = batch
+        noise = torch.rand(()) + random.random() + float(np.random.rand())  # noqa: NPY002 - it may
+        pull: Tensor = noise * (policy.state_mean - self.anchor).sum()
+        return policy.action_loss(demonstrations).mean() + policy.answer_loss(questions).mean() + pull
+
+    def state(self) -> State:
+        return {"anchor": self.anchor, "words": self.words}
+
+    def load_state(self, policy: Policy, state: State) -> None:
+        object.__setattr__(self, "anchor", state["anchor"])
+
+
+@dataclasses.dataclass
+class Seldom(Method):
+    """Asks a question at a few of the steps."""
+
+    uses = Uses(questions="throughout")
+
+    def batch(self, target: Source[Batch], prior: Prior) -> Any:
+        self.step += 1
+        return target.sample(target.batch_size), prior.questions.sample(4) if self.step % 9 == 0 else None
+
+    def start_task(self, policy: Policy, stage: Stage) -> Iterable[nn.Parameter]:
+        self.step = 0
+        return policy.parameters()
+
+    def loss(self, policy: Policy, batch: Any, progress: Progress) -> Tensor:
+        demonstrations, questions = batch
+        loss = policy.action_loss(demonstrations).mean()
+        return loss if questions is None else loss + policy.answer_loss(questions).mean()
+
+
+def test_prior_data_may_be_drawn_at_few_steps() -> None:
+    check_method(Seldom)
+
+
+CHECKS = method_checks(Sound)
+
+
+@pytest.mark.parametrize("check", CHECKS, ids=str)
+def test_a_sound_method_keeps_every_clause(check: Check) -> None:
+    check()
+
+
+def test_the_checks_have_names() -> None:
+    assert [str(check) for check in CHECKS][:3] == ["declaration", "constructor", "sound_hooks"]
+
+
+def test_settings_shorten_a_preparation() -> None:
+    ewc = load_method("ewc")
+    (check,) = (check for check in method_checks(ewc, samples=1) if str(check) == "sound_hooks")
+    assert check.subject.build() == ewc(samples=1)  # type: ignore[call-arg]
+    check()
+
+
+def test_the_hooks_are_called_in_the_order_that_the_page_tells() -> None:
+    called: list[str] = []
+
+    def telling(hook: str) -> Any:
+        def call(self: Method, *arguments: Any) -> Any:
+            called.append(hook)
+            return getattr(Method, hook)(self, *arguments)
+
+        return call
+
+    telltale: type[Method] = dataclasses.dataclass(
+        type("Telltale", (Method,), {hook: telling(hook) for hook in HOOKS})
+    )
+    ToyRun(telltale, targets=2, steps=2)
+    step = ["batch", "loss", "gradients", "learning_rate"]
+    stage = ["load_state", "start_task", *step, *step, "end_task", "diagnostics", "state"]
+    assert called == ["prepare", "diagnostics", "state", *stage, *stage, "load_state"]

@@ -1,0 +1,212 @@
+"""`check_scenario`: it passes what is sound, and names the first thing that is not."""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from gymnasium import spaces
+
+from clbench.data.questions import QuestionKind
+from clbench.spec.scenario import Scenario
+from clbench.testing import TOY, TOY_QUESTIONS, ScenarioError, ToyWorld, check_scenario, toy_expert
+from clbench.worlds.lanes import PlainVectorWorld
+
+HERE = f"{__name__}:"
+
+
+class Rounded(ToyWorld):
+    """States are of another type than their space."""
+
+    def reset(self, **options: Any) -> tuple[Any, dict[str, Any]]:
+        state, info = super().reset(**options)
+        return state.astype(np.float64), info
+
+
+class Remembering(ToyWorld):
+    """An episode depends on how many were run before."""
+
+    episodes = 0
+
+    def reset(self, **options: Any) -> tuple[Any, dict[str, Any]]:
+        state, info = super().reset(**options)
+        self.episodes += 1
+        state[3] += self.episodes
+        return state, info
+
+
+class Alike(ToyWorld):
+    """All seeds begin alike."""
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
+        return super().reset(seed=0, options=options)
+
+
+class Mute(ToyWorld):
+    """Its info does not say success."""
+
+    def step(self, action: Any) -> Any:
+        return *super().step(action)[:4], {}
+
+
+class Giving(ToyWorld):
+    """It is a success whatever is done."""
+
+    def step(self, action: Any) -> Any:
+        state, reward, *_ = super().step(action)
+        return state, reward, True, False, {"success": True}
+
+
+class Lost(ToyWorld):
+    """Its rewards are no numbers."""
+
+    def step(self, action: Any) -> Any:
+        state, _, *rest = super().step(action)
+        return state, float("nan"), *rest
+
+
+class Strong(ToyWorld):
+    """Its actions go beyond 1."""
+
+    action_space = spaces.Box(-2.0, 2.0, (2,), np.float32)
+
+
+class Framed(ToyWorld):
+    """Its observation is a dictionary."""
+
+    observation_space = spaces.Dict({"state": ToyWorld.observation_space})  # type: ignore[assignment]
+
+
+class Wide(ToyWorld):
+    """Its states are longer than those of the toy."""
+
+    observation_space = spaces.Box(-np.inf, np.inf, (5,), np.float32)
+
+    def reset(self, **options: Any) -> Any:
+        state, info = super().reset(**options)
+        return np.append(state, np.float32(0)), info
+
+    def step(self, action: Any) -> Any:
+        state, *rest = super().step(action)
+        return np.append(state, np.float32(0)), *rest
+
+
+class Askew(ToyWorld):
+    """Side by side its episodes are others."""
+
+    @staticmethod
+    def vector_world(lanes: int, threads: int) -> PlainVectorWorld:
+        return PlainVectorWorld(Remembering, lanes)
+
+
+def lazy(task: str) -> Callable[[Any], Any]:
+    return lambda _: np.zeros(2, np.float32)
+
+
+def long(task: str) -> Callable[[Any], Any]:
+    return lambda _: np.zeros(3, np.float32)
+
+
+def careless(task: str) -> Callable[[Any], Any]:
+    """It forgets how to go down."""
+    return toy_expert("up" if task == "down" else task)
+
+
+def fractions(states: Any) -> Any:
+    """Answer with a number that is not whole."""
+    return np.zeros(len(states))
+
+
+NO_QUESTIONS: tuple[QuestionKind, ...] = ()
+TWICE = TOY_QUESTIONS[:1] * 2
+ONE_ANSWER = (dataclasses.replace(TOY_QUESTIONS[0], answers=("left",)),)
+LONG_ANSWER = (dataclasses.replace(TOY_QUESTIONS[0], answers=("left", "to the right")),)
+STRANGE_WORD = (dataclasses.replace(TOY_QUESTIONS[0], wordings=("wherefore is it",)),)
+THIRD_ANSWER = (dataclasses.replace(TOY_QUESTIONS[0], answers=("left", "right", "up")),)
+TOO_HIGH = (dataclasses.replace(TOY_QUESTIONS[0], answer=lambda states: np.full(len(states), 2)),)
+FLOATS = (dataclasses.replace(TOY_QUESTIONS[0], answer=fractions),)
+
+
+def with_parts(**parts: str) -> Scenario:
+    """Return the toy with the world or the expert of all tasks replaced."""
+    groups: dict[str, Any] = {
+        group: tuple(
+            dataclasses.replace(task, **{name: HERE + part for name, part in parts.items()})
+            for task in getattr(TOY, group)
+        )
+        for group in ("retained", "target", "held_out")
+    }
+    return dataclasses.replace(TOY, **groups)
+
+
+def test_the_toy_passes() -> None:
+    check_scenario(TOY)
+
+
+@pytest.mark.parametrize(
+    ("world", "message"),
+    [
+        ("Rounded", "task left, step 0: the state is not in"),
+        ("Remembering", "the same seed and actions give another episode after other episodes"),
+        ("Alike", "all seeds have the same initial state"),
+        ("Mute", r'terminated is True, but info\["success"\] None'),
+        ("Giving", "done by doing nothing"),
+        ("Lost", "step 0: the reward is nan"),
+        ("Strong", "actions must go from -1 to 1"),
+        ("Framed", "observation space must be a Box of one axis"),
+        ("Askew", "side by side its episodes differ"),
+    ],
+)
+def test_a_world_that_is_not_sound_is_named(world: str, message: str) -> None:
+    with pytest.raises(ScenarioError, match=message):
+        check_scenario(with_parts(world=world), episodes=3)
+
+
+@pytest.mark.parametrize(
+    ("expert", "message"),
+    [
+        ("lazy", "expert .*:lazy succeeds in 0% of 3 episodes, not in 90%"),
+        ("careless", "task down: its expert .* succeeds in 0%"),
+        ("long", "the action of .*:long must be in Box"),
+    ],
+)
+def test_an_expert_that_cannot_do_its_task_is_named(expert: str, message: str) -> None:
+    with pytest.raises(ScenarioError, match=message):
+        check_scenario(with_parts(expert=expert), episodes=3)
+
+
+@pytest.mark.parametrize(
+    ("questions", "message"),
+    [
+        ("NO_QUESTIONS", "there must be questions"),
+        ("TWICE", "each kind with a name of its own"),
+        ("ONE_ANSWER", "answers must be two words or more"),
+        ("LONG_ANSWER", "answers must be two words or more"),
+        ("STRANGE_WORD", "'wherefore' in 'wherefore is it' is not in the vocabulary"),
+        ("THIRD_ANSWER", "'up' is never the answer"),
+        ("TOO_HIGH", "answers must be from -1 to 1"),
+        ("FLOATS", "must be whole numbers"),
+    ],
+)
+def test_questions_that_cannot_be_asked_are_named(questions: str, message: str) -> None:
+    with pytest.raises(ScenarioError, match=message):
+        check_scenario(dataclasses.replace(TOY, questions=HERE + questions), episodes=3)
+
+
+def test_worlds_of_different_sizes_are_named() -> None:
+    wide = dataclasses.replace(TOY.held_out[0], world=f"{HERE}Wide")
+    with pytest.raises(
+        ScenarioError, match=r"one size in all worlds, not .*ToyWorld \(4, 2\), .*Wide \(5, 2\)"
+    ):
+        check_scenario(dataclasses.replace(TOY, held_out=(wide,)), episodes=3)
+
+
+def test_an_entry_point_that_is_not_there_is_named() -> None:
+    with pytest.raises(LookupError, match=r"has no 'Giveing'\. Did you mean 'Giving'"):
+        check_scenario(with_parts(world="Giveing"))
+
+
+def test_a_scenario_without_a_target_is_named() -> None:
+    with pytest.raises(ScenarioError, match="no target to learn"):
+        check_scenario(dataclasses.replace(TOY, target=()))

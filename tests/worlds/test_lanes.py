@@ -1,0 +1,171 @@
+import dataclasses
+import functools
+import threading
+import time
+
+import gymnasium
+import numpy as np
+import pytest
+
+from clbench.base.entry_points import resolve
+from clbench.spec.registry import load_scenario
+from clbench.spec.task import Task
+from clbench.testing import ToyWorld
+from clbench.worlds.lanes import Lanes, PlainVectorWorld, check_perturbable, vector_world
+from clbench.worlds.threads import Team
+
+TOY = load_scenario("clbench.testing:clbench/Toy-v0")
+LEFT, UP = TOY.task("left"), TOY.task("up")
+
+
+class OwnVectorWorld(PlainVectorWorld):
+    """A suite's own vector world: it remembers what it was made with."""
+
+    def __init__(self, lanes: int, threads: int, perturbed: bool = False) -> None:
+        super().__init__(functools.partial(ToyWorld, perturbed=perturbed), lanes)
+        self.made_with = (lanes, threads)
+
+
+class OtherToyWorld(ToyWorld):
+    """The toy world of another suite, which has its own vector world."""
+
+    vector_world = OwnVectorWorld
+
+
+class SteadyWorld(ToyWorld):
+    """The toy world of somebody who never heard of perturbations."""
+
+    def __init__(self, render_mode: str | None = None) -> None:
+        super().__init__(render_mode)
+
+
+class SteadyVectorWorld(PlainVectorWorld):
+    """The same, with a vector world of its own."""
+
+    def __init__(self, lanes: int, threads: int) -> None:
+        super().__init__(SteadyWorld, lanes)
+
+
+@pytest.fixture
+def other_task(monkeypatch: pytest.MonkeyPatch) -> Task:
+    monkeypatch.setattr("clbench.testing.OtherToyWorld", OtherToyWorld, raising=False)
+    return dataclasses.replace(UP, world="clbench.testing:OtherToyWorld")
+
+
+def test_a_suites_own_vector_world_is_found_by_name_and_others_get_plain_worlds(other_task: Task) -> None:
+    own = vector_world(other_task.world, lanes=3, threads=2)
+    assert isinstance(own, OwnVectorWorld)
+    assert own.made_with == (3, 2)
+    assert type(vector_world(LEFT.world, lanes=3, threads=2)) is PlainVectorWorld
+
+
+def test_each_lane_runs_the_episode_of_the_plain_world_whichever_world_it_is_in(other_task: Task) -> None:
+    lanes, tasks, seeds = Lanes(4), [LEFT, other_task, LEFT, other_task], [5, 6, 7, 8]
+    worlds = [resolve(task.world)() for task in tasks]
+    expected = [
+        world.reset(seed=seed, options={"task": task.name})[0]
+        for world, seed, task in zip(worlds, seeds, tasks, strict=True)
+    ]
+    order = [2, 0, 3, 1]
+    states = lanes.reset(order, [seeds[lane] for lane in order], [tasks[lane] for lane in order])
+    np.testing.assert_array_equal(states, [expected[lane] for lane in order])
+    generator = np.random.default_rng(0)
+    for moving in ([0, 1, 2, 3], [3, 0], [1], [2, 3, 1]):
+        actions = generator.uniform(-1, 1, (len(moving), 2)).astype(np.float32)
+        states, rewards, successes = lanes.step(moving, actions)
+        outcomes = [worlds[lane].step(action)[:3] for lane, action in zip(moving, actions, strict=True)]
+        for row, (state, reward, success) in enumerate(outcomes):
+            assert states[row].tobytes() == state.tobytes()
+            assert (rewards[row], successes[row]) == (reward, success)
+    lanes.close()
+
+
+def test_a_lane_goes_from_one_world_to_another(other_task: Task) -> None:
+    lanes = Lanes(1)
+    for task in (LEFT, other_task, LEFT):
+        expected, _ = resolve(task.world)().reset(seed=3, options={"task": task.name})
+        np.testing.assert_array_equal(lanes.reset([0], [3], [task]), [expected])
+
+
+def test_a_lane_without_an_episode_cannot_be_stepped() -> None:
+    with pytest.raises(gymnasium.error.ResetNeeded, match="Lane 1 has no episode"):
+        Lanes(2).step([1], np.zeros((1, 2), np.float32))
+    world = vector_world(LEFT.world, lanes=2)
+    with pytest.raises(gymnasium.error.ResetNeeded, match="Lane 1 has no episode"):
+        world.step([1], np.zeros((1, 2), np.float32))
+
+
+def episode(lanes: Lanes, lane: int, seed: int, task: Task, perturbed: bool) -> bytes:
+    """Return the states of an episode of five steps in a lane."""
+    states = [lanes.reset([lane], [seed], [task], [perturbed])]
+    states += [lanes.step([lane], np.full((1, 2), 0.7, np.float32))[0] for _ in range(5)]
+    return np.concatenate(states).tobytes()
+
+
+def test_perturbed_episodes_run_beside_plain_ones_which_they_do_not_change(other_task: Task) -> None:
+    for task in (LEFT, other_task):
+        plain = episode(Lanes(1), 0, 3, task, perturbed=False)
+        disturbed = episode(Lanes(1), 0, 3, task, perturbed=True)
+        assert plain != disturbed
+        lanes = Lanes(3)
+        for lane, perturbed in ((0, True), (1, False), (1, True), (0, False), (2, True)):
+            assert episode(lanes, lane, 3, task, perturbed) == (disturbed if perturbed else plain)
+        seeds, flags = [3, 3, 3], [False, True, False]
+        first = [np.frombuffer(one, np.float32)[:4] for one in (plain, disturbed, plain)]
+        np.testing.assert_array_equal(lanes.reset([0, 1, 2], seeds, [task] * 3, flags), first)
+
+
+@pytest.mark.parametrize(
+    ("world", "own", "message"),
+    [
+        ("SteadyWorld", None, "clbench.testing:SteadyWorld takes no argument `perturbed`"),
+        (
+            "SteadyWorld",
+            SteadyVectorWorld,
+            "the vector world of clbench.testing:SteadyWorld takes no argument",
+        ),
+    ],
+)
+def test_a_task_whose_world_cannot_be_perturbed_is_named_with_the_way_out(
+    world: str, own: object, message: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    steady = type(world, (SteadyWorld,), {} if own is None else {"vector_world": own})
+    monkeypatch.setattr(f"clbench.testing.{world}", steady, raising=False)
+    task = dataclasses.replace(UP, world=f"clbench.testing:{world}")
+    check_perturbable([LEFT, UP])
+    with pytest.raises(ValueError, match="The task 'up' cannot be perturbed: ") as raised:
+        check_perturbable([LEFT, task])
+    assert message in str(raised.value)
+    assert "Run without --perturb, or give it one, as docs/guide/your_scenario.md shows." in str(raised.value)
+    assert Lanes(1).reset([0], [3], [task]).shape == (1, 4)
+
+
+@pytest.mark.parametrize("threads", [1, 3])
+def test_a_team_does_each_piece_once_and_goes_on_after_one_that_failed(threads: int) -> None:
+    team, done = Team(threads), list[int]()
+
+    def work(item: int) -> None:
+        if item == 7:
+            raise ValueError("no seven")
+        done.append(item)
+
+    team.each(work, range(5))
+    assert sorted(done) == [0, 1, 2, 3, 4]
+    with pytest.raises(ValueError, match="no seven"):
+        team.each(work, [7, 7])
+    team.each(work, [])
+    team.each(work, [5])
+    assert sorted(done) == [0, 1, 2, 3, 4, 5]
+    team.close()
+
+
+def test_a_team_that_nobody_closed_leaves_no_thread_behind() -> None:
+    before = threading.active_count()
+    team = Team(3)
+    team.each(time.sleep, [0.01] * 3)
+    assert threading.active_count() == before + 2
+    del team
+    deadline = time.monotonic() + 10
+    while threading.active_count() > before and time.monotonic() < deadline:
+        time.sleep(0.01)
+    assert threading.active_count() == before

@@ -1,0 +1,232 @@
+"""What a policy is shown of a world: its states, or what a camera leaves of them."""
+
+import dataclasses
+import os
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from gymnasium.utils.env_checker import check_env
+from numpy.typing import NDArray
+
+from clbench.base.cache import cache_folder
+from clbench.data.questions import load_questions
+from clbench.evaluation.rollouts import Evaluator
+from clbench.learning.optimise import deterministic, optimise
+from clbench.learning.pretraining import policy_config, pretrained_policy, pretraining_inputs
+from clbench.learning.registry import build_method, method_names
+from clbench.learning.trainer import Trainer
+from clbench.policy.policy import Policy
+from clbench.spec.registry import load_scenario
+from clbench.testing.seen_toy import SEEN_TOY
+from clbench.testing.toy_camera import ToyCamera
+from clbench.worlds.camera import VIEW_SIZE
+from clbench.worlds.gl_backend import RenderingError
+from clbench.worlds.lanes import Lanes
+from clbench.worlds.observation import TOGETHER, Observer, frame_hash, observed
+from clbench.worlds.perturbation import draw_perturbation
+
+TOY = load_scenario("clbench.testing:clbench/Toy-v0")
+TASK = SEEN_TOY.retained[0]
+SHORT = dataclasses.replace(
+    SEEN_TOY,
+    target=SEEN_TOY.target[:1],
+    budget=dataclasses.replace(SEEN_TOY.budget, pretraining_steps=5, adaptation_steps=2),
+)
+FEWER = {"aegis": {"samples": 8}, "ewc": {"samples": 4}, "fast_dvla": {"steps": 3}}
+"""Hyper-parameters that make a long preparation short."""
+
+
+def _states(count: int) -> NDArray[np.float32]:
+    return np.random.default_rng(0).uniform(-1.0, 1.0, (count, 4)).astype(np.float32)
+
+
+def test_without_a_camera_states_are_shown_as_they_are() -> None:
+    states = _states(3)
+    numbers, images = Observer(TASK.world, None).observe(states)
+    assert np.array_equal(numbers, states)
+    assert images.shape == (3, 0, 0, 3)
+    assert frame_hash(TOY.retained[0]) is None
+
+
+def test_a_camera_that_lacks_something_is_refused_by_name() -> None:
+    with pytest.raises(
+        TypeError, match=r"ToyWorld is no camera: it lacks .*pictured.* docs/guide/pixels\.md shows"
+    ):
+        Observer(TASK.world, "clbench.testing.toy:ToyWorld")
+
+
+@pytest.fixture
+def camera_of(write_module: Callable[[str, str], None]) -> Callable[[str], str]:
+    """Return a function that writes a camera, the toy's but for some lines, and returns its entry point."""
+
+    def write(lines: str) -> str:
+        head = (
+            "import numpy as np\nfrom clbench.testing.toy_camera import ToyCamera\nclass Other(ToyCamera):\n"
+        )
+        write_module("other_camera", head + lines)
+        sys.modules.pop("other_camera", None)  # that of another test
+        return "other_camera:Other"
+
+    return write
+
+
+@pytest.mark.parametrize(
+    ("returned", "said"),
+    [
+        ("np.zeros((len(states), 16, 16, 3))", "of float64"),  # eight bytes for each that is read
+        ("np.zeros((len(states), 8, 8, 3), np.uint8)", r"\(3, 8, 8, 3\)"),  # the rest would never come
+    ],
+)
+def test_pictures_of_another_size_or_kind_are_refused(
+    camera_of: Callable[[str], str], returned: str, said: str
+) -> None:
+    camera = camera_of(f"    def draw(self, states, views): return {returned}\n")
+    observer = Observer(TASK.world, camera)
+    with pytest.raises(
+        RenderingError, match=rf"draw\(\) must return \(3, 16, 16, 3\) of uint8, not .*{said}"
+    ):
+        observer.observe(_states(3))
+    observer.close()
+
+
+def test_numbers_of_another_size_are_refused(camera_of: Callable[[str], str]) -> None:
+    camera = camera_of("    proprioception = staticmethod(lambda states: states[:, :3])\n")
+    with pytest.raises(TypeError, match=r"proprioception\(\) must return \(3, 1\), not \(3, 3\)"):
+        Observer(TASK.world, camera).observe(_states(3))
+
+
+def test_where_the_source_of_the_camera_changes_the_policy_is_pretrained_anew(
+    camera_of: Callable[[str], str],
+) -> None:
+    def inputs(column: int) -> Any:
+        camera = camera_of(
+            f"    proprioception = staticmethod(lambda states: states[:, {column} : {column + 1}])\n"
+        )
+        groups: dict[str, Any] = {
+            group: tuple(dataclasses.replace(task, camera=camera) for task in getattr(SEEN_TOY, group))
+            for group in ("retained", "target", "held_out")
+        }
+        return pretraining_inputs(dataclasses.replace(SEEN_TOY, **groups), 0)
+
+    assert inputs(0) != inputs(1)
+
+
+def test_processes_draw_what_the_camera_draws_in_the_order_of_the_states() -> None:
+    states = _states(2 * TOGETHER + 3)
+    views = np.zeros((len(states), VIEW_SIZE), np.float32)
+    views[::2] = np.random.default_rng(1).uniform(-1.0, 1.0, views[::2].shape)
+    observer = Observer(TASK.world, TASK.camera, processes=2)
+    numbers, images = observer.observe(states)
+    disturbed = observer.observe(states, views)[1]
+    one = observer.observe(states[:1])[1]
+    observer.close()
+    assert np.array_equal(numbers, states[:, :1])
+    assert np.array_equal(images, ToyCamera().draw(states, np.zeros_like(views)))
+    assert np.array_equal(disturbed, ToyCamera().draw(states, views))
+    assert np.array_equal(one, images[:1])
+
+
+def test_what_is_seen_is_disturbed_in_perturbed_episodes_alone() -> None:
+    lanes = Lanes(3)
+    seeds, tasks = [3, 3, 3], [TASK] * 3
+    states = lanes.reset(range(3), seeds, tasks, [True, False, True])
+    drawn = draw_perturbation(3).view
+    expected = ToyCamera().draw(states, np.array([drawn, [0.0] * VIEW_SIZE, drawn], np.float32))
+    _, images = lanes.observe(range(3), tasks, states)
+    assert np.array_equal(images, expected)
+    lanes.reset([0], [3], [TASK])
+    _, (again,) = lanes.observe([0], [TASK], states[1:2])
+    lanes.close()
+    assert np.array_equal(again, images[1])
+
+
+def test_pictures_of_a_data_set_are_drawn_once(empty_caches: Path) -> None:
+    first = observed(TASK, _states(5))
+    (file,) = cache_folder().rglob("frames.safetensors")
+    written = file.stat().st_mtime_ns
+    again = observed(TASK, _states(5))
+    other = observed(TASK, _states(6))
+    assert np.array_equal(first[0], again[0])
+    assert np.array_equal(first[1], again[1])
+    assert file.stat().st_mtime_ns == written
+    assert other[1].shape == (6, 16, 16, 3)
+    assert len(list(cache_folder().rglob("frames.safetensors"))) == 2
+
+
+def test_a_process_that_dies_is_named_with_its_last_words(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "dim.py").write_text(
+        "from clbench.testing.toy_camera import ToyCamera\n"
+        "class Dim(ToyCamera):\n"
+        "    def draw(self, states, views): raise RuntimeError('no light')\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")]))
+    observer = Observer(TASK.world, "dim:Dim")
+    with pytest.raises(
+        RenderingError, match="process of dim:Dim that draws has ended: RuntimeError: no light"
+    ):
+        observer.observe(_states(2))
+    observer.close()
+
+
+def test_where_nothing_draws_it_is_said_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("MUJOCO_GL", raising=False)
+    monkeypatch.setattr("clbench.worlds.gl_backend.rendering_fault", lambda *_: "no driver")
+    with pytest.raises(RenderingError, match=r"\(no driver\).*apt-get install"):
+        Observer("clbench.testing.toy:ToyWorld", TASK.camera).observe(_states(1))
+
+
+@pytest.mark.filterwarnings("ignore:.*(minimum|maximum) value.*infinity.*")
+def test_an_agent_of_the_scenario_sees_the_picture_and_no_more() -> None:
+    env = gymnasium.make(SEEN_TOY.id, instruction="tokens", disable_env_checker=True)
+    check_env(env.unwrapped, skip_render_check=True)
+    observation, _ = env.reset(seed=4)
+    many = gymnasium.make_vec(SEEN_TOY.id, num_envs=2, instruction="tokens")
+    side_by_side, _ = many.reset(seed=4)
+    assert observation["state"].shape == (1,)
+    assert observation["image"].shape == (16, 16, 3)
+    for name, value in observation.items():
+        assert np.array_equal(side_by_side[name][0], value)
+    many.close()
+    env.close()
+
+
+def test_a_policy_learns_what_only_the_picture_shows() -> None:
+    policy = Policy(policy_config(SEEN_TOY), seed=0)
+    assert (policy.config.state_size, policy.config.image_size) == (1, 16)
+    asked = load_questions(SEEN_TOY)[0].sample(32, torch.Generator().manual_seed(0))
+    asked = dataclasses.replace(asked, state=torch.zeros_like(asked.state))
+    blind = dataclasses.replace(asked, image=torch.zeros_like(asked.image))
+    with deterministic():
+        optimise(policy.parameters(), 2e-3, 150, lambda _: policy.answer_loss(asked).mean())
+    assert policy.answer_loss(asked).mean() < 0.2
+    assert policy.answer_loss(blind).mean() > 0.5
+
+
+def test_an_outcome_does_not_depend_on_what_else_is_seen() -> None:
+    policy, _ = pretrained_policy(SHORT, 0)
+    evaluator = Evaluator(SHORT, seed=0)
+    together = evaluator.evaluate(policy.eval(), SHORT.tasks)
+    alone = evaluator.evaluate(policy, SHORT.tasks[1:2])
+    evaluator.close()
+    assert together[4:8] == alone
+
+
+@pytest.mark.parametrize("name", method_names())
+def test_every_method_learns_from_pictures(name: str, tmp_path: Path) -> None:
+    trainer = Trainer(SHORT, lambda: build_method(name, FEWER.get(name, {})), 0, "cpu")
+    trainer.prepare()
+    trainer.save(tmp_path / "0", 0)
+    trainer.load(tmp_path / "0", 0)
+    trainer.learn(1, lambda _: None)
+    assert trainer.policy.config == policy_config(SEEN_TOY)
+    trainer.save(tmp_path / "1", 1)
+    trainer.load(tmp_path / "1", 1)

@@ -1,0 +1,166 @@
+"""Scenarios as Gymnasium environments, for Gymnasium's own tools and for Stable-Baselines3."""
+
+import os
+import subprocess
+import sys
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+
+from clbench.spec.language import encode
+from clbench.spec.registry import load_scenario
+from clbench.worlds.scenario_env import ScenarioEnv
+
+FETCH = "clbench/Fetch-v0"
+
+
+def _toy(**options: Any) -> ScenarioEnv:
+    return ScenarioEnv("clbench.testing:TOY", **options)
+
+
+def test_the_walk_goes_from_the_skills_to_each_target_and_stays_at_the_last() -> None:
+    env = _toy(episodes_per_stage=3)
+    schedule = []
+    for _ in range(12):
+        _, info = env.reset()
+        schedule.append((info["stage"], info["task"]))
+    skills = [(0, "left"), (0, "up"), (0, "left")]
+    assert schedule == skills + [(1, "right")] * 3 + [(2, "down")] * 6
+
+
+@pytest.mark.parametrize("vector", [False, True])
+def test_the_targets_come_in_the_order_that_is_asked_for(vector: bool) -> None:
+    if vector:
+        envs = gymnasium.make_vec("clbench.testing:clbench/Toy-v0", 2, order=1)
+        schedule = [envs.reset(options={"stage": stage})[1]["task"][1] for stage in range(3)]
+    else:
+        env = gymnasium.make("clbench.testing:clbench/Toy-v0", order=1)
+        schedule = [env.reset(options={"stage": stage})[1]["task"] for stage in range(3)]
+    assert schedule == ["left", "down", "right"]
+    with pytest.raises(ValueError, match="clbench/Toy-v0: 2 targets have orders 0 to 1, not 2"):
+        _toy(order=2)
+
+
+def test_a_seed_begins_the_walk_anew_and_repeats_it_bit_for_bit() -> None:
+    env = _toy(episodes_per_stage=2)
+
+    def schedule() -> list[tuple[str, str, bytes]]:
+        states = []
+        observation, info = env.reset(seed=5)
+        for _ in range(5):
+            states.append((info["task"], info["instruction"], observation["state"].tobytes()))
+            observation, info = env.reset()
+        return states
+
+    first = schedule()
+    assert len({state for _, _, state in first}) == 5
+    assert schedule() == first
+
+
+def test_options_choose_a_task_or_a_stage() -> None:
+    env = _toy()
+    assert env.reset(options={"task": "up_left"})[1]["task"] == "up_left"
+    _, info = env.reset(options={"stage": 2})
+    assert (info["stage"], info["task"]) == (2, "down")
+    assert env.reset()[1]["stage"] == 2
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "message"),
+    [
+        ({"task": "lefft"}, LookupError, "Did you mean 'left'"),
+        ({"stage": 3}, ValueError, "has stages 0 to 2, not 3"),
+        ({"goal": 3}, ValueError, "Options of reset are"),
+    ],
+)
+def test_wrong_options_are_refused_by_name(
+    options: dict[str, Any], error: type[Exception], message: str
+) -> None:
+    with pytest.raises(error, match=message):
+        _toy().reset(options=options)
+
+
+@pytest.mark.parametrize("options", [{"instruction": "audio"}, {"episodes_per_stage": 0}])
+def test_wrong_keywords_are_refused(options: dict[str, Any]) -> None:
+    with pytest.raises(ValueError, match=next(iter(options))):
+        _toy(**options)
+
+
+def test_an_episode_ends_with_success_or_at_the_horizon() -> None:
+    env = _toy()
+    env.reset(seed=0, options={"task": "left"})
+    results = [env.step(np.array([-1, 0], np.float32)) for _ in range(4)]
+    assert [result[2] for result in results] == [False, False, False, True]
+    assert results[-1][4]["success"]
+    env.reset(seed=0, options={"task": "left"})
+    results = [env.step(np.array([1, 0], np.float32)) for _ in range(12)]
+    assert [result[3] for result in results] == [False] * 11 + [True]
+    assert not any(result[2] for result in results)
+
+
+def test_observation_and_info_carry_the_instruction() -> None:
+    env = gymnasium.make(FETCH, instruction="tokens")
+    observation, info = env.reset(seed=0, options={"task": "lift"})
+    lift = load_scenario(FETCH).task("lift")
+    assert info["instruction"] in lift.instructions
+    assert np.array_equal(observation["instruction"], encode([info["instruction"]])[0])
+    assert set(info) == {"task", "stage", "instruction", "success"}
+    assert isinstance(env.unwrapped, ScenarioEnv)
+    assert env.unwrapped.scenario is load_scenario(FETCH)
+
+
+@pytest.mark.parametrize("mode", ["sync", "async"])
+def test_vector_environments_step(mode: str) -> None:
+    env = gymnasium.make_vec(FETCH, num_envs=2, vectorization_mode=mode, instruction="tokens")
+    observation, info = env.reset(seed=0)
+    assert observation["state"].shape == (2, 28)
+    assert list(info["task"]) == ["reach", "reach"]
+    for _ in range(3):
+        observation, reward, *_ = env.step(env.action_space.sample())
+    assert reward.shape == (2,)
+    env.close()
+
+
+def test_vector_environments_give_text_too() -> None:
+    env = gymnasium.make_vec(FETCH, num_envs=2, vectorization_mode="sync")
+    observation, _ = env.reset(seed=0)
+    assert all(text in load_scenario(FETCH).task("reach").instructions for text in observation["instruction"])
+    env.close()
+
+
+def test_stable_baselines_checks_and_trains_on_numeric_instructions() -> None:
+    from stable_baselines3 import SAC
+    from stable_baselines3.common.env_checker import check_env as check_env_of_stable_baselines
+
+    env = gymnasium.make(FETCH, instruction="tokens", episodes_per_stage=10)
+    check_env_of_stable_baselines(env)
+    agent = SAC(
+        "MultiInputPolicy", env, seed=0, learning_starts=100, train_freq=8, buffer_size=2000, device="cpu"
+    )
+    agent.learn(304)
+    assert agent.num_timesteps == 304
+    action, _ = agent.predict(env.reset()[0])
+    assert env.action_space.contains(action)
+
+
+def test_the_scene_renders_without_changing_the_episode() -> None:
+    """In a process of its own: a rendering back end that does not work may kill it."""
+    code = """
+import gymnasium, numpy as np
+env = gymnasium.make("clbench:clbench/Fetch-v0", render_mode="rgb_array")
+twin = gymnasium.make("clbench/Fetch-v0")
+env.reset(seed=0), twin.reset(seed=0)
+for action in np.random.default_rng(0).uniform(-1, 1, (20, 4)).astype(np.float32):
+    state, other = env.step(action)[0]["state"], twin.step(action)[0]["state"]
+    frame = env.render()
+    assert (state == other).all()
+print(frame.shape, frame.std() > 10)
+"""
+    environment = {**os.environ, "MUJOCO_GL": os.environ.get("MUJOCO_GL", "egl")}
+    command = [sys.executable, "-c", code]
+    result = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    if result.returncode and "Assert" not in result.stderr:
+        pytest.skip(f"nothing renders here: {result.stderr.strip().splitlines()[-1:]}")
+    assert result.stdout.strip() == "(480, 480, 3) True", result.stderr

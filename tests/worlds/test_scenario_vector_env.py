@@ -1,0 +1,102 @@
+"""The vector environments of scenarios, against Gymnasium's own of the plain ones."""
+
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.vector import VectorEnv
+
+from clbench.worlds.scenario_vector_env import ScenarioVectorEnv
+
+FETCH = "clbench/Fetch-v0"
+TOY = "clbench.testing:clbench/Toy-v0"
+
+
+def _same(first: Any, second: Any) -> None:
+    """Assert that two results are the same in type, shape and every bit."""
+    assert type(first) is type(second)
+    if isinstance(first, dict):
+        assert first.keys() == second.keys()
+        for name, value in first.items():
+            _same(value, second[name])
+    elif isinstance(first, tuple):
+        for value, other in zip(first, second, strict=True):
+            _same(value, other)
+    elif isinstance(first, np.ndarray):
+        assert first.dtype == second.dtype
+        np.testing.assert_array_equal(first, second)
+    else:
+        assert first == second
+
+
+def _walk_together(scenario: str, steps: int, towards: float, **options: Any) -> int:
+    """Step ours beside Gymnasium's, and return how many episodes ended."""
+    ours: VectorEnv[Any, Any, Any] = gymnasium.make_vec(scenario, num_envs=3, threads=2, **options)
+    plain = gymnasium.make_vec(scenario, num_envs=3, vectorization_mode="sync", **options)
+    assert isinstance(ours, ScenarioVectorEnv)
+    assert ours.observation_space == plain.observation_space
+    assert ours.action_space == plain.action_space
+    generator, ended = np.random.default_rng(0), 0
+    _same(ours.reset(seed=7), plain.reset(seed=7))
+    for _ in range(steps):
+        actions = generator.uniform(-1.0, 1.0, ours.action_space.shape).astype(np.float32)
+        actions[:, 0] -= towards
+        outcome = ours.step(actions)
+        _same(outcome, plain.step(actions))
+        assert outcome[0] in ours.observation_space
+        ended += int((outcome[2] | outcome[3]).sum())
+    _same(ours.reset(), plain.reset())
+    ours.close()
+    plain.close()
+    return ended
+
+
+@pytest.mark.parametrize("instruction", ["text", "tokens"])
+def test_it_does_what_gymnasiums_own_does_over_the_whole_walk(instruction: str) -> None:
+    assert _walk_together(TOY, 120, 0.5, instruction=instruction, episodes_per_stage=2) > 20
+
+
+def test_it_does_so_with_the_suites_own_vector_world() -> None:
+    assert _walk_together(FETCH, 130, 0.0, instruction="tokens", episodes_per_stage=2) >= 6
+
+
+def _toy(**options: Any) -> ScenarioVectorEnv:
+    return ScenarioVectorEnv("clbench.testing:TOY", num_envs=2, **options)
+
+
+def test_options_choose_for_all_and_seeds_for_each() -> None:
+    env = _toy()
+    first, info = env.reset(seed=[4, 5], options={"task": "up_left"})
+    assert list(info["task"]) == ["up_left", "up_left"]
+    second, _ = env.reset(seed=4, options={"task": "up_left"})
+    _same(first, second)
+    env.reset(seed=[4, None])
+    third, info = env.reset(options={"stage": 2})
+    assert list(info["stage"]) == [2, 2]
+    assert not np.array_equal(third["state"], first["state"])
+
+
+def test_wrong_calls_are_refused_by_name() -> None:
+    env = _toy()
+    with pytest.raises(gymnasium.error.ResetNeeded, match="call reset"):
+        env.step(env.action_space.sample())
+    with pytest.raises(ValueError, match="2 environments need as many seeds, not 3"):
+        env.reset(seed=[1, 2, 3])
+    with pytest.raises(LookupError, match="Did you mean 'left'"):
+        env.reset(options={"task": "lefft"})
+    with pytest.raises(ValueError, match="episodes_per_stage"):
+        _toy(episodes_per_stage=0)
+
+
+def test_what_was_returned_does_not_change_later() -> None:
+    env = _toy(instruction="tokens")
+    observation, _ = env.reset(seed=0)
+    state, tokens = observation["state"].copy(), observation["instruction"].copy()
+    ended = env.step(env.action_space.sample())[2]
+    before = ended.copy()
+    for _ in range(20):
+        env.step(env.action_space.sample())
+    np.testing.assert_array_equal(observation["state"], state)
+    np.testing.assert_array_equal(observation["instruction"], tokens)
+    np.testing.assert_array_equal(ended, before)
