@@ -252,7 +252,7 @@ def seed_deviations(records: Path) -> dict[str, dict[str, float]]:
     runs: dict[Path, list[Scores]] = {}
     for path in sorted(records.rglob("*.json")):
         record = read_record(path)
-        if "order" not in record.run:
+        if not record.run.order:
             runs.setdefault(path.parent, []).append(Scores.from_record(record))
     found = {}
     for name in ("retention", "adaptation", "final_average"):

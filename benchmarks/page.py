@@ -17,7 +17,15 @@ import numpy as np
 
 from clbench.base.entry_points import resolve
 from clbench.records.paths import record_path
-from clbench.records.record import ANSWER_COLUMNS, EPISODE_COLUMNS, POLICY_COLUMNS, Record
+from clbench.records.record import (
+    ANSWER_COLUMNS,
+    EPISODE_COLUMNS,
+    POLICY_COLUMNS,
+    Costs,
+    Record,
+    RunInfo,
+    ScenarioInfo,
+)
 from clbench.records.writer import write_record
 
 GROUPS = {
@@ -27,6 +35,7 @@ GROUPS = {
 }
 STEPS = (37, 75, 150, 300)
 EPISODES, ON_THE_WAY, VALIDATION, KINDS, ASKED = 20, 5, 10, 14, 72
+BUDGET = {"test_episodes": EPISODES, "curve_episodes": ON_THE_WAY, "validation_episodes": VALIDATION}
 REFERENCES = ("sft", "joint", "from_scratch", "frozen")
 """Methods that others are compared with."""
 
@@ -64,7 +73,7 @@ def make_records(folder: Path, methods: int, seeds: int, scenarios: int) -> None
         generator = np.random.default_rng([scenario, number, seed])
         learns, keeps = np.random.default_rng([scenario, number]).random(2)
         record = made_record(f"clbench/Made{scenario}-v0", method, seed, 0.5 + learns / 2, keeps, generator)
-        write_record(record, record_path(folder, record.run["scenario"], method, seed))
+        write_record(record, record_path(folder, record.run.scenario, method, seed))
 
 
 def made_record(
@@ -76,17 +85,19 @@ def made_record(
     points = list(product(range(1, len(GROUPS["target"]) + 1), STEPS))
     return Record(
         status="success",
-        run={
-            "scenario": scenario,
-            "method": method,
-            "seed": seed,
-            "device": "cpu",
-            "split": "test",
-            "settings": {},
-            "changes": {},
-            "uses": {"demonstrations": access, "questions": access, "reference": method in REFERENCES[1:]},
-        },
-        scenario={"id": scenario, **GROUPS, "evaluation_steps": list(STEPS), "budget": {"curve_episodes": 5}},
+        run=RunInfo(
+            scenario=scenario,
+            method=method,
+            seed=seed,
+            device="cpu",
+            split="test",
+            settings={},
+            changes={},
+            uses={"demonstrations": access, "questions": access, "reference": method in REFERENCES[1:]},
+        ),
+        scenario=ScenarioInfo(
+            scenario, **GROUPS, evaluation_steps=list(STEPS), budget=dict(BUDGET)
+        ),
         episodes=_columns(EPISODE_COLUMNS, _episodes(learns, keeps, generator)),
         answers=_columns(
             ANSWER_COLUMNS,
@@ -102,7 +113,7 @@ def made_record(
                 *((*point, *map(float, row)) for point, row in zip(points, policy, strict=True)),
             ],
         ),
-        costs={"optimiser_steps": 1200, "parameters": 673700, "parameters_added": 0, "bytes_kept": 2304},
+        costs=Costs(optimiser_steps=1200, parameters=673700, parameters_added=0, bytes_kept=2304),
         diagnostics={
             str(stage): {
                 **{f"share_{number}": float(generator.random()) for number in range(3)},

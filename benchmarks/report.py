@@ -12,41 +12,42 @@ from result_files import read_results
 from clbench.base.entry_points import resolve
 
 DOCS = Path(__file__).parents[1] / "docs" / "reference"
-grid = resolve("clbench.leaderboard.views.markdown:grid")
+table_lines = resolve("clbench.leaderboard.views.markdown:table_lines")
 VEGA_LITE = resolve("clbench.leaderboard.views.page.html:VEGA_LITE")
 
 INTRODUCTION = """\
 # Performance
 
-Made by `python benchmarks/report.py` from `benchmarks/results/`, which `make benchmark` measures. Ratios are
-of blocks that take turns on one machine, the median with a 95 % bootstrap interval; seconds are of that
-machine and of no use beside another's. Nothing else ran beside them but, on the other core, beside whole runs
-and steps of adaptation.
+`python benchmarks/report.py` makes this page from `benchmarks/results/`; `make benchmark` measures these.
+Ratios compare blocks that take turns on one machine: the median, with a 95 % bootstrap interval. Seconds
+depend on that machine and cannot be compared with another machine's. The machine was otherwise idle, except
+during whole runs and steps of adaptation, when its other core was busy.
 """
 TRIED = """\
 ## What was tried
 
-Measured once, in turns with what is there, on two cores of an AMD EPYC, of which most had no AVX-512.
+Each change was measured once, in turns with the present code, on two cores of an AMD EPYC, in most cases
+without AVX-512.
 
-| what | what came of it | kept |
+| change | result | kept |
 | --- | --- | --- |
 | fused AdamW | a step takes 0.92 of the time | yes |
 | bfloat16, by autocast | a step takes 8.9 times as long, 2.1 times with AVX512-BF16 | no |
 | `torch.compile` | a step takes 1.2 times as long, the first one two minutes | no |
-| leaving out the words that only pad a batch | no gain beyond noise, the same bits | no |
-| no collisions of robot parts that never touched on Fetch | 6 % of the physics; nothing proves it | no |
-| vector worlds, for a whole run on one core | nothing: its physics was at the limit before | for threads |
-| `mujoco.rollout` | drops the solver's warm start: other bits | no |
-| observing Fetch's lanes while others still move | at most 5 %, as observing takes no longer | no |
-| half steps of Fetch as pieces of work for threads, or fixed shares of lanes | 1 %, and 7 % less | no |
-| Meta-World's rewards and observations in batches | 2 to 3.5 times as many steps, the same bits | yes |
-| queues in C rather than an executor between threads | 2 to 4 % of Meta-World, nothing of Fetch | yes |
-| dm_control's rewards in batches, of the body where they have the same bits | 1.4 times as many steps | yes |
-| a process of Ray's for each job | 5 s each to import everything | no |
-| Ray's workers at the niceness that Ray gives them, 15 | 25 times as long beside other work | no |
-| reading all lanes at once, or each where it was advanced | a third less time besides the physics | yes |
-| importing PyTorch's compiler before jobs are forked | a second less for each job | yes |
-| lanes with many contacts first | nothing: these tell little of what a step takes | no |
+| no padding words in a batch | no gain beyond noise, the same bits | no |
+| no collisions between robot parts that never touched on Fetch | 6 % of the physics; not provably safe | no |
+| vector worlds, for a whole run on one core | no gain: the physics was at the limit before | for threads |
+| `mujoco.rollout` | other bits, because it drops the solver's warm start | no |
+| observing Fetch's lanes while others still move | at most 5 %, because observing takes no more | no |
+| half steps of Fetch as work items for threads; fixed shares of lanes | 1 % faster; 7 % slower | no |
+| Meta-World's rewards and observations in batches | 2 to 3.5 times the speed, the same bits | yes |
+| queues in C instead of an executor between threads | 2 to 4 % faster on Meta-World, no gain on Fetch | yes |
+| dm_control's rewards in batches, for the body where the bits agree | 1.4 times the speed | yes |
+| one Ray process per job | 5 s per job to import everything | no |
+| Ray's workers at Ray's own niceness, 15 | 25 times as slow next to other work | no |
+| reading all lanes at once, or each where it was advanced | a third less time outside the physics | yes |
+| importing PyTorch's compiler before jobs are forked | saves a second per job | yes |
+| lanes with many contacts first | no gain: contacts predict the time of a step poorly | no |
 """
 UNITS = {
     "tasks": "tasks of Meta-World, 4 episodes of 50 steps each",
@@ -70,7 +71,7 @@ def _ratio(ratio: dict[str, float]) -> str:
 
 
 def _table(head: list[str], rows: list[list[str]]) -> Iterator[str]:
-    yield from grid(head, rows, numbers=len(head) - 1)
+    yield from table_lines(head, rows, numbers=len(head) - 1)
     yield ""
 
 
@@ -80,9 +81,9 @@ def _rollouts() -> Iterator[str]:
     yield "## Environment steps"
     yield ""
     yield (
-        f"`gym.make_vec(id, num_envs={first['num_envs']})` with {first['threads']} threads, as a multiple of "
-        "the vector environments that people use, on the suite's own environment, and of `mj_step` alone on "
-        "as many threads: the limit."
+        f"Speed of `gym.make_vec(id, num_envs={first['num_envs']})` with {first['threads']} threads, as a "
+        "multiple of common vector environments on the suite's own environment, and of `mj_step` alone on as "
+        "many threads, which is the limit."
     )
     yield ""
     others = ["AsyncVectorEnv", "SubprocVecEnv", "SyncVectorEnv of ours", "clbench, one thread", "mj_step"]
@@ -104,8 +105,8 @@ def _whole_run() -> Iterator[str]:
     yield "## A whole run"
     yield ""
     yield (
-        "One thread; data and pretrained policy are in the cache, the evaluation with which runs of a seed "
-        "begin is not. Rows may be of different machines: compare shares, not seconds."
+        "One thread. Data and pretrained policy are in the cache; the first evaluation, which the runs of a "
+        "seed share, is not. Rows may come from different machines: compare shares, not seconds."
     )
     yield ""
     parts = list(next(iter(runs.values()))["parts"])
@@ -129,8 +130,9 @@ def _steps() -> Iterator[str]:
     yield "## A step of adaptation"
     yield ""
     yield (
-        f"Plain fine-tuning takes {1000 * steps['baseline_seconds_per_step']:.0f} ms a step. A bare PyTorch "
-        f"loop on the same model and batches takes {_ratio(steps['bare_loop'])} of that. Others, as ratios:"
+        f"Plain fine-tuning takes {1000 * steps['baseline_seconds_per_step']:.0f} ms per step. A bare "
+        f"PyTorch loop on the same model and batches takes {_ratio(steps['bare_loop'])} of that time. Other "
+        "methods, as ratios:"
     )
     yield ""
     ratios = sorted(steps["ratios"].items(), key=lambda item: item[1]["median_ratio"])
@@ -144,11 +146,12 @@ def _workers() -> Iterator[str]:
     yield "## Workers"
     yield ""
     yield (
-        f"{found['runs']} runs by one worker take {_ratio(found['one_worker_to_many'])} times as long as by "
-        f"{found['workers']}; by a Ray cluster of {found['workers']} workers "
-        f"{_ratio(found['ray_to_many'])} times as long as by these: {seconds}. The records are the same. "
-        "A worker of Ray keeps a process that has imported everything, and forks each job from it. A cluster "
-        f"and these processes start in {found['seconds_to_start'][ray]:.0f} s, which is not in the times."
+        f"One worker takes {_ratio(found['one_worker_to_many'])} times as long for {found['runs']} runs as "
+        f"{found['workers']} workers do. A Ray cluster of {found['workers']} workers takes "
+        f"{_ratio(found['ray_to_many'])} times as long as {found['workers']} local workers ({seconds}). The "
+        "records are the same. Each Ray worker keeps a process that has imported everything, and forks each "
+        f"job from it. A cluster with these processes starts in {found['seconds_to_start'][ray]:.0f} s; the "
+        "times do not include that."
     )
     yield ""
 
@@ -160,19 +163,25 @@ def _scaling() -> Iterator[str]:
     yield "![Seconds over size, with the straight line through the points](performance.svg)"
     yield ""
     yield from _table(
-        ["of what", "sizes", "seconds", "each more", "farthest off the line"],
+        ["quantity", "sizes", "seconds", "per additional one", "largest deviation from the line"],
         [
             [
                 UNITS[name],
                 ", ".join(map(str, one["sizes"])),
                 ", ".join(f"{seconds:.2f}" for seconds in one["seconds"]),
-                f"{1000 * one['seconds_each']:.2g} ms",
+                _milliseconds(one["seconds_each"]),
                 f"{one['farthest_off']:.0%}",
             ]
             for name, one in found["measures"].items()
         ],
     )
-    yield f"Peak memory of all together: {found['peak_memory_gb']:.2f} GB."
+    yield f"Peak memory of all measurements together: {found['peak_memory_gb']:.2f} GB."
+
+
+def _milliseconds(seconds: float) -> str:
+    """Return a duration with two digits; a slope that is nothing but noise is shown as 0."""
+    milliseconds = round(1000 * seconds, 2)
+    return f"{float(f'{milliseconds:.2g}') + 0.0:g} ms"
 
 
 def _picture() -> str:

@@ -1,7 +1,7 @@
-"""dm_control's walker, whose episodes advance side by side as those of our scenarios do.
+"""dm_control's walker, with episodes side by side as in our scenarios.
 
-It is in none of them: its six motors and 24 numbers do not fit the spaces that the bodies of `DMControl-v0`
-share. It is here as the body that vector environments are usually measured on.
+No scenario has it: its six motors and 24 numbers do not fit the shared spaces of `DMControl-v0`. The
+benchmarks use it because it is the usual body for measuring vector environments.
 """
 
 from __future__ import annotations
@@ -27,34 +27,34 @@ from clbench.worlds.world import OneLaneWorld, Outcomes, States, checked_actions
 
 ID = "walker/Walker-v0"
 SUBSTEPS, SECONDS = 10, 0.025
-"""Steps of the physics in one of ours, and what it lasts: those of dm_control."""
+"""Physics steps per action, and their duration: dm_control's own."""
 
 
 @functools.cache
 def _start() -> Any:
-    """Return how episodes begin and advance, as a `Start` of the bodies of our scenario."""
-    bodies = "clbench.envs.dm_control.bodies"
-    environment = resolve(f"{bodies}:original_environment")("walker", "walk")
-    body = resolve(f"{bodies}:Body")("walker", SUBSTEPS, (), "torso", (), {}, _views)
+    """Return the start of episodes, in the same type as our scenario's bodies."""
+    scene = "clbench.envs.dm_control.scene"
+    environment = resolve(f"{scene}:original_environment")("walker", "walk")
+    body = resolve(f"{scene}:Body")("walker", SUBSTEPS, (), "torso", (), {}, _views)
     physics = environment.physics
-    return resolve(f"{bodies}:Start")(body, physics, environment.task, physics.model.ptr)
+    return resolve(f"{scene}:Start")(body, physics, environment.task, physics.model.ptr)
 
 
 def _views(model: mujoco.MjModel, data: mujoco.MjData) -> Any:
-    """Return views of what is observed, and of what a step is rewarded for."""
+    """Return views of the observation and of the inputs of the reward."""
     torso, speed = model.body("torso").id, model.sensor("torso_subtreelinvel").adr[0]
     height, velocity = data.xpos[torso][2:], data.sensordata[speed : speed + 1]
     return data.xmat[1:].reshape(-1), height, data.qvel, data.xmat[torso][8:], velocity
 
 
 class WalkerVectorWorld:
-    """Walkers that are to walk: dm_control's physics, observations and rewards. None ends with success.
+    """Walkers with dm_control's physics, observations and rewards; no episode ends with success.
 
     It is a `clbench.worlds.world.VectorWorld`; an action (6,) sets the motors for one step.
 
     Args:
-        lanes: Places for episodes.
-        threads: Threads that advance the physics.
+        lanes: Number of lanes.
+        threads: Number of threads that advance the physics.
     """
 
     def __init__(self, lanes: int, threads: int = 1) -> None:
@@ -104,7 +104,7 @@ class WalkerVectorWorld:
 
 
 class WalkerWorld(OneLaneWorld):
-    """A `WalkerVectorWorld` of one lane."""
+    """A `WalkerVectorWorld` with one lane."""
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 40}  # noqa: RUF012
     vector_world = WalkerVectorWorld

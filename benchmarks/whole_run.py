@@ -28,8 +28,9 @@ from clbench.data.demonstrations import load_demonstrations
 from clbench.data.questions import load_questions
 from clbench.learning.pretraining import pretrained_policy
 from clbench.policy.policy import Policy
+from clbench.runs.length import run_length
 from clbench.runs.run import execute
-from clbench.runs.spec import RunSpec, run_length
+from clbench.runs.spec import ResolvedRun, RunSpec
 from clbench.worlds.lanes import Lanes
 
 PARTS = {
@@ -46,14 +47,14 @@ def main() -> None:
     parser.add_argument("--method", default="sft")
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
-    spec = RunSpec(arguments.scenario, arguments.method, arguments.seed)
-    scenario = spec.load()
+    run = RunSpec(arguments.scenario, arguments.method, arguments.seed).resolve()
+    spec, scenario = run.spec, run.scenario
     policy, _ = pretrained_policy(scenario, spec.seed)
     for task in scenario.target:
         load_demonstrations(task, scenario, policy.config)
     load_questions(scenario)
     with _cache_without_reports():
-        found = measure(spec)
+        found = measure(run)
     runs = (read_results("whole_run") or {"runs": {}})["runs"]
     write_results("whole_run", spec.scenario, {"runs": {**runs, spec.scenario: found}})
     print(f"{spec.scenario}, {spec.method}: {found['seconds']:.0f} s, {found['peak_memory_gb']:.2f} GB")
@@ -79,7 +80,7 @@ def _cache_without_reports() -> Iterator[None]:
                 os.environ["CLBENCH_CACHE"] = before
 
 
-def measure(spec: RunSpec) -> dict[str, Any]:
+def measure(run: ResolvedRun) -> dict[str, Any]:
     """Return how long a run takes, and its parts."""
     clocks: defaultdict[str, float] = defaultdict(float)
     for part, (owner, names) in PARTS.items():
@@ -87,20 +88,20 @@ def measure(spec: RunSpec) -> dict[str, Any]:
             setattr(owner, name, _clocked(getattr(owner, name), clocks, part))
     speeds = [_gigaflops()]
     with tempfile.TemporaryDirectory() as records, Progress(transient=True) as bars:
-        bar = bars.add_task(spec.scenario, total=run_length(spec.load()))
+        bar = bars.add_task(run.scenario.id, total=run_length(run.scenario, run.protocol))
         begin = time.perf_counter()
-        record = execute(spec, Path(records), lambda amount: bars.advance(bar, amount))
+        record = execute(run, Path(records), lambda amount: bars.advance(bar, amount))
         seconds = time.perf_counter() - begin
     speeds.append(_gigaflops())
     training = sum(stage["training"] for stage in record.timing["stages"])
     parts = {"training": training, **{part: clocks[part] for part in PARTS}}
     parts["other"] = seconds - sum(parts.values())
     return {
-        "method": spec.method,
+        "method": run.spec.method,
         "seconds": round(seconds, 1),
         "parts": {part: round(value, 1) for part, value in parts.items()},
         "environment_steps": sum(record.episodes["length"]),
-        "optimiser_steps": record.costs["optimiser_steps"],
+        "optimiser_steps": record.costs.optimiser_steps,
         "peak_memory_gb": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20, 2),
         "gigaflops": [round(speed, 1) for speed in speeds],
     }

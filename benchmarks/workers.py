@@ -24,10 +24,11 @@ from result_files import write_results
 from rich.console import Console
 
 from clbench.jobs.job import Job, Workers
-from clbench.jobs.plan import benchmark_jobs
+from clbench.jobs.plan import Plan
 from clbench.jobs.processes import Processes
 from clbench.jobs.ray import RayWorkers
 from clbench.jobs.scheduler import run_with_bars
+from clbench.jobs.work import collect_scenes
 from clbench.records.reader import read_record
 from clbench.runs.spec import RunSpec
 
@@ -78,15 +79,17 @@ def main() -> None:
 
 def _seconds(specs: list[RunSpec], records: Path, make: Callable[[], Workers]) -> tuple[float, float]:
     """Return how long workers take to be ready, and how long the runs take then."""
-    jobs, begin = benchmark_jobs(specs, records), time.perf_counter()
+    plan, begin = Plan(), time.perf_counter()
+    for spec in specs:
+        plan.add_run(spec.resolve(), records)
     workers = make()
     count, arguments = workers.free(), {"scenario": specs[0].scenario}
     for number in range(count):  # what it makes is in the cache: it takes as long as to import all
-        workers.start(Job(f"first job {number}", "clbench.jobs.work:scenes_job", arguments, 1))
+        workers.start(Job(f"first job {number}", collect_scenes, arguments, 1))
     while workers.free() < count:
         assert all(event.kind in ("progress", "done") for event in workers.events())
     ready = time.perf_counter()
-    failed = run_with_bars(jobs, workers, Console(file=io.StringIO()))
+    failed = run_with_bars(plan.jobs, workers, Console(file=io.StringIO()))
     assert not failed, failed
     return ready - begin, time.perf_counter() - ready
 

@@ -1,5 +1,17 @@
 """Continual-learning benchmark for robot policies: what a fine-tuned policy learned, and what it forgot."""
 
+import os
+import signal
+import sys
+
+if signal.getsignal(signal.SIGINT) is signal.default_int_handler and (
+    os.path.basename(sys.argv[0]) in ("clbench", "clbench.exe")
+    or (sys.argv[0] == "-m" and "-m clbench" in " ".join(sys.orig_argv))
+):
+    # This is the command `clbench`, not a program that uses the package: Ctrl-C during the imports below ends
+    # it without a traceback, before `clbench.cli.entry` takes over.
+    signal.signal(signal.SIGINT, lambda *_: os._exit(130))
+
 import importlib
 from importlib.metadata import version
 from pathlib import Path

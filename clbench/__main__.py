@@ -1,6 +1,6 @@
 """`python -m clbench` is the command `clbench`."""
 
-from clbench.cli.main import main
+from clbench.cli.entry import main
 
 if __name__ == "__main__":
     main()

@@ -20,10 +20,19 @@ from clbench.learning.optimise import deterministic
 from clbench.learning.prior import Uses
 from clbench.learning.registry import load_method
 from clbench.records.paths import record_path
-from clbench.records.record import ANSWER_COLUMNS, EPISODE_COLUMNS, POLICY_COLUMNS, Record
-from clbench.records.writer import write_record
+from clbench.records.record import (
+    ANSWER_COLUMNS,
+    EPISODE_COLUMNS,
+    POLICY_COLUMNS,
+    Costs,
+    Record,
+    RunInfo,
+    ScenarioInfo,
+)
+from clbench.records.writer import record_text
+from clbench.runs.length import run_length
 from clbench.runs.run import execute
-from clbench.runs.spec import RunSpec, run_length
+from clbench.runs.spec import RunSpec
 from clbench.spec.identifiers import built_in_methods
 
 collect_ignore = ["submission"]
@@ -78,7 +87,7 @@ def lasting_records() -> Callable[[Path], dict[str, Any]]:
         found = {}
         for path in sorted(folder.rglob("*.json")):
             record = json.loads(path.read_text())
-            del record["timing"]
+            del record["timing"], record["content"]
             found[path.relative_to(folder).as_posix()] = record
         return found
 
@@ -114,7 +123,8 @@ def execute_and_kill() -> Callable[..., None]:
     """Return a function that does a run as `execute` does, and kills it after a share of its length."""
 
     def execute_and_kill(spec: RunSpec, records: Path, share: float, **folders: Path) -> None:
-        left = share * run_length(spec.load())
+        run = spec.resolve()
+        left = share * run_length(run.scenario, run.protocol)
 
         def die(amount: float) -> None:
             nonlocal left
@@ -152,8 +162,9 @@ def add(make_record: Callable[..., Record], matrix: Any, tmp_path: Path) -> Call
         if edit:
             edit(record)
         records = tmp_path / "leaderboard" / "records"
-        path = records / place if place else record_path(records, record.run["scenario"], method, seed)
-        write_record(record, path)
+        path = records / place if place else record_path(records, record.run.scenario, method, seed)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(record_text(record), encoding="utf-8")  # unlike write_record, whatever it is
         return path
 
     return add
@@ -170,7 +181,7 @@ def _make_record(
     *,
     curves: Any = None,
     retained_curves: Any = None,
-    selection: Any = None,
+    validation: Any = None,
     perturbed: Any = None,
     sparsity: Any = None,
     drift: Any = None,
@@ -188,7 +199,7 @@ def _make_record(
         success: Success rates (stages + 1, tasks), or outcomes (stages + 1, tasks, episodes).
         curves: The same for the targets on the way, (targets, points before the end); none if None.
         retained_curves: The same for the retained skills, (targets, points before the end, retained).
-        selection: The same for the targets on validation episodes, (targets, points).
+        validation: The same for the targets on validation episodes, (targets, points).
         perturbed: The same for the retained skills in perturbed episodes at the ends, (stages + 1, retained).
         sparsity: Update sparsity, (targets, points). No policy was looked at if it and `drift` are None.
         drift: Activation drift, (targets, points).
@@ -219,7 +230,7 @@ def _make_record(
     ]
     for values, which, number in (
         (curves, split, on_the_way),
-        (selection, "validation", validation_episodes),
+        (validation, "validation", validation_episodes),
     ):
         rows += [
             (target + 1, steps[point], names[retained + target], which, episode, int(value), value, 50)
@@ -234,35 +245,31 @@ def _make_record(
         for (stage, task, episode), value in _each(perturbed, 2, outcomes.shape[2])
     ]
     run |= {} if perturbed is None else {"perturb": True}
+    budget = {
+        "adaptation_steps": steps[-1],
+        "test_episodes": outcomes.shape[2],
+        "curve_episodes": on_the_way,
+        "validation_episodes": validation_episodes,
+    }
     given = answers or {}
     return Record(
         status="success",
-        run=run,
-        scenario={
-            "id": run["scenario"],
-            "retained": names[:retained],
-            "target": names[retained : retained + targets],
-            "held_out": names[retained + targets :],
-            "evaluation_steps": list(steps),
-            "budget": {
-                "adaptation_steps": steps[-1],
-                "test_episodes": outcomes.shape[2],
-                "curve_episodes": on_the_way,
-                "validation_episodes": validation_episodes,
-            },
-        },
+        run=RunInfo(**run),
+        scenario=ScenarioInfo(
+            id=run["scenario"],
+            retained=names[:retained],
+            target=names[retained : retained + targets],
+            held_out=names[retained + targets :],
+            evaluation_steps=list(steps),
+            budget=budget,
+        ),
         episodes=_columns(EPISODE_COLUMNS, rows),
         answers=_columns(
             ANSWER_COLUMNS,
             [(stage, steps[-1] if stage else 0, kind, *value) for (stage, kind), value in given.items()],
         ),
         policy=_columns(POLICY_COLUMNS, _policy_rows(sparsity, drift, (stages, len(steps)), steps)),
-        costs={
-            "optimiser_steps": stages * steps[-1],
-            "parameters": 1000,
-            "parameters_added": 0,
-            "bytes_kept": 0,
-        },
+        costs=Costs(optimiser_steps=stages * steps[-1], parameters=1000, parameters_added=0, bytes_kept=0),
         fingerprint={"rollouts": {"toy:world": "0123"}},
     )
 

@@ -65,7 +65,7 @@ def test_it_runs_by_entry_point_and_from_the_working_directory_to_the_same_recor
     _python("clbench", "run", TOY, *arguments, folder=tmp_path, path=installed)
     records = [read_record(path) for path in sorted((tmp_path / "records").rglob("seed-0.json"))]
     one, other = records
-    assert {record.run["method"] for record in records} == {INSTALLED, BESIDE}
+    assert {record.run.method for record in records} == {INSTALLED, BESIDE}
     assert {record.status for record in records} == {"success"}
     assert (one.episodes, one.answers, one.policy) == (other.episodes, other.answers, other.policy)
     assert set(one.episodes["step"]) == {0, 60}  # it is evaluated at the ends of stages only

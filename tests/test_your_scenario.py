@@ -45,11 +45,12 @@ def test_its_scenario_is_an_environment_and_passes_the_check(folder: Path) -> No
 
 
 def test_its_world_is_perturbed_as_the_page_says(tmp_path: Path) -> None:
-    """The lines of the page go into the world, each before or after a line that stands there once."""
-    imported, made, drawn, displaced = _fragments()
+    """Insert the lines of the page into the world, each before or after a line that occurs once."""
+    imported, declared, made, drawn, displaced = _fragments()
     world = _blocks("python")[0].replace("render_mode=None", "render_mode=None, perturbed=False")
     for line, lines in (
         ("import clbench\n", f"import clbench\n{imported}\n"),
+        ("    def __init__", f"{textwrap.indent(textwrap.dedent(declared), ' ' * 4)}\n\n    def __init__"),
         ("self.data = mujoco.MjData(self.model)\n", f"self.data = mujoco.MjData(self.model)\n{made}\n"),
         ("        mujoco.mj_resetData", f"{drawn}\n        mujoco.mj_resetData"),
         ("        return self._state(), {", f"{displaced}\n        return self._state(), {{"),
@@ -76,7 +77,7 @@ for seed in range(4):
 
 
 def _fragments() -> list[str]:
-    """Return what the page adds to a world that can be perturbed: an import, and lines for three places."""
+    """Return the lines that the page adds to a perturbable world: an import, and lines for four places."""
     (block,) = re.findall(r"  ```py\n(.*?)  ```", PAGE.read_text(encoding="utf-8"), flags=re.DOTALL)
     first, *others = textwrap.dedent(block).strip("\n").split("\n\n")
     return [first, *(textwrap.indent(lines, " " * 8) for lines in others)]

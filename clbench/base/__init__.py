@@ -1,1 +1,1 @@
-"""The ground floor: files, seeds, names of things and errors. Nothing here imports another part of clbench."""
+"""The ground floor: files, seeds, names and errors. Nothing here imports another part of clbench."""

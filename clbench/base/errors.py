@@ -1,7 +1,7 @@
 """Errors that clbench explains.
 
-The command line shows the message of a `ClbenchError` in one line. Any other exception is a bug, and shows its
-traceback. Each class also derives from the built-in exception that a caller would expect.
+The command line shows the message of a `ClbenchError` in one line. Any other exception is a bug, and shows
+its traceback. Each class also derives from the built-in exception that a caller would expect.
 """
 
 from __future__ import annotations

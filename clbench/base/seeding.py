@@ -54,4 +54,4 @@ def seeded(*parts: str | int) -> Iterator[None]:
 
 
 SPLIT_LABELS = {"train": "train", "validation": "selection", "test": "report"}
-"""What seeds call the splits. These words are older than the names and must stay: others draw other episodes."""
+"""Names of the splits in seeds, older than the splits' own names: other words would draw other episodes."""

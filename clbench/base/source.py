@@ -1,19 +1,42 @@
-"""Hashes of source code, which cache keys contain."""
+"""Hashes of source code, which cache keys contain: a result is made again when the code that made it changes.
+
+A key names packages, each with every package below it, and not single modules: a module that moves inside its
+package stays covered, and code that cannot change a result (the film maker, the command line) is not in the
+key.
+"""
 
 from __future__ import annotations
 
 import hashlib
 import importlib.util
+import sys
 from pathlib import Path
+
+DATA_SOURCES = ("clbench.base", "clbench.spec", "clbench.policy", "clbench.worlds", "clbench.data")
+"""What demonstrations and questions depend on, besides the suite of their tasks."""
+
+TRAINING_SOURCES = (*DATA_SOURCES, "clbench.learning")
+"""What a pretrained policy depends on, besides the suites of its tasks and questions."""
+
+RUN_SOURCES = (*TRAINING_SOURCES, "clbench.records", "clbench.evaluation", "clbench.runs")
+"""What a run depends on, besides the suites of its tasks and the package of its method."""
 
 
 def source_hash(*modules: str) -> str:
-    """Return the hash of the source of `modules`; a package counts with all files below it."""
+    """Return the hash of the source of `modules`; a package counts with all files below it.
+
+    Args:
+        modules: Names of modules and packages, in any order.
+
+    Raises:
+        ModuleNotFoundError: A module does not exist. Its name must not be hashed in place of its source: the
+            key would never change.
+    """
     digest = hashlib.sha256()
-    for module in modules:
+    for module in sorted(set(modules)):
         origin = _origin(module)
-        if origin is None:  # typed in by hand: there is nothing to read
-            digest.update(module.encode())
+        digest.update(module.encode())
+        if origin is None:  # a class that was typed at a prompt has no source to read
             continue
         for path in sorted(origin.parent.rglob("*")) if origin.name == "__init__.py" else [origin]:
             if path.is_file() and path.suffix != ".pyc":
@@ -22,16 +45,26 @@ def source_hash(*modules: str) -> str:
 
 
 def _origin(module: str) -> Path | None:
-    """Return the file of a module, or None if it has none."""
+    """Return the file of a module, None if it has no file.
+
+    Raises:
+        ModuleNotFoundError: The module does not exist.
+    """
     try:
         spec = importlib.util.find_spec(module)
-    except ValueError:
-        return None
-    return Path(spec.origin) if spec is not None and spec.origin is not None else None
+    except ValueError:  # `__main__` has no spec
+        spec, file = None, getattr(sys.modules.get(module), "__file__", None)
+    else:
+        file = spec.origin if spec is not None else None
+    if spec is None and module not in sys.modules:
+        raise ModuleNotFoundError(
+            f"There is no module {module!r}, whose source is part of a key.", name=module
+        )
+    return Path(file) if file is not None else None
 
 
 def package_of(entry_point: str) -> str:
-    """Return the package that "package.module:attribute" lies in, or the module if it stands alone."""
+    """Return the package of "package.module:attribute", or the module if it is in no package."""
     module = entry_point.partition(":")[0]
     package = module.rpartition(".")[0]
     return package if package and _origin(package) is not None else module

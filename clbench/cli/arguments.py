@@ -1,4 +1,4 @@
-"""What all commands do with what people type: a wrong name or value ends in one line with the right one."""
+"""Input of commands: limits that `--help` shows, and errors in one line with the nearest right name."""
 
 from __future__ import annotations
 
@@ -7,33 +7,57 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+from cyclopts import CycloptsError, Parameter, UnknownCommandError
+from cyclopts.validators import Number
 from rich.console import Console
+from rich.text import Text
 
+from clbench.base.entry_points import unknown
 from clbench.base.errors import ClbenchError, InputError
+
+
+def whole_number(least: int) -> Parameter:
+    """Return the annotation of a whole number that is at least `least`; `--help` shows the limit."""
+    return Parameter(validator=Number(gte=least), metavar=f"INT>={least}")
+
+
+def error_line(message: object) -> Text:
+    """Return an error message as one line."""
+    return Text(f"error: {' '.join(str(message).split())}", style="bold red")
+
+
+def parsing_error(error: CycloptsError) -> Text:
+    """Return an error in the arguments as one line."""
+    if isinstance(error, UnknownCommandError) and error.app is not None and error.unused_tokens:
+        # the message of cyclopts imports every command
+        commands = [name for name in error.app if not name.startswith("-")]
+        return error_line(unknown("command", error.unused_tokens[0], commands))
+    return error_line(error)
 
 
 @contextmanager
 def checked_input() -> Iterator[None]:
-    """Check input inside: a wrong name or value ends with exit code 2 and says the nearest right one."""
+    """End with exit code 2 and one line if the input is wrong; a bug inside shows its traceback."""
     try:
         yield
     except ClbenchError as error:
-        console = Console(stderr=True, soft_wrap=True)
-        message = error.args[0] if error.args else type(error).__name__
-        console.print(f"error: {message}", style="bold red", highlight=False, markup=False)
+        Console(stderr=True, soft_wrap=True).print(
+            error_line(error.args[0] if error.args else type(error).__name__)
+        )
         sys.exit(2)
 
 
 def add_cwd_to_path() -> None:
-    """Look for modules, as those of module:Class, in the working directory too: a console script does not."""
+    """Let module:Class name a module in the working directory: a console script does not look there."""
     sys.path.insert(0, os.getcwd())
 
 
-def at_least(least: int, option: str, value: int | None) -> None:
-    """Refuse the value of an option that is too small.
+def require_min(least: int, option: str, value: int | None) -> None:
+    """Refuse the value of an option that is smaller than `least`.
 
     Raises:
-        ValueError: It is.
+        InputError: The value is too small.
     """
     if value is not None and value < least:
         raise InputError(f"{option} must be at least {least}, not {value}.")
+

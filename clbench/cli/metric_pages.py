@@ -1,53 +1,55 @@
-"""The registry of the metrics as text: a table, all about one, and the page docs/reference/metrics.md."""
+"""The metrics as text: a table, everything about one metric, and the page docs/reference/metrics.md."""
 
 from __future__ import annotations
 
 import inspect
+from pathlib import Path
 
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from rich.table import Table
 
 from clbench.scoring.metric import Metric
 from clbench.scoring.metrics import METRICS
 
 WIDTH = 150
-"""Least width of the table: in a narrower one names would be torn apart, and a long line only wraps."""
+"""Least width of the table in characters: a narrower table would break names, and a long line only wraps."""
 
-NOT_HERE = {
+LEFT_OUT = {
     "Continual World's RT": "it needs a run for every pair of tasks",
-    "the FWT of GEM, Mammoth and Avalanche": "it needs the success of an untrained network, which nobody "
-    "evaluates",
+    "the FWT of GEM, Mammoth and Avalanche": "it needs the success of an untrained network, which is "
+    "not evaluated",
     "min-ACC and WC-ACC at every step": "earlier targets are evaluated at the ends of the stages only, and "
     "`minimum_accuracy` and `worst_case_accuracy` say so",
-    "windowed forgetting and windowed plasticity": "their window is counted in evaluations after each step",
-    "recovery ratio": "no task is learned a second time, so that there is no relearning to time",
+    "windowed forgetting and windowed plasticity": "their window counts evaluations after each step",
+    "recovery ratio": "no task is learned a second time, so there is no relearning to time",
     "Diaz-Rodriguez's MS, SSS, CE, CL_score and CL_stability": "they need sizes and operations of every "
     "stage, and weights that the paper leaves to the user",
     "COOM's AP": "it needs the earlier targets while later ones are learned",
     "MEAL's two F": "they need the earlier targets while later ones are learned",
-    "MEAL's FT": "its ratio by the baseline has no value where learning from scratch fails, and how seeds "
-    "enter it is not settled here; `forward_transfer` is Continual World's",
+    "MEAL's FT": "its ratio to the baseline has no value where learning from scratch fails, and how to "
+    "combine seeds is not settled here; `forward_transfer` is Continual World's",
     "NBT of ReGen and the normalised NBT of arXiv 2603.03818": "which stages and tasks they average, and "
     "what stands for a success of 0, is not settled",
     "CLARE's and LifeLong-RFT's FWT": "it is the mean of R[k][k], our `adaptation`",
     "Sequoia's score": "it needs online performance and a cap on the run time",
 }
-"""Published definitions that are left out, and why."""
+"""Published definitions that clbench leaves out, and why."""
 
 
 def direction(metric: Metric) -> str:
-    """Return which way is better."""
+    """Return whether higher or lower is better."""
     return {True: "higher is better", False: "lower is better", None: "neither is better"}[
         metric.higher_is_better
     ]
 
 
 def span(metric: Metric) -> str:
-    """Return the least and the greatest possible value."""
+    """Return the range of possible values."""
     return f"{metric.low:g} to {metric.high:g}"
 
 
 def facts(metric: Metric) -> dict[str, str]:
-    """Return all about a metric, by title."""
+    """Return the facts about a metric by title."""
     seeds = "averaged before it is computed" if metric.pooled else "the mean of their values"
     return {
         "Formula": metric.formula,
@@ -63,12 +65,12 @@ def facts(metric: Metric) -> dict[str, str]:
 
 
 def remarks(metric: Metric) -> str:
-    """Return what its docstring says after the first line."""
+    """Return the docstring of a metric without its first line."""
     return inspect.cleandoc(metric.function.__doc__ or "").partition("\n")[2].strip()
 
 
 def text(metric: Metric) -> str:
-    """Return all about a metric as plain text."""
+    """Return everything about a metric as plain text."""
     lines = [
         metric.name,
         metric.description,
@@ -80,9 +82,9 @@ def text(metric: Metric) -> str:
 
 
 def table() -> Table:
-    """Return all metrics as a table of the terminal."""
+    """Return all metrics as a table for the terminal."""
     grid = Table(title="Metrics")
-    for column in ("name", "version", "direction", "range", "source", "what it tells"):
+    for column in ("name", "version", "direction", "range", "source", "description"):
         grid.add_column(column, overflow="fold", no_wrap=column in ("name", "direction", "range"))
     for metric in METRICS.values():
         grid.add_row(
@@ -98,29 +100,21 @@ def table() -> Table:
 
 def page() -> str:
     """Return docs/reference/metrics.md. The same registry gives the same bytes."""
-    lines = [
-        "# Metrics",
-        "",
-        "Made by `clbench metrics --markdown docs/reference/metrics.md` from the registry.",
-        "",
-        "R[l][s] is the success rate on task s at the end of stage l, stage 0 is the pretrained policy, "
-        "target k is learned in stage k, and K is the last stage. `None`, an empty field of the table, "
-        "stands where there is no value; it is never 0.",
-        "",
-    ]
-    lines += [f"- [{name}](#{name}): {_escaped(metric.description)}" for name, metric in METRICS.items()]
-    for metric in METRICS.values():
-        lines += ["", f"## {metric.name}", "", _escaped(metric.description), ""]
-        lines += [f"- **{key}**: {_escaped(value)}" for key, value in facts(metric).items()]
-        more = remarks(metric)
-        lines += ["", _escaped(more)] if more else []
-    lines += ["", "## Not here, and why", ""]
-    lines += [f"- {_escaped(name)}: {_escaped(why)}." for name, why in NOT_HERE.items()]
-    return "\n".join(lines) + "\n"
+    environment = Environment(
+        loader=FileSystemLoader(Path(__file__).with_name("templates")),
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
+        undefined=StrictUndefined,
+        autoescape=False,  # Markdown, whose marks `escaped` escapes
+    )
+    environment.filters["escaped"] = escaped
+    template = environment.get_template("metrics.md.jinja")
+    return template.render(metrics=METRICS.values(), facts=facts, remarks=remarks, left_out=LEFT_OUT)
 
 
-def _escaped(words: str) -> str:
-    """Return `words` so that Markdown does not take its brackets and stars for marks."""
+def escaped(words: str) -> str:
+    """Escape the characters that Markdown takes for links, emphasis and cells of a table."""
     for mark in "[]*|":
         words = words.replace(mark, f"\\{mark}")
     return words

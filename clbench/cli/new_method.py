@@ -1,4 +1,4 @@
-"""A new method: a commented template of a page, and its test."""
+"""The command `clbench new-method`: a commented template of a method on one page, and its test."""
 
 from __future__ import annotations
 
@@ -7,11 +7,14 @@ import re
 from importlib.util import find_spec
 from pathlib import Path
 
+from rich.console import Console
+
 from clbench.base.errors import InputError
 from clbench.base.strict_json import quoted
+from clbench.cli.arguments import checked_input
 from clbench.spec.identifiers import built_in_methods, check_method_name
 
-_TEMPLATE = Path(__file__).with_name("method_template.py")
+_TEMPLATE = Path(__file__).with_name("templates") / "method_template.py"
 
 _TEST = '''"""method_template keeps the contract of clbench."""
 
@@ -25,15 +28,30 @@ def test_method_template_keeps_the_contract() -> None:
 '''
 
 
+def new_method(name: str, /, *, folder: Path = Path()) -> None:
+    """Write NAME.py, a commented template of a method, and test_NAME.py.
+
+    Args:
+        name: Name of the module; the name of the class follows from it.
+        folder: Existing folder for both files; no file in it is overwritten.
+    """
+    with checked_input():
+        module, test = write_method(name, folder)
+    lines = [f"Wrote {module} and {test}. Make the method yours, then:"]
+    lines += [f"  cd {folder}"] if folder != Path() else []
+    lines += [f"  python -m pytest {test.name}", f"  clbench submit {name}:{class_name(name)}"]
+    Console().print("\n".join(lines), highlight=False, markup=False, soft_wrap=True)
+
+
 def write_method(name: str, folder: Path) -> tuple[Path, Path]:
     """Write `name`.py and its test to `folder`, both or neither, and return their paths.
 
     Args:
-        name: Of the module.
+        name: Name of the module.
         folder: An existing folder; no file in it is overwritten.
 
     Raises:
-        ValueError: The name is refused, or a file is there already or cannot be written.
+        InputError: The name is refused, or a file exists already or cannot be written.
     """
     check_new_name(name)
     texts = {folder / f"{name}.py": _TEMPLATE.read_text(encoding="utf-8"), folder / f"test_{name}.py": _TEST}
@@ -54,15 +72,15 @@ def write_method(name: str, folder: Path) -> tuple[Path, Path]:
 
 
 def class_name(name: str) -> str:
-    """Return the name of the class in the module `name`, as "MyMethod" in my_method."""
+    """Return the name of the class in the module `name`, for example "MyMethod" in my_method."""
     return "".join(word.capitalize() for word in name.split("_"))
 
 
 def check_new_name(name: str) -> None:
-    """Refuse a name that a new method's module cannot have.
+    """Refuse a name that the module of a new method cannot have.
 
     Raises:
-        ValueError: It is no name of a module, or one that is taken or can be mistaken; the message says why.
+        InputError: The name is taken, too like another, or not valid for a module; the message shows which.
     """
     if not re.fullmatch("[a-z][a-z0-9_]{0,49}", name):
         near = re.sub(r"\W+|(?<=[a-z0-9])(?=[A-Z])", "_", name, flags=re.ASCII).lower().strip("_0123456789")

@@ -1,10 +1,12 @@
-"""Leaks: what the hooks of a stage must not know. Every run is held to it.
+"""Access rules: the data that the hooks of a stage must not see. Every run checks them.
 
-While a method's hooks run, they may touch what the runner hands to them and nothing that is later than their
-stage: demonstrations and validation episodes of tasks up to this one, and no report at all. After each of them
-the policy must still have the normalisation of the retained skills, its vocabulary and its sizes.
+The hooks of a method may use the objects that the runner passes to them, and no data of a later stage. They may
+read the demonstrations and run the validation episodes of tasks up to their own, but no test episode and no test
+question. After each hook the policy must still have the normalisation of the retained skills, its vocabulary
+and its sizes.
 
-This finds mistakes. A method that goes around the functions of clbench is not held by it: `docs/guide/security.md`.
+These checks find mistakes. They do not stop a method that avoids the functions of clbench, see
+`docs/guide/security.md`.
 """
 
 from __future__ import annotations
@@ -23,19 +25,19 @@ if TYPE_CHECKING:
     from clbench.spec.protocol import Split
 
 _known: ContextVar[frozenset[str] | None] = ContextVar("known", default=None)
-"""Names of the tasks that the hooks under way may know; None outside of them."""
+"""Names of the tasks that the running hooks may know; None outside of hooks."""
 
 NORMALISATION = ("state_mean", "state_std", "action_mean", "action_std")
-"""Buffers of a policy that come from the demonstrations of the retained skills alone."""
+"""Buffers of a policy that the demonstrations of the retained skills alone determine."""
 
 
 class LeakError(ClbenchError, RuntimeError):
-    """A method touched what its stage must not know."""
+    """A method used data that its stage must not know."""
 
 
 @contextmanager
 def hooks(known: Iterable[str]) -> Iterator[None]:
-    """Hold the code inside to what the tasks called `known` may tell it."""
+    """Restrict the code inside to the data of the tasks called `known`."""
     token = _known.set(frozenset(known))
     try:
         yield
@@ -45,7 +47,7 @@ def hooks(known: Iterable[str]) -> Iterator[None]:
 
 @contextmanager
 def outside() -> Iterator[None]:
-    """Let the runner's own code, called from within a hook, touch everything."""
+    """Lift the restriction for the runner's own code that a hook calls."""
     token = _known.set(None)
     try:
         yield
@@ -54,10 +56,10 @@ def outside() -> Iterator[None]:
 
 
 def check_demonstrations(task: str) -> None:
-    """Refuse the demonstrations of a task that is later than the hooks under way.
+    """Refuse the demonstrations of a task that comes after the stage of the running hooks.
 
     Raises:
-        LeakError: It is.
+        LeakError: The task comes later.
     """
     known = _known.get()
     if known is not None and task not in known:
@@ -65,13 +67,13 @@ def check_demonstrations(task: str) -> None:
 
 
 def check_episodes(episodes: Iterable[tuple[str, Split]]) -> None:
-    """Refuse all but validation episodes, and those of a later task, to the hooks under way.
+    """Refuse to the running hooks all episodes but validation episodes of tasks that they may know.
 
     Args:
-        episodes: Task and split of each.
+        episodes: Task and split of each episode.
 
     Raises:
-        LeakError: One of them is refused.
+        LeakError: An episode is refused.
     """
     known = _known.get()
     if known is None:
@@ -84,24 +86,24 @@ def check_episodes(episodes: Iterable[tuple[str, Split]]) -> None:
 
 
 def check_questions() -> None:
-    """Refuse the questions, those of the report among them, to the hooks under way.
+    """Refuse all questions, training and test, to the running hooks.
 
     Raises:
-        LeakError: Hooks are under way.
+        LeakError: Hooks are running.
     """
     if _known.get() is not None:
         raise LeakError("The method loads questions by itself, those of the report too: `prior` has its own.")
 
 
 def check_policy(policy: Policy, pretrained: Policy) -> None:
-    """Check that a policy sees states and words as it was pretrained to.
+    """Check that a policy still reads states and words as it was pretrained to.
 
     Args:
-        policy: As a hook left it.
-        pretrained: As pretraining left it, on the retained skills alone; on the same device.
+        policy: Policy after a hook.
+        pretrained: Policy after pretraining on the retained skills alone, on the same device.
 
     Raises:
-        LeakError: Its normalisation, its vocabulary or another of its sizes has changed.
+        LeakError: The normalisation, the vocabulary or another size of the policy has changed.
     """
     if policy.config != pretrained.config:
         raise LeakError("The method changes the vocabulary or a size of the policy: all stages share them.")

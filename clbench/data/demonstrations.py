@@ -1,10 +1,11 @@
-"""Demonstrations: the expert's episodes, kept as Minari datasets, read as batches of action chunks."""
+"""Demonstrations: episodes of the expert, stored as Minari datasets and read as batches of action chunks."""
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import json
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -19,8 +20,9 @@ from torch import Tensor
 from clbench.base.cache import cached
 from clbench.base.dependencies import versions
 from clbench.base.entry_points import resolve
+from clbench.base.progress import ProgressCallback, no_progress
 from clbench.base.seeding import derive_seed, numpy_generator
-from clbench.base.source import source_hash
+from clbench.base.source import DATA_SOURCES, source_hash
 from clbench.data.access import check_demonstrations
 from clbench.policy.batch import Batch
 from clbench.policy.policy import PolicyConfig
@@ -32,21 +34,21 @@ from clbench.worlds.observation import observed
 from clbench.worlds.world import World
 
 SIMULATORS = ("gymnasium", "mujoco", "numpy")
-"""Packages whose version can change a trajectory in any suite; a task names those of its own suite."""
+"""Packages whose version can change a trajectory in any suite; a task adds the packages of its own suite."""
 
 
 @dataclass(frozen=True)
 class Demonstration:
-    """One episode of T steps."""
+    """An episode of T steps."""
 
     state: NDArray[np.float32]
-    """Observations, (T + 1, S)."""
+    """States of the world, (T + 1, S)."""
     executed: NDArray[np.float32]
-    """Actions that were executed, (T, A)."""
+    """Executed actions, (T, A)."""
     expert: NDArray[np.float32]
-    """What the expert would do in each state, (T + 1, A)."""
+    """Action of the expert in each state, (T + 1, A)."""
     noisy: NDArray[np.bool_]
-    """Where the executed action was not the expert's, (T + 1,); the last is False."""
+    """Whether a random action replaced the expert's, (T + 1,); the last entry is False."""
     reward: NDArray[np.float64]
     """Rewards, (T,)."""
     success: bool
@@ -58,10 +60,10 @@ def demonstrate(world: World, task: Task, seed: int, noisy: bool) -> Demonstrati
 
     Args:
         world: An environment of the task's world.
-        task: What to do.
+        task: Task of the episode.
         seed: Seed of the initial state and of the action noise.
-        noisy: Whether, as often as the task says, 3 to 6 random actions replace the expert's,
-            so that the episode shows how to recover.
+        noisy: Whether 3 to 6 random actions replace the expert's now and then, with the probability that the
+            task gives. Such an episode shows how to recover.
     """
     expert = resolve(task.expert)(task.name)
     generator = np.random.default_rng([seed, 1])
@@ -104,15 +106,27 @@ def _action_bounds(world: World) -> tuple[NDArray[np.float32], NDArray[np.float3
     return world.action_space.low, world.action_space.high
 
 
-def collect(
-    task: Task, budget: Budget, progress: Callable[[float], None] = lambda _: None
-) -> list[Demonstration]:
+def collect(task: Task, budget: Budget, progress: ProgressCallback = no_progress) -> list[Demonstration]:
     """Return the successful expert episodes that a budget asks for; failed attempts are repeated.
+
+    Args:
+        task: Task of the episodes.
+        budget: Budget with the number of demonstrations.
+        progress: Called with the number of episodes kept since its last call.
 
     Raises:
         RuntimeError: The expert fails more often than it succeeds.
     """
+    with contextlib.closing(_world(task)) as world:
+        return _collect(world, task, budget, progress)
+
+
+def _world(task: Task) -> World:
     world: World = resolve(task.world)()
+    return world
+
+
+def _collect(world: World, task: Task, budget: Budget, progress: ProgressCallback) -> list[Demonstration]:
     kept: list[Demonstration] = []
     for attempt in range(2 * budget.demonstrations):
         seed = derive_seed("demonstration", task.dataset_id, attempt)
@@ -122,7 +136,6 @@ def collect(
             kept.append(episode)
             progress(1)
         if len(kept) == budget.demonstrations:
-            world.close()
             return kept
     raise RuntimeError(
         f"The expert of {task.name!r} succeeded {len(kept)} times in {2 * budget.demonstrations} attempts; "
@@ -130,10 +143,15 @@ def collect(
     )
 
 
-def dataset_folder(task: Task, budget: Budget, progress: Callable[[float], None] = lambda _: None) -> Path:
+def dataset_folder(task: Task, budget: Budget, progress: ProgressCallback = no_progress) -> Path:
     """Return the folder of the task's Minari dataset, which is collected on first use.
 
-    It lies where Minari keeps its datasets, so that `minari.load_dataset(task.dataset_id)` finds it.
+    The folder is where Minari keeps its datasets, so that `minari.load_dataset(task.dataset_id)` finds it.
+
+    Args:
+        task: Task of the demonstrations.
+        budget: Budget with the number of demonstrations.
+        progress: Called with the number of episodes collected since its last call.
     """
     from minari.storage.datasets_root_dir import get_dataset_path
 
@@ -141,16 +159,17 @@ def dataset_folder(task: Task, budget: Budget, progress: Callable[[float], None]
         "task": dataclasses.asdict(task),
         "demonstrations": budget.demonstrations,
         "noisy_demonstrations": budget.noisy_demonstrations,
-        "source": source_hash(
-            __name__, "clbench.base.seeding", "clbench.worlds.lanes", *packages_of([task], "world", "expert")
-        ),
+        "source": source_hash(*DATA_SOURCES, *packages_of([task], "world", "expert")),
         "versions": simulator_versions([task]),
     }
     folder = get_dataset_path(task.dataset_id)
     _declare_namespaces(folder, task.dataset_id)
-    return cached(
-        folder, inputs, lambda partial: _write(partial / "data", task, collect(task, budget, progress))
-    )
+
+    def make(partial: Path) -> None:
+        with contextlib.closing(_world(task)) as world:
+            _write(partial / "data", task, world, _collect(world, task, budget, progress))
+
+    return cached(folder, inputs, make)
 
 
 def _declare_namespaces(folder: Path, dataset_id: str) -> None:
@@ -164,14 +183,12 @@ def _declare_namespaces(folder: Path, dataset_id: str) -> None:
             path.write_text(json.dumps({"description": "Expert demonstrations of clbench"}), encoding="utf-8")
 
 
-def _write(folder: Path, task: Task, episodes: Sequence[Demonstration]) -> None:
-    """Write episodes as a Minari dataset; actions are the executed ones, the expert's stand in the infos."""
+def _write(folder: Path, task: Task, world: World, episodes: Sequence[Demonstration]) -> None:
+    """Write episodes as a Minari dataset: the executed actions as actions, the expert's among the infos."""
     from minari.data_collector import EpisodeBuffer
     from minari.dataset.minari_storage import MinariStorage
 
-    world: World = resolve(task.world)()
     storage = MinariStorage.new(folder, world.observation_space, world.action_space)
-    world.close()
     buffers = []
     for number, episode in enumerate(episodes):
         last = np.arange(len(episode.executed)) == len(episode.executed) - 1
@@ -221,26 +238,26 @@ class Demonstrations:
     """Demonstrations of one or more tasks as tensors: one row for each of N moments."""
 
     scenes: Tensor
-    """The states of the world, (N, W); no method gets them."""
+    """States of the world, (N, W); no method gets them."""
     state: Tensor
-    """What a policy is shown of them as numbers, (N, S)."""
+    """Numbers that a policy sees of the states, (N, S)."""
     image: Tensor
-    """What it is shown as a picture, uint8 (N, size, size, 3); the size is 0 if it sees none."""
+    """Pictures that a policy sees of the states, uint8 (N, size, size, 3); the size is 0 without a camera."""
     action: Tensor
-    """The expert's next H actions, (N, H, A)."""
+    """Next H actions of the expert, (N, H, A)."""
     valid: Tensor
-    """Which of these count, (N, H): not those after the end, nor those after action noise."""
+    """Which of these actions count, (N, H): 0 after the end of the episode and after action noise, else 1."""
     words: Tensor
     """Word ids of the instructions, (tasks, wordings, L)."""
     rows: Tensor
-    """First row of each task and the number of its rows, (tasks, 2): rows of a task stand together."""
+    """First row of each task and the number of its rows, (tasks, 2): the rows of a task are consecutive."""
 
     @classmethod
     def of_task(cls, task: Task, episodes: Sequence[Demonstration], chunk: int) -> Demonstrations:
         """Return the episodes of one task, cut into chunks of `chunk` actions.
 
         Raises:
-            RenderingError: The task has a camera, and nothing here can draw.
+            RenderingError: The task has a camera, and no back end of this machine can draw.
         """
         pieces = [_chunks(episode, chunk) for episode in episodes]
         action, valid = (torch.from_numpy(np.concatenate(column)) for column in zip(*pieces, strict=True))
@@ -253,7 +270,7 @@ class Demonstrations:
 
     @classmethod
     def cat(cls, parts: Sequence[Demonstrations]) -> Demonstrations:
-        """Return the tasks of all parts together."""
+        """Return the demonstrations of all parts as one."""
         wordings = max(part.words.shape[1] for part in parts)
         words = [part.words[:, torch.arange(wordings) % part.words.shape[1]] for part in parts]
         starts = np.cumsum([0, *(len(part.state) for part in parts)])
@@ -270,11 +287,11 @@ class Demonstrations:
 
     @property
     def bytes(self) -> int:
-        """Memory that the data takes, without the scenes, of which nothing is learned."""
+        """Memory of the data in bytes, without the scenes, which no policy learns from."""
         return sum(value.nbytes for name, value in vars(self).items() if name != "scenes")
 
     def sample(self, count: int, generator: torch.Generator) -> Batch:
-        """Return `count` samples: a task at random, then a moment and a wording of it."""
+        """Return `count` samples: each draws a task, then one of its moments and one of its wordings."""
         task = torch.randint(len(self.rows), (count,), generator=generator)
         first, length = self.rows[task].unbind(1)
         row = first + (torch.rand(count, generator=generator) * length).long()
@@ -292,19 +309,19 @@ class Demonstrations:
 
 
 def _chunks(episode: Demonstration, chunk: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return chunks (T, chunk, A) and which of their steps count (T, chunk)."""
+    """Return the chunks of an episode (T, chunk, A), and which of their steps count (T, chunk)."""
     steps = len(episode.executed)
     index = np.arange(steps)[:, None] + np.arange(chunk)
     inside = index < steps
     index = np.minimum(index, steps - 1)
-    # what follows action noise answers a state that the chunk's own actions would not have led to
+    # after action noise the expert acts in states that the actions of this chunk do not lead to
     earlier = np.cumsum(episode.noisy[index], axis=1) - episode.noisy[index]
     valid = (inside & (earlier == 0)).astype(np.float32)
     return episode.expert[index], valid
 
 
 def load_demonstrations(task: Task, scenario: Scenario, config: PolicyConfig) -> Demonstrations:
-    """Return the demonstrations of `task`, collected on first use, as chunks that fit a policy."""
+    """Return the demonstrations of `task` in chunks that fit a policy; they are collected on first use."""
     check_demonstrations(task.name)
     episodes = read_dataset(dataset_folder(task, scenario.budget))
     return Demonstrations.of_task(task, episodes, config.chunk)

@@ -1,6 +1,6 @@
-"""Questions about a scene with one right answer, made from the simulator's state.
+"""Questions about a scene with one right answer, made from the state of the simulator.
 
-They stand for the knowledge of a vision-language model: what a policy knew before it was fine-tuned.
+They represent the knowledge of a vision-language model, which a policy has before it is fine-tuned.
 """
 
 from __future__ import annotations
@@ -20,8 +20,9 @@ from torch import Tensor
 from clbench.base.cache import cache_folder, cached, hash_of
 from clbench.base.entry_points import resolve
 from clbench.base.errors import InputError
+from clbench.base.progress import ProgressCallback, no_progress
 from clbench.base.seeding import SPLIT_LABELS, derive_seed, torch_generator
-from clbench.base.source import source_hash
+from clbench.base.source import DATA_SOURCES, source_hash
 from clbench.data.access import check_questions
 from clbench.data.demonstrations import demonstrate, simulator_versions
 from clbench.policy.batch import QuestionBatch
@@ -35,7 +36,7 @@ from clbench.worlds.world import World
 Truths: TypeAlias = NDArray[np.bool_]
 """Whether something holds in each of the states (N,)."""
 Answers: TypeAlias = NDArray[np.int64]
-"""The index of the right answer in each of the states (N,), or -1 where it is too close to tell."""
+"""Index of the right answer in each of the states (N,), -1 where it is too close to tell."""
 
 
 def which(*truths: Truths) -> Answers:
@@ -50,36 +51,34 @@ def sign(difference: NDArray[np.float32], margin: float) -> Answers:
 
 @dataclass(frozen=True)
 class QuestionKind:
-    """One thing that can be asked about a state, in several wordings."""
+    """A question about a state, in several wordings."""
 
     name: str
-    """Name of the kind, as "block_left_of_gripper"."""
+    """Name of the kind, such as "block_left_of_gripper"."""
     wordings: tuple[str, ...]
-    """The question in words; each means the same."""
+    """Wordings of the question, all with the same meaning."""
     answers: tuple[str, ...]
-    """The possible answers, each one word of the vocabulary."""
+    """Possible answers, each a word of the vocabulary."""
     answer: Callable[[NDArray[np.float32]], Answers]
-    """Maps states (N, S) to answers (N,)."""
+    """Function that maps states (N, S) to the indices of their answers (N,)."""
 
 
-def scenes_folder(scenario: Scenario, progress: Callable[[float], None] = lambda _: None) -> Path:
-    """Return the folder of the states that questions are asked about; they are collected on first use.
+def scenes_folder(scenario: Scenario, progress: ProgressCallback = no_progress) -> Path:
+    """Return the folder of the states for the questions, which are collected on first use.
 
     The states come from noisy expert episodes of the scenario's `scene_tasks`, and are split by episode
-    into `train` and `report`.
+    into `train` and `test`.
+
+    Args:
+        scenario: Scenario of the questions.
+        progress: Called with the number of episodes collected since its last call.
     """
     tasks = scenario.scene_tasks
     inputs = {
         "scenario": scenario.id,
         "tasks": [dataclasses.asdict(task) for task in tasks],
         "episodes": scenario.budget.question_episodes,
-        "source": source_hash(
-            "clbench.data.demonstrations",
-            "clbench.base.seeding",
-            "clbench.worlds.lanes",
-            __name__,
-            *packages_of(tasks, "world", "expert"),
-        ),
+        "source": source_hash(*DATA_SOURCES, *packages_of(tasks, "world", "expert")),
         "versions": simulator_versions(tasks),
     }
     folder = cache_folder() / "scenes" / hash_of(inputs)
@@ -90,7 +89,7 @@ def scenes_folder(scenario: Scenario, progress: Callable[[float], None] = lambda
     return cached(folder, inputs, make)
 
 
-def _scenes(scenario: Scenario, progress: Callable[[float], None]) -> dict[str, Tensor]:
+def _scenes(scenario: Scenario, progress: ProgressCallback) -> dict[str, Tensor]:
     worlds: dict[str, World] = {}
     scenes = {}
     count = scenario.budget.question_episodes
@@ -110,12 +109,12 @@ def _scenes(scenario: Scenario, progress: Callable[[float], None]) -> dict[str, 
 
 
 class Questions:
-    """Questions about a set of states, drawn so that every kind, and every answer of a kind, is as frequent.
+    """Questions about a set of states: all kinds are equally frequent, and all answers within a kind.
 
     Args:
-        kinds: What is asked.
+        kinds: Kinds of questions to ask.
         scenes: States (N, S) to ask about.
-        shown: What a policy is shown of them: numbers (N, P) and pictures. The states themselves if None.
+        shown: Numbers (N, P) and pictures that a policy sees of the states; None shows the states.
 
     Raises:
         ValueError: A kind has an answer that no state gives.
@@ -151,20 +150,20 @@ class Questions:
         return cells
 
     def __len__(self) -> int:
-        """Return the number of states that are asked about."""
+        """Return the number of states."""
         return len(self.scenes)
 
     @property
     def bytes(self) -> int:
-        """Memory that the states and the lists of questions take."""
+        """Memory of the states and the lists of questions, in bytes."""
         return self.state.nbytes + self.image.nbytes + self._rows.nbytes + self._words.nbytes
 
     def sample(self, count: int, generator: torch.Generator) -> QuestionBatch:
-        """Return `count` questions: a kind at random, then one of its answers, a state and a wording."""
+        """Return `count` questions: each draws a kind, then one of its answers, a state and a wording."""
         return self.ask(torch.randint(len(self.kinds), (count,), generator=generator), generator)
 
     def ask(self, kind: Tensor, generator: torch.Generator) -> QuestionBatch:
-        """Return one question for each index (count,) of a kind."""
+        """Return a question for each index (count,) of a kind."""
         draws = torch.rand(3, len(kind), generator=generator)
         cell = self._first_cell[kind] + (draws[0] * self._answers[kind]).long()
         row = self._rows[self._cell_starts[cell] + (draws[1] * self._cell_sizes[cell]).long()]
@@ -177,19 +176,19 @@ def load_questions(scenario: Scenario) -> tuple[Questions, Questions]:
     """Return the training and the test questions of a scenario.
 
     Raises:
-        RenderingError: It has a camera, and nothing here can draw.
+        RenderingError: The scenario has a camera, and no back end of this machine can draw.
     """
     check_questions()
     kinds = resolve(scenario.questions)
     scenes = load_file(scenes_folder(scenario) / "scenes.safetensors")
     first = scenario.scene_tasks[0]
-    train, report = (
+    train, test = (
         Questions(kinds, scenes[split], observed(first, scenes[split].numpy())) for split in ("train", "test")
     )
-    return train, report
+    return train, test
 
 
 def scored_questions(questions: Questions, count: int) -> tuple[Tensor, QuestionBatch]:
-    """Return the kinds (count,) and the questions of every report: the same for all methods and seeds."""
+    """Return the kinds (count,) and the questions of every test: the same for all methods and seeds."""
     kind = torch.arange(count) % len(questions.kinds)
     return kind, questions.ask(kind, torch_generator("report questions"))

@@ -1,4 +1,4 @@
-"""Evaluation: rollouts of many episodes in lock-step, and answers to questions.
+"""Rollouts: many evaluation episodes in lock-step.
 
 An episode's outcome depends on nothing but the policy, the task, its number and the run's seed. Every forward
 has one shape, `LANES` rows of which the unused are padding: a matrix product may round differently for
@@ -14,10 +14,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from clbench.base.progress import ProgressCallback, no_progress
 from clbench.base.seeding import SPLIT_LABELS, derive_seed, torch_generator
 from clbench.data.access import check_episodes
-from clbench.data.questions import QuestionKind
-from clbench.policy.batch import QuestionBatch
 from clbench.policy.policy import Policy
 from clbench.spec.language import encode
 from clbench.spec.protocol import Split
@@ -103,7 +102,7 @@ class Evaluator:
         policy: Policy,
         tasks: Iterable[Task],
         split: Split = "validation",
-        progress: Callable[[float], None] = lambda _: None,
+        progress: ProgressCallback = no_progress,
     ) -> list[Episode]:
         """Return the outcome of every episode of `split` on each of the tasks, in order of task and number.
 
@@ -120,7 +119,7 @@ class Evaluator:
         self,
         policy: Policy,
         trials: Sequence[Trial],
-        progress: Callable[[float], None] = lambda _: None,
+        progress: ProgressCallback = no_progress,
         watch: Watch = lambda _, __: None,
     ) -> list[Episode]:
         """Return the outcome of each of `trials`, in their order; none may be there twice.
@@ -217,32 +216,3 @@ def start_of(trial: Trial, seed: int) -> tuple[int, str]:
     instruction = task.instructions[number % len(task.instructions)]
     label = SPLIT_LABELS["test" if split == "perturbed" else split]
     return derive_seed("episode", seed, task.name, label, number), instruction
-
-
-@torch.inference_mode()
-def answer(
-    policy: Policy, kinds: Sequence[QuestionKind], kind: torch.Tensor, questions: QuestionBatch
-) -> list[tuple[str, int, int]]:
-    """Return, for each kind of question, its name, how often it was asked, and how often answered rightly.
-
-    Args:
-        policy: What answers, by the likeliest word of the whole vocabulary.
-        kinds: The kinds that there are.
-        kind: Index of each question's kind, (B,).
-        questions: The questions, B of them.
-    """
-    right = []
-    device = policy.state_mean.device
-    for start in range(0, len(questions), LANES):
-        rows = slice(start, start + LANES)
-        padding = LANES - len(questions.state[rows])
-        state = torch.nn.functional.pad(questions.state[rows], (0, 0, 0, padding))
-        words = torch.nn.functional.pad(questions.words[rows], (0, 0, 0, padding), value=1)
-        image = torch.nn.functional.pad(questions.image[rows], (0, 0, 0, 0, 0, 0, 0, padding))
-        word = policy.answer_logits(state.to(device), words.to(device), image.to(device)).argmax(dim=1).cpu()
-        right.append(word[: LANES - padding] == questions.answer[rows])
-    correct = torch.cat(right)
-    return [
-        (entry.name, int((kind == index).sum()), int(correct[kind == index].sum()))
-        for index, entry in enumerate(kinds)
-    ]

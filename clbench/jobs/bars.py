@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from types import TracebackType
 from typing import Self
 
@@ -31,8 +31,8 @@ class Bars:
         self._clock = clock
         self._total, self._done = max(total, 1e-9), 0.0
         self._started = self._last_line = clock()
-        self._bars: dict[str, TaskID] = {}
-        self._left: dict[str, float] = {}
+        self._bars: dict[Hashable, TaskID] = {}
+        self._left: dict[Hashable, float] = {}
         self._progress = Progress(
             TextColumn("{task.description}"),
             BarColumn(),
@@ -54,15 +54,15 @@ class Bars:
     ) -> None:
         self._progress.stop()
 
-    def start(self, name: str, length: float) -> None:
-        """Show a new piece of work."""
-        self._bars[name] = self._progress.add_task(name, total=length)
-        self._left[name] = length
+    def start(self, piece: Hashable, length: float) -> None:
+        """Show a new piece of work under its text, `str(piece)`."""
+        self._bars[piece] = self._progress.add_task(str(piece), total=length)
+        self._left[piece] = length
 
-    def advance(self, name: str, amount: float) -> None:
+    def advance(self, piece: Hashable, amount: float) -> None:
         """Show that `amount` of a piece was done."""
-        self._left[name] -= amount
-        self._progress.advance(self._bars[name], amount)
+        self._left[piece] -= amount
+        self._progress.advance(self._bars[piece], amount)
         self._progress.advance(self._all, amount)
         self._done += amount
         now = self._clock()
@@ -71,14 +71,14 @@ class Bars:
             share = min(1.0, self._done / self._total)
             # before anything is done nobody knows how long the rest takes
             left = f", about {_minutes((now - self._started) * (1 - share) / share)} left" if share else ""
-            self.say(f"{share:4.0%}{left}: {', '.join(self._bars)}")
+            self.say(f"{share:4.0%}{left}: {', '.join(map(str, self._bars))}")
 
-    def finish(self, name: str, text: str) -> None:
-        """Take a piece away, whatever was left of it, and say what came of it."""
-        self.advance(name, self._left[name])
-        del self._left[name]
-        self._progress.remove_task(self._bars.pop(name))
-        self.say(f"{name}: {text}")
+    def finish(self, piece: Hashable, text: str) -> None:
+        """Remove the bar of a piece, whatever was left of it, and print the outcome."""
+        self.advance(piece, self._left[piece])
+        del self._left[piece]
+        self._progress.remove_task(self._bars.pop(piece))
+        self.say(f"{piece}: {text}")
 
     def say(self, line: str) -> None:
         """Print a line as it is: names may look like markup, and a log is not to be wrapped."""

@@ -1,8 +1,8 @@
-"""Jobs, and the interface of whoever does them."""
+"""Jobs, and the interface of the workers that do them."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple, Protocol
 
@@ -10,56 +10,59 @@ from clbench.spec.limits import Limits
 
 
 class JobError(Exception):
-    """A job came to a bad end that its message tells in full."""
+    """A job failed for a reason that the message explains in full."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Job:
-    """A piece of work for one process."""
+    """A piece of work for one process. Two jobs are the same only if they are the same object."""
 
-    name: str
-    """What people see."""
-    function: str
-    """Entry point; called with the arguments and `progress`. What it returns, a text, is shown."""
+    title: str
+    """Name of the job on bars and in logs."""
+    function: Callable[..., str]
+    """Function of a module, called with the arguments and `progress`. The text that it returns is shown."""
     arguments: dict[str, Any]
-    """By name."""
+    """Arguments by name; they travel to another process."""
     length: float
-    """In optimiser steps, for the time left."""
-    needs: tuple[str, ...] = ()
-    """Names of the jobs that must have ended well before."""
+    """Length in optimiser steps, for the time left."""
+    needs: tuple[Job, ...] = ()
+    """Jobs that must have succeeded before."""
     limits: Limits | None = None
-    """What its process may take; anything if None."""
+    """Limits of the process; None sets none."""
     device: str = "cpu"
-    """Where it computes."""
+    """Device on which the job computes."""
     pace: float = 1.0
-    """Time that a unit of its length takes, compared with other jobs."""
+    """Time of a unit of length, relative to other jobs."""
+
+    def __str__(self) -> str:
+        return self.title
 
 
 class Event(NamedTuple):
-    """What a worker tells."""
+    """A message from a worker."""
 
     job: Job
     kind: Literal["progress", "done", "failed", "lost"]
-    """All but the first are the end of the job; it is lost if its process ended and said nothing."""
+    """All kinds but the first end the job. A job is lost if its process ended without a result."""
     value: Any
-    """How much was done since the last event, the text that the job returned, or what went wrong."""
+    """Length done since the last event, the text that the job returned, or the reason of the failure."""
 
 
 class Workers(Protocol):
-    """Who does jobs."""
+    """Workers that do jobs."""
 
     def free(self) -> int:
-        """Return how many more jobs can be under way."""
+        """Return the number of jobs that can be started now."""
         ...
 
     def start(self, job: Job) -> None:
-        """Begin a job."""
+        """Start a job."""
         ...
 
     def events(self) -> Iterator[Event]:
-        """Give what was told since the last call; wait for it, but no longer than a second."""
+        """Yield the events since the last call; wait for one at most a second."""
         ...
 
     def close(self) -> None:
-        """End what is under way: nothing stays behind."""
+        """End all jobs that are running: no process stays behind."""
         ...

@@ -1,189 +1,201 @@
-"""The jobs that a benchmark needs, in the order in which they depend on each other."""
+"""The plan of a benchmark: its jobs, with what each of them needs."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
+from typing import Any
 
+from clbench.jobs import work
 from clbench.jobs.job import Job
-from clbench.runs.run import is_reported
-from clbench.runs.spec import RunSpec, end_length, run_length
+from clbench.learning.pretraining import is_pretrained, vision_steps
+from clbench.runs.length import point_length, run_length, training_length
+from clbench.runs.spec import ResolvedRun
+from clbench.runs.start import is_evaluated
 from clbench.spec.identifiers import folder_name
 from clbench.spec.limits import Limits
-from clbench.spec.registry import load_scenario
+from clbench.spec.scenario import Scenario
 from clbench.spec.task import Task
 
-# ---- the jobs of a benchmark -----------------------------------------------------------------------
-
 REPLAY_PACE = 0.75
-"""Of runs that replay demonstrations: they keep their skills, and an episode ends with success. On Fetch-v0
-one takes 170 s where plain fine-tuning, which forgets, takes 232 s."""
+"""Pace of runs that replay demonstrations. They keep their skills, and an episode ends with success: on
+Fetch-v0 such a run takes 170 s, where plain fine-tuning, which forgets, takes 232 s."""
 
 
-def demonstration_jobs(scenario: str, tasks: Sequence[str]) -> list[Job]:
-    """Return the jobs that collect the demonstrations of `tasks`."""
-    length = load_scenario(scenario).budget.demonstrations
-    return [
-        Job(
-            _title(scenario, f"demonstrations {task}"),
-            "clbench.jobs.work:collect_job",
-            {"scenario": scenario, "task": task},
-            length,
-        )
-        for task in tasks
-    ]
+class Plan:
+    """The jobs of a benchmark. What several runs need is one job; what is in the cache has none.
 
-
-def benchmark_jobs(
-    specs: Sequence[RunSpec],
-    records: Path,
-    limits: Limits | None = None,
-    *,
-    checkpoints: Path | None = None,
-    tensorboard: Path | None = None,
-) -> list[Job]:
-    """Return all jobs that the runs `specs` need: demonstrations, pretraining, the runs.
+    Scenarios are named by their ids, which travel to the processes of the jobs: "module:id" imports the
+        module there.
 
     Args:
-        specs: What is run.
-        records: Folder of the records.
-        limits: What the process of a run may take.
-        checkpoints: Folder below which the policies of all stages are kept; none is if None.
-        tensorboard: Folder below which the runs are logged for TensorBoard; they are not if None.
+        first: A job that all others wait for.
     """
-    folders = {"records": records, "checkpoints": checkpoints, "tensorboard": tensorboard}
-    jobs, needs = _preparing_jobs(specs)
-    reports = _report_jobs(specs, needs)
-    jobs += reports.values()
-    for spec, needed in zip(specs, needs, strict=True):
-        report = _report(spec)
-        jobs.append(
-            Job(
-                _title(spec.scenario, _label(spec)),
-                "clbench.jobs.work:run_job",
-                {"spec": spec, **folders},
-                run_length(spec.load(), spec.split, spec.perturb),
-                (*needed, report) if report in reports else needed,
-                limits,
-                spec.device,
-                REPLAY_PACE if spec.build().uses.demonstrations == "throughout" else 1.0,
-            )
-        )
-    return jobs
 
+    def __init__(self, first: Job | None = None) -> None:
+        self._first = () if first is None else (first,)
+        self._target_data: dict[tuple[str, str], Job] = {}
+        self._questions: dict[str, Job] = {}
+        self._retained_data: dict[tuple[str, str], Job] = {}
+        self._policies: dict[tuple[str, int], Job | None] = {}
+        self._starts: dict[tuple[object, ...], Job | None] = {}
+        self._runs: list[Job] = []
 
-def stages_jobs(specs: Sequence[RunSpec], checkpoints: Path | None) -> list[Job]:
-    """Return all jobs that make the policies of all stages of runs, without a record.
-
-    Args:
-        specs: The runs.
-        checkpoints: Folder below which the policies are kept; they stay in the cache alone if None.
-    """
-    jobs, needs = _preparing_jobs(specs)
-    for spec, needed in zip(specs, needs, strict=True):
-        scenario = spec.load()
-        jobs.append(
-            Job(
-                _title(spec.scenario, f"stages of {_label(spec)}"),
-                "clbench.jobs.work:stages_job",
-                {"spec": spec, "checkpoints": checkpoints},
-                len(scenario.target) * scenario.budget.adaptation_steps,
-                needed,
-                device=spec.device,
-            )
-        )
-    return jobs
-
-
-def _title(scenario: str, work: str) -> str:
-    """Return what people see of a job."""
-    return f"{folder_name(scenario.rpartition(':')[2])} {work}"
-
-
-def _label(spec: RunSpec) -> str:
-    return f"{spec.label} {_seed(spec)}"
-
-
-def _seed(spec: RunSpec) -> str:
-    return f"seed {spec.seed} order {spec.order}" if spec.order else f"seed {spec.seed}"
-
-
-def _pretraining(scenario: str, seed: int) -> str:
-    """Return the name of the job that makes the policy that the runs of a seed begin with."""
-    return _title(scenario, f"pretraining seed {seed}")
-
-
-def _report(spec: RunSpec) -> str:
-    """Return the name of the job that evaluates the policy that a run begins with."""
-    return _title(spec.scenario, f"evaluation of the pretrained policy {_seed(spec)}")
-
-
-def _questions(scenario: str) -> str:
-    """Return the name of the job that collects what questions are asked about."""
-    return _title(scenario, "questions")
-
-
-def _demonstrations(scenario: str, tasks: Iterable[Task]) -> tuple[str, ...]:
-    """Return the names of the jobs that collect the demonstrations of tasks."""
-    return tuple(_title(scenario, f"demonstrations {task.name}") for task in tasks)
-
-
-def _needs(spec: RunSpec, pretrained: bool) -> tuple[str, ...]:
-    """Return the names of the jobs that a run waits for."""
-    scenario = spec.load()
-    prior = scenario.retained if spec.build().uses.demonstrations != "never" else ()
-    data = _demonstrations(spec.scenario, scenario.target + prior)
-    policy = () if pretrained else (_pretraining(spec.scenario, spec.seed),)
-    return *policy, _questions(spec.scenario), *data
-
-
-def _preparing_jobs(specs: Sequence[RunSpec]) -> tuple[list[Job], list[tuple[str, ...]]]:
-    """Return the jobs that make what runs begin with, and for each run the names of those it waits for.
-
-    A policy that lies in the cache or ships has no job, nor has what it was pretrained on for its sake.
-    """
-    from clbench.learning.pretraining import is_pretrained, vision_steps
-
-    starts = dict.fromkeys((spec.scenario, spec.seed) for spec in specs)
-    missing = [start for start in starts if not is_pretrained(load_scenario(start[0]), start[1])]
-    needs = [_needs(spec, (spec.scenario, spec.seed) not in missing) for spec in specs]
-    needed = {name for names in needs for name in names}
-    jobs: list[Job] = []
-    for name in dict.fromkeys(spec.scenario for spec in specs):
-        scenario = load_scenario(name)
-        arguments = {"scenario": name}
-        steps = scenario.budget.pretraining_steps + vision_steps(scenario)
-        length = scenario.budget.question_episodes
-        # what all runs wait for comes before what some do
-        data = [
-            *demonstration_jobs(name, [task.name for task in scenario.target]),
-            Job(_questions(name), "clbench.jobs.work:scenes_job", arguments, length),
-            *demonstration_jobs(name, [task.name for task in scenario.retained]),
+    @property
+    def jobs(self) -> list[Job]:
+        """All jobs; those that every run waits for come first."""
+        shared = (self._target_data, self._questions, self._retained_data, self._policies, self._starts)
+        return [
+            *self._first,
+            *(job for kind in shared for job in kind.values() if job is not None),
+            *self._runs,
         ]
-        seen = (_questions(name), *_demonstrations(name, scenario.retained))
-        for seed in (seed for owner, seed in missing if owner == name):
-            needed.update(seen)
-            job = "clbench.jobs.work:pretrain_job"
-            data.append(Job(_pretraining(name, seed), job, {**arguments, "seed": seed}, steps, seen))
-        jobs += [job for job in data if job.name in needed]
-    return jobs, needs
 
+    def add_run(
+        self,
+        run: ResolvedRun,
+        records: Path,
+        limits: Limits | None = None,
+        *,
+        checkpoints: Path | None = None,
+        tensorboard: Path | None = None,
+    ) -> Job:
+        """Add a run with all that it needs, and return its job.
 
-def _report_jobs(specs: Sequence[RunSpec], needs: Sequence[tuple[str, ...]]) -> dict[str, Job]:
-    """Return the jobs that evaluate what runs begin with, by name, where that is not in the cache.
-
-    Args:
-        specs: The runs.
-        needs: Names of the jobs that each of them waits for.
-    """
-    jobs = {}
-    for name, (spec, needed) in {_report(pair[0]): pair for pair in zip(specs, needs, strict=True)}.items():
-        pretraining = _pretraining(spec.scenario, spec.seed)
-        if pretraining not in needed and is_reported(spec):
-            continue
-        length = end_length(spec.load(), spec.split, spec.perturb)
-        waits = tuple(other for other in needed if other in (pretraining, _questions(spec.scenario)))
-        jobs[name] = Job(
-            name, "clbench.jobs.work:report_job", {"spec": spec}, length, waits, device=spec.device
+        Args:
+            run: The run.
+            records: Folder of the records.
+            limits: Limits of the process of the run; None sets none.
+            checkpoints: Folder below which the policies of all stages are kept; None keeps none.
+            tensorboard: Folder below which the run is logged for TensorBoard; None logs nothing.
+        """
+        folders = {"records": records, "checkpoints": checkpoints, "tensorboard": tensorboard}
+        start = self._start(run)
+        return self._add(
+            run,
+            _label(run),
+            work.do_run,
+            {"spec": run.spec, **folders},
+            run_length(run.scenario, run.protocol),
+            (*self._needs(run), *((start,) if start else ())),
+            limits,
+            REPLAY_PACE if run.method.uses.demonstrations == "throughout" else 1.0,
         )
-    return jobs
+
+    def add_stages(self, run: ResolvedRun, checkpoints: Path | None) -> Job:
+        """Add a job that makes the policies of all stages of a run, without a record, and return it.
+
+        Args:
+            run: The run.
+            checkpoints: Folder below which the policies are kept; None leaves them in the cache alone.
+        """
+        arguments = {"spec": run.spec, "checkpoints": checkpoints}
+        title, length = f"stages of {_label(run)}", training_length(run.scenario)
+        return self._add(run, title, work.make_policies, arguments, length, self._needs(run))
+
+    def add_demonstrations(self, name: str, scenario: Scenario, tasks: Iterable[Task]) -> tuple[Job, ...]:
+        """Add jobs that collect the demonstrations of tasks, and return them.
+
+        Args:
+            name: Id of the scenario, as it was typed.
+            scenario: The scenario.
+            tasks: Tasks of the scenario.
+        """
+        return tuple(self._demonstrations(name, scenario, task) for task in tasks)
+
+    def _add(
+        self,
+        run: ResolvedRun,
+        title: str,
+        function: Callable[..., str],
+        arguments: Mapping[str, Any],
+        length: float,
+        needs: tuple[Job, ...],
+        limits: Limits | None = None,
+        pace: float = 1.0,
+    ) -> Job:
+        title = _title(run.spec.scenario, title)
+        job = Job(title, function, {**arguments}, length, needs, limits, run.spec.device, pace)
+        self._runs.append(job)
+        return job
+
+    # ---- what runs need ----------------------------------------------------------------------------
+
+    def _needs(self, run: ResolvedRun) -> tuple[Job, ...]:
+        """Return the jobs that a run waits for, but for the evaluation of its start."""
+        name, scenario = run.spec.scenario, run.scenario
+        policy = self._policy(name, scenario, run.spec.seed)
+        targets = self.add_demonstrations(name, scenario, scenario.target)
+        prior = scenario.retained if run.method.uses.demonstrations != "never" else ()
+        retained = self.add_demonstrations(name, scenario, prior)
+        return (*((policy,) if policy else ()), self._question_job(name, scenario), *targets, *retained)
+
+    def _policy(self, name: str, scenario: Scenario, seed: int) -> Job | None:
+        """Return the job that pretrains the policy of a seed, None if the policy ships or is in the cache."""
+        key = name, seed
+        if key not in self._policies:
+            self._policies[key] = (
+                None if is_pretrained(scenario, seed) else self._pretraining(name, scenario, seed)
+            )
+        return self._policies[key]
+
+    def _pretraining(self, name: str, scenario: Scenario, seed: int) -> Job:
+        steps = scenario.budget.pretraining_steps + vision_steps(scenario)
+        needs = (
+            self._question_job(name, scenario),
+            *self.add_demonstrations(name, scenario, scenario.retained),
+        )
+        title = _title(name, f"pretraining seed {seed}")
+        return Job(title, work.pretrain, {"scenario": name, "seed": seed}, steps, needs)
+
+    def _start(self, run: ResolvedRun) -> Job | None:
+        """Return the job that evaluates the policy that a run starts with, None if the cache has that."""
+        spec = run.spec
+        key = spec.scenario, spec.seed, spec.order, spec.targets, spec.split, spec.perturb, spec.device
+        if key not in self._starts:
+            policy = self._policy(spec.scenario, run.scenario, spec.seed)
+            if policy is None and is_evaluated(run):
+                self._starts[key] = None
+            else:
+                needs = (*((policy,) if policy else ()), self._question_job(spec.scenario, run.scenario))
+                title = _title(spec.scenario, f"evaluation of the pretrained policy {_seed(run)}")
+                length = point_length(run.protocol, run.protocol.end(0))
+                self._starts[key] = Job(
+                    title, work.evaluate_policy, {"spec": spec}, length, needs, device=spec.device
+                )
+        return self._starts[key]
+
+    def _question_job(self, name: str, scenario: Scenario) -> Job:
+        """Return the job that collects the scenes of the questions."""
+        if name not in self._questions:
+            title, length = _title(name, "questions"), scenario.budget.question_episodes
+            self._questions[name] = Job(title, work.collect_scenes, {"scenario": name}, length, self._first)
+        return self._questions[name]
+
+    def _demonstrations(self, name: str, scenario: Scenario, task: Task) -> Job:
+        """Return the job that collects the demonstrations of a task."""
+        is_target = any(task.name == target.name for target in scenario.target)
+        jobs = self._target_data if is_target else self._retained_data
+        key = name, task.name
+        if key not in jobs:
+            title, arguments = (
+                _title(name, f"demonstrations {task.name}"),
+                {"scenario": name, "task": task.name},
+            )
+            length = scenario.budget.demonstrations
+            jobs[key] = Job(title, work.collect_demonstrations, arguments, length, self._first)
+        return jobs[key]
+
+
+def _title(name: str, text: str) -> str:
+    """Return the title of a job of the scenario `name`."""
+    return f"{folder_name(name.rpartition(':')[2])} {text}"
+
+
+def _label(run: ResolvedRun) -> str:
+    return f"{run.label} {_seed(run)}"
+
+
+def _seed(run: ResolvedRun) -> str:
+    spec = run.spec
+    return f"seed {spec.seed} order {spec.order}" if spec.order else f"seed {spec.seed}"

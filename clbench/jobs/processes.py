@@ -16,9 +16,9 @@ from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from typing import Any, Literal
 
-from clbench.base.entry_points import resolve
+from clbench.base.progress import ProgressCallback
 from clbench.jobs.job import Event, Job, JobError
-from clbench.spec.limits import end
+from clbench.jobs.process_limits import end, exceeded
 
 SEND_SECONDS = 0.2
 """How often a worker tells how far it is, at most."""
@@ -86,7 +86,7 @@ class Processes:
                 continue
             worker.looked = now
             assert worker.process.pid is not None
-            worker.broken = limits.exceeded(worker.process.pid, now - worker.started)
+            worker.broken = exceeded(limits, worker.process.pid, now - worker.started)
             if worker.broken:
                 end(worker.process.pid)
 
@@ -127,11 +127,13 @@ def _context() -> Any:
     context = multiprocessing.get_context("forkserver")
     # the second takes a second too, and asking PyTorch for deterministic algorithms imports it
     context.set_forkserver_preload(["clbench.runs.run", "torch._inductor.config"])
-    if threading.current_thread() is threading.main_thread():
-        # what it starts ignores Ctrl-C as it does: from the first instruction, not from `_work` on
-        before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    # The server inherits the mask: a Ctrl-C, which reaches all processes of a terminal, does not end it
+    # before it ignores the signal by itself. A Ctrl-C that comes meanwhile waits here, and is not lost.
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
         forkserver.ensure_running()
-        signal.signal(signal.SIGINT, before)
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
     return context
 
 
@@ -158,11 +160,16 @@ def _receive(worker: _Worker) -> tuple[Any, Any]:
 
 
 def _work(
-    connection: Connection, function: str, arguments: dict[str, Any], environment: dict[str, str]
+    connection: Connection,
+    function: Callable[..., str],
+    arguments: dict[str, Any],
+    environment: dict[str, str],
 ) -> None:
-    """Do one job in this process and send what comes of it."""
+    """Do one job in this process and send its outcome."""
     os.environ.update(environment)  # the process that this one was forked from may have an older one
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the parent, which ends its workers
+    if hasattr(signal, "pthread_sigmask"):  # what a job starts does not inherit the mask of the server
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
 
     def send(amount: float) -> None:
         try:
@@ -174,14 +181,14 @@ def _work(
 
 
 def _do_job(
-    function: str, arguments: dict[str, Any], send: Callable[[float], None]
+    function: Callable[..., str], arguments: dict[str, Any], send: ProgressCallback
 ) -> tuple[Literal["done", "failed"], str]:
-    """Do one job in this process, and return how it ended and what came of it.
+    """Do one job in this process, and return how it ended and its result.
 
     Args:
-        function: Entry point of the job.
-        arguments: By name.
-        send: Called now and then with how much was done since its last call.
+        function: Function of the job.
+        arguments: Arguments by name.
+        send: Called now and then with the length done since its last call.
     """
     owed, sent = 0.0, time.monotonic()
 
@@ -193,7 +200,7 @@ def _do_job(
             owed, sent = 0.0, time.monotonic()
 
     try:
-        text = resolve(function)(**arguments, progress=progress)
+        text = function(**arguments, progress=progress)
         send(owed)
     except JobError as error:
         return "failed", str(error)

@@ -74,9 +74,9 @@ class RayWorkers:
             raise UnknownNameError(
                 f"No Ray cluster answers at {address!r}; --ray local starts one."
             ) from error
-        self._told: Any = ray.remote(num_cpus=0)(_Told).remote()
+        self._progress_actor: Any = ray.remote(num_cpus=0)(_ProgressActor).remote()
         self._running: dict[Any, Job] = {}
-        self._shown: defaultdict[str, float] = defaultdict(float)
+        self._shown: defaultdict[Job, float] = defaultdict(float)
 
     def free(self) -> int:
         """Return how many more jobs can be under way."""
@@ -92,7 +92,7 @@ class RayWorkers:
             name: value.absolute() if isinstance(value, Path) else value
             for name, value in job.arguments.items()
         }
-        self._running[task.remote(self._told, replace(job, arguments=arguments))] = job
+        self._running[task.remote(self._progress_actor, replace(job, arguments=arguments, needs=()))] = job
 
     def events(self) -> Iterator[Event]:
         """Give what was told since the last call; wait for it, but no longer than a second."""
@@ -100,10 +100,10 @@ class RayWorkers:
             time.sleep(1.0)
             return
         ended, _ = self._ray.wait(list(self._running), num_returns=1, timeout=1.0)
-        told = self._ray.get(self._told.amounts.remote())
+        done = self._ray.get(self._progress_actor.amounts.remote())
         for job in self._running.values():
-            amount = told.get(job.name, 0.0) - self._shown[job.name]
-            self._shown[job.name] += amount
+            amount = done.get(job.title, 0.0) - self._shown[job]
+            self._shown[job] += amount
             if amount:  # less than nothing after a worker was lost
                 yield Event(job, "progress", amount)
         for reference in ended:
@@ -143,7 +143,7 @@ class _Result(NamedTuple):
     """By their path below the folder of records."""
 
 
-class _Told:
+class _ProgressActor:
     """Keeps how much of each job is done: an actor, which tasks tell and the driver asks."""
 
     def __init__(self) -> None:
@@ -162,22 +162,22 @@ class _Told:
         return self._amounts
 
 
-def _do(told: Any, job: Job) -> _Result:
+def _do(actor: Any, job: Job) -> _Result:
     """Do a job on a node of the cluster. Its records are returned: the node may not see their folder."""
-    told.begin.remote(job.name)
+    actor.begin.remote(job.title)
     if "records" not in job.arguments:
-        return _Result(*_do_apart(told, job), {})
+        return _Result(*_do_apart(actor, job), {})
     # the same on every attempt, for it is part of what a run goes on by
-    folder = cache_folder() / "ray" / hash_of([job.name, str(job.arguments["records"])])
+    folder = cache_folder() / "ray" / hash_of([job.title, str(job.arguments["records"])])
     shutil.rmtree(folder, ignore_errors=True)
-    ended = _do_apart(told, replace(job, arguments=job.arguments | {"records": folder}))
+    ended = _do_apart(actor, replace(job, arguments=job.arguments | {"records": folder}))
     found = sorted(folder.rglob("*.json"))
     records = {path.relative_to(folder).as_posix(): read_record(path) for path in found}
     shutil.rmtree(folder, ignore_errors=True)
     return _Result(*ended, records)
 
 
-def _do_apart(told: Any, job: Job) -> tuple[Literal["done", "failed"], str]:
+def _do_apart(actor: Any, job: Job) -> tuple[Literal["done", "failed"], str]:
     """Do a job in a process of its own, as on one machine: what a method leaves behind meets no other.
 
     It is forked from one that this worker keeps and that has imported all; a worker for each job takes 5 s.
@@ -193,7 +193,7 @@ def _do_apart(told: Any, job: Job) -> tuple[Literal["done", "failed"], str]:
         while True:
             for _, kind, value in processes.events():
                 if kind == "progress":
-                    told.add.remote(job.name, value)
+                    actor.add.remote(job.title, value)
                 elif kind == "lost":
                     raise LostProcessError(value)
                 else:

@@ -1,4 +1,4 @@
-"""The grid: many runs, and what they need, on all cores or on a cluster."""
+"""The scheduler: does many jobs that need each other, on all cores or on a cluster."""
 
 from __future__ import annotations
 
@@ -8,78 +8,83 @@ from functools import cache
 
 from rich.console import Console
 
+from clbench.base import interrupts
 from clbench.jobs.bars import Bars
 from clbench.jobs.job import Job, Workers
 
 
-def run_jobs(jobs: Sequence[Job], workers: Workers, bars: Bars) -> dict[str, str]:
-    """Do all jobs, and return what went wrong, by the name of the job.
+def run_jobs(jobs: Sequence[Job], workers: Workers, bars: Bars) -> dict[Job, str]:
+    """Do all jobs, and return the reason of each failure by job.
 
-    A job that fails, or whose process dies, does not stop the others; what needs it is left out. However this
-    function is left, by Ctrl-C too, nothing stays behind.
+    A job that fails, or whose process dies, does not stop the others; jobs that need it are left out. Nothing
+    stays behind, however this function ends, by Ctrl-C too.
 
     Args:
-        jobs: In any order: those that the longest work waits for begin first.
-        workers: Who does them; closed in the end.
-        bars: Where it is shown.
+        jobs: Jobs in any order, with all that they need. Jobs on the critical path start first.
+        workers: Workers that do the jobs; they are closed at the end.
+        bars: Bars that show the progress.
     """
-    waiting, started = _by_urgency(jobs), dict[str, float]()
-    ended: set[str] = set()
-    failed: dict[str, str] = {}
+    waiting, started = _by_urgency(jobs), dict[Job, float]()
+    succeeded: set[Job] = set()
+    failed: dict[Job, str] = {}
     try:
         while waiting or started:
+            interrupts.check()
             waiting = _drop_hopeless(waiting, failed)
-            for job in _ready(waiting, ended, workers.free()):
+            for job in _ready(waiting, succeeded, workers.free()):
                 waiting.remove(job)
                 workers.start(job)
-                started[job.name] = time.monotonic()
-                bars.start(job.name, job.length)
+                started[job] = time.monotonic()
+                bars.start(job, job.length)
             for job, kind, value in workers.events():
                 if kind == "progress":
-                    bars.advance(job.name, value)
+                    bars.advance(job, value)
                     continue
                 if kind == "done":
-                    ended.add(job.name)
+                    succeeded.add(job)
                 else:
-                    failed[job.name] = value
-                bars.finish(job.name, f"{value} ({time.monotonic() - started.pop(job.name):.0f} s)")
+                    failed[job] = value
+                bars.finish(job, f"{value} ({time.monotonic() - started.pop(job):.0f} s)")
     finally:
         workers.close()
     return failed
 
 
-def run_with_bars(jobs: Sequence[Job], workers: Workers, console: Console | None = None) -> dict[str, str]:
+def run_with_bars(jobs: Sequence[Job], workers: Workers, console: Console | None = None) -> dict[Job, str]:
     """Do all jobs as `run_jobs` does, with a bar for each."""
     with Bars(sum(job.length for job in jobs), console) as bars:
         return run_jobs(jobs, workers, bars)
 
 
 def _by_urgency(jobs: Sequence[Job]) -> list[Job]:
-    """Return the jobs by falling time of the work that waits for them, their own included.
+    """Return the jobs by falling time of the longest chain that waits for them, their own time included.
 
-    The longest run begins first, so that no worker ends with it alone.
+    The longest run starts first, so that no worker ends with it alone.
     """
+    dependents: dict[Job, list[Job]] = {job: [] for job in jobs}
+    for job in jobs:
+        for needed in job.needs:
+            dependents[needed].append(job)
 
     @cache
-    def work(name: str) -> float:
-        return max((work(job.name) for job in jobs if name in job.needs), default=0.0) + times[name]
+    def time_of_chain(job: Job) -> float:
+        return max(map(time_of_chain, dependents[job]), default=0.0) + job.length * job.pace
 
-    times = {job.name: job.length * job.pace for job in jobs}
-    return sorted(jobs, key=lambda job: -work(job.name))
+    return sorted(jobs, key=lambda job: -time_of_chain(job))
 
 
-def _drop_hopeless(waiting: list[Job], failed: dict[str, str]) -> list[Job]:
-    """Return the jobs that can still be done; the others fail with what they needed."""
+def _drop_hopeless(waiting: list[Job], failed: dict[Job, str]) -> list[Job]:
+    """Return the jobs that can still be done; the others fail because of a job that they need."""
     kept = []
     for job in waiting:
-        missing = [name for name in job.needs if name in failed]
+        missing = [needed for needed in job.needs if needed in failed]
         if missing:
-            failed[job.name] = f"left out, because {missing[0]} failed"
+            failed[job] = f"left out, because {missing[0]} failed"
         else:
             kept.append(job)
     return kept
 
 
-def _ready(waiting: Sequence[Job], ended: set[str], free: int) -> list[Job]:
-    """Return the jobs to start: those whose needs have ended, in their order."""
-    return [job for job in waiting if ended.issuperset(job.needs)][:free]
+def _ready(waiting: Sequence[Job], succeeded: set[Job], free: int) -> list[Job]:
+    """Return the jobs to start: those whose needs have succeeded, in their order."""
+    return [job for job in waiting if succeeded.issuperset(job.needs)][:free]

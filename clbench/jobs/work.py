@@ -1,18 +1,18 @@
-"""The work of each kind of job."""
+"""The work of each kind of job: functions that a worker calls in a process of its own."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 
+from clbench.base.progress import ProgressCallback
 from clbench.jobs.job import JobError
-from clbench.learning.optimise import MethodError
-from clbench.runs.run import evaluate_pretrained, execute
 from clbench.runs.spec import RunSpec
 from clbench.spec.registry import load_scenario
 
+# PyTorch and what needs it is imported inside: a plan names these functions without waiting for it.
 
-def collect_job(scenario: str, task: str, progress: Callable[[float], None]) -> str:
+
+def collect_demonstrations(scenario: str, task: str, progress: ProgressCallback) -> str:
     """Collect the demonstrations of a task, unless they are in the cache."""
     from clbench.data.demonstrations import dataset_folder, read_dataset
 
@@ -21,19 +21,17 @@ def collect_job(scenario: str, task: str, progress: Callable[[float], None]) -> 
     return f"{len(episodes)} episodes, {sum(len(episode.executed) for episode in episodes)} steps"
 
 
-def scenes_job(scenario: str, progress: Callable[[float], None]) -> str:
+def collect_scenes(scenario: str, progress: ProgressCallback) -> str:
     """Collect the states that questions are asked about, unless they are in the cache."""
     from clbench.data.questions import load_questions, scenes_folder
 
     loaded = load_scenario(scenario)
     scenes_folder(loaded, progress)
-    train, report = load_questions(loaded)
-    return (
-        f"{len(train.kinds)} kinds about {len(train.scenes)} states, and {len(report.scenes)} for the report"
-    )
+    train, test = load_questions(loaded)
+    return f"{len(train.kinds)} kinds about {len(train.scenes)} states, and {len(test.scenes)} for the test"
 
 
-def pretrain_job(scenario: str, seed: int, progress: Callable[[float], None]) -> str:
+def pretrain(scenario: str, seed: int, progress: ProgressCallback) -> str:
     """Pretrain the policy of a seed, unless it is in the cache."""
     from clbench.learning.pretraining import pretrained_policy
 
@@ -41,20 +39,27 @@ def pretrain_job(scenario: str, seed: int, progress: Callable[[float], None]) ->
     return f"{sum(parameter.numel() for parameter in policy.parameters()):,} parameters"
 
 
-def report_job(spec: RunSpec, progress: Callable[[float], None]) -> str:
-    """Evaluate the pretrained policy that a run begins with, unless that is in the cache."""
-    evaluate_pretrained(spec, progress)
-    return "what runs of most methods begin with"
+def evaluate_policy(spec: RunSpec, progress: ProgressCallback) -> str:
+    """Evaluate the pretrained policy that a run starts with, unless the cache has the evaluation."""
+    from clbench.runs.start import evaluate_pretrained
+
+    evaluate_pretrained(spec.resolve(), progress)
+    return "the start of most runs"
 
 
-def run_job(
+def do_run(
     spec: RunSpec,
     records: Path,
-    progress: Callable[[float], None],
+    progress: ProgressCallback,
     checkpoints: Path | None = None,
     tensorboard: Path | None = None,
 ) -> str:
-    """Do one run, write its record, and return its main scores."""
+    """Do one run, write its record, and return its main scores.
+
+    Raises:
+        JobError: The run failed; its record says where.
+    """
+    from clbench.runs.run import execute
     from clbench.scoring.metrics import measure
     from clbench.scoring.scores import Scores
 
@@ -70,15 +75,21 @@ def run_job(
     return ", ".join(f"{name} {'-' if value is None else f'{value:.2f}'}" for name, value in values.items())
 
 
-def stages_job(spec: RunSpec, checkpoints: Path | None, progress: Callable[[float], None]) -> str:
-    """Make the policies of all stages of a run again, and keep them below `checkpoints`, if any."""
+def make_policies(spec: RunSpec, checkpoints: Path | None, progress: ProgressCallback) -> str:
+    """Make the policies of all stages of a run again, and keep them below `checkpoints`, if given.
+
+    Raises:
+        JobError: The method fails.
+    """
+    from clbench.learning.optimise import MethodError
     from clbench.runs.checkpoints import keep_stages, make_stages
 
+    run = spec.resolve()
     try:
         if checkpoints is None:
-            make_stages(spec, progress)
+            make_stages(run, progress)
         else:
-            keep_stages(spec, checkpoints, progress)
+            keep_stages(run, checkpoints, progress)
     except MethodError as error:
         raise JobError(str(error)) from error
     return "policies of all stages"

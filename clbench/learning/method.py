@@ -15,7 +15,7 @@ from clbench.policy.batch import Batch
 from clbench.policy.policy import Policy
 from clbench.spec.task import Task
 
-State = dict[str, Tensor | str | float | int | bool | None]
+MethodState = dict[str, Tensor | str | float | int | bool | None]
 
 
 _TEXTS = {
@@ -127,7 +127,7 @@ class Method:
     def end_task(self, policy: Policy, stage: Stage) -> None:
         """Merge or consolidate after a target."""
 
-    def state(self) -> State:
+    def state(self) -> MethodState:
         """Return all that later hooks need, tensors and plain values by name; its bytes count as kept.
 
         Every stage begins with a new object of the method that has this state and nothing else, whether the
@@ -135,7 +135,7 @@ class Method:
         """
         return {}
 
-    def load_state(self, policy: Policy, state: State) -> None:
+    def load_state(self, policy: Policy, state: MethodState) -> None:
         """Take back what `state` returned, and add to a plain policy what `prepare` added, as adapters."""
         if state:
             raise WrongTypeError(f"{type(self).__name__} returns a state() but has no load_state().")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +12,9 @@ from torch import Tensor
 from clbench.base.cache import cache_folder, cached, hash_of, is_cached
 from clbench.base.dependencies import versions
 from clbench.base.entry_points import resolve
+from clbench.base.progress import ProgressCallback, no_progress
 from clbench.base.seeding import derive_seed, torch_generator
-from clbench.base.source import package_of, source_hash
+from clbench.base.source import TRAINING_SOURCES, package_of, source_hash
 from clbench.data.demonstrations import Demonstrations, load_demonstrations, simulator_versions
 from clbench.data.questions import Questions, load_questions
 from clbench.learning.optimise import deterministic, optimise
@@ -46,11 +47,6 @@ def pretraining_inputs(scenario: Scenario, seed: int) -> dict[str, Any]:
     tasks = scenario.retained + scenario.scenes
     suites = {*packages_of(tasks, "world", "expert", "camera"), package_of(scenario.questions)}
     budget = dataclasses.asdict(scenario.budget)
-    parts = (
-        *("policy", "demonstrations", "questions", "camera", "observer", "drawing"),
-        *("vision_pretraining", "seeding", "training", "world"),
-    )
-    core = (*(f"clbench.{part}" for part in parts), __name__)
     installed = {**simulator_versions(tasks), **versions(("torch", "tokenizers"))}
     return {
         "retained": [dataclasses.asdict(task) for task in scenario.retained],
@@ -58,7 +54,7 @@ def pretraining_inputs(scenario: Scenario, seed: int) -> dict[str, Any]:
         "budget": {name: value for name, value in budget.items() if name not in AFTER_PRETRAINING},
         "seed": seed,
         "frame": frame_hash(scenario.scene_tasks[0]),
-        "source": source_hash(*core, *sorted(suites)),
+        "source": source_hash(*TRAINING_SOURCES, *suites),
         # a label, as +cpu of torch, names what else a build can do: policies are pretrained without it
         "versions": {name: version.partition("+")[0] for name, version in installed.items()},
     }
@@ -88,7 +84,7 @@ def _folder(scenario: Scenario, seed: int, inputs: Mapping[str, Any]) -> Path:
 
 
 def pretrained_policy(
-    scenario: Scenario, seed: int, progress: Callable[[float], None] = lambda _: None
+    scenario: Scenario, seed: int, progress: ProgressCallback = no_progress
 ) -> tuple[Policy, Path]:
     """Return the policy pretrained on the retained tasks and the questions, and the folder it lies in.
 
@@ -133,7 +129,7 @@ def policy_config(scenario: Scenario) -> PolicyConfig:
     return config
 
 
-def _pretrain(scenario: Scenario, seed: int, progress: Callable[[float], None]) -> Policy:
+def _pretrain(scenario: Scenario, seed: int, progress: ProgressCallback) -> Policy:
     config, budget = policy_config(scenario), scenario.budget
     questions, _ = load_questions(scenario)
     policy = Policy(config, seed=derive_seed("weights", seed))
@@ -176,7 +172,7 @@ def _open_eyes(
     scenario: Scenario,
     seed: int,
     data: Sequence[Questions | Demonstrations],
-    progress: Callable[[float], None],
+    progress: ProgressCallback,
 ) -> None:
     """Pretrain the eyes on the pictures of all data."""
     entry_point = scenario.scene_tasks[0].camera

@@ -81,7 +81,11 @@ class Source(Generic[Rows]):
     """
 
     def __init__(
-        self, data: Samples[Rows], generator: torch.Generator, batch_size: int, device: str = "cpu"
+        self,
+        data: Samples[Rows],
+        generator: torch.Generator,
+        batch_size: int,
+        device: torch.device | str = "cpu",
     ) -> None:
         self.batch_size = batch_size
         self._data: Samples[Rows] | None = data

@@ -77,14 +77,30 @@ def build_method(spec: str, changes: Mapping[str, Any]) -> Method:
     """Return the method that `spec` names, with `changes` to its hyper-parameters.
 
     Args:
-        spec: As for `load_method`.
-        changes: Values by field name; strings, as the command line gives them, become the field's own type.
+        spec: Name of the method, as for `load_method`.
+        changes: Values by name of the hyper-parameter, as for `read_changes`.
 
     Raises:
-        LookupError: The method has no such hyper-parameter; the nearest one is named.
-        ValueError: A value cannot be read as the field's type, or the method refuses it.
+        UnknownNameError: The method has no such hyper-parameter; the message names the nearest one.
+        InputError: A value cannot be read as the type of its field, or the method refuses it.
     """
     cls = load_method(spec)
+    return new_method(spec, cls, read_changes(spec, cls, changes))
+
+
+def read_changes(spec: str, cls: type[Method], changes: Mapping[str, Any]) -> dict[str, Any]:
+    """Return changed hyper-parameters as the method holds them.
+
+    Args:
+        spec: Name of the method, for error messages.
+        cls: Class of the method.
+        changes: Values by name of the hyper-parameter. A text, which the command line gives, becomes the type
+            of the field.
+
+    Raises:
+        UnknownNameError: The method has no such hyper-parameter; the message names the nearest one.
+        InputError: A value cannot be read as the type of its field, or the method refuses it.
+    """
     hints = get_type_hints(cls)
     fields = [field.name for field in dataclasses.fields(cls)]  # type: ignore[arg-type]
     values = {}
@@ -96,6 +112,21 @@ def build_method(spec: str, changes: Mapping[str, Any]) -> Method:
                 f"{spec} has no hyper-parameter {name!r}.{hint} It has: {', '.join(fields) or 'none'}."
             )
         values[name] = _read(name, value, hints[name]) if isinstance(value, str) else value
+    held = new_method(spec, cls, values)
+    return {name: getattr(held, name) for name in values}
+
+
+def new_method(spec: str, cls: type[Method], values: Mapping[str, Any]) -> Method:
+    """Return a new object of a method.
+
+    Args:
+        spec: Name of the method, for error messages.
+        cls: Class of the method.
+        values: Hyper-parameters that differ from the defaults, as the method holds them.
+
+    Raises:
+        InputError: The method refuses a value.
+    """
     try:
         return cls(**values)
     except Exception as error:

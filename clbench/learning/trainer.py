@@ -16,49 +16,73 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 
 from clbench.base.seeding import derive_seed, seeded, torch_generator
-from clbench.base.source import source_hash
+from clbench.base.source import RUN_SOURCES, source_hash
 from clbench.base.strict_json import check_json, read_json
 from clbench.data.access import check_policy, hooks, outside
-from clbench.data.demonstrations import Demonstrations, load_demonstrations
-from clbench.data.questions import load_questions
+from clbench.data.demonstrations import Demonstrations
+from clbench.data.training_data import TrainingData
 from clbench.learning.adaptation import Step, adapt
-from clbench.learning.method import Method, Stage, State
+from clbench.learning.method import Method, MethodState, Stage
 from clbench.learning.optimise import deterministic
 from clbench.learning.pretraining import pretrained_policy, pretraining_inputs
 from clbench.learning.prior import Access, Nothing, Prior, Source
 from clbench.policy.checkpoint import CheckpointError, load_policy, save_policy
 from clbench.policy.policy import Policy
 from clbench.spec.scenario import Scenario
-from clbench.spec.task import Task, packages_of
+from clbench.spec.task import packages_of
 
 STAGE_FILES = ("policy.safetensors", "policy.json", "method.safetensors", "method.json")
 """What a stage leaves: the policy, and the state of the method that the next stage begins with."""
 
 
 class Trainer:
-    """The policy and the method of a run, and the data that they learn from.
+    """Takes the policy and the method of a run from stage to stage.
 
-    Each stage begins with what the last one saved: a policy from its checkpoint and a new object of the
-    method that was given its state. Whoever stopped after a stage therefore goes on as one who did not.
+    Each stage begins with what the last one saved: a policy from its checkpoint, and a new object of the
+        method that
+    is given its saved state. A run that was interrupted after a stage therefore continues as if it had not
+    been.
 
     Args:
-        scenario: With the targets that are learned.
+        scenario: Scenario with the targets that are learned.
+        data: Demonstrations and questions of the scenario.
+        pretrained: The pretrained policy, on the device where the run computes; it is not changed.
         new_method: Returns a new object of the method.
-        seed: Of the run.
-        device: Where the policy is computed.
+        seed: Seed of the run.
     """
 
-    def __init__(self, scenario: Scenario, new_method: Callable[[], Method], seed: int, device: str) -> None:
-        self.scenario, self.seed, self.device = scenario, seed, device
-        self.new_method = new_method
-        self.method = new_method()
+    def __init__(
+        self,
+        scenario: Scenario,
+        data: TrainingData,
+        pretrained: Policy,
+        new_method: Callable[[], Method],
+        seed: int,
+    ) -> None:
+        self.scenario, self.data, self.seed = scenario, data, seed
+        self.pretrained, self.new_method = pretrained, new_method
+        self.policy, self.method = copy.deepcopy(pretrained), new_method()
         self.where = "start"
-        """The hook, or the stage, that is under way."""
-        pretrained, self.pretrained_folder = pretrained_policy(scenario, seed)
-        self.pretrained = pretrained.to(device)
-        self.policy = copy.deepcopy(self.pretrained)
-        self._demonstrations: dict[str, Demonstrations] = {}
-        self.questions, self.report_questions = load_questions(scenario)
+        """The hook, or the stage, that is running: a failed run records it."""
+
+    @classmethod
+    def open(cls, scenario: Scenario, new_method: Callable[[], Method], seed: int, device: str) -> Trainer:
+        """Return the trainer of a run; its policy is pretrained, and its data collected, on first use.
+
+        Args:
+            scenario: Scenario with the targets that are learned.
+            new_method: Returns a new object of the method.
+            seed: Seed of the run.
+            device: Device on which the policy is computed.
+        """
+        pretrained, _ = pretrained_policy(scenario, seed)
+        data = TrainingData.open(scenario, pretrained.config)
+        return cls(scenario, data, pretrained.to(device), new_method, seed)
+
+    @property
+    def device(self) -> torch.device:
+        """Device on which the policy is computed."""
+        return self.pretrained.state_mean.device
 
     def prepare(self) -> int:
         """Let the method prepare for the sequence, and return the optimiser steps that it took."""
@@ -79,7 +103,7 @@ class Trainer:
         """
         budget, task = self.scenario.budget, self.scenario.target[number - 1]
         self.where = f"stage {number} ({task.name})"
-        target = self._source("target", number, self._demonstrations_of(task))
+        target = self._source("target", number, self.data.demonstrations(task))
         prior = self.prior(number, ("throughout",))
         method_seed = derive_seed("method", self.seed, number)
         stage = Stage(number, task, method_seed, budget.adaptation_steps, target, prior)
@@ -104,18 +128,12 @@ class Trainer:
         sources = {}
         if self.method.uses.demonstrations in when:
             before = self.scenario.retained + self.scenario.target[: max(0, number - 1)]
-            parts = [self._demonstrations_of(task) for task in before]
+            parts = [self.data.demonstrations(task) for task in before]
             demonstrations = Demonstrations.cat(parts) if parts else Nothing()
             sources["demonstrations"] = self._source("prior demonstrations", number, demonstrations)
         if self.method.uses.questions in when:
-            sources["questions"] = self._source("prior questions", number, self.questions)
+            sources["questions"] = self._source("prior questions", number, self.data.questions)
         return Prior(sources)
-
-    def _demonstrations_of(self, task: Task) -> Demonstrations:
-        """Return the demonstrations of a task; most methods never see those of the retained skills."""
-        if task.name not in self._demonstrations:
-            self._demonstrations[task.name] = load_demonstrations(task, self.scenario, self.policy.config)
-        return self._demonstrations[task.name]
 
     def _source(self, name: str, number: int, data: Any) -> Source[Any]:
         """Return data with its own random stream: what one source draws does not move another's draws."""
@@ -143,15 +161,15 @@ class Trainer:
             self.policy = load_stage(folder, self.method, self.device)
 
 
-def load_stage(folder: Path, method: Method, device: str) -> Policy:
+def load_stage(folder: Path, method: Method, device: torch.device | str) -> Policy:
     """Return the policy that a stage left in `folder`, and give `method` the state that it left there.
 
     Raises:
         CheckpointError: A file is missing or torn, or is not what a stage leaves.
     """
     try:
-        state: State = {**read_json(folder / "method.json")}
-        state.update(load_file(folder / "method.safetensors", device=device))
+        state: MethodState = {**read_json(folder / "method.json")}
+        state.update(load_file(folder / "method.safetensors", device=str(device)))
     except (OSError, ValueError, TypeError, SafetensorError) as error:
         raise CheckpointError(f"{folder}: cannot be read as the state of a method ({error}).") from error
     return load_policy(folder, lambda policy: method.load_state(policy, state)).to(device)
@@ -159,10 +177,11 @@ def load_stage(folder: Path, method: Method, device: str) -> Policy:
 
 def sources(scenario: Scenario, seed: int, *modules: str) -> dict[str, Any]:
     """Return the code and data that any result of a run depends on, `modules` besides, as JSON."""
+    suites = packages_of(scenario.tasks, "world", "expert", "camera")
     return {
         "pretraining": pretraining_inputs(scenario, seed),
         "tasks": [dataclasses.asdict(task) for task in scenario.tasks],
-        "source": source_hash("clbench", *modules, *packages_of(scenario.tasks, "world", "expert", "camera")),
+        "source": source_hash(*RUN_SOURCES, *modules, *suites),
     }
 
 

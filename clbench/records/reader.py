@@ -1,63 +1,24 @@
-"""The reader of records, which checks all that a stranger may have written."""
+"""The reader of records, which checks everything that a stranger may have written."""
 
 from __future__ import annotations
 
-import dataclasses
-import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from clbench.base.entry_points import unknown
-from clbench.base.errors import ClbenchError
-from clbench.base.strict_json import StrictJSONError, quoted, read_json
-from clbench.records.record import ANSWER_COLUMNS, EPISODE_COLUMNS, POLICY_COLUMNS, SCHEMA, Record
+from clbench.base.errors import ClbenchError, InputError
+from clbench.base.strict_json import StrictJSONError, read_json
+from clbench.records.content import content_hash
+from clbench.records.fields import load_fields
+from clbench.records.history import to_present
+from clbench.records.record import ANSWER_COLUMNS, EPISODE_COLUMNS, POLICY_COLUMNS, SCHEMA, Costs, Record
 from clbench.spec.identifiers import check_plain
 
 MOST_ROWS = 200_000
 """Rows of a table. A record of Fetch-v0 has 1,780 episodes."""
 
-_Fields = Mapping[str, type | None]
-"""Types of the values that must be there by name; None for any."""
-
-_RUN: _Fields = {
-    "scenario": str,
-    "method": str,
-    "seed": int,
-    "device": str,
-    "split": str,
-    "settings": dict,
-    "changes": dict,
-    "uses": dict,
-}
-_MAY_RUN: _Fields = {"order": int, "perturb": bool}
-"""Of `Record.run` too, where it is not what it usually is."""
-_SCENARIO: _Fields = {
-    "id": str,
-    "retained": list,
-    "target": list,
-    "held_out": list,
-    "evaluation_steps": list,
-    "budget": dict,
-}
-_COSTS = (
-    "optimiser_steps",
-    "parameters",
-    "preparation_steps",
-    "parameters_added",
-    "bytes_kept",
-    "environment_steps",
-)
-"""A run that failed need not have all, nor that of an agent that learned online."""
-_ERROR: _Fields = dict.fromkeys(("where", "type", "message", "traceback"), str)
-
-_WORDS = {
-    str: "a text",
-    int: "a whole number",
-    bool: "true or false",
-    list: "a list",
-    dict: "an object with named entries",
-}
+ERROR_FIELDS = ("where", "type", "message", "traceback")
+"""Names of the texts in `Record.error`."""
 
 
 class RecordError(ClbenchError, ValueError):
@@ -67,84 +28,91 @@ class RecordError(ClbenchError, ValueError):
 def read_record(path: Path) -> Record:
     """Read the record at `path`, which a stranger may have written.
 
-    What its values mean is not looked at: that they can be together is checked by `Scores.from_record`.
+    A record of an older schema is converted. The reader checks the form of a record. Whether its values agree
+    with each other is checked by `Scores.from_record`.
 
     Raises:
-        RecordError: It is not a regular file of JSON within the limits, is of another schema, has a field too
-            many or too few, or its columns do not fit together.
+        RecordError: The file is not a regular file of JSON within the limits, is of an unknown schema, has a
+            field too many or too few or of another type, its columns do not fit together, or its content does
+            not match its hash.
     """
     try:
-        return _record(read_json(path))
+        return parse_record(read_json(path))
     except (StrictJSONError, RecordError) as error:
         raise RecordError(f"{path}: {error}") from error
 
 
+def parse_record(values: Any) -> Record:
+    """Return the record in `values`, which `json` read from its file.
+
+    Raises:
+        RecordError: `values` are no record, see `read_record`.
+    """
+    try:
+        return _record(values)
+    except InputError as error:
+        raise RecordError(str(error)) from error
+
+
 def _record(values: Any) -> Record:
-    schema = values.pop("schema", None) if isinstance(values, dict) else None
-    if type(schema) is int and 0 < schema < SCHEMA:
-        raise RecordError(f"is of the older schema {schema}, not {SCHEMA}: its run must be done again.")
-    if type(schema) is not int or schema != SCHEMA:
+    schema = values.get("schema") if isinstance(values, dict) else None
+    if type(schema) is not int or schema < 1:
         raise RecordError(f"is no record of schema {SCHEMA}.")
-    names = [entry.name for entry in dataclasses.fields(Record)]
-    _check_fields(f"a record of schema {SCHEMA}", values, dict.fromkeys(names))
-    record = Record(**values)
-    if record.status not in ("success", "failed"):
-        raise RecordError(f"status must be success or failed, not {quoted(str(record.status))}.")
-    _check_fields("run", record.run, _RUN, _MAY_RUN)
-    if record.run.get("order", 1) < 1:
-        raise RecordError("run: order must be above 0; it is left out where the targets have theirs.")
-    if not record.run.get("perturb", True):
-        raise RecordError("run: perturb must be true; it is left out where nothing was perturbed.")
-    _check_fields("scenario", record.scenario, _SCENARIO)
-    for name in ("costs", "diagnostics", "fingerprint", "timing"):
-        _check_type(name, values[name], dict)
+    if schema > SCHEMA:
+        raise RecordError(f"is of schema {schema}, newer than {SCHEMA}: update clbench.")
+    fields = {name: value for name, value in values.items() if name not in ("schema", "content")}
+    if schema < SCHEMA:
+        fields = to_present(fields, schema)
+    record = load_fields(Record, fields, f"a record of schema {schema}")
+    assert isinstance(record, Record)
     _check_costs(record.costs)
-    if record.status == "failed":
-        _check_fields("error", record.error, _ERROR)
-    elif record.error is not None:
-        raise RecordError("error must be null: the run went through.")
+    _check_error(record)
     _check_columns("episodes", record.episodes, EPISODE_COLUMNS)
     _check_columns("answers", record.answers, ANSWER_COLUMNS)
     _check_columns("policy", record.policy, POLICY_COLUMNS)
-    groups = (record.scenario[group] for group in ("retained", "target", "held_out"))
-    _check_names("task", (name for group in groups for name in group))
+    scenario = record.scenario
+    _check_names("task", (*scenario.retained, *scenario.target, *scenario.held_out))
     _check_names("kind of question", set(record.answers["kind"]))
+    if record.run.order < 0:
+        raise RecordError("run: order must not be below 0.")
+    if schema == SCHEMA:
+        _check_content(values)
+    elif "content" in values:
+        raise RecordError(f"a record of schema {schema} has no content: only later ones are hashed.")
     return record
 
 
-def _check_fields(where: str, values: Any, fields: _Fields, optional: _Fields | None = None) -> None:
-    """Refuse what is not an object with exactly these entries, but for the optional ones."""
-    _check_type(where, values, dict)
-    missing = [name for name in fields if name not in values]
-    if missing:
-        raise RecordError(f"{where}: {', '.join(missing)} is missing.")
-    known = {**fields, **(optional or {})}
-    for name in values:
-        if name not in known:
-            raise RecordError(str(unknown(f"field of {where}", name, known)))
-    for name, kind in known.items():
-        if kind is not None and name in values:
-            _check_type(f"{where}: {name}", values[name], kind)
+def _check_content(values: dict[str, Any]) -> None:
+    if "content" not in values:
+        raise RecordError(f"a record of schema {SCHEMA}: content is missing.")
+    if values["content"] != content_hash(values):
+        raise RecordError("its content does not match its hash: the file was changed or damaged.")
 
 
-def _check_costs(costs: Mapping[str, Any]) -> None:
-    for name, value in costs.items():
-        if name not in _COSTS:
-            raise RecordError(str(unknown("field of costs", name, _COSTS)))
-        _check_type(f"costs: {name}", value, int)
+def _check_costs(costs: Costs) -> None:
+    for name, value in vars(costs).items():
         # a method may leave parameters out, but nothing else is less than nothing
-        if value < 0 and name != "parameters_added":
+        if value is not None and value < 0 and name != "parameters_added":
             raise RecordError(f"costs: {name} must not be below 0.")
 
 
-def _check_type(where: str, value: Any, kind: type) -> None:
-    # not isinstance: True would pass for a whole number
-    if type(value) is not kind:
-        raise RecordError(f"{where} must be {_WORDS[kind]}, not {json.dumps(value)[:60]}.")
+def _check_error(record: Record) -> None:
+    """Refuse an error of a run that succeeded, and a failure without its texts."""
+    if record.status == "success":
+        if record.error is not None:
+            raise RecordError("error must be null: the run succeeded.")
+        return
+    if record.error is None:
+        raise RecordError("error must be an object with named entries: the run failed.")
+    if set(record.error) != set(ERROR_FIELDS):
+        raise RecordError(f"error must have the entries {', '.join(ERROR_FIELDS)}.")
+    for name, text in record.error.items():
+        if not isinstance(text, str):
+            raise RecordError(f"error: {name} must be a text.")
 
 
-def _check_columns(name: str, table: Any, columns: Iterable[str]) -> None:
-    if not isinstance(table, dict) or tuple(table) != tuple(columns):
+def _check_columns(name: str, table: dict[str, Any], columns: Iterable[str]) -> None:
+    if tuple(table) != tuple(columns):
         raise RecordError(f"{name} must have the columns {', '.join(columns)}.")
     lengths = {len(column) if isinstance(column, list) else -1 for column in table.values()}
     if len(lengths) != 1 or -1 in lengths:
@@ -158,8 +126,6 @@ def _check_columns(name: str, table: Any, columns: Iterable[str]) -> None:
 
 def _check_names(kind: str, names: Iterable[Any]) -> None:
     for name in names:
-        _check_type(f"the name of a {kind}", name, str)
-        try:
-            check_plain(kind, name)
-        except ValueError as error:
-            raise RecordError(str(error)) from error
+        if not isinstance(name, str):
+            raise RecordError(f"the name of a {kind} must be a text, not {name!r}.")
+        check_plain(kind, name)

@@ -8,9 +8,9 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
-from clbench.spec.protocol import Protocol, Split
+from clbench.spec.protocol import Point, Protocol, Split
 
 SCHEMA = 3
 """Version of the file format. A reader refuses a newer one, and converts older ones (`clbench.records.history`)."""
@@ -29,6 +29,25 @@ POLICY_COLUMNS = ("stage", "step", "update_sparsity", "activation_drift")
 squared 2-Wasserstein distance between its hidden states on the questions and those of the pretrained policy, mean
 over layers. Each may be None.
 """
+
+
+class EpisodeRow(NamedTuple):
+    """A row of `Record.episodes`: one evaluation episode at one point."""
+
+    stage: int
+    step: int
+    task: str
+    split: Split
+    episode: int
+    success: int
+    total_reward: float | None
+    """Sum of the dense rewards, None if it is not finite."""
+    length: int
+
+    @property
+    def point(self) -> Point:
+        """The evaluation point."""
+        return Point(self.stage, self.step)
 
 
 @dataclass
@@ -77,9 +96,17 @@ class ScenarioInfo:
     def protocol(self, run: RunInfo) -> Protocol:
         """Return the evaluation protocol of a run on this scenario."""
         split: Split = "validation" if run.split == "validation" else "test"
-        counts = (self.budget[name] for name in ("validation_episodes", "test_episodes", "curve_episodes"))
-        names = (tuple(self.retained), tuple(self.target), tuple(self.held_out))
-        return Protocol(*names, tuple(self.evaluation_steps), *counts, split=split, perturb=run.perturb)
+        return Protocol(
+            tuple(self.retained),
+            tuple(self.target),
+            tuple(self.held_out),
+            tuple(self.evaluation_steps),
+            self.budget["validation_episodes"],
+            self.budget["test_episodes"],
+            self.budget["curve_episodes"],
+            split,
+            run.perturb,
+        )
 
 
 @dataclass
@@ -127,6 +154,10 @@ class Record:
     """Dates and seconds: all that may differ between two equal runs."""
     error: dict[str, str] | None = None
     """For a failed run: `where` (the hook and stage), `type`, `message`, `traceback`."""
+
+    def episode_rows(self) -> list[EpisodeRow]:
+        """Return the rows of `episodes`."""
+        return [EpisodeRow(*values) for values in zip(*self.episodes.values(), strict=True)]
 
 
 def append_row(columns: dict[str, list[Any]], row: Iterable[Any]) -> None:

@@ -9,16 +9,33 @@ import uuid
 from pathlib import Path
 from typing import Any
 
+from clbench.base.errors import InputError
+from clbench.base.strict_json import LONGEST_TEXT, MOST_BYTES, StrictJSONError, check_json
+from clbench.records.content import content_hash
+from clbench.records.reader import RecordError, parse_record
 from clbench.records.record import SCHEMA, Record
+
+MOST_DIAGNOSTICS = 2 * 2**20
+"""Bytes of the diagnostics of a run, as JSON. Those of `consft` on Fetch-v0 have 4,000."""
+
+CUT = "\n[... clbench left out {count:,} characters ...]\n"
+"""Stands in an error's text where its middle was left out."""
 
 
 def write_record(record: Record, path: Path) -> None:
     """Write `record` to `path` in one step: a reader sees the whole file or none.
 
-    A symbolic link that is there is replaced, and what it leads to is left alone.
+    Whatever is written can be read: texts of the error are cut to `LONGEST_TEXT` characters, and anything else that
+    `read_record` would refuse is refused before a file is touched. A symbolic link at `path` is replaced, and
+    its target is left alone.
+
+    Raises:
+        InputError: The record could not be read again: a field does not fit the schema, holds what JSON cannot
+            hold, or is too large.
     """
-    values = {"schema": SCHEMA, **dataclasses.asdict(record)}
-    text = "{\n" + ",\n".join(f"{json.dumps(key)}: {_dump(value)}" for key, value in values.items()) + "\n}\n"
+    check_diagnostics(record.diagnostics)
+    text = record_text(record)
+    _check_readable(text)
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(f".{path.name}.{uuid.uuid4().hex}.partial")
     try:
@@ -27,6 +44,58 @@ def write_record(record: Record, path: Path) -> None:
         os.replace(partial, path)
     finally:
         partial.unlink(missing_ok=True)
+
+
+def record_text(record: Record) -> str:
+    """Return the text of the file of `record`; nothing but its being JSON is checked."""
+    try:
+        values = {"schema": SCHEMA, **dataclasses.asdict(record)}
+        if isinstance(record.error, dict):
+            values["error"] = {name: _cut(text) for name, text in record.error.items()}
+        lines = [f"{json.dumps(name)}: {_dump(value)}" for name, value in values.items()]
+        # the hash is of what a reader finds: tuples are lists there, and names of entries are texts
+        content = content_hash(json.loads("{" + ",".join(lines) + "}"))
+    except (TypeError, ValueError, RecursionError) as error:
+        raise InputError(f"the record holds what JSON cannot hold: {error}") from error
+    return "{\n" + ",\n".join([*lines, f'"content": "{content}"']) + "\n}\n"
+
+
+def check_diagnostics(diagnostics: dict[str, Any]) -> None:
+    """Refuse diagnostics that a record cannot hold.
+
+    Args:
+        diagnostics: `Record.diagnostics`: what a method reported, by stage.
+
+    Raises:
+        InputError: They are no JSON within the limits, or larger than `MOST_DIAGNOSTICS`.
+    """
+    try:
+        text = json.dumps(diagnostics, allow_nan=False)
+        check_json(json.loads(text), "diagnostics")
+    except (TypeError, ValueError, RecursionError) as error:
+        raise InputError(f"diagnostics cannot be written as JSON: {error}") from error
+    if len(text) > MOST_DIAGNOSTICS:
+        raise InputError(f"diagnostics have {len(text):,} bytes, more than {MOST_DIAGNOSTICS:,}.")
+
+
+def _check_readable(text: str) -> None:
+    """Refuse a text that `read_record` would refuse."""
+    if len(text) > MOST_BYTES:
+        raise InputError(f"the record has {len(text):,} bytes, more than {MOST_BYTES:,}.")
+    values = json.loads(text)
+    try:
+        check_json(values)
+        parse_record(values)
+    except (StrictJSONError, RecordError) as error:
+        raise InputError(f"the record could not be read again: {error}") from error
+
+
+def _cut(text: Any) -> Any:
+    """Return a text of an error without its middle if it is too long: tracebacks matter at both ends."""
+    if not isinstance(text, str) or len(text) <= LONGEST_TEXT:
+        return text
+    half = LONGEST_TEXT // 2 - 100
+    return text[:half] + CUT.format(count=len(text) - 2 * half) + text[-half:]
 
 
 def _dump(value: Any) -> str:

@@ -8,6 +8,7 @@ Until the last stage the record waits in the cache: who is interrupted loses the
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import logging
 import shutil
@@ -19,7 +20,8 @@ from datetime import UTC, datetime
 from functools import cached_property
 from importlib.metadata import packages_distributions, version
 from pathlib import Path
-from typing import Any, Protocol, TypeAlias
+from typing import Any, TypeAlias
+from typing import Protocol as Interface
 
 import gymnasium
 import numpy as np
@@ -33,16 +35,17 @@ from clbench.base.entry_points import resolve
 from clbench.base.errors import InputError, WrongTypeError
 from clbench.base.seeding import seeded
 from clbench.base.strict_json import check_json
+from clbench.evaluation.examiner import episode_row
 from clbench.evaluation.rollouts import Episode, Trial, start_of
 from clbench.learning.trainer import sources
 from clbench.records.paths import RECORDS, record_path
 from clbench.records.reader import read_record
-from clbench.records.record import Record, append_row
+from clbench.records.record import Record, RunInfo, append_row
 from clbench.records.writer import write_record
 from clbench.runs.fingerprint import fingerprint
-from clbench.runs.run import episode_row
 from clbench.runs.spec import describe_scenario
 from clbench.spec.identifiers import built_in_methods, check_method_name
+from clbench.spec.protocol import Protocol
 from clbench.spec.registry import load_scenario
 from clbench.spec.scenario import Scenario
 from clbench.worlds.lanes import Lanes
@@ -56,7 +59,7 @@ USES = {"demonstrations": "never", "questions": "never", "reference": False, "on
 """What the record of an agent says of prior data: it has none of ours, and learns by trial."""
 
 
-class Predictor(Protocol):
+class Predictor(Interface):
     """What Stable-Baselines3's algorithms are, and anything that acts as they do."""
 
     def predict(self, observation: Any, *, deterministic: bool) -> tuple[Any, Any]:
@@ -195,7 +198,8 @@ class _OnlineRun:
 
     @cached_property
     def _sources(self) -> dict[str, Any]:
-        return {"scenario": describe_scenario(self.scenario), **sources(self.scenario, self.seed)}
+        scenario = dataclasses.asdict(describe_scenario(self.scenario))
+        return {"scenario": scenario, **sources(self.scenario, self.seed)}
 
     def _inputs(self, stage: int) -> dict[str, Any]:
         """Return all that what waits depends on, but for the agent."""
@@ -235,44 +239,40 @@ class _OnlineRun:
                 "To evaluate stage 0 begins anew."
             )
         record = read_record(self._stage_folder(done) / "record.json")
-        if record.run["settings"] != settings:
+        if record.run.settings != settings:
             raise InputError(
-                f"The settings of {name} are {settings}, but were {record.run['settings']} in stage 0."
+                f"The settings of {name} are {settings}, but were {record.run.settings} in stage 0."
             )
         return record
 
     def _new_record(self, settings: dict[str, Any], agent: Agent) -> Record:
-        run = {
-            "scenario": self.scenario.id,
-            "method": self.method,
-            "seed": self.seed,
-            "device": str(getattr(agent, "device", "unknown")),
-            "split": "test",
-            "settings": settings,
-            "changes": {},
-            "uses": dict(USES),
-        }
+        run = RunInfo(
+            scenario=self.scenario.id,
+            method=self.method,
+            seed=self.seed,
+            device=str(getattr(agent, "device", "unknown")),
+            split="test",
+            settings=settings,
+            changes={},
+            uses=dict(USES),
+        )
         record = Record("success", run, describe_scenario(self.scenario))
         record.fingerprint = {**fingerprint(self.scenario), "method": _describe(agent)}
         record.timing = {"started": datetime.now(UTC).isoformat(timespec="seconds"), "stages": []}
         network = getattr(agent, "policy", None)
         if isinstance(network, torch.nn.Module):
-            record.costs["parameters"] = sum(parameter.numel() for parameter in network.parameters())
+            record.costs.parameters = sum(parameter.numel() for parameter in network.parameters())
         return record
 
     def report(self, record: Record, stage: int, play: Callable[[Trial], Episode]) -> None:
         """Add the episodes that every run has at the end of a stage, and that no question was asked."""
-        budget = self.scenario.budget
-        step = budget.adaptation_steps if stage else 0  # the end of a stage, on the scale of the scenario
-        target = self.scenario.target[stage - 1 : stage] if stage else ()
-        trials: list[Trial] = [
-            (task, "test", n) for task in self.scenario.tasks for n in range(budget.test_episodes)
-        ]
-        trials += [(task, "validation", n) for task in target for n in range(budget.validation_episodes)]
-        for trial in trials:
-            append_row(record.episodes, episode_row(stage, step, play(trial)))
+        protocol = Protocol.of(self.scenario)
+        point = protocol.end(stage)  # in optimiser steps, as if a method had trained
+        for key in protocol.episodes(point):
+            trial = self.scenario.task(key.task), key.split, key.number
+            append_row(record.episodes, episode_row(point, play(trial)))
         for kind in resolve(self.scenario.questions):
-            append_row(record.answers, (stage, step, kind.name, 0, 0))
+            append_row(record.answers, (*point, kind.name, 0, 0))
 
     def count(
         self, record: Record, stage: int, steps: int | None, trained: float | None, evaluated: float
@@ -280,9 +280,7 @@ class _OnlineRun:
         """Add what a stage cost: environment steps, and seconds of training and of evaluation."""
         record.diagnostics[str(stage)] = {"environment_steps": steps}
         each = [told["environment_steps"] for told in record.diagnostics.values()]
-        record.costs.pop("environment_steps", None)
-        if None not in each:
-            record.costs["environment_steps"] = sum(each)
+        record.costs.environment_steps = None if None in each else sum(each)
         training = None if trained is None else round(trained, 2)
         record.timing["stages"].append({"training": training, "evaluation": round(evaluated, 2)})
         parts = [seconds for one in record.timing["stages"] for seconds in one.values()]

@@ -6,34 +6,35 @@ itself bit for bit, policies that are made again are those that it had.
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import logging
 import shutil
-from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from clbench.base.cache import cache_folder, cached, hash_of, is_cached
+from clbench.base.progress import ProgressCallback, no_progress
 from clbench.base.source import package_of
 from clbench.learning.optimise import MethodError
 from clbench.learning.trainer import STAGE_FILES, Trainer, load_stage, repeatable, sources
 from clbench.policy.policy import Policy
 
 if TYPE_CHECKING:
-    from clbench.runs.spec import RunSpec
+    from clbench.runs.spec import ResolvedRun
 
 LOG = logging.getLogger("clbench")
 
 
 def stage_policies(
-    spec: RunSpec, checkpoints: Path | None = None, progress: Callable[[float], None] = lambda _: None
+    run: ResolvedRun, checkpoints: Path | None = None, progress: ProgressCallback = no_progress
 ) -> list[Policy]:
     """Return the policy after every stage of a run, from stage 0.
 
     Where the run kept them, these are read; else they are made again, and stay in the cache.
 
     Args:
-        spec: The run. On which episodes it is evaluated makes no difference.
+        run: The run. On which episodes it is evaluated makes no difference.
         checkpoints: Folder below which policies were kept, as for `execute`.
         progress: Called with the number of optimiser steps done since its last call; a stage that need not
             be made counts in full.
@@ -41,56 +42,58 @@ def stage_policies(
     Raises:
         MethodError: The method fails; the message says where.
     """
-    folder = find_stages(spec, checkpoints)
+    folder = find_stages(run, checkpoints)
     if folder is None:
-        return load_stages(spec, make_stages(spec, progress))
-    scenario = spec.load()
+        return load_stages(run, make_stages(run, progress))
+    scenario = run.scenario
     progress(len(scenario.target) * scenario.budget.adaptation_steps)
-    return load_stages(spec, folder)
+    return load_stages(run, folder)
 
 
-def find_stages(spec: RunSpec, checkpoints: Path | None = None) -> Path | None:
+def find_stages(run: ResolvedRun, checkpoints: Path | None = None) -> Path | None:
     """Return the folder that holds the policies of all stages of a run, "stage-0" and so on, or None.
 
     Args:
-        spec: The run.
+        run: The run.
         checkpoints: Folder below which policies were kept. If these are not there, which is said in the log,
             those in the cache are looked for.
     """
-    kept = kept_stages(spec, checkpoints)
+    kept = kept_stages(run, checkpoints)
     if kept is not None:
         return kept
-    made = _made(spec)
-    return made if _are_whole(spec, made) else None
+    made = _made(run)
+    return made if _are_whole(run, made) else None
 
 
-def kept_stages(spec: RunSpec, checkpoints: Path | None) -> Path | None:
+def kept_stages(run: ResolvedRun, checkpoints: Path | None) -> Path | None:
     """Return the folder below `checkpoints` in which a run kept the policies of all stages, or None.
 
     Where there are checkpoints without them, the log says so.
     """
     if checkpoints is None:
         return None
-    if has_stages(spec, checkpoints):
-        return _kept(spec, checkpoints)
+    if has_stages(run, checkpoints):
+        return _kept(run, checkpoints)
     missing = "%s does not hold the policies of all stages of %s, seed %d."
-    LOG.warning(missing, checkpoints, spec.label, spec.seed)
+    LOG.warning(missing, checkpoints, run.label, run.spec.seed)
     return None
 
 
-def make_stages(spec: RunSpec, progress: Callable[[float], None] = lambda _: None) -> Path:
+def make_stages(run: ResolvedRun, progress: ProgressCallback = no_progress) -> Path:
     """Make the policies of all stages by adapting alone, and return the folder of the cache that holds them.
 
     Args:
-        spec: The run.
+        run: The run.
         progress: As for `stage_policies`.
 
     Raises:
         MethodError: The method fails; the message says where.
     """
-    scenario = spec.load()
-    root = _made(spec)
-    new_trainer = functools.cache(lambda: Trainer(scenario, spec.build, spec.seed, spec.device))
+    scenario = run.scenario
+    root = _made(run)
+    new_trainer = functools.cache(
+        lambda: Trainer.open(scenario, run.new_method, run.spec.seed, run.spec.device)
+    )
 
     def make(number: int, folder: Path) -> None:
         trainer = new_trainer()
@@ -102,12 +105,12 @@ def make_stages(spec: RunSpec, progress: Callable[[float], None] = lambda _: Non
                 trainer.prepare()
             trainer.save(folder, number)
         except Exception as error:
-            message = f"{spec.label} failed in {trainer.where}: {type(error).__name__}: {error}"
+            message = f"{run.label} failed in {trainer.where}: {type(error).__name__}: {error}"
             raise MethodError(message) from error
 
-    with repeatable(spec.device):
+    with repeatable(run.spec.device):
         for number in range(len(scenario.target) + 1):
-            folder, identity = root / f"stage-{number}", _identity(spec, number)
+            folder, identity = root / f"stage-{number}", _identity(run, number)
             if is_cached(folder, identity):
                 progress(scenario.budget.adaptation_steps if number else 0)
             else:
@@ -115,66 +118,66 @@ def make_stages(spec: RunSpec, progress: Callable[[float], None] = lambda _: Non
     return root
 
 
-def load_stages(spec: RunSpec, folder: Path) -> list[Policy]:
+def load_stages(run: ResolvedRun, folder: Path) -> list[Policy]:
     """Return the policies of all stages of a run that lie in a folder, as "stage-0" and so on."""
-    numbers = range(len(spec.load().target) + 1)
-    return [load_stage(folder / f"stage-{number}", spec.build(), spec.device) for number in numbers]
+    numbers = range(len(run.scenario.target) + 1)
+    return [load_stage(folder / f"stage-{number}", run.new_method(), run.spec.device) for number in numbers]
 
 
-def keep_stages(spec: RunSpec, checkpoints: Path, progress: Callable[[float], None] = lambda _: None) -> None:
+def keep_stages(run: ResolvedRun, checkpoints: Path, progress: ProgressCallback = no_progress) -> None:
     """Keep the policies of all stages of a run that went through without keeping them.
 
     Args:
-        spec: The run.
+        run: The run.
         checkpoints: Folder below which they are kept.
         progress: As for `stage_policies`.
     """
-    folder = make_stages(spec, progress)
-    drop_stages(spec, checkpoints)
-    for number in range(len(spec.load().target) + 1):
-        keep_stage(spec, checkpoints, number, folder / f"stage-{number}")
+    folder = make_stages(run, progress)
+    drop_stages(run, checkpoints)
+    for number in range(len(run.scenario.target) + 1):
+        keep_stage(run, checkpoints, number, folder / f"stage-{number}")
 
 
-def has_stages(spec: RunSpec, checkpoints: Path, last: int | None = None) -> bool:
+def has_stages(run: ResolvedRun, checkpoints: Path, last: int | None = None) -> bool:
     """Return whether the policies of this very run, up to stage `last`, are kept and whole; all if None."""
-    return _are_whole(spec, _kept(spec, checkpoints), last)
+    return _are_whole(run, _kept(run, checkpoints), last)
 
 
-def _are_whole(spec: RunSpec, folder: Path, last: int | None = None) -> bool:
-    last = len(spec.load().target) if last is None else last
-    return all(is_cached(folder / f"stage-{n}", _identity(spec, n)) for n in range(last + 1))
+def _are_whole(run: ResolvedRun, folder: Path, last: int | None = None) -> bool:
+    last = len(run.scenario.target) if last is None else last
+    return all(is_cached(folder / f"stage-{n}", _identity(run, n)) for n in range(last + 1))
 
 
-def _kept(spec: RunSpec, checkpoints: Path) -> Path:
+def _kept(run: ResolvedRun, checkpoints: Path) -> Path:
     """Return where a run keeps its policies."""
-    return spec.path(checkpoints).with_suffix("")
+    return run.path(checkpoints).with_suffix("")
 
 
-def _made(spec: RunSpec) -> Path:
+def _made(run: ResolvedRun) -> Path:
     """Return where the cache has policies that were made again, by this version of the code."""
-    code = sources(spec.load(), spec.seed, package_of(type(spec.build()).__module__))
-    return cache_folder() / "stages" / hash_of({**_identity(spec, 0), **code})
+    code = sources(run.scenario, run.spec.seed, package_of(run.method.__module__))
+    return cache_folder() / "stages" / hash_of({**_identity(run, 0), **code})
 
 
-def keep_stage(spec: RunSpec, checkpoints: Path, number: int, source: Path) -> None:
+def keep_stage(run: ResolvedRun, checkpoints: Path, number: int, source: Path) -> None:
     """Keep what stage `number` of a run left in the folder `source`."""
 
     def write(folder: Path) -> None:
         for name in STAGE_FILES:
             shutil.copyfile(source / name, folder / name)
 
-    cached(_kept(spec, checkpoints) / f"stage-{number}", _identity(spec, number), write)
+    cached(_kept(run, checkpoints) / f"stage-{number}", _identity(run, number), write)
 
 
-def drop_stages(spec: RunSpec, checkpoints: Path) -> None:
+def drop_stages(run: ResolvedRun, checkpoints: Path) -> None:
     """Remove what is kept of a run: its policies belong to what another version of the code computed."""
-    for folder in _kept(spec, checkpoints).glob("stage-*"):
+    for folder in _kept(run, checkpoints).glob("stage-*"):
         shutil.rmtree(folder)
 
 
-def _identity(spec: RunSpec, number: int) -> dict[str, Any]:
+def _identity(run: ResolvedRun, number: int) -> dict[str, Any]:
     """Return what tells the policy of a stage from those of other runs, in every version of the code."""
-    run, scenario = spec.describe()
-    for name in ("split", "perturb"):  # on what it is evaluated makes no difference
-        run.pop(name, None)
-    return {"run": run, "scenario": scenario, "stage": number}
+    info = dataclasses.asdict(run.info)
+    for name in ("split", "perturb"):  # the episodes of its evaluation make no difference
+        del info[name]
+    return {"run": info, "scenario": dataclasses.asdict(run.scenario_info), "stage": number}

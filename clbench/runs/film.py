@@ -1,7 +1,7 @@
 """Films: the same episode side by side, as the policy of each stage of a run does it.
 
-A film shows validation episodes, never those of the report. The policies act as they do in evaluation: what is
-drawn repeats the actions that an `Evaluator` saw, so a film ends as the recorded episode does.
+A film shows validation episodes, never those of the report. The policies act as they do in evaluation: what
+is drawn repeats the actions that an `Evaluator` saw, so a film ends as the recorded episode does.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from __future__ import annotations
 import functools
 import os
 from collections import defaultdict
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,10 +21,11 @@ from PIL import Image, ImageColor, ImageDraw, ImageFont
 from clbench.base.dependencies import require
 from clbench.base.entry_points import resolve
 from clbench.base.errors import InputError
+from clbench.base.progress import ProgressCallback, no_progress
 from clbench.evaluation.rollouts import Episode, Evaluator, Trial, start_of
 from clbench.learning.optimise import deterministic
 from clbench.policy.policy import Policy
-from clbench.runs.spec import RunSpec
+from clbench.runs.spec import ResolvedRun
 from clbench.spec.scenario import Scenario
 from clbench.spec.task import Task
 from clbench.worlds.world import World
@@ -77,7 +78,7 @@ def shoot(
     policies: Sequence[Policy],
     trials: Sequence[Trial],
     width: int,
-    progress: Callable[[float], None] = lambda _: None,
+    progress: ProgressCallback = no_progress,
 ) -> list[list[Take]]:
     """Return the takes: for each trial, one with each policy.
 
@@ -278,32 +279,32 @@ def _write(draw: ImageDraw.ImageDraw, place: tuple[int, int], text: str, width: 
 
 
 def film_run(
-    spec: RunSpec,
+    run: ResolvedRun,
     policies: Mapping[int, Policy],
     tasks: Sequence[Task],
     number: int,
     width: int,
-    progress: Callable[[float], None] = lambda _: None,
+    progress: ProgressCallback = no_progress,
 ) -> Film:
     """Return the film of a run.
 
     Args:
-        spec: The run.
+        run: The run.
         policies: By the number of their stage, in the order of the columns.
         tasks: What they are asked to do.
         number: Which validation episode.
         width: Of a picture, in pixels.
         progress: Called with the number of takes made since its last call.
     """
-    scenario = spec.load()
+    scenario, seed = run.scenario, run.spec.seed
     trials: list[Trial] = [(task, "validation", number) for task in tasks]
     rows = [
-        f"{task.name} ({scenario.group(task.name).replace('_', ' ')}): {start_of(trial, spec.seed)[1]}"
+        f"{task.name} ({scenario.group(task.name).replace('_', ' ')}): {start_of(trial, seed)[1]}"
         for task, trial in zip(tasks, trials, strict=True)
     ]
     stages = ["before any target", *(f"after {task.name}" for task in scenario.target)]
-    title = f"{scenario.id}, {spec.label}, seed {spec.seed}, validation episode {number}"
-    takes = shoot(scenario, spec.seed, list(policies.values()), trials, width, progress)
+    title = f"{scenario.id}, {run.label}, seed {seed}, validation episode {number}"
+    takes = shoot(scenario, seed, list(policies.values()), trials, width, progress)
     return Film(title, rows, [f"stage {stage}, {stages[stage]}" for stage in policies], takes)
 
 

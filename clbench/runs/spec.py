@@ -1,4 +1,4 @@
-"""What is run: scenario x method x seed, and how long that takes, before any of it is done."""
+"""Run specifications: scenario x method x seed by name, and the same with everything resolved."""
 
 from __future__ import annotations
 
@@ -6,13 +6,15 @@ import dataclasses
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from clbench.base.errors import InputError
 from clbench.records.paths import label_of, record_path
 from clbench.records.reader import RecordError, read_record
-from clbench.spec.protocol import Split
+from clbench.records.record import RunInfo, ScenarioInfo
+from clbench.spec.protocol import Protocol, Split
 from clbench.spec.registry import load_scenario
 from clbench.spec.scenario import Scenario
 from clbench.worlds.lanes import check_perturbable
@@ -23,153 +25,166 @@ if TYPE_CHECKING:
 # PyTorch, which methods need, is imported late: that takes seconds, for which neither `--help` nor a process
 # of Ray that passes a spec on waits.
 
-EPISODE_WEIGHT = 0.3
-"""What an evaluation episode takes, in optimiser steps; for the time left that a progress bar shows."""
-
 
 @dataclass(frozen=True)
 class RunSpec:
-    """What is run."""
+    """A run by name: plain data that travels between processes. `resolve` looks the names up, once."""
 
     scenario: str
-    """Gymnasium id of the scenario."""
+    """Gymnasium id of the scenario; "module:id" imports the module first."""
     method: str
     """Name of an installed method, or "module:Class"."""
     seed: int
-    """Of every draw of the run."""
+    """Seed of every draw of the run."""
     changes: Mapping[str, Any] = field(default_factory=dict)
-    """Hyper-parameters that differ from the method's own."""
+    """Hyper-parameters that differ from the method's defaults, by name."""
     device: str = "cpu"
-    """Where the policy is computed."""
+    """Device on which the policy is computed."""
     split: Split = "test"
-    """Which episodes it is evaluated on; those of "validation" may be looked at to choose settings."""
+    """The split that is scored. Choices may look at "validation" episodes alone."""
     targets: int | None = None
-    """How many targets are learned, from the first; all if None."""
+    """Number of targets to learn, from the first; all if None."""
     order: int = 0
-    """In which order the targets come, as `Scenario.in_order` says; 0 is the published one."""
+    """Order of the targets, see `Scenario.in_order`; 0 is the published one."""
     perturb: bool = False
-    """Whether the retained skills are evaluated on perturbed episodes too."""
+    """Whether the retained skills also meet perturbed episodes."""
+
+    @property
+    def label(self) -> str:
+        """The method with its changed hyper-parameters, for example "experience_replay+replay=0.02"."""
+        return label_of(self.method, self.changes)
 
     def path(self, records: Path) -> Path:
-        """Return where the record lies below the folder `records`."""
+        """Return the path of the record below the folder `records`."""
         return record_path(records, self.scenario.rpartition(":")[2], self.label, self.seed, self.order)
 
-    def load(self) -> Scenario:
-        """Return the scenario, with the targets that are learned.
+    def resolve(self) -> ResolvedRun:
+        """Return the run with its scenario and its method looked up.
 
         Raises:
-            LookupError: There is no such scenario.
-            ValueError: There is no such order, or nothing that can be perturbed.
+            UnknownNameError: There is no such scenario, method or hyper-parameter.
+            InputError: There is no such order, nothing can be perturbed, or the method refuses a value.
         """
-        scenario = load_scenario(self.scenario).in_order(self.order)
+        from clbench.learning.registry import load_method, read_changes
+
+        scenario, published = self.scenarios()
+        method = load_method(self.method)
+        return ResolvedRun(self, scenario, published, method, read_changes(self.method, method, self.changes))
+
+    def scenarios(self) -> tuple[Scenario, Scenario]:
+        """Return the scenario with the targets that are learned, and the same in the published order.
+
+        Raises:
+            UnknownNameError: There is no such scenario.
+            InputError: There is no such order, or nothing can be perturbed.
+        """
+        published = load_scenario(self.scenario)
+        scenario = published.in_order(self.order)
         if self.perturb and not scenario.retained:
             raise InputError(f"{scenario.id} retains no skills that could be perturbed: leave out --perturb.")
         if self.perturb:
             check_perturbable(scenario.retained)
-        return dataclasses.replace(scenario, target=scenario.target[: self.targets])
+        return (
+            dataclasses.replace(scenario, target=scenario.target[: self.targets]),
+            dataclasses.replace(published, target=published.target[: self.targets]),
+        )
+
+
+@dataclass(frozen=True)
+class ResolvedRun:
+    """A run whose names have been looked up: everything that follows is handed this, and looks up nothing."""
+
+    spec: RunSpec
+    """The run by name."""
+    scenario: Scenario
+    """Scenario with the targets that are learned, in their order."""
+    published: Scenario
+    """The same scenario with its targets in the published order."""
+    method: type[Method]
+    """Class of the method."""
+    changes: Mapping[str, Any]
+    """Changed hyper-parameters as the method holds them: the text "0.5" may be a number."""
+
+    def new_method(self) -> Method:
+        """Return a new object of the method."""
+        from clbench.learning.registry import new_method
+
+        return new_method(self.spec.method, self.method, self.changes)
+
+    @cached_property
+    def protocol(self) -> Protocol:
+        """The evaluation protocol of the run."""
+        return Protocol.of(self.scenario, self.spec.split, self.spec.perturb)
+
+    @cached_property
+    def info(self) -> RunInfo:
+        """`Record.run`. Two runs with equal `info` and `scenario_info` are the same run."""
+        spec, method = self.spec, self.new_method()
+        values = dataclasses.asdict(method)  # type: ignore[call-overload]
+        settings = {name: _plain(value) for name, value in values.items()}
+        return RunInfo(
+            scenario=self.scenario.id,
+            method=spec.method,
+            seed=spec.seed,
+            device=spec.device,
+            split=spec.split,
+            settings=settings,
+            changes={name: settings[name] for name in sorted(self.changes)},
+            uses=dataclasses.asdict(method.uses),
+            order=spec.order,
+            perturb=spec.perturb,
+        )
+
+    @cached_property
+    def scenario_info(self) -> ScenarioInfo:
+        """`Record.scenario`."""
+        return describe_scenario(self.scenario)
 
     @property
     def label(self) -> str:
-        """The method and what was changed of it, as "experience_replay+replay=0.02"."""
-        return label_of(self.method, self.changes)
+        """The method with its changed hyper-parameters, for example "experience_replay+replay=0.02"."""
+        return label_of(self.spec.method, self.changes)
 
-    def build(self) -> Method:
-        """Return a new object of the method."""
-        from clbench.learning.registry import build_method
-
-        return build_method(self.method, self.changes)
-
-    def describe(self) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Return `Record.run` and `Record.scenario`: two runs for which they are equal are the same run."""
-        scenario, method = self.load(), self.build()
-        values = dataclasses.asdict(method)  # type: ignore[call-overload]
-        settings = {name: _plain(value) for name, value in values.items()}
-        run = {
-            "scenario": scenario.id,
-            "method": self.method,
-            "seed": self.seed,
-            **({"order": self.order} if self.order else {}),
-            "device": self.device,
-            "split": self.split,
-            **({"perturb": True} if self.perturb else {}),
-            "settings": settings,
-            "changes": {name: settings[name] for name in sorted(self.changes)},
-            "uses": dataclasses.asdict(method.uses),
-        }
-        return run, describe_scenario(scenario)
+    def path(self, records: Path) -> Path:
+        """Return the path of the record below the folder `records`."""
+        return record_path(records, self.scenario.id, self.label, self.spec.seed, self.spec.order)
 
 
-def describe_scenario(scenario: Scenario) -> dict[str, Any]:
+def describe_scenario(scenario: Scenario) -> ScenarioInfo:
     """Return `Record.scenario`."""
-    groups = ("retained", "target", "held_out")
-    return {
-        "id": scenario.id,
-        **{group: [task.name for task in getattr(scenario, group)] for group in groups},
-        "evaluation_steps": list(scenario.budget.evaluation_steps),
-        "budget": dataclasses.asdict(scenario.budget),
-    }
+    groups = (scenario.retained, scenario.target, scenario.held_out)
+    retained, target, held_out = ([task.name for task in group] for group in groups)
+    steps, budget = list(scenario.budget.evaluation_steps), dataclasses.asdict(scenario.budget)
+    return ScenarioInfo(scenario.id, retained, target, held_out, steps, budget)
 
 
 def _plain(value: Any) -> Any:
-    """Return a value as JSON holds it; what it cannot hold becomes text."""
+    """Return a value as JSON holds it; what JSON cannot hold becomes text."""
     try:
         return json.loads(json.dumps(value, allow_nan=False))
     except (TypeError, ValueError):
         return repr(value)
 
 
-def has_record(spec: RunSpec, records: Path) -> bool:
-    """Return whether this very run went through before, or one that has perturbed episodes besides.
+def has_record(run: ResolvedRun, records: Path) -> bool:
+    """Return whether this very run has completed, or one that also has perturbed episodes.
 
-    One that failed, that cannot be read, or that is of another budget, device or settings does not count.
+    A record that failed, that cannot be read, or that is of another budget, device or settings does not
+    count.
     """
     try:
-        record = read_record(spec.path(records))
+        record = read_record(run.path(records))
     except RecordError:
         return False
-    if not spec.perturb:
-        record.run.pop("perturb", None)
-    return record.status == "success" and (record.run, record.scenario) == spec.describe()
-
-
-def run_length(scenario: Scenario, split: Split = "test", perturb: bool = False) -> float:
-    """Return how long a run takes, in optimiser steps.
-
-    Args:
-        scenario: With the targets that are learned.
-        split: Episodes that it is evaluated on.
-        perturb: Whether the retained skills are evaluated on perturbed episodes too.
-    """
-    budget, stages, retained = scenario.budget, len(scenario.target), len(scenario.retained)
-    points = len(budget.evaluation_steps)
-    scored = split == "test"
-    on_the_way = stages * (points - 1) * (retained + 1)
-    on_the_way *= budget.curve_episodes if scored else budget.validation_episodes
-    selection = stages * points * budget.validation_episodes if scored else 0
-    ends = (stages + 1) * end_length(scenario, split, perturb)
-    return stages * budget.adaptation_steps + ends + EPISODE_WEIGHT * (on_the_way + selection)
-
-
-def end_length(scenario: Scenario, split: Split, perturb: bool) -> float:
-    """Return how long the evaluation of all tasks takes, as at the end of a stage, in optimiser steps."""
-    budget = scenario.budget
-    perturbed = len(scenario.retained) * budget.episodes("perturbed") if perturb else 0
-    return EPISODE_WEIGHT * (len(scenario.tasks) * budget.episodes(split) + perturbed)
-
-
-def read_changes(method: str, changes: Mapping[str, Any]) -> dict[str, Any]:
-    """Return changed hyper-parameters as the method holds them: the text "0.5" may be a number."""
-    from clbench.learning.registry import build_method
-
-    built = build_method(method, changes)
-    return {name: getattr(built, name) for name in changes}
+    found = record.run if run.spec.perturb else dataclasses.replace(record.run, perturb=False)
+    return record.status == "success" and (found, record.scenario) == (run.info, run.scenario_info)
 
 
 def check_device(device: str) -> None:
-    """Refuse a device that is not here.
+    """Refuse a device that this machine does not have.
 
     Raises:
-        ValueError: The name is none that PyTorch knows, or this machine has no such device.
+        InputError: PyTorch does not know the name, or this machine has no such device.
     """
     import torch
 

@@ -9,6 +9,7 @@ from typing import Any
 from clbench.base.dependencies import require
 from clbench.learning.adaptation import Step
 from clbench.records.record import Record
+from clbench.spec.protocol import Point
 
 LOG_STEPS = 10
 """Optimiser steps between two points of the loss."""
@@ -56,10 +57,10 @@ class Log:
         values = {"training/loss": step.loss.item(), "training/learning_rate": step.learning_rate}
         self._write(values.items(), stage, step.done)
 
-    def report(self, record: Record, stage: int, step: int) -> None:
+    def report(self, record: Record, point: Point) -> None:
         """Log what a record holds about an evaluation point."""
         if self._writer is not None:
-            self._write(_report(record, stage, step), stage, step)
+            self._write(_report(record, point), *point)
             self._writer.flush()  # the checkpoint that follows counts on it
 
     def diagnostics(self, found: Mapping[str, Any], stage: int) -> None:
@@ -84,26 +85,26 @@ class Log:
                 self._writer.add_scalar(tag, value, place)
 
 
-def _report(record: Record, stage: int, step: int) -> Iterator[tuple[str, float | None]]:
+def _report(record: Record, point: Point) -> Iterator[tuple[str, float | None]]:
     """Yield the tags and values of an evaluation point."""
     outcomes: dict[str, list[int]] = {}
-    for row in _rows(record.episodes, stage, step):
+    for row in _rows(record.episodes, point):
         outcomes.setdefault(f"success_{row['split']}/{row['task']}", []).append(row["success"])
     for tag, successes in outcomes.items():
         yield tag, sum(successes) / len(successes)
-    answers = list(_rows(record.answers, stage, step))
+    answers = list(_rows(record.answers, point))
     for row in answers:
         yield f"question_accuracy/{row['kind']}", row["correct"] / row["asked"]
     asked = sum(row["asked"] for row in answers)
     yield "question_accuracy/all", sum(row["correct"] for row in answers) / asked
-    for row in _rows(record.policy, stage, step):
+    for row in _rows(record.policy, point):
         yield "policy/update_sparsity", row["update_sparsity"]
         yield "policy/activation_drift", row["activation_drift"]
 
 
-def _rows(columns: Mapping[str, list[Any]], stage: int, step: int) -> Iterator[dict[str, Any]]:
+def _rows(columns: Mapping[str, list[Any]], point: Point) -> Iterator[dict[str, Any]]:
     """Yield the rows of a table that belong to an evaluation point."""
     for values in zip(*columns.values(), strict=True):
         row = dict(zip(columns, values, strict=True))
-        if (row["stage"], row["step"]) == (stage, step):
+        if (row["stage"], row["step"]) == point:
             yield row

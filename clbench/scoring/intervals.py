@@ -1,24 +1,23 @@
-"""Intervals and paired differences that follow how a benchmark row comes about.
+"""Intervals and paired differences, with the two sources of variation that a row of the benchmark has.
 
-A row's number varies because another seed would have given another sequence of policies, and because other
-initial states would have met it. A seed is one whole run, from the pretrained policy to the last stage: its
-tasks share a policy. What the numbers of several seeds differ by comes from both, so that
+Another seed would give another sequence of policies, and other initial states would give other outcomes. A seed
+is one whole run, from the pretrained policy to the last stage: its tasks share a policy. The numbers of several
+seeds vary for both reasons. Therefore:
 
-1. with two or more seeds the interval is Student's over the seeds. Its standard error is that of the
-   jackknife, which leaves out one whole seed at a time; its degrees of freedom are the seeds less one. A
-   quantity with a least and a greatest value is taken on the scale of the arcsine of the root, as is usual
-   for rates: the interval stays inside the range, and reaches farther towards the middle of it, where the
-   truth more often is;
-2. with one seed, or where the seeds agree exactly, nothing tells how seeds differ, and the interval is of
-   episodes: the percentiles of replicates in which every run keeps its policy and meets episodes drawn with
-   replacement, for each task. All stages and evaluation points of a run get the same ones, and so do runs of
-   other methods with this seed: they met the same initial states. Where fewer episodes are run, at the points
-   before the end of a stage, the rate is the mean over those drawn among them. Right answers are drawn from a
-   binomial for each stage and kind of question, since records hold counts only.
+1. With two or more seeds the interval is Student's over the seeds. Its standard error comes from the jackknife,
+   which leaves out one whole seed at a time. Its degrees of freedom are the seeds less one. A quantity with a
+   least and a greatest value is transformed by the arcsine of its root, as is usual for rates. The interval
+   then stays inside the range, and is longer towards the middle of it, where the truth more often is.
+2. With one seed, or where the seeds agree exactly, the variation between seeds is unknown, and the interval
+   covers episodes alone. It holds the percentiles of replicates in which every run keeps its policy and meets
+   episodes drawn with replacement, for each task. All stages and evaluation points of a run get the same draws,
+   and so do runs of other methods with this seed: they met the same initial states. Fewer episodes are run
+   before the end of a stage. There the rate is the mean over the drawn ones among them. Right answers are drawn
+   from a binomial for each stage and kind of question, since records hold counts only.
 
-Tasks are fixed: a scenario is those tasks. Fixed too is what was chosen on the validation episodes of a run,
-as the points of `retention_at_matched_adaptation`: the interval says nothing of the luck of the choice. How
-often these intervals of 95 % hold the truth, and what they cannot do, stands in `docs/guide/statistics.md`.
+Tasks are fixed: a scenario consists of them. Choices on a run's validation episodes are fixed too, for example
+the points of `retention_at_matched_adaptation`: the interval does not cover the luck of the choice.
+`docs/guide/statistics.md` reports the coverage of these 95 % intervals and their limits.
 """
 
 from __future__ import annotations
@@ -28,7 +27,6 @@ import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
-from statistics import NormalDist
 from typing import NamedTuple
 
 import numpy as np
@@ -47,11 +45,11 @@ Runs = Mapping[int, Scores]
 REPLICATES = 2000
 """Draws behind an interval of episodes."""
 LEVEL = 95.0
-"""Per cent of the intervals that are to hold the truth."""
+"""Nominal coverage of the intervals in per cent."""
 SEED_DEVIATION = 0.05
-"""Standard deviation of a success rate between seeds that is assumed where none is measured. In the committed
-records of Fetch-v0 that of retention, beyond the noise of episodes, is 0.037 (root mean square over methods)
-and at most 0.07."""
+"""Standard deviation of a success rate between seeds, assumed where none is measured. In the committed records
+of Fetch-v0 retention deviates by 0.037 beyond the noise of episodes (root mean square over methods), and by 0.07
+at most."""
 MANY = 10**6
 """Degrees of freedom of a standard deviation that is known."""
 
@@ -75,13 +73,13 @@ class Span(NamedTuple):
     high: float = math.inf
 
     def angles(self, values: Array) -> Array:
-        """Return the arcsine of the root of where `values` lie in a finite span, else the values."""
+        """Return the arcsine of the root of positions in a finite span; in an infinite one, `values`."""
         if not math.isfinite(self.high - self.low):
             return values
         return np.asarray(np.arcsin(np.sqrt(np.clip((values - self.low) / (self.high - self.low), 0, 1))))
 
     def values(self, angles: Array) -> Array:
-        """Return the values in the span that have these angles, or are nearest to having them."""
+        """Return the values in the span with these angles, or the nearest ones."""
         if not math.isfinite(self.high - self.low):
             return np.clip(angles, self.low, self.high)
         return np.asarray(self.low + (self.high - self.low) * np.sin(np.clip(angles, 0, math.pi / 2)) ** 2)
@@ -109,11 +107,11 @@ def estimate(
         generator: Source of the draws.
         references: Runs of reference methods by name and seed. One that lacks a seed of `runs` counts as
             missing: its metrics have no value.
-        replicates: How many draws.
+        replicates: Number of draws.
 
     Raises:
-        LookupError: A metric is unknown.
-        ValueError: The runs are of different tasks, episodes, evaluation points or questions.
+        UnknownNameError: A metric is unknown.
+        InputError: The runs are of different tasks, episodes, evaluation points or questions.
     """
     wanted = [load_metric(name) for name in metrics]
     if not runs:
@@ -145,9 +143,9 @@ def paired_difference(
 ) -> Estimate:
     """Return the value of `metric` for `runs` minus that for `others`, over the seeds that both have.
 
-    Seeds are left out, and episodes drawn, for both at once, so that what is hard for both cancels. Right
-    answers are drawn apart, since records do not tell which questions they were: with one seed, differences
-    of answers are a little too wide.
+    Seeds are left out, and episodes drawn, for both at once, so that difficulty for both cancels. Right answers
+    are drawn separately, since records do not name the questions: with one seed, intervals of differences of
+    answers are a little too wide.
 
     Args:
         metric: Name of a metric.
@@ -155,11 +153,11 @@ def paired_difference(
         others: Runs of the other method by seed.
         generator: Source of the draws.
         references: Runs of reference methods by name and seed.
-        replicates: How many draws.
+        replicates: Number of draws.
 
     Raises:
-        LookupError: The metric is unknown.
-        ValueError: The runs are of different tasks, episodes, evaluation points or questions.
+        UnknownNameError: The metric is unknown.
+        InputError: The runs are of different tasks, episodes, evaluation points or questions.
     """
     wanted = load_metric(metric)
     seeds = sorted(set(runs) & set(others))
@@ -188,10 +186,10 @@ def bootstrap(
         runs: Runs of each method: the same seeds in the same order. All get the same draws.
         generator: Source of the draws.
         span: Least and greatest possible value.
-        replicates: How many draws.
+        replicates: Number of draws.
 
     Raises:
-        ValueError: The runs are of different tasks, episodes, evaluation points or questions.
+        InputError: The runs are of different tasks, episodes, evaluation points or questions.
     """
     samples = _Samples(list(runs.values()), {}, generator, replicates)
     return samples.estimate(lambda rates: quantity(dict(zip(runs, rates, strict=True))), Span(*span))
@@ -208,8 +206,8 @@ def interval(
     Args:
         value: The value of all seeds.
         without_one: The values if one seed is left out, (seeds,); with one seed there are none, (0,).
-        other_episodes: Returns the values with episodes drawn anew, (replicates,). It is asked only if the
-            seeds tell nothing; without it there is no interval then.
+        other_episodes: Returns the values with episodes drawn anew, (replicates,). It is called only if the
+            seeds do not vary; without it there is then no interval.
         span: Least and greatest possible value.
     """
     if not math.isfinite(value):
@@ -243,8 +241,8 @@ def draw_episodes(shape: tuple[int, ...], episodes: int, generator: np.random.Ge
     """Return how often each episode is drawn, with replacement, in each cell of `shape`: (*shape, episodes).
 
     Args:
-        shape: Of the cells.
-        episodes: How many there are, and are drawn for a cell.
+        shape: Shape of the cells.
+        episodes: Number of episodes, and of draws for each cell.
         generator: Source of the draws.
     """
     drawn = generator.integers(episodes, size=(math.prod(shape), episodes))
@@ -254,7 +252,7 @@ def draw_episodes(shape: tuple[int, ...], episodes: int, generator: np.random.Ge
     return counts.reshape(*shape, episodes).astype(np.float64)
 
 
-# ---- rates of the runs, as they are and as they might have been --------------------------------------------
+# ---- rates of the runs, and their replicates ---------------------------------------------------------------
 
 _Quantity = Callable[[Sequence[Rates]], Array]
 """Maps the rates of each method, with batch axes (..., runs), to values (...)."""
@@ -262,7 +260,7 @@ _Quantity = Callable[[Sequence[Rates]], Array]
 
 @dataclass(frozen=True, eq=False)
 class _Samples:
-    """Runs of several methods with the same seeds, and what might have been in their place."""
+    """Runs of several methods with the same seeds, and the replicates drawn from them."""
 
     methods: Sequence[Sequence[Scores]]
     """Runs of each method, in the order of the seeds."""
@@ -271,7 +269,7 @@ class _Samples:
     generator: np.random.Generator
     """Source of the draws."""
     replicates: int
-    """How many draws."""
+    """Number of draws."""
 
     def __post_init__(self) -> None:
         every = (*self.methods, *self.references.values())
@@ -323,55 +321,46 @@ class _Samples:
 # ---- quantiles ---------------------------------------------------------------------------------------------
 
 
+@cache
 def student_quantile(degrees: int) -> float:
-    """Return what Student's t with these degrees of freedom exceeds, up or down, in 5 % of the cases."""
-    return studentised_range_quantile(2, degrees) / math.sqrt(2)
+    """Return the number that the absolute value of Student's t exceeds in 5 % of the cases.
+
+    Args:
+        degrees: Degrees of freedom, one or more.
+    """
+    from scipy import stats  # here, since its import takes 0.6 s
+
+    return float(stats.t.ppf(0.5 + LEVEL / 200, degrees))
 
 
 @cache
 def studentised_range_quantile(count: int, degrees: int) -> float:
-    """Return what Tukey's studentised range exceeds in 5 % of the cases.
+    """Return the number that Tukey's studentised range exceeds in 5 % of the cases.
 
     It is the range of `count` normal numbers, divided by an estimate of their standard deviation with these
-    degrees of freedom. It is integrated numerically, true to four digits: SciPy is no dependency.
+    degrees of freedom.
 
     Args:
         count: How many numbers, two or more.
         degrees: Degrees of freedom, one or more.
     """
-    step, normal = 0.02, NormalDist()
-    places, widths = np.arange(-400, 401), np.arange(801)
-    below = np.array([normal.cdf(step * place) for place in range(-1200, 401)])
-    density = np.exp(-((step * places) ** 2) / 2) / math.sqrt(2 * math.pi)
-    # The greatest number is at one of the places, all others are less than a width below.
-    inside = below[places + 1200] - below[places - widths[:, None] + 1200]
-    narrower = count * step * (density * inside ** (count - 1)).sum(axis=1)
-    reach = 10 / math.sqrt(2 * degrees)
-    edges = np.linspace(max(0.0, 1 - reach), 1 + reach, 4001)
-    deviations = (edges[1:] + edges[:-1]) / 2
-    logarithms = (degrees - 1) * np.log(deviations) - degrees * deviations**2 / 2
-    weights = np.exp(logarithms - logarithms.max())
-    weights /= weights.sum()
-    low, high = 0.0, 1e4
-    while high - low > 1e-6 * high:
-        middle = (low + high) / 2
-        covered = weights @ np.interp(middle * deviations, step * widths, narrower, right=1.0)
-        low, high = (middle, high) if covered < LEVEL / 100 else (low, middle)
-    return high
+    from scipy import stats
+
+    return float(stats.studentized_range.ppf(LEVEL / 100, count, degrees))
 
 
 # ---- before a run ------------------------------------------------------------------------------------------
 
 
 def half_width(seeds: int, episodes: int, tasks: int, *, seed_deviation: float = SEED_DEVIATION) -> float:
-    """Return half of the width to expect of the interval of a mean success rate.
+    """Return half of the expected width of the interval of a mean success rate.
 
-    Assumed is the worst, a rate of one half. With one seed the interval is of its episodes alone.
+    The rate is assumed to be one half, the worst case. With one seed the interval covers its episodes alone.
 
     Args:
-        seeds: How many seeds are run.
+        seeds: Number of seeds.
         episodes: Scored episodes of a task.
-        tasks: How many tasks the mean is over.
+        tasks: Number of tasks in the mean.
         seed_deviation: Standard deviation of the rate between seeds.
     """
     of_seeds = seed_deviation**2 if seeds > 1 else 0.0
@@ -382,12 +371,12 @@ def half_width(seeds: int, episodes: int, tasks: int, *, seed_deviation: float =
 def episodes_needed(
     wished: float, seeds: int, tasks: int, *, seed_deviation: float = SEED_DEVIATION
 ) -> int | None:
-    """Return how many episodes of a task `half_width` needs to be as `wished`.
+    """Return the number of episodes of a task for which `half_width` is as `wished`.
 
     Args:
         wished: Half of the width of the interval, above 0.
-        seeds: How many seeds are run.
-        tasks: How many tasks the mean is over.
+        seeds: Number of seeds.
+        tasks: Number of tasks in the mean.
         seed_deviation: Standard deviation of the rate between seeds.
 
     Returns:
@@ -396,7 +385,7 @@ def episodes_needed(
     of_seeds = seed_deviation**2 if seeds > 1 else 0.0
     error = math.asin(min(2 * wished, 1.0)) / 2 / _quantile(seeds)
     of_episodes = seeds * error**2 - of_seeds
-    # A half-width that some number reaches exactly is not to need one more.
+    # A number of episodes that gives the half-width exactly needs no further one.
     return math.ceil(0.25 / (tasks * of_episodes) - 1e-6) if of_episodes > 0 else None
 
 
@@ -405,7 +394,7 @@ def _quantile(seeds: int) -> float:
 
 
 def expected_precision(scenario: Scenario, seeds: int) -> str:
-    """Return a sentence on how wide the intervals of a run of `scenario` will be."""
+    """Return a sentence on the expected width of the intervals of a run of `scenario`."""
     episodes = scenario.budget.test_episodes
     retained, target = len(scenario.retained), len(scenario.target)
     counts = {"retention": retained, "adaptation": target, "final average": retained + target}

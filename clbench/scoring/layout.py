@@ -1,4 +1,4 @@
-"""The layout of score arrays: what their axes stand for."""
+"""The layout of score arrays: the meaning of their axes."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Layout:
-    """What the axes of a run's scores stand for. Runs can be put together if their layouts are equal."""
+    """Meaning of the axes of a run's scores. Runs with equal layouts can be combined."""
 
     retained: tuple[str, ...]
     """Names of the skills that are pretrained and never trained again."""
@@ -25,11 +25,11 @@ class Layout:
     episodes: tuple[int, ...]
     """Numbers of the scored episodes at the end of a stage, rising."""
     curve_episodes: tuple[int, ...]
-    """Numbers of those that are run at the points before the end too, rising."""
+    """Numbers of the scored episodes that are also run before the end of a stage, rising."""
     validation_episodes: tuple[int, ...]
     """Numbers of the validation episodes on a stage's target, rising."""
     steps: tuple[int, ...]
-    """Steps of a stage after which it is evaluated, rising, all above 0; the last one is its end."""
+    """Steps of a stage after which the policy is evaluated, rising, above 0; the last one is the stage's end."""
     kinds: tuple[str, ...]
     """Kinds of questions, sorted."""
 

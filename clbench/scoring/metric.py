@@ -1,6 +1,6 @@
 """The registry of metrics: named, versioned functions from the success rates of runs to one number.
 
-A new metric is one function with the decorator `metric`; intervals, tables and tests then find it. The metrics
+A new metric is one function with the decorator `metric`: intervals, tables and tests then find it. The metrics
 of the leaderboard are in `clbench.scoring.ours`, definitions of other papers in `clbench.scoring.published`;
 `clbench.scoring.metrics` loads both.
 """
@@ -27,27 +27,27 @@ class Metric:
     function: Function
     """Maps rates with batch axes (...) to values (...), NaN where something is missing."""
     description: str
-    """What it tells, in one sentence."""
+    """Meaning in one sentence."""
     formula: str
-    """How it is computed, in words and in the letters of this module's docstring."""
+    """Formula, in words and in the letters of `clbench.scoring.ours`."""
     source: str
-    """Paper or convention that it comes from."""
+    """Paper or convention that defines it."""
     low: float
     """Least possible value."""
     high: float
     """Greatest possible value."""
     higher_is_better: bool | None
-    """None if it says nothing of better or worse."""
+    """None if neither is better."""
     units: str
-    """What is counted."""
+    """Unit of the value."""
     missing: str
-    """When it has no value, in one sentence."""
+    """Condition under which it has no value, in one sentence."""
     references: tuple[str, ...]
-    """Methods without whose records, of the same seeds, it has no value."""
+    """Methods whose records of the same seeds it needs."""
     compares_itself: bool
-    """Whether a reference method has a value too, by comparison with itself."""
+    """Whether a reference method has a value too, compared with itself."""
     pooled: bool
-    """Whether seeds are averaged before it is computed; if not, it is the mean of the seeds' values."""
+    """Whether the rates are averaged over seeds first; if not, the value is the mean of the seeds' values."""
     version: int
     """Number of the definition."""
 
@@ -78,7 +78,7 @@ def metric(
     pooled: bool = False,
     version: int = 0,
 ) -> Callable[[Function], Function]:
-    """Return a decorator that enters a function as a metric: its name, and its docstring's first line.
+    """Return a decorator that registers a function as a metric, with its name and its docstring's first line.
 
     The arguments are the fields of `Metric`.
     """

@@ -21,7 +21,7 @@ def load_metric(name: str) -> Metric:
     """Return the metric called `name`.
 
     Raises:
-        LookupError: No metric has this name; the nearest one is named.
+        UnknownNameError: No metric has this name; the message names the nearest one.
     """
     if name not in METRICS:
         raise unknown("metric", name, METRICS)
@@ -29,7 +29,7 @@ def load_metric(name: str) -> Metric:
 
 
 def measure(name: str, scores: Scores, references: Mapping[str, Scores] | None = None) -> float | None:
-    """Return the value of the metric `name` for one run, None where something that it needs is missing.
+    """Return the value of a metric for one run, None if something that it needs is missing.
 
     Args:
         name: Name of the metric.

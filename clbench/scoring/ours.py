@@ -13,9 +13,10 @@ import numpy as np
 from clbench.scoring.layout import Array, average
 from clbench.scoring.metric import metric
 from clbench.scoring.rates import Rates
+from clbench.spec.references import BASELINE, FROM_SCRATCH
 
 MATCHED_SHARE = 0.9
-"""Share of plain fine-tuning's final success on a target from which on a method has adapted as well as it."""
+"""Share of plain fine-tuning's final success on a target at which a method counts as having learned it as well."""
 
 
 @metric(
@@ -51,35 +52,36 @@ def retention(rates: Rates) -> Array:
 @metric(
     formula="mean over the retained skills s of the success on s after the last target in perturbed episodes",
     source="clbench",
-    missing="The run did not meet perturbed episodes, as with `clbench run --perturb`.",
+    missing="The run has no perturbed episodes; `clbench run --perturb` adds them.",
 )
 def perturbed_retention(rates: Rates) -> Array:
-    """Success on the retained skills after the last target, with start poses, masses and views disturbed.
+    """Success on the retained skills after the last target, with perturbed start poses, masses and views.
 
-    The episodes are those of `retention`, number by number: what this is lower by is lost to the disturbance.
-    How much of that was lost before any target, the success of the pretrained policy says.
+    The episodes are the same as for `retention`, number by number: the difference is the loss by perturbation.
+    The success of the pretrained policy shows how much of that loss was there before any target.
     """
     return average(rates.perturbed[..., -1, :])
 
 
 @metric(
     formula="mean over the stages k of the success on the retained skills at the first evaluation point of "
-    f"stage k at which the success on target k is at least {MATCHED_SHARE:g} of that of sft at the end of "
-    "its stage k; the point is chosen on validation episodes, the success at it is from test episodes",
+    f"stage k at which the success on target k is at least {MATCHED_SHARE:g} times the success of "
+    f"{BASELINE} on it at the end of stage k; the point is chosen on validation episodes, the success at it is "
+    "from test episodes",
     source="the protocol of ConSFT, arXiv 2605.08879, Sec. 5.1: comparison at comparable target success",
-    references=("sft",),
+    references=(BASELINE,),
     compares_itself=True,
-    missing="A target is never learned as well as by sft, a rate up to that point is missing, "
-    "or there is no sft.",
+    missing=f"A target is never learned as well as by {BASELINE}, a rate up to that point is missing, "
+    f"or there is no {BASELINE}.",
 )
 def retention_at_matched_adaptation(rates: Rates) -> Array:
     """Success on the retained skills at the point where the target is learned about as well as by sft.
 
-    It tells a method that forgets less from one that merely learns less, or later. Conventions:
+    It distinguishes a method that forgets less from one that merely learns less, or later. Conventions:
 
     1. The value is missing if the target of any stage is never learned that well.
-    2. sft is compared with itself: what it still knew when it first came near its final success.
-    3. The stages before are not matched: each begins with the policy that the full stage before left.
+    2. sft is compared with itself: its retention when it first came near its final success.
+    3. Earlier stages are not matched: each stage begins with the policy that the full stage before it left.
     """
     points = matched_points(rates)
     kept = average(rates.retained_curves)
@@ -91,18 +93,18 @@ def retention_at_matched_adaptation(rates: Rates) -> Array:
 def matched_points(rates: Rates) -> Array:
     """Return the evaluation point of each stage at which its target is first learned about as well as by sft.
 
-    It is the first at which the success on the validation episodes reaches `MATCHED_SHARE` of what sft has on
-    them at the end of the stage. Test episodes, of which scores are made, have no part in the choice.
+    At this point the success on the validation episodes first reaches `MATCHED_SHARE` times the success of sft on
+    them at the end of the stage. Test episodes, which make the scores, have no part in the choice.
 
     Args:
         rates: Success rates with the reference sft.
 
     Returns:
-        Indices into `Layout.steps`, (..., targets); NaN where none reaches it, or where it cannot be told.
+        Indices into `Layout.steps`, (..., targets); NaN where none reaches it, or where a rate is missing.
     """
-    if "sft" not in rates.references:
+    if BASELINE not in rates.references:
         return np.full(rates.validation.shape[:-1], np.nan)
-    goal = MATCHED_SHARE * rates.references["sft"].validation[..., -1:]
+    goal = MATCHED_SHARE * rates.references[BASELINE].validation[..., -1:]
     # Rates are quotients of whole numbers: equal ones may differ in the last bit.
     reached = rates.validation >= goal - 1e-9
     # A missing rate may have been the first to reach it: no later one is known to be the first.
@@ -153,9 +155,9 @@ def backward_transfer(rates: Rates) -> Array:
     source="Continual World, arXiv 2105.10919 (FT)",
     low=-math.inf,
     units="share of the area that learning from scratch leaves",
-    references=("from_scratch",),
+    references=(FROM_SCRATCH,),
     pooled=True,
-    missing="A point of a learning curve is missing, or there is no from_scratch of the same seeds.",
+    missing=f"A point of a learning curve is missing, or there is no {FROM_SCRATCH} of the same seeds.",
 )
 def forward_transfer(rates: Rates) -> Array:
     """How much faster targets are learned than from scratch.
@@ -163,17 +165,17 @@ def forward_transfer(rates: Rates) -> Array:
     Conventions, where the source leaves room:
 
     1. Trapezoid rule through the evaluation points and a point at step 0. A stage starts with the policy of
-       the stage before, so that its point at step 0 is R[k-1][k]: what the policy can do at once is transfer.
-    2. The policy from scratch starts untrained, and nobody evaluates that one: its success at step 0 is taken
-       as 0. For manipulation this is true to a few in a thousand; where it is not, the value is too high by
-       at most half the first interval's share of the stage times the untrained policy's success. To begin
-       both curves at the first common point instead would leave out the very part where transfer shows.
+       the stage before, so that its point at step 0 is R[k-1][k]: success without a step counts as transfer.
+    2. The policy from scratch starts untrained and is not evaluated then: its success at step 0 is taken as 0.
+       For manipulation this is true to a few in a thousand. Where it is not, the value is too high by at most
+       half the first interval's share of the stage times the untrained policy's success. Curves that begin at
+       the first common point instead would leave out the very part in which transfer shows.
     3. Curves are averaged over seeds before the ratio, as in the source's code.
     4. The value is capped by 1 and not bounded below. Point 2 keeps the divisor above 0.
     """
     starts = np.diagonal(rates.target[..., :-1, :], axis1=-2, axis2=-1)
     area = _area(rates.layout.steps, rates.learning_curves, starts)
-    curves_from_scratch = rates.references["from_scratch"].learning_curves
+    curves_from_scratch = rates.references[FROM_SCRATCH].learning_curves
     area_from_scratch = _area(rates.layout.steps, curves_from_scratch, np.zeros_like(starts))
     return average((area - area_from_scratch) / (1 - area_from_scratch))
 
@@ -212,24 +214,25 @@ def zero_shot(rates: Rates) -> Array:
     source="ConSFT, arXiv 2605.08879, Eq. 8",
     higher_is_better=None,
     units="share of parameters",
-    missing="It was not measured after the last target, as where a method changes the set of the parameters.",
+    missing="It was not measured after the last target, for example because a method changes the set of "
+    "parameters.",
 )
 def update_sparsity(rates: Rates) -> Array:
-    """Share of the parameters that are after the last target nearly what they were after pretraining."""
+    """Share of the parameters that have hardly changed from pretraining to after the last target."""
     return _at_the_end(rates.update_sparsity)
 
 
 @metric(
-    formula="squared 2-Wasserstein distance between the hidden states of the policy on the test questions "
-    "and those of the pretrained policy, mean over layers, at the end of stage K",
-    source="AEGIS, arXiv 2604.16067, where it is the penalty",
+    formula="squared 2-Wasserstein distance between the hidden states of the policy and of the pretrained policy "
+    "on the test questions, mean over layers, at the end of stage K",
+    source="the penalty of AEGIS, arXiv 2604.16067",
     high=math.inf,
     higher_is_better=False,
     units="squared distance",
     missing="It was not measured after the last target.",
 )
 def activation_drift(rates: Rates) -> Array:
-    """How far the hidden states have moved after the last target from where pretraining left them."""
+    """Distance of the hidden states after the last target from where pretraining left them."""
     return _at_the_end(rates.activation_drift)
 
 

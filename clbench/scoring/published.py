@@ -1,10 +1,9 @@
-"""Definitions of other benchmarks, papers and libraries, as metrics beside ours.
+"""Metrics as other benchmarks, papers and libraries define them.
 
-One word has many meanings in this field; here each has the name of whose it is. As published they are over
-the sequence of learned tasks: the targets, without the retained skills and the held-out tasks. The letters
-are those of `clbench.scoring.metric`: R[l][k] is the success on target k at the end of stage l, K is the last stage.
-What lies between the ends of the stages is known of the current target alone, so that earlier and later
-targets count at the ends only.
+One word has many meanings in this field: here each definition carries the name of its source. As published, they
+cover the sequence of learned tasks: the targets, without the retained skills and the held-out tasks. R[l][k] is the
+success on target k at the end of stage l, and K is the last stage. Between the ends of the stages only the current
+target is known, so that earlier and later targets count at the ends only.
 """
 
 from __future__ import annotations
@@ -14,6 +13,7 @@ import numpy as np
 from clbench.scoring.layout import Array, average
 from clbench.scoring.metric import metric
 from clbench.scoring.rates import Rates
+from clbench.spec.references import JOINT
 
 ALL_TARGETS = "There are no targets, or a success on one at the end of a stage that it needs is missing."
 TWO_TARGETS = "There are fewer than two targets, or a success on one at the end of a stage is missing."
@@ -25,7 +25,7 @@ def _matrix(rates: Rates) -> Array:
 
 
 def _later(rates: Rates) -> Array:
-    """Return 1 where stage l comes after that of target k, else 0: (targets, targets)."""
+    """Return 1 where stage l comes after the stage of target k, else 0: (targets, targets)."""
     return np.tri(len(rates.layout.target), k=-1)
 
 
@@ -87,7 +87,7 @@ def average_incremental_accuracy(rates: Rates) -> Array:
     higher_is_better=False,
 )
 def forgetting_chaudhry(rates: Rates) -> Array:
-    """Drop from the best success on a target at any earlier stage, before it was learned too."""
+    """Drop from the best success on a target at any earlier stage, stages before it was learned included."""
     matrix = _matrix(rates)
     if matrix.shape[-1] < 2:
         return np.full(matrix.shape[:-2], np.nan)
@@ -139,14 +139,14 @@ def forgetting_continual_world(rates: Rates) -> Array:
 @metric(
     formula="mean over the targets k of J[k][k] - R[k][k]; J is R of joint",
     source="Chaudhry et al. 2018, arXiv 1801.10112 (I), the mean over the tasks",
-    missing="There is no joint of the same seeds, or the success on a target right after it is missing.",
+    missing=f"There is no {JOINT} of the same seeds, or the success on a target right after learning it is missing.",
     low=-1.0,
     higher_is_better=False,
-    references=("joint",),
+    references=(JOINT,),
 )
 def intransigence(rates: Rates) -> Array:
     """How much worse targets are learned than by training on everything met so far."""
-    return average(rates.references["joint"].learned - rates.learned)
+    return average(rates.references[JOINT].learned - rates.learned)
 
 
 @metric(
@@ -180,7 +180,7 @@ def backward_transfer_diaz_rodriguez(rates: Rates) -> Array:
     missing=TWO_TARGETS,
 )
 def remembering_diaz_rodriguez(rates: Rates) -> Array:
-    """What the negative part of backward transfer leaves of 1."""
+    """1 less the size of the negative part of backward transfer."""
     return 1 - np.abs(np.minimum(_backward_transfer(rates), 0))
 
 
@@ -246,8 +246,8 @@ def worst_case_accuracy(rates: Rates) -> Array:
 def isolated_forgetting_cora(rates: Rates) -> Array:
     """What each later target costs an earlier one, as a share of the highest success.
 
-    The highest is that of the one run at the ends of the stages; CORA's code takes it from every evaluation
-    of all runs together.
+    The highest success is taken at the ends of the stages of the one run; CORA's code takes it from every
+    evaluation of all runs together.
     """
     return _mean(-_isolated(rates), _later(rates))
 
@@ -263,8 +263,8 @@ def isolated_forgetting_cora(rates: Rates) -> Array:
 def isolated_zero_shot_transfer_cora(rates: Rates) -> Array:
     """What each target gives a later one, as a share of the highest success.
 
-    The highest is that of the one run at the ends of the stages, as in `isolated_forgetting_cora`. The policy
-    before the first target is the pretrained one, CORA's is untrained.
+    The highest success is taken as in `isolated_forgetting_cora`. The policy before the first target is
+    pretrained here, untrained in CORA.
     """
     return _mean(_isolated(rates), _later(rates).T)
 
@@ -276,7 +276,7 @@ def _isolated(rates: Rates) -> Array:
     return np.asarray(changes / np.where(highest > 0, highest, np.nan))
 
 
-# ---- LIBERO and what is called NBT -------------------------------------------------------------------------
+# ---- LIBERO, and metrics called NBT ------------------------------------------------------------------------
 
 
 @metric(
@@ -288,8 +288,8 @@ def _isolated(rates: Rates) -> Array:
 def forward_transfer_libero(rates: Rates) -> Array:
     """Success on the target while it is learned, compared with nothing.
 
-    LIBERO's points are equally spaced, ours those of the scenario. It goes on from the best checkpoint of a
-    stage, by the very episodes that it reports, and holds the curve there; here a stage ends with its
+    LIBERO's points are equally spaced, ours are the scenario's. LIBERO continues from the best checkpoint of a
+    stage, chosen on the same episodes that it reports, and holds the curve there; here a stage ends with its
     last step.
     """
     return average(_own_curves(rates))
@@ -334,7 +334,7 @@ def _over_later(rates: Rates) -> Array:
 
 @metric(
     formula="mean over all targets k but the last of max(0, R[k][k] - R[K][k])",
-    source="ARFM (NBT), as our survey of the peers has it",
+    source="ARFM (NBT), from our survey of related work",
     missing=TWO_TARGETS,
     higher_is_better=False,
 )
@@ -371,7 +371,7 @@ def area_under_curve_libero(rates: Rates) -> Array:
     low=-1.0,
 )
 def zero_shot_change(rates: Rates) -> Array:
-    """What learning the targets gave, or took, on tasks that were never trained."""
+    """Change of the success on tasks that were never trained, from before the first target to after the last."""
     change = rates.held_out[..., -1, :] - rates.held_out[..., 0, :]
     return average(change if rates.layout.target else change[..., :0])
 
@@ -383,10 +383,10 @@ def zero_shot_change(rates: Rates) -> Array:
     missing="There are no retained skills or no targets, or they were not evaluated at every point.",
 )
 def minimum_retention(rates: Rates) -> Array:
-    """The lowest success on a retained skill at any evaluation point, on the way included.
+    """The lowest success on a retained skill at any evaluation point, before the end of a stage too.
 
     The lowest of several noisy rates is too low by a part of their noise, all the more since fewer episodes
-    are run on the way.
+    are run before the end of a stage.
     """
     curves = rates.retained_curves
     if not len(rates.layout.target):

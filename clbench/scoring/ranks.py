@@ -1,10 +1,4 @@
-"""Comparison of methods over runs and tasks: interquartile mean, probability of improvement, tie groups.
-
-The first two are those of Agarwal et al. 2021, arXiv 2108.13264 (rliable). Their scores are the success after
-the last target on each retained skill and each target, one for every seed and task. They look at all scores
-at once, so that they are no metrics, which have a value for each run. Intervals are those of
-`clbench.scoring.intervals`.
-"""
+"""Ranks: rows of the leaderboard in order, those that cannot be told apart together."""
 
 from __future__ import annotations
 
@@ -17,94 +11,23 @@ from itertools import combinations
 import numpy as np
 
 from clbench.base.errors import InputError
-from clbench.scoring.intervals import (
-    MANY,
-    Estimate,
-    Runs,
-    bootstrap,
-    needed_references,
-    studentised_range_quantile,
-)
+from clbench.scoring.intervals import MANY, Runs, needed_references, studentised_range_quantile
 from clbench.scoring.layout import Array
 from clbench.scoring.metric import Metric
 from clbench.scoring.metrics import load_metric, measure
-from clbench.scoring.rates import Rates
 from clbench.scoring.scores import rates_of
 
 UNKNOWN_DEVIATION = 0.15
-"""Standard deviation between seeds that a board is on the safe side with where no row has a second seed:
-twice the greatest that the committed records show."""
-
-
-def interquartile_mean(runs: Runs, generator: np.random.Generator) -> Estimate:
-    """Return the mean of the middle half of the final success over seeds and trained tasks.
-
-    A quarter of the scores is cut off at each end, rounded down to a whole number of them.
-
-    Args:
-        runs: Runs of a method by seed.
-        generator: Source of the draws.
-    """
-    if not runs:
-        return Estimate(None, None, None)
-    return bootstrap(
-        lambda rates: trimmed_mean(_final(rates["method"])),
-        {"method": [runs[seed] for seed in sorted(runs)]},
-        generator,
-        span=(0, 1),
-    )
-
-
-def trimmed_mean(scores: Array) -> Array:
-    """Return the mean (...) of the middle half of scores (..., runs, tasks)."""
-    ordered = np.sort(scores.reshape(*scores.shape[:-2], -1), axis=-1)
-    cut = ordered.shape[-1] // 4
-    return np.asarray(ordered[..., cut : ordered.shape[-1] - cut].mean(axis=-1))
-
-
-def probability_of_improvement(runs: Runs, others: Runs, generator: np.random.Generator) -> Estimate:
-    """Return how probably a run of one method does better on a trained task than a run of another method.
-
-    It is the share of the pairs of runs in which the first has the greater final success, equal ones counted
-    half; mean over the tasks, of the seeds that both methods have.
-
-    Args:
-        runs: Runs of one method by seed.
-        others: Runs of the other method by seed.
-        generator: Source of the draws.
-
-    Raises:
-        ValueError: The runs are of different tasks, episodes, evaluation points or questions.
-    """
-    seeds = sorted(set(runs) & set(others))
-    if not seeds:
-        return Estimate(None, None, None)
-    methods = {"one": [runs[seed] for seed in seeds], "other": [others[seed] for seed in seeds]}
-    return bootstrap(
-        lambda rates: share_of_wins(_final(rates["one"]), _final(rates["other"])),
-        methods,
-        generator,
-        span=(0, 1),
-    )
-
-
-def share_of_wins(scores: Array, others: Array) -> Array:
-    """Return the share (...) of won pairs, half of the drawn ones included, of scores (..., runs, tasks)."""
-    differences = scores[..., :, None, :] - others[..., None, :, :]
-    return np.asarray(((np.sign(differences) + 1) / 2).mean(axis=(-3, -2, -1)))
-
-
-def _final(rates: Rates) -> Array:
-    """Return the success after the last target on everything that was ever trained, (..., tasks)."""
-    return np.concatenate([rates.retained[..., -1, :], rates.target[..., -1, :]], axis=-1)
+"""Standard deviation between seeds, assumed where no row has a second seed. It is twice the greatest in the
+committed records, to be on the safe side."""
 
 
 def deviation_of_differences(metric: str, rows: Iterable[Runs]) -> float | None:
     """Return the standard deviation of the difference of two rows from seed to seed.
 
     It is the root mean square over all pairs of rows, each over its common seeds. With it,
-    `student_quantile(n - 1) * deviation / sqrt(n)` is half of the width to expect of the interval of a
-    difference over n seeds: rows that are nearer are not told apart.
+    `student_quantile(n - 1) * deviation / sqrt(n)` is half of the expected width of the interval of a difference
+    over n seeds: rows that are nearer cannot be told apart.
 
     Args:
         metric: Name of a metric that needs no reference.
@@ -142,13 +65,13 @@ def tie_groups(
     tells them apart if it exceeds the largest of three standard errors, times Tukey's factor for so many
     rows:
 
-    1. that of all rows together: what the runs vary by, once each row and each seed has its mean;
-    2. that of the two rows' own differences between seeds, if there are several;
-    3. that which leaving out each episode shows, since seeds may agree by chance.
+    1. from all rows together: the variation of runs around the means of their row and seed;
+    2. from the two rows alone: the variation of their difference between seeds, if there are several;
+    3. from the episodes: the jackknife over them, since seeds may agree by chance.
 
     So at most 5 % of the boards of equal methods are split; `docs/guide/statistics.md` has the figures. Rows
-    without a common seed are compared by what the runs of a row vary by. Where no row has a second seed, runs
-    are assumed to vary by `UNKNOWN_DEVIATION`: only what is far apart is told apart.
+    without a common seed are compared by the variation of runs around the mean of their row. Where no row has a
+    second seed, a deviation of `UNKNOWN_DEVIATION` is assumed: only distant rows are told apart.
 
     Args:
         metric: Name of a metric.
@@ -159,8 +82,8 @@ def tie_groups(
         Ranks by row, the best row first. Rows without a value have none.
 
     Raises:
-        LookupError: The metric is unknown.
-        ValueError: It says nothing of better or worse, or the runs are of different tasks, episodes,
+        UnknownNameError: The metric is unknown.
+        InputError: It says nothing of better or worse, or the runs are of different tasks, episodes,
             evaluation points or questions.
     """
     wanted = load_metric(metric)
@@ -188,7 +111,7 @@ def tie_groups(
 
 
 def ranks(values: Array, without_episode: Array) -> list[int]:
-    """Return the rank of each of several rows, the best first, as `tie_groups` says.
+    """Return the ranks of several rows, the best first, by the rule of `tie_groups`.
 
     Args:
         values: Higher is better, NaN where a row lacks a seed, (rows, seeds).
@@ -205,7 +128,7 @@ def ranks(values: Array, without_episode: Array) -> list[int]:
 
 @dataclass(frozen=True, eq=False)
 class _Board:
-    """Rows to be told apart; arrays as those of `ranks`."""
+    """Rows to be told apart; the arrays are the arguments of `ranks`."""
 
     values: Array
     without_episode: Array
@@ -254,14 +177,14 @@ class _Board:
 
 
 def _jackknife(without_episode: Array) -> Array:
-    """Return the variances (...) that values (..., episodes) without each one of the episodes show."""
+    """Return the jackknife variances (...) of values (..., episodes), each without one of the episodes."""
     return np.asarray(np.nan_to_num((without_episode.shape[-1] - 1) * without_episode.var(axis=-1)))
 
 
 def _measured(
     metric: Metric, runs: Runs, seeds: Sequence[int], references: Mapping[str, Runs]
 ) -> tuple[float, Array, Array]:
-    """Return the value of a row, those of its runs (seeds,), and without each episode (seeds, episodes)."""
+    """Return the value of a row, its runs' values (seeds,), and these without each episode (seeds, episodes)."""
     own = [seed for seed in seeds if seed in runs]
     needed = needed_references([metric], own, references)
     ordered = [runs[seed] for seed in own]

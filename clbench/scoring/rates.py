@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 import numpy as np
@@ -11,35 +11,13 @@ import numpy as np
 from clbench.base.errors import InputError
 from clbench.scoring.layout import Array, Layout
 
-# ---- rates -------------------------------------------------------------------------------------------------
 
-
-_ARRAYS = (
-    "success",
-    "curves",
-    "perturbed",
-    "validation",
-    "asked",
-    "correct",
-    "answer_curves",
-    "update_sparsity",
-    "activation_drift",
-)
-"""Fields of `Rates` that are arrays."""
-
-
-@dataclass(frozen=True, eq=False)
-class Rates:
-    """Success rates, the input of every metric: arrays with any batch axes in front, NaN where missing."""
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Measured:
+    """Arrays that scores and rates have in common, with any batch axes in front, NaN where missing."""
 
     layout: Layout
-    """What the axes stand for."""
-    success: Array
-    """Success rate at the end of each stage, (..., stages + 1, tasks)."""
-    curves: Array
-    """Success rate at the points of each stage, (..., targets, points, tasks); the last one is its end."""
-    perturbed: Array
-    """Success rate on the retained skills in perturbed episodes, (..., stages + 1, retained)."""
+    """Meaning of the axes."""
     validation: Array
     """Success rate on target k over validation episodes at the points of stage k, (..., targets, points)."""
     asked: Array
@@ -52,6 +30,26 @@ class Rates:
     """Share of the parameters that have hardly changed since pretraining, (..., targets, points)."""
     activation_drift: Array
     """Distance of the hidden states from those of the pretrained policy, (..., targets, points)."""
+
+
+def _arrays(cls: type[Measured]) -> tuple[str, ...]:
+    return tuple(entry.name for entry in fields(cls) if entry.type == "Array")
+
+
+MEASURED = _arrays(Measured)
+"""Names of the arrays that scores and rates have in common."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Rates(Measured):
+    """Success rates, the input of every metric: arrays with any batch axes in front, NaN where missing."""
+
+    success: Array
+    """Success rate at the end of each stage, (..., stages + 1, tasks)."""
+    curves: Array
+    """Success rate at the points of each stage, (..., targets, points, tasks); the last one is its end."""
+    perturbed: Array
+    """Success rate on the retained skills in perturbed episodes, (..., stages + 1, retained)."""
     references: Mapping[str, Rates] = field(default_factory=dict)
     """Rates of reference methods with the same seeds, by the method's name."""
 
@@ -87,29 +85,30 @@ class Rates:
         return self.curves[..., self.layout.columns("retained")]
 
     def each(self, change: Callable[[Array], Array]) -> Rates:
-        """Return rates whose arrays, those of the references included, went through `change`."""
-        changed: dict[str, Any] = {name: change(getattr(self, name)) for name in _ARRAYS}
+        """Return rates with `change` applied to all arrays, the references' included."""
+        changed: dict[str, Any] = {name: change(getattr(self, name)) for name in _arrays(Rates)}
         references = {name: rates.each(change) for name, rates in self.references.items()}
         return replace(self, references=references, **changed)
 
     def mean_over_runs(self) -> Rates:
-        """Return rates averaged over the last batch axis, that of the runs: (..., runs) becomes (...)."""
+        """Return rates averaged over the last batch axis, the runs: (..., runs) becomes (...)."""
         # counted from the front: behind the batch axes some arrays have two axes and some have three
         axis = self.success.ndim - 3
         return self.each(lambda array: np.mean(array, axis=axis))
 
 
 def combine(rates: Sequence[Rates], join: Callable[[Sequence[Array]], Array]) -> Rates:
-    """Return rates whose arrays are those of `rates`, put together by `join`; references stay behind.
+    """Return the arrays of several rates, put together by `join`, as one; references stay behind.
 
     Raises:
-        ValueError: The layouts differ.
+        InputError: The layouts differ.
     """
-    _check_same(part.layout for part in rates)
-    joined: dict[str, Any] = {name: join([getattr(part, name) for part in rates]) for name in _ARRAYS}
-    return Rates(rates[0].layout, **joined)
+    check_same(part.layout for part in rates)
+    joined: dict[str, Any] = {name: join([getattr(part, name) for part in rates]) for name in _arrays(Rates)}
+    return Rates(layout=rates[0].layout, **joined)
 
 
-def _check_same(layouts: Iterable[Layout]) -> None:
+def check_same(layouts: Iterable[Layout]) -> None:
+    """Refuse runs whose layouts differ."""
     if len(set(layouts)) != 1:
         raise InputError("Runs with different tasks, episodes, evaluation points or questions do not mix.")

@@ -1,8 +1,8 @@
-"""Names that strangers choose: what they may look like, and that none is taken for one of ours.
+"""Names that strangers choose: their form, and a check that none can be mistaken for one of ours.
 
-A name becomes a folder and a cell of a table. It is made of ASCII letters, digits and underscores, with
-single dashes and dots between them where these are allowed: it cannot leave its folder, hide in a listing, or
-be written with the letters of another alphabet.
+A name becomes a folder and a cell of a table. It has ASCII letters, digits and underscores, and single dashes
+and dots between them where these are allowed. It therefore cannot leave its folder, hide in a listing, or use
+the letters of another alphabet.
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ from clbench.base.errors import InputError
 from clbench.base.strict_json import quoted
 
 LONGEST = 100
-"""Characters of a name."""
+"""Largest number of characters of a name."""
 
 LONGEST_LABEL = 200
-"""Characters of a method with its changed settings: file systems allow 255."""
+"""Largest number of characters of a method with its changed settings; file systems allow 255."""
 
 _IDENTIFIER = r"[A-Za-z_]\w*"
 _WORD = r"[A-Za-z0-9]\w*(?:[.-]\w+)*"
@@ -31,13 +31,13 @@ _CHANGES = re.compile(rf"(?:\+{_IDENTIFIER}=[\w .,()\[\]'+-]*[\w)\]'])*", re.ASC
 _PLAIN = re.compile(r"\w+(?:[.-]\w+)*", re.ASCII)
 
 _RESERVED = {"con", "prn", "aux", "nul", *(f"{port}{n}" for port in ("com", "lpt") for n in range(10))}
-"""Devices of Windows, whatever follows a dot."""
+"""Names of devices on Windows, whatever follows after a dot."""
 
 _ALIKE = str.maketrans("01i", "oll")
 
 
 def installed_methods() -> dict[str, EntryPoint]:
-    """Map names to entry points: ours as they are, those of other packages as "package/name"."""
+    """Map names to entry points: our own names as they are, names of other packages as "package/name"."""
     found = {}
     for entry in entry_points(group="clbench.methods"):
         package = entry.dist.name if entry.dist is not None else "unknown"
@@ -47,15 +47,15 @@ def installed_methods() -> dict[str, EntryPoint]:
 
 @cache
 def built_in_methods() -> dict[str, EntryPoint]:
-    """Return the methods that are part of clbench by name; nothing is imported."""
+    """Return the entry points of the methods that are part of clbench, by name; nothing is imported."""
     return {name: entry for name, entry in installed_methods().items() if "/" not in name}
 
 
 def check_scenario_id(scenario: str) -> None:
-    """Refuse what cannot be the id of a scenario.
+    """Refuse a text that cannot be the id of a scenario.
 
     Raises:
-        ValueError: It is not of the form "namespace/Name-v0", or looks like another that is registered.
+        ValueError: It does not have the form "namespace/Name-v0", or looks like another registered id.
     """
     if len(scenario) > LONGEST or not _SCENARIO.fullmatch(scenario):
         raise InputError(
@@ -67,7 +67,7 @@ def check_scenario_id(scenario: str) -> None:
 
 
 def check_method_name(method: str) -> None:
-    """Refuse what cannot be the name of a method.
+    """Refuse a text that cannot be the name of a method.
 
     Raises:
         ValueError: It is neither a name, "package/name" nor "module:Class", or looks like a built-in.
@@ -86,10 +86,10 @@ def check_method_name(method: str) -> None:
 
 
 def check_label(label: str) -> None:
-    """Refuse what cannot be a method with its changed settings, as "lora+rank=4".
+    """Refuse a text that cannot be a method with its changed settings, such as "lora+rank=4".
 
     Raises:
-        ValueError: It is not, it is too long for the name of a folder, or the method's name is refused.
+        ValueError: It has another form, is too long for the name of a folder, or its method is refused.
     """
     method, plus, changes = label.partition("+")
     check_method_name(method)
@@ -101,17 +101,21 @@ def check_label(label: str) -> None:
 
 
 def check_plain(kind: str, name: str) -> None:
-    """Refuse the name of a `kind` of thing, as of a task, that is more than letters, digits, _, - and dots.
+    """Refuse a name with other characters than letters, digits, _, - and dots.
+
+    Args:
+        kind: Kind of thing that it names, such as "task", for the message.
+        name: Name to check.
 
     Raises:
-        ValueError: It is.
+        ValueError: It has other characters, or too many.
     """
     if len(name) > LONGEST or not _PLAIN.fullmatch(name):
         raise InputError(f"{quoted(name)} cannot be the name of a {kind}: letters, digits, _, - and . only.")
 
 
 def folder_name(name: str) -> str:
-    """Return a checked scenario id or label as the name of a folder; no two have the same."""
+    """Return the name of a folder for a checked scenario id or label; no two share one."""
     return name.removeprefix("clbench/").replace("/", "--").replace(":", ".")
 
 
@@ -121,7 +125,7 @@ def _check_reserved(name: str) -> None:
 
 
 def _check_alike(kind: str, name: str, ours: Iterable[str]) -> None:
-    """Refuse a name that is read as one of `ours` and is another."""
+    """Refuse a name that is easily mistaken for one of `ours`."""
     for other in ours:
         if name != other and _folded(name) == _folded(other):
             raise InputError(f"{quoted(name)} can be taken for the {kind} {other!r}.")
@@ -133,7 +137,7 @@ def _check_not_ours(kind: str, name: str, package: str) -> None:
 
 
 def _folded(name: str) -> str:
-    """Return a name without what is easily overlooked: case, punctuation, 0 for o, 1 and i for l."""
+    """Return a name without easily overlooked differences: case, punctuation, 0 for o, 1 and i for l."""
     return "".join(filter(str.isalnum, name.casefold())).translate(_ALIKE)
 
 

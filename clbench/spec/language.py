@@ -12,15 +12,15 @@ from tokenizers import Tokenizer, models, normalizers, pre_tokenizers
 
 from clbench.base.errors import InputError
 
-if TYPE_CHECKING:  # it takes seconds to import, and environments do without it
+if TYPE_CHECKING:  # PyTorch takes seconds to import, and environments do not need it
     from torch import Tensor
 
 TEXT_LENGTH = 12
-"""Words that the policy reads at most; shorter texts are padded, so that every forward has one shape."""
+"""Largest number of words that the policy reads; shorter texts are padded, so that every forward has one shape."""
 
 VOCABULARY_SIZE = 1024
-"""Rows of the embedding and of the answers: more than there are words. A word that a new suite needs is
-appended to the vocabulary's end, and changes neither the shapes nor the initial weights of a policy."""
+"""Rows of the embedding and of the answers, more than there are words. A new suite appends its words to the
+vocabulary, which changes neither the shapes nor the initial weights of a policy."""
 
 PADDING = "[padding]"
 
@@ -60,7 +60,7 @@ def encode(texts: Sequence[str]) -> Tensor:
 
 
 def word_ids(texts: Sequence[str]) -> list[list[int]]:
-    """Return what `encode` does, as lists.
+    """Return the result of `encode` as lists.
 
     Raises:
         UnknownWordError: A word is not in the vocabulary, or there are more than `TEXT_LENGTH` words.

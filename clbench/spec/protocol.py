@@ -20,6 +20,10 @@ perturbed episode is the test episode of the same number in a perturbed world (`
 SPLITS: tuple[Split, ...] = ("validation", "test", "perturbed")
 
 
+EPISODE_WEIGHT = 0.3
+"""Duration of an evaluation episode in optimiser steps, for the time left that a progress bar shows."""
+
+
 class Point(NamedTuple):
     """A moment of a run: after some optimiser steps of a stage."""
 
@@ -118,15 +122,17 @@ class Protocol:
         """
         target = self.target[point.stage - 1 : point.stage] if point.stage else ()
         at_end = self.is_end(point)
-        keys = self._each(self.tasks if at_end else self.retained + target, self.split, self._scored(at_end))
+        keys = self._each(
+            self.tasks if at_end else self.retained + target, self.split, self.scored_episodes(at_end)
+        )
         if self.split == "test":
             keys += self._each(target, "validation", self.validation_episodes)
         if self.perturb and at_end:
             keys += self._each(self.retained, "perturbed", self.test_episodes)
         return keys
 
-    def _scored(self, at_end: bool) -> int:
-        """Return the number of scored episodes of a task."""
+    def scored_episodes(self, at_end: bool) -> int:
+        """Return the number of scored episodes of a task, at the end of a stage or before it."""
         if self.split == "validation":
             return self.validation_episodes
         return self.test_episodes if at_end else self.curve_episodes

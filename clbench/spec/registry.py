@@ -1,4 +1,4 @@
-"""Registration: a scenario gets its Gymnasium id, by name alone: nothing of it is imported."""
+"""Registration of scenarios with Gymnasium, by name alone: a scenario is imported when it is first used."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from clbench.spec.scenario import Scenario
 def register(scenario_id: str, entry_point: str) -> None:
     """Register a scenario with Gymnasium, as one environment and as many side by side.
 
-    It is imported, and its parts are checked, when it is first used.
+    The scenario is imported and checked when it is first used.
 
     Args:
-        scenario_id: Of the form "namespace/Name-v0": a changed scenario is a new version.
-        entry_point: Where the `Scenario` is, as "module:attribute".
+        scenario_id: Id of the form "namespace/Name-v0"; a changed scenario gets a new version.
+        entry_point: Entry point "module:attribute" of the `Scenario`.
 
     Raises:
-        ValueError: The id is of another form, can be taken for another scenario, is registered already for
-            another one, or is in our namespace; or the entry point is of another form.
+        ValueError: The id has another form, is easily mistaken for another scenario, is already registered for
+            another entry point, or uses our namespace; or the entry point has another form.
     """
     check_scenario_id(scenario_id)
     module, colon, attribute = entry_point.partition(":")
@@ -44,15 +44,13 @@ def register(scenario_id: str, entry_point: str) -> None:
 
 
 def load_scenario(scenario_id: str) -> Scenario:
-    """Return the scenario registered with Gymnasium under this id, ready to be used.
+    """Return the scenario registered with Gymnasium under this id, ready to use.
 
     Raises:
-        LookupError: Nothing is registered under this id, what is registered is no scenario, or a package that
-            its tasks need is not installed; the message says how to get it.
+        LookupError: No scenario is registered under this id, or a package that its tasks need is not installed;
+            the message says how to get it.
     """
-    scenario = registered_scenario(scenario_id)
-    scenario.require_packages()
-    return scenario
+    return opened_scenario(registered_scenario(scenario_id))
 
 
 def registered_scenario(scenario_id: str) -> Scenario:
@@ -62,42 +60,38 @@ def registered_scenario(scenario_id: str) -> Scenario:
         scenario_id: Gymnasium id; "module:id" imports `module` first.
 
     Raises:
-        LookupError: Nothing is registered under this id, or what is registered is no scenario.
+        LookupError: No scenario is registered under this id.
     """
-    import gymnasium
-
     module, _, name = scenario_id.rpartition(":")
     if module:
         import_module(module, scenario_id)
     if name not in gymnasium.registry or "scenario" not in (gymnasium.registry[name].kwargs or {}):
         raise unknown("scenario", name, scenario_ids())
     entry_point = gymnasium.registry[name].kwargs["scenario"]
-    scenario = scenario_at(entry_point)
+    scenario = _scenario_at(entry_point)
     if scenario.id != name:
         raise UnknownNameError(f"{entry_point!r} is registered as {name!r}, but its id is {scenario.id!r}.")
     return scenario
 
 
 def opened_scenario(scenario: Scenario | str, order: int = 0) -> Scenario:
-    """Return a scenario, or the one at an entry point, in an order of its targets and ready to be used.
+    """Return a scenario, ready to use, with its targets in an order.
+
+    Args:
+        scenario: Scenario, or its entry point "module:attribute".
+        order: Number of the order, see `Scenario.in_order`.
 
     Raises:
-        LookupError: There is none, or a package that its tasks need is not installed.
+        LookupError: The entry point leads to no scenario, or a package that the tasks need is not installed.
         ValueError: There is no such order, or a word of the instructions is not in the vocabulary.
     """
-    published = scenario_at(scenario) if isinstance(scenario, str) else scenario
+    published = _scenario_at(scenario) if isinstance(scenario, str) else scenario
     published.require_packages()
     return published.in_order(order)
 
 
-def scenario_at(entry_point: str) -> Scenario:
-    """Return the scenario at "module:attribute".
-
-    Raises:
-        LookupError: There is none.
-        ValueError: A word of its instructions is not in the vocabulary.
-    """
-    from clbench.spec.language import word_ids
+def _scenario_at(entry_point: str) -> Scenario:
+    from clbench.spec.language import word_ids  # imports the tokenizer, which registration does without
 
     scenario = resolve(entry_point)
     if not isinstance(scenario, Scenario):

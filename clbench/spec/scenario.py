@@ -18,8 +18,8 @@ from clbench.spec.task import Task
 Group = Literal["retained", "target", "held_out"]
 
 MOST_ORDERS = 99
-"""Orders of the targets besides the published one, where there are as many: a number in a stranger's record
-must not keep a reader busy."""
+"""Largest number of orders besides the published one: a number in a stranger's record must not keep a reader
+busy."""
 
 
 @dataclass(frozen=True)
@@ -27,23 +27,23 @@ class Scenario:
     """A named, versioned sequence of tasks with its budget: skills to keep, then tasks to learn in order."""
 
     id: str
-    """Gymnasium id, as "clbench/Fetch-v0"."""
+    """Gymnasium id, such as "clbench/Fetch-v0"."""
     description: str
-    """One sentence for lists."""
+    """Description for lists, in one sentence."""
     retained: tuple[Task, ...]
-    """Skills that the policy is pretrained on and that are never trained again; there may be none."""
+    """Skills that the policy is pretrained on and that no stage trains again; there may be none."""
     target: tuple[Task, ...]
-    """Tasks that are learned, in this order."""
+    """Tasks to learn, in this order."""
     held_out: tuple[Task, ...]
     """Tasks that are never trained."""
     questions: str
-    """Entry point of a tuple of `QuestionKind`: what can be asked about a state."""
+    """Entry point of a tuple of `QuestionKind`, the questions about a state."""
     scenes: tuple[Task, ...] = ()
-    """Tasks whose expert episodes' states the questions ask about, where these are not the retained ones."""
+    """Tasks whose expert episodes give the states for the questions; empty for the retained tasks."""
     budget: Budget = field(default_factory=Budget)
-    """What every method gets."""
+    """Data, steps and evaluation episodes that every method gets."""
     limits: Limits = field(default_factory=Limits)
-    """What the process of a submitted run may take."""
+    """Limits of the process of a submitted run."""
 
     def __post_init__(self) -> None:
         names = [task.name for task in self.tasks]
@@ -61,21 +61,21 @@ class Scenario:
 
     @property
     def scene_tasks(self) -> tuple[Task, ...]:
-        """The tasks whose expert episodes' states the questions ask about."""
+        """Tasks whose expert episodes give the states for the questions."""
         return self.scenes or self.retained
 
     def require_packages(self) -> None:
-        """Refuse to go on without the packages of its tasks.
+        """Check that the packages of its tasks are installed.
 
         Raises:
-            LookupError: One is not installed; the message says how to get it.
+            LookupError: A package is not installed; the message says how to get it.
         """
         require_packages({package for task in self.tasks for package in task.packages}, self.id)
 
     def in_order(self, order: int) -> Scenario:
-        """Return the scenario with its targets in another order, see `target_order`; 0 is the published one.
+        """Return the scenario with its targets in an order of `target_order`; 0 is the published order.
 
-        All else is the same: pretrained policy, demonstrations, questions and the episodes' initial states.
+        All else stays the same: pretrained policy, demonstrations, questions and initial states of episodes.
 
         Raises:
             ValueError: There is no such order.
@@ -87,7 +87,7 @@ class Scenario:
         return replace(self, target=tuple(self.target[place] for place in places)) if order else self
 
     def group(self, task: str) -> Group:
-        """Return which part of the scenario the task belongs to."""
+        """Return the part of the scenario that the task called `task` belongs to."""
         for group in ("retained", "target", "held_out"):
             if any(task == member.name for member in getattr(self, group)):
                 return group
@@ -109,19 +109,23 @@ class Scenario:
 
 
 def target_order(count: int, order: int) -> tuple[int, ...]:
-    """Return which of `count` targets, by their published places from 0, is learned in each stage.
+    """Return, for each stage, the published place, from 0, of the target that it learns.
 
-    Order 0 is the published one. The others are different permutations, drawn at random once and for all.
+    Order 0 is the published order. The others are distinct permutations, drawn at random once and for all.
+
+    Args:
+        count: Number of targets.
+        order: Number of the order.
 
     Raises:
         ValueError: There is no such order.
     """
-    # the factorial of a stranger's list of targets may have millions of digits; that of 5 exceeds the limit
+    # a stranger's long list of targets has a factorial of millions of digits; the factorial of 5 is enough
     last = min(math.factorial(min(count, 5)) - 1, MOST_ORDERS)
     if not 0 <= order <= last:
         orders = f"orders 0 to {last}" if last else "order 0 alone"
         raise InputError(f"{count} targets have {orders}, not {order}.")
-    generator = random.Random(0)  # of all generators, its random() is the one that may never change
+    generator = random.Random(0)  # the only generator whose random() Python promises never to change
     found = {tuple(range(count)): None}
     while len(found) <= order:
         draws = [generator.random() for _ in range(count)]

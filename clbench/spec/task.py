@@ -1,4 +1,4 @@
-"""Tasks, scenarios and budgets: what there is to learn, as data."""
+"""Tasks: one thing to do in one simulated world, as data."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 from clbench.base.errors import InputError, WrongTypeError
 from clbench.base.source import package_of
+from clbench.spec.identifiers import check_plain
 
 
 @dataclass(frozen=True)
@@ -14,34 +15,35 @@ class Task:
     """One thing to do in one simulated world."""
 
     name: str
-    """Name inside its suite, as "push"."""
+    """Name inside its suite, such as "push"."""
     suite: str
-    """Family of worlds that it belongs to, as "fetch"."""
+    """Family of worlds that it belongs to, such as "fetch"."""
     instructions: tuple[str, ...]
-    """The instruction in words; paraphrases follow the canonical one."""
+    """Instruction in words: the canonical wording, then its paraphrases."""
     horizon: int
-    """Steps after which an episode ends without success."""
+    """Length in steps after which an episode ends without success."""
     world: str
-    """Entry point "module:callable" that makes the Gymnasium environment. One environment serves every
-    task of its world: `reset(options={"task": name})` chooses. Its observation is the state, a float32
-    vector; `terminated` means success, and `info["success"]` says so."""
+    """Entry point "module:callable" that makes the Gymnasium environment. One environment serves every task of
+    its world: `reset(options={"task": name})` chooses the task. The observation is the state, a float32 vector;
+    `terminated` means success, and `info["success"]` repeats it."""
     expert: str
-    """Entry point of a callable that takes the task's name and returns a callable (S,) -> (A,): the
-    expert's action in a state. It must not remember earlier states: it also labels perturbed episodes."""
+    """Entry point of a callable that takes the task's name and returns a callable (S,) -> (A,): the expert's
+    action in a state. It must not remember earlier states: it also labels noisy demonstrations."""
     camera: str | None = None
-    """Entry point of the `clbench.worlds.camera.Camera` that a policy sees the world through, as the states hold
-    more than it may know; if None, it is shown the states."""
+    """Entry point of the `clbench.worlds.camera.Camera` through which a policy sees the world, for states that
+    hold more than a policy may know. None shows it the states."""
     version: int = 0
-    """Raised whenever the task, its expert or its demonstrations change."""
+    """Version, raised whenever the task, its expert or its demonstrations change."""
     action_noise: float = 0.1
-    """Chance, at each step of a noisy demonstration, that 3 to 6 random actions begin."""
+    """Probability, at each step of a noisy demonstration, that 3 to 6 random actions begin."""
     packages: tuple[str, ...] = ()
-    """Distributions whose version can change a trajectory, beside those that all worlds have in common: the
-    simulator of its suite, as ("gymnasium-robotics",)."""
+    """Distributions whose version can change a trajectory, besides those common to all worlds: the simulator of
+    the suite, such as ("gymnasium-robotics",)."""
+    seed_name: str | None = None
+    """Spelling of the suite in seeds and data set ids, where it differs from `suite`: it may never change, or
+    demonstrations and measurements would change with it."""
 
     def __post_init__(self) -> None:
-        from clbench.spec.identifiers import check_plain  # it knows the scenarios
-
         check_plain("task", self.name)
         if isinstance(self.instructions, str):
             raise WrongTypeError(
@@ -53,12 +55,17 @@ class Task:
             raise InputError(f"horizon of the task {self.name} must be at least 1 step, not {self.horizon}.")
 
     @property
+    def seed_suite(self) -> str:
+        """Spelling of the suite in seeds and data set ids."""
+        return self.seed_name or self.suite
+
+    @property
     def dataset_id(self) -> str:
         """Id of the Minari dataset that holds the demonstrations."""
-        return f"clbench/{self.suite}/{self.name.replace('_', '-')}-v{self.version}"
+        return f"clbench/{self.seed_suite}/{self.name.replace('_', '-')}-v{self.version}"
 
 
 def packages_of(tasks: Iterable[Task], *parts: str) -> list[str]:
-    """Return the packages that parts of the tasks lie in, as "world", "expert" and "camera", in order."""
+    """Return the packages of some parts of the tasks, such as "world", "expert" and "camera", sorted."""
     entry_points = (getattr(task, part) for task in tasks for part in parts)
     return sorted({package_of(entry_point) for entry_point in entry_points if entry_point is not None})

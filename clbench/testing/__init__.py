@@ -1,6 +1,7 @@
 """For tests, ours and yours: a toy scenario on which a run takes seconds, and contract checks.
 
-Importing this package registers the toy as `clbench/Toy-v0`; "clbench.testing:clbench/Toy-v0" names it in a command.
+Importing this package registers the toy as `clbench/Toy-v0`; "clbench.testing:clbench/Toy-v0" names it in a
+command.
 """
 
 import lazy_loader

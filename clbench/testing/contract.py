@@ -33,7 +33,7 @@ from clbench.policy.policy import Policy
 from clbench.testing.error import ContractError
 from clbench.testing.global_state import GENERATORS, same, watched
 from clbench.testing.toy import TOY
-from clbench.testing.toy_run import HOOKS, ToyRun, toy_trainer
+from clbench.testing.toy_run import HOOKS, ToyRun, toy_data
 
 TARGETS, STEPS = 2, 2
 """Length of the runs in which only what happens matters, and not what is learned."""
@@ -295,7 +295,7 @@ def same_numbers(subject: Subject) -> None:
 
 
 def state(subject: Subject) -> None:
-    """State that survives: an object that is given it goes on as the one that returned it."""
+    """MethodState that survives: an object that is given it goes on as the one that returned it."""
     difference = _difference(subject.second, subject.kept)
     if difference:
         raise _breach(
@@ -382,7 +382,8 @@ def _difference(one: ToyRun, other: ToyRun) -> str | None:
 
 @functools.cache
 def _frozen_return() -> float:
-    return _mean_return(toy_trainer().policy)
+    _, pretrained = toy_data()
+    return _mean_return(pretrained)
 
 
 def _mean_return(policy: Policy) -> float:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, ClassVar
 
 import gymnasium
 import numpy as np
@@ -42,6 +42,7 @@ class ToyWorld(gymnasium.Env[State, Action]):
     metadata = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012
     observation_space = spaces.Box(-np.inf, np.inf, (4,), np.float32)
     action_space = spaces.Box(-1.0, 1.0, (2,), np.float32)
+    perturbable: ClassVar[bool] = True
 
     def __init__(self, render_mode: str | None = None, perturbed: bool = False) -> None:
         self.render_mode, self.perturbed = render_mode, perturbed

@@ -16,11 +16,14 @@ from typing import Any
 from torch import Tensor, nn
 
 from clbench.base.seeding import seeded
+from clbench.data.training_data import TrainingData
 from clbench.learning.method import Method, Stage
 from clbench.learning.optimise import MethodError
+from clbench.learning.pretraining import pretrained_policy
 from clbench.learning.prior import Prior, Source, UndeclaredAccessError
 from clbench.learning.trainer import Trainer, repeatable
 from clbench.policy.checkpoint import CheckpointError
+from clbench.policy.policy import Policy
 from clbench.testing.error import ContractError
 from clbench.testing.global_state import GENERATORS, read, watched
 from clbench.testing.toy import TOY
@@ -58,9 +61,10 @@ _numbers = itertools.count()
 
 
 @functools.cache
-def toy_trainer() -> Trainer:
-    """Return a trainer of the toy that is not to be used itself: to read its data takes a second."""
-    return Trainer(TOY, Method, 0, "cpu")
+def toy_data() -> tuple[TrainingData, Policy]:
+    """Return the data and the pretrained policy of the toy; to read them takes a second."""
+    pretrained, _ = pretrained_policy(TOY, 0)
+    return TrainingData.open(TOY, pretrained.config), pretrained
 
 
 class ToyRun:
@@ -92,15 +96,12 @@ class ToyRun:
         self.generators: dict[str, dict[str, Any]] = {}
         """The global random generators after the first call of each hook for which a run seeds them."""
         self._build, self._hook, self._running, self._step_rows = build, "prepare", False, 0
-        trainer = copy.copy(toy_trainer())
         budget = dataclasses.replace(TOY.budget, adaptation_steps=steps)
-        trainer.scenario = dataclasses.replace(TOY, target=TOY.target[:targets], budget=budget)
-        trainer.policy, trainer.seed = copy.deepcopy(trainer.policy), seed
-        trainer.new_method = self._watched_method
-        self.trainer = trainer
+        scenario = dataclasses.replace(TOY, target=TOY.target[:targets], budget=budget)
+        data, pretrained = toy_data()
         # no two begin with the same global generators: what depends on them differs
         with repeatable("cpu"), seeded("toy run", next(_numbers)), tempfile.TemporaryDirectory() as folder:
-            trainer.method = self._watched_method()
+            self.trainer = Trainer(scenario, data, pretrained, self._watched_method, seed)
             self._go(Path(folder), resumed)
 
     def _go(self, folder: Path, resumed: bool) -> None:

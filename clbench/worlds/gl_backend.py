@@ -17,7 +17,7 @@ _BACK_ENDS = tuple(DEBIAN_PACKAGES) if sys.platform == "linux" else ("glfw",)
 
 _DRAW = """
 import sys
-from clbench.spec.task import resolve
+from clbench.base.entry_points import resolve
 world = resolve(sys.argv[1])(render_mode="rgb_array")
 world.reset(seed=0)
 world.render().shape

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import inspect
 from collections.abc import Callable, Iterable, Iterator, Sequence
 
 import gymnasium
@@ -21,11 +20,11 @@ from clbench.worlds.world import Outcomes, States, VectorWorld, World
 
 
 class PlainVectorWorld:
-    """The vector world of a suite that has no own: a plain world in each lane, one stepped after the other.
+    """The vector world of a suite without its own: a plain world in each lane, stepped one after the other.
 
     Args:
-        make: Makes a world.
-        lanes: Places for episodes; a world is made when its lane is first reset.
+        make: Function that makes a world.
+        lanes: Number of lanes; a world is made when its lane is first reset.
     """
 
     def __init__(self, make: Callable[[], World], lanes: int) -> None:
@@ -67,36 +66,36 @@ class PlainVectorWorld:
 
 
 def vector_world(entry_point: str, lanes: int, threads: int = 1, perturbed: bool = False) -> VectorWorld:
-    """Return a vector world of the world that `entry_point` names: the suite's own if it has one.
+    """Return a vector world of the world at `entry_point`: the suite's own if it has one.
 
     Args:
-        entry_point: Of the world.
+        entry_point: Entry point of the world.
         lanes: Places for episodes.
         threads: Threads that a suite's own vector world may use.
-        perturbed: Whether its episodes are perturbed, which not every world's can be: `check_perturbable`.
+        perturbed: Whether its episodes are perturbed; `check_perturbable` refuses worlds that cannot be.
     """
     world = resolve(entry_point)
-    disturbed = {"perturbed": True} if perturbed else {}
+    options = {"perturbed": True} if perturbed else {}
     own: Callable[..., VectorWorld] | None = getattr(world, "vector_world", None)
     if own is None:
-        return PlainVectorWorld(functools.partial(world, **disturbed), lanes)
-    return own(lanes, threads, **disturbed)
+        return PlainVectorWorld(functools.partial(world, **options), lanes)
+    return own(lanes, threads, **options)
 
 
 def check_perturbable(tasks: Iterable[Task]) -> None:
     """Refuse tasks whose worlds cannot be perturbed.
 
     Raises:
-        ValueError: The world of a task takes no `perturbed`; the message says what to do.
+        InputError: The world of a task does not declare itself perturbable; the message says what to do.
     """
     for task in tasks:
         world = resolve(task.world)
         own = getattr(world, "vector_world", None)
-        if "perturbed" not in inspect.signature(own or world).parameters:
+        if not getattr(own or world, "perturbable", False):
             what = f"the vector world of {task.world}" if own else task.world
             raise InputError(
-                f"The task {task.name!r} cannot be perturbed: {what} takes no argument `perturbed`. Run "
-                "without --perturb, or give it one, as docs/guide/your_scenario.md shows."
+                f"The task {task.name!r} cannot be perturbed: {what} does not declare `perturbable = True`. Run "
+                "without --perturb, or perturb its episodes as docs/guide/your_scenario.md shows."
             )
 
 
@@ -104,7 +103,7 @@ class Lanes:
     """Places for episodes of any tasks: each runs in the vector world of its task.
 
     Args:
-        count: How many; they are numbered from 0.
+        count: Number of lanes; they are numbered from 0.
         threads: Threads that a suite's own vector world may use.
     """
 
@@ -116,29 +115,29 @@ class Lanes:
         self._views = np.zeros((count, VIEW_SIZE), np.float32)
 
     def world(self, task: Task, perturbed: bool = False) -> VectorWorld:
-        """Return the vector world of a task, or its perturbed twin; it is made when first needed."""
+        """Return the vector world of a task, or its perturbed twin, which is made on first use."""
         key = task.world, perturbed
         if key not in self._worlds:
             self._worlds[key] = vector_world(task.world, self._count, self._threads, perturbed)
         return self._worlds[key]
 
     def observer(self, task: Task) -> Observer:
-        """Return what shows the states of a task to a policy; it is made when first needed."""
+        """Return the observer that shows the states of a task to a policy, which is made on first use."""
         key = None if task.camera is None else (task.world, task.camera)
         if key not in self._observers:
             self._observers[key] = Observer(task.world, task.camera)
         return self._observers[key]
 
     def observe(self, lanes: Sequence[int], tasks: Sequence[Task], states: States) -> tuple[States, Images]:
-        """Return what a policy is shown of the states (N, S) of `lanes`: numbers (N, P) and pictures.
+        """Return the observations of the states (N, S) of `lanes`: numbers (N, P) and pictures.
 
         Args:
-            lanes: Whose states they are; in a perturbed episode camera and light are disturbed.
-            tasks: What each of them does.
-            states: What is shown.
+            lanes: Lanes of the states; in a perturbed episode camera and light are perturbed too.
+            tasks: Task of each lane.
+            states: States (N, S) to show.
 
         Raises:
-            RenderingError: Nothing here can draw a world.
+            RenderingError: No back end of this machine can draw a world.
         """
         views = self._views[list(lanes)]
         if len({(task.world, task.camera) if task.camera else None for task in tasks}) == 1:
@@ -160,15 +159,15 @@ class Lanes:
         """Start an episode of a task in each of `lanes`, and return the states (N, S).
 
         Args:
-            lanes: Where to.
-            seeds: Of the initial states.
-            tasks: What to do.
-            perturbed: Which of the episodes are perturbed; none is if None.
+            lanes: Lanes of the episodes.
+            seeds: Seeds of the initial states.
+            tasks: Tasks of the episodes.
+            perturbed: Whether each episode is perturbed; None perturbs none.
         """
-        disturbed = perturbed or [False] * len(tasks)
-        for lane, seed, task, is_disturbed in zip(lanes, seeds, tasks, disturbed, strict=True):
-            self._home[lane] = self.world(task, is_disturbed)
-            self._views[lane] = draw_perturbation(seed).view if is_disturbed else 0.0
+        flags = perturbed or [False] * len(tasks)
+        for lane, seed, task, is_perturbed in zip(lanes, seeds, tasks, flags, strict=True):
+            self._home[lane] = self.world(task, is_perturbed)
+            self._views[lane] = draw_perturbation(seed).view if is_perturbed else 0.0
         states = self._empty(lanes)
         for world, rows in self._by_world(lanes):
             names = [tasks[row].name for row in rows]
@@ -202,7 +201,7 @@ class Lanes:
         self._home = [None] * self._count
 
     def _empty(self, lanes: Sequence[int]) -> States:
-        """Return memory for the states of `lanes`, all of which have an episode."""
+        """Return uninitialised memory for the states of `lanes`, each of which must have an episode."""
         homes = [self._home[lane] for lane in lanes]
         if None in homes:
             raise gymnasium.error.ResetNeeded(f"Lane {lanes[homes.index(None)]} has no episode: reset it.")
@@ -210,7 +209,7 @@ class Lanes:
         return np.empty((len(lanes), *homes[0].single_observation_space.shape), np.float32)
 
     def _by_world(self, lanes: Sequence[int]) -> Iterator[tuple[VectorWorld, list[int]]]:
-        """Return each world with the rows of `lanes` that are in it."""
+        """Return each world with the rows of `lanes` that it runs."""
         for world in self._worlds.values():
             rows = [row for row, lane in enumerate(lanes) if self._home[lane] is world]
             if rows:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
-from typing import Any, ClassVar, Protocol, TypeAlias
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Sequence
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Protocol, TypeAlias, TypeVar
 
 import gymnasium
 import numpy as np
@@ -13,29 +14,36 @@ from numpy.typing import NDArray
 
 from clbench.base.errors import InputError
 
+if TYPE_CHECKING:
+    import mujoco
+    from gymnasium.envs.mujoco.mujoco_rendering import MujocoRenderer
+
+Lane = TypeVar("Lane")
 World = gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]
 
 States: TypeAlias = NDArray[np.float32]
 """States of N lanes, (N, S)."""
 Outcomes: TypeAlias = tuple[States, NDArray[np.float64], NDArray[np.bool_]]
-"""What a step led to in N lanes: states (N, S), rewards (N,), and which episodes succeeded (N,)."""
+"""Result of a step in N lanes: states (N, S), rewards (N,), and whether each episode succeeded (N,)."""
 
 
 class VectorWorld(Protocol):
     """Many episodes of one world side by side, each in a lane.
 
-    A suite has its own where stepping many episodes together is faster than one after the other: the
-    attribute `vector_world` of its world makes it, from the number of lanes and of threads. Each episode is
-    bit for bit that of the plain world, whatever the other lanes do. Who uses it resets a lane before
-    stepping it, counts the steps, and lets a lane rest once its episode has succeeded.
+    A suite has its own where many episodes step faster together than one after the other: the attribute
+    `vector_world` of its world makes it from the number of lanes and the number of threads. Each episode equals
+    the plain world's bit for bit, whatever the other lanes do. The caller resets a lane before stepping it,
+    counts the steps, and stops stepping a lane once its episode has succeeded.
 
-    A world can be perturbed if what makes it takes `perturbed` besides, the vector world or, where there is
-    none, the plain world. Its episodes are then disturbed as `clbench.worlds.perturbation.draw_perturbation` says.
+    The class that makes the episodes, this one or a plain world without vector world, declares
+    `perturbable: ClassVar[bool] = True` if it also takes the keyword argument `perturbed`. Its episodes are
+    then perturbed by `clbench.worlds.perturbation.draw_perturbation`. Without the declaration it cannot be.
     """
 
     single_observation_space: spaces.Box
-    """Of the state in one lane."""
+    """Space of the state in one lane, (S,)."""
     single_action_space: spaces.Box
+    """Space of the action in one lane, (A,)."""
 
     def reset(self, lanes: Sequence[int], seeds: Sequence[int], tasks: Sequence[str]) -> States:
         """Start an episode of a task in each of `lanes`, and return the states."""
@@ -46,24 +54,24 @@ class VectorWorld(Protocol):
         ...
 
     def close(self) -> None:
-        """Free what it holds."""
+        """Free the worlds and threads that it holds."""
         ...
 
 
 class OneLaneWorld(World, ABC):
-    """A suite's own vector world with one lane, as the plain world: one physics serves both.
+    """A plain world that is the suite's own vector world with one lane: one physics serves both.
 
-    A suite names its vector world and its first task, and draws the picture in `picture`; its metadata say
-    how many steps a second has.
+    A suite names its vector world and its first task, draws the picture in `picture`, and gives the number of
+    steps per second in its metadata. The vector world declares whether it is `perturbable`.
 
     Args:
         render_mode: "rgb_array", or None to draw nothing.
     """
 
     vector_world: ClassVar[Callable[[int, int], Any]]
-    """Makes the vector world, from the number of lanes and of threads."""
+    """Function that makes the vector world from the number of lanes and the number of threads."""
     first_task: ClassVar[str]
-    """What `reset` starts if no task is asked for."""
+    """Name of the task that `reset` starts if its options name none."""
 
     def __init__(self, render_mode: str | None = None) -> None:
         self.render_mode = render_mode
@@ -75,7 +83,7 @@ class OneLaneWorld(World, ABC):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[States, dict[str, Any]]:
-        """Start an episode of the task `options["task"]`, by default of the first, and return the state (S,).
+        """Start an episode of the task `options["task"]`, by default the first, and return the state (S,).
 
         Raises:
             LookupError: No task has this name; the nearest one is named.
@@ -106,6 +114,44 @@ class OneLaneWorld(World, ABC):
         """Draw the scene, (480, 480, 3)."""
 
 
+class Drawable(NamedTuple):
+    """Everything that a picture of one lane is drawn from."""
+
+    model: mujoco.MjModel
+    """The compiled scene."""
+    data: mujoco.MjData
+    """The physics of the lane's episode, with the mark of its goal in place."""
+    camera: dict[str, Any]
+    """Settings of a free camera: distance in metres, azimuth and elevation in degrees, and `lookat` (3,)."""
+
+
+class MujocoWorld(OneLaneWorld):
+    """A world whose vector world has `drawable(lane) -> Drawable`; Gymnasium's renderer draws it.
+
+    Args:
+        render_mode: "rgb_array", or None to draw nothing.
+    """
+
+    _renderer: MujocoRenderer | None = None
+
+    def picture(self) -> NDArray[np.uint8]:
+        """Draw the scene, (480, 480, 3)."""
+        from gymnasium.envs.mujoco.mujoco_rendering import MujocoRenderer  # only drawing needs MuJoCo here
+
+        model, data, camera = self._world.drawable(0)
+        if self._renderer is None or self._renderer.data is not data:
+            self.close()
+            self._renderer = MujocoRenderer(model, data, camera, 480, 480)
+        picture: NDArray[np.uint8] = self._renderer.render("rgb_array")
+        return picture
+
+    def close(self) -> None:
+        """Free the renderer, if there is one."""
+        if self._renderer is not None:
+            self._renderer.close()  # type: ignore[no-untyped-call]
+            self._renderer = None
+
+
 def checked_actions(actions: NDArray[np.float32], space: spaces.Box, world: str) -> NDArray[np.float32]:
     """Return actions (N, A) within the bounds of the action space of a world.
 
@@ -122,6 +168,21 @@ def checked_actions(actions: NDArray[np.float32], space: spaces.Box, world: str)
     return np.minimum(np.maximum(actions, space.low), space.high)
 
 
-def no_episode(lane: int, world: str) -> gymnasium.error.ResetNeeded:
-    """Return the error for a lane that is used before its first episode."""
-    return gymnasium.error.ResetNeeded(f"Lane {lane} of the {world} world has no episode: reset it.")
+def lane_at(lanes: Sequence[Lane | None], number: int, world: str) -> Lane:
+    """Return lane `number` of a vector world.
+
+    Raises:
+        ResetNeeded: The lane has had no episode yet.
+    """
+    lane = lanes[number]
+    if lane is None:
+        raise gymnasium.error.ResetNeeded(f"Lane {number} of the {world} world has no episode: reset it.")
+    return lane
+
+
+def rows_by_task(tasks: Iterable[str]) -> dict[str, list[int]]:
+    """Return the rows in which each task occurs, in the order of first occurrence."""
+    rows: defaultdict[str, list[int]] = defaultdict(list)
+    for row, task in enumerate(tasks):
+        rows[task].append(row)
+    return rows

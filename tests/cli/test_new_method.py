@@ -59,7 +59,7 @@ def test_the_command_says_what_to_do_next(tmp_path: Path) -> None:
 def test_a_fresh_template_runs(fresh: str, tmp_path: Path) -> None:
     spec = RunSpec("clbench.testing:clbench/Toy-v0", f"{fresh}:FreshlyWritten", 0)
     record = execute(spec, tmp_path / "records")
-    assert (record.status, record.run["settings"]) == ("success", {"share": 0.9})
+    assert (record.status, record.run.settings) == ("success", {"share": 0.9})
 
 
 def test_another_folder_is_named_in_what_to_do_next(tmp_path: Path) -> None:

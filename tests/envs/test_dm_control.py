@@ -1,4 +1,4 @@
-"""The dm_control world: bit for bit dm_control's own physics, padded, with returns to reach."""
+"""The dm_control world: bit for bit dm_control's own physics, with padded states and returns to reach."""
 
 import importlib
 import json
@@ -20,14 +20,14 @@ from clbench.worlds.perturbation import draw_perturbation
 from clbench.worlds.world import World
 
 SCENARIO = load_scenario("clbench:clbench/DMControl-v0")
-bodies, experts, questions, rules, state, symmetry = (
+experts, questions, rules, scene, state, symmetry = (
     importlib.import_module(f"clbench.envs.dm_control.{name}")
-    for name in ("bodies", "expert", "questions", "rules", "state", "symmetry")
+    for name in ("experts", "questions", "rules", "scene", "state", "expert_training.symmetry")
 )
 RULES, HORIZON = rules.RULES, rules.HORIZON
 NAMES = [task.name for task in SCENARIO.tasks]
 OURS = [name for name in NAMES if name.removeprefix(f"{RULES[name].body}_") == RULES[name].start]
-"""Tasks that are dm_control's own."""
+"""dm_control's own tasks."""
 
 
 def world() -> World:
@@ -36,12 +36,12 @@ def world() -> World:
 
 
 def dm_control_environment(task: str, seed: int) -> Any:
-    """Return dm_control's own environment of a task, whose steps are as long as ours."""
+    """Return dm_control's own environment of a task, with steps as long as ours."""
     from dm_control.rl import control
 
     rule = RULES[task]
     made = importlib.import_module(f"dm_control.suite.{rule.body}").SUITE[rule.start](random=seed)
-    substeps = bodies.BODY_OF[rule.body].substeps
+    substeps = scene.BODY_OF[rule.body].substeps
     return control.Environment(made.physics, made.task, n_sub_steps=substeps)
 
 
@@ -92,7 +92,7 @@ def test_lanes_of_any_bodies_in_any_company_give_the_plain_worlds_bits() -> None
     for threads in (1, 3):
         together = vector_world(SCENARIO.tasks[0].world, len(NAMES), threads)
         lanes = list(range(len(NAMES)))
-        together.reset(lanes, [0] * len(NAMES), NAMES[::-1])  # other bodies had the lanes before
+        together.reset(lanes, [0] * len(NAMES), NAMES[::-1])  # other bodies used the lanes before
         together.step(lanes, actions[:, 0])
         states = [together.reset(lanes, [5] * len(NAMES), NAMES)]
         rewards, successes = [], np.zeros(len(NAMES), np.bool_)
@@ -109,7 +109,7 @@ def test_lanes_of_any_bodies_in_any_company_give_the_plain_worlds_bits() -> None
 
 def test_a_body_that_does_not_fit_is_refused_and_never_cut() -> None:
     with pytest.raises(ValueError, match=r"walker is observed in 24 numbers; a state has places for 8\."):
-        bodies.start("walker", "stand")
+        scene.start("walker", "stand")
     with pytest.raises(ValueError, match=r"point_mass is observed in 9 numbers; a state has places for 8\."):
         state.padded("point_mass", np.zeros(9))
 
@@ -150,7 +150,7 @@ def test_success_is_the_return_of_the_whole_episode_and_comes_at_its_last_step()
 
 @pytest.mark.parametrize("task", SCENARIO.tasks, ids=NAMES)
 def test_every_expert_does_its_task(task: Task) -> None:
-    """What 100 episodes say stands in its JSON; a few are played again."""
+    """Its JSON has the results of 100 episodes; a few are repeated here."""
     card = json.loads((experts.FOLDER / f"{task.name}.json").read_text(encoding="utf-8"))
     assert card["success"] >= 0.9
     assert card["episodes"] == 100
@@ -160,7 +160,7 @@ def test_every_expert_does_its_task(task: Task) -> None:
 
 
 def test_experts_of_retained_tasks_do_no_target_task_by_chance() -> None:
-    """Where the body is shared, the words alone say what to do: another task's expert fails."""
+    """Only the instruction tells tasks of one body apart: the expert of another task fails."""
     plain = world()
     for target in SCENARIO.target:
         for task in SCENARIO.retained:
@@ -172,7 +172,7 @@ def test_experts_of_retained_tasks_do_no_target_task_by_chance() -> None:
                 assert not success, f"the expert of {task.name} does {target.name}"
 
 
-def test_the_weights_are_small_and_come_with_what_made_them() -> None:
+def test_the_weights_are_small_and_come_with_the_command_and_versions_that_made_them() -> None:
     files = sorted(experts.FOLDER.iterdir())
     assert {path.suffix for path in files} == {".json", ".safetensors"}
     assert sum(path.stat().st_size for path in files) < 10e6
@@ -202,12 +202,12 @@ def test_wrong_files_of_an_expert_are_refused_by_name_with_the_way_out(tmp_path:
         assert "clbench experts train cartpole_left" in str(caught.value)
 
     weights.write_bytes(whole[:-8])
-    refused("another hash than its JSON says")
+    refused("another hash than its JSON states")
     weights.write_bytes(whole)
     card.write_text(json.dumps(said | {"sizes": [5, 32, 64, 1]}), encoding="utf-8")
     refused("float32 of .* are expected")
     card.write_text(json.dumps(said | {"task": "cartpole_right"}), encoding="utf-8")
-    refused("is that of the task 'cartpole_right'")
+    refused("belongs to the task 'cartpole_right'")
     card.write_text("{", encoding="utf-8")
     refused("cannot be read as JSON")
     card.unlink()
@@ -228,7 +228,7 @@ def test_questions_are_answered_in_known_words_and_only_where_they_apply() -> No
         assert len(bodies) == (len(state.BODIES) if kind.name == "body" else 1), kind.name
 
 
-def test_questions_say_what_a_scene_shows() -> None:
+def test_questions_describe_a_scene_correctly() -> None:
     cartpole = state.padded("cartpole", np.array([-0.5, 0.9, 0.3, 0.0, 0.0]))[None]
     said = {
         kind.name: kind.answers[answer]
@@ -250,7 +250,7 @@ def test_the_world_is_drawn_with_the_target_of_its_task() -> None:
         assert picture.shape == (480, 480, 3)
         pictures.append(picture)
     drawn.close()
-    # the same state, but for the mark
+    # the same state, except the mark
     differing = (pictures[0] != pictures[1]).any(axis=2)
     assert 0 < differing.mean() < 0.02
 
@@ -276,12 +276,12 @@ THINGS = {"point_mass": "pointmass", "cartpole": "pole_1", "ball_in_cup": "ball"
 @pytest.mark.parametrize("name", ["point_mass_easy", "cartpole_swingup", "ball_in_cup_catch"])
 def test_in_a_perturbed_episode_a_thing_is_heavier_and_the_body_in_motion(name: str) -> None:
     worlds = [vector_world(SCENARIO.tasks[0].world, 1, 1, perturbed) for perturbed in (False, True)]
-    body = bodies.BODY_OF[RULES[name].body]
+    body = scene.BODY_OF[RULES[name].body]
     for seed in range(4):
         for made in worlds:
             made.reset([0], [seed], [name])
-        pictures = [made.picture(0) for made in worlds]  # type: ignore[attr-defined]
-        (plain, before, _), (perturbed, after, _) = pictures
+        drawables = [made.drawable(0) for made in worlds]  # type: ignore[attr-defined]
+        (plain, before, _), (perturbed, after, _) = drawables
         drawn = draw_perturbation(seed)
         thing = THINGS[body.name]
         assert perturbed.body(thing).mass == drawn.mass * plain.body(thing).mass

@@ -1,6 +1,6 @@
-"""What every built-in scenario keeps, whatever its suite: a new one is tested by being registered.
+"""Tests of every built-in scenario: registering a new one is enough to test it.
 
-A scenario that cannot be made here, for want of an extra or of a renderer, is skipped with the reason.
+A scenario that lacks an extra or a renderer here is skipped with the reason.
 """
 
 import itertools
@@ -60,7 +60,7 @@ def make_environment(scenario: Scenario, **options: Any) -> ScenarioEnv:
 
 def check(environment: gymnasium.Env[Any, Any]) -> None:
     with warnings.catch_warnings():
-        # the checker prefers bounded boxes; what a simulator measures has no bound
+        # the checker prefers bounded boxes; measurements of a simulator have no bound
         warnings.filterwarnings("ignore", message=r".*A Box observation space (minimum|maximum) value is")
         check_env(environment, skip_render_check=True)
 

@@ -35,13 +35,13 @@ def rollout(world: Any, task: str, seed: int, steps: int = 20) -> State:
     return np.stack(rows)
 
 
-def expert_succeeds(task: Task, seed: int, disturbed: bool = False) -> bool:
-    """Run the task's expert for an episode, with five random actions from the tenth step on if disturbed."""
+def expert_succeeds(task: Task, seed: int, noisy: bool = False) -> bool:
+    """Run the task's expert for an episode, with five random actions from the tenth step on if noisy."""
     world, expert = World(), resolve(task.expert)(task.name)
     state, _ = world.reset(seed=seed, options={"task": task.name})
     noise = random_actions(seed, 5)
     for step in range(task.horizon):
-        action = noise[step - 10] if disturbed and 10 <= step < 15 else expert(state)
+        action = noise[step - 10] if noisy and 10 <= step < 15 else expert(state)
         state, _, terminated, truncated, info = world.step(action)
         assert not truncated
         assert info == {"success": terminated, "task": task.name}
@@ -74,7 +74,7 @@ def test_states_have_28_numbers_and_actions_4() -> None:
     assert world.action_space == gymnasium.spaces.Box(-1.0, 1.0, (4,), np.float32)
 
 
-# In these episodes of FetchPickAndPlace the block lies within reach, so that it is not placed again.
+# in these episodes of FetchPickAndPlace the block is within reach, so our world does not place it again
 @pytest.mark.parametrize("seed", [0, 1, 3])
 def test_physics_and_observation_are_those_of_fetch_pick_and_place(seed: int) -> None:
     import gymnasium_robotics
@@ -84,7 +84,7 @@ def test_physics_and_observation_are_those_of_fetch_pick_and_place(seed: int) ->
     world = World()
     expected = [original.reset(seed=seed)[0]["observation"]]
     got = [world.reset(seed=seed, options={"task": "push"})[0]]
-    # The expert of grasping touches the block; the random half of the actions throws it about.
+    # the expert for grasping touches the block, and the random actions knock it about
     expert, noise = resolve(SCENARIO.task("lift").expert)("lift"), random_actions(seed, 200)
     for step in range(200):
         action = noise[step] if step % 40 >= 20 else expert(got[-1])
@@ -123,11 +123,11 @@ def test_the_block_starts_in_the_same_place_for_every_task() -> None:
         np.testing.assert_array_equal(block, blocks[0])
 
 
-@pytest.mark.parametrize("disturbed", [False, True])
+@pytest.mark.parametrize("noisy", [False, True])
 @pytest.mark.parametrize("task", SCENARIO.tasks, ids=NAMES)
-def test_the_expert_does_its_task(task: Task, disturbed: bool) -> None:
-    # Five random actions can knock the block out of a straight way: one episode of four may be lost.
-    assert sum(expert_succeeds(task, seed, disturbed) for seed in range(100, 104)) >= 4 - disturbed
+def test_the_expert_does_its_task(task: Task, noisy: bool) -> None:
+    # five random actions can knock the block off a straight way: one episode of four may fail
+    assert sum(expert_succeeds(task, seed, noisy) for seed in range(100, 104)) >= 4 - noisy
 
 
 def test_the_reward_grows_while_the_expert_acts_and_is_highest_at_success() -> None:

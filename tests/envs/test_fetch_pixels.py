@@ -31,7 +31,7 @@ COLOURS = ("green", "blue", "yellow", "purple")
 
 @pytest.fixture(scope="module")
 def observer() -> Iterator[Observer]:
-    """What shows the world to a policy; without graphics there is none."""
+    """Return the observer of the pixel world, or skip without graphics."""
     observer = Observer(WORLD, CAMERA)
     try:
         observer.observe(_start(0)[None])
@@ -47,7 +47,7 @@ def _start(seed: int, task: str = "push") -> State:
 
 
 def _shown(colour: str, image: Images) -> NDArray[np.bool_]:
-    """Return where an image (64, 64, 3) shows a colour: red, green, blue, yellow or purple."""
+    """Return the pixels of an image (64, 64, 3) with a colour: red, green, blue, yellow or purple."""
     red, green, blue = np.moveaxis(image.astype(int), -1, 0)
     others = {
         "red": red - np.maximum(green, blue),
@@ -60,7 +60,7 @@ def _shown(colour: str, image: Images) -> NDArray[np.bool_]:
 
 
 def _place(images: Images) -> NDArray[np.float64]:
-    """Return the row and the column of the target in each image, (2, N)."""
+    """Return the rows and columns of the target in all images, (2, N)."""
     return np.array([np.mean(np.nonzero(_shown("red", image)), axis=1) for image in images]).T
 
 
@@ -85,11 +85,11 @@ def test_an_episode_is_bit_for_bit_that_of_fetch() -> None:
 
 
 @pytest.mark.parametrize("task", SCENARIO.tasks, ids=lambda task: task.name)
-def test_experts_act_on_what_policies_do_not_see(task: Task) -> None:
+def test_experts_act_on_numbers_that_policies_do_not_see(task: Task) -> None:
     assert all(demonstrate(World(), task, seed, noisy=False).success for seed in range(3))
 
 
-def test_things_lie_apart_in_two_colours_and_follow_from_the_seed() -> None:
+def test_things_are_apart_in_two_colours_and_follow_from_the_seed() -> None:
     starts = np.stack([_start(seed) for seed in range(40)])
     assert np.array_equal(starts[7], _start(7))
     things = starts[:, THINGS].reshape(-1, 2, 3)
@@ -112,19 +112,19 @@ def test_a_picture_shows_the_target_and_both_things_and_no_other_colour(observer
         assert {colour for colour in COLOURS if _shown(colour, image).sum() >= 3} == there
 
 
-def test_what_eyes_learn_to_tell_is_where_block_target_and_things_are() -> None:
+def test_eyes_learn_the_places_of_block_target_and_things() -> None:
     state = _start(3)[None]
     swapped = state.copy()
     swapped[0, THINGS] = state[0, THINGS].reshape(2, 3)[::-1].ravel()
     camera = resolve(str(CAMERA))
-    (told,), (again,) = camera.pictured(state), camera.pictured(swapped)
-    assert np.array_equal(told, again)  # nothing but their places tells the things apart
+    (places_seen,), (again,) = camera.pictured(state), camera.pictured(swapped)
+    assert np.array_equal(places_seen, again)  # only their places tell the things apart
     places = state[0, THINGS].reshape(2, 3)[:, :2]
     right, left = places[places[:, 1].argsort()]
-    np.testing.assert_array_equal(told, [*state[0, BLOCK], *state[0, TARGET][:2], *right, *left])
+    np.testing.assert_array_equal(places_seen, [*state[0, BLOCK], *state[0, TARGET][:2], *right, *left])
 
 
-def test_a_policy_is_not_told_where_block_and_target_are(observer: Observer) -> None:
+def test_the_numbers_of_a_policy_do_not_depend_on_block_and_target(observer: Observer) -> None:
     state = _start(3)
     moved = state.copy()
     moved[BLOCK] += 0.05
@@ -154,7 +154,7 @@ def test_a_picture_depends_on_its_state_alone(observer: Observer) -> None:
     other.close()
 
 
-def test_a_disturbed_view_moves_what_is_seen_by_pixels_and_its_light_is_another(observer: Observer) -> None:
+def test_a_perturbed_view_moves_the_target_by_pixels_and_changes_the_light(observer: Observer) -> None:
     states = np.stack([_start(seed) for seed in range(6)])
     whole = np.eye(4, dtype=np.float32)
     _, plain = observer.observe(states)
@@ -205,12 +205,12 @@ def _answer(name: str, state: State) -> str | None:
         ("colour_near_target", "blue"),
     ],
 )
-def test_colours_are_told_by_place(name: str, expected: str) -> None:
+def test_questions_name_colours_by_place(name: str, expected: str) -> None:
     assert _answer(name, _scene(COLOURS.index("yellow"), COLOURS.index("blue"))) == expected
     assert _answer(name, _scene(2, 1, left_y=0.76, right_y=0.74)) is None
 
 
-def test_no_question_is_answered_by_what_a_robot_knows_of_itself() -> None:
+def test_no_question_can_be_answered_from_the_robots_own_measurements() -> None:
     assert set(QUESTIONS) >= {"block_side", "nearest", "block_place", "colour_left"}
     assert not {"gripper_opening", "gripper_moving"} & set(QUESTIONS)
 

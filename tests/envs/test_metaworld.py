@@ -13,9 +13,11 @@ import pytest
 from numpy.typing import NDArray
 
 from clbench.base.entry_points import resolve
-from clbench.cli import main as cli
+from clbench.cli.catalogue import list_
+from clbench.cli.data import demonstrations
 from clbench.cli.film import film
-from clbench.cli.runs import run, tune
+from clbench.cli.runs import run
+from clbench.cli.tune import tune
 from clbench.spec.registry import load_scenario
 from clbench.spec.task import Task
 
@@ -71,7 +73,7 @@ def scene(
 
 @pytest.fixture
 def _without_metaworld(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Make it look as if the package metaworld were not installed."""
+    """Hide the package metaworld from this process."""
     installed = importlib.metadata.version
 
     def version(package: str) -> str:
@@ -84,7 +86,7 @@ def _without_metaworld(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.usefixtures("_without_metaworld")
 @pytest.mark.parametrize("name", list(SCENARIOS))
-def test_without_the_package_whatever_would_use_it_says_what_to_install(
+def test_without_the_package_every_user_of_it_names_the_extra_to_install(
     name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     message = f"clbench/{name}-v0 needs the package metaworld: pip install 'clbench[metaworld]'"
@@ -95,7 +97,7 @@ def test_without_the_package_whatever_would_use_it_says_what_to_install(
         lambda: run(f"clbench/{name}-v0", "sft", records=tmp_path),
         lambda: tune(f"clbench/{name}-v0", "consft", values={"kappa": "1"}, records=tmp_path),
         lambda: film(f"clbench/{name}-v0", "sft"),
-        lambda: cli.demonstrations(f"clbench/{name}-v0"),
+        lambda: demonstrations(f"clbench/{name}-v0"),
     )
     for command in commands:
         with pytest.raises(SystemExit) as end:
@@ -110,7 +112,7 @@ def test_without_the_package_the_scenarios_are_listed_all_the_same(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("COLUMNS", "160")
-    cli.list_()
+    list_()
     listed = capsys.readouterr().out
     assert all(f"clbench/{name}-v0" in listed for name in SCENARIOS)
 
@@ -163,7 +165,7 @@ def test_a_copy_of_a_world_goes_on_as_the_world_does_and_leaves_it_alone(task: s
 
 
 @pytest.mark.parametrize("task", TASKS, ids=lambda task: task.name)
-def test_nothing_moves_in_the_first_state_and_things_stand_elsewhere_each_time(task: Task) -> None:
+def test_nothing_moves_in_the_first_state_and_objects_have_new_places_each_time(task: Task) -> None:
     world, states = World(), []
     for seed in range(5):
         states.append(world.reset(seed=seed, options={"task": task.name})[0])
@@ -173,7 +175,7 @@ def test_nothing_moves_in_the_first_state_and_things_stand_elsewhere_each_time(t
 
 @pytest.mark.parametrize("task", TASKS, ids=lambda task: task.name)
 def test_the_expert_does_its_task(task: Task) -> None:
-    # the least that an expert reaches on 100 episodes is 0.9
+    # the lowest success of an expert in 100 episodes is 0.9
     assert sum(expert_succeeds(task, seed) for seed in range(100, 103)) >= 2
 
 

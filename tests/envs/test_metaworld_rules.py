@@ -1,4 +1,4 @@
-"""What is computed for many episodes at once, against Meta-World's own step of each, bit for bit."""
+"""Computations for many episodes at once, compared bit for bit with Meta-World's own steps."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -24,7 +24,7 @@ State = NDArray[np.float32]
 
 
 class Peer:
-    """One lane of a vector world, and an episode that takes Meta-World's own steps."""
+    """One lane of a vector world, with an episode that takes Meta-World's own steps."""
 
     def __init__(self, world: VectorWorld, lane: int, task: str, perturbed: bool) -> None:
         self.world, self.lane, self.task, self.perturbed = world, lane, task, perturbed
@@ -32,7 +32,7 @@ class Peer:
         self.left = 0
 
     def begin(self, generator: np.random.Generator) -> None:
-        """Begin both anew from one seed."""
+        """Begin both anew with one seed."""
         seed, self.left = int(generator.integers(2**31)), int(generator.integers(50, 140))
         drawn = draw_perturbation(seed) if self.perturbed else None
         self.episode = new_episode(self.task, drawn.mass if drawn else None)
@@ -41,15 +41,15 @@ class Peer:
         assert state.tobytes() == self.state.tobytes()
 
     def follow(self, action: State, state: State, reward: float, success: bool) -> None:
-        """Let the episode take the step that the lane took, and compare what they return."""
+        """Repeat the lane's step in the episode, and compare the results."""
         self.state, expected, succeeded = self.episode.advance(action.clip(-1.0, 1.0))
         assert state.tobytes() == self.state.tobytes()
         assert (reward, success) == (expected, succeeded)
         self.left = 0 if success else self.left - 1
 
     def check_physics(self) -> None:
-        """Compare what the next step depends on."""
-        _, data = self.world.picture_of(self.lane)  # type: ignore[attr-defined]
+        """Compare everything that the next step depends on."""
+        data = self.world.drawable(self.lane).data  # type: ignore[attr-defined]
         for name in ("qpos", "qvel", "qacc_warmstart", "mocap_pos", "mocap_quat", "ctrl", "time"):
             np.testing.assert_array_equal(getattr(data, name), getattr(self.episode.data, name))
 
@@ -57,8 +57,8 @@ class Peer:
 def compare(tasks: Sequence[str], steps: int, threads: int = 1, perturbed: bool = False) -> int:
     """Compare `steps` steps of a lane for each of `tasks`, and return how many episodes succeeded.
 
-    Expert and random actions take turns; an episode is begun anew after success, or at a random age. Where
-    lanes have several tasks, three quarters of them take a step, in any order.
+    Expert and random actions take turns; an episode begins anew after success, or at a random age. If lanes
+    have several tasks, three quarters of them take each step, in any order.
     """
     world = vector_world(WORLD, len(tasks), threads, perturbed)
     peers = [Peer(world, lane, task, perturbed) for lane, task in enumerate(tasks)]
@@ -89,7 +89,7 @@ def test_all_tasks_that_are_learned_or_kept_have_a_rule() -> None:
 
 
 @pytest.mark.parametrize("task", TASKS)
-def test_lanes_of_a_task_do_what_meta_world_does(task: str) -> None:
+def test_lanes_of_a_task_equal_meta_worlds_own_steps(task: str) -> None:
     compare([task] * 3, steps=60)
 
 

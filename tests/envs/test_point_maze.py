@@ -18,6 +18,8 @@ import torch
 from numpy.typing import NDArray
 
 from clbench.base.entry_points import resolve
+from clbench.base.seeding import derive_seed
+from clbench.data import demonstrations, expert_rates
 from clbench.data.questions import load_questions, scored_questions
 from clbench.spec.language import word_id
 from clbench.spec.registry import load_scenario
@@ -41,13 +43,13 @@ def random_actions(seed: int, steps: int) -> NDArray[np.float32]:
     return np.random.default_rng(seed).uniform(-1.0, 1.0, (steps, 2)).astype(np.float32)
 
 
-def expert_succeeds(task: Task, seed: int, disturbed: bool) -> bool:
-    """Run the task's expert for an episode, with five random actions from the tenth step on if disturbed."""
+def expert_succeeds(task: Task, seed: int, noisy: bool) -> bool:
+    """Run the task's expert for an episode, with five random actions from the tenth step on if noisy."""
     world, expert = World(), resolve(task.expert)(task.name)
     state, _ = world.reset(seed=seed, options={"task": task.name})
     noise = random_actions(seed, 5)
     for step in range(task.horizon):
-        action = noise[step - 10] if disturbed and 10 <= step < 15 else expert(state)
+        action = noise[step - 10] if noisy and 10 <= step < 15 else expert(state)
         state, _, terminated, truncated, info = world.step(action)
         assert not truncated
         assert info == {"success": terminated, "task": task.name}
@@ -59,7 +61,7 @@ def expert_succeeds(task: Task, seed: int, disturbed: bool) -> bool:
 def state(
     x: float = 0.0, y: float = 0.0, vx: float = 0.0, vy: float = 0.0, colour: str = "red", **ahead: float
 ) -> State:
-    """Return a state (1, 11) made by hand; walls are 0.5 m away where `ahead` does not say otherwise."""
+    """Return a state (1, 11) made by hand; walls are 0.5 m away unless `ahead` gives a distance."""
     ways = [ahead.get(direction, 0.5) for direction in ("right", "left", "above", "below")]
     return np.array([[x, y, vx, vy, *ways, *(colour == name for name in MAZES)]], np.float32)
 
@@ -72,7 +74,7 @@ def test_the_scenario_has_the_promised_parts() -> None:
     assert world.action_space == gymnasium.spaces.Box(-1.0, 1.0, (2,), np.float32)
 
 
-def test_every_target_lies_in_a_maze_of_a_skill_and_shares_its_states() -> None:
+def test_every_target_is_in_a_maze_of_a_skill_and_shares_its_states() -> None:
     mazes = {task.name.partition("_")[0] for task in SCENARIO.retained}
     assert mazes == set(MAZES)
     starts = {name: World().reset(seed=3, options={"task": name})[0] for name in NAMES}
@@ -81,7 +83,7 @@ def test_every_target_lies_in_a_maze_of_a_skill_and_shares_its_states() -> None:
         assert [bool(flag) for flag in starts[task.name][8:]] == [colour == maze for maze in MAZES]
 
 
-# The map is written into a file that gymnasium-robotics leaves behind.
+# gymnasium-robotics writes the map into a file and leaves it behind
 @pytest.mark.parametrize("maze", MAZES.values(), ids=list(MAZES))
 def test_physics_and_observation_are_those_of_point_maze(
     maze: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -95,8 +97,8 @@ def test_physics_and_observation_are_those_of_point_maze(
     world = World.vector_world(lanes=1)
     first = world.reset([0], [0], [f"{maze.colour}_middle"])[0]
     original.reset(seed=0)
-    original.set_state(world.picture_data(0)[1].qpos, np.zeros(2))
-    # Actions that often agree bring the ball to its top speed and against the walls.
+    original.set_state(world.drawable(0).data.qpos, np.zeros(2))
+    # repeated actions bring the ball to its top speed and against the walls
     actions = np.repeat(random_actions(1, 30), 5, axis=0)
     got, speeds = [], []
     for action in actions:
@@ -165,11 +167,11 @@ def test_the_ball_starts_anywhere_that_is_three_cells_from_the_goal() -> None:
     assert starts == {cell for cell in maze.free if maze.steps(cell, "upper") >= 3}
 
 
-@pytest.mark.parametrize("disturbed", [False, True])
+@pytest.mark.parametrize("noisy", [False, True])
 @pytest.mark.parametrize("task", SCENARIO.tasks, ids=NAMES)
-def test_the_expert_does_its_task(task: Task, disturbed: bool) -> None:
-    # Five random actions can carry the ball to the other end: of the way back one may lack the time.
-    assert sum(expert_succeeds(task, seed, disturbed) for seed in range(100, 104)) >= 4 - disturbed
+def test_the_expert_does_its_task(task: Task, noisy: bool) -> None:
+    # five random actions can carry the ball to the other end: one episode may lack time for the way back
+    assert sum(expert_succeeds(task, seed, noisy) for seed in range(100, 104)) >= 4 - noisy
 
 
 def test_the_reward_grows_while_the_expert_acts_and_is_highest_at_success() -> None:
@@ -199,7 +201,7 @@ def test_experts_of_retained_tasks_do_no_target_task_by_chance() -> None:
         assert successes == 4 * same_room, f"the expert of {known.name} does {task.name}"
 
 
-def test_who_passes_through_the_room_without_a_stop_has_not_succeeded() -> None:
+def test_passing_through_the_room_without_a_stop_is_no_success() -> None:
     world = World()
     current, _ = world.reset(seed=0, options={"task": "red_upper"})
     # from the hub up, at full speed through the room against its wall
@@ -288,7 +290,7 @@ def test_questions_have_balanced_answers_for_training_and_report() -> None:
 
 
 def test_pictures_show_the_maze_of_the_task_and_leave_the_episode_alone() -> None:
-    """In a process of its own: a rendering back end that does not work may kill it."""
+    """Draw in another process, which a broken rendering back end may kill."""
     code = """
 import numpy as np
 from clbench.envs.point_maze.world import PointMazeWorld
@@ -316,7 +318,7 @@ print("drawn")
 def test_in_a_perturbed_episode_the_ball_is_heavier_and_beside_its_place(seed: int) -> None:
     worlds = [vector_world(SCENARIO.tasks[0].world, 1, 1, perturbed) for perturbed in (False, True)]
     (plain,), (perturbed,) = (world.reset([0], [seed], [NAMES[0]]) for world in worlds)
-    models = [world.picture_data(0)[0] for world in worlds]  # type: ignore[attr-defined]
+    models = [world.drawable(0).model for world in worlds]  # type: ignore[attr-defined]
     drawn = draw_perturbation(seed)
     assert models[1].body("particle").mass == drawn.mass * models[0].body("particle").mass
     np.testing.assert_allclose(perturbed[:2] - plain[:2], 0.1 * np.array(drawn.start[:2]), atol=1e-6)
@@ -329,3 +331,27 @@ def test_a_perturbed_ball_never_starts_in_a_wall() -> None:
     for seed, name in enumerate(NAMES * 20):
         ahead = world.reset([0], [seed], [name])[0, 4:8]
         assert ahead.min() > 0.1  # its radius
+
+
+def test_seeds_and_data_set_ids_keep_the_old_spelling_of_the_suite(monkeypatch: pytest.MonkeyPatch) -> None:
+    task = SCENARIO.task("red_left")
+    assert task.suite == "point_maze"
+    assert task.dataset_id == "clbench/point-maze/red-left-v0"
+    assert derive_seed("demonstration", task.dataset_id, 0) == 1484796457
+    assert derive_seed("picture", task.seed_suite, task.name) == 242747921
+    seeds = []
+
+    def note_seed(world: gymnasium.Env[Any, Any], task: Task, seed: int, noisy: bool) -> Any:
+        seeds.append(seed)
+        return demonstrations.demonstrate(world, task, seed, noisy=noisy)
+
+    monkeypatch.setattr(expert_rates, "demonstrate", note_seed)
+    expert_rates.measure(SCENARIO, [task], episodes=2)
+    assert seeds == [1642424505, 688404758]
+
+
+def test_only_this_suite_has_another_spelling_in_seeds() -> None:
+    names = ("Fetch", "FetchPixels", "DMControl", "MetaWorld", "MetaWorldCW")
+    scenarios = [load_scenario(f"clbench:clbench/{name}-v0") for name in names]
+    spellings = [{task.seed_suite for task in scenario.target} for scenario in scenarios]
+    assert spellings == [{"fetch"}, {"fetch-pixels"}, {"dm_control"}, {"metaworld"}, {"metaworld-cw"}]

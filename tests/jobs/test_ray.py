@@ -1,5 +1,6 @@
 """Ray: the same records as on one machine, and nothing is lost with a worker."""
 
+import importlib
 import io
 import os
 import threading
@@ -13,7 +14,7 @@ import pytest
 
 from clbench.jobs.bars import Bars
 from clbench.jobs.job import Job
-from clbench.jobs.plan import benchmark_jobs
+from clbench.jobs.plan import Plan
 from clbench.jobs.processes import Processes
 from clbench.jobs.ray import RayWorkers
 from clbench.jobs.scheduler import run_jobs
@@ -77,17 +78,19 @@ def test_a_job_that_fails_leaves_the_others_alone_and_one_whose_worker_is_killed
     ancestor: int, tmp_path: Path, bars: Bars
 ) -> None:
     path = tmp_path / "attempts"
+    some = importlib.import_module("some_jobs")
+    wrong = Job("wrong", some.bad, {}, 1)
     jobs = [
-        Job("wrong", "some_jobs:bad", {}, 1),
-        Job("hopeless", "some_jobs:good", {}, 1, ("wrong",)),
-        Job("fine", "some_jobs:good", {}, 1),
-        Job("lost", "some_jobs:lost_once", {"path": str(path)}, 1),
-        Job("cursed", "some_jobs:lost_always", {}, 1),
-        Job("endless", "some_jobs:endless", {}, 1, limits=Limits(seconds=3)),
+        wrong,
+        Job("hopeless", some.good, {}, 1, (wrong,)),
+        Job("fine", some.good, {}, 1),
+        Job("lost", some.lost_once, {"path": str(path)}, 1),
+        Job("cursed", some.lost_always, {}, 1),
+        Job("endless", some.endless, {}, 1, limits=Limits(seconds=3)),
     ]
     killer = threading.Thread(target=_kill_first, args=(path, ancestor))
     killer.start()
-    failed = run_jobs(jobs, RayWorkers("local", 2), bars)
+    failed = {job.title: reason for job, reason in run_jobs(jobs, RayWorkers("local", 2), bars).items()}
     killer.join()
     assert set(failed) == {"wrong", "hopeless", "cursed", "endless"}
     assert failed["endless"] == "stopped, because it took longer than 3 s"
@@ -103,16 +106,21 @@ def test_a_job_that_fails_leaves_the_others_alone_and_one_whose_worker_is_killed
 def test_the_records_are_those_of_one_machine(
     tmp_path: Path, bars: Bars, lasting_records: Callable[[Path], dict[str, Any]]
 ) -> None:
-    specs = [RunSpec(TOY, method, 0) for method in ("sft", "frozen", "experience_replay")]
-    assert run_jobs(benchmark_jobs(specs, tmp_path / "here"), Processes(2), bars) == {}
-    assert run_jobs(benchmark_jobs(specs, tmp_path / "ray"), RayWorkers("local", 2), bars) == {}
+    here, on_ray = Plan(), Plan()
+    for method in ("sft", "frozen", "experience_replay"):
+        here.add_run(RunSpec(TOY, method, 0).resolve(), tmp_path / "here")
+    assert run_jobs(here.jobs, Processes(2), bars) == {}
+    for method in ("sft", "frozen", "experience_replay"):
+        on_ray.add_run(RunSpec(TOY, method, 0).resolve(), tmp_path / "ray")
+    assert run_jobs(on_ray.jobs, RayWorkers("local", 2), bars) == {}
     records = lasting_records(tmp_path / "here")
     assert len(records) == 3
     assert records == lasting_records(tmp_path / "ray")
 
 
 def test_a_job_on_this_machine_gives_way_to_nothing_else(bars: Bars) -> None:
-    assert run_jobs([Job("niceness", "some_jobs:niceness", {}, 1)], RayWorkers("local", 1), bars) == {}
+    niceness = importlib.import_module("some_jobs").niceness
+    assert run_jobs([Job("niceness", niceness, {}, 1)], RayWorkers("local", 1), bars) == {}
     assert isinstance(bars.console.file, io.StringIO)
     assert f"niceness: nicer by {os.nice(0)} (" in bars.console.file.getvalue()
 

@@ -1,5 +1,6 @@
 """The grid: processes that work, fail, die and are stopped."""
 
+import importlib
 import io
 import os
 import signal
@@ -14,12 +15,13 @@ import pytest
 
 from clbench.jobs.bars import Bars
 from clbench.jobs.job import Job
-from clbench.jobs.plan import benchmark_jobs
+from clbench.jobs.plan import Plan
 from clbench.jobs.processes import Processes
 from clbench.jobs.scheduler import run_jobs
 from clbench.learning.pretraining import pretrained_policy
-from clbench.runs.run import evaluate_pretrained, execute
+from clbench.runs.run import execute
 from clbench.runs.spec import RunSpec, has_record
+from clbench.runs.start import evaluate_pretrained
 from clbench.spec.registry import load_scenario
 
 TOY = "clbench.testing:clbench/Toy-v0"
@@ -54,8 +56,20 @@ def _jobs_module(write_module: Callable[[str, str], None]) -> None:
     write_module("some_jobs", JOBS)
 
 
-def _job(name: str, function: str, *needs: str, **arguments: Any) -> Job:
-    return Job(name, f"some_jobs:{function}", arguments, 1, needs)
+def _job(title: str, function: str, *needs: Job, **arguments: Any) -> Job:
+    return Job(title, _function(function), arguments, 1, needs)
+
+
+def _function(name: str) -> Callable[..., str]:
+    found: Callable[..., str] = getattr(importlib.import_module("some_jobs"), name)
+    return found
+
+
+def _plan(records: Path, *specs: RunSpec) -> list[Job]:
+    plan = Plan()
+    for spec in specs:
+        plan.add_run(spec.resolve(), records)
+    return plan.jobs
 
 
 def _printed(bars: Bars) -> str:
@@ -64,24 +78,18 @@ def _printed(bars: Bars) -> str:
 
 
 def test_a_job_starts_after_what_it_needs(tmp_path: Path, bars: Bars) -> None:
-    jobs = [
-        _job("second", "good", "first", path=str(tmp_path / "2")),
-        _job("first", "good", path=str(tmp_path / "1")),
-    ]
-    assert run_jobs(jobs, Processes(2), bars) == {}
+    first = _job("first", "good", path=str(tmp_path / "1"))
+    second = _job("second", "good", first, path=str(tmp_path / "2"))
+    assert run_jobs([second, first], Processes(2), bars) == {}
     assert (tmp_path / "1").stat().st_mtime_ns < (tmp_path / "2").stat().st_mtime_ns
     assert "first: went well" in _printed(bars)
 
 
 def test_a_job_that_fails_or_is_killed_does_not_stop_the_others(bars: Bars) -> None:
-    jobs = [
-        _job("wrong", "bad"),
-        _job("dead", "killed"),
-        _job("hopeless", "good", "dead"),
-        _job("worse", "good", "hopeless"),
-        _job("fine", "good"),
-    ]
-    failed = run_jobs(jobs, Processes(2), bars)
+    wrong, dead, fine = _job("wrong", "bad"), _job("dead", "killed"), _job("fine", "good")
+    hopeless = _job("hopeless", "good", dead)
+    jobs = [wrong, dead, hopeless, _job("worse", "good", hopeless), fine]
+    failed = {job.title: reason for job, reason in run_jobs(jobs, Processes(2), bars).items()}
     assert set(failed) == {"wrong", "dead", "hopeless", "worse"}
     assert "ValueError: went wrong" in failed["wrong"]
     assert "exit code -9" in failed["dead"]
@@ -99,7 +107,7 @@ def test_a_job_that_leaves_a_thread_behind_is_over_when_it_says_so(
     assert "next: went well" in _printed(bars)
 
 
-def test_stopping_the_grid_ends_its_processes(
+def test_stopping_the_scheduler_ends_its_processes(
     tmp_path: Path, bars: Bars, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = tmp_path / "pid"
@@ -117,10 +125,15 @@ def test_stopping_the_grid_ends_its_processes(
 
 
 def test_what_the_longest_work_waits_for_begins_first(bars: Bars) -> None:
-    lengths = {"short run": 1.0, "long run": 9.0, "pretraining of the long run": 2.0, "middle run": 5.0}
-    needs = {"long run": ("pretraining of the long run",)}
-    jobs = [Job(name, "some_jobs:good", {}, length, needs.get(name, ())) for name, length in lengths.items()]
-    jobs.append(Job("run that goes fast", "some_jobs:good", {}, 8.0, pace=0.5))
+    good = _function("good")
+    pretraining = Job("pretraining of the long run", good, {}, 2.0)
+    jobs = [
+        Job("short run", good, {}, 1.0),
+        Job("long run", good, {}, 9.0, (pretraining,)),
+        pretraining,
+        Job("middle run", good, {}, 5.0),
+        Job("run that goes fast", good, {}, 8.0, pace=0.5),
+    ]
     assert run_jobs(jobs, Processes(1), bars) == {}
     ended = [line.partition(":")[0] for line in _printed(bars).splitlines()]
     assert ended == [
@@ -137,8 +150,7 @@ def test_runs_of_two_scenarios_have_jobs_of_their_own_and_one_pretraining_for_ea
 ) -> None:
     scenarios = ("clbench/Fetch-v0", TOY)
     specs = [RunSpec(name, method, 1) for name in scenarios for method in ("sft", "frozen")]
-    jobs = benchmark_jobs(specs, tmp_path)
-    names = [job.name for job in jobs]
+    names = [job.title for job in _plan(tmp_path, *specs)]
     assert len(set(names)) == len(names)
     assert [name for name in names if "pretraining" in name] == [
         "Fetch-v0 pretraining seed 1",
@@ -150,8 +162,8 @@ def test_a_run_waits_for_what_it_is_made_from_and_nothing_else_is_made(
     tmp_path: Path, empty_caches: Path
 ) -> None:
     def needs(*methods: str) -> dict[str, set[str]]:
-        jobs = benchmark_jobs([RunSpec(TOY, method, 0) for method in methods], tmp_path)
-        return {job.name: set(job.needs) for job in jobs}
+        jobs = _plan(tmp_path, *(RunSpec(TOY, method, 0) for method in methods))
+        return {job.title: {needed.title for needed in job.needs} for job in jobs}
 
     scenario = load_scenario(TOY)
     skills = {f"Toy-v0 demonstrations {task.name}" for task in scenario.retained}
@@ -174,7 +186,7 @@ def test_a_run_waits_for_what_it_is_made_from_and_nothing_else_is_made(
     assert set(found) == {sft, joint} | found[joint]
     pretrained_policy(scenario, 0)
     assert needs("sft")[report] == {questions}
-    evaluate_pretrained(RunSpec(TOY, "joint", 0))
+    evaluate_pretrained(RunSpec(TOY, "joint", 0).resolve())
     assert needs("sft") == {sft: {questions} | targets, questions: set(), **{name: set() for name in targets}}
     demonstrated = {path.parent.name for path in (empty_caches / "minari").rglob("data")}
     execute(RunSpec(TOY, "sft", 0), tmp_path)  # reads those of the skills never, so makes none
@@ -182,15 +194,15 @@ def test_a_run_waits_for_what_it_is_made_from_and_nothing_else_is_made(
     assert after - demonstrated == {f"{task.name}-v0" for task in scenario.target}
 
 
-def test_one_worker_and_two_give_equal_records_and_a_stopped_grid_goes_on(
+def test_one_worker_and_two_give_equal_records_and_a_stopped_benchmark_goes_on(
     tmp_path: Path, bars: Bars, lasting_records: Callable[[Path], dict[str, Any]]
 ) -> None:
     specs = [RunSpec(TOY, method, 0) for method in ("frozen", "sft", "joint")]
-    assert run_jobs(benchmark_jobs(specs, tmp_path / "one"), Processes(1), bars) == {}
-    assert run_jobs(benchmark_jobs(specs[:1], tmp_path / "two"), Processes(2), bars) == {}
-    missing = [spec for spec in specs if not has_record(spec, tmp_path / "two")]
+    assert run_jobs(_plan(tmp_path / "one", *specs), Processes(1), bars) == {}
+    assert run_jobs(_plan(tmp_path / "two", *specs[:1]), Processes(2), bars) == {}
+    missing = [spec for spec in specs if not has_record(spec.resolve(), tmp_path / "two")]
     assert missing == specs[1:]
-    assert run_jobs(benchmark_jobs(missing, tmp_path / "two"), Processes(2), bars) == {}
+    assert run_jobs(_plan(tmp_path / "two", *missing), Processes(2), bars) == {}
     records = lasting_records(tmp_path / "one")
     assert len(records) == 3
     assert records == lasting_records(tmp_path / "two")

@@ -26,17 +26,17 @@ def board() -> Any:
 
 def test_every_method_has_the_same_seeds_and_the_same_pretrained_policies() -> None:
     every = [read_record(path) for path in RECORDS.rglob("*.json")]
-    records = [record for record in every if "online" not in record.run["uses"]]
+    records = [record for record in every if "online" not in record.run.uses]
     policies = {
-        (record.run["scenario"], record.run["seed"], record.fingerprint["pretrained"]) for record in records
+        (record.run.scenario, record.run.seed, record.fingerprint["pretrained"]) for record in records
     }
     assert len(policies) == len({run[:2] for run in policies})
     seeds: dict[tuple[str, str], set[int]] = {}
     for record in records:
-        seeds.setdefault((record.run["scenario"], record.run["method"]), set()).add(record.run["seed"])
+        seeds.setdefault((record.run.scenario, record.run.method), set()).add(record.run.seed)
     for (scenario, method), found in seeds.items():
         assert found == set(range(5 if scenario == "clbench/Fetch-v0" else 3)), f"{scenario}, {method}"
-    assert not any(record.run["changes"] for record in records)
+    assert not any(record.run.changes for record in records)
     assert not any(record.fingerprint["commit"]["dirty"] for record in records)
 
 
@@ -95,9 +95,9 @@ def test_stop_gradient_keeps_every_answer(board: Any) -> None:
 def test_what_a_row_may_touch_is_what_its_class_declares() -> None:
     for path in (RECORDS / "Fetch-v0").rglob("*.json"):
         run = read_record(path).run
-        if "online" in run["uses"]:  # an agent, not a method
+        if "online" in run.uses:  # an agent, not a method
             continue
-        assert run["uses"] == dataclasses.asdict(load_method(run["method"]).uses), path
+        assert run.uses == dataclasses.asdict(load_method(run.method).uses), path
 
 
 def test_aegis_sheds_little_energy_at_every_stage() -> None:

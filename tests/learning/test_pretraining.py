@@ -30,7 +30,7 @@ def test_the_policies_that_ship_are_those_that_this_source_makes() -> None:
     made_from, present = _made_from(SHIPS), json.loads(json.dumps(pretraining_inputs(FETCH, 0)))
     if made_from["versions"] != present["versions"]:
         pytest.skip(f"it was made with {made_from['versions']}, here are {present['versions']}")
-    assert made_from == present, "make it again: python -m clbench.pretrained clbench/Fetch-v0"
+    assert made_from == present, "make it again: clbench pretrain clbench/Fetch-v0 --ship"
     assert pretrained_folder(FETCH, 0) == SHIPS
     assert is_pretrained(FETCH, 0)
 

@@ -3,7 +3,6 @@
 import importlib
 import json
 import os
-import re
 import subprocess
 import sys
 from collections.abc import Callable
@@ -15,7 +14,9 @@ import numpy as np
 import pytest
 
 from clbench.base.entry_points import resolve
+from clbench.records.content import sealed
 from clbench.records.reader import read_record
+from clbench.records.record import Costs
 from clbench.runs.agents import evaluate_agent, next_stage
 from clbench.scoring.metrics import measure
 from clbench.scoring.scores import Scores
@@ -23,7 +24,6 @@ from clbench.spec.registry import load_scenario
 from clbench.worlds.scenario_env import Observation, ScenarioEnv
 from clbench.worlds.scenario_vector_env import ScenarioVectorEnv
 
-DOCS = Path(__file__).parents[2] / "docs" / "guide"
 ID = "clbench.testing:clbench/Toy-v0"
 TOY = load_scenario(ID)
 EXPERTS = {words: resolve(task.expert)(task.name) for task in TOY.tasks for words in task.instructions}
@@ -112,9 +112,9 @@ def test_an_agent_leaves_a_record_of_what_it_knew_after_each_stage(
     }
     for missing in ("question_retention", "retention_at_matched_adaptation", "activation_drift"):
         assert measure(missing, scores, {"sft": scores}) is None
-    assert record.costs == {"environment_steps": 60}
+    assert record.costs == Costs(environment_steps=60)
     assert record.diagnostics["1"] == {"environment_steps": 20}
-    assert record.run["settings"] == {"speed": 3}
+    assert record.run.settings == {"speed": 3}
     assert record.fingerprint["method"]["class"].endswith(":Knowing")
     assert [one["training"] is not None for one in record.timing["stages"]] == [True] * 3
 
@@ -193,9 +193,9 @@ def test_what_an_agent_draws_leaves_no_trace_and_repeats_itself(evaluate: Callab
 def test_steps_that_were_taken_elsewhere_are_told_and_unknown_ones_are_missing(
     evaluate: Callable[..., Any],
 ) -> None:
-    assert evaluate(Knowing(), stage_env(0), steps=500).costs["environment_steps"] == 500
+    assert evaluate(Knowing(), stage_env(0), steps=500).costs.environment_steps == 500
     record = evaluate(Knowing(), stage_env(0))
-    assert "environment_steps" not in record.costs
+    assert record.costs.environment_steps is None
     assert record.diagnostics["0"] == {"environment_steps": None}
     assert record.timing["seconds"] is None
 
@@ -209,7 +209,7 @@ def test_many_environments_side_by_side_count_their_steps_together(evaluate: Cal
     assert isinstance(env.unwrapped, ScenarioVectorEnv)
     assert env.unwrapped.steps_taken == 12
     env = gymnasium.make_vec(ID, num_envs=3, stage=0)
-    assert evaluate(Knowing(), env).run["scenario"] == TOY.id
+    assert evaluate(Knowing(), env).run.scenario == TOY.id
 
 
 @pytest.mark.parametrize(
@@ -331,7 +331,7 @@ def test_a_killed_program_goes_on_with_the_stage_that_it_was_in(empty_caches: Pa
     assert run(last=9) == 0
     assert next_stage(ID, method="me/still", records=records) == 3
     record = read_record(records / "Toy-v0/me--still/seed-0.json")
-    assert record.costs == {"environment_steps": 3}
+    assert record.costs == Costs(environment_steps=3)
     assert not list((empty_caches / "cache" / "online").iterdir())
 
 
@@ -408,68 +408,7 @@ def test_a_record_that_claims_to_be_online_and_more_is_refused(
     values["run"]["uses"] = uses
     path = tmp_path / "Toy-v0/me--knows/seed-0.json"
     path.parent.mkdir(parents=True)
-    path.write_text(json.dumps(values), encoding="utf-8")
+    path.write_text(json.dumps(sealed(values)), encoding="utf-8")
     table = importlib.import_module("clbench.leaderboard.board.rows").read_table(tmp_path)
     assert not table.rows
     assert table.not_shown[0].reason == "run: uses of an agent that learned online must be of nothing else."
-
-
-# ---- the page ----------------------------------------------------------------------------------------------
-
-
-def _blocks(language: str) -> list[str]:
-    text = (DOCS / "online.md").read_text(encoding="utf-8")
-    return re.findall(rf"```{language}\n(.*?)```", text, flags=re.DOTALL)
-
-
-SHOW_FLAT = """
-class Shown:
-    def predict(self, observation, deterministic):
-        print(observation.shape)
-
-Flat(Shown(), env).predict(env.reset()[0], deterministic=True)
-"""
-
-
-def _output(command: list[str], folder: Path) -> str:
-    """Return what a program prints; threads would only get in each other's way here."""
-    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-    done = subprocess.run(command, cwd=folder, env=environment, check=False, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    return done.stdout
-
-
-@pytest.mark.slow
-def test_the_page_s_own_lines_make_a_row(tmp_path: Path) -> None:
-    learning, flat = _blocks("python")
-    small = learning.replace("clbench/Fetch-v0", ID).replace("range(5)", "range(3)").replace("5_000", "120")
-    command = [sys.executable, "-c", small + flat + SHOW_FLAT]
-    told = _output(command, tmp_path)
-    assert told == "(16,)\n"
-    record = read_record(tmp_path / "leaderboard/records/Toy-v0/me--sac/seed-0.json")
-    assert record.costs["environment_steps"] == 360
-    assert record.costs["parameters"] > 0
-    assert record.fingerprint["method"]["class"] == "stable_baselines3.sac.sac:SAC"
-    assert record.run["device"] == "cpu"
-    (shown,) = _blocks("console")
-    command = [sys.executable, "-m", *shown.split()]
-    told = _output(command, tmp_path)
-    assert "me/sac" in told
-
-
-@pytest.mark.slow
-def test_the_program_of_the_page_makes_a_record_of_each_seed_and_skips_those_it_has(tmp_path: Path) -> None:
-    (line,) = _blocks("shell")
-    python, script, scenario, *seeds = line.split()
-    assert (python, script, scenario, seeds) == (
-        "python",
-        "docs/guide/online_sac.py",
-        "clbench/Fetch-v0",
-        ["--seeds", "3"],
-    )
-    command = [sys.executable, str(DOCS.parent / script), ID, "--seeds", "1", "--steps", "110"]
-    for expected in ("seed 0, stage 2: left ", "seed 0 has a record already"):
-        told = _output(command, tmp_path)
-        assert expected in told
-    record = read_record(tmp_path / "leaderboard/records/Toy-v0/sac/seed-0.json")
-    assert record.costs["environment_steps"] == 330

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from clbench.cli.runs import run
-from clbench.learning.method import Method, Stage, State
+from clbench.learning.method import Method, MethodState, Stage
 from clbench.learning.optimise import MethodError
 from clbench.policy.checkpoint import CheckpointError
 from clbench.policy.policy import Policy
@@ -35,12 +35,12 @@ class Restless(Method):
         policy.register_parameter("scale", torch.nn.Parameter(torch.rand(3)))
         self.steps = 0
 
-    def load_state(self, policy: Policy, state: State) -> None:
+    def load_state(self, policy: Policy, state: MethodState) -> None:
         policy.register_parameter("scale", torch.nn.Parameter(torch.zeros(3)))
         assert isinstance(state["steps"], int)
         self.steps = state["steps"]
 
-    def state(self) -> State:
+    def state(self) -> MethodState:
         return {"steps": self.steps}
 
     def loss(self, policy: Policy, batch: Any, progress: Any) -> Tensor:
@@ -87,8 +87,8 @@ def test_a_run_keeps_a_folder_for_each_stage(kept: Path) -> None:
 
 def test_kept_policies_are_those_that_are_made_again(kept: Path) -> None:
     amounts: list[float] = []
-    again = stage_policies(SPEC, progress=amounts.append)
-    _assert_equal(stage_policies(SPEC, kept), again)
+    again = stage_policies(SPEC.resolve(), progress=amounts.append)
+    _assert_equal(stage_policies(SPEC.resolve(), kept), again)
     assert len(again) == 3
     assert sum(amounts) == 2 * 60
     words = "backbone.words.weight"  # under the adapters: it never changes
@@ -100,11 +100,11 @@ def test_kept_policies_are_those_that_are_made_again(kept: Path) -> None:
 
 
 def test_policies_of_a_run_of_the_same_settings_that_is_evaluated_otherwise_count(kept: Path) -> None:
-    assert has_stages(dataclasses.replace(SPEC, split="validation"), kept)
-    assert has_stages(dataclasses.replace(SPEC, perturb=True), kept)
-    assert not has_stages(dataclasses.replace(SPEC, seed=1), kept)
-    assert not has_stages(dataclasses.replace(SPEC, targets=1), kept)
-    assert not has_stages(dataclasses.replace(SPEC, changes={"rank": 4}), kept)
+    assert has_stages(dataclasses.replace(SPEC, split="validation").resolve(), kept)
+    assert has_stages(dataclasses.replace(SPEC, perturb=True).resolve(), kept)
+    assert not has_stages(dataclasses.replace(SPEC, seed=1).resolve(), kept)
+    assert not has_stages(dataclasses.replace(SPEC, targets=1).resolve(), kept)
+    assert not has_stages(dataclasses.replace(SPEC, changes={"rank": 4}).resolve(), kept)
 
 
 def test_a_method_that_draws_from_global_generators_makes_the_same_policies_again(
@@ -112,7 +112,7 @@ def test_a_method_that_draws_from_global_generators_makes_the_same_policies_agai
 ) -> None:
     spec = RunSpec(TOY, stranger(Restless), seed=0, targets=1)
     execute(spec, tmp_path / "records", checkpoints=tmp_path)
-    _assert_equal(stage_policies(spec, tmp_path), stage_policies(spec))
+    _assert_equal(stage_policies(spec.resolve(), tmp_path), stage_policies(spec.resolve()))
 
 
 def test_a_run_that_was_killed_keeps_all_stages_in_the_end(
@@ -120,17 +120,17 @@ def test_a_run_that_was_killed_keeps_all_stages_in_the_end(
 ) -> None:
     spec = RunSpec(TOY, "sft", seed=0)
     execute_and_kill(spec, tmp_path, 0.75, checkpoints=tmp_path)
-    assert not has_stages(spec, tmp_path)
+    assert not has_stages(spec.resolve(), tmp_path)
     assert execute(spec, tmp_path, checkpoints=tmp_path).timing["resumed_after"] == 1
-    _assert_equal(stage_policies(spec, tmp_path), stage_policies(spec))
+    _assert_equal(stage_policies(spec.resolve(), tmp_path), stage_policies(spec.resolve()))
 
 
 def test_what_another_version_of_the_code_kept_is_replaced(kept: Path, tmp_path: Path) -> None:
     stale = tmp_path / "Toy-v0" / "lora" / "seed-0" / "stage-2"
     stale.mkdir(parents=True)
     (stale / "policy.safetensors").write_bytes(b"stale")
-    keep_stages(SPEC, tmp_path)
-    _assert_equal(stage_policies(SPEC, tmp_path), stage_policies(SPEC, kept))
+    keep_stages(SPEC.resolve(), tmp_path)
+    _assert_equal(stage_policies(SPEC.resolve(), tmp_path), stage_policies(SPEC.resolve(), kept))
 
 
 @pytest.mark.slow
@@ -141,7 +141,7 @@ def test_the_command_keeps_the_policies_of_a_run_that_has_a_record(
     records = kept.parent / "records"
     run(TOY, "lora", seeds=1, records=records, checkpoints=tmp_path, workers=1)
     assert "0 runs and the policies of 1 in" in capsys.readouterr().err
-    _assert_equal(stage_policies(SPEC, tmp_path), stage_policies(SPEC, kept))
+    _assert_equal(stage_policies(SPEC.resolve(), tmp_path), stage_policies(SPEC.resolve(), kept))
     run(TOY, "lora", seeds=1, records=records, checkpoints=tmp_path, workers=1)
     assert "policies" not in capsys.readouterr().err  # they are there now
 
@@ -149,13 +149,13 @@ def test_the_command_keeps_the_policies_of_a_run_that_has_a_record(
 def test_a_torn_policy_is_not_taken_and_the_log_says_so(
     kept: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    keep_stages(SPEC, tmp_path)
+    keep_stages(SPEC.resolve(), tmp_path)
     path = tmp_path / "Toy-v0" / "lora" / "seed-0" / "stage-1" / "policy.safetensors"
     path.write_bytes(path.read_bytes()[:-4] + bytes(4))
-    assert not has_stages(SPEC, tmp_path)
-    assert has_stages(SPEC, tmp_path, last=0)
+    assert not has_stages(SPEC.resolve(), tmp_path)
+    assert has_stages(SPEC.resolve(), tmp_path, last=0)
     with caplog.at_level(logging.WARNING, "clbench"):
-        assert find_stages(SPEC, tmp_path) == find_stages(SPEC)
+        assert find_stages(SPEC.resolve(), tmp_path) == find_stages(SPEC.resolve())
     assert "does not hold the policies of all stages of lora, seed 0" in caplog.text
 
 
@@ -174,7 +174,7 @@ def test_a_state_that_a_stranger_wrote_is_read_within_limits_and_refused_by_name
     folder = shutil.copytree(kept / "Toy-v0" / "lora" / "seed-0", tmp_path / "stages")
     (folder / "stage-1" / "method.json").write_text(text)
     with pytest.raises(CheckpointError, match=reason) as refused:
-        load_stages(SPEC, folder)
+        load_stages(SPEC.resolve(), folder)
     assert str(folder / "stage-1") in str(refused.value)
 
 
@@ -182,7 +182,7 @@ def test_a_state_that_a_stranger_wrote_is_read_within_limits_and_refused_by_name
 class Boundless(Method):
     """A method whose state no file can hold."""
 
-    def state(self) -> State:
+    def state(self) -> MethodState:
         return {"best": float("inf")}
 
 
@@ -191,9 +191,9 @@ def test_a_state_that_could_not_be_read_again_is_refused_when_it_is_kept(
 ) -> None:
     message = r"failed in state\(\) after stage 0: .*best: a number that is not finite"
     with pytest.raises(MethodError, match=message):
-        stage_policies(RunSpec(TOY, stranger(Boundless), seed=0))
+        stage_policies(RunSpec(TOY, stranger(Boundless), seed=0).resolve())
 
 
 def test_a_method_that_fails_says_where(stranger: Callable[[type[Method]], str]) -> None:
     with pytest.raises(MethodError, match=r"failed in stage 1 \(right\): RuntimeError: cannot merge right"):
-        stage_policies(RunSpec(TOY, stranger(Stumbling), seed=0))
+        stage_policies(RunSpec(TOY, stranger(Stumbling), seed=0).resolve())

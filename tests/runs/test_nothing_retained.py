@@ -102,7 +102,7 @@ def test_questions_ask_about_the_scenes_of_other_tasks() -> None:
 def test_a_method_that_replays_begins_with_the_first_target(method: str, tmp_path: Path) -> None:
     record = run(method, tmp_path)
     assert record.error is None
-    assert record.costs["optimiser_steps"] == 20
+    assert record.costs.optimiser_steps == 20
 
 
 def test_a_method_that_cannot_do_without_says_so(tmp_path: Path) -> None:
@@ -135,8 +135,8 @@ def test_retention_is_missing_and_forgetting_is_of_earlier_targets(record: Recor
 
 def test_table_and_page_are_drawn_without_retention(record: Record, tmp_path: Path) -> None:
     for method in ("sft", "joint"):
-        run = {**record.run, "method": method, "uses": dataclasses.asdict(load_method(method).uses)}
-        other = dataclasses.replace(record, run=run)
+        uses = dataclasses.asdict(load_method(method).uses)
+        other = dataclasses.replace(record, run=dataclasses.replace(record.run, method=method, uses=uses))
         write_record(other, record_path(tmp_path / "records", "clbench/Toy-v0", method, 0))
     importlib.import_module("clbench.leaderboard.cli").show(records=tmp_path / "records")
     assert "| sft |" in (tmp_path / "site" / "LEADERBOARD.md").read_text()

@@ -64,7 +64,7 @@ def whole_run(shape: Layout, success: Any, **arrays: Any) -> Scores:
         **missing,
         **arrays,
     }
-    return Scores(shape, success, **given)
+    return Scores(layout=shape, success=success, **given)
 
 
 def random_run(generator: np.random.Generator, shape: Layout) -> Scores:

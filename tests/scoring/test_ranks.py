@@ -33,12 +33,8 @@ from clbench.scoring.layout import Layout
 from clbench.scoring.ranks import (
     UNKNOWN_DEVIATION,
     deviation_of_differences,
-    interquartile_mean,
-    probability_of_improvement,
     ranks,
-    share_of_wins,
     tie_groups,
-    trimmed_mean,
 )
 from clbench.scoring.scores import Scores
 from clbench.testing import TOY
@@ -54,7 +50,7 @@ def run(final: Any) -> Scores:
     layout = Layout(skills, ("target",), (), tuple(range(final.shape[1])), (), (), (100,), ("left",))
     missing = np.full((1, 1), np.nan)
     return Scores(
-        layout,
+        layout=layout,
         success=np.stack([np.ones_like(final), final]),
         on_the_way=np.zeros((1, 0, len(final), 0)),
         perturbed=np.full((2, len(skills), final.shape[1]), np.nan),
@@ -89,84 +85,6 @@ def board(
             seed: run(generator.random((tasks, 20)) < of_seeds[seed]) for seed in range(seeds)
         }
     return rows
-
-
-# ---- interquartile mean and probability of improvement -----------------------------------------------------
-
-
-@pytest.mark.parametrize("shape", [(1, 2), (3, 3), (3, 10), (5, 9)])
-def test_the_interquartile_mean_is_that_of_scipy(shape: tuple[int, int]) -> None:
-    scores = np.random.default_rng(0).random((4, *shape))
-    expected = [stats.trim_mean(some.ravel(), 0.25) for some in scores]
-    assert trimmed_mean(scores) == pytest.approx(np.array(expected))
-
-
-def test_the_interquartile_mean_is_over_seeds_and_trained_tasks() -> None:
-    generator = np.random.default_rng(0)
-    runs = {seed: run(generator.random((5, 20)) < 0.4 + 0.1 * seed) for seed in range(3)}
-    finals = [one.success[-1].mean(axis=-1) for one in runs.values()]
-    got = interquartile_mean(runs, generator)
-    assert got.value == pytest.approx(stats.trim_mean(np.ravel(finals), 0.25))
-    assert got.value is not None
-    assert got.low is not None
-    assert got.high is not None
-    assert 0 <= got.low < got.value < got.high <= 1
-    without_one = [stats.trim_mean(np.ravel(np.delete(finals, seed, axis=0)), 0.25) for seed in range(3)]
-    angles = np.arcsin(np.sqrt(without_one))
-    reach = stats.t.ppf(0.975, 2) * np.sqrt(2 / 3 * ((angles - angles.mean()) ** 2).sum())
-    assert got.high == pytest.approx(np.sin(np.arcsin(np.sqrt(got.value)) + reach) ** 2, rel=1e-3)
-
-
-def test_one_bad_task_of_one_seed_does_not_move_the_interquartile_mean() -> None:
-    good = row(8, 8, 8)
-    bad = {**good, 2: run([[1] * 8 + [0] * 2] * 3 + [[0] * 10])}
-    for runs in (good, bad):
-        assert interquartile_mean(runs, np.random.default_rng(0)).value == pytest.approx(0.8)
-
-
-def test_the_probability_of_improvement_is_that_of_plain_loops_and_of_mann_and_whitney() -> None:
-    generator = np.random.default_rng(0)
-    for runs, others, tasks in itertools.product((1, 3), (2, 5), (1, 4)):
-        scores = generator.integers(0, 5, (runs, tasks)) / 5
-        theirs = generator.integers(0, 5, (others, tasks)) / 5
-        wins = [
-            (x > y) + 0.5 * (x == y)
-            for task in range(tasks)
-            for x in scores[:, task]
-            for y in theirs[:, task]
-        ]
-        got = float(share_of_wins(scores, theirs))
-        assert got == pytest.approx(np.mean(wins))
-        statistics = [stats.mannwhitneyu(scores[:, t], theirs[:, t]).statistic for t in range(tasks)]
-        assert got == pytest.approx(np.mean(statistics) / (runs * others))
-
-
-def test_the_probability_of_improvement_is_over_pairs_of_runs_on_each_trained_task() -> None:
-    # On the first task wins, draw, win, win of four pairs; on the target all draws.
-    ours = {0: run([[1, 1], [1, 0]]), 1: run([[1, 0], [1, 0]])}
-    theirs = {0: run([[0, 0], [0, 1]]), 1: run([[1, 0], [1, 0]])}
-    got = probability_of_improvement(ours, theirs, np.random.default_rng(0))
-    assert got.value == pytest.approx((3.5 / 4 + 0.5) / 2)
-
-
-def test_the_probability_of_improvement_of_a_method_over_itself_is_one_half() -> None:
-    generator = np.random.default_rng(0)
-    runs = board(generator, [0.5], 3, 0.1)["method_0"]
-    assert probability_of_improvement(runs, runs, generator) == Estimate(0.5, 0.5, 0.5)
-    other = board(generator, [0.3], 3, 0.1)["method_0"]
-    one, two = (probability_of_improvement(*pair, generator) for pair in ((runs, other), (other, runs)))
-    assert (one.value or 0) + (two.value or 0) == pytest.approx(1)
-    assert (one.low or 0) + (two.high or 0) == pytest.approx(1)
-
-
-def test_only_common_seeds_and_the_same_tasks_are_compared() -> None:
-    generator = np.random.default_rng(0)
-    good, bad = equal_run(9), equal_run(1)
-    assert probability_of_improvement({0: good, 1: bad}, {0: bad, 2: good}, generator).value == 1
-    assert probability_of_improvement({0: good}, {1: bad}, generator) == NOTHING
-    assert interquartile_mean({}, generator) == NOTHING
-    with pytest.raises(ValueError, match="same tasks"):
-        probability_of_improvement({0: good}, {0: equal_run(9, episodes=20)}, generator)
 
 
 # ---- tie groups --------------------------------------------------------------------------------------------
@@ -370,8 +288,8 @@ def test_the_command_line_says_before_a_run_how_wide_the_intervals_will_be(
 ) -> None:
     scenario = "clbench.testing:clbench/Toy-v0"
     spec = RunSpec(scenario, "sft", 0)
-    run_section, scenario_section = spec.describe()
-    record = replace(make_record(np.ones((3, 5))), run=run_section, scenario=scenario_section)
+    run = spec.resolve()
+    record = replace(make_record(np.ones((3, 5))), run=run.info, scenario=run.scenario_info)
     write_record(record, spec.path(tmp_path))
     monkeypatch.setattr(sys, "path", [*sys.path])  # the command adds the working directory
     run_command(scenario, "sft", seeds=1, records=tmp_path)

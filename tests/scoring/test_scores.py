@@ -166,7 +166,7 @@ def test_perturbed_episodes_are_drawn_with_those_of_their_numbers(scores: Callab
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({}, "119 are perturbed, not 120: each retained skill has those of the report, at the end of each"),
+        ({}, "119 are perturbed, not 120: each retained skill has perturbed test episodes at the end of each stage"),
         (
             {"task": "target_0"},
             "the perturbed episode 19 of target_0 at stage 2, step 400, must not be there",
@@ -177,7 +177,7 @@ def test_perturbed_episodes_are_drawn_with_those_of_their_numbers(scores: Callab
         ({"episode": 3}, "an episode is there twice"),
     ],
 )
-def test_perturbed_episodes_other_than_those_of_the_report_are_refused(
+def test_perturbed_episodes_other_than_the_test_episodes_are_refused(
     change: dict[str, Any], words: str, make_record: MakeRecord
 ) -> None:
     record = make_record(MATRIX, perturbed=PERTURBED)
@@ -256,8 +256,8 @@ def test_the_order_of_rows_does_not_matter(make_record: MakeRecord) -> None:
         ("step", 100, "no evaluation point"),
         ("episode", None, "impossible"),
         ("episode", 1, "twice"),
-        ("split", "training", "'training', which is none of selection, report, perturbed"),
-        ("split", [], "which is none of selection, report, perturbed"),
+        ("split", "training", "'training', which is none of validation, test, perturbed"),
+        ("split", [], "which is none of validation, test, perturbed"),
         ("split", "perturbed", "there are perturbed ones, but its run does not say perturb"),
         ("success", 0.5, "neither true nor false"),
         ("success", "yes", "neither true nor false"),
@@ -336,7 +336,7 @@ def test_a_row_of_the_policy_table_that_cannot_be_is_refused(
 @pytest.mark.parametrize("names", [None, "skill_0", [1], ["target_0"]])
 def test_a_scenario_without_clear_task_names_is_refused(names: Any, make_record: MakeRecord) -> None:
     record = make_record(MATRIX)
-    record.scenario["retained"] = names
+    record.scenario.retained = names
     with pytest.raises(RecordError, match="scenario"):
         Scores.from_record(record)
 
@@ -344,15 +344,15 @@ def test_a_scenario_without_clear_task_names_is_refused(names: Any, make_record:
 @pytest.mark.parametrize("steps", [None, 400, [], [400, 100], [400, 400], [0, 400], [100.0], ["400"], [True]])
 def test_a_scenario_without_clear_evaluation_steps_is_refused(steps: Any, make_record: MakeRecord) -> None:
     record = make_record(MATRIX)
-    record.scenario["evaluation_steps"] = steps
+    record.scenario.evaluation_steps = steps
     with pytest.raises(RecordError, match="evaluation_steps"):
         Scores.from_record(record)
 
 
 def test_a_run_of_an_unknown_split_is_refused(make_record: MakeRecord) -> None:
     record = make_record(MATRIX)
-    record.run["split"] = ["test"]
-    with pytest.raises(RecordError, match="split must be report or selection"):
+    record.run.split = "all"
+    with pytest.raises(RecordError, match="split must be test or validation"):
         Scores.from_record(record)
 
 

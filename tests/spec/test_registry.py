@@ -9,7 +9,7 @@ from typing import Any
 import gymnasium
 import pytest
 
-from clbench.spec.registry import load_scenario, register, scenario_at
+from clbench.spec.registry import load_scenario, opened_scenario, register
 from clbench.spec.scenario import Scenario
 from clbench.testing import TOY
 
@@ -96,7 +96,7 @@ def test_a_word_outside_the_vocabulary_is_named_with_the_nearest(module: types.M
     with pytest.raises(
         ValueError, match=r"'wright' in 'go wright' is not in the vocabulary\. Did you mean 'right'"
     ):
-        scenario_at("strangers_module:ODD")
+        opened_scenario("strangers_module:ODD")
 
 
 @pytest.mark.parametrize(

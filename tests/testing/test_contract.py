@@ -1,12 +1,8 @@
 """The contract: faults that were planted are found, each by its own message; sound methods pass."""
 
 import dataclasses
-import os
 import pickle
 import random
-import sys
-import time
-import warnings
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, ClassVar
@@ -16,7 +12,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from clbench.learning.method import Method, Progress, Stage, State
+from clbench.learning.method import Method, MethodState, Progress, Stage
 from clbench.learning.prior import Prior, Source, Uses
 from clbench.learning.registry import load_method
 from clbench.policy.batch import Batch
@@ -77,66 +73,6 @@ class Forgetful(Method):
 
     def loss(self, policy: Policy, batch: Batch) -> Tensor:
         return policy.action_loss(batch).mean()
-
-
-@dataclasses.dataclass
-class Demanding(Method):
-    """Has a hyper-parameter without a default."""
-
-    rate: float
-
-
-@dataclasses.dataclass
-class Prepared(Method):
-    """Sets what it learns in the constructor."""
-
-    def __post_init__(self) -> None:
-        self.buffer: list[Tensor] = []
-
-
-@dataclasses.dataclass
-class Rounding(Method):
-    """Changes what it is given."""
-
-    rate: float = 0.5
-
-    def __post_init__(self) -> None:
-        self.rate = round(self.rate)
-
-
-@dataclasses.dataclass
-class Loaded(Method):
-    """Has a tensor as hyper-parameter."""
-
-    weights: Tensor = dataclasses.field(default_factory=lambda: torch.zeros(2))
-
-
-@dataclasses.dataclass(eq=False)
-class Unequal(Method):
-    """Has objects that differ."""
-
-
-@dataclasses.dataclass
-class Learned(Method):
-    """Has a field for what it learns."""
-
-    anchor: float = dataclasses.field(default=0.0, init=False)
-
-
-@dataclasses.dataclass
-class Seeded(Method):
-    """Seeds in the constructor."""
-
-    def __post_init__(self) -> None:
-        torch.manual_seed(0)
-
-
-@dataclasses.dataclass
-class Picky(Method):
-    """Refuses its own defaults."""
-
-    def __post_init__(self) -> None:
-        raise ValueError("never")
 
 
 # ---- faults of a hook --------------------------------------------------------------------------------------
@@ -298,197 +234,6 @@ class Early(Method):
         prior.demonstrations.sample(8)
 
 
-# ---- faults of repetition and state ------------------------------------------------------------------------
-
-
-@dataclasses.dataclass
-class Timed(Method):
-    """Weighs by the clock."""
-
-    def loss(self, policy: Policy, batch: Batch, progress: Progress) -> Tensor:
-        return policy.action_loss(batch).mean() * (1 + time.perf_counter() % 1)
-
-
-@dataclasses.dataclass
-class Remembers(Method):
-    """Counts in its class."""
-
-    runs: ClassVar[list[int]] = []
-
-    def prepare(self, policy: Policy, prior: Prior) -> None:
-        self.runs.append(1)
-
-    def diagnostics(self) -> dict[str, Any]:
-        return {"runs": len(self.runs)}
-
-
-@dataclasses.dataclass
-class Reseeds(Method):
-    """Seeds before it draws."""
-
-    def batch(self, target: Source[Batch], prior: Prior) -> Batch:
-        np.random.seed(0)  # noqa: NPY002 - the fault
-        return target.sample(target.batch_size)
-
-
-@dataclasses.dataclass
-class Anchored(Method):
-    """Keeps the anchor in the object alone."""
-
-    def prepare(self, policy: Policy, prior: Prior) -> None:
-        self.anchor = policy.state_mean.clone()
-
-    def loss(self, policy: Policy, batch: Batch, progress: Progress) -> Tensor:
-        return policy.action_loss(batch).mean() + self.anchor.sum()
-
-
-@dataclasses.dataclass
-class Restarts(Method):
-    """Begins to count anew without a word."""
-
-    def gradients(self, policy: Policy, loss: Tensor) -> None:
-        self.count = getattr(self, "count", 0) + 1
-        loss.backward()  # type: ignore[no-untyped-call]
-        for parameter in policy.parameters():
-            if parameter.grad is not None:
-                parameter.grad.mul_(0.1**self.count)
-
-
-@dataclasses.dataclass
-class Structured(Method):
-    """Has a list as state."""
-
-    def state(self) -> State:
-        return {"losses": [0.5]}
-
-
-@dataclasses.dataclass
-class OneWay(Method):
-    """Cannot take back its state."""
-
-    def state(self) -> State:
-        return {"count": 1}
-
-
-@dataclasses.dataclass
-class Grows(Method):
-    """Adds a parameter and never again."""
-
-    def prepare(self, policy: Policy, prior: Prior) -> None:
-        policy.register_parameter("scale", nn.Parameter(torch.ones(3)))
-
-
-@dataclasses.dataclass
-class Draws(Method):
-    """Draws while it tells."""
-
-    def diagnostics(self) -> dict[str, Any]:
-        return {"luck": bool(random.random() < 2)}
-
-
-# ---- faults that stay in the process -----------------------------------------------------------------------
-
-
-@dataclasses.dataclass
-class Threads(Method):
-    """Takes more threads."""
-
-    def prepare(self, policy: Policy, prior: Prior) -> None:
-        torch.set_num_threads(2)
-
-
-@dataclasses.dataclass
-class Doubles(Method):
-    """Changes the default dtype."""
-
-    def prepare(self, policy: Policy, prior: Prior) -> None:
-        torch.set_default_dtype(torch.float64)
-
-
-@dataclasses.dataclass
-class Blind(Method):
-    """Turns gradients off."""
-
-    def end_task(self, policy: Policy, stage: Stage) -> None:
-        torch.set_grad_enabled(False)
-
-
-@dataclasses.dataclass
-class Careless(Method):
-    """Allows what does not repeat itself."""
-
-    def start_task(self, policy: Policy, stage: Stage) -> Iterable[nn.Parameter]:
-        torch.use_deterministic_algorithms(False)
-        return policy.parameters()
-
-
-@dataclasses.dataclass
-class Exports(Method):
-    """Sets a variable of the environment."""
-
-    def prepare(self, policy: Policy, prior: Prior) -> None:
-        os.environ["LIVELY"] = "1"
-
-
-@dataclasses.dataclass
-class Moves(Method):
-    """Changes the working directory."""
-
-    def prepare(self, policy: Policy, prior: Prior) -> None:
-        os.chdir("/")
-
-
-@dataclasses.dataclass
-class Paths(Method):
-    """Changes where modules are looked for."""
-
-    def prepare(self, policy: Policy, prior: Prior) -> None:
-        sys.path.append("/nowhere")
-
-
-@dataclasses.dataclass
-class Quiet(Method):
-    """Silences warnings."""
-
-    def prepare(self, policy: Policy, prior: Prior) -> None:
-        warnings.simplefilter("ignore")
-
-
-@dataclasses.dataclass
-class Writes(Method):
-    """Writes a file."""
-
-    def end_task(self, policy: Policy, stage: Stage) -> None:
-        Path("losses.txt").write_text("0.5")
-
-
-@dataclasses.dataclass
-class Patches(Method):
-    """Changes what all policies are."""
-
-    def prepare(self, policy: Policy, prior: Prior) -> None:
-        setattr(Policy, "predict", Policy.act)  # noqa: B010 - mypy minds an assignment
-
-
-# ---- faults of learning ------------------------------------------------------------------------------------
-
-
-@dataclasses.dataclass
-class Standstill(Method):
-    """Takes steps of length 0."""
-
-    def learning_rate(self, scheduled: float, progress: Progress) -> float:
-        return 0.0
-
-
-@dataclasses.dataclass
-class Backwards(Method):
-    """Ascends."""
-
-    def loss(self, policy: Policy, batch: Batch, progress: Progress) -> Tensor:
-        return -policy.action_loss(batch).mean()
-
-
 FAULTS: list[tuple[Any, str, str, str]] = [
     (3, "declaration", "a subclass of clbench.Method", "found:    3"),
     (Plain, "declaration", "a dataclass", "Plain is not decorated"),
@@ -498,14 +243,6 @@ FAULTS: list[tuple[Any, str, str, str]] = [
     (Misdeclared, "declaration", "uses.questions to be one of never, prepare, throughout", "'always'"),
     (Misspelt, "declaration", "did you mean gradients()?", "gradient() is never called"),
     (Forgetful, "declaration", "loss(self, policy, batch, progress)", "loss(self, policy, batch)"),
-    (Demanding, "constructor", "a default for every hyper-parameter", "rate has none"),
-    (Prepared, "constructor", "only hyper-parameters to be stored", "it sets buffer"),
-    (Rounding, "constructor", "to be kept as they are given", "rate=0.5 becomes 0"),
-    (Loaded, "constructor", "numbers, truth values, text", "weights is a Tensor"),
-    (Unequal, "constructor", "equal objects from equal arguments", "two objects of the defaults differ"),
-    (Learned, "constructor", "every field to be a hyper-parameter", "anchor has init=False"),
-    (Seeded, "constructor", "nothing to be done but storing", "torch's random generator was moved or set"),
-    (Picky, "constructor", "an object of the defaults to be made", "ValueError: never"),
     (Counts, "sound hooks", "the optimiser steps that it took, or None", "0.5"),
     (Idle, "sound hooks", "only a guide, `uses = Uses(reference=True)`, may train none", "none"),
     (Nameless, "sound hooks", "an iterable of the policy's parameters", "a str among them"),
@@ -524,27 +261,6 @@ FAULTS: list[tuple[Any, str, str, str]] = [
     (Hoards, "declared data", "to draw from what it is handed", "after the hooks that it was handed to"),
     (Modest, "declared data", "prior questions to be drawn", "they are never drawn; leave them out"),
     (Early, "declared data", "prior demonstrations to be drawn", "in prepare() alone; declare 'prepare'"),
-    (Timed, "same numbers", "two runs with one seed to be equal", "differs in stage 1 (right) by up to"),
-    (Remembers, "same numbers", "two runs with one seed to be equal", "diagnostics differs in prepare"),
-    (Reseeds, "seeding", "draw, but do not seed", "after batch() numpy.random stands alike"),
-    (Anchored, "state", "a new object that has what load_state() sets", "no attribute 'anchor'"),
-    (Restarts, "state", "state() to return all that later stages need", "differs in stage 2 (down)"),
-    (Structured, "state", "tensors and plain values", "a list, 'losses'"),
-    (OneWay, "state", "load_state() to go through", "returns a state() but has no load_state()"),
-    (Grows, "state", "load_state() to add to a plain policy what prepare() added", "scale"),
-    (Draws, "global state", "as it was", "after diagnostics() Python's random generator was moved"),
-    (Threads, "global state", "as it was", "after prepare() torch.get_num_threads() is 2, was 1"),
-    (Doubles, "global state", "as it was", "torch.get_default_dtype() is torch.float64"),
-    (Blind, "global state", "as it was", "after end_task() torch.is_grad_enabled() is False"),
-    (Careless, "global state", "as it was", "are_deterministic_algorithms_enabled() is False"),
-    (Exports, "global state", "as it was", "os.environ differs in LIVELY"),
-    (Moves, "global state", "as it was", "os.getcwd() is /"),
-    (Paths, "global state", "as it was", "sys.path differs in /nowhere"),
-    (Quiet, "global state", "as it was", "warnings.filters differs in"),
-    (Writes, "global state", "in clbench's cache alone", "losses.txt is written"),
-    (Patches, "global state", "as it was", "the class clbench.Policy differs in predict"),
-    (Standstill, "learning", "a mean return of -", "before"),
-    (Backwards, "learning", "only a guide, `uses = Uses(reference=True)`, may learn nothing", "before"),
 ]
 
 
@@ -587,23 +303,6 @@ def test_the_page_of_the_contract_has_a_heading_for_each_clause_in_order() -> No
     assert headings == [str(check).replace("_", " ").capitalize() for check in method_checks(Method)]
 
 
-def test_what_a_faulty_method_leaves_behind_is_put_back(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-
-    def process() -> list[Any]:
-        torch_settings = (torch.get_num_threads(), torch.get_default_dtype(), torch.is_grad_enabled())
-        generators = (random.getstate(), str(np.random.get_state()), torch.get_rng_state().tolist())  # noqa: NPY002
-        return [*torch_settings, *generators, dict(os.environ), Path.cwd(), list(sys.path), Policy.predict]
-
-    before = process()
-    for cls in (Seeded, Threads, Doubles, Exports, Moves, Patches, Draws):
-        with pytest.raises(ContractError):
-            check_method(cls)
-    assert process() == before
-
-
 @dataclasses.dataclass(frozen=True)
 class Sound(Method):
     """Draws from every generator, keeps a state, and uses all that it declares."""
@@ -626,10 +325,10 @@ class Sound(Method):
         pull: Tensor = noise * (policy.state_mean - self.anchor).sum()
         return policy.action_loss(demonstrations).mean() + policy.answer_loss(questions).mean() + pull
 
-    def state(self) -> State:
+    def state(self) -> MethodState:
         return {"anchor": self.anchor, "words": self.words}
 
-    def load_state(self, policy: Policy, state: State) -> None:
+    def load_state(self, policy: Policy, state: MethodState) -> None:
         object.__setattr__(self, "anchor", state["anchor"])
 
 

@@ -1,7 +1,5 @@
 import dataclasses
 import functools
-import threading
-import time
 
 import gymnasium
 import numpy as np
@@ -12,7 +10,6 @@ from clbench.spec.registry import load_scenario
 from clbench.spec.task import Task
 from clbench.testing import ToyWorld
 from clbench.worlds.lanes import Lanes, PlainVectorWorld, check_perturbable, vector_world
-from clbench.worlds.threads import Team
 
 TOY = load_scenario("clbench.testing:clbench/Toy-v0")
 LEFT, UP = TOY.task("left"), TOY.task("up")
@@ -20,6 +17,8 @@ LEFT, UP = TOY.task("left"), TOY.task("up")
 
 class OwnVectorWorld(PlainVectorWorld):
     """A suite's own vector world: it remembers what it was made with."""
+
+    perturbable = True
 
     def __init__(self, lanes: int, threads: int, perturbed: bool = False) -> None:
         super().__init__(functools.partial(ToyWorld, perturbed=perturbed), lanes)
@@ -34,6 +33,8 @@ class OtherToyWorld(ToyWorld):
 
 class SteadyWorld(ToyWorld):
     """The toy world of somebody who never heard of perturbations."""
+
+    perturbable = False
 
     def __init__(self, render_mode: str | None = None) -> None:
         super().__init__(render_mode)
@@ -118,11 +119,11 @@ def test_perturbed_episodes_run_beside_plain_ones_which_they_do_not_change(other
 @pytest.mark.parametrize(
     ("world", "own", "message"),
     [
-        ("SteadyWorld", None, "clbench.testing:SteadyWorld takes no argument `perturbed`"),
+        ("SteadyWorld", None, "clbench.testing:SteadyWorld does not declare `perturbable = True`"),
         (
             "SteadyWorld",
             SteadyVectorWorld,
-            "the vector world of clbench.testing:SteadyWorld takes no argument",
+            "the vector world of clbench.testing:SteadyWorld does not declare `perturbable = True`",
         ),
     ],
 )
@@ -136,36 +137,7 @@ def test_a_task_whose_world_cannot_be_perturbed_is_named_with_the_way_out(
     with pytest.raises(ValueError, match="The task 'up' cannot be perturbed: ") as raised:
         check_perturbable([LEFT, task])
     assert message in str(raised.value)
-    assert "Run without --perturb, or give it one, as docs/guide/your_scenario.md shows." in str(raised.value)
+    assert "Run without --perturb, or perturb its episodes as docs/guide/your_scenario.md shows." in str(
+        raised.value
+    )
     assert Lanes(1).reset([0], [3], [task]).shape == (1, 4)
-
-
-@pytest.mark.parametrize("threads", [1, 3])
-def test_a_team_does_each_piece_once_and_goes_on_after_one_that_failed(threads: int) -> None:
-    team, done = Team(threads), list[int]()
-
-    def work(item: int) -> None:
-        if item == 7:
-            raise ValueError("no seven")
-        done.append(item)
-
-    team.each(work, range(5))
-    assert sorted(done) == [0, 1, 2, 3, 4]
-    with pytest.raises(ValueError, match="no seven"):
-        team.each(work, [7, 7])
-    team.each(work, [])
-    team.each(work, [5])
-    assert sorted(done) == [0, 1, 2, 3, 4, 5]
-    team.close()
-
-
-def test_a_team_that_nobody_closed_leaves_no_thread_behind() -> None:
-    before = threading.active_count()
-    team = Team(3)
-    team.each(time.sleep, [0.01] * 3)
-    assert threading.active_count() == before + 2
-    del team
-    deadline = time.monotonic() + 10
-    while threading.active_count() > before and time.monotonic() < deadline:
-        time.sleep(0.01)
-    assert threading.active_count() == before

@@ -222,7 +222,7 @@ def test_an_outcome_does_not_depend_on_what_else_is_seen() -> None:
 
 @pytest.mark.parametrize("name", method_names())
 def test_every_method_learns_from_pictures(name: str, tmp_path: Path) -> None:
-    trainer = Trainer(SHORT, lambda: build_method(name, FEWER.get(name, {})), 0, "cpu")
+    trainer = Trainer.open(SHORT, lambda: build_method(name, FEWER.get(name, {})), 0, "cpu")
     trainer.prepare()
     trainer.save(tmp_path / "0", 0)
     trainer.load(tmp_path / "0", 0)

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from clbench.records.content import sealed
 from clbench.records.paths import record_path
 from clbench.records.record import Record
 from clbench.records.writer import write_record
@@ -118,11 +119,12 @@ NAMES = [
 ]
 
 FIELDS = [
-    ("schema", 1, "is of the older schema 1"),
-    ("schema", 3, "is no record of schema 2"),
-    ("schema", "2", "is no record of schema 2"),
-    ("score", 0.99, "No field of a record of schema 2 is called 'score'"),
-    ("costs", ABSENT, "a record of schema 2: costs is missing"),
+    ("schema", 1, "a record: schema 1 has no policy"),
+    ("schema", 2, "run: order must be above 0 in schema 2"),
+    ("schema", 4, "is of schema 4, newer than 3: update clbench"),
+    ("schema", "3", "is no record of schema 3"),
+    ("score", 0.99, "No field of a record of schema 3 is called 'score'"),
+    ("costs", ABSENT, "a record of schema 3: costs is missing"),
     ("costs.bytes_kept", -1, "costs: bytes_kept must not be below 0"),
     ("costs.optimiser_steps", "few", "costs: optimiser_steps must be a whole number"),
     ("costs.parametres", 1, "No field of costs is called 'parametres'. Did you mean 'parameters'?"),
@@ -153,7 +155,7 @@ FIELDS = [
 ROWS = [
     ("episodes.stage", [], "the columns of episodes have different lengths"),
     ("episodes.reward", [1.0], "episodes must have the columns"),
-    ("episodes", None, "episodes must have the columns"),
+    ("episodes", None, "episodes must be an object with named entries"),
     ("answers.kind", "left", "the columns of answers have different lengths"),
     ("episodes.task.0", ["skill_0"], "episodes: task must not hold lists or objects"),
     ("episodes.task.0", "unseen", "row 0 is of a task that is not in the scenario: 'unseen'"),
@@ -180,7 +182,7 @@ def test_a_record_that_cannot_be_is_refused_by_what_is_wrong_with_it(
     def damage() -> None:
         values = json.loads((board / MINE).read_text(encoding="utf-8"))
         put(values, field, value)
-        (board / MINE).write_text(json.dumps(values), encoding="utf-8")
+        (board / MINE).write_text(json.dumps(sealed(values)), encoding="utf-8")
 
     check_refused(board, damage, MINE, reason)
 
@@ -234,16 +236,16 @@ FILES = [
     (written(b"\x00" * 64), "cannot be read as JSON"),
     (written(b"\xff\xfe{"), "cannot be read as JSON"),
     (written(b"[" * 100_000), "cannot be read as JSON"),
-    (written(b"[]"), "is no record of schema 2"),
-    (written(b"{'schema': 2}"), "cannot be read as JSON"),
-    (written(pickle.dumps({"schema": 2})), "cannot be read as JSON"),
+    (written(b"[]"), "is no record of schema 3"),
+    (written(b"{'schema': 3}"), "cannot be read as JSON"),
+    (written(pickle.dumps({"schema": 3})), "cannot be read as JSON"),
     (encoded, "cannot be read as JSON"),
     (marked, "cannot be read as JSON"),
     (inflated, "has 8,589,934,592 bytes, more than 8,388,608"),
     (linked, "is a symbolic link"),
     (piped, "is no regular file"),
     (replaced_by_folder, "cannot be read (Is a directory)"),
-    (replaced('"schema": 2', '"schema": 2, "schema": 2'), "the name 'schema' is there twice"),
+    (replaced('"schema": 3', '"schema": 3, "schema": 3'), "the name 'schema' is there twice"),
     (replaced('"seed": 0', '"seed": 0, "seed": 1'), "the name 'seed' is there twice"),
     (replaced('"seed": 0', '"seed": ' + "9" * 5000), "cannot be read as JSON"),
     (replaced("0.5", "NaN"), "NaN is no number"),
@@ -298,7 +300,7 @@ def test_a_record_cannot_claim_to_be_of_another_run(
             put(values["run"], field, value)
         path = board / place
         path.parent.mkdir(exist_ok=True)
-        path.write_text(json.dumps(values), encoding="utf-8")
+        path.write_text(json.dumps(sealed(values)), encoding="utf-8")
 
     check_refused(board, damage, place, reason)
 
@@ -339,7 +341,7 @@ def test_a_record_that_would_take_all_memory_is_refused_before_it_does(
     def damage() -> None:
         values = json.loads((board / MINE).read_text(encoding="utf-8"))
         grow(values)
-        (board / MINE).write_text(json.dumps(values), encoding="utf-8")
+        (board / MINE).write_text(json.dumps(sealed(values)), encoding="utf-8")
 
     check_refused(board, damage, MINE, reason)
 
@@ -360,7 +362,7 @@ def test_all_that_is_refused_together_changes_no_number_of_the_table(
         if number < len(edits):
             values = json.loads(path.read_text(encoding="utf-8"))
             put(values, *edits[number][:2])
-            path.write_text(json.dumps(values), encoding="utf-8")
+            path.write_text(json.dumps(sealed(values)), encoding="utf-8")
         else:
             FILES[number - len(edits)][0](path)
     show(records=board)
@@ -401,7 +403,7 @@ def test_records_of_strangers_do_not_outvote_those_of_built_in_methods(count: in
         values["run"]["method"] = f"a{number}/mine"
         path = board / "Toy-v0" / f"a{number}--mine" / "seed-0.json"
         path.parent.mkdir()
-        path.write_text(json.dumps(values), encoding="utf-8")
+        path.write_text(json.dumps(sealed(values)), encoding="utf-8")
     (board / "Toy-v0" / "sft" / "seed-1.json").unlink()
     before = ["Toy-v0/sft/seed-0.json", MINE, "Toy-v0/theirs--plain/seed-0.json"]
     after, refused = shown(board)
@@ -437,7 +439,7 @@ def test_nothing_that_a_record_names_is_imported(
         label = "evil_module.Evil" + ("+strength=1" if folder == "controls" else "")
         path = tmp_path / "leaderboard" / folder / "Toy-v0" / label / "seed-0.json"
         path.parent.mkdir(parents=True)
-        path.write_text(json.dumps(changed), encoding="utf-8")
+        path.write_text(json.dumps(sealed(changed)), encoding="utf-8")
     cli = importlib.import_module("clbench.leaderboard.cli")
     cli.show()
     cli.claims(scenario=SCENARIO)

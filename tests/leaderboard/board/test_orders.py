@@ -12,12 +12,14 @@ import pandas
 import pytest
 
 from clbench.base.entry_points import resolve
+from clbench.records.content import sealed
 from clbench.records.paths import record_path
 from clbench.records.record import Record
 from clbench.records.writer import write_record
 from clbench.spec.scenario import target_order
 
 SCENARIO = "clbench/Toy-v0"
+BUDGET = {"curve_episodes": 20, "test_episodes": 20, "validation_episodes": 10}
 TARGETS = ["target_0", "target_1", "target_2"]
 
 
@@ -29,8 +31,8 @@ def add(make_record: Callable[..., Record], tmp_path: Path) -> Callable[..., Pat
         matrix = np.full((4, 6), final)
         record = make_record(matrix, groups=(2, 3, 1), method=method, seed=seed)
         if order:
-            record.run["order"] = order
-            record.scenario["target"] = [TARGETS[place] for place in target_order(3, order)]
+            record.run.order = order
+            record.scenario.target = [TARGETS[place] for place in target_order(3, order)]
         path = record_path(tmp_path / "leaderboard" / "records", SCENARIO, method, seed, order)
         write_record(record, path)
         return path
@@ -124,7 +126,7 @@ def test_a_method_that_was_run_in_other_orders_alone_has_no_row_and_it_is_said_w
 def edit(path: Path, part: str, **values: Any) -> None:
     record = json.loads(path.read_text(encoding="utf-8"))
     record[part].update(values)
-    path.write_text(json.dumps(record), encoding="utf-8")
+    path.write_text(json.dumps(sealed(record)), encoding="utf-8")
 
 
 @pytest.mark.parametrize(
@@ -134,7 +136,7 @@ def edit(path: Path, part: str, **values: Any) -> None:
         ("run", {"order": 6}, "3 targets have orders 0 to 5, not 6"),
         ("run", {"order": 10**12}, "3 targets have orders 0 to 5"),
         ("scenario", {"target": TARGETS}, "its scenario is not that of most records: target differ."),
-        ("scenario", {"budget": {"curve_episodes": 20}}, "its scenario is not that of most records: budget"),
+        ("scenario", {"budget": BUDGET}, "its scenario is not that of most records: budget"),
     ],
 )
 def test_a_record_that_is_not_of_its_order_is_not_counted(

@@ -1,5 +1,6 @@
 """The page of the claims: every verdict follows from records by its rule, and nothing makes it fail."""
 
+import dataclasses
 import json
 import re
 from collections.abc import Callable
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 
 from clbench.base.entry_points import resolve
+from clbench.records.content import sealed
 from clbench.records.paths import record_path
 from clbench.records.record import Record
 from clbench.records.writer import write_record
@@ -85,7 +87,7 @@ class Bench:
                 changes=changed,
                 settings=changed,
             )
-            record.costs.update(costs or {})
+            record.costs = dataclasses.replace(record.costs, **(costs or {}))
             record.diagnostics.update(diagnostics or {})
             if edit:
                 edit(record)
@@ -360,7 +362,7 @@ def test_a_control_that_was_not_evaluated_like_the_board_is_left_out_with_its_re
     bench.add("frozen", right=(500, 500))
     bench.add("aegis", right=(500, 500))
     bench.add(
-        "aegis+direction=random", edit=lambda record: record.scenario["budget"].update(adaptation_steps=9)
+        "aegis+direction=random", edit=lambda record: record.scenario.budget.update(adaptation_steps=9)
     )
     page = bench.page()
     assert "--set.direction random" in section(page, "A4")
@@ -385,7 +387,7 @@ def test_words_of_strangers_stay_on_their_line_and_are_no_markup(bench: Bench) -
         record.error = {"where": "loss", "type": "ValueError", "message": hostile, "traceback": ""}
 
     def rename(record: Record) -> None:
-        record.run["method"] = hostile
+        record.run.method = hostile
 
     bench.add("consft", edit=fail)
     bench.add("lora+rank=4", edit=rename)
@@ -405,7 +407,7 @@ def test_any_damage_to_a_record_leaves_a_page(bench: Bench) -> None:
     whole = json.loads(path.read_text(encoding="utf-8"))
     for number, name in enumerate(whole):
         for damage in damages:
-            text = json.dumps({**whole, name: damage})
+            text = json.dumps({**sealed({**whole, name: damage}), name: damage})
             place = record_path(bench.folder / "controls", SCENARIO, f"sft+x={number}", 0)
             place.parent.mkdir(parents=True, exist_ok=True)
             place.write_text(text, encoding="utf-8")

@@ -1,5 +1,6 @@
 """The pages of the methods: everything from the code and the records, the same headings each."""
 
+import dataclasses
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -61,7 +62,7 @@ class Bench:
             settings={**fields.pop("settings", {}), **changed},
             split="validation" if selection else "test",
         )
-        record.costs.update(fields["costs"])
+        record.costs = dataclasses.replace(record.costs, **fields["costs"])
         record.diagnostics.update(fields["diagnostics"])
         write_record(record, record_path(self.folder / kind, SCENARIO, label, seed))
         return record
@@ -239,7 +240,7 @@ def test_records_of_the_board_are_not_settings_that_were_tried(bench: Bench) -> 
 def test_words_of_strangers_in_records_are_no_markup(bench: Bench) -> None:
     hostile = "x | y\n## z <b> ```"
     record = bench.add("aegis", diagnostics={"1": {hostile: 0.5}})
-    record.run.update(changes={hostile: hostile}, split="validation")
+    record.run.changes, record.run.split = {hostile: hostile}, "validation"
     record.episodes["split"] = ["validation" for _ in record.episodes["split"]]
     for name in record.episodes:
         record.episodes[name] = record.episodes[name][:5]

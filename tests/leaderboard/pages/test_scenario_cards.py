@@ -14,6 +14,7 @@ from PIL import Image
 from scipy import stats
 
 from clbench.base.entry_points import resolve
+from clbench.records.content import sealed
 from clbench.records.record import Record
 from clbench.records.writer import write_record
 from clbench.runs.spec import RunSpec
@@ -46,13 +47,13 @@ class Bench:
         for seed in seeds:
             asked = {(stage, "side"): (100, 90) for stage in range(3)}
             record = self.make_record(success, groups=(2, 2, 1), method=method, seed=seed, answers=asked)
-            made = chain.from_iterable(record.scenario[group] for group in GROUPS)
+            made = chain.from_iterable(getattr(record.scenario, group) for group in GROUPS)
             names = dict(zip(made, NAMES, strict=True))
             record.episodes["task"] = [names[name] for name in record.episodes["task"]]
-            spec = RunSpec("clbench.testing:clbench/Toy-v0", method, seed, order=order)
-            record.run, record.scenario = spec.describe()
+            run = RunSpec("clbench.testing:clbench/Toy-v0", method, seed, order=order).resolve()
+            record.run, record.scenario = run.info, run.scenario_info
             if online:
-                record.run["uses"] = ONLINE
+                record.run.uses = ONLINE
             steps = dict(zip((100, 200, 300, 400), (7, 15, 30, 60), strict=True))
             for table in (record.episodes, record.answers):
                 table["step"] = [steps.get(step, step) for step in table["step"]]
@@ -248,7 +249,7 @@ def test_records_of_another_version_of_the_scenario_are_told_from_it(bench: Benc
     for path in bench.records.rglob("*.json"):
         values = json.loads(path.read_text(encoding="utf-8"))
         values["scenario"]["budget"]["batch_size"] = 8
-        path.write_text(json.dumps(values), encoding="utf-8")
+        path.write_text(json.dumps(sealed(values)), encoding="utf-8")
     assert "The records are of another version of this scenario: budget differ." in bench.card()
 
 
@@ -257,7 +258,7 @@ def test_words_of_strangers_are_no_markup(bench: Bench) -> None:
     for path in bench.records.rglob("*.json"):
         values = json.loads(path.read_text(encoding="utf-8"))
         values["fingerprint"]["versions"] = {"<b>x": "1 | 2\n## y", "z": ["<b>"]}
-        path.write_text(json.dumps(values), encoding="utf-8")
+        path.write_text(json.dumps(sealed(values)), encoding="utf-8")
     bench.card()
     text = (bench.output / "Toy-v0.md").read_text(encoding="utf-8")
     assert "<b>" not in text.replace("\\<", "")

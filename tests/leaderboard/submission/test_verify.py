@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 
+from clbench.records.content import sealed
 from clbench.records.paths import record_path
 from clbench.records.reader import read_record
 from clbench.runs.run import execute
@@ -67,7 +68,7 @@ def failures(checks: list[Any]) -> str:
 def edit(path: Path, change: Edit) -> None:
     values = json.loads(path.read_text(encoding="utf-8"))
     change(values)
-    path.write_text(json.dumps(values), encoding="utf-8")
+    path.write_text(json.dumps(sealed(values)), encoding="utf-8")
 
 
 @pytest.mark.parametrize("tier", ["recomputed", "replayed", "retrained"])
@@ -262,9 +263,9 @@ def test_what_a_record_names_is_not_imported_unless_the_verifier_says_so(
     record = read_record(mine)
     place = record_path(mine.parents[2], "clbench/Toy-v0", "stranger:Mine", 0)
     place.parent.mkdir()
-    run = {**record.run, "method": "stranger:Mine"}
+    run = {**vars(record.run), "method": "stranger:Mine"}
     values = {**json.loads(mine.read_text(encoding="utf-8")), "run": run}
-    place.write_text(json.dumps(values), encoding="utf-8")
+    place.write_text(json.dumps(sealed(values)), encoding="utf-8")
     checks = verify(place, "replayed", honest)
     assert "stranger:Mine is not installed: name it with --method" in failures(checks)
     assert tiers.tier_of(place) == "recomputed"

@@ -115,7 +115,7 @@ def test_the_same_records_give_the_same_bytes_in_another_place_time_zone_and_loc
 
 def test_what_strangers_wrote_is_text(add: Callable[..., Path], records: Path) -> None:
     def edit(record: Record) -> None:
-        record.run["settings"] = {HOSTILE: HOSTILE}
+        record.run.settings = {HOSTILE: HOSTILE}
         record.diagnostics = {"1": {HOSTILE: HOSTILE, "x": [1.0, 2.0]}, HOSTILE: {"y": [HOSTILE]}}
         record.fingerprint.update(hardware={"processor": HOSTILE}, commit=HOSTILE, python=[{HOSTILE: 1}])
 
@@ -138,7 +138,7 @@ def test_what_strangers_wrote_is_text(add: Callable[..., Path], records: Path) -
 
 def test_a_command_can_be_pasted_whatever_its_record_says(add: Callable[..., Path], records: Path) -> None:
     def edit(record: Record) -> None:
-        record.run["device"] = "cpu; touch /tmp/gone"
+        record.run.device = "cpu; touch /tmp/gone"
         record.fingerprint["commit"] = {"id": "; touch /tmp/gone", "dirty": True}
 
     add("careless", 3, edit=edit)

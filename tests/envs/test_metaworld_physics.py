@@ -1,4 +1,4 @@
-"""The vector world of Meta-World, against the plain world and against Meta-World itself, bit for bit."""
+"""The physics of Meta-World, compared bit for bit with the plain world and with Meta-World itself."""
 
 import itertools
 from typing import Any
@@ -22,7 +22,7 @@ PlainWorld = resolve(WORLD)
 new_episode = resolve("clbench.envs.metaworld.episode:new_episode")
 PHYSICS = resolve("clbench.envs.metaworld.episode:PHYSICS")
 LONGEST = 120
-"""Steps after which an episode is begun anew if it has not ended."""
+"""Steps after which an unfinished episode begins anew."""
 
 State = NDArray[np.float32]
 
@@ -41,7 +41,7 @@ class Peer:
         del self.original.sawyer_observation_space
 
     def reset(self, seed: int) -> State:
-        """Begin both as one of our episodes begins, and return the first state."""
+        """Begin both as our episodes begin, and return the first state."""
         state: State = self.episode.begin(seed)
         self.original._last_rand_vec = self.episode._last_rand_vec
         self.original.reset()
@@ -60,7 +60,7 @@ class Peer:
 
 
 def check_start(episode: Any, original: Any) -> None:
-    """Check that our start is Meta-World's second reset of the same draw, but for where its physics lags."""
+    """Check that our start equals Meta-World's second reset of the same draw."""
     # MuJoCo's positions are those before the last of the 250 steps of the hand's way; ours are up to date
     mujoco.mj_forward(original.model, original.data)
     np.testing.assert_allclose(episode.data.qpos, original.data.qpos, rtol=0, atol=1e-6)
@@ -72,14 +72,14 @@ def check_start(episode: Any, original: Any) -> None:
         "_prev_obs",
         "prev_obs",
         "_last_stable_obs",
-    )  # in earlier steps, of which the episode here has none
+    )  # of earlier steps, which our episode does not have
     for name, value in vars(original).items():
         if isinstance(value, float | np.ndarray) and name not in (*PHYSICS, *seen):
             np.testing.assert_allclose(vars(episode)[name], value, rtol=0, atol=2e-4, err_msg=name)
 
 
 def continue_as(original: Any, episode: Any) -> None:
-    """Put Meta-World's environment where our episode is."""
+    """Set Meta-World's environment to the state of our episode."""
     original.model.body_pos[:] = episode.model.body_pos
     original.model.site_pos[:] = episode.model.site_pos
     mujoco.mj_copyData(original.data, original.model, episode.data)
@@ -91,7 +91,7 @@ def continue_as(original: Any, episode: Any) -> None:
 def compare(task: str, steps: int, lanes: int = 4) -> int:
     """Compare `steps` steps of a task, and return the successes.
 
-    Expert and random actions take turns; an episode is begun anew after success, or at a random age.
+    Expert and random actions take turns; an episode begins anew after success, or at a random age.
     """
     world, peers = metaworld(lanes), [Peer(task) for _ in range(lanes)]
     generator = np.random.default_rng([7, list(TASKS).index(task)])
@@ -164,7 +164,7 @@ def test_in_a_perturbed_episode_things_are_heavier_and_the_hand_elsewhere(name: 
     worlds = [vector_world(WORLD, 1, 1, perturbed) for perturbed in (False, True)]
     for seed in range(3):
         (plain,), (perturbed,) = (world.reset([0], [seed], [name]) for world in worlds)
-        models = [world.picture_of(0)[0] for world in worlds]  # type: ignore[attr-defined]
+        models = [world.drawable(0).model for world in worlds]  # type: ignore[attr-defined]
         drawn = draw_perturbation(seed)
         factors = models[1].body_mass[models[0].body_mass > 0] / models[0].body_mass[models[0].body_mass > 0]
         assert set(factors) == {1.0, drawn.mass}

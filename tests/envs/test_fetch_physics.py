@@ -1,4 +1,4 @@
-"""The vector world of Fetch, against the plain world and against gymnasium-robotics, bit for bit."""
+"""The physics of Fetch, compared bit for bit with the plain world and with gymnasium-robotics."""
 
 from typing import Any
 
@@ -18,7 +18,7 @@ NAMES = [task.name for task in SCENARIO.tasks]
 PlainWorld = resolve(SCENARIO.tasks[0].world)
 GRIPPER_VELOCITY = resolve("clbench.envs.fetch.state:GRIPPER_VELOCITY")
 LONGEST = 80
-"""Steps after which an episode is begun anew if it has not ended: more than the horizon."""
+"""Steps after which an unfinished episode begins anew: more than the horizon."""
 
 State = NDArray[np.float32]
 
@@ -37,7 +37,7 @@ class Peer:
     def reset(self, seed: int, task: str) -> State:
         state, _ = self.plain.reset(seed=seed, options={"task": task})
         observation = self.original.reset(seed=seed)[0]["observation"].astype(np.float32)
-        # Where the block lies out of our reach, ours is placed again: of these episodes it knows nothing.
+        # if its block is out of our reach, ours is placed again, and the episodes differ
         self.follows = bool((observation == state[:25]).all())
         return state  # type: ignore[no-any-return]
 
@@ -50,9 +50,9 @@ class Peer:
 
 
 def compare(task: str, steps: int, threads: int, lanes: int = 8) -> tuple[int, int]:
-    """Compare `steps` steps of a task; return how many gymnasium-robotics followed, and the successes.
+    """Compare `steps` steps of a task; return the numbers of followed steps and of successes.
 
-    Expert and random actions take turns; an episode is begun anew after success, or at a random age.
+    Expert and random actions take turns; an episode begins anew after success, or at a random age.
     """
     import gymnasium_robotics
 
@@ -112,19 +112,17 @@ def test_it_is_so_over_ten_thousand_steps_of_each_task(task: str) -> None:
 def test_in_a_perturbed_episode_the_block_is_heavier_and_the_gripper_elsewhere_and_at_rest(seed: int) -> None:
     plain, perturbed = (vector_world(SCENARIO.tasks[0].world, 2, 1, flag) for flag in (False, True))
     states = [world.reset([1], [seed], ["push"])[0] for world in (plain, perturbed)]
-    models = [world.picture_data(1).model for world in (plain, perturbed)]  # type: ignore[attr-defined]
+    models = [world.drawable(1).model for world in (plain, perturbed)]  # type: ignore[attr-defined]
     drawn = draw_perturbation(seed)
     np.testing.assert_array_equal(models[1].body_mass, models[0].body_mass * heavier(models[0], drawn.mass))
     moved = states[1] - states[0]
     np.testing.assert_allclose(moved[:3], 0.025 * np.array(drawn.start), atol=0.006)
     assert np.abs(moved[GRIPPER_VELOCITY]).max() < 1e-3
-    np.testing.assert_allclose(
-        moved[[3, 4, 5, -3, -2, -1]], 0, atol=1e-3
-    )  # block and target are where they were
+    np.testing.assert_allclose(moved[[3, 4, 5, -3, -2, -1]], 0, atol=1e-3)  # block and target stay in place
 
 
 def heavier(model: Any, mass: float) -> NDArray[np.float64]:
-    """Return what the masses of the bodies are multiplied by."""
+    """Return the factors on the masses of the bodies."""
     factors = np.ones(model.nbody)
     factors[model.body("object0").id] = mass
     return factors

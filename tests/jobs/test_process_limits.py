@@ -1,4 +1,4 @@
-"""Limits: a process that takes too much is ended, said why, and the others go on."""
+"""Limits: a process that takes too much is ended with a reason, and the others go on."""
 
 import os
 import time
@@ -11,6 +11,7 @@ import pytest
 
 from clbench.jobs.bars import Bars
 from clbench.jobs.job import Job
+from clbench.jobs.process_limits import exceeded
 from clbench.jobs.processes import Processes
 from clbench.jobs.scheduler import run_jobs
 from clbench.spec.limits import Limits
@@ -96,4 +97,4 @@ def test_what_a_stopped_job_started_is_stopped_too(tmp_path: Path, done: Done) -
 
 
 def test_a_process_that_is_gone_is_beyond_no_limit() -> None:
-    assert Limits().exceeded(2**22 - 1, 1.0) is None
+    assert exceeded(Limits(), 2**22 - 1, 1.0) is None

@@ -1,17 +1,16 @@
-"""method_template: what it does, in one line, and the paper that it is from.
+"""method_template: what it does, in one line, and the paper that describes it.
 
 The rule in full, if the line above is not all of it.
 
 Details:
-1. Where you differ from the paper, or where it leaves something open: number each.
+1. Number each difference from the paper, and each choice that the paper leaves open.
 2. `share` was chosen with `clbench tune`, which looks at validation episodes alone.
 """
 
 from dataclasses import dataclass
 
-from torch import Tensor
-
 from clbench import Batch, Metadata, Method, Policy, Progress, Uses
+from torch import Tensor
 
 
 @dataclass
@@ -22,8 +21,8 @@ class MethodTemplate(Method):
     share: float = 0.9
     """Share of the batch that is trained on."""
 
-    # The prior data that it may touch: "never", "prepare" (before the first target)
-    # or "throughout". It competes with methods that use the same.
+    # Use of the prior data: "never", "prepare" (before the first target) or
+    # "throughout". The method competes with methods of the same use.
     uses = Uses(demonstrations="never", questions="never")
     metadata = Metadata(
         authors="Your name",
@@ -39,7 +38,7 @@ class MethodTemplate(Method):
     # Override what differs from plain fine-tuning; this hook is an example. The others
     # are prepare, start_task, batch, gradients, learning_rate, end_task, diagnostics,
     # and state with load_state: every stage begins with a new object of the class.
-    # help(clbench.Method) says what each of them is given and returns.
+    # help(clbench.Method) describes their arguments and results.
     def loss(self, policy: Policy, batch: Batch, progress: Progress) -> Tensor:
         """Return the mean of the lowest losses."""
         losses = policy.action_loss(batch)  # (B,): one for each sample

@@ -1,0 +1,263 @@
+"""The command `clbench cache`: what the cache holds, and which of it is stale."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import re
+import shutil
+import time
+import uuid
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from stat import S_ISDIR
+from typing import Annotated, Any
+
+from cyclopts import Parameter
+from rich.console import Console
+from rich.table import Table
+
+from clbench.base.cache import cache_folder, hash_of
+from clbench.base.errors import InputError
+from clbench.cli.arguments import checked_input, whole_number
+
+DEMONSTRATIONS = "demonstrations"
+"""Kind of the Minari datasets that clbench collected."""
+
+KINDS = {
+    DEMONSTRATIONS: "episodes of the experts, as Minari datasets",
+    "scenes": "states that questions are asked about",
+    "frames": "pictures of demonstrations and scenes",
+    "pretrained": "pretrained policies",
+    "reports": "evaluations of pretrained policies",
+    "runs": "checkpoints of unfinished runs",
+    "stages": "policies of finished runs, made again",
+    "online": "agents between two stages",
+    "ray": "records of runs on a Ray cluster",
+    "experts": "checkpoints of expert training",
+    "vectors": "capability vectors of fast_dvla",
+}
+"""Kinds of entries and their contents. All kinds but the first are folders of the cache."""
+
+_MANIFEST = "clbench.json"
+_NAME = re.compile(r"(?:.*-)?[0-9a-f]{16}(?:\.\w+)?")
+"""Names of entries: they end with a hash. Nothing else is shown or deleted."""
+_LEFTOVER = re.compile(r"\..+\.[0-9a-f]{32}\.(?:partial|old)")
+_CODE = ("source", "versions", "torch")
+_DAY = 24 * 60 * 60
+
+
+def cache(
+    *,
+    prune: Annotated[bool, Parameter(negative="")] = False,
+    dry_run: Annotated[bool, Parameter(negative="")] = False,
+    older_than: Annotated[int, whole_number(0)] = 30,
+) -> None:
+    """Show what the cache and the Minari datasets of clbench hold, and which entries are stale.
+
+    An entry is stale if it has not been used for --older-than days, if newer code has made its replacement
+    since its last use, or if a killed process left it behind more than a day ago. The cache holds no records,
+    and everything in it can be made again. Where the file system does not note when a file is read, an entry
+    counts as used when it was made.
+
+    Args:
+        prune: List the stale entries, and delete them.
+        dry_run: List the stale entries without deleting them.
+        older_than: Days without use after which an entry is stale.
+    """
+    now = time.time()
+    found = list(entries())
+    stale = find_stale(found, older_than, now)
+    console = Console(highlight=False)
+    console.print(_table(found, stale, now))
+    lines = [
+        f"Cache: {cache_folder()} (CLBENCH_CACHE moves it)",
+        f"Demonstrations: {minari_folder()} (MINARI_DATASETS_PATH moves it)",
+    ]
+    if prune or dry_run:
+        lines += [f"{_size(entry.size):>9}  {entry.path}: {reason}" for entry, reason in stale.items()]
+    console.print("\n".join(lines), markup=False, soft_wrap=True)
+    count = f"{len(stale)} stale {'entry' if len(stale) == 1 else 'entries'}"
+    size = _size(sum(entry.size for entry in stale))
+    if prune and not dry_run:
+        with checked_input():
+            for entry in stale:
+                entry.delete()
+        console.print(f"Deleted {count}, {size}.", soft_wrap=True)
+    elif stale:
+        console.print(f"`clbench cache --prune` deletes {count}, {size}.", soft_wrap=True)
+
+
+@dataclass(frozen=True, eq=False)
+class Entry:
+    """A folder or a file that is kept or deleted as a whole."""
+
+    kind: str
+    """Kind of the entry, see `KINDS`."""
+    path: Path
+    """Path of the folder or file."""
+
+    @cached_property
+    def _stats(self) -> dict[Path, os.stat_result]:
+        stats = {}
+        for path in (self.path, *_walk(self.path)):
+            with contextlib.suppress(FileNotFoundError):  # a run has just removed it
+                stats[path] = path.lstat()
+        return stats
+
+    @property
+    def size(self) -> int:
+        """Bytes of its files."""
+        return sum(stat.st_size for stat in self._stats.values() if not S_ISDIR(stat.st_mode))
+
+    @property
+    def made(self) -> float:
+        """Time of the last change."""
+        return max((stat.st_mtime for stat in self._stats.values()), default=0.0)
+
+    @property
+    def used(self) -> float:
+        """Time of the last change, or of the last reading as far as the file system notes it."""
+        # this command itself reads manifests and lists folders
+        read = (
+            stat.st_atime
+            for path, stat in self._stats.items()
+            if path.name != _MANIFEST and not S_ISDIR(stat.st_mode)
+        )
+        return max((self.made, *read))
+
+    @property
+    def is_leftover(self) -> bool:
+        """Whether a process is filling it, or was killed while it did."""
+        return _LEFTOVER.fullmatch(self.path.name) is not None
+
+    @cached_property
+    def origin(self) -> tuple[str, str] | None:
+        """Hashes of what it was made for and of the code that made it; None if no manifest shows these."""
+        manifests = sorted(path for path in self._stats if path.name == _MANIFEST)
+        try:
+            made_from = json.loads(manifests[0].read_text(encoding="utf-8"))["made_from"]
+        except (IndexError, OSError, ValueError, KeyError, TypeError):
+            return None
+        code: list[Any] = []
+        purpose = _without_code(made_from, code)
+        return hash_of([self.kind, purpose]), hash_of(code)
+
+    def delete(self) -> None:
+        """Delete it. It gets another name first, so that no process meets half of it.
+
+        Raises:
+            InputError: The file system refuses.
+        """
+        doomed = self.path.with_name(f".{self.path.name.lstrip('.')}.{uuid.uuid4().hex}.old")
+        try:
+            self.path.rename(doomed)
+            if doomed.is_dir():
+                shutil.rmtree(doomed)
+            else:
+                doomed.unlink()
+        except FileNotFoundError:  # another process has just deleted it
+            return
+        except OSError as error:
+            raise InputError(f"{self.path} cannot be deleted: {error.strerror}.") from error
+
+
+def entries() -> Iterator[Entry]:
+    """Yield everything in the cache, and all Minari datasets that clbench collected. Links are left alone."""
+    for folder in sorted(path for path in cache_folder().glob("*") if path.is_dir()):
+        for path in sorted(folder.iterdir()):
+            if _NAME.fullmatch(path.name) and not path.is_symlink():
+                yield Entry(folder.name, path)
+        yield from _leftovers(folder.name, folder)
+    root = minari_folder()
+    manifests = sorted(path for path in _walk(root) if path.name == _MANIFEST)
+    yield from (Entry(DEMONSTRATIONS, path.parent) for path in manifests)
+    yield from _leftovers(DEMONSTRATIONS, root)
+
+
+def _walk(folder: Path) -> Iterator[Path]:
+    """Yield everything below a folder, except leftovers; what vanishes meanwhile is left out."""
+    for place, folders, files in os.walk(folder):
+        folders[:] = [name for name in folders if not _LEFTOVER.fullmatch(name)]
+        yield from (Path(place, name) for name in (*folders, *files))
+
+
+def _leftovers(kind: str, folder: Path) -> Iterator[Entry]:
+    for place, folders, _ in os.walk(folder):
+        found = [Path(place, name) for name in sorted(folders) if _LEFTOVER.fullmatch(name)]
+        yield from (Entry(kind, path) for path in found if not path.is_symlink())
+
+
+def _without_code(value: Any, code: list[Any]) -> Any:
+    """Return inputs of the cache without those that describe code, which are appended to `code`."""
+    if isinstance(value, list):
+        return [_without_code(part, code) for part in value]
+    if not isinstance(value, dict):
+        return value
+    code.extend(value[name] for name in _CODE if name in value)
+    return {name: _without_code(part, code) for name, part in value.items() if name not in (*_CODE, "stage")}
+
+
+def find_stale(found: Iterable[Entry], days: int, now: float) -> dict[Entry, str]:
+    """Return the stale entries, each with the reason.
+
+    Args:
+        found: Entries.
+        days: Days without use after which an entry is stale.
+        now: Present time, in seconds since the epoch.
+    """
+    found = list(found)
+    newest: dict[str, Entry] = {}
+    for entry in found:
+        if entry.origin is not None and not entry.is_leftover:
+            purpose, _ = entry.origin
+            newest[purpose] = max(newest.get(purpose, entry), entry, key=lambda one: one.made)
+    stale = {}
+    for entry in found:
+        newer = newest.get(entry.origin[0]) if entry.origin is not None else None
+        if entry.is_leftover:
+            if now - entry.made > _DAY:
+                stale[entry] = "left behind by a killed process"
+        elif now - entry.used > days * _DAY:
+            stale[entry] = f"not used for {_days(now - entry.used)}"
+        elif newer is not None and newer.origin != entry.origin and entry.used < newer.made:
+            stale[entry] = f"replaced by {newer.path.name}, which newer code made"
+    return stale
+
+
+def minari_folder() -> Path:
+    """Return the folder of all Minari datasets."""
+    return Path(os.environ.get("MINARI_DATASETS_PATH") or "~/.minari/datasets").expanduser()
+
+
+def _table(found: Sequence[Entry], stale: Mapping[Entry, str], now: float) -> Table:
+    """Return the kinds as a table."""
+    table = Table()
+    for column in ("kind", "contents", "entries", "size", "oldest", "stale"):
+        right = column in ("entries", "size", "oldest", "stale")
+        table.add_column(column, justify="right" if right else "left", no_wrap=column != "contents")
+    present = {entry.kind for entry in found}
+    for kind in (*(kind for kind in KINDS if kind in present), *sorted(present - set(KINDS))):
+        ours = [entry for entry in found if entry.kind == kind]
+        unused = [entry.size for entry in ours if entry in stale]
+        table.add_row(
+            kind,
+            KINDS.get(kind, ""),
+            str(len(ours)),
+            _size(sum(entry.size for entry in ours)),
+            _days(max(now - entry.made for entry in ours)),
+            f"{len(unused)} ({_size(sum(unused))})" if unused else "-",
+        )
+    return table
+
+
+def _size(count: int) -> str:
+    return f"{count / 1e6:.1f} MB"
+
+
+def _days(seconds: float) -> str:
+    days = int(max(0.0, seconds) // _DAY)
+    return f"{days} day" if days == 1 else f"{days} days"

@@ -1,0 +1,141 @@
+"""The commands that make what runs start from: `clbench demonstrations`, `pretrain` and `experts measure`."""
+
+from __future__ import annotations
+
+import shutil
+import sys
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Annotated
+
+from cyclopts import Parameter
+from rich.console import Console
+from rich.table import Table
+
+from clbench.base.errors import InputError
+from clbench.cli.arguments import add_cwd_to_path, checked_input, whole_number
+
+if TYPE_CHECKING:
+    from clbench.data.expert_rates import Measurement
+    from clbench.spec.scenario import Scenario
+
+# PyTorch and the simulators are imported where they are needed: `--help` does not wait for them.
+
+
+def demonstrations(scenario: str, /, *, workers: Annotated[int | None, whole_number(1)] = None) -> None:
+    """Collect the expert demonstrations of SCENARIO as Minari datasets, and show a table of them.
+
+    Args:
+        scenario: Gymnasium id of the scenario.
+        workers: Number of tasks to collect at once; all cores if not given.
+    """
+    from clbench.data.demonstrations import dataset_folder, read_dataset
+    from clbench.jobs.plan import Plan
+    from clbench.jobs.processes import Processes
+    from clbench.jobs.scheduler import run_with_bars
+    from clbench.spec.registry import load_scenario
+
+    add_cwd_to_path()
+    with checked_input():
+        loaded = load_scenario(scenario)
+    plan = Plan()
+    plan.add_demonstrations(scenario, loaded, loaded.tasks)
+    if run_with_bars(plan.jobs, Processes(workers)):
+        sys.exit(1)
+    table = Table(title=f"Demonstrations of {loaded.id}")
+    for column in ("dataset", "group", "episodes", "noisy", "success", "mean length"):
+        table.add_column(column, no_wrap=column == "dataset")
+    for task in loaded.tasks:
+        episodes = read_dataset(dataset_folder(task, loaded.budget))
+        lengths = [len(episode.executed) for episode in episodes]
+        table.add_row(
+            task.dataset_id,
+            loaded.group(task.name),
+            str(len(episodes)),
+            str(sum(bool(episode.noisy.any()) for episode in episodes)),
+            f"{sum(episode.success for episode in episodes) / len(episodes):.2f}",
+            f"{sum(lengths) / len(lengths):.1f}",
+        )
+    Console().print(table)
+
+
+def pretrain(
+    scenario: str,
+    /,
+    *,
+    seed: Annotated[int, whole_number(0)] = 0,
+    ship: Annotated[bool, Parameter(negative="")] = False,
+) -> None:
+    """Pretrain the policy that every method starts from on SCENARIO, unless it is in the cache.
+
+    `clbench run` does the same where a pretrained policy is missing.
+
+    Args:
+        scenario: Gymnasium id of the scenario.
+        seed: Seed of the policy.
+        ship: Copy the policy to clbench/pretrained/, so that it ships with the package. Needs a checkout.
+    """
+    from clbench.jobs.bars import Bars
+    from clbench.learning.pretraining import SHIPPED, pretrained_policy, shipped_folder, vision_steps
+    from clbench.spec.registry import load_scenario
+
+    add_cwd_to_path()
+    with checked_input():
+        loaded = load_scenario(scenario)
+        if ship and not (SHIPPED.parents[1] / "pyproject.toml").is_file():
+            raise InputError("--ship needs a checkout of clbench: it does not change an installed package.")
+    length = loaded.budget.pretraining_steps + vision_steps(loaded)
+    with Bars(length) as bars:
+        name = f"{loaded.id} pretraining seed {seed}"
+        bars.start(name, length)
+        _, folder = pretrained_policy(loaded, seed, lambda steps: bars.advance(name, steps))
+        shipped = shipped_folder(loaded, seed)
+        if ship and folder != shipped:
+            shutil.rmtree(shipped, ignore_errors=True)
+            folder = shutil.copytree(folder, shipped)
+        bars.finish(name, f"in {folder}")
+
+
+def measure(scenario: str, /, *tasks: str, episodes: Annotated[int, whole_number(1)] = 100) -> None:
+    """Measure the experts of SCENARIO, or of TASKS alone: their success rates and returns.
+
+    Args:
+        scenario: Gymnasium id of the scenario.
+        tasks: Names of tasks; all tasks of the scenario if not given.
+        episodes: Number of episodes of each task.
+    """
+    from clbench.data import expert_rates
+    from clbench.jobs.bars import Bars
+    from clbench.spec.registry import load_scenario
+
+    add_cwd_to_path()
+    with checked_input():
+        loaded = load_scenario(scenario)
+        chosen = [loaded.task(name) for name in tasks] or list(loaded.tasks)
+    with Bars(len(chosen) * episodes) as bars:
+        bars.start(loaded.id, len(chosen) * episodes)
+        rows = expert_rates.measure(loaded, chosen, episodes, lambda done: bars.advance(loaded.id, done))
+    Console().print(_table(loaded, rows, episodes))
+    found = [expert_rates.complaint(task, row) for task, row in zip(chosen, rows, strict=True)]
+    complaints = [text for text in found if text is not None]
+    for text in complaints:
+        Console(stderr=True).print(text, style="bold red", highlight=False, markup=False, soft_wrap=True)
+    if complaints:
+        sys.exit(1)
+
+
+def _table(scenario: Scenario, rows: Sequence[Measurement], episodes: int) -> Table:
+    """Return measurements of experts as a table for the terminal."""
+    table = Table(title=f"Experts of {scenario.id}, {episodes} episodes each")
+    columns = ("task", "group", "success", "mean return", "lowest return", "mean steps")
+    for number, column in enumerate(columns):
+        table.add_column(column, no_wrap=number == 0, justify="left" if number < 2 else "right")
+    for row in rows:
+        table.add_row(
+            row.task,
+            row.group.replace("_", " "),
+            f"{row.success:.2f}",
+            f"{row.mean_return:.2f}",
+            f"{row.lowest_return:.2f}",
+            f"{row.mean_steps:.1f}",
+        )
+    return table

@@ -1,0 +1,66 @@
+"""The entry point of the command `clbench`: Ctrl-C ends it at any moment, without a traceback."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import sys
+from collections.abc import Callable
+from types import FrameType
+
+from clbench.base import interrupts
+
+INTERRUPTED = 128 + signal.SIGINT
+"""Exit code after Ctrl-C, as shells report it."""
+
+
+def main() -> None:
+    """Run the command line.
+
+    While the command works, Ctrl-C raises KeyboardInterrupt, so that it can clean up. Before and after, there
+    is nothing to clean up: the process ends at once.
+    """
+    _end_at_once_when_stopped()
+    from clbench.cli.main import main as run_command  # takes 0.1 s, in which Ctrl-C must not show a traceback
+
+    try:
+        try:
+            if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
+                interrupts.install()
+            # a scheduler's SIGTERM ends the workers too, as Ctrl-C does
+            _handle(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
+            run_command()
+        finally:
+            with contextlib.suppress(OSError, ValueError):  # a closed pipe
+                sys.stdout.flush()
+            _end_at_once_when_stopped()
+    except BaseException:
+        # an import can turn the KeyboardInterrupt into an ImportError, a command into an error of its own
+        if not _interrupted():
+            raise
+    if _interrupted():
+        _end_at_once_when_stopped()
+        print("Stopped. Finished records are kept; the same command continues.", file=sys.stderr)  # noqa: T201
+        sys.exit(INTERRUPTED)
+
+
+def _interrupted() -> bool:
+    """Return whether Ctrl-C came."""
+    try:
+        interrupts.check()
+    except KeyboardInterrupt:
+        return True
+    return False
+
+
+def _handle(number: signal.Signals, handler: Callable[[int, FrameType | None], object]) -> None:
+    """Set the handler of a signal, unless the process was started to ignore the signal."""
+    if signal.getsignal(number) is not signal.SIG_IGN:
+        signal.signal(number, handler)
+
+
+def _end_at_once_when_stopped() -> None:
+    """Let Ctrl-C and SIGTERM end the process at once, without what Python does at the end."""
+    for number in (signal.SIGINT, signal.SIGTERM):
+        _handle(number, lambda number, _: os._exit(128 + number))

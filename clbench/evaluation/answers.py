@@ -1,0 +1,41 @@
+"""Answers of a policy to questions."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+
+from clbench.data.questions import QuestionKind
+from clbench.evaluation.rollouts import LANES
+from clbench.policy.batch import QuestionBatch
+from clbench.policy.policy import Policy
+
+
+@torch.inference_mode()
+def answer(
+    policy: Policy, kinds: Sequence[QuestionKind], kind: torch.Tensor, questions: QuestionBatch
+) -> list[tuple[str, int, int]]:
+    """Return, for each kind of question, its name, how often it was asked, and how often answered rightly.
+
+    Args:
+        policy: What answers, by the likeliest word of the whole vocabulary.
+        kinds: The kinds that there are.
+        kind: Index of each question's kind, (B,).
+        questions: The questions, B of them.
+    """
+    right = []
+    device = policy.state_mean.device
+    for start in range(0, len(questions), LANES):
+        rows = slice(start, start + LANES)
+        padding = LANES - len(questions.state[rows])
+        state = torch.nn.functional.pad(questions.state[rows], (0, 0, 0, padding))
+        words = torch.nn.functional.pad(questions.words[rows], (0, 0, 0, padding), value=1)
+        image = torch.nn.functional.pad(questions.image[rows], (0, 0, 0, 0, 0, 0, 0, padding))
+        word = policy.answer_logits(state.to(device), words.to(device), image.to(device)).argmax(dim=1).cpu()
+        right.append(word[: LANES - padding] == questions.answer[rows])
+    correct = torch.cat(right)
+    return [
+        (entry.name, int((kind == index).sum()), int(correct[kind == index].sum()))
+        for index, entry in enumerate(kinds)
+    ]

@@ -1,0 +1,35 @@
+"""Probes: how far a policy has moved from the pretrained one."""
+
+from __future__ import annotations
+
+import torch
+
+from clbench.policy.activations import Gaussian
+from clbench.policy.batch import QuestionBatch
+from clbench.policy.policy import Policy
+
+SPARSITY_THRESHOLD = 1e-3
+"""Relative change below which a weight counts as unchanged: ConSFT (arXiv 2605.08879), Eq. 8."""
+
+
+@torch.no_grad()
+def activations(policy: Policy, questions: QuestionBatch) -> Gaussian:
+    """Return a Gaussian of the policy's hidden states on `questions`, which are on the policy's device."""
+    hidden = policy.hidden_states(questions.state, questions.words, questions.image)
+    return Gaussian.of(hidden, policy.backbone.mask(questions.words))
+
+
+@torch.no_grad()
+def update_sparsity(policy: Policy, pretrained: Policy) -> float | None:
+    """Return the share of the pretrained weights that hardly changed, None if the weights are others now.
+
+    ConSFT (arXiv 2605.08879), Eq. 8: relative change below 1e-3.
+    """
+    before, now = dict(pretrained.named_parameters()), dict(policy.named_parameters())
+    if now.keys() != before.keys():
+        return None
+    unchanged = [
+        (now[name] - value).abs() / (value.abs() + 1e-8) < SPARSITY_THRESHOLD
+        for name, value in before.items()
+    ]
+    return sum(int(part.sum()) for part in unchanged) / sum(part.numel() for part in unchanged)

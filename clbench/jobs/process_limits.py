@@ -1,0 +1,50 @@
+"""Measure the memory and the writes of a process against its limits, and kill it with all that it started."""
+
+from __future__ import annotations
+
+import contextlib
+
+from clbench.spec.limits import Limits
+
+
+def exceeded(limits: Limits, process: int, seconds: float) -> str | None:
+    """Return in words which limit a process exceeds, None if it exceeds none.
+
+    Args:
+        limits: Limits of the process.
+        process: Id of the process.
+        seconds: Time since its start, in seconds.
+    """
+    if seconds > limits.seconds:
+        return f"it took longer than {limits.seconds:g} s"
+    memory, written = usage(process)
+    if memory > limits.memory:
+        return f"it took {memory / 1e9:.1f} GB of memory, more than {limits.memory / 1e9:.1f} GB"
+    if written > limits.written:
+        return f"it wrote {written / 1e9:.1f} GB, more than {limits.written / 1e9:.1f} GB"
+    return None
+
+
+def usage(process: int) -> tuple[int, int]:
+    """Return the resident bytes and the written bytes of a process and of its living children."""
+    import psutil
+
+    memory = written = 0
+    with contextlib.suppress(psutil.NoSuchProcess):
+        parent = psutil.Process(process)
+        for one in (parent, *parent.children(recursive=True)):
+            with contextlib.suppress(psutil.Error):
+                memory += one.memory_info().rss
+                written += one.io_counters().write_chars if hasattr(one, "io_counters") else 0
+    return memory, written
+
+
+def end(process: int) -> None:
+    """Kill a process and its children."""
+    import psutil
+
+    with contextlib.suppress(psutil.NoSuchProcess):
+        parent = psutil.Process(process)
+        for one in (*parent.children(recursive=True), parent):
+            with contextlib.suppress(psutil.NoSuchProcess):
+                one.kill()

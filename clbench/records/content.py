@@ -1,0 +1,31 @@
+"""The hash of a record's content, by which its reader notices damage.
+
+It is the SHA-256 of the record's JSON in canonical form: every entry of the file but `content` itself, names
+sorted, no spaces, and all but ASCII escaped. A file may be indented or reordered, but no value in it may change.
+
+The hash finds damage and careless edits. It does not prove honesty: a forger can compute it again. `clbench verify`
+and the tiers of the leaderboard are for that.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from typing import Any
+
+
+def content_hash(values: Mapping[str, Any]) -> str:
+    """Return the hash of a record's content, 64 hexadecimal digits.
+
+    Args:
+        values: The record as read from JSON, with its `schema`. An entry `content` has no part in the hash.
+    """
+    content = {name: value for name, value in values.items() if name != "content"}
+    text = json.dumps(content, sort_keys=True, separators=(",", ":"), ensure_ascii=True)
+    return hashlib.sha256(text.encode("ascii")).hexdigest()
+
+
+def sealed(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a record's JSON with the hash of its content as `content`."""
+    return {**values, "content": content_hash(values)}

@@ -1,0 +1,88 @@
+"""The evaluation before the first target, kept in the cache: most methods start from the same policy."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+from typing import Any
+
+from clbench.base.cache import cache_folder, cached, hash_of, hash_of_tensors, is_cached
+from clbench.base.progress import ProgressCallback, no_progress
+from clbench.data.training_data import TrainingData
+from clbench.evaluation.examiner import Examiner
+from clbench.learning.pretraining import pretrained_policy
+from clbench.learning.trainer import repeatable, sources
+from clbench.policy.policy import Policy
+from clbench.records.record import Record
+from clbench.runs.length import point_length
+from clbench.runs.spec import ResolvedRun
+
+TABLES = ("episodes", "answers", "policy")
+"""Tables of a record that an evaluation fills."""
+
+
+def evaluate_start(
+    run: ResolvedRun, examiner: Examiner, policy: Policy, record: Record, progress: ProgressCallback
+) -> None:
+    """Evaluate a policy before the first target into `record`, or copy the evaluation from the cache.
+
+    Args:
+        run: The run.
+        examiner: Evaluates the policies of the run, and reports its progress.
+        policy: The policy that the method's `prepare` left.
+        record: Record of the run, whose tables are still empty.
+        progress: Called with the length of the evaluation if the cache has it.
+    """
+    evaluated = False
+
+    def write(folder: Path) -> None:
+        nonlocal evaluated
+        examiner.examine(policy, run.protocol.end(0), record)
+        evaluated = True
+        values = {name: getattr(record, name) for name in TABLES}
+        (folder / "report.json").write_text(json.dumps(values), encoding="utf-8")
+
+    folder, inputs = _kept(run, policy)
+    cached(folder, inputs, write)
+    if not evaluated:
+        for name, value in json.loads((folder / "report.json").read_text(encoding="utf-8")).items():
+            setattr(record, name, value)
+        progress(point_length(run.protocol, run.protocol.end(0)))
+
+
+def evaluate_pretrained(run: ResolvedRun, progress: ProgressCallback = no_progress) -> None:
+    """Evaluate the pretrained policy, with which runs like `run` start, unless the cache has the evaluation.
+
+    Args:
+        run: One of the runs; its method makes no difference.
+        progress: Called with the length of what was done since its last call, in optimiser steps.
+    """
+    with repeatable(run.spec.device):
+        policy, _ = pretrained_policy(run.scenario, run.spec.seed)
+        policy = policy.to(run.spec.device)
+        data = TrainingData.open(run.scenario, policy.config)
+        examiner = Examiner(run.scenario, run.protocol, data, policy, run.spec.seed, progress)
+        record = Record("success", run.info, run.scenario_info)
+        try:
+            evaluate_start(run, examiner, policy, record, progress)
+        finally:
+            examiner.close()
+
+
+def is_evaluated(run: ResolvedRun) -> bool:
+    """Return whether the cache has the evaluation of the pretrained policy, which itself is there."""
+    policy, _ = pretrained_policy(run.scenario, run.spec.seed)
+    return is_cached(*_kept(run, policy))
+
+
+def _kept(run: ResolvedRun, policy: Policy) -> tuple[Path, dict[str, Any]]:
+    """Return the folder of an evaluation in the cache, and everything that it depends on."""
+    spec = run.spec
+    inputs = {
+        "policy": hash_of_tensors(policy.state_dict()),
+        "scenario": dataclasses.asdict(run.scenario_info),
+        "spec": [spec.seed, spec.device, spec.split, spec.perturb],
+        **sources(run.scenario, spec.seed),
+    }
+    return cache_folder() / "reports" / hash_of(inputs), inputs

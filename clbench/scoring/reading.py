@@ -1,0 +1,238 @@
+"""Rows of a record, checked against its evaluation protocol: what scores are made of."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from clbench.records.reader import RecordError
+from clbench.records.record import EPISODE_COLUMNS, Record
+from clbench.scoring.layout import Array
+from clbench.spec.protocol import SPLITS, Point, Protocol
+
+MOST = 10**9
+"""More steps, episodes or questions than any run has: a number beyond it is damage."""
+
+MOST_POINTS = 100
+"""Evaluation points of a stage."""
+
+MOST_CELLS = 20_000
+"""Cells of a table of rates, for example stages x points x tasks: 2,000 replicates of it take 320 MB. Fetch-v0
+has 240, a sequence of 40 targets among 50 tasks 8,200."""
+
+FARTHEST = 1e18
+"""A greater activation drift than any policy has whose hidden states are numbers of any use."""
+
+
+class Row(NamedTuple):
+    """An evaluation episode."""
+
+    point: Point
+    task: str
+    split: str
+    episode: int
+    """Number of the initial state."""
+    success: float
+    """0 or 1."""
+
+
+def read_protocol(record: Record) -> Protocol:
+    """Return the evaluation protocol that a record states.
+
+    Raises:
+        RecordError: Names of tasks, evaluation steps, counts of episodes or the split are impossible, or the
+            scenario is too large to be shown.
+    """
+    scenario, tasks = record.scenario, 0
+    for group in ("retained", "target", "held_out"):
+        names = getattr(scenario, group)
+        if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+            raise RecordError(f"scenario: {group} must be a list of task names.")
+        tasks += len(names)
+    if len({*scenario.retained, *scenario.target, *scenario.held_out}) != tasks:
+        raise RecordError("scenario: a task name occurs twice.")
+    if record.run.split not in ("test", "validation"):
+        raise RecordError(f"run: split must be test or validation, not {record.run.split!r}.")
+    _check_steps(scenario.evaluation_steps)
+    for name in ("validation_episodes", "test_episodes", "curve_episodes"):
+        count = scenario.budget.get(name)
+        if type(count) is not int or not 0 <= count <= MOST:
+            raise RecordError(f"scenario: {name} of its budget must be a whole number, not {count!r}.")
+    # few rows may ask for more memory than there is
+    check_cells(
+        "stages x points x tasks", len(scenario.target) + 1, len(scenario.evaluation_steps), tasks
+    )
+    return scenario.protocol(record.run)
+
+
+def _check_steps(steps: Any) -> None:
+    if (
+        not isinstance(steps, list)
+        or not steps
+        or any(type(step) is not int or not 0 < step <= MOST for step in steps)
+        or steps != sorted(set(steps))
+    ):
+        raise RecordError("scenario: evaluation_steps must be a list of rising whole numbers above 0.")
+    if len(steps) > MOST_POINTS:
+        raise RecordError(f"scenario: {len(steps):,} evaluation_steps; {MOST_POINTS} are the most.")
+
+
+def check_cells(what: str, *sizes: int) -> None:
+    """Refuse a table that is too large to be resampled."""
+    if math.prod(sizes) > MOST_CELLS:
+        text = " x ".join(f"{size:,}" for size in sizes)
+        raise RecordError(f"it is too large to be shown: {what} are {text}, and {MOST_CELLS:,} are the most.")
+
+
+def place(protocol: Protocol, point: Point) -> int:
+    """Return the index of a point among the evaluation steps; stage 0, which has one point, is at its end."""
+    return protocol.steps.index(point.step) if point.stage else -1
+
+
+class _Points:
+    """The evaluation points of a protocol, to check rows of tables against."""
+
+    def __init__(self, protocol: Protocol) -> None:
+        self.last = protocol.stages[-1]
+        self.points = {point for stage in protocol.stages for point in protocol.points(stage)}
+
+    def check(self, where: str, stage: Any, step: Any) -> Point:
+        """Return the point of a row; refuse one that the protocol does not have."""
+        whole = type(stage) is int and type(step) is int
+        if not (whole and 0 <= stage <= self.last and 0 <= step <= MOST):
+            raise RecordError(f"{where} has an impossible stage or step.")
+        point = Point(stage, step)
+        if point not in self.points:
+            raise RecordError(f"{where} is of stage {stage}, step {step}, which is no evaluation point.")
+        return point
+
+
+def read_episodes(record: Record, protocol: Protocol) -> list[Row]:
+    """Return all episodes of a record, each checked.
+
+    Raises:
+        RecordError: An episode is impossible, occurs twice, or is of another kind of run.
+    """
+    rows, known, points = [], set(protocol.tasks), _Points(protocol)
+    columns = (record.episodes[name] for name in EPISODE_COLUMNS)
+    for number, values in enumerate(zip(*columns, strict=True)):
+        stage, step, task, split, episode, success, total_reward, length = values
+        where = f"episodes: row {number}"
+        point = points.check(where, stage, step)
+        if type(episode) is not int or not 0 <= episode <= MOST:
+            raise RecordError(f"{where} has an impossible number of an episode.")
+        if not isinstance(task, str) or task not in known:
+            raise RecordError(f"{where} is of a task that is not in the scenario: {task!r}.")
+        if split not in SPLITS:
+            raise RecordError(f"{where} has the split {split!r}, which is none of {', '.join(SPLITS)}.")
+        if success not in (0, 1):
+            raise RecordError(f"{where} has the success {success!r}, neither true nor false.")
+        if total_reward is not None and not _is_number(total_reward, FARTHEST, -FARTHEST):
+            raise RecordError(f"{where} has an impossible return.")
+        if type(length) is not int or not 0 <= length <= MOST:
+            raise RecordError(f"{where} has an impossible length.")
+        rows.append(Row(point, task, split, episode, float(success)))
+    if len({row[:4] for row in rows}) != len(rows):
+        raise RecordError("episodes: an episode is there twice.")
+    _check_kinds(protocol, rows)
+    check_cells("tasks x episodes", len(protocol.tasks), len(numbers(rows)))
+    return rows
+
+
+def _check_kinds(protocol: Protocol, rows: Iterable[Row]) -> None:
+    """Refuse a record without scored episodes, or with episodes that its kind of run does not have."""
+    splits = {row.split for row in rows}
+    if protocol.split not in splits:
+        raise RecordError(f"episodes: there is no {protocol.split} episode.")
+    if protocol.split == "validation" and len(splits) > 1:
+        raise RecordError("episodes: a tuning run has validation episodes alone.")
+    if "perturbed" in splits and not protocol.perturb:
+        raise RecordError("episodes: there are perturbed ones, but its run does not say perturb.")
+
+
+def read_perturbed(protocol: Protocol, rows: Iterable[Row], episodes: Iterable[int]) -> list[Row]:
+    """Return the perturbed episodes among `rows`: all that the protocol demands, and no other.
+
+    Args:
+        protocol: Protocol of the run.
+        rows: All episodes.
+        episodes: Numbers of the scored episodes.
+
+    Raises:
+        RecordError: One is missing, or must not be there.
+    """
+    rule = "each retained skill has perturbed test episodes at the end of each stage"
+    scored, retained = set(episodes), set(protocol.retained)
+    found = [row for row in rows if row.split == "perturbed"]
+    for row in found:
+        if not (protocol.is_end(row.point) and row.task in retained and row.episode in scored):
+            where = f"of {row.task} at stage {row.point.stage}, step {row.point.step}"
+            raise RecordError(
+                f"episodes: the perturbed episode {row.episode} {where}, must not be there: {rule}."
+            )
+    count = len(protocol.stages) * len(retained) * len(scored) if protocol.perturb else 0
+    if len(found) != count:
+        raise RecordError(f"episodes: {len(found):,} are perturbed, not {count:,}: {rule}.")
+    return found
+
+
+def numbers(rows: Iterable[Row]) -> tuple[int, ...]:
+    """Return the numbers of the episodes among `rows`, rising."""
+    return tuple(sorted({row.episode for row in rows}))
+
+
+def read_answers(record: Record, protocol: Protocol) -> tuple[tuple[str, ...], Array]:
+    """Return the kinds of questions, and the counts of questions and of right answers.
+
+    Returns:
+        The kinds, sorted, and the counts, (2, stages + 1, points, kinds).
+
+    Raises:
+        RecordError: A count is impossible, or a kind occurs twice at one point.
+    """
+    rows, points = list(zip(*record.answers.values(), strict=True)), _Points(protocol)
+    for number, (stage, step, kind, asked, correct) in enumerate(rows):
+        where = f"answers: row {number}"
+        points.check(where, stage, step)
+        if any(type(value) is not int for value in (asked, correct)) or not isinstance(kind, str):
+            raise RecordError(f"{where} must hold whole numbers and the name of a kind.")
+        if not 0 <= correct <= asked <= MOST:
+            raise RecordError(f"{where} has impossible numbers.")
+    if len({row[:3] for row in rows}) != len(rows):
+        raise RecordError("answers: a kind is there twice at one evaluation point.")
+    kinds = tuple(sorted({row[2] for row in rows}))
+    shape = len(protocol.stages), len(protocol.steps), len(kinds)
+    check_cells("stages x points x kinds of questions", *shape)
+    counts = np.zeros((2, *shape))
+    for stage, step, kind, asked, correct in rows:
+        counts[:, stage, place(protocol, Point(stage, step)), kinds.index(kind)] = asked, correct
+    return kinds, counts
+
+
+def read_policy(record: Record, protocol: Protocol) -> tuple[Array, Array]:
+    """Return the update sparsity and the activation drift at the points of each stage, (targets, points).
+
+    Raises:
+        RecordError: A value is impossible, or a point occurs twice.
+    """
+    rows, points = list(zip(*record.policy.values(), strict=True)), _Points(protocol)
+    values = np.full((2, len(protocol.stages), len(protocol.steps)), np.nan)
+    for number, (stage, step, *both) in enumerate(rows):
+        where = f"policy: row {number}"
+        point = points.check(where, stage, step)
+        for value, name, high in zip(
+            both, ("update_sparsity", "activation_drift"), (1, FARTHEST), strict=True
+        ):
+            if value is not None and not _is_number(value, high):
+                raise RecordError(f"{where} has an impossible {name}.")
+        values[:, stage, place(protocol, point)] = [np.nan if value is None else value for value in both]
+    if len({row[:2] for row in rows}) != len(rows):
+        raise RecordError("policy: an evaluation point is there twice.")
+    return values[0, 1:], values[1, 1:]
+
+
+def _is_number(value: Any, high: float, low: float = 0) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and low <= value <= high

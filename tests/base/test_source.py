@@ -1,0 +1,80 @@
+"""Hashes of source code: a cache key covers all code that a stage runs, and names nothing that does not exist."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from clbench.base.source import DATA_SOURCES, RUN_SOURCES, TRAINING_SOURCES, source_hash
+
+STAGES = {
+    "demonstrations": (
+        DATA_SOURCES,
+        "from clbench.data.demonstrations import dataset_folder\n"
+        "dataset_folder(scenario.target[0], scenario.budget)",
+    ),
+    "questions": (DATA_SOURCES, "from clbench.data.questions import load_questions\nload_questions(scenario)"),
+    "pretraining": (
+        TRAINING_SOURCES,
+        "from clbench.learning.pretraining import pretrained_policy\npretrained_policy(scenario, 0)",
+    ),
+    "run": (
+        (*RUN_SOURCES, "clbench.methods"),
+        "from clbench.runs.run import execute\nfrom clbench.runs.spec import RunSpec\n"
+        "execute(RunSpec('clbench.testing:clbench/Toy-v0', 'sft', 0, targets=1), 'records')",
+    ),
+}
+"""Stages that are cached: the packages that their keys name, and code that does all of the stage."""
+
+ELSEWHERE = ("clbench.envs", "clbench.testing")
+"""Suites: keys name the package of each task. The toy's package is `clbench.testing`."""
+
+
+@pytest.mark.parametrize("stage", STAGES)
+def test_a_key_names_every_package_that_its_stage_imports(stage: str, tmp_path: Path) -> None:
+    packages, code = STAGES[stage]
+    program = (
+        "import sys\nfrom clbench.spec.registry import load_scenario\n"
+        f"scenario = load_scenario('clbench.testing:clbench/Toy-v0')\n{code}\n"
+        "print(*(name for name in sys.modules if name.startswith('clbench.')), sep='\\n')"
+    )
+    result = subprocess.run(
+        [sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True, check=True
+    )
+    covered = (*packages, *ELSEWHERE)
+    imported = result.stdout.split()
+    assert [name for name in imported if not f"{name}.".startswith(tuple(f"{one}." for one in covered))] == []
+    used = {package for package in packages for name in imported if f"{name}.".startswith(f"{package}.")}
+    assert used == set(packages), "the key names packages that its stage does not use"
+
+
+def test_a_module_that_does_not_exist_is_refused_by_name() -> None:
+    for name in ("clbench.pretrainning", "clbench.no.such", "nowhere"):
+        with pytest.raises(ModuleNotFoundError, match=name.rpartition(".")[0] or name):
+            source_hash("clbench.policy", name)
+
+
+def test_a_change_of_a_file_below_a_package_changes_its_hash(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    deep = tmp_path / "some_package" / "inside"
+    deep.mkdir(parents=True)
+    for folder in (deep.parent, deep):
+        (folder / "__init__.py").touch()
+    (deep / "words.txt").write_text("one")
+    monkeypatch.syspath_prepend(tmp_path)
+    before = source_hash("some_package")
+    assert source_hash("some_package") == before
+    (deep / "words.txt").write_text("two")
+    assert source_hash("some_package") != before
+
+
+def test_the_order_in_which_packages_are_named_does_not_matter() -> None:
+    assert source_hash("clbench.policy", "clbench.spec") == source_hash("clbench.spec", "clbench.policy")
+
+
+def test_a_class_typed_at_a_prompt_has_a_hash() -> None:
+    code = "from clbench.base.source import source_hash; print(len(source_hash('__main__')))"
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert result.stdout.strip() == "16"

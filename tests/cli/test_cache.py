@@ -1,0 +1,141 @@
+"""`clbench cache`: what it shows, and what it deletes."""
+
+import os
+import time
+from pathlib import Path
+
+import pytest
+
+from clbench.base.cache import cache_folder, cached, hash_of
+from clbench.cli.cache import entries, find_stale, minari_folder
+from clbench.cli.main import app
+
+DAY = 24 * 60 * 60
+
+
+def _make(kind: str, days: float = 0.0, code: str = "a", purpose: str = "a") -> Path:
+    """Make an entry of the cache that was last used a number of days ago, and return its folder."""
+    inputs = {"purpose": purpose, "nested": {"source": code, "versions": {"torch": code}}}
+    folder = cached(
+        cache_folder() / kind / hash_of([inputs, days]),
+        inputs,
+        lambda partial: _write(partial / "data", 2_000_000),
+    )
+    return _age(folder, days)
+
+
+def _write(path: Path, size: int = 1) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(b"x" * size)
+    return path
+
+
+def _age(folder: Path, days: float) -> Path:
+    for path in (*folder.rglob("*"), folder):
+        os.utime(path, (time.time() - days * DAY,) * 2)
+    return folder
+
+
+def _cache(capsys: pytest.CaptureFixture[str], *options: str) -> str:
+    app(["cache", *options], result_action="return_value")
+    return capsys.readouterr().out
+
+
+@pytest.mark.usefixtures("empty_caches")
+def test_every_kind_is_shown_with_its_number_size_and_age(capsys: pytest.CaptureFixture[str]) -> None:
+    _make("runs", 40)
+    _make("runs", 3)
+    _make("scenes", 1)
+    out = _cache(capsys)
+    (runs,) = (line for line in out.splitlines() if line.startswith("│ runs "))
+    assert [cell.strip() for cell in runs.strip("│").split("│")][2:] == [
+        "2",
+        "4.0 MB",
+        "40 days",
+        "1 (2.0 MB)",
+    ]
+    assert "│ scenes " in out
+    assert "│ pretrained " not in out
+    assert f"Cache: {cache_folder()}" in out
+    assert "`clbench cache --prune` deletes 1 stale entry, 2.0 MB." in out
+    assert len(list(entries())) == 3
+
+
+@pytest.mark.usefixtures("empty_caches")
+def test_pruning_lists_and_deletes_what_has_not_been_used(capsys: pytest.CaptureFixture[str]) -> None:
+    old, young = _make("pretrained", 31), _make("pretrained", 29)
+    out = _cache(capsys, "--dry-run")
+    assert f"2.0 MB  {old}: not used for 31 days" in out
+    assert old.is_dir()
+    out = _cache(capsys, "--prune")
+    assert f"2.0 MB  {old}: not used for 31 days" in out
+    assert "Deleted 1 stale entry, 2.0 MB." in out
+    assert list(old.parent.iterdir()) == [young]
+    assert "Deleted 1 stale" in _cache(capsys, "--prune", "--older-than", "20")
+    assert list(old.parent.iterdir()) == []
+
+
+@pytest.mark.usefixtures("empty_caches")
+def test_what_was_read_lately_is_not_stale(capsys: pytest.CaptureFixture[str]) -> None:
+    folder = _make("pretrained", 31)
+    os.utime(folder / "data", (time.time(), time.time() - 31 * DAY))
+    assert "stale entr" not in _cache(capsys)
+
+
+@pytest.mark.usefixtures("empty_caches")
+def test_what_newer_code_has_replaced_is_stale_unless_it_was_used_since(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    old, newer = _make("stages", 5), _make("stages", 2, code="b")
+    _make("stages", 4, purpose="b")
+    same_code = _make("runs", 5)
+    _make("runs", 4)
+    assert f"{old}: replaced by {newer.name}, which newer code made" in _cache(capsys, "--dry-run")
+    os.utime(old / "data", (time.time(), time.time() - 5 * DAY))
+    assert "stale entr" not in _cache(capsys)
+    assert same_code.is_dir()
+
+
+@pytest.mark.usefixtures("empty_caches")
+def test_leftovers_of_killed_processes_are_deleted_after_a_day(capsys: pytest.CaptureFixture[str]) -> None:
+    root, whole = cache_folder() / "stages" / hash_of("run"), "f" * 32
+    _write(root / "stage-0" / "data")
+    old, fresh = root / f".stage-1.{whole}.partial", root / f".stage-2.{whole}.partial"
+    dataset = minari_folder() / "clbench" / "toy" / f".left-v0.{whole}.old"
+    for folder in (old, fresh, dataset):
+        _write(folder / "data")
+    _age(old, 2)
+    _age(dataset, 2)
+    out = _cache(capsys, "--prune")
+    assert f"{old}: left behind by a killed process" in out
+    assert "Deleted 2 stale entries" in out
+    assert sorted(path.name for path in root.iterdir()) == [fresh.name, "stage-0"]
+    assert list(dataset.parent.iterdir()) == []
+
+
+@pytest.mark.usefixtures("empty_caches")
+def test_only_what_clbench_has_made_is_deleted(capsys: pytest.CaptureFixture[str]) -> None:
+    foreign = _write(cache_folder() / "runs" / "my thesis" / "record.json")
+    dataset = _write(minari_folder() / "d4rl" / "door-v2" / "data" / "main_data.hdf5")
+    linked = _write(cache_folder().parent / "elsewhere" / "data")
+    (cache_folder() / "runs" / "0123456789abcdef").symlink_to(linked.parent)
+    for path in (foreign, dataset, linked):
+        _age(path.parent, 1000)
+    assert "Deleted 0 stale entries" in _cache(capsys, "--prune", "--older-than", "0")
+    assert foreign.is_file()
+    assert dataset.is_file()
+    assert linked.is_file()
+
+
+@pytest.mark.usefixtures("empty_caches")
+def test_datasets_that_clbench_collected_are_entries() -> None:
+    folder = minari_folder() / "clbench" / "toy" / "left-v0"
+    cached(folder, {"task": "left"}, lambda partial: _write(partial / "data" / "main_data.hdf5") and None)
+    (entry,) = entries()
+    assert (entry.kind, entry.path) == ("demonstrations", folder)
+    assert list(find_stale([entry], 30, time.time() + 31 * DAY)) == [entry]
+
+
+@pytest.mark.usefixtures("empty_caches")
+def test_an_empty_cache_is_shown_too(capsys: pytest.CaptureFixture[str]) -> None:
+    assert "Deleted 0 stale entries, 0.0 MB." in _cache(capsys, "--prune")

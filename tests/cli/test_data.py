@@ -1,0 +1,52 @@
+"""`clbench demonstrations` and `clbench pretrain`."""
+
+from pathlib import Path
+
+import pytest
+
+from clbench.base.cache import cache_folder
+from clbench.cli.main import app
+from clbench.learning import pretraining
+from clbench.spec.registry import load_scenario
+
+TOY = "clbench.testing:clbench/Toy-v0"
+
+
+def _clbench(*arguments: str) -> None:
+    app(arguments, result_action="return_value")
+
+
+@pytest.fixture(autouse=True)
+def _restored_path(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(".")  # and take back what the command puts there
+
+
+def test_a_policy_is_pretrained_unless_it_is_in_the_cache(capsys: pytest.CaptureFixture[str]) -> None:
+    _clbench("pretrain", TOY)
+    folder = pretraining.pretrained_folder(load_scenario(TOY), 0)
+    assert folder.is_relative_to(cache_folder() / "pretrained")
+    assert f"clbench/Toy-v0 pretraining seed 0: in {folder}" in capsys.readouterr().err
+    times = {path: path.stat().st_mtime_ns for path in folder.iterdir()}
+    _clbench("pretrain", TOY)
+    assert {path: path.stat().st_mtime_ns for path in folder.iterdir()} == times
+
+
+def test_a_policy_ships_from_a_checkout_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shipped = tmp_path / "clbench" / "pretrained"
+    monkeypatch.setattr(pretraining, "SHIPPED", shipped)
+    with pytest.raises(SystemExit) as ended:
+        _clbench("pretrain", TOY, "--ship")
+    assert ended.value.code == 2
+    assert "error: --ship needs a checkout of clbench" in capsys.readouterr().err
+    (tmp_path / "pyproject.toml").touch()
+    cached = pretraining.pretrained_folder(load_scenario(TOY), 0)
+    for _ in range(2):  # the second time, the policy that ships is the one that is used
+        _clbench("pretrain", TOY, "--ship")
+        (folder,) = shipped.iterdir()
+        assert folder.name == "clbench--Toy-v0-seed-0"
+        assert pretraining.pretrained_folder(load_scenario(TOY), 0) == folder
+    assert {path.name: path.read_bytes() for path in folder.iterdir()} == {
+        path.name: path.read_bytes() for path in cached.iterdir()
+    }

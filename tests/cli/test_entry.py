@@ -1,0 +1,112 @@
+"""Ctrl-C at any moment of a command: exit code 130 and no traceback."""
+
+import random
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+STARTED = """
+import signal, sys
+sys.argv = ["clbench", *sys.argv[1:]]
+set_handler = signal.signal
+def note(number, handler):
+    signal.signal = set_handler
+    set_handler(number, handler)
+    print("handled", file=sys.stderr, flush=True)
+signal.signal = note
+"""
+"""Begins like the script that pip writes, and reports the first handler: Python itself has started then."""
+
+RUN = "from clbench.cli.entry import main; sys.exit(main())"
+
+STUBBORN = f"""
+{STARTED}
+import clbench.cli.main, time
+class Closed:
+    def __del__(self):
+        print("waiting", file=sys.stderr, flush=True)
+        time.sleep(5)
+def command():
+    Closed()
+    time.sleep(60)
+def converted():
+    try:
+        print("waiting", file=sys.stderr, flush=True)
+        time.sleep(60)
+    except KeyboardInterrupt:
+        raise ImportError("numpy.core.multiarray failed to import")
+def late():
+    import atexit
+    atexit.register(lambda: (print("waiting", file=sys.stderr, flush=True), time.sleep(60)))
+    print("done")
+clbench.cli.main.main = {{}}
+{RUN}
+"""
+
+
+def _start(program: str, *arguments: str) -> subprocess.Popen[str]:
+    command = [sys.executable, "-c", program, *arguments]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+def _wait_for(process: subprocess.Popen[str], line: str) -> None:
+    assert process.stderr is not None
+    while (found := process.stderr.readline()) != f"{line}\n":
+        assert found, "the process has ended"
+
+
+def _exit_code(process: subprocess.Popen[str]) -> tuple[int, str, str]:
+    """Return the exit code as a shell reports it, and what the process has printed since."""
+    out, err = process.communicate(timeout=100)
+    code = process.returncode
+    return (128 - code if code < 0 else code), out, err
+
+
+@pytest.mark.parametrize("number", range(10))
+def test_ctrl_c_at_any_moment_ends_the_command(number: int) -> None:
+    process = _start(STARTED + RUN, "list")
+    _wait_for(process, "handled")
+    time.sleep(random.Random(number).uniform(0, 1.5 if number % 2 else 0.4))
+    process.send_signal(signal.SIGINT)
+    code, _, err = _exit_code(process)
+    assert code in (0, 130)
+    assert "Traceback" not in err
+    assert "Exception ignored" not in err
+
+
+@pytest.mark.parametrize("function", ["command", "converted", "late"])
+def test_ctrl_c_is_neither_dropped_nor_turned_into_another_error(function: str) -> None:
+    process = _start(STUBBORN.format(function))
+    _wait_for(process, "waiting")
+    process.send_signal(signal.SIGINT)
+    code, out, err = _exit_code(process)
+    assert code == 130
+    assert "Traceback" not in err
+    assert out == ("done\n" if function == "late" else "")
+
+
+def test_a_process_that_ignores_ctrl_c_still_does_so_as_a_command(tmp_path: Path) -> None:
+    ignoring = "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)"
+    look = "import sys; sys.argv[0] = 'clbench'; import clbench.cli.entry, clbench.cli.main"
+    check = "clbench.cli.main.main = lambda: print(signal.getsignal(signal.SIGINT) is signal.SIG_IGN)"
+    process = _start(f"{ignoring}; {look}; {check}; clbench.cli.entry.main()")
+    assert _exit_code(process)[:2] == (0, "True\n")
+
+
+def test_a_program_that_uses_the_package_keeps_its_own_handling() -> None:
+    process = _start(
+        "import clbench, signal; print(signal.getsignal(signal.SIGINT) is signal.default_int_handler)"
+    )
+    assert _exit_code(process)[:2] == (0, "True\n")
+
+
+def test_a_bug_shows_its_traceback() -> None:
+    bug = "import clbench.cli.main, clbench.cli.entry\ndef main():\n    {}['key']\n"
+    process = _start(f"{bug}clbench.cli.main.main = main\nclbench.cli.entry.main()")
+    code, _, err = _exit_code(process)
+    assert code == 1
+    assert err.rstrip().endswith("KeyError: 'key'")

@@ -1,0 +1,143 @@
+"""Records of older schemas are read for good: `historic` holds real ones of each, as runs left them."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from clbench.records.reader import RecordError, read_record
+from clbench.records.record import SCHEMA, Costs
+from clbench.records.writer import write_record
+from clbench.scoring.metrics import measure
+from clbench.scoring.scores import Scores
+
+HISTORIC = Path(__file__).parent / "historic"
+
+VALUES = {
+    "schema-1/Fetch-v0-sft-seed-0.json": {
+        "final_average": 0.1,
+        "adaptation": 0.9875,
+        "question_retention": 0.928,
+        "update_sparsity": None,
+    },
+    "schema-2/DMControl-v0-sac-online.json": {
+        "final_average": 0.15,
+        "retention": 0.22,
+        "question_retention": None,
+    },
+    "schema-2/Fetch-v0-weight_interpolation-tuning.json": {
+        "final_average": 0.5285714285714286,
+        "question_retention": 0.989,
+        "activation_drift": 7.534790515899658,
+    },
+    "schema-2/MetaWorld-v0-sft-order-1.json": {
+        "final_average": 0.5333333333333333,
+        "retention": 0.41875,
+        "zero_shot": 0.65,
+    },
+}
+"""Values of metrics of every historic record, by its path."""
+
+
+def test_every_older_schema_has_a_historic_record() -> None:
+    assert {path.name for path in HISTORIC.iterdir()} == {f"schema-{number}" for number in range(1, SCHEMA)}
+    assert {path.relative_to(HISTORIC).as_posix() for path in HISTORIC.rglob("*.json")} == set(VALUES)
+
+
+@pytest.mark.parametrize("name", VALUES)
+def test_a_historic_record_has_its_metrics(name: str) -> None:
+    scores = Scores.from_record(read_record(HISTORIC / name))
+    found = {metric: measure(metric, scores) for metric in VALUES[name]}
+    assert found == pytest.approx(VALUES[name])
+
+
+@pytest.mark.parametrize("name", VALUES)
+def test_a_historic_record_can_be_written_in_the_present_schema(name: str, tmp_path: Path) -> None:
+    record = read_record(HISTORIC / name)
+    write_record(record, tmp_path / "record.json")
+    assert json.loads((tmp_path / "record.json").read_text(encoding="utf-8"))["schema"] == SCHEMA
+    assert read_record(tmp_path / "record.json") == record
+
+
+def test_words_of_schema_2_are_those_of_today() -> None:
+    tuning = read_record(HISTORIC / "schema-2" / "Fetch-v0-weight_interpolation-tuning.json")
+    assert (tuning.run.split, set(tuning.episodes["split"])) == ("validation", {"validation"})
+    budget = tuning.scenario.budget
+    assert (budget["validation_episodes"], budget["test_episodes"], budget["test_questions"]) == (10, 20, 1000)
+    assert budget["noisy_demonstrations"] == 0.5
+    assert not {"selection_episodes", "report_episodes", "report_questions", "perturbation"} & set(budget)
+
+
+def test_what_schema_2_left_out_has_its_usual_value() -> None:
+    online = read_record(HISTORIC / "schema-2" / "DMControl-v0-sac-online.json")
+    assert (online.run.order, online.run.perturb) == (0, False)
+    assert online.costs == Costs(parameters=428296, environment_steps=30000)
+    assert read_record(HISTORIC / "schema-2" / "MetaWorld-v0-sft-order-1.json").run.order == 1
+
+
+def test_what_follows_from_the_budget_of_schema_1_is_filled_in() -> None:
+    record = read_record(HISTORIC / "schema-1" / "Fetch-v0-sft-seed-0.json")
+    assert record.run.split == "test"
+    assert record.scenario.evaluation_steps == [75, 150, 225, 300]
+    assert record.scenario.budget["curve_episodes"] == record.scenario.budget["test_episodes"] == 20
+    assert set(zip(record.answers["stage"], record.answers["step"], strict=True)) == {
+        (0, 0),
+        *((stage, 300) for stage in range(1, 5)),
+    }
+    assert not record.policy["stage"]
+
+
+OLD = {1: HISTORIC / "schema-1" / "Fetch-v0-sft-seed-0.json"}
+OLD[2] = HISTORIC / "schema-2" / "DMControl-v0-sac-online.json"
+
+
+def put(values: dict[str, Any], place: str, value: Any) -> None:
+    *parents, last = place.split(".")
+    for parent in parents:
+        values = values[parent]
+    values[last] = value
+
+
+@pytest.mark.parametrize(
+    ("schema", "place", "value", "words"),
+    [
+        (2, "run.order", 0, "run: order must be above 0 in schema 2"),
+        (2, "run.order", "1", "run: order must be a whole number"),
+        (2, "run.perturb", False, "run: perturb must be true in schema 2"),
+        (2, "run.split", "test", "run: split: schema 2 has no test"),
+        (2, "run.oder", 1, "No field of run is called 'oder'. Did you mean 'order'?"),
+        (2, "scenario.budget.test_episodes", 20, "budget: schema 2 has no test_episodes"),
+        (2, "episodes.split", ["validation"], "episodes: split: schema 2 has no validation"),
+        (2, "episodes.stage", [0], "the columns of episodes have different lengths"),
+        (2, "costs.parametres", 1, "No field of costs is called 'parametres'"),
+        (2, "content", "0123", "a record of schema 2 has no content"),
+        (2, "scenario", [], "scenario must be an object"),
+        (2, "episodes", None, "episodes must be an object"),
+        (1, "policy", {}, "a record: schema 1 has no policy"),
+        (1, "run.split", "report", "run: schema 1 has no split"),
+        (1, "scenario.evaluation_steps", [300], "scenario: schema 1 has no evaluation_steps"),
+        (1, "scenario.budget.evaluation_points", 0, "evaluation_points of its budget must be whole numbers"),
+        (1, "scenario.budget", None, "scenario: evaluation_steps is missing"),
+        (1, "answers.step", [], "answers: schema 1 has no step"),
+        (1, "run", 5, "run must be an object"),
+    ],
+)
+def test_a_record_that_is_not_of_its_old_schema_is_refused_by_what_is_wrong_with_it(
+    schema: int, place: str, value: Any, words: str, tmp_path: Path
+) -> None:
+    values = json.loads(OLD[schema].read_text(encoding="utf-8"))
+    put(values, place, value)
+    (tmp_path / "record.json").write_text(json.dumps(values), encoding="utf-8")
+    with pytest.raises(RecordError, match=words):
+        read_record(tmp_path / "record.json")
+
+
+def test_perturbed_runs_of_schema_2_are_read(tmp_path: Path) -> None:
+    values = json.loads(OLD[2].read_text(encoding="utf-8"))
+    values["run"]["perturb"] = True
+    values["episodes"]["split"][0] = "perturbed"
+    (tmp_path / "record.json").write_text(json.dumps(values), encoding="utf-8")
+    record = read_record(tmp_path / "record.json")
+    assert record.run.perturb
+    assert record.episodes["split"][:2] == ["perturbed", "test"]

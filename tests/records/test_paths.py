@@ -1,0 +1,48 @@
+"""Paths of records: every run has one of its own, inside the folder."""
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from clbench.records.paths import record_path
+
+
+def test_every_run_has_a_path_of_its_own_below_the_folder(tmp_path: Path) -> None:
+    runs: list[Any] = [
+        ("clbench/Toy-v0", "sft", 0),
+        ("clbench/Toy-v0", "sft", 1),
+        ("clbench/Toy-v1", "sft", 0),
+        ("clbench/Toy-v0", "sft", 0, 1),
+        ("clbench/Toy-v0", "theirs:SFT", 0),
+        ("clbench/Toy-v0", "theirs/SFT", 0),
+        ("clbench/Toy-v0", "theirs:SFT+strength=2", 0),
+        ("theirs/Toy-v0", "sft", 0),
+    ]
+    paths = {record_path(tmp_path, *run) for run in runs}
+    assert len(paths) == len(runs)
+    assert all(path.parent.parent.parent == tmp_path for path in paths)
+
+
+@pytest.mark.parametrize(
+    ("scenario", "label"),
+    [
+        ("../Toy-v0", "sft"),
+        ("clbench/Toy-v0", ".."),
+        ("clbench/Toy-v0", "sft+x=../../.."),
+        ("/Toy-v0", "sft"),
+    ],
+)
+def test_no_name_leads_out_of_the_folder(scenario: str, label: str, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="cannot be the"):
+        record_path(tmp_path, scenario, label, 0)
+
+
+def test_no_link_leads_out_of_the_folder(tmp_path: Path) -> None:
+    records = tmp_path / "records"
+    records.mkdir()
+    (records / "Toy-v0").symlink_to(tmp_path)
+    with pytest.raises(ValueError, match="a symbolic link leads out of"):
+        record_path(records, "clbench/Toy-v0", "sft", 0)
+    (tmp_path / "link").symlink_to(records)  # the folder itself may be one
+    assert record_path(tmp_path / "link", "theirs/Toy-v0", "sft", 0).parents[2] == tmp_path / "link"

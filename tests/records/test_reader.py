@@ -1,0 +1,194 @@
+"""The reader of records: what is no record is refused by what is wrong with it."""
+
+import json
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from clbench.records.content import sealed
+from clbench.records.reader import RecordError, read_record
+from clbench.records.record import Record
+from clbench.records.writer import write_record
+
+
+@pytest.fixture
+def record(make_record: Callable[..., Record]) -> Record:
+    return make_record(
+        [[1.0, 0.0, 0.0], [0.5, 1.0, 0.0]],
+        answers={(0, "left"): (10, 9), (1, "left"): (10, 8)},
+        sparsity=[[0.9, 0.8, 0.7, 0.6]],
+    )
+
+
+def change(path: Path, **fields: Any) -> None:
+    """Set fields of the record at `path`, and its hash."""
+    values = json.loads(path.read_text(encoding="utf-8"))
+    path.write_text(json.dumps(sealed({**values, **fields})), encoding="utf-8")
+
+
+def test_a_torn_record_is_refused_wherever_it_is_torn(record: Record, tmp_path: Path) -> None:
+    path = tmp_path / "record.json"
+    write_record(record, path)
+    whole = path.read_bytes()
+    for length in range(0, len(whole) - 2, 97):
+        path.write_bytes(whole[:length])
+        with pytest.raises(RecordError, match="cannot be read as JSON"):
+            read_record(path)
+
+
+@pytest.mark.parametrize(
+    "content",
+    [b"[1, 2]", b"7", b"{}", b'{"schema": 0}', b'{"results": {"success": 1.0}}', b'{"schema": 3}'],
+)
+def test_foreign_json_is_refused(content: bytes, tmp_path: Path) -> None:
+    (tmp_path / "record.json").write_bytes(content)
+    with pytest.raises(RecordError, match="schema"):
+        read_record(tmp_path / "record.json")
+
+
+@pytest.mark.parametrize(
+    "content", [b"\xff\xfe", b"[" * 100_000, b'{"schema": NaN}', b'{"schema": ' + b"9" * 5000 + b"}"]
+)
+def test_hostile_bytes_are_refused(content: bytes, tmp_path: Path) -> None:
+    (tmp_path / "record.json").write_bytes(content)
+    with pytest.raises(RecordError, match="JSON"):
+        read_record(tmp_path / "record.json")
+
+
+def test_what_is_no_file_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "folder.json").mkdir()
+    for name in ("folder.json", "absent.json"):
+        with pytest.raises(RecordError, match="cannot be read"):
+            read_record(tmp_path / name)
+
+
+@pytest.mark.parametrize(
+    ("fields", "words"),
+    [
+        ({"schema": 4}, "is of schema 4, newer than 3: update clbench"),
+        ({"schema": 0}, "is no record of schema 3"),
+        ({"schema": True}, "is no record of schema 3"),
+        ({"score": 0.99}, "score"),
+        ({"status": "great"}, "great"),
+        ({"run": None}, "run"),
+        ({"costs": [1]}, "costs"),
+        ({"error": "yes"}, "error"),
+        ({"status": "failed"}, "error must be an object"),
+        (
+            {"run": {}},
+            "run: scenario, method, seed, device, split, settings, changes, uses, order, perturb are missing",
+        ),
+        (
+            {"scenario": {"id": "x"}},
+            "scenario: retained, target, held_out, evaluation_steps, budget are missing",
+        ),
+        ({"costs": {}}, "costs: optimiser_steps, parameters, preparation_steps, parameters_added, "),
+        ({"status": "failed", "error": {"where": "loss"}}, "error must have the entries where, type, mess"),
+        (
+            {"status": "failed", "error": dict.fromkeys(("where", "type", "message", "traceback"), 1)},
+            "error: where must be a text",
+        ),
+    ],
+)
+def test_a_field_that_does_not_fit_the_schema_is_refused_by_name(
+    fields: dict[str, Any], words: str, record: Record, tmp_path: Path
+) -> None:
+    write_record(record, tmp_path / "record.json")
+    change(tmp_path / "record.json", **fields)
+    with pytest.raises(RecordError, match=words):
+        read_record(tmp_path / "record.json")
+
+
+@pytest.mark.parametrize(
+    ("field", "words"),
+    [
+        ({"order": "1"}, "run: order must be a whole number"),
+        ({"order": True}, "run: order must be a whole number"),
+        ({"order": 1.0}, "run: order must be a whole number, not 1.0"),
+        ({"order": -1}, "run: order must not be below 0"),
+        ({"perturb": 1}, "run: perturb must be true or false, not 1"),
+        ({"seed": False}, "run: seed must be a whole number, not false"),
+        ({"method": ["sft"]}, "run: method must be a text"),
+        ({"oder": 1}, "No field of run is called 'oder'. Did you mean 'order'?"),
+    ],
+)
+def test_a_field_of_the_run_of_another_type_is_refused_by_name(
+    field: dict[str, Any], words: str, record: Record, tmp_path: Path
+) -> None:
+    path = tmp_path / "record.json"
+    write_record(record, path)
+    change(path, run={**vars(record.run), "order": 3})
+    assert read_record(path).run.order == 3
+    change(path, run={**vars(record.run), **field})
+    with pytest.raises(RecordError, match=re.escape(words)):
+        read_record(path)
+
+
+@pytest.mark.parametrize("name", ["episodes", "answers", "policy"])
+def test_columns_that_do_not_fit_together_are_refused_by_name(
+    name: str, record: Record, tmp_path: Path
+) -> None:
+    path = tmp_path / "record.json"
+    columns = getattr(record, name)
+    unequal = {**columns, "stage": columns["stage"][1:]}
+    foreign = {**columns, "reward": columns["stage"]}
+    tables: tuple[Any, ...] = (unequal, foreign, {}, None, [], dict.fromkeys(columns, 1))
+    for table in tables:
+        write_record(record, path)
+        change(path, **{name: table})
+        with pytest.raises(RecordError, match=name):
+            read_record(path)
+
+
+@pytest.mark.parametrize(
+    ("field", "words"),
+    [
+        ({"retained": [1]}, "an entry of scenario: retained must be a text, not 1"),
+        ({"evaluation_steps": [True]}, "an entry of scenario: evaluation_steps must be a whole number"),
+        ({"budget": []}, "scenario: budget must be an object with named entries"),
+    ],
+)
+def test_an_entry_of_the_scenario_of_another_type_is_refused_by_name(
+    field: dict[str, Any], words: str, record: Record, tmp_path: Path
+) -> None:
+    path = tmp_path / "record.json"
+    write_record(record, path)
+    change(path, scenario={**vars(record.scenario), **field})
+    with pytest.raises(RecordError, match=re.escape(words)):
+        read_record(path)
+
+
+def test_a_record_whose_values_changed_is_refused_by_its_hash(record: Record, tmp_path: Path) -> None:
+    path = tmp_path / "record.json"
+    write_record(record, path)
+    text = path.read_text(encoding="utf-8")
+    path.write_text(text.replace('"seed": 0', '"seed": 1'), encoding="utf-8")
+    words = "its content does not match its hash: the file was changed or damaged"
+    with pytest.raises(RecordError, match=words):
+        read_record(path)
+    path.write_text(text.replace('"content": "', '"content": "0'), encoding="utf-8")
+    with pytest.raises(RecordError, match=words):
+        read_record(path)
+
+
+def test_a_record_without_its_hash_is_refused(record: Record, tmp_path: Path) -> None:
+    path = tmp_path / "record.json"
+    write_record(record, path)
+    values = json.loads(path.read_text(encoding="utf-8"))
+    del values["content"]
+    path.write_text(json.dumps(values), encoding="utf-8")
+    with pytest.raises(RecordError, match="a record of schema 3: content is missing"):
+        read_record(path)
+
+
+def test_a_record_may_be_indented_and_its_settings_reordered(record: Record, tmp_path: Path) -> None:
+    record.run.settings = {"strength": 0.1, "name": "naïve"}
+    path = tmp_path / "record.json"
+    write_record(record, path)
+    values = json.loads(path.read_text(encoding="utf-8"))
+    values["run"]["settings"] = dict(reversed(values["run"]["settings"].items()))
+    path.write_text(json.dumps(values, indent=4, ensure_ascii=False), encoding="utf-8")
+    assert read_record(path) == record

@@ -1,0 +1,76 @@
+"""The guide to online agents: its own lines, as they stand."""
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from clbench.records.reader import read_record
+
+ID = "clbench.testing:clbench/Toy-v0"
+
+DOCS = Path(__file__).parents[2] / "docs" / "guide"
+
+
+# ---- the page ----------------------------------------------------------------------------------------------
+
+
+def _blocks(language: str) -> list[str]:
+    text = (DOCS / "online.md").read_text(encoding="utf-8")
+    return re.findall(rf"```{language}\n(.*?)```", text, flags=re.DOTALL)
+
+
+SHOW_FLAT = """
+class Shown:
+    def predict(self, observation, deterministic):
+        print(observation.shape)
+
+Flat(Shown(), env).predict(env.reset()[0], deterministic=True)
+"""
+
+
+def _output(command: list[str], folder: Path) -> str:
+    """Return what a program prints; threads would only get in each other's way here."""
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    done = subprocess.run(command, cwd=folder, env=environment, check=False, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+@pytest.mark.slow
+def test_the_page_s_own_lines_make_a_row(tmp_path: Path) -> None:
+    learning, flat = _blocks("python")
+    small = learning.replace("clbench/Fetch-v0", ID).replace("range(5)", "range(3)").replace("5_000", "120")
+    command = [sys.executable, "-c", small + flat + SHOW_FLAT]
+    told = _output(command, tmp_path)
+    assert told == "(16,)\n"
+    record = read_record(tmp_path / "leaderboard/records/Toy-v0/me--sac/seed-0.json")
+    assert record.costs.environment_steps == 360
+    assert (record.costs.parameters or 0) > 0
+    assert record.fingerprint["method"]["class"] == "stable_baselines3.sac.sac:SAC"
+    assert record.run.device == "cpu"
+    (shown,) = _blocks("console")
+    command = [sys.executable, "-m", *shown.split()]
+    told = _output(command, tmp_path)
+    assert "me/sac" in told
+
+
+@pytest.mark.slow
+def test_the_program_of_the_page_makes_a_record_of_each_seed_and_skips_those_it_has(tmp_path: Path) -> None:
+    (line,) = _blocks("shell")
+    python, script, scenario, *seeds = line.split()
+    assert (python, script, scenario, seeds) == (
+        "python",
+        "docs/guide/online_sac.py",
+        "clbench/Fetch-v0",
+        ["--seeds", "3"],
+    )
+    command = [sys.executable, str(DOCS.parents[1] / script), ID, "--seeds", "1", "--steps", "110"]
+    for expected in ("seed 0, stage 2: left ", "seed 0 has a record already"):
+        told = _output(command, tmp_path)
+        assert expected in told
+    record = read_record(tmp_path / "leaderboard/records/Toy-v0/sac/seed-0.json")
+    assert record.costs.environment_steps == 330

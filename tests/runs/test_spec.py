@@ -1,0 +1,59 @@
+"""Run specifications: names are looked up once, and everything that follows is handed what was found."""
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from clbench.base.errors import InputError, UnknownNameError
+from clbench.runs.run import execute
+from clbench.runs.spec import RunSpec
+
+TOY = "clbench.testing:clbench/Toy-v0"
+
+
+def test_a_run_looks_up_one_scenario_and_one_method(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    counts = {"scenario_at": 0, "load_method": 0}
+
+    def counted(name: str, function: Any) -> Any:
+        def count(*arguments: Any) -> Any:
+            counts[name] += 1
+            return function(*arguments)
+
+        return count
+
+    execute(RunSpec(TOY, "sft", 0, targets=1), tmp_path / "first")  # makes what runs need
+    for module in [one for name, one in sys.modules.items() if name.startswith("clbench.")]:
+        for name in counts:
+            if name in vars(module):
+                monkeypatch.setattr(module, name, counted(name, getattr(module, name)))
+    execute(RunSpec(TOY, "sft", 0, targets=1), tmp_path / "second")
+    assert counts == {"scenario_at": 1, "load_method": 1}
+
+
+def test_a_resolved_run_has_everything_that_its_record_says() -> None:
+    run = RunSpec(TOY, "experience_replay", 3, {"replay": "0.25"}, order=1, targets=1).resolve()
+    assert (run.info.scenario, run.info.method, run.info.seed) == ("clbench/Toy-v0", "experience_replay", 3)
+    assert (run.info.changes, run.info.order) == ({"replay": 0.25}, 1)
+    assert run.scenario_info.target == ["down"]
+    assert [task.name for task in run.published.target] == ["right"]
+    assert run.label == "experience_replay+replay=0.25"
+    assert run.protocol.target == ("down",)
+
+
+@pytest.mark.parametrize(
+    ("spec", "error", "message"),
+    [
+        (RunSpec("clbench/Fetsh-v0", "sft", 0), UnknownNameError, "Did you mean 'clbench/Fetch-v0'"),
+        (RunSpec(TOY, "stf", 0), UnknownNameError, "Did you mean 'sft'"),
+        (RunSpec(TOY, "lora", 0, {"rang": 4}), UnknownNameError, "Did you mean 'rank'"),
+        (RunSpec(TOY, "lora", 0, {"rank": "four"}), InputError, "rank must be int"),
+        (RunSpec(TOY, "sft", 0, order=9), InputError, "not 9"),
+    ],
+)
+def test_a_wrong_name_or_value_is_refused_before_any_work(
+    spec: RunSpec, error: type[Exception], message: str
+) -> None:
+    with pytest.raises(error, match=message):
+        spec.resolve()

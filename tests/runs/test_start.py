@@ -1,0 +1,56 @@
+"""The evaluation before the first target: done once, and shared by runs."""
+
+import shutil
+from pathlib import Path
+
+import pytest
+
+from clbench.base.cache import cache_folder
+from clbench.runs.length import run_length
+from clbench.runs.run import execute
+from clbench.runs.spec import RunSpec
+
+TOY = "clbench.testing:clbench/Toy-v0"
+
+
+@pytest.fixture
+def reports() -> Path:
+    """Return the folder that keeps the evaluations of pretrained policies; there is none yet."""
+    kept = cache_folder() / "reports"
+    shutil.rmtree(kept, ignore_errors=True)
+    return kept
+
+
+@pytest.mark.parametrize("perturb", [False, True])
+def test_progress_adds_up_to_the_length_of_the_run(perturb: bool, tmp_path: Path, reports: Path) -> None:
+    for _ in range(2):  # the second time the report of the pretrained policy is there already
+        amounts: list[float] = []
+        run = RunSpec(TOY, "sft", seed=0, perturb=perturb).resolve()
+        execute(run, tmp_path, amounts.append)
+        assert sum(amounts) == pytest.approx(run_length(run.scenario, run.protocol))
+
+
+def test_the_report_of_the_pretrained_policy_is_made_once(tmp_path: Path, reports: Path) -> None:
+    first = execute(RunSpec(TOY, "sft", seed=0), tmp_path)
+    (folder,) = reports.iterdir()
+    before = (folder / "report.json").stat().st_mtime_ns
+    second = execute(RunSpec(TOY, "frozen", seed=0), tmp_path)
+    assert [path.name for path in reports.iterdir()] == [folder.name]
+    assert (folder / "report.json").stat().st_mtime_ns == before
+    starts = [
+        [row for row in zip(*one.episodes.values(), strict=True) if row[0] == 0] for one in (first, second)
+    ]
+    assert starts[0] == starts[1]
+    execute(RunSpec(TOY, "frozen", seed=0, perturb=True), tmp_path)
+    assert len(list(reports.iterdir())) == 2  # it has more in it
+
+
+def test_a_report_that_another_run_makes_at_the_same_time_is_taken(
+    tmp_path: Path, reports: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first = execute(RunSpec(TOY, "frozen", seed=0), tmp_path)
+    # what was looked for was not there yet; when it is to be made, it is
+    monkeypatch.setattr("clbench.runs.run.is_cached", lambda *_: False)
+    second = execute(RunSpec(TOY, "sft", seed=0), tmp_path)
+    starts = [[stage for stage in one.episodes["stage"] if stage == 0] for one in (first, second)]
+    assert starts[0] == starts[1] != []

@@ -1,0 +1,111 @@
+"""Teams: each piece of work is done once, and no thread outlives its team."""
+
+import gc
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+
+import pytest
+
+from clbench.worlds.threads import Team
+
+
+class Owner:
+    """Owns a team and works with it, like a vector world."""
+
+    def __init__(self) -> None:
+        self.team = Team(3)
+        self.team.each(self.rest, [0.01] * 3)
+
+    def rest(self, seconds: float) -> None:
+        time.sleep(seconds)
+
+
+def _own_threads(before: set[threading.Thread]) -> list[threading.Thread]:
+    return [thread for thread in threading.enumerate() if thread not in before]
+
+
+@pytest.fixture
+def before() -> Iterator[set[threading.Thread]]:
+    """Return the threads of other tests, which may end at any time; the test must leave no thread behind."""
+    before = set(threading.enumerate())
+    yield before
+    assert _own_threads(before) == []
+
+
+@pytest.mark.parametrize("threads", [1, 3])
+def test_a_team_does_each_piece_once_and_goes_on_after_one_that_failed(threads: int) -> None:
+    team, done = Team(threads), list[int]()
+
+    def work(item: int) -> None:
+        if item == 7:
+            raise ValueError("no seven")
+        done.append(item)
+
+    team.each(work, range(5))
+    assert sorted(done) == [0, 1, 2, 3, 4]
+    with pytest.raises(ValueError, match="no seven"):
+        team.each(work, [7, 7])
+    team.each(work, [])
+    team.each(work, [5])
+    assert sorted(done) == [0, 1, 2, 3, 4, 5]
+    team.close()
+
+
+def test_a_closed_team_has_ended_its_threads_and_works_with_the_calling_thread(
+    before: set[threading.Thread],
+) -> None:
+    team = Team(3)
+    team.each(time.sleep, [0.01] * 3)
+    assert len(_own_threads(before)) == 2
+    team.close()
+    assert _own_threads(before) == []
+    team.close()
+    names: list[str] = []
+    team.each(lambda _: names.append(threading.current_thread().name), range(3))
+    assert names == [threading.current_thread().name] * 3
+
+
+def test_a_team_that_nobody_closed_leaves_no_thread_behind(before: set[threading.Thread]) -> None:
+    team = Team(3)
+    team.each(time.sleep, [0.01] * 3)
+    assert len(_own_threads(before)) == 2
+    del team
+    assert _own_threads(before) == []
+
+
+def test_a_team_ends_with_an_owner_whose_method_its_threads_called(before: set[threading.Thread]) -> None:
+    owner = Owner()
+    assert len(_own_threads(before)) == 2
+    del owner
+    gc.collect()
+    assert _own_threads(before) == []
+
+
+def test_a_team_that_one_of_its_threads_drops_does_not_wait_for_itself(
+    before: set[threading.Thread],
+) -> None:
+    teams, dropped = [Team(2)], threading.Event()
+
+    def drop(_: int) -> None:
+        if threading.current_thread() is not threading.main_thread() and teams:
+            teams.pop().close()
+            dropped.set()
+        dropped.wait(10)
+
+    teams[0].each(drop, range(2))
+    assert dropped.is_set()
+    deadline = time.monotonic() + 10
+    while _own_threads(before) and time.monotonic() < deadline:
+        time.sleep(0.01)
+
+
+def test_an_interpreter_exits_at_once_with_a_team_that_nobody_closed() -> None:
+    code = "from clbench.worlds.threads import Team; team = Team(3); done = []; team.each(done.append, 'abc')"
+    code += "; print(sorted(done))"
+    ended = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True
+    )
+    assert (ended.stdout, ended.stderr) == ("['a', 'b', 'c']\n", "")
