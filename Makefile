@@ -60,17 +60,16 @@ check: .venv/installed-dev
 
 # What a wheel may do otherwise than the checkout, against a built one outside of it: its files, the parts that are
 # found by name, the commands; and all that strangers type.
-WALKS := tests/test_cli.py tests/test_readme.py tests/test_submission.py tests/test_your_scenario.py \
-	tests/test_online.py
-WHEEL_TESTS := $(WALKS) tests/test_package.py tests/test_new_method.py tests/methods/test_methods.py \
-	$(addprefix tests/leaderboard/test_,table.py page.py submit.py verify.py claims.py method_pages.py scenario_cards.py)
+WALKS := tests/cli tests/test_readme.py tests/test_submission.py tests/test_your_scenario.py tests/runs/test_agents_guide.py
+WHEEL_TESTS := $(WALKS) tests/test_package.py tests/methods/test_methods.py tests/leaderboard/views/test_table.py \
+	tests/leaderboard/views/test_page.py tests/leaderboard/submission tests/leaderboard/claims tests/leaderboard/pages
 wheel-test: .venv/installed-dev
 	rm -rf build/wheel && mkdir -p build/wheel
 	$(BIN)/python -m build --wheel --outdir build/wheel . >/dev/null
 	$(BIN)/python -m zipfile -l build/wheel/*.whl | grep -v '^File\|^clbench/\|^clbench-[^/]*dist-info/'; test $$? -eq 1
 	$(PYTHON) -m venv build/wheel/venv
 	build/wheel/venv/bin/pip install -q -c constraints.txt "$$(ls build/wheel/*.whl)[dev]"
-	outside=$$(mktemp -d) && cp -r tests docs pyproject.toml *.md LICENSE "$$outside" && here=$$PWD && cd "$$outside" \
+	outside=$$(mktemp -d) && cp -r tests docs pyproject.toml *.md *.cff LICENSE "$$outside" && here=$$PWD && cd "$$outside" \
 		&& $$here/build/wheel/venv/bin/python -m pytest $(WHEEL_TESTS) \
 		&& $$here/build/wheel/venv/bin/python -m pytest -m slow $(WALKS) && rm -rf "$$outside"
 

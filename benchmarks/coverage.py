@@ -1,14 +1,15 @@
-"""How often intervals hold the truth and tie groups split equals: `python benchmarks/coverage.py`, minutes.
+"""Coverage of the intervals and false splits of the ranks, simulated in minutes.
 
-The model is that of a benchmark row. A run succeeds on a task at a rate that is, on the scale of the logit,
-the sum of
+Run `python benchmarks/coverage.py`.
+
+The model mimics a row of the benchmark. A run's success rate on a task is, on the scale of the logit,
 
     the method's level + the task's effect + the seed's, shared by all methods + the run's own
 
-The last two are normal, and the same for all tasks of a run. Their standard deviation is given as that of a
-rate of one half; it is 4 times as large on the scale of the logit. An episode succeeds if its luck is below
-the rate; half of the variance of luck belongs to the initial state, which all methods share. Draws are
-seeded, so that the same file comes out again.
+The last two are normal, and the same for all tasks of a run. Their standard deviation is stated for a rate of
+one half; it is 4 times as large on the scale of the logit. An episode succeeds if its luck is below the rate.
+Half of the variance of luck belongs to the initial state, which all methods share. Draws are seeded, so that
+the result is the same each time.
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ EPISODES = 20
 ROOT = math.sqrt(0.5)
 """Weight of each half of a variance."""
 SKILLS, TRAINED = 6, 9
-"""Tasks that retention is over, and those that a board's final average is over."""
+"""Tasks in retention, and in the final average of a board."""
 Outcomes = NDArray[np.bool_]
 """Success of episodes, (methods, seeds, tasks, episodes)."""
 
@@ -88,9 +89,9 @@ def outcomes(
     Args:
         generator: Source of the draws.
         levels: The methods' levels, (methods,).
-        deviations: Of their runs' own effects, (methods,).
-        shared: Deviation of the effects that all methods share.
-        shape: How many seeds and tasks.
+        deviations: Standard deviations of their runs' own effects, (methods,).
+        shared: Standard deviation of the effects that all methods share.
+        shape: Number of seeds and of tasks.
     """
     methods, seeds = len(levels), shape[0]
     effects = levels[:, None] + 4 * deviations[:, None] * generator.standard_normal((methods, seeds))
@@ -124,21 +125,21 @@ def _rate(logit: Array) -> Array:
 
 
 def interval_coverage(generator: np.random.Generator, simulations: int) -> Iterator[dict[str, Any]]:
-    """Yield how often the intervals of a rate, and of its difference to another rate, hold the truth.
+    """Yield the coverage of the intervals of a rate, and of its difference to another rate.
 
-    With one seed the truth is that of the one run, so that seeds do not differ.
+    With one seed the truth is the rate of this run, so that seeds do not differ.
     """
     deviations = {1: (0.0,)}
-    grid = [
+    cells = [
         (seeds, deviation, rate)
         for seeds in (1, 2, 3, 5, 10)
         for deviation in deviations.get(seeds, (0.0, 0.05, 0.1, 0.15))
         for rate in (0.1, 0.5, 0.9, 0.98)
     ]
-    for seeds, deviation, rate in track(grid, "intervals"):
+    for seeds, deviation, rate in track(cells, "intervals"):
         other = rate - 0.2 if rate > 0.5 else rate + 0.2
         levels = np.array([level_of(one, deviation, SKILLS) for one in (rate, other)])
-        # Seeds do not depend on each other: those of all simulations are drawn at once.
+        # Seeds are independent: the seeds of all simulations are drawn at once.
         shape = (simulations * seeds, SKILLS)
         success = outcomes(generator, levels, np.full(2, ROOT * deviation), ROOT * deviation, shape)
         for name, weights, truth, span in (
@@ -180,10 +181,10 @@ def _interval(
 
 
 def false_splits(generator: np.random.Generator, boards: int) -> Iterator[dict[str, Any]]:
-    """Yield how many boards of equal methods have more than one group.
+    """Yield the share of boards of equal methods that have more than one group.
 
-    The boards asked for, and harder ones: runs of every second method vary, those of the others do not; a
-    third of the rows has the first seed only; all have only that.
+    Besides plain boards there are harder ones: runs of every second method vary and other runs do not; a
+    third of the rows has only the first seed; all rows have only the first seed.
     """
     asked = itertools.product(("equal",), (5, 10, 15), (3, 5), (0.0, 0.05, 0.15))
     harder = itertools.product(("unequal", "ragged"), (10,), (3, 5), (0.05, 0.15))
@@ -211,8 +212,8 @@ def power(generator: np.random.Generator, boards: int) -> Iterator[dict[str, Any
 
     Five of ten methods are better by a difference, all around a rate of one half.
     """
-    grid = list(itertools.product((0.15, 0.2, 0.3), (3, 5), (0.0, 0.05, 0.1)))
-    for difference, seeds, deviation in track(grid, "power"):
+    cells = list(itertools.product((0.15, 0.2, 0.3), (3, 5), (0.0, 0.05, 0.1)))
+    for difference, seeds, deviation in track(cells, "power"):
         rates = [0.5 + difference / 2, 0.5 - difference / 2]
         total = math.hypot(deviation, deviation)
         levels = np.repeat([level_of(rate, total, TRAINED) for rate in rates], 5)
@@ -244,10 +245,10 @@ def board_ranks(success: Outcomes, single: int = 0) -> NDArray[np.int64]:
 
 
 def seed_deviations(records: Path) -> dict[str, dict[str, float]]:
-    """Return by how much seeds differ in `records`, beyond what their episodes explain, for some metrics.
+    """Return the deviation between seeds in `records`, beyond the noise of their episodes, for some metrics.
 
-    Over the methods with several seeds: how many these are, the root mean square and the greatest of the
-    standard deviations.
+    For each metric: the number of methods with several seeds, and the root mean square and the greatest of
+    their standard deviations.
     """
     runs: dict[Path, list[Scores]] = {}
     for path in sorted(records.rglob("*.json")):
@@ -266,7 +267,7 @@ def seed_deviations(records: Path) -> dict[str, dict[str, float]]:
 
 
 def _excess(metric: str, runs: list[Scores]) -> float:
-    """Return the variance of a metric between runs less that of their episodes, by the jackknife."""
+    """Return the variance of a metric between runs less the jackknife variance of their episodes."""
     values = load_metric(metric).function(rates_of(runs, {}))
     episodes = len(runs[0].layout.episodes)
     weights = (1 - np.eye(episodes)) * episodes / (episodes - 1)
@@ -280,7 +281,7 @@ def _excess(metric: str, runs: list[Scores]) -> float:
 Row = dict[str, Any]
 """A row of the results."""
 Lines = dict[str, Row]
-"""Lines or columns of a table: what the rows of the results that belong there have."""
+"""Lines or columns of a table, with the values that a row of the results must have to belong there."""
 
 
 def tables(results: Row) -> list[str]:

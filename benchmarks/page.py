@@ -1,6 +1,6 @@
 """How large the page is and how long it takes to make, from made records: `python benchmarks/page.py`.
 
-The records have the shape of those of Fetch-v0; a method is two numbers, how well it learns, what it keeps.
+The records have the shape of Fetch-v0's. A method is two numbers: how well it learns, and how much it keeps.
 Asked for are less than 3 MB and 20 s with 15 methods, 5 seeds and 4 scenarios.
 """
 
@@ -41,7 +41,7 @@ REFERENCES = ("sft", "joint", "from_scratch", "frozen")
 
 
 def main() -> None:
-    """Make the records, then the page, and print what that took."""
+    """Make the records, then the page, and print the time that each step took."""
     parser = argparse.ArgumentParser(description=__doc__)
     for name, count in (("methods", 15), ("seeds", 5), ("scenarios", 4)):
         parser.add_argument(f"--{name}", type=int, default=count)
@@ -79,7 +79,7 @@ def make_records(folder: Path, methods: int, seeds: int, scenarios: int) -> None
 def made_record(
     scenario: str, method: str, seed: int, learns: float, keeps: float, generator: np.random.Generator
 ) -> Record:
-    """Return the record of a run in which each stage leaves the share `keeps` of what was known."""
+    """Return the record of a run in which each stage keeps the share `keeps` of the skills."""
     access = "throughout" if method == "joint" else "never"
     policy = generator.random((len(GROUPS["target"]) * len(STEPS), 2))
     points = list(product(range(1, len(GROUPS["target"]) + 1), STEPS))
@@ -95,9 +95,7 @@ def made_record(
             changes={},
             uses={"demonstrations": access, "questions": access, "reference": method in REFERENCES[1:]},
         ),
-        scenario=ScenarioInfo(
-            scenario, **GROUPS, evaluation_steps=list(STEPS), budget=dict(BUDGET)
-        ),
+        scenario=ScenarioInfo(scenario, **GROUPS, evaluation_steps=list(STEPS), budget=dict(BUDGET)),
         episodes=_columns(EPISODE_COLUMNS, _episodes(learns, keeps, generator)),
         answers=_columns(
             ANSWER_COLUMNS,

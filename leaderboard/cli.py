@@ -6,49 +6,41 @@ import os
 import secrets
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
 
 from rich.console import Console
 from rich.text import Text
 
 from clbench.base.entry_points import unknown
 from clbench.base.errors import InputError
-from clbench.cli.arguments import add_cwd_to_path, at_least, checked_input
-from clbench.learning.registry import build_method
+from clbench.cli.arguments import add_cwd_to_path, checked_input, whole_number
 from clbench.records.paths import RECORDS, TUNING, record_path
-from clbench.runs.spec import RunSpec
-from clbench.spec.identifiers import folder_name, scenario_ids
-from clbench.spec.registry import load_scenario
 
-from .board.costs import STEP_TIME
-from .board.rows import Table, read_table
-from .board.tiers import TIERS
-from .claims import page
-from .claims.evidence import CONTROLS, SCENARIO, read_evidence
-from .claims.judges import judge_all
-from .pages.descriptions import built_in_methods
-from .pages.method_pages import pages, read_sources
-from .pages.scenario_cards import Card
-from .pages.scenario_tasks import choose_renderer, make_missing, picture_path, undrawn
-from .submission.submit import placement, run_submission
-from .submission.verify import Request, run_verifications
-from .views import page as web_page
-from .views.table import csv_text, markdown, terminal, write_if_changed
+from .board.places import CONTROLS, SCENARIO, STEP_TIME
+
+if TYPE_CHECKING:
+    from .board.rows import Table
+
+# Whatever imports PyTorch, SciPy or the charts is imported where it is needed: `--help` does not wait for it.
 
 WIDTH = 108
-"""Least width: in a narrower one the last metrics would be cut off, and a long line only wraps."""
+"""Least width of the console in characters: a narrower table loses metrics, and a long line only wraps."""
 
 
 def show(*, records: Path = RECORDS) -> None:
-    """Show the leaderboard, and write it beside the records.
+    """Show the leaderboard, and write it to the folder `site` next to the records.
 
-    As LEADERBOARD.md, as leaderboard.csv with every metric, and as index.html, a page for a browser that has
-    all that is behind the numbers and needs no network; pareto.svg and pareto-dark.svg are pictures of it.
+    Files: LEADERBOARD.md; leaderboard.csv with every metric; index.html, a page for the browser with the
+    details of every row, which needs no network; pareto.svg and pareto-dark.svg, its chart as pictures.
 
     Args:
         records: Folder of the records.
     """
+    from .board.rows import read_table
+    from .views.terminal import terminal
+
     if not any(records.rglob("*.json")):
-        message = f"There are no records in {records}. Make some first: clbench run clbench/Fetch-v0 sft"
+        message = f"There are no records in {records}. Make some first: clbench run {SCENARIO} sft"
         Console(stderr=True, soft_wrap=True).print(Text(message))
         raise SystemExit(2)
     table = read_table(records)
@@ -62,41 +54,43 @@ def submit(
     /,
     *,
     scenario: str = SCENARIO,
-    seeds: int = 3,
-    first_seed: int = 0,
-    order: int = 0,
-    workers: int | None = None,
+    seeds: Annotated[int, whole_number(1)] = 3,
+    first_seed: Annotated[int, whole_number(0)] = 0,
+    order: Annotated[int, whole_number(0)] = 0,
+    workers: Annotated[int | None, whole_number(1)] = None,
     records: Path = RECORDS,
 ) -> None:
-    """Check METHOD, run it, and put it on the board: its row, its rank and, if it is not shown, why.
+    """Check METHOD, run it, and print its row and rank, or the reason why it has no row.
 
-    The check takes seconds on a toy scenario and says what to mend. Each run is a process of its own, which
-    is stopped when it goes beyond the scenario's limits of time, memory and written bytes; a run that has a
-    record is skipped. Submitting runs the method's code as you: read it first if it is not yours.
+    The check takes seconds on a toy scenario and reports what to fix. Each run has its own process, which is
+    stopped if it exceeds the scenario's limits on time, memory and written bytes. Runs with a record are
+    skipped. Submitting runs the method's code as you: read the code first if it is not yours.
 
     Args:
         method: module:Class, or the name of an installed method.
-        scenario: Gymnasium id of the scenario, as clbench/Fetch-v0; module:id imports the module first.
-        seeds: How many seeds.
-        first_seed: The first of them.
-        order: In which order the targets are learned, as for `clbench run`: a row is of the published one, 0.
-        workers: Runs at once, each a process with one thread; all cores if not given.
+        scenario: Gymnasium id of the scenario, for example clbench/Fetch-v0; module:id imports the module
+            first.
+        seeds: Number of seeds.
+        first_seed: The first seed.
+        order: Order in which the targets are learned, as for `clbench run`; rows use the published order, 0.
+        workers: Number of runs at once, each a process with one thread (default: all cores).
         records: Folder of the records.
     """
+    from clbench.runs.spec import RunSpec
+
+    from .board.rows import read_table
+    from .submission.submit import placement, run_submission
+
     add_cwd_to_path()
     with checked_input():
-        at_least(1, "--seeds", seeds)
-        at_least(0, "--first-seed", first_seed)
-        at_least(1, "--workers", workers)
-        name = load_scenario(scenario).in_order(order).id
-        build_method(method, {})
-    numbers = range(first_seed, first_seed + seeds)
-    specs = [RunSpec(scenario, method, seed, order=order) for seed in numbers]
-    went_well = run_submission(specs, records, workers)
+        numbers = range(first_seed, first_seed + seeds)
+        runs = [RunSpec(scenario, method, seed, order=order).resolve() for seed in numbers]
+        went_well = run_submission(runs, records, workers)
     if records.is_dir():
         table, console = read_table(records), _console()
         _write_table(console, table, records)
-        console.print(Text("\n".join(placement(table, name, method, records))), soft_wrap=True)
+        lines = placement(table, runs[0].scenario.id, method, records)
+        console.print(Text("\n".join(lines)), soft_wrap=True)
     if not went_well:
         raise SystemExit(1)
 
@@ -104,35 +98,37 @@ def submit(
 def verify(
     *paths: Path,
     tier: str = "replayed",
-    episodes: int = 40,
-    seed: int | None = None,
+    episodes: Annotated[int, whole_number(1)] = 40,
+    seed: Annotated[int | None, whole_number(0)] = None,
     method: str | None = None,
     scenario: str | None = None,
     checkpoints: Path | None = None,
-    workers: int | None = None,
+    workers: Annotated[int | None, whole_number(1)] = None,
     records: Path = RECORDS,
 ) -> None:
-    """Check the records at PATHS, and write the tier that each reaches beside it.
+    """Check the records at PATHS, and write the tier that each reaches into a file next to it.
 
-    recomputed: the record is whole, is what its method and scenario say, and its metrics follow from its
-    episodes. replayed: test episodes, drawn at random, and all questions come out the same with the
-    policies of its stages. retrained: the whole run does. Each tier includes those before it.
+    recomputed: the record is intact, matches its method and scenario, and its metrics follow from its
+    episodes. replayed: the policies of its stages give the same results in randomly chosen test episodes and
+    on all questions. retrained: the whole run gives the same record again. Each tier includes the tiers
+    before it.
 
     Args:
-        paths: Records, or folders of them.
-        tier: How far to go: recomputed, replayed or retrained.
-        episodes: How many episodes are replayed.
-        seed: Of the choice of these; by chance if not given. Whoever made the record must not know it.
-        method: The method's module:Class, if it is not installed: it is imported, and its code runs as you.
-        scenario: Where the scenario is registered, as module:id, if clbench does not register it.
-        checkpoints: Folder of policies that `clbench run --checkpoints` kept; made again if not given.
-        workers: Verifications at once, each a process with one thread; all cores if not given.
+        paths: Records, or folders of records.
+        tier: Highest tier to check: recomputed, replayed or retrained.
+        episodes: Number of episodes to replay.
+        seed: Random seed that selects the episodes (default: random; keep it secret from the submitter).
+        method: module:Class of the method, if it is not installed: it is imported, and its code runs as you.
+        scenario: module:id of the scenario, if clbench does not register it.
+        checkpoints: Folder of policies from `clbench run --checkpoints` (default: train them again).
+        workers: Number of verifications at once, each a process with one thread (default: all cores).
         records: Folder of the records.
     """
+    from .board.tiers import TIERS
+    from .submission.verify import Request, run_verifications
+
     add_cwd_to_path()
     with checked_input():
-        at_least(1, "--episodes", episodes)
-        at_least(1, "--workers", workers)
         if tier not in TIERS[1:]:
             raise unknown("tier", tier, TIERS[1:])
         found = _found(paths, records)
@@ -143,12 +139,12 @@ def verify(
 
 
 def _found(paths: Sequence[Path], records: Path) -> list[Path]:
-    """Return the records at `paths`, those in folders too."""
+    """Return the records at `paths`, including those in folders."""
     found = [one for path in paths for one in (sorted(path.rglob("*.json")) if path.is_dir() else [path])]
     absent = [path for path in found if not path.is_file()]
     if absent or not found:
         what = f"There is no record at {absent[0]}." if absent else "There is no record to verify."
-        raise InputError(f"{what} Give paths, as {record_path(records, SCENARIO, 'sft', 0)}.")
+        raise InputError(f"{what} Give paths, for example {record_path(records, SCENARIO, 'sft', 0)}.")
     return found
 
 
@@ -160,20 +156,24 @@ def claims(
     step_time: Path = STEP_TIME,
     output: Path = Path("docs/reference/claims.md"),
 ) -> None:
-    """Judge the claims of the papers by the records, and write the page that says why.
+    """Judge the claims of the papers by the records, and write a page with the verdicts and figures.
 
     Args:
-        records: Folder of the records of the board.
+        records: Folder of the records of the leaderboard.
         controls: Folder of the records of changed settings.
         scenario: Gymnasium id of the scenario.
-        step_time: What the speed benchmark left.
-        output: The page.
+        step_time: Results of the speed benchmark.
+        output: Path of the page.
     """
+    from .claims.evidence import read_evidence
+    from .claims.judges import judge_all
+    from .pages.claims_page import page, terminal
+
     evidence = read_evidence(scenario, records, controls, step_time)
     findings = judge_all(evidence)
     console = _console()
-    console.print(page.terminal(findings))
-    _write(console, output, page.page(evidence, findings))
+    console.print(terminal(findings))
+    _write(console, output, page(evidence, findings))
 
 
 def method_pages(
@@ -188,16 +188,21 @@ def method_pages(
     """Write a page for each built-in method, from its code and its records.
 
     Args:
-        records: Folder of the records of the board.
+        records: Folder of the records of the leaderboard.
         controls: Folder of the records of changed settings.
         tuning: Folder of the records of tuning runs.
         scenario: Gymnasium id of the scenario.
-        step_time: What the speed benchmark left.
+        step_time: Results of the speed benchmark.
         output: Folder of the pages.
     """
+    from .claims.evidence import read_evidence
+    from .claims.judges import judge_all
+    from .pages.method_pages import pages, read_sources
+    from .views.descriptions import built_in_methods
+    from .views.format import write_if_changed
+
     evidence = read_evidence(scenario, records, controls, step_time)
-    board = read_table(records) if records.is_dir() else Table({}, (), ())
-    sources = read_sources(evidence, judge_all(evidence), board, tuning)
+    sources = read_sources(evidence, judge_all(evidence), _table(records), tuning)
     texts = pages(built_in_methods(), sources)
     output.mkdir(parents=True, exist_ok=True)
     for name, text in texts.items():
@@ -207,34 +212,39 @@ def method_pages(
 
 def scenario_card(
     *scenarios: str,
-    episodes: int = 100,
+    episodes: Annotated[int, whole_number(1)] = 100,
     records: Path = RECORDS,
     output: Path = Path("docs/reference/scenarios"),
 ) -> None:
     """Write the card of each of SCENARIOS: its tasks with pictures, and whether it tells methods apart.
 
-    Experts are measured, and pictures drawn, where the folder beside the card does not have them yet. Where
-    nothing can draw, a card goes without the pictures that are missing, and says so.
+    The command measures experts and draws pictures only where they are missing from the folder of the card.
+    Where no renderer works, a card lacks the missing pictures and reports it.
 
     Args:
-        scenarios: Gymnasium ids; those that have records if none is given.
-        episodes: How many episodes of each task the experts are measured on.
+        scenarios: Gymnasium ids (default: all scenarios with records).
+        episodes: Number of episodes of each task for measuring the experts.
         records: Folder of the records.
         output: Folder of the cards.
     """
+    from clbench.spec.identifiers import folder_name, scenario_ids
+    from clbench.spec.registry import load_scenario
+
+    from .pages.scenario_cards import Card
+    from .pages.scenario_tasks import choose_renderer, make_missing, picture_path, undrawn
+
     add_cwd_to_path()
     with checked_input():
-        at_least(1, "--episodes", episodes)
-        board = read_table(records) if records.is_dir() else Table({}, (), ())
+        board = _table(records)
         names = scenarios or [name for name in scenario_ids() if name in board.scenarios]
         if not names:
-            raise InputError(f"No scenario has records in {records}: name one, as {SCENARIO}.")
+            raise InputError(f"No scenario has records in {records}. Name one, for example {SCENARIO}.")
         loaded = [load_scenario(name) for name in names]
     homes = {output / folder_name(scenario.id): scenario for scenario in loaded}
     console = Console(stderr=True, soft_wrap=True)
     fault = choose_renderer([task for home, scenario in homes.items() for task in undrawn(scenario, home)])
     if fault is not None:
-        console.print(Text(f"No pictures are drawn; those that are there are kept. {fault}"))
+        console.print(Text(f"No pictures are drawn; existing ones are kept. {fault}"))
     for home, scenario in homes.items():
         experts = make_missing(scenario, home, episodes, drawing=fault is None, console=console)
         drawn = {task.name for task in scenario.tasks if picture_path(home, task).is_file()}
@@ -242,8 +252,19 @@ def scenario_card(
         _write(_console(), output / f"{home.name}.md", card.page())
 
 
+def _table(records: Path) -> Table:
+    """Return the table of the records, an empty one if there is no folder."""
+    from .board.rows import Table, read_table
+
+    return read_table(records) if records.is_dir() else Table({}, (), ())
+
+
 def _write_table(console: Console, table: Table, records: Path) -> None:
-    """Write every form of the table beside the records."""
+    """Write every form of the table to the folder `site` next to the records."""
+    from .views import page as web_page
+    from .views.csv import csv_text
+    from .views.markdown import markdown
+
     folder = Path(os.path.normpath(records / "../site"))
     texts = {
         "LEADERBOARD.md": markdown(table),
@@ -261,6 +282,8 @@ def _console() -> Console:
 
 
 def _write(console: Console, path: Path, text: str) -> None:
+    from .views.format import write_if_changed
+
     path.parent.mkdir(parents=True, exist_ok=True)
     write_if_changed(path, text)
     console.print(Text(f"Written: {path}"), soft_wrap=True)

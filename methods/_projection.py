@@ -1,4 +1,4 @@
-"""Directions of blocks of parameters: A-GEM's one-sided projection, and a random one for controls."""
+"""Directions of blocks of parameters: A-GEM's one-sided projection, and random directions for controls."""
 
 from collections.abc import Sequence
 
@@ -15,10 +15,10 @@ def inner(first: Sequence[Tensor], second: Sequence[Tensor]) -> float:
 
 @torch.no_grad()
 def project_out(gradient: Sequence[Tensor], against: Sequence[Tensor]) -> float:
-    """Remove from `gradient`, in place, its part along `against` if their inner product is negative.
+    """Remove from `gradient`, in place, the part along `against` if their inner product is negative.
 
     Returns:
-        The energy that was removed, ||before||^2 - ||after||^2: 0 if the product is not negative, or if
+        The removed energy, ||before||^2 - ||after||^2. It is 0 if the product is not negative, or if
         `against` is zero and so has no direction.
     """
     product, norm = inner(gradient, against), inner(against, against)

@@ -1,4 +1,4 @@
-"""Questions beside demonstrations, as much of each as in pretraining."""
+"""Batches of demonstrations and questions, in the proportion of pretraining."""
 
 from clbench.learning.prior import Source
 from clbench.policy.batch import Batch, QuestionBatch
@@ -7,6 +7,6 @@ from clbench.policy.batch import Batch, QuestionBatch
 def with_questions(
     demonstrations: Source[Batch], questions: Source[QuestionBatch]
 ) -> tuple[Batch, QuestionBatch]:
-    """Return a batch of demonstrations and half a one of questions."""
+    """Return a batch of demonstrations, and half as many questions."""
     size = demonstrations.batch_size
     return demonstrations.sample(size), questions.sample(size // 2)

@@ -1,4 +1,4 @@
-"""What a method requires of its hyper-parameters and of a policy, asked for by name before any training."""
+"""Checks of a method's hyper-parameters and of its policy, made before any training."""
 
 import math
 
@@ -10,10 +10,10 @@ from clbench.spec.language import TEXT_LENGTH
 
 
 def require_hidden_states(policy: Policy, method: str) -> None:
-    """Refuse a policy that does not show its hidden states.
+    """Refuse a policy that does not return its hidden states.
 
     Raises:
-        TypeError: It has no `hidden_states`.
+        TypeError: The policy has no `hidden_states`.
     """
     if not hasattr(policy, "hidden_states"):
         raise TypeError(
@@ -23,10 +23,10 @@ def require_hidden_states(policy: Policy, method: str) -> None:
 
 
 def require_loss_per_sample(policy: Policy, method: str) -> None:
-    """Refuse a policy whose action loss is not one number per sample; two blank samples tell.
+    """Refuse a policy whose action loss is not one number per sample; two blank samples are tried.
 
     Raises:
-        TypeError: `action_loss` of two samples has another shape than (2,).
+        TypeError: `action_loss` of two samples does not have the shape (2,).
     """
     with torch.no_grad():
         shape = tuple(policy.action_loss(blank_batch(policy, 2)).shape)
@@ -38,7 +38,7 @@ def require_loss_per_sample(policy: Policy, method: str) -> None:
 
 
 def blank_batch(policy: Policy, count: int) -> Batch:
-    """Return `count` samples of the shapes that a policy reads, with nothing in them."""
+    """Return `count` empty samples of the shapes that a policy reads."""
     config = policy.config
     chunks = (count, config.chunk, config.action_size)
     blank = Batch(
@@ -57,7 +57,7 @@ def in_range(name: str, value: float, low: float, high: float = float("inf")) ->
     """Refuse a hyper-parameter outside its range, ends included.
 
     Raises:
-        ValueError: `value` is outside, or no number.
+        ValueError: `value` is outside the range, or not a finite number.
     """
     if not (low <= value <= high and math.isfinite(value)):
         allowed = f"from {low:g}" + (f" to {high:g}" if high < float("inf") else "")

@@ -1,4 +1,4 @@
-"""Copies of a policy's weights, and the pull back to them that several methods share."""
+"""Copies of a policy's weights, and a penalty on moving away from them, for several methods."""
 
 from collections.abc import Mapping
 
@@ -22,13 +22,13 @@ def pull_back(
     strength: float,
     importance: Mapping[str, Tensor] | None = None,
 ) -> None:
-    """Add to the gradients that of (strength / 2) sum_i importance_i (weight_i - anchor_i)^2.
+    """Add the gradient of (strength / 2) sum_i importance_i (weight_i - anchor_i)^2 to the gradients.
 
     Args:
-        policy: What is trained; parameters without a gradient are left alone.
-        anchor: Where the weights are pulled to, by name.
+        policy: Policy in training. Parameters without a gradient do not change.
+        anchor: Weights to pull back to, by name.
         strength: Factor of the penalty.
-        importance: Of each weight, by name; 1 if None.
+        importance: Importance of each weight, by name; 1 if None.
     """
     for name, parameter in policy.named_parameters():
         if parameter.grad is None:
@@ -40,12 +40,12 @@ def pull_back(
 
 
 def packed(prefix: str, weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Return the weights under names that begin with `prefix`, for a method's `state`."""
+    """Return the weights with `prefix` before each name, for a method's `state`."""
     return {f"{prefix}.{name}": value for name, value in weights.items()}
 
 
 def unpacked(prefix: str, state: Mapping[str, object]) -> Weights:
-    """Return what `packed` put into `state`."""
+    """Return the weights that `packed` put into `state`."""
     start = f"{prefix}."
     return {
         name.removeprefix(start): value

@@ -1,13 +1,13 @@
-"""A-GEM: a step may not raise the loss on prior demonstrations, to first order (arXiv 1812.00420).
+"""A-GEM: to first order, no step raises the loss on prior demonstrations (arXiv 1812.00420).
 
-If the gradient g on the target and the gradient r on a batch of prior demonstrations have a negative inner
-product, g - (g.r / ||r||^2) r is taken (Eq. 11). AEGIS does the same layer by layer, against activations.
+Let g be the gradient on the target and r the gradient on a batch of prior demonstrations. If their inner
+product is negative, the step uses g - (g.r / ||r||^2) r instead of g (Eq. 11). AEGIS projects layer by layer,
+against activations.
 
 Details:
-1. The memory is all prior demonstrations, as for experience replay; the batch drawn from it has the budget's
-   size.
-2. One projection for all weights together.
-3. Where nothing was learned before, the gradient is the target's as it is.
+1. The memory holds all prior demonstrations, as in experience replay. A batch from it has the budget's size.
+2. There is one projection for all weights together.
+3. If there is no earlier task, the gradient on the target is not changed.
 """
 
 from dataclasses import dataclass
@@ -25,23 +25,23 @@ from ._projection import project_out
 
 @dataclass
 class AGEM(Method):
-    """Project the gradient off what raises the loss on prior demonstrations."""
+    """Project out the part of the gradient that raises the loss on prior demonstrations."""
 
     uses = Uses(demonstrations="throughout")
     metadata = Metadata(link="https://arxiv.org/abs/1812.00420")
 
     def batch(self, target: Source[Batch], prior: Prior) -> tuple[Batch, Batch | None]:
-        """Return a batch of the target and one of prior demonstrations, None if there are none."""
+        """Return a batch of the target and a batch of prior demonstrations, None if there are none."""
         batch = target.sample(target.batch_size)
         return batch, prior.demonstrations.sample(len(batch)) if len(prior.demonstrations) else None
 
     def loss(self, policy: Policy, batch: tuple[Batch, Batch | None], progress: Progress) -> Tensor:
-        """Return the action loss on the target; the prior batch is for `gradients`."""
+        """Return the action loss on the target, and keep the prior batch for `gradients`."""
         demonstrations, self.remembered = batch
         return policy.action_loss(demonstrations).mean()
 
     def gradients(self, policy: Policy, loss: Tensor) -> None:
-        """Set the target's gradients, projected."""
+        """Set the projected gradients of the target."""
         loss.backward()  # type: ignore[no-untyped-call]
         if self.remembered is None:
             return

@@ -1,26 +1,26 @@
-"""AEGIS: the backbone's gradient may not lead away from where its hidden states lay (arXiv 2604.16067).
+"""AEGIS: the backbone's gradient must not move its hidden states away from an anchor (arXiv 2604.16067).
 
-Before training, questions are read by the pretrained policy, and mean and variance of the hidden states of
-every layer are kept as a diagonal Gaussian: the anchor. At each step the squared 2-Wasserstein distance of
-the batch's hidden states to the anchor is differentiated besides the action loss. Where the two gradients of
-a layer have a negative inner product d, so that descending the loss would raise the distance, the part of the
-loss's gradient along the anchor's is removed: g - d / ||g_anchor||^2 g_anchor (Eq. 12 and 13).
+Before training, the pretrained policy reads questions. The mean and variance of the hidden states of every
+layer form a diagonal Gaussian: the anchor. Each step differentiates the action loss and also the squared
+2-Wasserstein distance between the batch's hidden states and the anchor. If the two gradients of a layer have
+a negative inner product d, a step that lowers the loss would raise the distance. The part of the loss's
+gradient along the anchor's gradient is then removed: g - d / ||g_anchor||^2 g_anchor (Eq. 12 and 13).
 
 Details:
-1. The anchor is read on the benchmark's training questions, in the place of 3,000 questions of VQAv2, from
-   all tokens that are not padding. Mean and deviation are kept for each channel: the paper says "means and
-   variances" of a layer, and its distance is exact for diagonal Gaussians.
-2. The hidden state is the output of each backbone layer, the statistics of a step are those of its batch.
-3. A layer's block is all its weights. What lies outside the backbone's layers (embeddings, action head,
-   answer head) keeps the loss's gradient.
+1. The anchor is computed on the benchmark's training questions instead of 3,000 questions of VQAv2, from all
+   tokens except padding. Mean and deviation are kept per channel: the paper writes "means and variances" of a
+   layer, and its distance is exact for diagonal Gaussians.
+2. The hidden state is the output of each backbone layer. The statistics of a step come from its batch.
+3. The block of a layer holds all its weights. Weights outside the backbone's layers (embeddings, action head,
+   answer head) keep the loss's gradient.
 4. The paper adds eps to the norm, which leaves a small negative product. Here the division is exact, and an
-   anchor gradient of norm 0 leaves the block as it is.
-5. The distance is summed over channels and averaged over layers; its scale cancels out of the projection.
-6. Projection is before clipping and before Adam, whose step need not be orthogonal any more.
-7. The paper fine-tunes on one data set. In a sequence the anchor stays that of the pretrained policy.
+   anchor gradient of norm 0 does not change the block.
+5. The distance is summed over channels and averaged over layers. Its scale cancels out of the projection.
+6. Projection comes before clipping and before Adam, so the final step need not be orthogonal.
+7. The paper fine-tunes on one data set. In a sequence, the pretrained policy remains the anchor.
 
-`direction="random"` is the control: the same projection against a random direction. (It has the norm of the
-anchor's gradient, which the projection does not depend on.)
+`direction="random"` is the control: the same projection against a random direction. (This direction has the
+norm of the anchor's gradient, but the projection does not depend on the norm.)
 """
 
 from collections.abc import Iterable
@@ -30,7 +30,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from clbench.learning.method import Metadata, Method, Progress, Stage, State
+from clbench.learning.method import Metadata, Method, MethodState, Progress, Stage
 from clbench.learning.prior import Prior, Uses
 from clbench.policy.activations import Gaussian
 from clbench.policy.batch import Batch
@@ -42,12 +42,12 @@ from ._requirements import in_range, require_hidden_states
 
 @dataclass
 class Aegis(Method):
-    """Project the backbone's gradient, layer by layer, off what leads away from pretrained activations."""
+    """Project out, layer by layer, the part of the gradient that moves activations away from the anchor."""
 
     samples: int = 3000
-    """Questions that the anchor is computed from (the paper's number)."""
+    """Number of questions for the anchor (the paper's number)."""
     direction: str = "anchor"
-    """What is projected against: "anchor", or "random" for the control."""
+    """Direction of the projection: "anchor", or "random" for the control."""
 
     uses = Uses(questions="prepare")
     metadata = Metadata(link="https://arxiv.org/abs/2604.16067")
@@ -73,14 +73,14 @@ class Aegis(Method):
         return policy.parameters()
 
     def loss(self, policy: Policy, batch: Batch, progress: Progress) -> Tensor:
-        """Return the action loss; the distance of its hidden states to the anchor is kept for `gradients`."""
+        """Return the action loss, and keep the hidden states' distance to the anchor for `gradients`."""
         hidden = policy.hidden_states(batch.state, batch.words, batch.image)
         now = Gaussian.of(hidden, policy.backbone.mask(batch.words))
         self.distances.append(now.distance(self.anchor).mean())
         return policy.action_loss(batch, hidden).mean()
 
     def gradients(self, policy: Policy, loss: Tensor) -> None:
-        """Set the gradients of the loss, those of the backbone's layers projected."""
+        """Set the gradients of the loss, projected in the backbone's layers."""
         blocks = [list(layer.parameters()) for layer in policy.backbone.layers]
         weights = [weight for block in blocks for weight in block]
         away = iter(
@@ -100,23 +100,23 @@ class Aegis(Method):
         self.shed.append(removed / energy if energy else 0.0)
         self.projected.append(projected / len(blocks))
 
-    def state(self) -> State:
+    def state(self) -> MethodState:
         """Return the anchor."""
         return {"mean": self.anchor.mean, "deviation": self.anchor.deviation}
 
-    def load_state(self, policy: Policy, state: State) -> None:
-        """Take the anchor back."""
+    def load_state(self, policy: Policy, state: MethodState) -> None:
+        """Restore the anchor."""
         mean, deviation = state["mean"], state["deviation"]
         assert isinstance(mean, Tensor)
         assert isinstance(deviation, Tensor)
         self.anchor = Gaussian(mean, deviation)
 
     def diagnostics(self) -> dict[str, Any]:
-        """Return what was projected, and the distance to the anchor along the stage.
+        """Return how much was projected out, and the distance to the anchor during the stage.
 
-        `energy_shed`: share of the energy of the backbone layers' gradients that was removed;
-        `layers_projected`: share of the layers with a negative product; `anchor_distance`: squared
-        2-Wasserstein distance of the batch to the anchor at eleven steps, the first and the last included.
+        `energy_shed`: removed share of the energy of the backbone layers' gradients. `layers_projected`:
+        share of the layers with a negative product. `anchor_distance`: squared 2-Wasserstein distance
+        between the batch and the anchor at eleven steps, the first and the last included.
         """
         if not getattr(self, "shed", None):
             return {}

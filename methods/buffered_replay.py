@@ -1,14 +1,13 @@
 """Buffered replay: experience replay from a buffer of 2 % of the prior demonstrations.
 
-The buffer sizes of arXiv 2603.03818, where a few per cent of the data nearly stop the forgetting of
+The buffer sizes come from arXiv 2603.03818, where a few per cent of the data nearly stop forgetting in
 vision-language-action models.
 
 Details:
-1. The buffer is drawn at random, moment by moment, each skill as likely as the other, before the first
-   target; of each target the same share is added when it was learned. Nothing else of the prior data is seen
-   again.
+1. Before the first target, single time steps are drawn at random into the buffer; all skills are equally
+   likely. After each target, the same share of its data is added. No other prior data are seen again.
 2. As in `experience_replay`, half of every batch is replayed. Flow time and noise are drawn anew each time.
-   While the buffer is empty, as nothing was learned before, the batch is the target's alone.
+   While the buffer is empty, because there is no earlier task, the batch holds the target alone.
 """
 
 import dataclasses
@@ -17,7 +16,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from clbench.learning.method import Metadata, Method, Stage, State
+from clbench.learning.method import Metadata, Method, MethodState, Stage
 from clbench.learning.prior import Prior, Source, Uses
 from clbench.policy.batch import Batch
 from clbench.policy.policy import Policy
@@ -27,12 +26,12 @@ from ._requirements import blank_batch, in_range
 
 @dataclass
 class BufferedReplay(Method):
-    """Replay a small share of the prior demonstrations next to the target's."""
+    """Replay a small share of the prior demonstrations together with the target's."""
 
     share: float = 0.02
-    """Of the prior demonstrations that is kept."""
+    """Share of the prior demonstrations in the buffer."""
     replay: float = 0.5
-    """Share of each batch that is replayed."""
+    """Replayed share of each batch."""
 
     uses = Uses(demonstrations="prepare")
     metadata = Metadata(link="https://arxiv.org/abs/2603.03818")
@@ -50,7 +49,7 @@ class BufferedReplay(Method):
         self.buffer = self._kept(prior.demonstrations) if known else blank_batch(policy, 0)
 
     def batch(self, target: Source[Batch], prior: Prior) -> Batch:
-        """Return target and buffered samples in one batch."""
+        """Return one batch of target and buffered samples."""
         if not len(self.buffer):
             return target.sample(target.batch_size)
         count = round(self.replay * target.batch_size)
@@ -62,13 +61,13 @@ class BufferedReplay(Method):
         return Batch.cat([target.sample(target.batch_size - count), replayed])
 
     def end_task(self, policy: Policy, stage: Stage) -> None:
-        """Add a share of the target."""
+        """Add a share of the target's demonstrations to the buffer."""
         self.buffer = Batch.cat([self.buffer, self._kept(stage.target)])
 
-    def state(self) -> State:
+    def state(self) -> MethodState:
         """Return the buffer."""
         return {**vars(self.buffer)}
 
-    def load_state(self, policy: Policy, state: State) -> None:
-        """Take the buffer back."""
+    def load_state(self, policy: Policy, state: MethodState) -> None:
+        """Restore the buffer."""
         self.buffer = Batch(**{name: value for name, value in state.items() if isinstance(value, Tensor)})

@@ -1,10 +1,10 @@
-"""Co-training: plain fine-tuning that goes on answering questions.
+"""Co-training: plain fine-tuning that continues to train on questions.
 
-What AEGIS (arXiv 2604.16067) calls the costly alternative, and what the capability vector of CapVector (arXiv
-2605.10903) is to replace: the auxiliary objective at every step.
+The auxiliary objective is present at every step. AEGIS (arXiv 2604.16067) calls this the costly alternative;
+the capability vector of CapVector (arXiv 2605.10903) is meant to replace it.
 
 Details:
-1. Half a batch of questions for each batch of demonstrations, as in pretraining.
+1. Each batch of demonstrations comes with half as many questions, as in pretraining.
 """
 
 from dataclasses import dataclass
@@ -22,7 +22,7 @@ from ._requirements import in_range
 
 @dataclass
 class CoTraining(Method):
-    """Descend the target's action loss and the loss of the questions."""
+    """Minimise the sum of the target's action loss and the answer loss of the questions."""
 
     auxiliary: float = 1.0
     """Factor of the answer loss."""
@@ -34,7 +34,7 @@ class CoTraining(Method):
         in_range("auxiliary", self.auxiliary, 0.0)
 
     def batch(self, target: Source[Batch], prior: Prior) -> tuple[Batch, QuestionBatch]:
-        """Return a batch of the target and half a one of questions."""
+        """Return a batch of the target, and half as many questions."""
         return with_questions(target, prior.questions)
 
     def loss(self, policy: Policy, batch: tuple[Batch, QuestionBatch], progress: Progress) -> Tensor:

@@ -1,11 +1,10 @@
-"""Constant weight: fine-tuning whose loss has ConSFT's mean weight, one for all samples of a step.
+"""Constant weight: the loss is scaled by the mean of ConSFT's weights, the same for all samples of a step.
 
-The control that tells the weighing of samples from the shrinking of the loss: what remains of ConSFT
-(arXiv 2605.08879) when no sample is preferred.
+A control. It separates the effect of weighing samples from the effect of a smaller loss: it keeps ConSFT's
+(arXiv 2605.08879) smaller loss, but prefers no sample.
 
 Details:
-1. The weights are those of ConSFT, with its constants, for the very losses of the step; each sample gets
-   their mean.
+1. The weights are ConSFT's, with its constants, for the losses of the same step. Each sample gets their mean.
 """
 
 from dataclasses import dataclass
@@ -14,14 +13,14 @@ from torch import Tensor
 
 from clbench.learning.method import Progress
 
-from .consft import ConSFT
+from ._consft_weights import WeightedSFT
 
 
 @dataclass
-class ConstantWeight(ConSFT):
+class ConstantWeight(WeightedSFT):
     """Weigh every sample by the mean of ConSFT's weights."""
 
     def weights(self, losses: Tensor, progress: Progress) -> Tensor:
         """Return the mean weight for every sample (B,)."""
-        weights = super().weights(losses, progress)
+        weights = self.confidence(losses, progress)
         return weights.mean().expand_as(weights)

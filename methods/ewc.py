@@ -1,14 +1,14 @@
-"""EWC: weights that what was learned before depends on are pulled back more strongly (arXiv 1612.00796).
+"""EWC: the weights that earlier tasks depend on are pulled back more strongly (arXiv 1612.00796).
 
 Details:
 1. The importance of a weight is its diagonal Fisher information: the mean over samples of the squared
-   gradient of each sample's loss. The flow-matching loss stands for the negative log-likelihood, whose bound
-   it is, at the demonstrated actions ("empirical Fisher").
+   gradient of the sample's loss. The flow-matching loss replaces the negative log-likelihood, of which it is
+   a bound, at the demonstrated actions ("empirical Fisher").
 2. It is computed for the retained skills before the first target, from prior demonstrations, and for each
-   target after it was learned; the sum of both pulls to the weights after the last target ("online" EWC, one
+   target after training on it. The sum of these pulls to the weights after the last target ("online" EWC, one
    anchor).
-3. The penalty is (strength / 2) sum_i F_i (theta_i - theta*_i)^2, its gradient added in its closed form.
-4. Where nothing is retained, no weight is important for the first target.
+3. The penalty is (strength / 2) sum_i F_i (theta_i - theta*_i)^2. Its gradient is added in closed form.
+4. If nothing is retained, no weight is important during the first target.
 5. `strength` was chosen on validation episodes of seed 100.
 """
 
@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from clbench.learning.method import Metadata, Method, Stage, State
+from clbench.learning.method import Metadata, Method, MethodState, Stage
 from clbench.learning.prior import Prior, Source, Uses
 from clbench.policy.batch import Batch
 from clbench.policy.policy import Policy
@@ -33,7 +33,7 @@ class EWC(Method):
     strength: float = 10000.0
     """Factor of the penalty."""
     samples: int = 256
-    """Samples that the Fisher information is the mean of."""
+    """Number of samples for the Fisher information."""
 
     uses = Uses(demonstrations="prepare")
     metadata = Metadata(link="https://arxiv.org/abs/1612.00796")
@@ -55,22 +55,22 @@ class EWC(Method):
         pull_back(policy, self.anchor, self.strength, self.importance)
 
     def end_task(self, policy: Policy, stage: Stage) -> None:
-        """Add the importance for the target, and move the anchor to the weights that know it."""
+        """Add the importance for the target, and move the anchor to the present weights."""
         self.anchor = copy_of(policy)
         for name, value in fisher_information(policy, stage.target, self.samples).items():
             self.importance[name] += value
 
-    def state(self) -> State:
-        """Return the anchor and the importance of its weights."""
+    def state(self) -> MethodState:
+        """Return the anchor and the importance of the weights."""
         return {**packed("anchor", self.anchor), **packed("importance", self.importance)}
 
-    def load_state(self, policy: Policy, state: State) -> None:
-        """Take them back."""
+    def load_state(self, policy: Policy, state: MethodState) -> None:
+        """Restore the anchor and the importance."""
         self.anchor, self.importance = unpacked("anchor", state), unpacked("importance", state)
 
 
 def fisher_information(policy: Policy, source: Source[Batch], samples: int) -> Weights:
-    """Return the mean of the squared gradients of `samples` losses, for each weight by name; 0 of none."""
+    """Return the mean squared gradient over `samples` losses, for each weight by name; 0 if none."""
     names, weights = zip(*policy.named_parameters(), strict=True)
     squares = [torch.zeros_like(weight) for weight in weights]
     for _ in range(samples):

@@ -1,11 +1,12 @@
-"""Experience replay: every batch mixes the target with demonstrations of what was learned before.
+"""Experience replay: every batch mixes the target with demonstrations of earlier tasks.
 
-Rehearsal as in Rolnick et al. 2019 (arXiv 1811.11682), for vision-language-action models in arXiv 2603.03818.
+Rehearsal as in Rolnick et al. 2019 (arXiv 1811.11682); arXiv 2603.03818 applies it to vision-language-action
+models.
 Details:
-1. Prior data are all demonstrations of the retained skills and of the targets learned before, each task as
-   likely as the other.
-2. The batch has the budget's size: the share of replay is taken out of the target's.
-3. Where nothing was learned before, the batch is the target's alone.
+1. Prior data are all demonstrations of the retained skills and of the earlier targets. All tasks are equally
+   likely.
+2. The batch has the budget's size: replayed samples replace samples of the target.
+3. If there is no earlier task, the batch holds the target alone.
 """
 
 from dataclasses import dataclass
@@ -17,10 +18,10 @@ from clbench.policy.batch import Batch
 
 @dataclass
 class ExperienceReplay(Method):
-    """Replay prior demonstrations next to the target's."""
+    """Replay prior demonstrations together with the target's."""
 
     replay: float = 0.5
-    """Share of each batch that is replayed; 0.5 is 1:1."""
+    """Replayed share of each batch; 0.5 is 1:1."""
 
     uses = Uses(demonstrations="throughout")
     metadata = Metadata(link="https://arxiv.org/abs/1811.11682")
@@ -30,7 +31,7 @@ class ExperienceReplay(Method):
             raise ValueError(f"replay must be from 0 to 1, not {self.replay}.")
 
     def batch(self, target: Source[Batch], prior: Prior) -> Batch:
-        """Return target and prior samples in one batch."""
+        """Return one batch of target and prior samples."""
         replayed = round(self.replay * target.batch_size)
         if not len(prior.demonstrations):
             return target.sample(target.batch_size)

@@ -1,26 +1,25 @@
-"""FastDVLA: a capability vector is added to the pretrained weights and kept by an orthogonal regulariser.
+"""FastDVLA: a capability vector is added to the pretrained weights, and an orthogonal regulariser keeps it.
 
-The abstract of "Fast-dVLA" (arXiv 2603.25661) is that of another paper, pasted by mistake: it tells the
-method of CapVector (arXiv 2605.10903), while its body accelerates discrete-diffusion policies. This is the
-method of the abstract; equations are CapVector's. Two small fine-tunings on skills that are known, one with
-an auxiliary objective and one without, differ by the capability vector (Eq. 3). It is added to the pretrained
-weights (Eq. 4), and plain fine-tuning follows, with a penalty on moving the weights that the vector is large
-in: lambda sum_i |g_i (theta_i - theta_meta_i)| (Eq. 7 and 8).
+The abstract of "Fast-dVLA" (arXiv 2603.25661) describes another paper by mistake: the method of CapVector
+(arXiv 2605.10903). Its body accelerates discrete-diffusion policies. This is the method of the abstract, with
+CapVector's equations. Two short fine-tunings on known skills, one with an auxiliary objective and one
+without, give two sets of weights; their difference is the capability vector (Eq. 3). It is added to the
+pretrained weights (Eq. 4). Plain fine-tuning follows, with a penalty on moving the weights where the vector
+is large: lambda sum_i |g_i (theta_i - theta_meta_i)| (Eq. 7 and 8).
 
 Details:
-1. The auxiliary objective is the answering of questions, in the place of the paper's Spatial Forcing, which
-   aligns hidden states with a vision model's: both give the backbone a task beside acting.
-2. Both fine-tunings see the same demonstrations in the same order with the same draws, all retained skills'.
-   The paper extracts on a small task set; here it is the number of steps that is small.
-3. All parameters are in the vector, none is newly initialised.
-4. theta_meta is the merged policy for all targets of the sequence; the paper fine-tunes on one.
-5. The regulariser's gradient is added in its closed form, lambda |g| sign(theta - theta_meta), with sign(0) =
-   0.
-6. No LoRA: the matrices are regularised in full. lambda = 1e-4 belongs to 7 billion parameters;
+1. The auxiliary objective is to answer questions. The paper's Spatial Forcing aligns hidden states with those
+   of a vision model instead: both give the backbone a second task besides acting.
+2. Both fine-tunings see the same demonstrations of all retained skills, in the same order with the same
+   draws. The paper extracts the vector on a small set of tasks; here the number of steps is small.
+3. The vector covers all parameters. None is newly initialised.
+4. theta_meta is the merged policy for all targets of the sequence; the paper fine-tunes on one target.
+5. The regulariser's gradient is added in closed form, lambda |g| sign(theta - theta_meta), with sign(0) = 0.
+6. No LoRA: the full matrices are regularised. lambda = 1e-4 was chosen for 7 billion parameters;
    docs/reference/methods/fast_dvla.md shows other values here.
-7. The vector is kept in the cache; the steps that it took count in every row.
+7. The vector is cached. The steps that made it count in every row.
 
-`direction="random"` is the control: a random vector with the norm of the vector in each matrix.
+`direction="random"` is the control: a random vector with the capability vector's norm in each matrix.
 """
 
 from collections.abc import Iterable, Iterator
@@ -33,8 +32,8 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
 from clbench.base.cache import cache_folder, cached, hash_of, hash_of_tensors
-from clbench.base.source import source_hash
-from clbench.learning.method import Metadata, Method, Stage, State
+from clbench.base.source import TRAINING_SOURCES, source_hash
+from clbench.learning.method import Metadata, Method, MethodState, Stage
 from clbench.learning.optimise import optimise
 from clbench.learning.prior import Prior, Uses
 from clbench.policy.batch import Batch, QuestionBatch
@@ -50,20 +49,20 @@ Drawn = list[tuple[Batch, QuestionBatch]]
 
 @dataclass
 class FastDVLA(Method):
-    """Start from the pretrained weights plus a capability vector, and keep the vector while fine-tuning."""
+    """Add a capability vector to the pretrained weights, and protect it during fine-tuning."""
 
     alpha: float = 1.1
     """Factor of the vector in the merge (Table S1)."""
     orthogonal: float = 1e-4
     """Factor lambda of the regulariser (Fig. 2b)."""
     auxiliary: float = 1.0
-    """Factor of the auxiliary objective while the vector is made."""
+    """Factor of the auxiliary objective in the fine-tuning that makes the vector."""
     steps: int = 150
     """Optimiser steps of each of the two fine-tunings."""
     step_size: float = 3e-4
-    """Their peak step size, that of adaptation."""
+    """Peak step size of these fine-tunings, the same as in adaptation."""
     direction: str = "capability"
-    """What is merged: "capability", or "random" for the control."""
+    """Vector to merge: "capability", or "random" for the control."""
 
     uses = Uses(demonstrations="prepare", questions="prepare")
     metadata = Metadata(link="https://arxiv.org/abs/2603.25661")
@@ -77,7 +76,7 @@ class FastDVLA(Method):
             raise ValueError(f"direction must be capability or random, not {self.direction!r}.")
 
     def prepare(self, policy: Policy, prior: Prior) -> int:
-        """Make the capability vector, or take it from the cache, and merge it."""
+        """Make the capability vector or read it from the cache, and merge it."""
         drawn = [with_questions(prior.demonstrations, prior.questions) for _ in range(self.steps)]
         self.vector = self._cached_vector(policy, drawn)
         if self.direction == "random":
@@ -89,7 +88,7 @@ class FastDVLA(Method):
         return 2 * self.steps
 
     def _cached_vector(self, policy: Policy, drawn: Drawn) -> Weights:
-        """Return theta_ao - theta_ft (Eq. 3), made once for a policy, what was drawn and settings."""
+        """Return theta_ao - theta_ft (Eq. 3), cached by policy, drawn samples and settings."""
         columns = {
             f"{number}.{type(part).__name__}.{name}": value
             for number, parts in enumerate(drawn)
@@ -100,7 +99,7 @@ class FastDVLA(Method):
             "policy": hash_of_tensors(policy.state_dict()),
             "drawn": hash_of_tensors(columns),
             "settings": [self.auxiliary, self.steps, self.step_size],
-            "source": source_hash(__name__, "clbench.policy", "clbench.learning.optimise"),
+            "source": source_hash(__name__, *TRAINING_SOURCES),
             "torch": torch.__version__,
         }
 
@@ -114,7 +113,7 @@ class FastDVLA(Method):
         return load_file(folder / "vector.safetensors", device=str(policy.state_mean.device))
 
     def start_task(self, policy: Policy, stage: Stage) -> Iterable[nn.Parameter]:
-        """Return all parameters, and lay out the regulariser's weights."""
+        """Return all parameters, and compute the regulariser's weights."""
         self.pull = {name: self.orthogonal * value.abs() for name, value in self.vector.items()}
         return policy.parameters()
 
@@ -126,17 +125,17 @@ class FastDVLA(Method):
                 if parameter.grad is not None:
                     parameter.grad.addcmul_((parameter - self.merged[name]).sign_(), self.pull[name])
 
-    def state(self) -> State:
+    def state(self) -> MethodState:
         """Return the vector and the merged weights."""
         return {**packed("vector", self.vector), **packed("merged", self.merged)}
 
-    def load_state(self, policy: Policy, state: State) -> None:
-        """Take them back."""
+    def load_state(self, policy: Policy, state: MethodState) -> None:
+        """Restore the vector and the merged weights."""
         self.vector, self.merged = unpacked("vector", state), unpacked("merged", state)
 
 
 def _fine_tuned(policy: Policy, drawn: Drawn, auxiliary: float, step_size: float) -> Weights:
-    """Return the weights of a copy of the policy after fine-tuning on all that was drawn, in its order."""
+    """Return the weights of a copy of the policy, fine-tuned on the drawn samples in their order."""
     copy = deepcopy(policy)
     batches: Iterator[tuple[Batch, QuestionBatch]] = iter(drawn)
 

@@ -1,13 +1,14 @@
-"""FINCH: the step size follows the loss (arXiv 2605.20005), the rival of weighing samples.
+"""FINCH: the step size follows the loss (arXiv 2605.20005), an alternative to weighing samples.
 
-From a bound on how much a step can raise the loss of what was learned before, which grows with the root of
-the present loss: the step size is kappa / sqrt(EMA(L) + eps), capped. Where the loss is high, at the start of
-a new target, steps are small.
+A step can raise the loss on earlier tasks by a bounded amount, which grows with the root of the present loss.
+The step size is therefore kappa / sqrt(EMA(L) + eps), capped: steps are small while the loss is high, at the
+start of a target.
 
 Details:
-1. The cap is the benchmark's own schedule, in the place of the paper's constant 5e-5, so that no method takes
-   larger steps than plain fine-tuning; kappa is therefore a factor of that schedule.
-2. kappa was chosen on validation episodes of seed 100. The average begins with each target's first loss.
+1. The cap is the benchmark's own schedule instead of the paper's constant 5e-5, so that no method takes
+   larger steps than plain fine-tuning. kappa is therefore a factor of that schedule.
+2. kappa was chosen on validation episodes of seed 100. The average restarts with the first loss of each
+   target.
 """
 
 import math
@@ -28,9 +29,9 @@ class Finch(Method):
     """Take smaller steps while the loss is high."""
 
     kappa: float = 0.3
-    """Root of the average loss from which on the steps are as large as scheduled."""
+    """Root of the average loss at and below which steps have the scheduled size."""
     momentum: float = 0.9
-    """Of the exponential moving average of the loss (the paper's value)."""
+    """Momentum of the exponential moving average of the loss (the paper's value)."""
 
     metadata = Metadata(link="https://arxiv.org/abs/2605.20005")
 
@@ -39,12 +40,12 @@ class Finch(Method):
         in_range("momentum", self.momentum, 0.0, 1.0)
 
     def start_task(self, policy: Policy, stage: Stage) -> Iterable[nn.Parameter]:
-        """Return all parameters, and forget the last target's losses."""
+        """Return all parameters, and clear the average of the losses."""
         self.average: float | None = None
         return policy.parameters()
 
     def loss(self, policy: Policy, batch: Batch, progress: Progress) -> Tensor:
-        """Return the action loss, and average it."""
+        """Return the action loss, and add it to the average."""
         loss = policy.action_loss(batch).mean()
         now = loss.item()
         before = now if self.average is None else self.average
@@ -52,6 +53,6 @@ class Finch(Method):
         return loss
 
     def learning_rate(self, scheduled: float, progress: Progress) -> float:
-        """Return kappa / sqrt(average) of the scheduled step size, at most all of it."""
+        """Return the scheduled step size times kappa / sqrt(average), or times 1 if that is larger."""
         assert self.average is not None
         return scheduled * min(1.0, self.kappa / math.sqrt(self.average + 1e-8))

@@ -1,7 +1,7 @@
-"""From scratch: for each target a new policy that was never pretrained.
+"""From scratch: a new policy without pretraining for each target.
 
-A reference row: its learning curves are what forward transfer (Continual World, arXiv 2105.10919) compares
-with. The policy keeps the pretrained one's normalisation, so that both read the same numbers.
+A reference row: forward transfer (Continual World, arXiv 2105.10919) compares a method with its learning
+curves. The policy keeps the normalisation of the pretrained policy, so that both read the same numbers.
 """
 
 from collections.abc import Iterable
@@ -17,12 +17,12 @@ from clbench.policy.policy import Policy
 
 @dataclass
 class FromScratch(Method):
-    """Forget everything at the start of each target."""
+    """Start every target from random weights."""
 
     uses = Uses(reference=True)
 
     def start_task(self, policy: Policy, stage: Stage) -> Iterable[nn.Parameter]:
-        """Draw all weights anew and return them."""
+        """Return all parameters, set to new random weights."""
         fresh = Policy(policy.config, seed=stage.seed)
         with torch.no_grad():
             for parameter, value in zip(policy.parameters(), fresh.parameters(), strict=True):

@@ -1,7 +1,7 @@
-"""Joint: all data of everything met so far, questions included. The upper guide.
+"""Joint: training on all data seen so far, questions included. The upper reference.
 
-A reference row: it keeps every demonstration and is no answer to forgetting, but it says what this policy and
-this budget of steps allow. Its success right after a target is the a* of intransigence (Chaudhry 2018).
+A reference row: it keeps every demonstration, so it does not solve forgetting, but it shows the limit of this
+policy and this budget of steps. Its success right after a target is a* in intransigence (Chaudhry 2018).
 """
 
 from dataclasses import dataclass
@@ -16,12 +16,12 @@ from clbench.policy.policy import Policy
 
 @dataclass
 class Joint(Method):
-    """Train on the target, on all prior demonstrations and on the questions at once."""
+    """Train on the target, all prior demonstrations and the questions together."""
 
     uses = Uses(demonstrations="throughout", questions="throughout", reference=True)
 
     def batch(self, target: Source[Batch], prior: Prior) -> tuple[Batch, QuestionBatch]:
-        """Return a batch of the target, one of prior demonstrations, if any, and half a one of questions."""
+        """Return target samples, as many prior samples if there are any, and half as many questions."""
         size = target.batch_size
         batch = target.sample(size)
         if len(prior.demonstrations):
@@ -29,6 +29,6 @@ class Joint(Method):
         return batch, prior.questions.sample(size // 2)
 
     def loss(self, policy: Policy, batch: tuple[Batch, QuestionBatch], progress: Progress) -> Tensor:
-        """Return the sum of the action loss and the answer loss, as in pretraining."""
+        """Return the sum of the action loss and the answer loss, which pretraining also minimises."""
         demonstrations, questions = batch
         return policy.action_loss(demonstrations).mean() + policy.answer_loss(questions).mean()

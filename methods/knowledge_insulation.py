@@ -1,10 +1,10 @@
-"""Knowledge insulation: the head's gradient ends at the backbone, which goes on answering (arXiv 2505.23705).
+"""Knowledge insulation: the backbone trains on questions, not on the head's gradient (arXiv 2505.23705).
 
 Details:
-1. The backbone is trained by the questions alone. In the paper it also learns to predict discrete action
-   tokens (FAST), which this policy does not have: what the backbone learns of the new task is nothing here.
-2. Half a batch of questions for each batch of demonstrations, as in pretraining; alpha = 1 weighs the action
-   loss (Eq. 6).
+1. The backbone trains on questions alone. In the paper it also learns to predict discrete action tokens
+   (FAST), which this policy does not have: here the backbone learns nothing about the new task.
+2. Each batch of demonstrations comes with half as many questions, as in pretraining; alpha = 1 weighs the
+   action loss (Eq. 6).
 """
 
 from dataclasses import dataclass
@@ -23,7 +23,7 @@ from ._requirements import in_range, require_hidden_states
 
 @dataclass
 class KnowledgeInsulation(Method):
-    """Train the head on detached hidden states and the backbone on questions."""
+    """Train the head on detached hidden states, and the backbone on questions."""
 
     alpha: float = 1.0
     """Factor of the action loss."""
@@ -39,11 +39,11 @@ class KnowledgeInsulation(Method):
         require_hidden_states(policy, "knowledge_insulation")
 
     def batch(self, target: Source[Batch], prior: Prior) -> tuple[Batch, QuestionBatch]:
-        """Return a batch of the target and half a one of questions."""
+        """Return a batch of the target, and half as many questions."""
         return with_questions(target, prior.questions)
 
     def loss(self, policy: Policy, batch: tuple[Batch, QuestionBatch], progress: Progress) -> Tensor:
-        """Return the answer loss, and the action loss whose gradient ends at the head."""
+        """Return the answer loss plus the action loss, whose gradient reaches the head alone."""
         demonstrations, questions = batch
         with torch.no_grad():
             hidden = policy.hidden_states(demonstrations.state, demonstrations.words, demonstrations.image)

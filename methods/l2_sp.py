@@ -1,9 +1,9 @@
-"""L2-SP: weights are pulled back to where they started from (arXiv 1802.01483).
+"""L2-SP: a penalty pulls the weights back to their starting point (arXiv 1802.01483).
 
 Details:
-1. The penalty (strength / 2) ||theta - theta*||^2 is on all weights; no layer is new here. Its gradient is
-   added in its closed form.
-2. theta* is the pretrained policy for the whole sequence.
+1. The penalty (strength / 2) ||theta - theta*||^2 applies to all weights, because no layer is new here. Its
+   gradient is added in closed form.
+2. theta* is the pretrained policy during the whole sequence.
 3. `strength` was chosen on validation episodes of seed 100.
 """
 
@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
-from clbench.learning.method import Metadata, Method, State
+from clbench.learning.method import Metadata, Method, MethodState
 from clbench.learning.prior import Prior
 from clbench.policy.policy import Policy
 
@@ -40,10 +40,10 @@ class L2SP(Method):
         loss.backward()  # type: ignore[no-untyped-call]
         pull_back(policy, self.anchor, self.strength)
 
-    def state(self) -> State:
+    def state(self) -> MethodState:
         """Return the pretrained weights."""
         return {**packed("anchor", self.anchor)}
 
-    def load_state(self, policy: Policy, state: State) -> None:
-        """Take them back."""
+    def load_state(self, policy: Policy, state: MethodState) -> None:
+        """Restore the pretrained weights."""
         self.anchor = unpacked("anchor", state)

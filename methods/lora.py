@@ -1,13 +1,12 @@
-"""LoRA: only low-rank additions to the linear layers are trained (arXiv 2106.09685), by the library peft.
+"""LoRA: only low-rank additions to the linear layers are trained (arXiv 2106.09685), with the library peft.
 
 Details:
-1. Adapters sit on every linear map inside the layers of the backbone and of the action head: queries, keys
-   and values, outputs and feed-forward. Rank 16 and alpha 32 are those of AEGIS's baseline (arXiv
-   2604.16067).
-2. One adapter is trained through all targets, as in arXiv 2603.11653; the weights under it never change.
-3. `variant` chooses between "lora", "dora" (arXiv 2402.09353) and "rslora" (arXiv 2312.03732).
-4. Adapters begin as no change at all and must go further than full weights do: `speed` multiplies the step
-   size. It was chosen on validation episodes of seed 100.
+1. Every linear map inside the layers of the backbone and of the action head has an adapter: queries, keys and
+   values, outputs and feed-forward. Rank 16 and alpha 32 come from AEGIS's baseline (arXiv 2604.16067).
+2. One adapter is trained on all targets in turn, as in arXiv 2603.11653; the weights below it never change.
+3. `variant` is "lora", "dora" (arXiv 2402.09353) or "rslora" (arXiv 2312.03732).
+4. Adapters start from zero and must move further than full weights: `speed` multiplies the step size. It was
+   chosen on validation episodes of seed 100.
 """
 
 from collections.abc import Iterable
@@ -15,7 +14,7 @@ from dataclasses import dataclass
 
 from torch import nn
 
-from clbench.learning.method import Metadata, Method, Progress, Stage, State
+from clbench.learning.method import Metadata, Method, MethodState, Progress, Stage
 from clbench.learning.prior import Prior
 from clbench.policy.policy import Policy
 
@@ -26,14 +25,14 @@ VARIANTS = ("lora", "dora", "rslora")
 
 @dataclass
 class LoRA(Method):
-    """Train low-rank adapters on the frozen policy."""
+    """Train low-rank adapters on a frozen policy."""
 
     rank: int = 16
     """Rank r of each adapter."""
     alpha: float = 32.0
     """Scale: an adapter's output is multiplied by alpha / rank (by alpha / sqrt(rank) with rslora)."""
     variant: str = "lora"
-    """One of lora, dora and rslora."""
+    """lora, dora or rslora."""
     speed: float = 3.0
     """Factor of the step size."""
 
@@ -75,10 +74,10 @@ class LoRA(Method):
         """Return the adapters' step size."""
         return self.speed * scheduled
 
-    def state(self) -> State:
-        """Return that there are adapters; their weights are the policy's own."""
+    def state(self) -> MethodState:
+        """Return a mark for the adapters; their weights belong to the policy."""
         return {"adapted": True}
 
-    def load_state(self, policy: Policy, state: State) -> None:
-        """Add the adapters to a plain policy; their weights come with the checkpoint."""
+    def load_state(self, policy: Policy, state: MethodState) -> None:
+        """Add the adapters to a plain policy; the checkpoint holds their weights."""
         self._add(policy)

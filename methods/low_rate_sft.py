@@ -1,6 +1,6 @@
 """Low-rate SFT: plain fine-tuning at a fifth of the step size.
 
-The control for every method that forgets less: perhaps it only moves less.
+The control for every method that forgets less: such a method may only take smaller steps.
 """
 
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ from ._requirements import in_range
 
 @dataclass
 class LowRateSFT(Method):
-    """Descend the target's action loss with smaller steps."""
+    """Minimise the target's action loss with smaller steps."""
 
     speed: float = 0.2
     """Factor of the step size."""

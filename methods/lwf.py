@@ -1,11 +1,11 @@
-"""LwF: on the target's data the policy must still predict what it predicted before (arXiv 1606.09282).
+"""LwF: on the target's data, the policy must keep its earlier predictions (arXiv 1606.09282).
 
 Details:
-1. For a flow-matching head the distillation loss is the squared difference of the velocities that the policy
-   and its frozen copy predict at the same flow time and noise, as the ConSFT paper (arXiv 2605.08879, Table
-   3) has it for its baseline. It is evaluated on the target's data: no prior data are used.
-2. The copy is made at the start of each target, as in LwF's own sequence; in the ConSFT paper it is the
-   pretrained model, which is the same for the first target.
+1. For a flow-matching head, the distillation loss is the squared difference between the velocities that the
+   policy and its frozen copy predict at the same flow time and noise. The ConSFT paper (arXiv 2605.08879,
+   Table 3) defines its baseline this way. The loss is computed on the target's data: no prior data are used.
+2. The copy is made at the start of each target, as in LwF's own sequences. In the ConSFT paper it is the
+   pretrained model, which is the same thing for the first target.
 3. `strength` was chosen on validation episodes of seed 100.
 """
 
@@ -26,7 +26,7 @@ from ._requirements import in_range
 
 @dataclass
 class LwF(Method):
-    """Distil the policy's own earlier velocities on the target's data."""
+    """Distil the policy's own earlier velocities, on the target's data."""
 
     strength: float = 0.1
     """Factor of the distillation loss."""
@@ -42,7 +42,7 @@ class LwF(Method):
         return policy.parameters()
 
     def loss(self, policy: Policy, batch: Batch, progress: Progress) -> Tensor:
-        """Return the action loss and the distillation loss."""
+        """Return the sum of the action loss and the weighted distillation loss."""
         with torch.no_grad():
             taught = self.teacher.predict(batch)
         difference = mean_over_valid((policy.predict(batch) - taught).square(), batch.valid)

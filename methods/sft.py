@@ -1,6 +1,6 @@
-"""SFT: plain supervised fine-tuning, every parameter on the target's demonstrations alone.
+"""SFT: plain supervised fine-tuning of all parameters, on the target's demonstrations alone.
 
-The baseline that every other method is compared with: it learns the target and protects nothing.
+The baseline for every other method: it learns the target and protects nothing.
 """
 
 from dataclasses import dataclass
@@ -10,4 +10,4 @@ from clbench.learning.method import Method
 
 @dataclass
 class SFT(Method):
-    """Descend the target's action loss with all parameters."""
+    """Minimise the target's action loss over all parameters."""

@@ -1,10 +1,10 @@
-"""Shuffled weights: ConSFT's weights, dealt out to the samples of the batch at random.
+"""Shuffled weights: ConSFT's weights, assigned to the samples of the batch at random.
 
-The control that tells which samples weigh little from that some do: what remains of ConSFT (arXiv 2605.08879)
-when a weight says nothing of its own sample.
+A control. It separates the choice of which samples get a small weight from the fact that some do: it keeps
+ConSFT's (arXiv 2605.08879) distribution of weights, but a weight no longer depends on its own sample.
 
 Details:
-1. The weights are those of ConSFT, with its constants, for the losses of the step, in a random order.
+1. The weights are ConSFT's, with its constants, for the losses of the same step, in a random order.
 """
 
 from dataclasses import dataclass
@@ -14,14 +14,14 @@ from torch import Tensor
 
 from clbench.learning.method import Progress
 
-from .consft import ConSFT
+from ._consft_weights import WeightedSFT
 
 
 @dataclass
-class ShuffledWeights(ConSFT):
-    """Give each sample the weight of another one."""
+class ShuffledWeights(WeightedSFT):
+    """Give each sample the weight of another sample of the batch."""
 
     def weights(self, losses: Tensor, progress: Progress) -> Tensor:
         """Return ConSFT's weights (B,) in a random order."""
-        weights = super().weights(losses, progress)
+        weights = self.confidence(losses, progress)
         return weights[torch.randperm(len(weights)).to(weights.device)]

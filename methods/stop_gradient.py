@@ -1,11 +1,11 @@
-"""Stop-gradient: the action head reads the backbone, and its gradient ends there.
+"""Stop-gradient: the action head reads the backbone, but sends no gradient into it.
 
-The baseline of AEGIS (arXiv 2604.16067) that keeps the backbone by giving up its training: what answers the
-questions cannot change.
+A baseline of AEGIS (arXiv 2604.16067). It keeps the backbone by not training it: the answers to questions
+cannot change.
 
 Details:
 1. The hidden states of every layer are detached, keys and values alike.
-2. Only the head's weights are given to the optimiser.
+2. The optimiser gets the head's weights only.
 """
 
 from collections.abc import Iterable
@@ -24,7 +24,7 @@ from ._requirements import require_hidden_states
 
 @dataclass
 class StopGradient(Method):
-    """Train the action head alone, on the hidden states of a backbone that stays as it was."""
+    """Train the action head alone, on the hidden states of a fixed backbone."""
 
     metadata = Metadata(link="https://arxiv.org/abs/2604.16067")
 
@@ -37,7 +37,7 @@ class StopGradient(Method):
         return policy.head.parameters()
 
     def loss(self, policy: Policy, batch: Batch, progress: Progress) -> Tensor:
-        """Return the action loss on hidden states that have no graph."""
+        """Return the action loss on detached hidden states."""
         with torch.no_grad():
             hidden = policy.hidden_states(batch.state, batch.words, batch.image)
         return policy.action_loss(batch, hidden).mean()

@@ -1,13 +1,13 @@
-"""Weight interpolation: after each target the policy goes a part of its way back, in weights.
+"""Weight interpolation: after each target, the weights move part of the way back.
 
 WiSE-FT (arXiv 2109.01903) for fine-tuned models, RETAIN (arXiv 2512.08333) for vision-language-action models:
 theta = (1 - coefficient) theta_before + coefficient theta_after.
 
 Details:
-1. theta_before is the policy at the start of the target, so that earlier targets are kept as well as skills.
+1. theta_before is the policy at the start of the target, so that the merge protects earlier targets as well
+   as skills.
 2. One coefficient for all weights. It was chosen on validation episodes of seed 100.
-3. While a target is learned the policy is not yet what the method makes of it: it is evaluated after the
-   merge only, and has no learning curve.
+3. The method's policy exists only after the merge: it is evaluated there alone, and has no learning curve.
 """
 
 from collections.abc import Iterable
@@ -25,7 +25,7 @@ from ._weights import copy_of
 
 @dataclass
 class WeightInterpolation(Method):
-    """Fine-tune, then average with the weights from before."""
+    """Fine-tune, then average with the weights from the start of the target."""
 
     coefficient: float = 0.5
     """Share of the fine-tuned weights."""
@@ -37,7 +37,7 @@ class WeightInterpolation(Method):
         in_range("coefficient", self.coefficient, 0.0, 1.0)
 
     def start_task(self, policy: Policy, stage: Stage) -> Iterable[nn.Parameter]:
-        """Return all parameters, and keep them as they are."""
+        """Return all parameters, and keep a copy of them."""
         self.before = copy_of(policy)
         return policy.parameters()
 

@@ -33,6 +33,7 @@ from clbench.records.writer import record_text
 from clbench.runs.length import run_length
 from clbench.runs.run import execute
 from clbench.runs.spec import RunSpec
+from clbench.scoring.scores import Scores
 from clbench.spec.identifiers import built_in_methods
 
 collect_ignore = ["submission"]
@@ -174,6 +175,12 @@ def add(make_record: Callable[..., Record], matrix: Any, tmp_path: Path) -> Call
 def make_record() -> Callable[..., Record]:
     """Return a function that makes a record out of matrices, as a run would have left it."""
     return _make_record
+
+
+@pytest.fixture(scope="session")
+def scores(make_record: Callable[..., Record]) -> Callable[..., Scores]:
+    """Return a function that makes the scores of a record out of matrices, see `make_record`."""
+    return lambda *arguments, **options: Scores.from_record(make_record(*arguments, **options))
 
 
 def _make_record(

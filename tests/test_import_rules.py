@@ -1,8 +1,8 @@
 """Import rules: which package may import which, and how large a module and a package may be.
 
 The imports are read from the source, at the top of modules and inside functions. Imports below
-`if TYPE_CHECKING` serve type checkers alone and do not count. A name in a string, such as the entry point of a
-world, is not an import: the core finds its parts by such names.
+`if TYPE_CHECKING` serve type checkers alone and do not count. A name in a string, such as the entry point of
+a world, is not an import: the core finds its parts by such names.
 """
 
 from __future__ import annotations
@@ -40,15 +40,19 @@ SIDEWAYS: frozenset[tuple[str, str]] = frozenset()
 PARTS = ("envs", "methods", "leaderboard")
 """Packages beside the core, which import it and which it never imports."""
 
-USERS_OF_THE_COMMAND_LINE = ("clbench.cli", "clbench.leaderboard.cli")
-"""The only modules and packages that import `clbench.cli`."""
+USERS_OF_THE_COMMAND_LINE = (
+    "clbench.cli",
+    "clbench.leaderboard.cli",
+    "clbench.envs.dm_control.expert_training.cli",
+)
+"""The modules and packages that define commands: nothing else imports `clbench.cli`."""
 
 FORBIDDEN = {
     "clbench.scoring": ("torch", "mujoco", "minari"),
     "clbench.records": ("torch", "mujoco", "minari"),
     "clbench.worlds": ("torch", "clbench.policy"),
 }
-"""Modules that a package must not import, neither in its functions nor through the modules that it imports."""
+"""Modules that a package must not import, neither in a function nor by way of the modules that it imports."""
 
 LIGHT = ("clbench.scoring.metrics", "clbench.records.reader", "clbench.leaderboard")
 """Modules that read scores: they need neither PyTorch nor a simulator."""
@@ -269,7 +273,7 @@ def test_reading_scores_imports_neither_pytorch_nor_a_simulator(imported: str) -
     assert _run(f"import sys, {imported}; print({heavy} & set(sys.modules))") == "set()\n"
 
 
-def test_no_module_is_longer_than_a_person_can_keep_in_mind() -> None:
+def test_no_module_has_more_than_450_lines() -> None:
     folders = ("clbench", *PARTS, "benchmarks", "tests")
     lengths = {
         path.relative_to(ROOT).as_posix(): len(path.read_text(encoding="utf-8").splitlines())
@@ -279,7 +283,7 @@ def test_no_module_is_longer_than_a_person_can_keep_in_mind() -> None:
     assert {name: lines for name, lines in lengths.items() if lines > MOST_LINES} == {}
 
 
-def test_no_package_has_more_modules_than_a_person_can_keep_in_mind() -> None:
+def test_no_package_has_more_than_12_modules() -> None:
     """`methods` is exempt: it has one module for each method."""
     found = {}
     for folder in ("clbench", "envs", "leaderboard"):

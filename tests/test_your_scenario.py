@@ -50,7 +50,7 @@ def test_its_world_is_perturbed_as_the_page_says(tmp_path: Path) -> None:
     world = _blocks("python")[0].replace("render_mode=None", "render_mode=None, perturbed=False")
     for line, lines in (
         ("import clbench\n", f"import clbench\n{imported}\n"),
-        ("    def __init__", f"{textwrap.indent(textwrap.dedent(declared), ' ' * 4)}\n\n    def __init__"),
+        ("    def __init__(", f"{declared}\n\n    def __init__("),
         ("self.data = mujoco.MjData(self.model)\n", f"self.data = mujoco.MjData(self.model)\n{made}\n"),
         ("        mujoco.mj_resetData", f"{drawn}\n        mujoco.mj_resetData"),
         ("        return self._state(), {", f"{displaced}\n        return self._state(), {{"),
@@ -67,20 +67,20 @@ from clbench.worlds.perturbation import draw_perturbation
 from clbench.worlds.lanes import check_perturbable
 
 check_perturbable(mypackage.SCENARIO.retained)
-plain, disturbed = mypackage.Table(), mypackage.Table(perturbed=True)
+plain, perturbed = mypackage.Table(), mypackage.Table(perturbed=True)
 for seed in range(4):
     drawn = draw_perturbation(seed)
-    one, other = (world.reset(seed=seed)[0] for world in (plain, disturbed))
+    one, other = (world.reset(seed=seed)[0] for world in (plain, perturbed))
     assert abs(other[:2] - one[:2] - 0.05 * mypackage.np.array(drawn.start[:2])).max() < 1e-6
-    assert disturbed.model.body("ball").mass == drawn.mass * plain.model.body("ball").mass
+    assert perturbed.model.body("ball").mass == drawn.mass * plain.model.body("ball").mass
 """
 
 
 def _fragments() -> list[str]:
     """Return the lines that the page adds to a perturbable world: an import, and lines for four places."""
     (block,) = re.findall(r"  ```py\n(.*?)  ```", PAGE.read_text(encoding="utf-8"), flags=re.DOTALL)
-    first, *others = textwrap.dedent(block).strip("\n").split("\n\n")
-    return [first, *(textwrap.indent(lines, " " * 8) for lines in others)]
+    first, declared, *others = textwrap.dedent(block).strip("\n").split("\n\n")
+    return [first, textwrap.indent(declared, " " * 4), *(textwrap.indent(lines, " " * 8) for lines in others)]
 
 
 @pytest.mark.slow

@@ -1,4 +1,4 @@
-"""Installed packages: their versions, and the extras that bring those which only some things need."""
+"""Installed packages: their versions, and the extras of clbench that bring optional ones."""
 
 from __future__ import annotations
 
@@ -14,43 +14,43 @@ from clbench.base.errors import MissingPackageError
 
 
 def versions(packages: Iterable[str]) -> dict[str, str]:
-    """Return the version of each distribution, in order of the names.
+    """Return the version of each distribution, sorted by name.
 
     Raises:
-        importlib.metadata.PackageNotFoundError: One is not installed.
+        importlib.metadata.PackageNotFoundError: A distribution is not installed.
     """
     return {package: _version(package) for package in sorted(packages)}
 
 
-@functools.cache  # to parse the metadata of a package takes 10 ms, and a run asks for about 70
+@functools.cache  # parsing the metadata of a package takes 10 ms, and a run asks for about 70
 def _version(package: str) -> str:
     return metadata.version(package)
 
 
 def require(module: str, extra: str, purpose: str) -> None:
-    """Refuse to go on without an extra, before any work is done.
+    """Check that an optional module is installed, before any work starts.
 
     Args:
-        module: What would be imported.
-        extra: Name of the extra of clbench that brings it.
-        purpose: What needs it, as the subject of a sentence.
+        module: Module to be imported later.
+        extra: Extra of clbench that brings the module.
+        purpose: Purpose of the module, as the subject of a sentence in the message.
 
     Raises:
-        LookupError: It is not installed; the message says how to get it.
+        LookupError: The module is not installed; the message says how to get it.
     """
     if find_spec(module) is None:
         raise MissingPackageError(f"{purpose} needs the package {module}: pip install 'clbench[{extra}]'")
 
 
 def require_packages(packages: Iterable[str], purpose: str) -> None:
-    """Refuse to go on without distributions, before any work is done.
+    """Check that distributions are installed, before any work starts.
 
     Args:
         packages: Names of the distributions.
-        purpose: What needs them, as the subject of a sentence.
+        purpose: Purpose of the distributions, as the subject of a sentence in the message.
 
     Raises:
-        LookupError: One is not installed; the message says how to get it.
+        LookupError: A distribution is not installed; the message says how to get it.
     """
     for package in sorted(packages):
         if not is_installed(package):
@@ -60,7 +60,7 @@ def require_packages(packages: Iterable[str], purpose: str) -> None:
 
 
 def is_installed(package: str) -> bool:
-    """Return whether a distribution is there."""
+    """Return whether a distribution is installed."""
     try:
         metadata.version(package)
     except metadata.PackageNotFoundError:
@@ -69,12 +69,12 @@ def is_installed(package: str) -> bool:
 
 
 def extra_of(requirement: Requirement) -> str:
-    """Return the extra of clbench that a requirement belongs to, empty if it is always installed."""
+    """Return the extra of clbench that a requirement belongs to, empty if it is in none."""
     return str(requirement.marker).partition("==")[2].strip(" \"'") if requirement.marker else ""
 
 
 def _wanted(package: str) -> str:
-    """Return what to install to get a distribution: the extra of clbench that brings it, else itself."""
+    """Return the argument of `pip install` for a distribution: its extra of clbench, else itself."""
     for requirement in map(Requirement, metadata.requires("clbench") or []):
         if canonicalize_name(requirement.name) == canonicalize_name(package) and extra_of(
             requirement

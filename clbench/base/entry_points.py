@@ -1,4 +1,4 @@
-"""Entry points: objects named as "module:attribute"."""
+"""Entry points: objects by their names "module:attribute"."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from clbench.base.errors import UnknownNameError
 
 
 def resolve(name: str) -> Any:
-    """Return the object that `name`, "module:attribute", names.
+    """Return the object at the entry point `name`, "module:attribute".
 
     Raises:
         LookupError: There is no such module, or it has no such attribute; the nearest one is named.
@@ -28,8 +28,12 @@ def resolve(name: str) -> Any:
 def import_module(module: str, needed_for: str) -> Any:
     """Return a module.
 
+    Args:
+        module: Name of the module.
+        needed_for: Name of the thing that needs it, for the message.
+
     Raises:
-        LookupError: It, or one that it imports, is not there.
+        LookupError: The module, or a module that it imports, does not exist.
     """
     try:
         return importlib.import_module(module)
@@ -39,7 +43,13 @@ def import_module(module: str, needed_for: str) -> Any:
 
 
 def unknown(kind: str, name: str, known: Iterable[str]) -> UnknownNameError:
-    """Return the error for a name that is not among the `known` ones, with the nearest of them."""
+    """Return the error for a name that is not `known`, with the nearest known name.
+
+    Args:
+        kind: Kind of thing that is named, such as "task".
+        name: Unknown name.
+        known: Known names.
+    """
     known = sorted(known)
     near = difflib.get_close_matches(name, known, n=1)
     hint = f" Did you mean {near[0]!r}?" if near else ""

@@ -8,11 +8,11 @@ from __future__ import annotations
 
 
 class ClbenchError(Exception):
-    """An error whose message says all that a user needs: what is wrong, and what was expected."""
+    """An error with a complete message for the user: the fault, and the expected value."""
 
 
 class InputError(ClbenchError, ValueError):
-    """A value is out of range, of another form, or contradicts another value."""
+    """A value is out of range, has the wrong form, or contradicts another value."""
 
 
 class UnknownNameError(ClbenchError, LookupError):
@@ -24,4 +24,4 @@ class MissingPackageError(ClbenchError, LookupError):
 
 
 class WrongTypeError(ClbenchError, TypeError):
-    """An object is not of the type that was expected."""
+    """An object does not have the expected type."""

@@ -1,4 +1,4 @@
-"""Seeds by name: every random stream of a run follows from what it is for, never from what ran before."""
+"""Seeds by name: every random stream follows from its purpose, never from the code that ran before."""
 
 from __future__ import annotations
 
@@ -10,23 +10,23 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-if TYPE_CHECKING:  # it takes seconds to import, and environments do without it
+if TYPE_CHECKING:  # PyTorch takes seconds to import, and environments do not need it
     import torch
 
 
 def derive_seed(*parts: str | int) -> int:
-    """Return the 31-bit seed that `parts`, as `("episode", 0, "push", 3)`, name."""
+    """Return the 31-bit seed with the name `parts`, such as `("episode", 0, "push", 3)`."""
     digest = hashlib.sha256("\x1f".join(map(str, parts)).encode()).digest()
-    return int.from_bytes(digest[:4], "big") >> 1  # 31 bits: the widest that every library's seed takes
+    return int.from_bytes(digest[:4], "big") >> 1  # 31 bits: every library accepts such seeds
 
 
 def numpy_generator(*parts: str | int) -> np.random.Generator:
-    """Return the NumPy generator of the stream that `parts` name."""
+    """Return the NumPy generator of the stream with the name `parts`."""
     return np.random.default_rng(derive_seed(*parts))
 
 
 def torch_generator(*parts: str | int) -> torch.Generator:
-    """Return the PyTorch generator, on the CPU, of the stream that `parts` name."""
+    """Return the PyTorch generator, on the CPU, of the stream with the name `parts`."""
     import torch
 
     return torch.Generator().manual_seed(derive_seed(*parts))
@@ -34,13 +34,13 @@ def torch_generator(*parts: str | int) -> torch.Generator:
 
 @contextmanager
 def seeded(*parts: str | int) -> Iterator[None]:
-    """Seed the global generators of Python, NumPy and PyTorch inside, and put them back after.
+    """Seed the global generators of Python, NumPy and PyTorch inside the block, and restore them after it.
 
     Our own code draws from explicit generators; a method, or a library that it uses, may not.
     """
     import torch
 
-    python, numpy_state = random.getstate(), np.random.get_state()  # noqa: NPY002 - to put it back
+    python, numpy_state = random.getstate(), np.random.get_state()  # noqa: NPY002 - to restore it
     seed = derive_seed(*parts)
     with torch.random.fork_rng():
         random.seed(seed)

@@ -1,4 +1,4 @@
-"""JSON that a stranger wrote: read within limits, and refused by what is wrong with it."""
+"""Reader for JSON that a stranger wrote: it enforces limits, and names the fault of a refused file."""
 
 from __future__ import annotations
 
@@ -13,32 +13,32 @@ from typing import Any
 from clbench.base.errors import ClbenchError, InputError
 
 MOST_BYTES = 8 * 2**20
-"""Size of a file. A record of Fetch-v0 has 0.1 MB; 8 MB of brackets take 0.3 GB of memory and 3 s."""
+"""Size limit of a file. A record of Fetch-v0 has 0.1 MB; 8 MB of brackets take 0.3 GB of memory and 3 s."""
 
 DEEPEST = 16
-"""Lists and objects inside each other. Records have 5."""
+"""Nesting limit of lists and objects. Records have 5 levels."""
 
 LONGEST_TEXT = 100_000
-"""Characters of a text. Tracebacks are the longest."""
+"""Length limit of a text in characters. Tracebacks are the longest texts."""
 
 LONGEST_NAME = 200
-"""Characters of the name of an entry."""
+"""Length limit of the name of an entry in characters."""
 
 LARGEST = 2**64
-"""What whole numbers stay below, seeds of 64 bits included."""
+"""Bound of whole numbers: their absolute value is smaller. Seeds have up to 64 bits."""
 
 _SCALARS = {str, int, float, bool, type(None)}
 
 _PLAINLY = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
-"""No link is followed, and a pipe that nobody writes to is not waited for."""
+"""Flags for opening a file: do not follow a link, and do not wait for a pipe without a writer."""
 
 
 class StrictJSONError(ClbenchError, ValueError):
-    """A file is not JSON within the limits."""
+    """A file is not JSON, or exceeds a limit."""
 
 
 def quoted(text: str) -> str:
-    """Return a stranger's text as Python writes it, cut to 60 characters."""
+    """Return a stranger's text as a Python literal, cut to 60 characters."""
     return repr(text) if len(text) <= 60 else f"{text[:60]!r}..."
 
 
@@ -46,8 +46,8 @@ def read_json(path: Path) -> Any:
     """Return the JSON in the regular file at `path`.
 
     Raises:
-        StrictJSONError: It is no regular file, too large, not UTF-8 or not JSON; a name is there twice in one
-            object; something is nested too deep, too long or too large, or is no finite number.
+        StrictJSONError: It is not a regular file, too large, not UTF-8 or not JSON; a name occurs twice in
+            one object; or a value is nested too deep, too long, too large or not finite.
     """
     try:
         content = _read(path)
@@ -77,12 +77,12 @@ def _read(path: Path) -> bytes:
 
 
 def _no_number(name: str) -> Any:
-    """Refuse NaN and infinities, which Python reads although JSON has none."""
+    """Refuse NaN and infinities, which Python reads although JSON does not have them."""
     raise InputError(f"{name} is no number")
 
 
 def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """Refuse a name that is there twice: readers would differ in which one they take."""
+    """Refuse a name that occurs twice: readers would differ in the one that they keep."""
     values = dict(pairs)
     if len(values) != len(pairs):
         ((name, _),) = Counter(name for name, _ in pairs).most_common(1)
@@ -91,14 +91,14 @@ def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def check_json(value: Any, where: str = "it") -> None:
-    """Refuse a value that is no JSON within the limits.
+    """Refuse a value that is not JSON or exceeds a limit.
 
     Args:
-        value: What `json` may have read.
-        where: What it is called. The entries of an object are called by their names.
+        value: Value that `json` may have read.
+        where: Name of the value in messages. Entries of an object have their own names.
 
     Raises:
-        StrictJSONError: It is not.
+        StrictJSONError: The value is refused.
     """
     if isinstance(value, dict):
         for name, entry in value.items():

@@ -13,7 +13,7 @@ from rich.console import Console
 from rich.text import Text
 
 from clbench.base.entry_points import unknown
-from clbench.base.errors import ClbenchError, InputError
+from clbench.base.errors import ClbenchError
 
 
 def whole_number(least: int) -> Parameter:
@@ -50,14 +50,3 @@ def checked_input() -> Iterator[None]:
 def add_cwd_to_path() -> None:
     """Let module:Class name a module in the working directory: a console script does not look there."""
     sys.path.insert(0, os.getcwd())
-
-
-def require_min(least: int, option: str, value: int | None) -> None:
-    """Refuse the value of an option that is smaller than `least`.
-
-    Raises:
-        InputError: The value is too small.
-    """
-    if value is not None and value < least:
-        raise InputError(f"{option} must be at least {least}, not {value}.")
-

@@ -1,9 +1,9 @@
 """Access rules: the data that the hooks of a stage must not see. Every run checks them.
 
-The hooks of a method may use the objects that the runner passes to them, and no data of a later stage. They may
-read the demonstrations and run the validation episodes of tasks up to their own, but no test episode and no test
-question. After each hook the policy must still have the normalisation of the retained skills, its vocabulary
-and its sizes.
+The hooks of a method may use the objects that the runner passes to them, and no data of a later stage. They
+may read the demonstrations and run the validation episodes of tasks up to their own, but no test episode and
+no test question. After each hook the policy must still have the normalisation of the retained skills, its
+vocabulary and its sizes.
 
 These checks find mistakes. They do not stop a method that avoids the functions of clbench, see
 `docs/guide/security.md`.
@@ -92,7 +92,7 @@ def check_questions() -> None:
         LeakError: Hooks are running.
     """
     if _known.get() is not None:
-        raise LeakError("The method loads questions by itself, those of the report too: `prior` has its own.")
+        raise LeakError("The method loads questions by itself, the test questions too: `prior` has its own.")
 
 
 def check_policy(policy: Policy, pretrained: Policy) -> None:

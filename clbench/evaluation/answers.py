@@ -16,13 +16,13 @@ from clbench.policy.policy import Policy
 def answer(
     policy: Policy, kinds: Sequence[QuestionKind], kind: torch.Tensor, questions: QuestionBatch
 ) -> list[tuple[str, int, int]]:
-    """Return, for each kind of question, its name, how often it was asked, and how often answered rightly.
+    """Return the name of each kind of question, the number of its questions, and of correct answers.
 
     Args:
-        policy: What answers, by the likeliest word of the whole vocabulary.
-        kinds: The kinds that there are.
+        policy: Policy that answers with the most likely word of the whole vocabulary.
+        kinds: All kinds of questions.
         kind: Index of each question's kind, (B,).
-        questions: The questions, B of them.
+        questions: B questions.
     """
     right = []
     device = policy.state_mean.device

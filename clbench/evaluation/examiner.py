@@ -29,7 +29,7 @@ class Examiner:
         data: Questions of the scenario.
         pretrained: The pretrained policy, with which later policies are compared.
         seed: Seed of the run: it chooses the initial states.
-        progress: Called with the duration of what was done, in optimiser steps.
+        progress: Called with the length of the work done since its last call, in optimiser steps.
     """
 
     def __init__(
@@ -47,7 +47,7 @@ class Examiner:
 
     @cached_property
     def _asked(self) -> tuple[torch.Tensor, QuestionBatch]:
-        """Kinds and questions that are scored: a tuning run must not see the test questions."""
+        """Kinds and questions to score: a tuning run must not see the test questions."""
         tuning = self._protocol.split == "validation"
         questions = self._data.questions if tuning else self._data.test_questions
         return scored_questions(questions, self._scenario.budget.test_questions)

@@ -1,4 +1,4 @@
-"""Probes: how far a policy has moved from the pretrained one."""
+"""Probes: measure how far a policy has moved from the pretrained policy."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ SPARSITY_THRESHOLD = 1e-3
 
 @torch.no_grad()
 def activations(policy: Policy, questions: QuestionBatch) -> Gaussian:
-    """Return a Gaussian of the policy's hidden states on `questions`, which are on the policy's device."""
+    """Return a Gaussian of the policy's hidden states on `questions`, given on the policy's device."""
     hidden = policy.hidden_states(questions.state, questions.words, questions.image)
     return Gaussian.of(hidden, policy.backbone.mask(questions.words))
 
 
 @torch.no_grad()
 def update_sparsity(policy: Policy, pretrained: Policy) -> float | None:
-    """Return the share of the pretrained weights that hardly changed, None if the weights are others now.
+    """Return the share of the pretrained weights that hardly changed, None if the parameter names differ.
 
     ConSFT (arXiv 2605.08879), Eq. 8: relative change below 1e-3.
     """

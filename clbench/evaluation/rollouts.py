@@ -1,8 +1,8 @@
 """Rollouts: many evaluation episodes in lock-step.
 
-An episode's outcome depends on nothing but the policy, the task, its number and the run's seed. Every forward
-has one shape, `LANES` rows of which the unused are padding: a matrix product may round differently for
-another number of rows.
+The outcome of an episode depends only on the policy, the task, the number of the episode and the seed of the
+run. Every forward pass has the same shape: `LANES` rows, with padding in unused rows, because a matrix
+product may round differently for another number of rows.
 """
 
 from __future__ import annotations
@@ -28,40 +28,40 @@ Trial = tuple[Task, Split, int]
 """One episode to run: its task, its split and its number."""
 
 Watch = Callable[[Trial, NDArray[np.float32]], None]
-"""Called with a trial and an action (A,) that is taken in it."""
+"""Called with a trial and each action (A,) taken in it."""
 
 LANES = 40
-"""Episodes that are stepped together, and rows of every forward."""
+"""Number of episodes that step together, and of rows in every forward pass."""
 
 
 @dataclass(frozen=True)
 class Episode:
-    """What came of one evaluation episode."""
+    """The outcome of one evaluation episode."""
 
     task: str
     """Name of the task."""
     split: Split
-    """What its outcome may be used for."""
+    """Split of the episode, which limits the use of its outcome."""
     number: int
-    """Which of the initial states of its task and split it had."""
+    """Number of the episode, which chooses its initial state within its task and split."""
     success: bool
     """Whether the success rule held before the horizon."""
     total_reward: float
     """Sum of the dense rewards."""
     length: int
-    """Steps taken."""
+    """Number of steps."""
 
 
 @dataclass
 class _Lane:
-    """One episode on its way."""
+    """One running episode."""
 
     number: int
-    """Which of the lanes it runs in."""
+    """Number of its lane."""
     trial: Trial
     words: torch.Tensor
     noise: torch.Tensor
-    """Draws for every forward of the episode, (forwards, H, A)."""
+    """Noise for every forward pass of the episode, (forwards, H, A)."""
     state: NDArray[np.float32]
     total_reward: float = 0.0
     length: int = 0
@@ -74,18 +74,18 @@ class _Lane:
 
     @property
     def episode(self) -> Episode:
-        """What came of it."""
+        """Outcome of the episode."""
         task, split, number = self.trial
         return Episode(task.name, split, number, self.success, self.total_reward, self.length)
 
 
 class Evaluator:
-    """Runs episodes of a scenario; its worlds are made when first needed and used again.
+    """Runs episodes of a scenario; it makes each world on first use and keeps it.
 
     Args:
-        scenario: Where the tasks come from.
-        seed: Of the run: it chooses the initial states, the same for all methods.
-        threads: Threads that may step the worlds; no outcome depends on it.
+        scenario: Scenario of the tasks.
+        seed: Seed of the run: it chooses the initial states, the same for all methods.
+        threads: Number of threads that may step the worlds; no outcome depends on it.
     """
 
     def __init__(self, scenario: Scenario, seed: int, threads: int = 1) -> None:
@@ -107,9 +107,9 @@ class Evaluator:
         """Return the outcome of every episode of `split` on each of the tasks, in order of task and number.
 
         Args:
-            policy: What acts.
-            tasks: What it is asked to do.
-            split: Which episodes. Choose on "validation"; the others are for scores alone.
+            policy: Policy that acts.
+            tasks: Tasks to evaluate.
+            split: Split of the episodes. Base choices on "validation"; the others are only for scores.
             progress: Called with the number of episodes that have ended since its last call.
         """
         numbers = range(self.scenario.budget.episodes(split))
@@ -122,14 +122,14 @@ class Evaluator:
         progress: ProgressCallback = no_progress,
         watch: Watch = lambda _, __: None,
     ) -> list[Episode]:
-        """Return the outcome of each of `trials`, in their order; none may be there twice.
+        """Return the outcome of each of `trials`, in their order; no trial may occur twice.
 
         Args:
-            policy: What acts.
-            trials: Which episodes: task, split and number.
+            policy: Policy that acts.
+            trials: Episodes by task, split and number.
             progress: Called with the number of episodes that have ended since its last call.
-            watch: Called with every action: the plain world, reset as `start_of` says, repeats the episode
-                unless it is perturbed.
+            watch: Called with every action. With these actions the plain world, reset with the seed of
+                `start_of`, repeats the episode unless it is perturbed.
         """
         check_episodes((task.name, split) for task, split, _ in trials)
         queue = list(reversed(trials))
@@ -149,7 +149,7 @@ class Evaluator:
         return [ended[task.name, split, number] for task, split, number in trials]
 
     def _start(self, policy: Policy, starting: Sequence[tuple[int, Trial]]) -> list[_Lane]:
-        """Begin each trial in the lane that stands beside it."""
+        """Begin each trial in the lane that is paired with it."""
         if not starting:
             return []
         tasks = [task for _, (task, _, _) in starting]
@@ -188,7 +188,7 @@ class Evaluator:
         device = policy.state_mean.device
         chunks = policy.act(state.to(device), words.to(device), noise.to(device), image.to(device))
         actions: NDArray[np.float32] = chunks[: len(live), : config.executed].cpu().numpy()
-        # a diverged policy acts in NaN: it stands still and fails rather than stop the run
+        # a diverged policy returns NaN: with zero actions it fails and does not stop the run
         return np.nan_to_num(actions).clip(-1.0, 1.0)
 
     def _execute(self, live: Sequence[_Lane], chunks: NDArray[np.float32], watch: Watch) -> None:
@@ -208,9 +208,9 @@ class Evaluator:
 
 
 def start_of(trial: Trial, seed: int) -> tuple[int, str]:
-    """Return what a trial starts with in a run of `seed`: the seed of its initial state, its instruction.
+    """Return the start of a trial in a run of `seed`: the seed of its initial state, and its instruction.
 
-    A perturbed episode starts with what the test episode of its number does.
+    A perturbed episode has the same start as the test episode of its number.
     """
     task, split, number = trial
     instruction = task.instructions[number % len(task.instructions)]

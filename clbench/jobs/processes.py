@@ -122,13 +122,15 @@ def _context() -> Any:
     """Return how processes are started: from one that has imported all once (50 ms), or anew (2 s)."""
     if "forkserver" not in multiprocessing.get_all_start_methods():
         return multiprocessing.get_context("spawn")
-    from multiprocessing import forkserver  # cannot be imported where there is none
+    from multiprocessing import forkserver, resource_tracker  # cannot be imported where there is none
 
     context = multiprocessing.get_context("forkserver")
     # the second takes a second too, and asking PyTorch for deterministic algorithms imports it
     context.set_forkserver_preload(["clbench.runs.run", "torch._inductor.config"])
-    # The server inherits the mask: a Ctrl-C, which reaches all processes of a terminal, does not end it
-    # before it ignores the signal by itself. A Ctrl-C that comes meanwhile waits here, and is not lost.
+    # else the server starts it, and unblocks Ctrl-C for itself on the way
+    resource_tracker.ensure_running()
+    # The server inherits the mask. It ignores Ctrl-C, which reaches all processes of a terminal, only after
+    # its imports: until then the mask protects it. A Ctrl-C that comes meanwhile waits here, and is not lost.
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         forkserver.ensure_running()

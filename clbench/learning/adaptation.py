@@ -19,11 +19,11 @@ class Step:
     """One optimiser step of a stage."""
 
     done: int
-    """How many steps of the stage are done with it."""
+    """Number of steps done in the stage, this one included."""
     loss: Tensor | None
-    """What was descended, a scalar; None if the method trains nothing."""
+    """Loss of the step, a scalar; None if the method trains nothing."""
     learning_rate: float | None
-    """The step size that was taken, of the last optimiser group; None if the method trains nothing."""
+    """Step size of the last optimiser group; None if the method trains nothing."""
 
 
 def adapt(
@@ -36,11 +36,14 @@ def adapt(
     """Let `method` fine-tune the policy on one target, in place, and return the optimiser steps done.
 
     Args:
-        policy: What is trained.
-        method: How.
-        stage: Which target, with the data that the method may touch.
-        budget: Step size.
+        policy: Policy to train.
+        method: Method that trains it.
+        stage: Stage of the target, with the data that the method may use.
+        budget: Budget that gives the step size.
         after: Called after each step.
+
+    Raises:
+        MethodError: Optimisation fails, or leaves a parameter that is not finite.
     """
     parameters = method.start_task(policy, stage)
     loss: Tensor | None = None

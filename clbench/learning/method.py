@@ -1,4 +1,4 @@
-"""The method: hooks around a loop that is ours. A method file holds only what differs from fine-tuning."""
+"""The method: hooks of a training loop. A method file contains only its differences from fine-tuning."""
 
 from __future__ import annotations
 
@@ -24,28 +24,28 @@ _TEXTS = {
         r"https?://[A-Za-z0-9][A-Za-z0-9.-]*(:\d{1,5})?(/[A-Za-z0-9._~:/?#@!$&()*+,;=%-]{0,300})?",
         "a web address that begins with http:// or https://",
     ),
-    "licence": (r"[A-Za-z0-9][A-Za-z0-9 .()+-]{0,99}", 'an SPDX expression, as "MIT" or "Apache-2.0"'),
-    "version": (r"[A-Za-z0-9][A-Za-z0-9.+!_-]{0,49}", 'a version, as "1.0"'),
+    "licence": (r"[A-Za-z0-9][A-Za-z0-9 .()+-]{0,99}", 'an SPDX expression such as "MIT" or "Apache-2.0"'),
+    "version": (r"[A-Za-z0-9][A-Za-z0-9.+!_-]{0,49}", 'a version such as "1.0"'),
 }
-"""What the texts of `Metadata` must match, and the same in words."""
+"""Pattern that each text of `Metadata` must match, and its description."""
 
 
 @dataclass(frozen=True)
 class Metadata:
-    """Who made a method, and on what terms; None is not said.
+    """Authors and licence of a method; None leaves a field out.
 
     Raises:
-        ValueError: A text is not of its kind: all of them are shown on a page that strangers read.
+        InputError: A text does not match its pattern. All texts appear on a public page.
     """
 
     authors: str | None = None
-    """Names of who made it."""
+    """Names of the authors."""
     link: str | None = None
-    """Of the paper, or of the code."""
+    """Web address of the paper or of the code."""
     licence: str | None = None
-    """Of the code, as an SPDX expression."""
+    """Licence of the code, as an SPDX expression."""
     version: str | None = None
-    """Of the code."""
+    """Version of the code."""
 
     def __post_init__(self) -> None:
         for name, (pattern, words) in _TEXTS.items():
@@ -58,50 +58,51 @@ class Metadata:
 
 @dataclass(frozen=True)
 class Stage:
-    """One target task of the sequence, as a method meets it."""
+    """One target task of the sequence, with the data for it."""
 
     number: int
-    """1 for the first target."""
+    """Number of the target, from 1."""
     task: Task
-    """What is learned."""
+    """Task to learn."""
     seed: int
-    """For the method's own random draws in this stage."""
+    """Seed for the method's own random draws in this stage."""
     steps: int
-    """Optimiser steps of the budget."""
+    """Number of optimiser steps in the budget."""
     target: Source[Batch]
-    """The task's demonstrations."""
+    """Demonstrations of the task."""
     prior: Prior
-    """What may be touched of what was learned before."""
+    """Data of earlier tasks that the method may use."""
 
 
 @dataclass(frozen=True)
 class Progress:
-    """How far the adaptation to a target has come."""
+    """Progress of the adaptation to a target."""
 
     step: int
-    """Optimiser steps done in this stage."""
+    """Number of optimiser steps done in this stage."""
     steps: int
-    """Optimiser steps of the whole stage."""
+    """Number of optimiser steps in the whole stage."""
 
 
 class Method:
     """A rule for fine-tuning: a dataclass whose fields are its hyper-parameters.
 
-    The constructor only stores, and `__post_init__` refuses what is out of range; what a method learns is set
-    by the hooks. Override what differs from plain fine-tuning, and declare in `uses` the prior data it needs.
+    The constructor only stores values, and `__post_init__` refuses values out of range; the hooks set all
+    learned values. Override the hooks that differ from plain fine-tuning, and declare in `uses` the prior
+    data that the method needs.
     """
 
     uses: Uses = Uses()
     metadata: Metadata = Metadata()
     whole_stages: bool = False
-    """Whether the policy is what the method means it to be at the end of a stage only, as one that `end_task`
-    merges: it is then not evaluated on the way."""
+    """Whether the policy is ready only at the end of a stage, for example because `end_task` merges it. Such
+    a policy is not evaluated within a stage."""
 
     def prepare(self, policy: Policy, prior: Prior) -> int | None:
         """Prepare for the sequence, once, before stage 1: anchors, vectors, adapters, frozen copies.
 
         Returns:
-            The optimiser steps that it took, or that what it found in a cache once took; none if None.
+            The number of optimiser steps that it took, or that a cached result once took; None counts as 0.
         """
 
     def start_task(self, policy: Policy, stage: Stage) -> Iterable[nn.Parameter] | list[dict[str, Any]]:
@@ -109,11 +110,11 @@ class Method:
         return policy.parameters()
 
     def batch(self, target: Source[Batch], prior: Prior) -> Any:
-        """Return what to train on at this step; it goes to `loss` as it is."""
+        """Return the training data of this step; it is passed to `loss` unchanged."""
         return target.sample(target.batch_size)
 
     def loss(self, policy: Policy, batch: Any, progress: Progress) -> Tensor:
-        """Return the scalar to descend."""
+        """Return the loss to minimise, a scalar."""
         return policy.action_loss(batch).mean()
 
     def gradients(self, policy: Policy, loss: Tensor) -> None:
@@ -121,25 +122,25 @@ class Method:
         loss.backward()  # type: ignore[no-untyped-call]
 
     def learning_rate(self, scheduled: float, progress: Progress) -> float:
-        """Return the step size of this step, asked for after `loss` and `gradients`, for each group."""
+        """Return the step size of an optimiser group; called for each group, after `loss` and `gradients`."""
         return scheduled
 
     def end_task(self, policy: Policy, stage: Stage) -> None:
         """Merge or consolidate after a target."""
 
     def state(self) -> MethodState:
-        """Return all that later hooks need, tensors and plain values by name; its bytes count as kept.
+        """Return everything that later hooks need, tensors and plain values by name; its bytes count as kept.
 
-        Every stage begins with a new object of the method that has this state and nothing else, whether the
-        run was interrupted or not.
+        Every stage begins with a new object of the method that receives only this state, whether or not the
+        run was interrupted.
         """
         return {}
 
     def load_state(self, policy: Policy, state: MethodState) -> None:
-        """Take back what `state` returned, and add to a plain policy what `prepare` added, as adapters."""
+        """Restore what `state` returned, and add to a plain policy what `prepare` added, such as adapters."""
         if state:
             raise WrongTypeError(f"{type(self).__name__} returns a state() but has no load_state().")
 
     def diagnostics(self) -> dict[str, Any]:
-        """Return what the method tells about the stage that ends, or about `prepare`, as JSON."""
+        """Return the method's report on the stage that ends, or on `prepare`, as JSON."""
         return {}

@@ -1,4 +1,4 @@
-"""Training: the only place that steps an optimiser."""
+"""Optimisation: the only module that steps an optimiser."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from torch import Tensor, nn
 from clbench.base.errors import ClbenchError
 
 GRADIENT_NORM = 1.0
-"""Gradients are clipped at this norm, after the method has set them."""
+"""Maximum norm of the gradients; they are clipped after the method has set them."""
 
 BETAS = (0.9, 0.95)
-"""Of AdamW, as the three seed papers and openpi have them; weight decay 1e-10 likewise."""
+"""Betas of AdamW, as in the three seed papers and openpi; the weight decay of 1e-10 is theirs too."""
 
 
 class MethodError(ClbenchError, RuntimeError):
-    """A method did something that the loop cannot go on with."""
+    """A method did something after which the loop cannot continue."""
 
 
 def learning_rate_factor(step: int, steps: int) -> float:
-    """Return the share of the peak step size at `step`: 5 % linear warm-up, then a cosine down to a tenth."""
+    """Return the step size at `step` as a share of its peak: 5 % linear warm-up, then a cosine to a tenth."""
     warm_up = max(1, round(0.05 * steps))
     if step < warm_up:
         return (step + 1) / warm_up
@@ -34,7 +34,7 @@ def learning_rate_factor(step: int, steps: int) -> float:
 
 @contextmanager
 def deterministic() -> Iterator[None]:
-    """One thread and deterministic kernels, so that a computation repeats itself bit for bit."""
+    """Use one thread and deterministic kernels inside, so that a computation repeats itself bit for bit."""
     threads, algorithms = torch.get_num_threads(), torch.are_deterministic_algorithms_enabled()
     torch.set_num_threads(1)
     torch.use_deterministic_algorithms(True)
@@ -54,19 +54,20 @@ def optimise(
     after: Callable[[int], None] = lambda _: None,
     rate: Callable[[float, int], float] = lambda scheduled, _: scheduled,
 ) -> int:
-    """Descend a loss with AdamW and return the number of steps done; without parameters none is.
+    """Minimise a loss with AdamW and return the number of steps done, 0 if there are no parameters.
 
     Args:
-        parameters: What is trained, or optimiser groups of it.
-        learning_rate: Peak step size, for groups that have none of their own.
-        steps: How often.
+        parameters: Parameters to train, or optimiser groups of them.
+        learning_rate: Peak step size, for groups without their own.
+        steps: Number of steps.
         loss_at: Returns the scalar loss of a step.
         gradients: Sets the gradients from the loss.
         after: Called after each step with the number of steps done.
-        rate: Maps the scheduled step size of a group, and the steps done, to the one that is taken.
+        rate: Maps the scheduled step size of a group, and the number of steps done, to its actual step size.
 
     Raises:
-        MethodError: The loss is not a finite scalar with a gradient, or a step size is no positive number.
+        MethodError: The loss is not a finite scalar with a gradient, a gradient is not finite, or a step size
+            is not a finite float of at least 0.
     """
     groups: list[Any] = list(parameters)
     if not groups:
@@ -91,7 +92,7 @@ def optimise(
 
 def _checked_rate(rate: float, step: int) -> float:
     if not (isinstance(rate, float) and 0.0 <= rate < math.inf):
-        raise MethodError(f"step {step}: the step size must be a number from 0, not {rate!r}.")
+        raise MethodError(f"step {step}: the step size must be a finite float of at least 0, not {rate!r}.")
     return rate
 
 

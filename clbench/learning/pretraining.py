@@ -1,4 +1,4 @@
-"""Pretraining: the policy that every method of a seed starts from, made once and kept in the cache."""
+"""Pretraining: makes the policy that every method starts from, once per seed, and keeps it in the cache."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from clbench.worlds.camera import load_camera
 from clbench.worlds.observation import Observer, frame_hash
 
 SHIPPED = Path(__file__).parents[1] / "pretrained"
-"""Where the policies lie that ship with the package."""
+"""Folder of the policies that ship with the package."""
 
 AFTER_PRETRAINING = (
     "adaptation_steps",
@@ -39,11 +39,11 @@ AFTER_PRETRAINING = (
     "curve_episodes",
     "test_questions",
 )
-"""Fields of the budget that a pretrained policy does not depend on."""
+"""Fields of the budget that do not affect a pretrained policy."""
 
 
 def pretraining_inputs(scenario: Scenario, seed: int) -> dict[str, Any]:
-    """Return all that a pretrained policy depends on."""
+    """Return everything that a pretrained policy depends on."""
     tasks = scenario.retained + scenario.scenes
     suites = {*packages_of(tasks, "world", "expert", "camera"), package_of(scenario.questions)}
     budget = dataclasses.asdict(scenario.budget)
@@ -55,18 +55,18 @@ def pretraining_inputs(scenario: Scenario, seed: int) -> dict[str, Any]:
         "seed": seed,
         "frame": frame_hash(scenario.scene_tasks[0]),
         "source": source_hash(*TRAINING_SOURCES, *suites),
-        # a label, as +cpu of torch, names what else a build can do: policies are pretrained without it
+        # a label such as torch's +cpu names other abilities of a build; pretraining does not use them
         "versions": {name: version.partition("+")[0] for name, version in installed.items()},
     }
 
 
 def shipped_folder(scenario: Scenario, seed: int) -> Path:
-    """Return where the pretrained policy lies if it ships."""
+    """Return the folder of the pretrained policy if it ships."""
     return SHIPPED / f"{scenario.id.replace('/', '--')}-seed-{seed}"
 
 
 def pretrained_folder(scenario: Scenario, seed: int) -> Path:
-    """Return where the pretrained policy lies, or will lie: in the cache, unless the same one ships."""
+    """Return the folder of the pretrained policy, made or not: in the cache, unless the same policy ships."""
     return _folder(scenario, seed, pretraining_inputs(scenario, seed))
 
 
@@ -86,16 +86,16 @@ def _folder(scenario: Scenario, seed: int, inputs: Mapping[str, Any]) -> Path:
 def pretrained_policy(
     scenario: Scenario, seed: int, progress: ProgressCallback = no_progress
 ) -> tuple[Policy, Path]:
-    """Return the policy pretrained on the retained tasks and the questions, and the folder it lies in.
+    """Return the policy pretrained on the retained tasks and the questions, and its folder.
 
-    Where no tasks are retained it is pretrained on the questions alone: its states are normalised by what is
-    asked about, its actions are not, and its action head is as it was drawn.
+    A scenario without retained tasks pretrains on the questions alone: the states of the questions set the
+    normalisation of states, actions are not normalised, and the action head keeps its initial weights.
 
-    It is trained on first use, and shared by all methods.
+    The policy is trained on first use, and all methods share it.
 
     Args:
-        scenario: What to learn.
-        seed: Of the weights and of every draw.
+        scenario: Scenario of the retained tasks and the questions.
+        seed: Seed of the weights and of every draw.
         progress: Called with the number of steps done since its last call.
     """
     inputs = pretraining_inputs(scenario, seed)
@@ -108,7 +108,7 @@ def pretrained_policy(
 
 
 def vision_steps(scenario: Scenario) -> int:
-    """Return how many optimiser steps the eyes are pretrained for, before the policy; 0 if it has none."""
+    """Return the number of optimiser steps that pretrain the vision before the policy; 0 without a camera."""
     seen = scenario.scene_tasks[0].camera is not None
     return round(STEPS_SHARE * scenario.budget.pretraining_steps) if seen else 0
 
@@ -174,7 +174,7 @@ def _open_eyes(
     data: Sequence[Questions | Demonstrations],
     progress: ProgressCallback,
 ) -> None:
-    """Pretrain the eyes on the pictures of all data."""
+    """Pretrain the vision on the pictures of all data."""
     entry_point = scenario.scene_tasks[0].camera
     assert entry_point is not None
     kinds = resolve(scenario.questions)

@@ -1,4 +1,4 @@
-"""Prior data: what a method may touch of the tasks learned before, and when."""
+"""Prior data: the data of earlier tasks that a method may use, and when."""
 
 from __future__ import annotations
 
@@ -18,25 +18,25 @@ Drawn = TypeVar("Drawn", Batch, QuestionBatch, covariant=True)
 
 @dataclass(frozen=True)
 class Uses:
-    """Which prior data a method may touch, and when. The runner hands over nothing else."""
+    """Prior data that a method may use, and when. The trainer provides nothing else."""
 
     demonstrations: Access = "never"
-    """Of the retained skills and of the targets learned before; where there are none, the source is empty."""
+    """Access to demonstrations of the retained skills and of earlier targets; the source may be empty."""
     questions: Access = "never"
-    """The training questions."""
+    """Access to the training questions."""
     reference: bool = False
-    """Whether this is no competitor but a guide: an upper or a lower bound, a baseline of transfer."""
+    """Whether the method does not compete but is a guide: an upper or lower bound, or a transfer baseline."""
 
 
 class UndeclaredAccessError(ClbenchError, RuntimeError):
-    """A method touched prior data that its `uses` does not declare."""
+    """A method used prior data that its `uses` does not declare."""
 
 
 class Samples(Protocol[Drawn]):
-    """Data that can be drawn from."""
+    """Data to draw samples from."""
 
     def __len__(self) -> int:
-        """Return how many different moments or scenes there are."""
+        """Return the number of different moments or scenes."""
 
     def sample(self, count: int, generator: torch.Generator) -> Drawn:
         """Return `count` samples."""
@@ -47,11 +47,11 @@ class Samples(Protocol[Drawn]):
 
 
 class MissingDataError(ClbenchError, RuntimeError):
-    """A method draws from data that is not there."""
+    """A method draws from data that does not exist."""
 
 
 class Nothing:
-    """The demonstrations of no task: what was learned before the first target where nothing is retained."""
+    """Demonstrations of no task: the prior data of the first target if the scenario retains no tasks."""
 
     bytes = 0
 
@@ -71,13 +71,13 @@ class Nothing:
 
 
 class Source(Generic[Rows]):
-    """Data with the random stream that draws from it, open as long as the hooks it was handed to.
+    """Data with its own random stream. It closes when the hooks that received it have ended.
 
     Args:
-        data: What is drawn from.
-        generator: Of the draws.
-        batch_size: How many samples the budget gives each step.
-        device: Where the samples go.
+        data: Data to draw from.
+        generator: Random generator of the draws.
+        batch_size: Number of samples per step in the budget.
+        device: Device of the samples.
     """
 
     def __init__(
@@ -104,7 +104,7 @@ class Source(Generic[Rows]):
         """Return `count` samples.
 
         Raises:
-            UndeclaredAccessError: The hooks that it was handed to are over.
+            UndeclaredAccessError: The hooks that received the source have ended.
         """
         rows: Rows = self._open.sample(count, self._generator).to(self._device)
         return rows
@@ -117,15 +117,15 @@ class Source(Generic[Rows]):
     def _open(self) -> Samples[Rows]:
         if self._data is None:
             raise UndeclaredAccessError(
-                "The method draws from data after the hooks that it was handed to. What it needs later it "
-                'must keep in `state()`, or declare with "throughout" in its `uses`.'
+                "The method draws from data after the hooks that received it. Keep data that later hooks "
+                'need in `state()`, or declare it with "throughout" in `uses`.'
             )
         return self._data
 
 
 @dataclass(frozen=True)
 class Prior:
-    """What was learned before: the data that a method's `uses` declares, and nothing else."""
+    """Prior data: the sources that a method's `uses` declares, and no others."""
 
     sources: Mapping[str, Source[Any]]
     """The declared sources, by the name of the field of `Uses`."""
@@ -143,7 +143,7 @@ class Prior:
     def _source(self, name: str) -> Source[Any]:
         if name not in self.sources:
             raise UndeclaredAccessError(
-                f"The method touches prior {name} that it does not declare for this hook: "
+                f"The method uses prior {name} that it does not declare for this hook: "
                 f'set `uses = Uses({name}="prepare")` or "throughout".'
             )
         return self.sources[name]

@@ -1,4 +1,4 @@
-"""The registry of methods: installed names and module:Class."""
+"""The registry of methods: finds a method by its installed name or by module:Class."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ def load_method(spec: str) -> type[Method]:
     """Return the method class that `spec` names: an installed name, or "module:Class".
 
     Raises:
-        LookupError: Nothing is installed or can be imported under this name; the nearest one is named.
-        TypeError: What is found is no method.
+        UnknownNameError: No such method is installed or can be imported; the message names the nearest one.
+        WrongTypeError: The object of this name is not a method.
     """
     if ":" in spec:
         cls = _import_method(spec)
@@ -47,12 +47,12 @@ def load_method(spec: str) -> type[Method]:
 
 
 def describe_method(cls: type[Method]) -> dict[str, Any]:
-    """Return a method's metadata, and as `source` the hash of the package or the module that it lies in."""
+    """Return a method's metadata, and as `source` the hash of its package or of its module."""
     return {**dataclasses.asdict(cls.metadata), "source": source_hash(package_of(cls.__module__))}
 
 
 def _guarded(spec: str, load: Callable[[], Any]) -> Any:
-    """Return what `load` returns; whatever goes wrong in a stranger's module is told in one line."""
+    """Return the result of `load`; any error in a third-party module becomes an error of one line."""
     try:
         return load()
     except ModuleNotFoundError as error:
@@ -134,7 +134,7 @@ def new_method(spec: str, cls: type[Method], values: Mapping[str, Any]) -> Metho
 
 
 def _read(name: str, text: str, hint: Any) -> Any:
-    """Return `text` as a value of the type `hint`: str, int, float, bool, or one of these or None."""
+    """Return `text` as a value of the type `hint`: str, int, float, bool, or a union of these and None."""
     kinds = get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)
     if text.lower() == "none" and NoneType in kinds:
         return None

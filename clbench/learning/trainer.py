@@ -1,4 +1,4 @@
-"""The trainer: the policy and the method of a run on their way from stage to stage, without evaluation."""
+"""The trainer: takes the policy and the method of a run through the stages, without evaluation."""
 
 from __future__ import annotations
 
@@ -32,16 +32,14 @@ from clbench.spec.scenario import Scenario
 from clbench.spec.task import packages_of
 
 STAGE_FILES = ("policy.safetensors", "policy.json", "method.safetensors", "method.json")
-"""What a stage leaves: the policy, and the state of the method that the next stage begins with."""
+"""Files of a finished stage: the policy, and the state of the method with which the next stage begins."""
 
 
 class Trainer:
     """Takes the policy and the method of a run from stage to stage.
 
     Each stage begins with what the last one saved: a policy from its checkpoint, and a new object of the
-        method that
-    is given its saved state. A run that was interrupted after a stage therefore continues as if it had not
-    been.
+    method that receives its saved state. An interrupted run therefore continues as if nothing had happened.
 
     Args:
         scenario: Scenario with the targets that are learned.
@@ -63,7 +61,7 @@ class Trainer:
         self.pretrained, self.new_method = pretrained, new_method
         self.policy, self.method = copy.deepcopy(pretrained), new_method()
         self.where = "start"
-        """The hook, or the stage, that is running: a failed run records it."""
+        """Hook or stage that is running; a failed run records it."""
 
     @classmethod
     def open(cls, scenario: Scenario, new_method: Callable[[], Method], seed: int, device: str) -> Trainer:
@@ -85,7 +83,7 @@ class Trainer:
         return self.pretrained.state_mean.device
 
     def prepare(self) -> int:
-        """Let the method prepare for the sequence, and return the optimiser steps that it took."""
+        """Let the method prepare for the sequence, and return the number of optimiser steps that it took."""
         self.where = "prepare"
         prior = self.prior(0, ("prepare", "throughout"))
         with seeded("method", self.seed, 0), hooks(self._known(0)):
@@ -95,10 +93,10 @@ class Trainer:
         return steps
 
     def learn(self, number: int, after: Callable[[Step], None]) -> int:
-        """Adapt to target `number`, from 1, and return the optimiser steps done.
+        """Adapt to a target, and return the number of optimiser steps done.
 
         Args:
-            number: Which target.
+            number: Number of the target, from 1.
             after: Called after each step.
         """
         budget, task = self.scenario.budget, self.scenario.target[number - 1]
@@ -136,12 +134,12 @@ class Trainer:
         return Prior(sources)
 
     def _source(self, name: str, number: int, data: Any) -> Source[Any]:
-        """Return data with its own random stream: what one source draws does not move another's draws."""
+        """Return data with its own random stream: draws from one source do not change those of another."""
         generator = torch_generator(name, self.seed, number)
         return Source(data, generator, self.scenario.budget.batch_size, self.device)
 
     def save(self, folder: Path, number: int) -> None:
-        """Write what stage `number` leaves, `STAGE_FILES`, to `folder`."""
+        """Write the `STAGE_FILES` of stage `number` to `folder`."""
         self.where = f"state() after stage {number}"
         save_policy(self.policy, folder)
         state = self.method.state()
@@ -150,11 +148,11 @@ class Trainer:
         save_file(copies, folder / "method.safetensors")
         values = {name: value for name, value in state.items() if name not in tensors}
         text = json.dumps(values)
-        check_json(json.loads(text))  # what would be refused when it is read is refused here, by its name
+        check_json(json.loads(text))  # refuse here, with a name, what reading the file would refuse
         (folder / "method.json").write_text(text, encoding="utf-8")
 
     def load(self, folder: Path, number: int) -> None:
-        """Take the policy and the method as stage `number` left them in `folder`."""
+        """Load the policy and the method that stage `number` left in `folder`."""
         self.where = f"load_state() after stage {number}"
         self.method = self.new_method()
         with seeded("method", self.seed, number):  # adapters are drawn before they are filled
@@ -162,10 +160,10 @@ class Trainer:
 
 
 def load_stage(folder: Path, method: Method, device: torch.device | str) -> Policy:
-    """Return the policy that a stage left in `folder`, and give `method` the state that it left there.
+    """Return the policy that a stage left in `folder`, and load the state in the same folder into `method`.
 
     Raises:
-        CheckpointError: A file is missing or torn, or is not what a stage leaves.
+        CheckpointError: A file is missing or torn, or is not a file of a stage.
     """
     try:
         state: MethodState = {**read_json(folder / "method.json")}
@@ -176,7 +174,7 @@ def load_stage(folder: Path, method: Method, device: torch.device | str) -> Poli
 
 
 def sources(scenario: Scenario, seed: int, *modules: str) -> dict[str, Any]:
-    """Return the code and data that any result of a run depends on, `modules` besides, as JSON."""
+    """Return the code, with `modules`, and the data that any result of a run depends on, as JSON."""
     suites = packages_of(scenario.tasks, "world", "expert", "camera")
     return {
         "pretraining": pretraining_inputs(scenario, seed),
@@ -189,7 +187,7 @@ def sources(scenario: Scenario, seed: int, *modules: str) -> dict[str, Any]:
 def repeatable(device: str) -> Iterator[None]:
     """Make computations on `device` repeat themselves bit for bit inside."""
     if device != "cpu":
-        # without it cuBLAS may choose another kernel each time, and PyTorch refuses to be deterministic
+        # without it cuBLAS may choose another kernel each time, and PyTorch refuses deterministic mode
         os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")
     with deterministic():
         yield

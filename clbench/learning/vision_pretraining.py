@@ -1,9 +1,9 @@
-"""Pretraining of the eyes: before a policy learns to act, its vision learns to tell what a picture shows.
+"""Pretraining of the vision: before a policy learns to act, its vision learns to describe pictures.
 
-It stands for the vision encoder of a vision-language model, which knows pictures before it sees a robot. A
-linear probe on the tokens, thrown away after, is to say what the camera's `pictured` says of the state,
-and the answer to everything that can be asked about it. Questions alone teach seeing too slowly: in 2,400
-steps of one answer to a picture, colours stayed at chance; 800 steps of all answers made 0.95 of them right.
+It takes the place of the vision encoder of a vision-language model, which knows pictures before it sees a
+robot. A linear probe on the tokens, discarded afterwards, predicts the numbers of the camera's `pictured` and
+the answer to every kind of question. One question per picture teaches vision too slowly: after 2,400 steps
+colours stayed at chance; with all answers at once, 0.95 of them were right after 800 steps.
 """
 
 from __future__ import annotations
@@ -22,28 +22,29 @@ from clbench.policy.vision import Vision
 from clbench.worlds.camera import Camera
 
 STEPS_SHARE = 0.25
-"""Steps of it for each step of pretraining."""
+"""Steps of the vision for each step of pretraining."""
 LEARNING_RATE = 3e-3
 """Peak step size."""
 NUMBERS_WEIGHT = 3.0
-"""Weight of the numbers' loss beside that of the answers: where a thing is matters more than what it is."""
+"""Weight of the loss of the numbers relative to the answers: the position of an object matters more than its
+kind."""
 PICTURES = 64
-"""Pictures of each set that a step looks at."""
+"""Number of pictures from each set in a step."""
 
 
 @dataclass(frozen=True)
 class Pictures:
-    """Pictures with all that is to be told of them."""
+    """Pictures with the targets that the vision learns to predict."""
 
     image: Tensor
     """Pictures, uint8 (N, size, size, 3)."""
     numbers: Tensor
-    """What they show in numbers of about 1, (N, K)."""
+    """Numbers that describe the pictures, scaled to about 1, (N, K)."""
     answers: Tensor
-    """Index of the right answer to each kind of question, -1 where it is too close to tell, (N, kinds)."""
+    """Index of the right answer to each kind of question, -1 where it is too close to call, (N, kinds)."""
 
     def sample(self, count: int, generator: torch.Generator) -> Pictures:
-        """Return `count` of them at random."""
+        """Return `count` random pictures."""
         rows = torch.randint(len(self.image), (count,), generator=generator)
         return Pictures(self.image[rows], self.numbers[rows], self.answers[rows])
 
@@ -51,17 +52,17 @@ class Pictures:
 def pictures_of(
     sets: Sequence[tuple[Tensor, Tensor]], camera: type[Camera], kinds: Sequence[QuestionKind]
 ) -> list[Pictures]:
-    """Return sets of pictures with what is to be told of them.
+    """Return sets of pictures with their targets.
 
     Args:
         sets: States of the world (N, W) with their pictures, (N, size, size, 3).
-        camera: What drew them.
-        kinds: What can be asked about a state.
+        camera: Camera that drew the pictures.
+        kinds: Kinds of questions about a state.
     """
     shown = [camera.pictured(scene.numpy()) for scene, _ in sets]
-    # quartiles, as the few pictures of a block that fell off the table would stretch a standard deviation
+    # quartiles, because the few pictures of a block off the table would inflate a standard deviation
     low, middle, high = np.quantile(np.concatenate(shown), (0.25, 0.5, 0.75), axis=0)
-    scale = ((high - low) / 1.35).clip(1e-2)  # that of a normal distribution is its standard deviation
+    scale = ((high - low) / 1.35).clip(1e-2)  # the standard deviation of a normal distribution
     return [
         Pictures(
             image,
@@ -80,14 +81,14 @@ def pretrain_vision(
     generator: torch.Generator,
     after: Callable[[int], None] = lambda _: None,
 ) -> None:
-    """Teach the eyes of a policy, in place, to tell what pictures show.
+    """Train the vision of a policy, in place, to describe pictures.
 
     Args:
-        vision: The eyes.
-        sets: Pictures; each step looks at `PICTURES` of each.
-        kinds: What can be asked about them.
-        steps: How many.
-        generator: Draws the probe and the pictures.
+        vision: Vision of the policy.
+        sets: Sets of pictures; each step draws `PICTURES` from each set.
+        kinds: Kinds of questions about the pictures.
+        steps: Number of steps.
+        generator: Random generator of the probe and of the pictures.
         after: Called after each step with the number of steps done.
     """
     numbers = sets[0].numbers.shape[1]
@@ -99,14 +100,14 @@ def pretrain_vision(
 
     def loss_at(_: int) -> Tensor:
         parts = [one.sample(PICTURES, generator) for one in sets]
-        told = probe(vision(torch.cat([part.image for part in parts])).flatten(1))
+        predicted = probe(vision(torch.cat([part.image for part in parts])).flatten(1))
         shown = torch.cat([part.numbers for part in parts])
-        loss = NUMBERS_WEIGHT * F.smooth_l1_loss(told[:, :numbers], shown, beta=0.1)
+        loss = NUMBERS_WEIGHT * F.smooth_l1_loss(predicted[:, :numbers], shown, beta=0.1)
         answers = torch.cat([part.answers for part in parts])
         answer_losses = [
             F.cross_entropy(logits, answer, ignore_index=-1, reduction="sum")
             / max(1, int((answer >= 0).sum()))
-            for logits, answer in zip(told[:, numbers:].split(choices, dim=1), answers.T, strict=True)
+            for logits, answer in zip(predicted[:, numbers:].split(choices, dim=1), answers.T, strict=True)
         ]
         return loss + torch.stack(answer_losses).mean()
 

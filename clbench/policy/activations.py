@@ -1,4 +1,4 @@
-"""Activations: where the hidden states of a policy lie, and how far they have moved from there."""
+"""Activations: the distribution of a policy's hidden states, and the distance that it has moved."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 VARIANCE_FLOOR = 1e-6
-"""Added to variances before the root, whose slope is infinite at 0."""
+"""Addend to variances before the root, whose slope is infinite at 0."""
 
 
 @dataclass(frozen=True)
@@ -23,11 +23,11 @@ class Gaussian:
 
     @classmethod
     def of(cls, hidden: Sequence[Tensor], mask: Tensor) -> Gaussian:
-        """Return mean and deviation over all tokens that are read, of all samples together.
+        """Return the mean and the deviation over all tokens of all samples that are read.
 
         Args:
             hidden: Hidden states, one (B, P, W) per layer.
-            mask: Which tokens are read, as `Backbone.mask` gives it, (B, 1, 1, P).
+            mask: Which tokens are read, the result of `Backbone.mask`, (B, 1, 1, P).
         """
         weight = (mask[:, 0, 0, :, None] / mask.sum()).to(hidden[0].dtype)
         states = torch.stack(list(hidden))
@@ -38,7 +38,7 @@ class Gaussian:
     def distance(self, other: Gaussian) -> Tensor:
         """Return the squared 2-Wasserstein distance to `other`, layer by layer, (L,).
 
-        For diagonal Gaussians it is ||mean - mean'||^2 + ||deviation - deviation'||^2.
+        For diagonal Gaussians it equals ||mean - mean'||^2 + ||deviation - deviation'||^2.
         """
         return (self.mean - other.mean).square().sum(dim=1) + (self.deviation - other.deviation).square().sum(
             dim=1

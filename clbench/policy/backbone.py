@@ -12,7 +12,7 @@ from clbench.policy.vision import Vision
 
 
 class Attention(nn.Module):
-    """Multi-head attention; its queries read the memory, and themselves where they are part of it."""
+    """Multi-head attention: queries read the memory, which may contain them."""
 
     def __init__(self, width: int, heads: int) -> None:
         super().__init__()
@@ -44,7 +44,7 @@ class Layer(nn.Module):
         )
 
     def forward(self, tokens: Tensor, mask: Tensor, prefix: Tensor | None = None) -> Tensor:
-        """Map tokens (B, Q, W) to (B, Q, W). With a prefix (B, P, W) they also attend to it."""
+        """Map tokens (B, Q, W) to (B, Q, W). They also attend to the prefix (B, P, W), if there is one."""
         own = self.attention_norm(tokens)
         memory = own if prefix is None else torch.cat([self.attention_norm(prefix), own], dim=1)
         tokens = tokens + self.attention(own, memory, mask)
@@ -54,7 +54,7 @@ class Layer(nn.Module):
 class Backbone(nn.Module):
     """Reads [observation tokens; a readout token; word tokens], every token attending to every other.
 
-    The observation is the state, in `state_tokens` tokens, and the tokens of the image, where there is one.
+    The observation has `state_tokens` tokens of the state, then the tokens of the image, if there is one.
     """
 
     state_tokens = 4

@@ -1,7 +1,7 @@
-"""Batches: what a loss is computed on, the random draws of the loss included.
+"""Batches: the samples of a loss, with its random draws.
 
-A loss is therefore a function of the parameters and the batch alone: the same batch gives the same loss, to
-two policies or twice to one.
+A loss is therefore a function of the parameters and the batch alone: equal policies have equal losses on the
+same batch.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 NO_IMAGE = torch.zeros(0, 0, 0, 3, dtype=torch.uint8)
-"""Stands for images of no pixel, (B, 0, 0, 3): what a batch has where the policy reads states alone."""
+"""Placeholder for images without pixels, (B, 0, 0, 3), where the policy reads states alone."""
 
 
 class _Rows:
@@ -31,7 +31,7 @@ class _Rows:
 
     @classmethod
     def cat(cls, parts: Sequence[Self]) -> Self:
-        """Return the parts as one, in their order."""
+        """Return the parts as one batch, in their order."""
         columns = {
             field.name: torch.cat([getattr(part, field.name) for part in parts])
             for field in dataclasses.fields(cls)  # type: ignore[arg-type]
@@ -53,19 +53,19 @@ class Batch(_Rows):
     """Demonstrated action chunks, B samples of H actions."""
 
     state: Tensor
-    """Observations as the world, or its camera, gives them, (B, S)."""
+    """Numbers of the observations, as the world or its camera gives them, (B, S)."""
     words: Tensor
     """Word ids of the instructions, (B, L)."""
     action: Tensor
-    """The expert's next actions as the world takes them, (B, H, A)."""
+    """Next actions of the expert in the units of the world, (B, H, A)."""
     valid: Tensor
-    """Which of them count, (B, H): not those after the episode's end or after action noise."""
+    """Which of these actions count, (B, H): 0 after the end of the episode and after action noise, else 1."""
     draw: Tensor
     """Uniform draws in [0, 1) for the action head, (B,)."""
     noise: Tensor
     """Standard normal draws for the action head, (B, H, A)."""
     image: Tensor = NO_IMAGE
-    """What the camera sees, uint8 (B, N, N, 3); N is 0 where the policy has no eyes."""
+    """Pictures of the camera, uint8 (B, N, N, 3); N is 0 where the policy sees none."""
 
 
 @dataclass(frozen=True)
@@ -73,10 +73,10 @@ class QuestionBatch(_Rows):
     """Questions with their answers, B samples."""
 
     state: Tensor
-    """Observations as the world, or its camera, gives them, (B, S)."""
+    """Numbers of the observations, as the world or its camera gives them, (B, S)."""
     words: Tensor
     """Word ids of the questions, (B, L)."""
     answer: Tensor
     """Word id of the right answer, (B,)."""
     image: Tensor = NO_IMAGE
-    """What the camera sees, uint8 (B, N, N, 3); N is 0 where the policy has no eyes."""
+    """Pictures of the camera, uint8 (B, N, N, 3); N is 0 where the policy sees none."""

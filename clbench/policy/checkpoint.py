@@ -1,4 +1,4 @@
-"""Checkpoints: safetensors for the tensors, JSON for the rest. Nothing is ever unpickled."""
+"""Checkpoints: safetensors for the tensors, JSON for the rest. Nothing is unpickled."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from clbench.base.strict_json import read_json
 from clbench.policy.policy import Policy, PolicyConfig
 
 LARGEST = 65_536
-"""Of every size in a `PolicyConfig`."""
+"""Upper limit of every size in a `PolicyConfig`."""
 
 
 class CheckpointError(ClbenchError, ValueError):
-    """A file is not a checkpoint that can be read."""
+    """A file is not a readable checkpoint."""
 
 
 def save_policy(policy: Policy, folder: Path) -> None:
@@ -41,12 +41,12 @@ def load_policy(folder: Path, extend: Callable[[Policy], None] = lambda _: None)
     """Read the policy that `save_policy` wrote to `folder`.
 
     Args:
-        folder: Where it lies.
-        extend: Adds to a plain policy what it had more when it was saved, as adapters.
+        folder: Folder of the checkpoint.
+        extend: Function that adds modules, such as adapters, to a plain policy before its tensors are loaded.
 
     Raises:
-        CheckpointError: A file is missing or torn, sizes cannot be, or the tensors do not have the names,
-            shapes and types that a policy of these sizes has, or hold what is not finite.
+        CheckpointError: A file is missing or torn, a size is out of range, the tensors do not have the names,
+            shapes and types of a policy of these sizes, or a value is not finite.
     """
     try:
         config = PolicyConfig(**read_json(folder / "policy.json"))
@@ -73,7 +73,7 @@ def _kinds(tensors: Mapping[str, Tensor]) -> dict[str, tuple[Any, ...]]:
 
 
 def _fault(config: PolicyConfig, tensors: Mapping[str, Tensor]) -> str | None:
-    """Return why a policy of these sizes must not be built, or None: it may be larger than the memory is."""
+    """Return why a policy of these sizes must not be built, None if it may: it could exceed the memory."""
     for name, size in dataclasses.asdict(config).items():
         least = 0 if name == "image_size" else 1
         if type(size) is not int or not least <= size <= LARGEST:
@@ -83,7 +83,7 @@ def _fault(config: PolicyConfig, tensors: Mapping[str, Tensor]) -> str | None:
     if config.layers > len(tensors):
         return f"{config.layers:,} layers cannot have {len(tensors):,} tensors"
     held = sum(value.numel() for value in tensors.values())
-    # one square matrix of each layer, one vector of each number, word and action: a tenth of a policy
+    # one square matrix per layer and one vector per number, word and action: a tenth of a policy
     rows = config.layers * config.width + config.state_size + config.vocabulary_size
     least = config.width * (rows + config.action_size + config.chunk)
     if least > held:

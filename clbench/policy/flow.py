@@ -48,7 +48,7 @@ class FlowHead(nn.Module):
     def predict(
         self, action: Tensor, draw: Tensor, noise: Tensor, hidden: list[Tensor], mask: Tensor
     ) -> Tensor:
-        """Return the velocity (B, H, A) at chunks that are noisy by `draw` and `noise`; see `loss`."""
+        """Return the velocity (B, H, A) at chunks with added noise; `loss` documents the arguments."""
         time = draw ** (1 / 1.5)  # the inverse of Beta(1.5, 1)'s distribution function t ** 1.5
         noisy = torch.lerp(action, noise, time[:, None, None])
         return self.velocity(noisy, time, hidden, mask)

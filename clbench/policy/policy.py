@@ -1,4 +1,4 @@
-"""The policy itself: backbone, action head, and the normalisation it was pretrained with."""
+"""The policy: backbone, action head, and the normalisation from pretraining."""
 
 from __future__ import annotations
 
@@ -17,38 +17,38 @@ from clbench.spec.language import TEXT_LENGTH, VOCABULARY_SIZE
 
 @dataclass(frozen=True)
 class PolicyConfig:
-    """Sizes of a policy, and the conventions between it and its world."""
+    """Sizes of a policy, and its conventions with the world."""
 
     state_size: int
-    """Length of the world's observation vector."""
+    """Length of the observation vector of the world."""
     action_size: int
-    """Length of the world's action vector."""
+    """Length of the action vector of the world."""
     width: int = 96
-    """Channels of every token."""
+    """Channels of each token."""
     layers: int = 3
-    """Layers of the backbone, and as many of the action head."""
+    """Layers of the backbone, and also of the action head."""
     heads: int = 4
     """Attention heads."""
     chunk: int = 8
-    """Actions that one forward predicts."""
+    """Actions that a forward predicts."""
     executed: int = 4
-    """Actions of a chunk that are executed before the next forward."""
+    """Actions of a chunk to execute before the next forward."""
     euler_steps: int = 5
-    """Integration steps of the flow."""
+    """Euler steps that integrate the flow."""
     vocabulary_size: int = VOCABULARY_SIZE
-    """Words it can read and answer."""
+    """Number of words that it can read and answer."""
     image_size: int = 0
-    """Width and height of the image that it sees, in pixels; 0 if it sees none."""
+    """Width and height of the image that it sees, in pixels; 0 without images."""
 
 
 class Policy(nn.Module):
     """A small vision-language-action model: state, image and words in, action chunks and answers out.
 
-    Where a policy sees images, each function that takes states also takes images, uint8 (B, N, N, 3).
+    If a policy sees images, each function that takes states also takes images, uint8 (B, N, N, 3).
 
     Args:
-        config: Sizes.
-        seed: Of the initial weights; the global generator is left as it was.
+        config: Sizes of the policy.
+        seed: Seed of the initial weights; the state of the global generator does not change.
     """
 
     state_mean: Tensor
@@ -88,11 +88,11 @@ class Policy(nn.Module):
             if values is None:
                 continue
             getattr(self, f"{name}_mean").copy_(values.mean(dim=0))
-            # at least 1e-2, a centimetre or a hundredth of the actions: what hardly varies stays small
+            # at least 1e-2, a centimetre or a hundredth of the actions: nearly constant values stay small
             getattr(self, f"{name}_std").copy_(values.std(dim=0, correction=0).clamp(min=1e-2))
 
     def hidden_states(self, state: Tensor, words: Tensor, image: Tensor | None = None) -> list[Tensor]:
-        """Return the hidden state (B, P, W) of every backbone layer, of states (B, S), words (B, L)."""
+        """Return the hidden state (B, P, W) of every backbone layer for states (B, S) and words (B, L)."""
         normalised = ((state - self.state_mean) / self.state_std).clamp(-10, 10)
         return cast(list[Tensor], self.backbone(normalised, words, image))
 
@@ -100,7 +100,7 @@ class Policy(nn.Module):
         """Return the head's loss of each sample, (B,).
 
         Args:
-            batch: What to learn.
+            batch: Demonstrated action chunks.
             hidden: Hidden states to use instead of `hidden_states(batch.state, batch.words, batch.image)`:
                 detached ones stop the gradient at the backbone.
         """
@@ -110,7 +110,7 @@ class Policy(nn.Module):
         return self.head.loss(action, batch.valid, batch.draw, batch.noise, hidden, mask)
 
     def predict(self, batch: Batch) -> Tensor:
-        """Return what the head predicts for the batch's noisy chunks, (B, H, A): how two policies compare."""
+        """Return the velocities (B, H, A) that the head predicts at the noisy chunks, to compare policies."""
         hidden = self.hidden_states(batch.state, batch.words, batch.image)
         action = (batch.action - self.action_mean) / self.action_std
         mask = self.backbone.mask(batch.words)

@@ -10,17 +10,17 @@ from torch import Tensor, nn
 from clbench.base.errors import InputError
 
 PATCH = 16
-"""Pixels along the side of a patch, of which 64 x 64 pixels have 16."""
+"""Pixels along the side of a patch; 64 x 64 pixels have 16 patches."""
 TOKENS = 4
-"""Tokens that the backbone reads of an image: each a linear map of all patches, as the state has them too."""
+"""Tokens of an image for the backbone, each a linear map of all patches; the state has as many."""
 
 
 class Vision(nn.Module):
-    """Maps images to tokens: four convolutions, of which each halves the picture, then a map of all patches.
+    """Maps images to tokens: four convolutions, each of which halves the picture, then a map of all patches.
 
-    The kernels overlap, and so tell where in its patch a thing lies. A token for each patch instead, of which
-    attention must learn to find the one with the thing, makes learning to act three times slower: on pictures
-    of the Fetch world 1,000 steps of pretraining lead to success 0.60 rather than 0.22.
+    The kernels overlap and so show the place of an object inside its patch. With one token per patch,
+    attention must first learn to find the patch of the object, and learning to act takes three times as long:
+    on pictures of the Fetch world, 1,000 steps of pretraining reach success 0.22 rather than 0.60.
 
     Args:
         image_size: Width and height N, a multiple of `PATCH`.
@@ -41,7 +41,7 @@ class Vision(nn.Module):
         for number, (read, written) in enumerate(itertools.pairwise(channels)):
             kernel = 3 if number else 5
             convolution = nn.Conv2d(read, written, kernel, stride=2, padding=kernel // 2)
-            # PyTorch's own draw weakens what is seen sixfold in two layers, until the biases drown it
+            # PyTorch's default weakens the signal sixfold in two layers, until the biases drown it
             nn.init.kaiming_normal_(convolution.weight, nonlinearity="relu")
             assert convolution.bias is not None
             nn.init.zeros_(convolution.bias)

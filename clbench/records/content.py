@@ -1,10 +1,11 @@
 """The hash of a record's content, by which its reader notices damage.
 
 It is the SHA-256 of the record's JSON in canonical form: every entry of the file but `content` itself, names
-sorted, no spaces, and all but ASCII escaped. A file may be indented or reordered, but no value in it may change.
+sorted, no spaces, and all but ASCII escaped. A file may be indented or its entries reordered, but no
+value may change.
 
-The hash finds damage and careless edits. It does not prove honesty: a forger can compute it again. `clbench verify`
-and the tiers of the leaderboard are for that.
+The hash finds damage and careless edits. It does not prove honesty: a forger can compute it again. For that
+there are `clbench verify` and the tiers of the leaderboard.
 """
 
 from __future__ import annotations

@@ -90,7 +90,9 @@ def _from_1(values: _Values) -> _Values:
 def _equal_steps(last: Any, points: Any) -> list[int]:
     """Return the evaluation steps of schema 1, at equal distances up to the last one."""
     if type(last) is not int or type(points) is not int or not 1 <= points <= 100 or last < 1:
-        raise InputError("scenario: adaptation_steps and evaluation_points of its budget must be whole numbers.")
+        raise InputError(
+            "scenario: adaptation_steps and evaluation_points of its budget must be whole numbers."
+        )
     points = min(points, last)
     return [round((point + 1) * last / points) for point in range(points)]
 

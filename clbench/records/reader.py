@@ -37,24 +37,13 @@ def read_record(path: Path) -> Record:
             not match its hash.
     """
     try:
-        return parse_record(read_json(path))
-    except (StrictJSONError, RecordError) as error:
+        return _record(read_json(path))
+    except (StrictJSONError, InputError, RecordError) as error:
         raise RecordError(f"{path}: {error}") from error
 
 
-def parse_record(values: Any) -> Record:
-    """Return the record in `values`, which `json` read from its file.
-
-    Raises:
-        RecordError: `values` are no record, see `read_record`.
-    """
-    try:
-        return _record(values)
-    except InputError as error:
-        raise RecordError(str(error)) from error
-
-
 def _record(values: Any) -> Record:
+    """Return the record in `values`, which `json` read from its file."""
     schema = values.get("schema") if isinstance(values, dict) else None
     if type(schema) is not int or schema < 1:
         raise RecordError(f"is no record of schema {SCHEMA}.")

@@ -1,7 +1,7 @@
 """The record: the one file that a run leaves, written once and never edited.
 
-A record holds every evaluation episode, every answer count, and how far the policy moved. Whatever can be computed
-from these is not stored.
+A record holds every evaluation episode, every answer count, and how far the policy moved. Whatever can be
+computed from these is not stored.
 """
 
 from __future__ import annotations
@@ -13,11 +13,13 @@ from typing import Any, Literal, NamedTuple
 from clbench.spec.protocol import Point, Protocol, Split
 
 SCHEMA = 3
-"""Version of the file format. A reader refuses a newer one, and converts older ones (`clbench.records.history`)."""
+"""Version of the file format. A reader refuses a newer one, and converts older ones
+(`clbench.records.history`)."""
 
 EPISODE_COLUMNS = ("stage", "step", "task", "split", "episode", "success", "return", "length")
-"""`stage` and `step` are the evaluation point: see `clbench.spec.protocol.Point`. `episode` numbers the initial
-state inside its task and split. `clbench.spec.protocol.Protocol.episodes` says which episodes each point has."""
+"""`stage` and `step` are the evaluation point: see `clbench.spec.protocol.Point`. `episode` numbers the
+initial state inside its task and split. `clbench.spec.protocol.Protocol.episodes` says which episodes each
+point has."""
 
 ANSWER_COLUMNS = ("stage", "step", "kind", "asked", "correct")
 """One row for each evaluation point and kind of question; an agent that learned online is asked 0."""
@@ -25,9 +27,9 @@ ANSWER_COLUMNS = ("stage", "step", "kind", "asked", "correct")
 POLICY_COLUMNS = ("stage", "step", "update_sparsity", "activation_drift")
 """One row for each evaluation point: how far the policy is from the pretrained one.
 
-`update_sparsity` is the share of its parameters whose relative change is below 1e-3. `activation_drift` is the
-squared 2-Wasserstein distance between its hidden states on the questions and those of the pretrained policy, mean
-over layers. Each may be None.
+`update_sparsity` is the share of its parameters whose relative change is below 1e-3. `activation_drift` is
+the squared 2-Wasserstein distance between its hidden states on the questions and those of the pretrained
+policy, mean over layers. Each may be None.
 """
 
 
@@ -71,7 +73,8 @@ class RunInfo:
     uses: dict[str, Any]
     """The prior data that the method may touch; `online` is true for an agent that learned by trial."""
     order: int = 0
-    """Order in which the targets were learned; 0 is the published one. See `clbench.spec.scenario.target_order`."""
+    """Order in which the targets were learned; 0 is the published one. See
+    `clbench.spec.scenario.target_order`."""
     perturb: bool = False
     """Whether the retained skills also met perturbed episodes."""
 
@@ -148,8 +151,8 @@ class Record:
     diagnostics: dict[str, Any] = field(default_factory=dict)
     """What the method reports about itself, by stage."""
     fingerprint: dict[str, Any] = field(default_factory=dict)
-    """Commit, package versions, hardware, `rollouts` (a hash for each world), `method` (authors, version, hash of the
-    source), and the hash of the pretrained policy."""
+    """Commit, package versions, hardware, `rollouts` (a hash for each world), `method` (authors, version,
+    hash of the source), and the hash of the pretrained policy."""
     timing: dict[str, Any] = field(default_factory=dict)
     """Dates and seconds: all that may differ between two equal runs."""
     error: dict[str, str] | None = None

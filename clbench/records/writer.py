@@ -10,50 +10,54 @@ from pathlib import Path
 from typing import Any
 
 from clbench.base.errors import InputError
-from clbench.base.strict_json import LONGEST_TEXT, MOST_BYTES, StrictJSONError, check_json
+from clbench.base.strict_json import LONGEST_TEXT, check_json
 from clbench.records.content import content_hash
-from clbench.records.reader import RecordError, parse_record
+from clbench.records.reader import RecordError, read_record
 from clbench.records.record import SCHEMA, Record
 
 MOST_DIAGNOSTICS = 2 * 2**20
-"""Bytes of the diagnostics of a run, as JSON. Those of `consft` on Fetch-v0 have 4,000."""
+"""Most bytes of the diagnostics of a run, as JSON. The committed records have 1,506 at most."""
 
 CUT = "\n[... clbench left out {count:,} characters ...]\n"
-"""Stands in an error's text where its middle was left out."""
+"""Replaces the middle of an error's text that is too long."""
 
 
 def write_record(record: Record, path: Path) -> None:
     """Write `record` to `path` in one step: a reader sees the whole file or none.
 
-    Whatever is written can be read: texts of the error are cut to `LONGEST_TEXT` characters, and anything else that
-    `read_record` would refuse is refused before a file is touched. A symbolic link at `path` is replaced, and
-    its target is left alone.
+    Whatever is written can be read: texts of the error are cut to `LONGEST_TEXT` characters, and anything
+    else that `read_record` would refuse is refused before `path` is touched. A symbolic link at `path` is
+    replaced, and its target is left alone.
 
     Raises:
-        InputError: The record could not be read again: a field does not fit the schema, holds what JSON cannot
-            hold, or is too large.
+        InputError: The record could not be read again: a field does not fit the schema, is no JSON, or is too
+            large.
     """
     check_diagnostics(record.diagnostics)
     text = record_text(record)
-    _check_readable(text)
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(f".{path.name}.{uuid.uuid4().hex}.partial")
     try:
         with open(partial, "x", encoding="utf-8") as file:
             file.write(text)
+        _check_readable(partial)
         os.replace(partial, path)
     finally:
         partial.unlink(missing_ok=True)
 
 
 def record_text(record: Record) -> str:
-    """Return the text of the file of `record`; nothing but its being JSON is checked."""
+    """Return the text of the file of `record`, which need not be a valid record.
+
+    Raises:
+        InputError: The record holds values that JSON cannot hold.
+    """
     try:
         values = {"schema": SCHEMA, **dataclasses.asdict(record)}
         if isinstance(record.error, dict):
             values["error"] = {name: _cut(text) for name, text in record.error.items()}
         lines = [f"{json.dumps(name)}: {_dump(value)}" for name, value in values.items()]
-        # the hash is of what a reader finds: tuples are lists there, and names of entries are texts
+        # hashed as a reader finds it: tuples are lists there, and names of entries are texts
         content = content_hash(json.loads("{" + ",".join(lines) + "}"))
     except (TypeError, ValueError, RecursionError) as error:
         raise InputError(f"the record holds what JSON cannot hold: {error}") from error
@@ -78,20 +82,17 @@ def check_diagnostics(diagnostics: dict[str, Any]) -> None:
         raise InputError(f"diagnostics have {len(text):,} bytes, more than {MOST_DIAGNOSTICS:,}.")
 
 
-def _check_readable(text: str) -> None:
-    """Refuse a text that `read_record` would refuse."""
-    if len(text) > MOST_BYTES:
-        raise InputError(f"the record has {len(text):,} bytes, more than {MOST_BYTES:,}.")
-    values = json.loads(text)
+def _check_readable(path: Path) -> None:
+    """Refuse a file that `read_record` would refuse."""
     try:
-        check_json(values)
-        parse_record(values)
-    except (StrictJSONError, RecordError) as error:
-        raise InputError(f"the record could not be read again: {error}") from error
+        read_record(path)
+    except RecordError as error:
+        reason = str(error).removeprefix(f"{path}: ")
+        raise InputError(f"the record could not be read again: {reason}") from error
 
 
 def _cut(text: Any) -> Any:
-    """Return a text of an error without its middle if it is too long: tracebacks matter at both ends."""
+    """Return a text of an error, without its middle if it is too long: tracebacks matter at both ends."""
     if not isinstance(text, str) or len(text) <= LONGEST_TEXT:
         return text
     half = LONGEST_TEXT // 2 - 100

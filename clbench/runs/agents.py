@@ -1,9 +1,9 @@
-"""Online use: an agent of any library learns a scenario by trial, and leaves a record as a run does.
+"""Online learning: an agent of any library learns a scenario by trial and error, and leaves a record.
 
-The loop is the agent's: it trains in the environment of one stage after another, and is evaluated after
-each. It meets the test episodes of every run, from the same initial states. What it cannot have, as answers
-to questions, points before the end of a stage, or a count of its optimiser steps, is missing in the record.
-Until the last stage the record waits in the cache: who is interrupted loses the stage that he was in.
+The agent brings its own loop: it trains in the environment of one stage after another, and is evaluated after
+each, on the same test episodes from the same initial states as every run. Its record has no answers to
+questions, no evaluation points within a stage, and no count of optimiser steps. Until the last stage the
+record is kept in the cache: an interrupted program loses only the stage that was running.
 """
 
 from __future__ import annotations
@@ -56,19 +56,19 @@ from clbench.worlds.schedule import InstructionFormat, observed
 LOG = logging.getLogger("clbench")
 
 USES = {"demonstrations": "never", "questions": "never", "reference": False, "online": True}
-"""What the record of an agent says of prior data: it has none of ours, and learns by trial."""
+"""`RunInfo.uses` of an agent: it uses no prior data of clbench, and learns by trial and error."""
 
 
 class Predictor(Interface):
-    """What Stable-Baselines3's algorithms are, and anything that acts as they do."""
+    """An agent with the interface of Stable-Baselines3's algorithms."""
 
     def predict(self, observation: Any, *, deterministic: bool) -> tuple[Any, Any]:
-        """Return an action (A,), and what goes with the next observation as `state`; nothing if None."""
+        """Return an action (A,), and a memory that the next call receives as `state` unless it is None."""
         ...
 
 
 Agent: TypeAlias = Predictor | Callable[[Observation], Any]
-"""What is evaluated: it predicts, or is called with an observation and returns an action (A,)."""
+"""An agent to evaluate: a `Predictor`, or a function of an observation that returns an action (A,)."""
 
 
 def evaluate_agent(
@@ -81,45 +81,45 @@ def evaluate_agent(
     settings: Mapping[str, Any] | None = None,
     records: Path | str = RECORDS,
 ) -> Record:
-    """Evaluate an agent at the end of a stage; after the last stage the record is written.
+    """Evaluate an agent at the end of a stage, and write the record after the last stage.
 
-    Stages are evaluated in their order, from 0, and each once. To evaluate stage 0 again begins anew.
+    Evaluate each stage once and in order, from stage 0. Evaluating stage 0 again starts over.
 
     Args:
-        agent: As it is after the stage. It is asked for the action of one observation at a time, as `env`
-            gives them, acts for a whole episode before the next begins, and should not choose at random. An
-            action that is no number stands still.
-        env: What it was trained in: `gymnasium.make(ID, stage=k)`. From it come the scenario, the stage, the
-            form of instructions, and how many steps it took.
-        method: Name of the row on the board, as "me/sac".
-        seed: Of the run; it chooses the initial states, the same for all methods.
-        steps: Environment steps of the stage, if they were not taken in `env` itself; 0 if none were.
-        settings: What a reader should know of how it learns, as JSON; the same in all stages.
+        agent: Agent after its training in the stage. It receives one observation at a time, in the format of
+            `env`, and plays one episode after another. Its actions should not be random; NaN counts as 0.
+        env: Environment in which the agent was trained: `gymnasium.make(ID, stage=k)`. It gives the scenario,
+            the stage, the format of instructions and the number of environment steps.
+        method: Name of the agent's row on the leaderboard, for example "me/sac".
+        seed: Seed of the run; it chooses the initial states, the same for all methods.
+        steps: Number of environment steps in the stage, if they were not taken in `env` itself.
+        settings: Settings of the agent that readers should know, as JSON; the same in all stages.
         records: Folder of the records.
 
     Returns:
-        The record so far. Its scores are of test episodes: nothing may be chosen on them.
+        The record so far. Its scores come from test episodes: base no choice on them.
 
     Raises:
-        TypeError: `env` is of no scenario, or `agent` is nothing that acts.
-        ValueError: The stage has no turn now, its targets are in another order, there is a record already, an
-            action has another shape than the action space, or a name, the seed, the steps or the settings are
-            refused.
+        WrongTypeError: `env` is not an environment of a scenario, or `agent` cannot act.
+        InputError: Another stage comes next, the targets are in another order, a record exists already, an
+            action has the wrong shape, or the name, the seed, the steps or the settings are invalid.
     """
     world = env.unwrapped
     if not isinstance(world, ScenarioEnv | ScenarioVectorEnv):
         raise WrongTypeError(
-            f"{env} is not of a scenario: make it as gymnasium.make('clbench/Fetch-v0', stage=0)."
+            f"{env} does not belong to a scenario: make it with gymnasium.make('clbench/Fetch-v0', stage=0)."
         )
     if world.stage is None:
         raise InputError(
-            f"{env} goes through all stages: make one that stays in a stage, as "
+            f"{env} goes through all stages: make an environment of a single stage, for example with "
             f"gymnasium.make({world.scenario.id!r}, stage=0)."
         )
     if world.order:
         raise InputError(f"{env} has its targets in order {world.order}: agents are scored in order 0.")
     if not (callable(agent) or hasattr(agent, "predict")):
-        raise WrongTypeError(f"A {type(agent).__name__} is no agent: it can neither predict nor be called.")
+        raise WrongTypeError(
+            f"{type(agent).__name__} is not an agent: it has no predict() and cannot be called."
+        )
     if steps is not None and (type(steps) is not int or steps < 0):
         raise InputError(f"steps must be a whole number from 0, not {steps!r}.")
     run = _OnlineRun(world.scenario, method, seed, Path(records))
@@ -136,16 +136,16 @@ def evaluate_agent(
 
 
 def next_stage(scenario: str, *, method: str, seed: int = 0, records: Path | str = RECORDS) -> int:
-    """Return the stage that `evaluate_agent` expects next: where an interrupted run goes on.
+    """Return the stage that `evaluate_agent` expects next: an interrupted program continues with it.
 
     Args:
         scenario: Gymnasium id of the scenario.
-        method: Name of the row on the board.
-        seed: Of the run.
+        method: Name of the agent's row on the leaderboard.
+        seed: Seed of the run.
         records: Folder of the records.
 
     Returns:
-        0 if there is nothing yet, one more than the last stage if there is a record.
+        0 if no stage has been evaluated, the last stage plus one if there is a record.
     """
     run = _OnlineRun(load_scenario(scenario), method, seed, Path(records))
     if run.path.exists():
@@ -156,7 +156,7 @@ def next_stage(scenario: str, *, method: str, seed: int = 0, records: Path | str
 
 @dataclass(frozen=True)
 class _OnlineRun:
-    """The run of an agent, and where its record is."""
+    """The run of an agent, and the location of its record."""
 
     scenario: Scenario
     method: str
@@ -166,31 +166,31 @@ class _OnlineRun:
     def __post_init__(self) -> None:
         if not self.scenario.retained:
             raise InputError(
-                f"{self.scenario.id} retains nothing: agents are evaluated after stage 0, which trains the "
-                "retained skills, and here there is none. Choose a scenario with retained skills."
+                f"{self.scenario.id} retains nothing: agents are evaluated from stage 0 on, which trains the "
+                "retained skills. Choose a scenario with retained skills."
             )
         check_method_name(self.method)
         if self.method in built_in_methods():
             raise InputError(
-                f"{self.method!r} is a method of clbench: give the agent a name of its own, "
-                f"as 'me/{self.method}'."
+                f"{self.method!r} is a method of clbench: give the agent its own name, "
+                f"for example 'me/{self.method}'."
             )
         if type(self.seed) is not int or self.seed < 0:
             raise InputError(f"seed must be a whole number from 0, not {self.seed!r}.")
 
     @property
     def last(self) -> int:
-        """The last stage."""
+        """Number of the last stage."""
         return len(self.scenario.target)
 
     @cached_property
     def path(self) -> Path:
-        """Where the record will lie."""
+        """Path of the finished record."""
         return record_path(self.records, self.scenario.id, self.method, self.seed)
 
     @cached_property
     def folder(self) -> Path:
-        """Where it waits for the last stage."""
+        """Folder of the unfinished record in the cache."""
         return cache_folder() / "online" / hash_of(str(self.path.resolve()))
 
     def _stage_folder(self, stage: int) -> Path:
@@ -202,19 +202,19 @@ class _OnlineRun:
         return {"scenario": scenario, **sources(self.scenario, self.seed)}
 
     def _inputs(self, stage: int) -> dict[str, Any]:
-        """Return all that what waits depends on, but for the agent."""
+        """Return everything that the unfinished record depends on, except the agent."""
         return {"method": self.method, "seed": self.seed, "stage": stage, **self._sources}
 
     def done(self) -> int | None:
-        """Return the last stage that was evaluated by this version of the code, None if there is none."""
+        """Return the last stage that this version of the code evaluated, None if there is none."""
         stages = range(self.last, -1, -1)
         return next((k for k in stages if is_cached(self._stage_folder(k), self._inputs(k))), None)
 
     def begin(self, stage: int, settings: dict[str, Any], agent: Agent) -> Record:
-        """Return the record of the stages before.
+        """Return the record of the earlier stages.
 
         Raises:
-            ValueError: It is not the turn of this stage, or the settings are not those of stage 0.
+            InputError: Another stage comes next, or the settings differ from the settings in stage 0.
         """
         name = f"{self.method}, seed {self.seed}, on {self.scenario.id}"
         if self.path.exists():
@@ -225,18 +225,18 @@ class _OnlineRun:
         done = self.done()
         if stage == 0:
             if done is not None:
-                LOG.warning("%s begins anew: what was evaluated up to stage %d is dropped.", name, done)
+                LOG.warning("%s starts over: its evaluations up to stage %d are dropped.", name, done)
                 shutil.rmtree(self.folder, ignore_errors=True)
             return self._new_record(settings, agent)
         if done is None:
             raise InputError(
                 f"Stage 0 of {name} comes first, not {stage}: "
-                "this version of clbench has evaluated none of it."
+                "this version of clbench has not evaluated any stage."
             )
         if stage != done + 1:
             raise InputError(
                 f"Stage {done + 1} of {name} comes next, not {stage}: it was evaluated up to stage {done}. "
-                "To evaluate stage 0 begins anew."
+                "Evaluating stage 0 starts over."
             )
         record = read_record(self._stage_folder(done) / "record.json")
         if record.run.settings != settings:
@@ -265,7 +265,7 @@ class _OnlineRun:
         return record
 
     def report(self, record: Record, stage: int, play: Callable[[Trial], Episode]) -> None:
-        """Add the episodes that every run has at the end of a stage, and that no question was asked."""
+        """Add the episodes of every run at the end of a stage, and answers to no questions."""
         protocol = Protocol.of(self.scenario)
         point = protocol.end(stage)  # in optimiser steps, as if a method had trained
         for key in protocol.episodes(point):
@@ -277,17 +277,17 @@ class _OnlineRun:
     def count(
         self, record: Record, stage: int, steps: int | None, trained: float | None, evaluated: float
     ) -> None:
-        """Add what a stage cost: environment steps, and seconds of training and of evaluation."""
+        """Add the costs of a stage: environment steps, and seconds of training and of evaluation."""
         record.diagnostics[str(stage)] = {"environment_steps": steps}
-        each = [told["environment_steps"] for told in record.diagnostics.values()]
+        each = [found["environment_steps"] for found in record.diagnostics.values()]
         record.costs.environment_steps = None if None in each else sum(each)
         training = None if trained is None else round(trained, 2)
         record.timing["stages"].append({"training": training, "evaluation": round(evaluated, 2)})
-        parts = [seconds for one in record.timing["stages"] for seconds in one.values()]
+        parts = [seconds for timing in record.timing["stages"] for seconds in timing.values()]
         record.timing["seconds"] = None if None in parts else round(sum(parts), 2)
 
     def keep(self, record: Record, stage: int) -> None:
-        """Write the record, after the last stage where it belongs, before where it waits."""
+        """Write the record: to its final path after the last stage, to the cache before."""
         if stage == self.last:
             write_record(record, self.path)
             shutil.rmtree(self.folder, ignore_errors=True)
@@ -300,7 +300,7 @@ class _OnlineRun:
 
 @dataclass(frozen=True)
 class _Player:
-    """An agent in the worlds of a scenario, one episode after the other."""
+    """Plays episodes with an agent in the worlds of a scenario, one after another."""
 
     agent: Agent
     lanes: Lanes
@@ -308,7 +308,7 @@ class _Player:
     instruction: InstructionFormat
 
     def play(self, trial: Trial) -> Episode:
-        """Return what comes of an episode."""
+        """Return the outcome of an episode."""
         task, split, number = trial
         world_seed, words = start_of(trial, self.seed)
         instruction = observed(words, self.instruction)
@@ -327,7 +327,7 @@ class _Player:
     def _act(
         self, observation: Observation, memory: Any, space: spaces.Box
     ) -> tuple[NDArray[np.float32], Any]:
-        """Return the agent's action (A,) within the space, and what it wants to be reminded of."""
+        """Return the agent's action (A,) within the space, and its memory for the next step."""
         predict = getattr(self.agent, "predict", None)
         if predict is None:
             action, memory = self.agent(observation), None  # type: ignore[operator]
@@ -335,7 +335,7 @@ class _Player:
             reminder = {} if memory is None else {"state": memory}
             found = predict(observation, deterministic=True, **reminder)
             if not (isinstance(found, tuple) and len(found) == 2):
-                raise InputError("predict() must return (action, state), as that of Stable-Baselines3 does.")
+                raise InputError("predict() must return (action, state), as in Stable-Baselines3.")
             action, memory = found
         try:
             numbers = np.asarray(action, np.float64)
@@ -345,12 +345,12 @@ class _Player:
             ) from error
         if numbers.shape != space.shape:
             raise InputError(f"The agent's action has the shape {numbers.shape}, not {space.shape}.")
-        # an agent that has diverged stands still and fails, as a policy does
+        # a diverged agent acts with zeros and fails, like a diverged policy
         return np.nan_to_num(numbers).clip(space.low, space.high).astype(np.float32), memory
 
 
 def _describe(agent: Agent) -> dict[str, Any]:
-    """Return the class of an agent, and the version of the package that it comes from, None if from none."""
+    """Return the class of an agent and the version of its package, None without a package."""
     kind = type(agent)
     packages = packages_distributions().get(kind.__module__.partition(".")[0], [])
     return {
@@ -360,14 +360,14 @@ def _describe(agent: Agent) -> dict[str, Any]:
 
 
 def _plain(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Return settings as a record holds them.
+    """Return settings in the form of a record.
 
     Raises:
-        ValueError: JSON cannot hold them.
+        InputError: JSON cannot hold the settings.
     """
     try:
         values: dict[str, Any] = json.loads(json.dumps(dict(settings), allow_nan=False))
         check_json(values)
     except (TypeError, ValueError) as error:
-        raise InputError(f"The settings cannot be in a record: {error}") from error
+        raise InputError(f"A record cannot hold the settings: {error}") from error
     return values

@@ -1,7 +1,7 @@
 """The policies of all stages of a run: kept by the run, or made again without evaluation.
 
-Stage 0 is the policy as the method's `prepare` left it, stage k the policy after target k. As a run repeats
-itself bit for bit, policies that are made again are those that it had.
+Stage 0 is the policy that the method's `prepare` left, stage k the policy after target k. A run repeats itself
+bit for bit, so policies that are made again equal the original ones.
 """
 
 from __future__ import annotations
@@ -31,16 +31,16 @@ def stage_policies(
 ) -> list[Policy]:
     """Return the policy after every stage of a run, from stage 0.
 
-    Where the run kept them, these are read; else they are made again, and stay in the cache.
+    Policies that the run kept are read; otherwise they are made again and stay in the cache.
 
     Args:
-        run: The run. On which episodes it is evaluated makes no difference.
+        run: The run. Its evaluation episodes make no difference.
         checkpoints: Folder below which policies were kept, as for `execute`.
-        progress: Called with the number of optimiser steps done since its last call; a stage that need not
-            be made counts in full.
+        progress: Called with the number of optimiser steps done since its last call; an existing stage counts
+            in full.
 
     Raises:
-        MethodError: The method fails; the message says where.
+        MethodError: The method fails; the message names the place.
     """
     folder = find_stages(run, checkpoints)
     if folder is None:
@@ -51,12 +51,12 @@ def stage_policies(
 
 
 def find_stages(run: ResolvedRun, checkpoints: Path | None = None) -> Path | None:
-    """Return the folder that holds the policies of all stages of a run, "stage-0" and so on, or None.
+    """Return the folder with the policies of all stages of a run, "stage-0" and so on, or None.
 
     Args:
         run: The run.
-        checkpoints: Folder below which policies were kept. If these are not there, which is said in the log,
-            those in the cache are looked for.
+        checkpoints: Folder below which policies were kept. If they are missing there, the log says so, and
+            the cache is searched.
     """
     kept = kept_stages(run, checkpoints)
     if kept is not None:
@@ -68,7 +68,7 @@ def find_stages(run: ResolvedRun, checkpoints: Path | None = None) -> Path | Non
 def kept_stages(run: ResolvedRun, checkpoints: Path | None) -> Path | None:
     """Return the folder below `checkpoints` in which a run kept the policies of all stages, or None.
 
-    Where there are checkpoints without them, the log says so.
+    If the policies are missing below `checkpoints`, the log says so.
     """
     if checkpoints is None:
         return None
@@ -80,14 +80,14 @@ def kept_stages(run: ResolvedRun, checkpoints: Path | None) -> Path | None:
 
 
 def make_stages(run: ResolvedRun, progress: ProgressCallback = no_progress) -> Path:
-    """Make the policies of all stages by adapting alone, and return the folder of the cache that holds them.
+    """Make the policies of all stages without evaluation, and return their folder in the cache.
 
     Args:
         run: The run.
         progress: As for `stage_policies`.
 
     Raises:
-        MethodError: The method fails; the message says where.
+        MethodError: The method fails; the message names the place.
     """
     scenario = run.scenario
     root = _made(run)
@@ -119,17 +119,17 @@ def make_stages(run: ResolvedRun, progress: ProgressCallback = no_progress) -> P
 
 
 def load_stages(run: ResolvedRun, folder: Path) -> list[Policy]:
-    """Return the policies of all stages of a run that lie in a folder, as "stage-0" and so on."""
+    """Return the policies of all stages of a run from a folder with "stage-0" and so on."""
     numbers = range(len(run.scenario.target) + 1)
     return [load_stage(folder / f"stage-{number}", run.new_method(), run.spec.device) for number in numbers]
 
 
 def keep_stages(run: ResolvedRun, checkpoints: Path, progress: ProgressCallback = no_progress) -> None:
-    """Keep the policies of all stages of a run that went through without keeping them.
+    """Keep the policies of all stages of a run that has finished without keeping them.
 
     Args:
         run: The run.
-        checkpoints: Folder below which they are kept.
+        checkpoints: Folder below which the policies are kept.
         progress: As for `stage_policies`.
     """
     folder = make_stages(run, progress)
@@ -149,18 +149,18 @@ def _are_whole(run: ResolvedRun, folder: Path, last: int | None = None) -> bool:
 
 
 def _kept(run: ResolvedRun, checkpoints: Path) -> Path:
-    """Return where a run keeps its policies."""
+    """Return the folder in which a run keeps its policies."""
     return run.path(checkpoints).with_suffix("")
 
 
 def _made(run: ResolvedRun) -> Path:
-    """Return where the cache has policies that were made again, by this version of the code."""
+    """Return the folder in the cache for policies that this version of the code made again."""
     code = sources(run.scenario, run.spec.seed, package_of(run.method.__module__))
     return cache_folder() / "stages" / hash_of({**_identity(run, 0), **code})
 
 
 def keep_stage(run: ResolvedRun, checkpoints: Path, number: int, source: Path) -> None:
-    """Keep what stage `number` of a run left in the folder `source`."""
+    """Keep the files that stage `number` of a run left in the folder `source`."""
 
     def write(folder: Path) -> None:
         for name in STAGE_FILES:
@@ -170,14 +170,14 @@ def keep_stage(run: ResolvedRun, checkpoints: Path, number: int, source: Path) -
 
 
 def drop_stages(run: ResolvedRun, checkpoints: Path) -> None:
-    """Remove what is kept of a run: its policies belong to what another version of the code computed."""
+    """Remove the kept policies of a run, which another version of the code computed."""
     for folder in _kept(run, checkpoints).glob("stage-*"):
         shutil.rmtree(folder)
 
 
 def _identity(run: ResolvedRun, number: int) -> dict[str, Any]:
-    """Return what tells the policy of a stage from those of other runs, in every version of the code."""
+    """Return what identifies the policy of a stage among all runs, in every version of the code."""
     info = dataclasses.asdict(run.info)
-    for name in ("split", "perturb"):  # the episodes of its evaluation make no difference
+    for name in ("split", "perturb"):  # evaluation episodes make no difference
         del info[name]
     return {"run": info, "scenario": dataclasses.asdict(run.scenario_info), "stage": number}

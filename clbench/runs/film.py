@@ -1,7 +1,7 @@
-"""Films: the same episode side by side, as the policy of each stage of a run does it.
+"""Films: show the same episode side by side with the policy of each stage of a run.
 
-A film shows validation episodes, never those of the report. The policies act as they do in evaluation: what
-is drawn repeats the actions that an `Evaluator` saw, so a film ends as the recorded episode does.
+A film shows validation episodes, never test episodes. The policies act as in evaluation: the drawn world
+repeats the actions of an `Evaluator`, so a film ends like the recorded episode.
 """
 
 from __future__ import annotations
@@ -33,20 +33,20 @@ from clbench.worlds.world import World
 FORMATS = (".gif", ".mp4")
 
 FASTEST = 50
-"""Frames in a second: a GIF counts in hundredths of a second, and browsers slow down what is faster."""
+"""Most frames per second: a GIF counts in hundredths of a second, and browsers slow down faster films."""
 
 FILMS = Path("films")
-"""Where films lie, seen from the working directory."""
+"""Folder of films, relative to the working directory."""
 
 HOLD_SECONDS = 2.0
-"""How long the end of a film stands still."""
+"""Time for which a film holds its last frame, in seconds."""
 
 PAPER, INK, FAINT = "#ffffff", "#1a1a1a", "#5c5c5c"
 SUCCESS, FAILURE = "#00694d", "#b34700"
-"""Bluish green and vermilion, which the colour-blind tell apart, dark enough for white letters on them."""
+"""Bluish green and vermilion: colour-blind readers can distinguish them, and white letters are legible."""
 
 GAP, BORDER, LINE = 8, 4, 18
-"""Pixels between panels, around a picture whose episode has ended, and of a line of text."""
+"""Gap between panels, border of a picture whose episode has ended, and height of a line, in pixels."""
 
 
 @dataclass(frozen=True)
@@ -54,17 +54,17 @@ class Take:
     """One episode on film."""
 
     pictures: list[Image.Image]
-    """Of the initial state and of the state after each step."""
+    """Pictures of the initial state and of the state after each step."""
     episode: Episode
-    """What came of it."""
+    """Outcome of the episode."""
 
 
 def check_format(path: Path) -> None:
-    """Refuse what no film can be written as.
+    """Check that a film can be written to `path`.
 
     Raises:
-        LookupError: MP4 needs a package that is not installed.
-        ValueError: The name of the file ends neither in .gif nor in .mp4.
+        MissingPackageError: MP4 needs a package that is not installed.
+        InputError: The name of the file ends neither in .gif nor in .mp4.
     """
     if path.suffix not in FORMATS:
         raise InputError(f"A film is a {' or '.join(FORMATS)} file, not {path.name!r}.")
@@ -80,14 +80,14 @@ def shoot(
     width: int,
     progress: ProgressCallback = no_progress,
 ) -> list[list[Take]]:
-    """Return the takes: for each trial, one with each policy.
+    """Return the takes: for each trial, one take per policy.
 
     Args:
-        scenario: Where the tasks come from.
-        seed: Of the run: it chooses the initial states.
-        policies: What acts.
-        trials: Which episodes.
-        width: Of a picture, in pixels.
+        scenario: Scenario of the tasks.
+        seed: Seed of the run: it chooses the initial states.
+        policies: Policies that act.
+        trials: Episodes by task, split and number.
+        width: Width of a picture, in pixels.
         progress: Called with the number of takes made since its last call.
 
     Raises:
@@ -117,7 +117,7 @@ def shoot(
 def _act(
     evaluator: Evaluator, policy: Policy, trials: Sequence[Trial]
 ) -> tuple[list[Episode], dict[Trial, list[NDArray[np.float32]]]]:
-    """Return what comes of the trials, and the actions taken in each."""
+    """Return the outcomes of the trials, and the actions (A,) taken in each."""
     actions: dict[Trial, list[NDArray[np.float32]]] = defaultdict(list)
     episodes = evaluator.play(policy.eval(), trials, watch=lambda trial, act: actions[trial].append(act))
     return episodes, actions
@@ -126,7 +126,7 @@ def _act(
 def _repeat(
     world: World, trial: Trial, seed: int, actions: Sequence[NDArray[np.float32]], width: int
 ) -> tuple[list[Image.Image], bool]:
-    """Return the pictures of an episode whose actions are known, and whether it is a success."""
+    """Return the pictures of an episode with the given actions, and whether it is a success."""
     task = trial[0]
     world.reset(seed=start_of(trial, seed)[0], options={"task": task.name})
     pictures, success = [picture(world, width)], False
@@ -137,7 +137,7 @@ def _repeat(
 
 
 def picture(world: World, width: int) -> Image.Image:
-    """Return what a world shows, `width` pixels wide. Small pictures keep their hard edges."""
+    """Return a picture of a world, `width` pixels wide. Enlarged pictures keep their hard edges."""
     picture = Image.fromarray(np.asarray(world.render()))
     size = (width, round(picture.height * width / picture.width))
     larger = width > picture.width
@@ -148,38 +148,39 @@ def picture(world: World, width: int) -> Image.Image:
 class Film:
     """Takes side by side: a row for each episode, a column for each policy.
 
-    All begin together. One that has ended stands still, in a frame and above a word that say how it ended.
+    All takes begin together. A take that has ended holds its last picture, with a frame and a word that show
+    the outcome.
     """
 
     title: str
-    """What it shows."""
+    """Title of the film."""
     rows: Sequence[str]
-    """What each episode is about."""
+    """Caption of each episode."""
     columns: Sequence[str]
-    """Which policy it is."""
+    """Name of each policy."""
     takes: Sequence[Sequence[Take]]
-    """Of each row, one for each column."""
+    """Takes of each row, one for each column."""
 
     def __len__(self) -> int:
-        """Return how many different frames there are."""
+        """Return the number of different frames."""
         return max(len(take.pictures) for row in self.takes for take in row)
 
     @property
     def size(self) -> tuple[int, int]:
-        """Width and height in pixels; even, as MP4 wants them."""
+        """Width and height in pixels; MP4 requires even numbers."""
         across, down = self._corner(len(self.rows), len(self.columns))
         down -= LINE
         return across + across % 2, down + down % 2
 
     def _corner(self, row: int, column: int) -> tuple[int, int]:
-        """Return the top left corner of a panel: a line with the policy, the picture, a line with its end."""
+        """Return the top left corner of a panel: a line for the policy, the picture, a line for the outcome."""
         sizes = [take.pictures[0].size for takes in self.takes for take in takes]
         width, height = (max(side) for side in zip(*sizes, strict=True))
         return GAP + column * (width + GAP), 2 * GAP + 2 * LINE + row * (3 * LINE + height + GAP)
 
     @functools.cached_property
     def _sheet(self) -> Image.Image:
-        """All that stands still."""
+        """Everything that is the same in all frames."""
         sheet = Image.new("RGB", self.size, PAPER)
         draw = ImageDraw.Draw(sheet)
         panel = self.takes[0][0].pictures[0].width
@@ -192,7 +193,7 @@ class Film:
         return sheet
 
     def frame(self, time: int) -> Image.Image:
-        """Return what is seen after `time` steps."""
+        """Return the frame after `time` steps."""
         frame = self._sheet.copy()
         draw = ImageDraw.Draw(frame)
         for row, takes in enumerate(self.takes):
@@ -214,15 +215,15 @@ class Film:
         return frame
 
     def save(self, path: Path, fps: int) -> None:
-        """Write the film, in one step, as the GIF or MP4 that the name of the file says.
+        """Write the film, in one step, as GIF or MP4 according to the name of the file.
 
         Args:
-            path: Where to.
-            fps: Steps shown in a second.
+            path: Path of the film.
+            fps: Number of steps shown per second.
 
         Raises:
-            LookupError: MP4 needs a package that is not installed.
-            ValueError: The name ends otherwise.
+            MissingPackageError: MP4 needs a package that is not installed.
+            InputError: The name of the file has another ending.
         """
         check_format(path)
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -242,7 +243,7 @@ class Film:
         next(frames).save(path, save_all=True, append_images=frames, duration=milliseconds, loop=0)
 
     def _palette(self) -> Image.Image:
-        """Return 256 colours for all frames, so that what stands still does not flicker."""
+        """Return 256 colours for all frames, so that unchanged parts do not flicker."""
         samples = [self.frame(time) for time in (0, len(self) // 2, len(self) - 1)]
         width, height = self.size
         stack = Image.new("RGB", (width, 3 * height), PAPER)
@@ -250,7 +251,7 @@ class Film:
             stack.paste(sample, (0, number * height))
         ours = np.array([ImageColor.getrgb(colour) for colour in (PAPER, INK, FAINT, SUCCESS, FAILURE)])
         found = np.reshape(stack.quantize(256 - len(ours)).getpalette() or [], (-1, 3))
-        # Pillow looks for the nearest colour in steps of 4: a near one would be taken for ours
+        # Pillow searches for the nearest colour in steps of 4 and would confuse a close colour with ours
         far = np.abs(found[:, None] - ours).max(axis=2).min(axis=1) > 8
         palette = Image.new("P", (1, 1))
         palette.putpalette([int(channel) for channel in np.concatenate([ours, found[far]]).ravel()])
@@ -259,7 +260,7 @@ class Film:
     def _save_mp4(self, path: Path, fps: int) -> None:
         from imageio_ffmpeg import write_frames
 
-        # one thread and no name of the encoder in the file: the same film is the same bytes
+        # one thread and no encoder name in the file: the same film has the same bytes
         exact = ["-threads", "1", "-fflags", "+bitexact", "-flags:v", "+bitexact", "-crf", "23"]
         writer = write_frames(path, self.size, fps=fps, macro_block_size=2, output_params=exact)
         writer.send(None)
@@ -269,7 +270,7 @@ class Film:
 
 
 def _write(draw: ImageDraw.ImageDraw, place: tuple[int, int], text: str, width: int, colour: str) -> None:
-    """Write a line of text that begins at `place`; what does not fit in `width` pixels is cut off."""
+    """Write a line of text that begins at `place`, cut to `width` pixels."""
     font = _font()
     if draw.textlength(text, font) > width:
         while text and draw.textlength(f"{text}...", font) > width:
@@ -290,10 +291,10 @@ def film_run(
 
     Args:
         run: The run.
-        policies: By the number of their stage, in the order of the columns.
-        tasks: What they are asked to do.
-        number: Which validation episode.
-        width: Of a picture, in pixels.
+        policies: Policies by the number of their stage, in the order of the columns.
+        tasks: Tasks of the rows.
+        number: Number of the validation episode.
+        width: Width of a picture, in pixels.
         progress: Called with the number of takes made since its last call.
     """
     scenario, seed = run.scenario, run.spec.seed
@@ -309,10 +310,7 @@ def film_run(
 
 
 def steps_per_second(task: Task) -> int:
-    """Return how many steps of a task's world are a second, as the world says, but at most `FASTEST`.
-
-    It is 25 if the world does not say.
-    """
+    """Return the steps per second of a task's world, at most `FASTEST`; 25 if the world does not give them."""
     world = resolve(task.world)()
     rate = world.metadata.get("render_fps", 25)
     world.close()
@@ -321,5 +319,5 @@ def steps_per_second(task: Task) -> int:
 
 @functools.cache
 def _font() -> Any:
-    """Return the letters that come with Pillow, so that films look alike on all machines."""
+    """Return the font that comes with Pillow, so that films look the same on all machines."""
     return ImageFont.load_default(LINE - 5)

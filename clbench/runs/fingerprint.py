@@ -1,4 +1,4 @@
-"""The fingerprint: what a score was measured with, down to the bits of the simulator."""
+"""The fingerprint of a record: software and hardware of a score, down to the bits of the simulator."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ PACKAGES = (
     "tokenizers",
     "torch",
 )
-"""Whose versions every record names, beside the packages of its scenario's tasks."""
+"""Packages whose versions are in every record, in addition to the packages of the scenario's tasks."""
 
 _ROLLOUT_STEPS = 50
 
 
 def rollout_hash(world: str, task: str) -> str:
-    """Return the hash of a fixed open-loop rollout of a world: it differs where the simulator does.
+    """Return the hash of a fixed open-loop rollout of a world; it changes with the simulator.
 
     Args:
         world: Entry point of the environment.
@@ -54,9 +54,9 @@ def rollout_hash(world: str, task: str) -> str:
 
 
 def fingerprint(scenario: Scenario) -> dict[str, Any]:
-    """Return versions, commit, hardware and the hashes of every world of the scenario.
+    """Return versions, commit, hardware and the rollout hash of every world of the scenario.
 
-    Beside the rollout of a world stands, under the name of the camera if there is one, the hash of a picture.
+    For a world with a camera, the hash of a picture is added under the name of the camera.
     """
     packages = {*PACKAGES, *(package for task in scenario.tasks for package in task.packages)}
     worlds: dict[str, Task] = {}
@@ -74,14 +74,14 @@ def fingerprint(scenario: Scenario) -> dict[str, Any]:
 
 
 def _commit() -> dict[str, Any] | None:
-    """Return the commit of the checkout that this file lies in and whether it was changed, or None."""
+    """Return the commit of the checkout that contains this file, and whether code was changed, or None."""
     folder = Path(__file__).resolve().parents[1]
     if not (folder.parent / ".git").exists():
         return None
     try:
         git = ["git", "-C", os.fspath(folder.parent)]
         head = subprocess.run([*git, "rev-parse", "HEAD"], capture_output=True, text=True, check=True)
-        # records and the table are what runs make: they do not change what the next run computes
+        # runs make records and the table, which do not affect later runs
         code = ["clbench", "envs", "methods", "pyproject.toml", "constraints.txt"]
         changed = subprocess.run(
             [*git, "status", "--porcelain", "--", *code], capture_output=True, text=True, check=True
@@ -92,8 +92,8 @@ def _commit() -> dict[str, Any] | None:
 
 
 def _hardware() -> dict[str, str]:
-    """Return what may round differently: processors of one name differ in the instructions that they have."""
-    import torch  # seconds, and environments that only step need not wait for them
+    """Return what affects rounding: processors of the same name may have different instructions."""
+    import torch  # takes seconds, for which environments that only step need not wait
 
     return {
         "machine": platform.machine(),
@@ -104,7 +104,7 @@ def _hardware() -> dict[str, str]:
 
 
 def _processor() -> str:
-    """Return the processor's model."""
+    """Return the model of the processor."""
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
     except OSError:

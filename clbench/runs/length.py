@@ -1,4 +1,4 @@
-"""Length of a run in optimiser steps, for the time left that a progress bar shows."""
+"""Length of a run in optimiser steps, from which a progress bar estimates the time left."""
 
 from __future__ import annotations
 

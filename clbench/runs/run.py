@@ -46,12 +46,12 @@ def execute(
 ) -> Record:
     """Do a run, or continue an interrupted one, and write its record.
 
-    A run that fails leaves a record of status "failed" that says where.
+    A run that fails leaves a record of status "failed" that names the place.
 
     Args:
         run: The run, by name or resolved.
         records: Folder of the records.
-        progress: Called with the length of what was done since its last call, in optimiser steps;
+        progress: Called with the length of the work done since its last call, in optimiser steps;
             `clbench.runs.length.run_length` returns the total.
         checkpoints: Folder below which the policies of all stages are kept; None keeps none.
         tensorboard: Folder below which the run is logged for TensorBoard; None logs nothing.
@@ -68,7 +68,7 @@ def execute(
 
 
 def pretrained_hash(folder: Path) -> str:
-    """Return the hash of the pretrained policy in `folder`, as a record names it."""
+    """Return the hash of the pretrained policy in `folder`, in the form of a record."""
     manifest = json.loads((folder / "clbench.json").read_text(encoding="utf-8"))
     return str(manifest["files"]["policy.safetensors"][:16])
 
@@ -81,7 +81,7 @@ def _new_record(run: ResolvedRun, trainer: Trainer, pretrained_folder: Path) -> 
         scenario=run.scenario_info,
         costs=Costs(optimiser_steps=0, parameters=_parameters(trainer)),
         fingerprint={
-            # the first task of each world plays its rollout: the order of the targets must not choose it
+            # the first task of each world starts its rollout: the order of the targets must not change it
             **fingerprint(run.published),
             "method": describe_method(run.method),
             "pretrained": pretrained_hash(pretrained_folder),
@@ -96,11 +96,10 @@ def _parameters(trainer: Trainer) -> int:
 
 @dataclasses.dataclass
 class _Run:
-    """A run under way: the trainer, the examiner, and the record so far.
+    """A running run: the trainer, the examiner, and the record so far.
 
-    After each stage a checkpoint of the trainer and of the record is written, and the next stage begins with
-        it: an
-    interrupted run continues as if it had not been.
+    After each stage it writes a checkpoint of the trainer and of the record, and the next stage begins with
+    it: an interrupted run therefore continues as if nothing had happened.
     """
 
     run: ResolvedRun
@@ -127,7 +126,7 @@ class _Run:
         kept: Path | None,
         tensorboard: Path | None,
     ) -> _Run:
-        """Return a run with all that it needs; the policy is pretrained, and data collected, on first use."""
+        """Return a run with everything it needs; the policy is pretrained, and data collected, on first use."""
         scenario, spec = run.scenario, run.spec
         pretrained, folder = pretrained_policy(scenario, spec.seed)
         pretrained = pretrained.to(spec.device)
@@ -141,7 +140,7 @@ class _Run:
         return cls(run, trainer, examiner, record, Log(), progress, checkpoints, kept, tensorboard)
 
     def go(self) -> Record:
-        """Go through all stages that no checkpoint has, and return the record."""
+        """Go through all stages without a checkpoint, and return the record."""
         self.record.timing["started"] = datetime.now(UTC).isoformat(timespec="seconds")
         try:
             self._go_through()
@@ -222,7 +221,7 @@ class _Run:
         )
 
     def _diagnose(self, number: int) -> None:
-        """Keep what the method reports about stage `number`."""
+        """Keep the method's report on stage `number`."""
         self.trainer.where = f"diagnostics() after stage {number}"
         found = _checked(self.trainer.method.diagnostics())
         if found:
@@ -261,16 +260,16 @@ class _Run:
         shutil.rmtree(self._checkpoint(number - 1), ignore_errors=True)
 
     def _load(self, number: int) -> None:
-        """Take the policy and the method as they were after stage `number`."""
+        """Load the policy and the method from the checkpoint after stage `number`."""
         self.trainer.load(self._checkpoint(number), number)
 
     def _checkpoint(self, number: int) -> Path:
         return self.checkpoints / f"stage-{number}"
 
     def _resume(self) -> int | None:
-        """Take the record of the latest checkpoint and return its stage, or None if there is none.
+        """Load the record of the latest checkpoint and return its stage, or None if there is no checkpoint.
 
-        Where policies are kept, a checkpoint without the policies of all stages before it does not count.
+        If the run keeps policies, a checkpoint without the policies of all stages before it does not count.
         """
         targets = len(self.run.scenario.target)
         for number in range(targets, -1, -1):

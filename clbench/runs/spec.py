@@ -1,4 +1,4 @@
-"""Run specifications: scenario x method x seed by name, and the same with everything resolved."""
+"""Run specifications: scenario x method x seed by name, and the same with all names resolved."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ from clbench.worlds.lanes import check_perturbable
 if TYPE_CHECKING:
     from clbench.learning.method import Method
 
-# PyTorch, which methods need, is imported late: that takes seconds, for which neither `--help` nor a process
-# of Ray that passes a spec on waits.
+# Methods need PyTorch, whose import takes seconds: it is imported late, so that neither `--help` nor a Ray
+# process that passes a spec on waits for it.
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class RunSpec:
     device: str = "cpu"
     """Device on which the policy is computed."""
     split: Split = "test"
-    """The split that is scored. Choices may look at "validation" episodes alone."""
+    """Split to score. Base choices only on "validation" episodes."""
     targets: int | None = None
     """Number of targets to learn, from the first; all if None."""
     order: int = 0
@@ -92,7 +92,7 @@ class RunSpec:
 
 @dataclass(frozen=True)
 class ResolvedRun:
-    """A run whose names have been looked up: everything that follows is handed this, and looks up nothing."""
+    """A run whose names have been looked up; code that receives it looks up nothing."""
 
     spec: RunSpec
     """The run by name."""
@@ -103,7 +103,7 @@ class ResolvedRun:
     method: type[Method]
     """Class of the method."""
     changes: Mapping[str, Any]
-    """Changed hyper-parameters as the method holds them: the text "0.5" may be a number."""
+    """Changed hyper-parameters as the method holds them: the text "0.5" may have become a number."""
 
     def new_method(self) -> Method:
         """Return a new object of the method."""
@@ -159,7 +159,7 @@ def describe_scenario(scenario: Scenario) -> ScenarioInfo:
 
 
 def _plain(value: Any) -> Any:
-    """Return a value as JSON holds it; what JSON cannot hold becomes text."""
+    """Return a value in JSON's types; a value that JSON cannot hold becomes text."""
     try:
         return json.loads(json.dumps(value, allow_nan=False))
     except (TypeError, ValueError):
@@ -167,10 +167,10 @@ def _plain(value: Any) -> Any:
 
 
 def has_record(run: ResolvedRun, records: Path) -> bool:
-    """Return whether this very run has completed, or one that also has perturbed episodes.
+    """Return whether exactly this run has completed, or the same run with perturbed episodes.
 
-    A record that failed, that cannot be read, or that is of another budget, device or settings does not
-    count.
+    A record does not count if its run failed, if it cannot be read, or if its budget, device or settings
+    differ.
     """
     try:
         record = read_record(run.path(records))

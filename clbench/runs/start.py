@@ -56,7 +56,7 @@ def evaluate_pretrained(run: ResolvedRun, progress: ProgressCallback = no_progre
 
     Args:
         run: One of the runs; its method makes no difference.
-        progress: Called with the length of what was done since its last call, in optimiser steps.
+        progress: Called with the length of the work done since its last call, in optimiser steps.
     """
     with repeatable(run.spec.device):
         policy, _ = pretrained_policy(run.scenario, run.spec.seed)
@@ -71,7 +71,7 @@ def evaluate_pretrained(run: ResolvedRun, progress: ProgressCallback = no_progre
 
 
 def is_evaluated(run: ResolvedRun) -> bool:
-    """Return whether the cache has the evaluation of the pretrained policy, which itself is there."""
+    """Return whether the cache has the evaluation of the pretrained policy; the policy must exist."""
     policy, _ = pretrained_policy(run.scenario, run.spec.seed)
     return is_cached(*_kept(run, policy))
 

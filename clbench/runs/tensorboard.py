@@ -1,4 +1,4 @@
-"""Live logging: what a run does, in TensorBoard while it is under way. The record does not depend on it."""
+"""Live logging: shows a running run in TensorBoard. The record does not depend on the log."""
 
 from __future__ import annotations
 
@@ -12,31 +12,31 @@ from clbench.records.record import Record
 from clbench.spec.protocol import Point
 
 LOG_STEPS = 10
-"""Optimiser steps between two points of the loss."""
+"""Number of optimiser steps between two points of the loss."""
 
 
 def require_tensorboard() -> None:
-    """Refuse to log where TensorBoard is missing.
+    """Check that TensorBoard is installed.
 
     Raises:
-        LookupError: The package is not installed.
+        MissingPackageError: TensorBoard is not installed.
     """
     require("tensorboard", "tensorboard", "Logging for TensorBoard")
 
 
 class Log:
-    """The scalars of one run, over the optimiser steps since the first target; without a folder, nothing.
+    """The scalars of one run over the optimiser steps since the first target; without a folder it logs nothing.
 
-    `training/` holds loss and step size every `LOG_STEPS` steps; `success_test/`, `success_validation/` and
-    `success_perturbed/` the success of each task, `question_accuracy/` that of each kind of question and of
-    all, and `policy/` how far the policy has moved, at every evaluation point; `diagnostics/` the numbers
-    that the method tells.
+    `training/` has the loss and the step size every `LOG_STEPS` steps. At every evaluation point,
+    `success_test/`, `success_validation/` and `success_perturbed/` have the success rate of each task,
+    `question_accuracy/` has the accuracy of each kind of question and of all questions, and `policy/` has the
+    distance from the pretrained policy. `diagnostics/` has the numbers among the method's diagnostics.
 
     Args:
-        folder: Where the event files go.
-        stage_steps: Optimiser steps of a stage.
-        resumed_after: The stage whose points, and those before, an interrupted run has written; TensorBoard
-            hides what is there beyond. All that is there if None.
+        folder: Folder of the event files.
+        stage_steps: Number of optimiser steps in a stage.
+        resumed_after: Last stage whose points an interrupted run has written; TensorBoard hides all later
+            points. None hides all earlier logs.
     """
 
     def __init__(
@@ -51,20 +51,20 @@ class Log:
             self._writer = SummaryWriter(folder, purge_step=first)
 
     def step(self, stage: int, step: Step) -> None:
-        """Log an optimiser step of a stage, if its turn has come."""
+        """Log every `LOG_STEPS`-th optimiser step of a stage."""
         if self._writer is None or step.loss is None or step.done % LOG_STEPS:
             return
         values = {"training/loss": step.loss.item(), "training/learning_rate": step.learning_rate}
         self._write(values.items(), stage, step.done)
 
     def report(self, record: Record, point: Point) -> None:
-        """Log what a record holds about an evaluation point."""
+        """Log the results of an evaluation point in a record."""
         if self._writer is not None:
             self._write(_report(record, point), *point)
-            self._writer.flush()  # the checkpoint that follows counts on it
+            self._writer.flush()  # the next checkpoint relies on it
 
     def diagnostics(self, found: Mapping[str, Any], stage: int) -> None:
-        """Log the numbers among a method's diagnostics of a stage."""
+        """Log the numbers among a method's diagnostics for a stage."""
         if self._writer is not None:
             numbers = ((name, value) for name, value in found.items() if type(value) in (int, float))
             values = ((f"diagnostics/{name}", value) for name, value in numbers)
@@ -77,7 +77,7 @@ class Log:
             self._writer.close()
 
     def _write(self, values: Iterable[tuple[str, float | None]], stage: int, step: int) -> None:
-        """Write the values that there are at `step` of a stage; stage 0 has no steps."""
+        """Write the values other than None at `step` of a stage; stage 0 has no steps."""
         assert self._writer is not None
         place = max(0, stage - 1) * self._stage_steps + step
         for tag, value in values:
@@ -86,7 +86,7 @@ class Log:
 
 
 def _report(record: Record, point: Point) -> Iterator[tuple[str, float | None]]:
-    """Yield the tags and values of an evaluation point."""
+    """Yield tag and value of each scalar at an evaluation point."""
     outcomes: dict[str, list[int]] = {}
     for row in _rows(record.episodes, point):
         outcomes.setdefault(f"success_{row['split']}/{row['task']}", []).append(row["success"])

@@ -1,22 +1,23 @@
 """Intervals and paired differences, with the two sources of variation that a row of the benchmark has.
 
-Another seed would give another sequence of policies, and other initial states would give other outcomes. A seed
-is one whole run, from the pretrained policy to the last stage: its tasks share a policy. The numbers of several
-seeds vary for both reasons. Therefore:
+Another seed would give another sequence of policies, and other initial states would give other outcomes. A
+seed is one whole run, from the pretrained policy to the last stage: its tasks share a policy. The numbers of
+several seeds vary for both reasons. Therefore:
 
-1. With two or more seeds the interval is Student's over the seeds. Its standard error comes from the jackknife,
-   which leaves out one whole seed at a time. Its degrees of freedom are the seeds less one. A quantity with a
-   least and a greatest value is transformed by the arcsine of its root, as is usual for rates. The interval
-   then stays inside the range, and is longer towards the middle of it, where the truth more often is.
+1. With two or more seeds the interval is Student's over the seeds. Its standard error comes from the
+   jackknife, which leaves out one whole seed at a time. Its degrees of freedom are the seeds less one. A
+   quantity with a least and a greatest value is transformed by the arcsine of its root, as is usual for
+   rates. The interval then stays inside the range, and is longer towards the middle of it, where the truth
+   more often is.
 2. With one seed, or where the seeds agree exactly, the variation between seeds is unknown, and the interval
    covers episodes alone. It holds the percentiles of replicates in which every run keeps its policy and meets
-   episodes drawn with replacement, for each task. All stages and evaluation points of a run get the same draws,
-   and so do runs of other methods with this seed: they met the same initial states. Fewer episodes are run
-   before the end of a stage. There the rate is the mean over the drawn ones among them. Right answers are drawn
-   from a binomial for each stage and kind of question, since records hold counts only.
+   episodes drawn with replacement, for each task. All stages and evaluation points of a run get the same
+   draws, and so do runs of other methods with this seed: they met the same initial states. Fewer episodes are
+   run before the end of a stage. There the rate is the mean over the drawn ones among them. Right answers are
+   drawn from a binomial for each stage and kind of question, since records hold counts only.
 
-Tasks are fixed: a scenario consists of them. Choices on a run's validation episodes are fixed too, for example
-the points of `retention_at_matched_adaptation`: the interval does not cover the luck of the choice.
+Tasks are fixed: a scenario consists of them. Choices on a run's validation episodes are fixed too, for
+example the points of `retention_at_matched_adaptation`: the interval does not cover the luck of the choice.
 `docs/guide/statistics.md` reports the coverage of these 95 % intervals and their limits.
 """
 
@@ -47,9 +48,9 @@ REPLICATES = 2000
 LEVEL = 95.0
 """Nominal coverage of the intervals in per cent."""
 SEED_DEVIATION = 0.05
-"""Standard deviation of a success rate between seeds, assumed where none is measured. In the committed records
-of Fetch-v0 retention deviates by 0.037 beyond the noise of episodes (root mean square over methods), and by 0.07
-at most."""
+"""Standard deviation of a success rate between seeds, assumed where none is measured. In the committed
+records of Fetch-v0 retention deviates by 0.037 beyond the noise of episodes (root mean square over methods),
+and by 0.07 at most."""
 MANY = 10**6
 """Degrees of freedom of a standard deviation that is known."""
 
@@ -143,9 +144,9 @@ def paired_difference(
 ) -> Estimate:
     """Return the value of `metric` for `runs` minus that for `others`, over the seeds that both have.
 
-    Seeds are left out, and episodes drawn, for both at once, so that difficulty for both cancels. Right answers
-    are drawn separately, since records do not name the questions: with one seed, intervals of differences of
-    answers are a little too wide.
+    Seeds are left out, and episodes drawn, for both at once, so that difficulty for both cancels. Right
+    answers are drawn separately, since records do not name the questions: with one seed, intervals of
+    differences of answers are a little too wide.
 
     Args:
         metric: Name of a metric.

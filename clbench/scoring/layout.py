@@ -29,7 +29,8 @@ class Layout:
     validation_episodes: tuple[int, ...]
     """Numbers of the validation episodes on a stage's target, rising."""
     steps: tuple[int, ...]
-    """Steps of a stage after which the policy is evaluated, rising, above 0; the last one is the stage's end."""
+    """Steps of a stage after which the policy is evaluated, rising, above 0; the last one is the stage's
+    end."""
     kinds: tuple[str, ...]
     """Kinds of questions, sorted."""
 

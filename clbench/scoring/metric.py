@@ -1,8 +1,8 @@
 """The registry of metrics: named, versioned functions from the success rates of runs to one number.
 
-A new metric is one function with the decorator `metric`: intervals, tables and tests then find it. The metrics
-of the leaderboard are in `clbench.scoring.ours`, definitions of other papers in `clbench.scoring.published`;
-`clbench.scoring.metrics` loads both.
+A new metric is one function with the decorator `metric`: intervals, tables and tests then find it. The
+metrics of the leaderboard are in `clbench.scoring.ours`, definitions of other papers in
+`clbench.scoring.published`; `clbench.scoring.metrics` loads both.
 """
 
 from __future__ import annotations

@@ -16,7 +16,8 @@ from clbench.scoring.rates import Rates
 from clbench.spec.references import BASELINE, FROM_SCRATCH
 
 MATCHED_SHARE = 0.9
-"""Share of plain fine-tuning's final success on a target at which a method counts as having learned it as well."""
+"""Share of plain fine-tuning's final success on a target at which a method counts as having learned it as
+well."""
 
 
 @metric(
@@ -57,8 +58,9 @@ def retention(rates: Rates) -> Array:
 def perturbed_retention(rates: Rates) -> Array:
     """Success on the retained skills after the last target, with perturbed start poses, masses and views.
 
-    The episodes are the same as for `retention`, number by number: the difference is the loss by perturbation.
-    The success of the pretrained policy shows how much of that loss was there before any target.
+    The episodes are the same as for `retention`, number by number: the difference is the loss by
+    perturbation. The success of the pretrained policy shows how much of that loss was there before any
+    target.
     """
     return average(rates.perturbed[..., -1, :])
 
@@ -66,8 +68,8 @@ def perturbed_retention(rates: Rates) -> Array:
 @metric(
     formula="mean over the stages k of the success on the retained skills at the first evaluation point of "
     f"stage k at which the success on target k is at least {MATCHED_SHARE:g} times the success of "
-    f"{BASELINE} on it at the end of stage k; the point is chosen on validation episodes, the success at it is "
-    "from test episodes",
+    f"{BASELINE} on it at the end of stage k; the point is chosen on validation episodes, the success at it "
+    "is from test episodes",
     source="the protocol of ConSFT, arXiv 2605.08879, Sec. 5.1: comparison at comparable target success",
     references=(BASELINE,),
     compares_itself=True,
@@ -93,8 +95,8 @@ def retention_at_matched_adaptation(rates: Rates) -> Array:
 def matched_points(rates: Rates) -> Array:
     """Return the evaluation point of each stage at which its target is first learned about as well as by sft.
 
-    At this point the success on the validation episodes first reaches `MATCHED_SHARE` times the success of sft on
-    them at the end of the stage. Test episodes, which make the scores, have no part in the choice.
+    At this point the success on the validation episodes first reaches `MATCHED_SHARE` times the success of
+    sft on them at the end of the stage. Test episodes, which make the scores, have no part in the choice.
 
     Args:
         rates: Success rates with the reference sft.
@@ -166,10 +168,10 @@ def forward_transfer(rates: Rates) -> Array:
 
     1. Trapezoid rule through the evaluation points and a point at step 0. A stage starts with the policy of
        the stage before, so that its point at step 0 is R[k-1][k]: success without a step counts as transfer.
-    2. The policy from scratch starts untrained and is not evaluated then: its success at step 0 is taken as 0.
-       For manipulation this is true to a few in a thousand. Where it is not, the value is too high by at most
-       half the first interval's share of the stage times the untrained policy's success. Curves that begin at
-       the first common point instead would leave out the very part in which transfer shows.
+    2. The policy from scratch starts untrained and is not evaluated then: its success at step 0 is taken as
+       0. For manipulation this is true to a few in a thousand. Where it is not, the value is too high by at
+       most half the first interval's share of the stage times the untrained policy's success. Curves that
+       begin at the first common point instead would leave out the very part in which transfer shows.
     3. Curves are averaged over seeds before the ratio, as in the source's code.
     4. The value is capped by 1 and not bounded below. Point 2 keeps the divisor above 0.
     """
@@ -223,8 +225,8 @@ def update_sparsity(rates: Rates) -> Array:
 
 
 @metric(
-    formula="squared 2-Wasserstein distance between the hidden states of the policy and of the pretrained policy "
-    "on the test questions, mean over layers, at the end of stage K",
+    formula="squared 2-Wasserstein distance between the hidden states of the policy and of the pretrained "
+    "policy on the test questions, mean over layers, at the end of stage K",
     source="the penalty of AEGIS, arXiv 2604.16067",
     high=math.inf,
     higher_is_better=False,

@@ -1,9 +1,9 @@
 """Metrics as other benchmarks, papers and libraries define them.
 
-One word has many meanings in this field: here each definition carries the name of its source. As published, they
-cover the sequence of learned tasks: the targets, without the retained skills and the held-out tasks. R[l][k] is the
-success on target k at the end of stage l, and K is the last stage. Between the ends of the stages only the current
-target is known, so that earlier and later targets count at the ends only.
+One word has many meanings in this field: here each definition carries the name of its source. As published,
+they cover the sequence of learned tasks: the targets, without the retained skills and the held-out tasks.
+R[l][k] is the success on target k at the end of stage l, and K is the last stage. Between the ends of the
+stages only the current target is known, so that earlier and later targets count at the ends only.
 """
 
 from __future__ import annotations
@@ -139,7 +139,8 @@ def forgetting_continual_world(rates: Rates) -> Array:
 @metric(
     formula="mean over the targets k of J[k][k] - R[k][k]; J is R of joint",
     source="Chaudhry et al. 2018, arXiv 1801.10112 (I), the mean over the tasks",
-    missing=f"There is no {JOINT} of the same seeds, or the success on a target right after learning it is missing.",
+    missing=f"There is no {JOINT} of the same seeds, or the success on a target right after learning it is "
+    "missing.",
     low=-1.0,
     higher_is_better=False,
     references=(JOINT,),
@@ -288,9 +289,9 @@ def _isolated(rates: Rates) -> Array:
 def forward_transfer_libero(rates: Rates) -> Array:
     """Success on the target while it is learned, compared with nothing.
 
-    LIBERO's points are equally spaced, ours are the scenario's. LIBERO continues from the best checkpoint of a
-    stage, chosen on the same episodes that it reports, and holds the curve there; here a stage ends with its
-    last step.
+    LIBERO's points are equally spaced, ours are the scenario's. LIBERO continues from the best checkpoint of
+    a stage, chosen on the same episodes that it reports, and holds the curve there; here a stage ends with
+    its last step.
     """
     return average(_own_curves(rates))
 
@@ -371,7 +372,7 @@ def area_under_curve_libero(rates: Rates) -> Array:
     low=-1.0,
 )
 def zero_shot_change(rates: Rates) -> Array:
-    """Change of the success on tasks that were never trained, from before the first target to after the last."""
+    """Change of the success on tasks that were never trained, from the pretrained policy to the end."""
     change = rates.held_out[..., -1, :] - rates.held_out[..., 0, :]
     return average(change if rates.layout.target else change[..., :0])
 

@@ -26,8 +26,8 @@ def deviation_of_differences(metric: str, rows: Iterable[Runs]) -> float | None:
     """Return the standard deviation of the difference of two rows from seed to seed.
 
     It is the root mean square over all pairs of rows, each over its common seeds. With it,
-    `student_quantile(n - 1) * deviation / sqrt(n)` is half of the expected width of the interval of a difference
-    over n seeds: rows that are nearer cannot be told apart.
+    `student_quantile(n - 1) * deviation / sqrt(n)` is half of the expected width of the interval of a
+    difference over n seeds: rows that are nearer cannot be told apart.
 
     Args:
         metric: Name of a metric that needs no reference.
@@ -70,8 +70,8 @@ def tie_groups(
     3. from the episodes: the jackknife over them, since seeds may agree by chance.
 
     So at most 5 % of the boards of equal methods are split; `docs/guide/statistics.md` has the figures. Rows
-    without a common seed are compared by the variation of runs around the mean of their row. Where no row has a
-    second seed, a deviation of `UNKNOWN_DEVIATION` is assumed: only distant rows are told apart.
+    without a common seed are compared by the variation of runs around the mean of their row. Where no row has
+    a second seed, a deviation of `UNKNOWN_DEVIATION` is assumed: only distant rows are told apart.
 
     Args:
         metric: Name of a metric.
@@ -184,7 +184,7 @@ def _jackknife(without_episode: Array) -> Array:
 def _measured(
     metric: Metric, runs: Runs, seeds: Sequence[int], references: Mapping[str, Runs]
 ) -> tuple[float, Array, Array]:
-    """Return the value of a row, its runs' values (seeds,), and these without each episode (seeds, episodes)."""
+    """Return a row's value, its runs' values (seeds,), and these without each episode (seeds, episodes)."""
     own = [seed for seed in seeds if seed in runs]
     needed = needed_references([metric], own, references)
     ordered = [runs[seed] for seed in own]

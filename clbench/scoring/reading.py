@@ -20,8 +20,8 @@ MOST_POINTS = 100
 """Evaluation points of a stage."""
 
 MOST_CELLS = 20_000
-"""Cells of a table of rates, for example stages x points x tasks: 2,000 replicates of it take 320 MB. Fetch-v0
-has 240, a sequence of 40 targets among 50 tasks 8,200."""
+"""Cells of a table of rates, for example stages x points x tasks: 2,000 replicates of it take 320 MB.
+Fetch-v0 has 240, a sequence of 40 targets among 50 tasks 8,200."""
 
 FARTHEST = 1e18
 """A greater activation drift than any policy has whose hidden states are numbers of any use."""
@@ -62,9 +62,7 @@ def read_protocol(record: Record) -> Protocol:
         if type(count) is not int or not 0 <= count <= MOST:
             raise RecordError(f"scenario: {name} of its budget must be a whole number, not {count!r}.")
     # few rows may ask for more memory than there is
-    check_cells(
-        "stages x points x tasks", len(scenario.target) + 1, len(scenario.evaluation_steps), tasks
-    )
+    check_cells("stages x points x tasks", len(scenario.target) + 1, len(scenario.evaluation_steps), tasks)
     return scenario.protocol(record.run)
 
 

@@ -87,12 +87,12 @@ class Scores(Measured):
     def rates(self, counts: Array | None = None) -> Rates:
         """Return the success rates with the batch axes of `counts`.
 
-        At the points before the end of a stage fewer episodes are run. There the counts are weights: the
-        rate is the weighted mean over those of the drawn episodes that are run, however many these are. Where none
-        of them was drawn all weigh the same.
+        Before the end of a stage fewer episodes are run. There the counts are weights: the rate is the
+        weighted mean over the episodes that are run. If none of them was drawn, all weigh the same.
 
         Args:
-            counts: How often each episode is drawn, the same for all stages and points, (..., tasks, episodes).
+            counts: How often each episode is drawn, the same for all stages and points, (..., tasks,
+                episodes).
                 They add up to the number of episodes. Once each, without batch axes, if None.
         """
         layout, number = self.layout, len(self.layout.episodes)
@@ -127,7 +127,7 @@ class Scores(Measured):
 
 
 def _is_chosen_on(row: Row, protocol: Protocol) -> bool:
-    """Return whether a method may look at the episode to choose: a validation episode of the stage's target."""
+    """Return whether choices may look at the episode: a validation episode of the stage's target."""
     return (
         row.split == "validation" and row.point.stage > 0 and row.task == protocol.target[row.point.stage - 1]
     )

@@ -16,7 +16,7 @@ if TYPE_CHECKING:  # PyTorch takes seconds to import, and environments do not ne
     from torch import Tensor
 
 TEXT_LENGTH = 12
-"""Largest number of words that the policy reads; shorter texts are padded, so that every forward has one shape."""
+"""Words that the policy reads at most; shorter texts are padded, so that every forward has one shape."""
 
 VOCABULARY_SIZE = 1024
 """Rows of the embedding and of the answers, more than there are words. A new suite appends its words to the

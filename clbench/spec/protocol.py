@@ -1,7 +1,7 @@
 """The evaluation protocol: which episodes a run evaluates, and after which steps.
 
-It is pure data, stated once. A run plays these episodes, a progress bar counts them, the scores expect them, and
-a verifier draws some of them again.
+It is pure data, stated once. A run plays these episodes, a progress bar counts them, the scores expect them,
+and a verifier draws some of them again.
 """
 
 from __future__ import annotations
@@ -15,7 +15,8 @@ if TYPE_CHECKING:
 
 Split = Literal["validation", "test", "perturbed"]
 """Purpose of an episode. Choices may look at validation episodes; scores are made of test episodes alone. A
-perturbed episode is the test episode of the same number in a perturbed world (`clbench.worlds.perturbation`)."""
+perturbed episode is the test episode of the same number in a perturbed world
+(`clbench.worlds.perturbation`)."""
 
 SPLITS: tuple[Split, ...] = ("validation", "test", "perturbed")
 
@@ -115,10 +116,10 @@ class Protocol:
     def episodes(self, point: Point) -> list[EpisodeKey]:
         """Return the episodes to play at `point`, in their order.
 
-        At the end of a stage these are all scored episodes of all tasks, and the perturbed ones of the retained
-        skills. Before the end they are the first scored episodes of what the stage can change: the retained
-        skills and its target. At every point the target has all its validation episodes, so that choices need
-        not look at test episodes.
+        At the end of a stage these are all scored episodes of all tasks, and the perturbed ones of the
+        retained skills. Before the end they are the first scored episodes of what the stage can change: the
+        retained skills and its target. At every point the target has all its validation episodes, so that
+        choices need not look at test episodes.
         """
         target = self.target[point.stage - 1 : point.stage] if point.stage else ()
         at_end = self.is_end(point)

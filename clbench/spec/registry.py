@@ -21,8 +21,8 @@ def register(scenario_id: str, entry_point: str) -> None:
         entry_point: Entry point "module:attribute" of the `Scenario`.
 
     Raises:
-        ValueError: The id has another form, is easily mistaken for another scenario, is already registered for
-            another entry point, or uses our namespace; or the entry point has another form.
+        ValueError: The id has another form, is easily mistaken for another, is already registered for another
+            entry point, or uses our namespace; or the entry point has another form.
     """
     check_scenario_id(scenario_id)
     module, colon, attribute = entry_point.partition(":")
@@ -47,8 +47,8 @@ def load_scenario(scenario_id: str) -> Scenario:
     """Return the scenario registered with Gymnasium under this id, ready to use.
 
     Raises:
-        LookupError: No scenario is registered under this id, or a package that its tasks need is not installed;
-            the message says how to get it.
+        LookupError: No scenario is registered under this id, or a package that its tasks need is not
+            installed; the message says how to get it.
     """
     return opened_scenario(registered_scenario(scenario_id))
 

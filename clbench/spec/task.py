@@ -23,22 +23,22 @@ class Task:
     horizon: int
     """Length in steps after which an episode ends without success."""
     world: str
-    """Entry point "module:callable" that makes the Gymnasium environment. One environment serves every task of
-    its world: `reset(options={"task": name})` chooses the task. The observation is the state, a float32 vector;
-    `terminated` means success, and `info["success"]` repeats it."""
+    """Entry point "module:callable" that makes the Gymnasium environment. One environment serves every task
+    of its world: `reset(options={"task": name})` chooses the task. The observation is the state, a float32
+    vector; `terminated` means success, and `info["success"]` repeats it."""
     expert: str
     """Entry point of a callable that takes the task's name and returns a callable (S,) -> (A,): the expert's
     action in a state. It must not remember earlier states: it also labels noisy demonstrations."""
     camera: str | None = None
-    """Entry point of the `clbench.worlds.camera.Camera` through which a policy sees the world, for states that
-    hold more than a policy may know. None shows it the states."""
+    """Entry point of the `clbench.worlds.camera.Camera` through which a policy sees the world, for states
+    that hold more than a policy may know. None shows it the states."""
     version: int = 0
     """Version, raised whenever the task, its expert or its demonstrations change."""
     action_noise: float = 0.1
     """Probability, at each step of a noisy demonstration, that 3 to 6 random actions begin."""
     packages: tuple[str, ...] = ()
-    """Distributions whose version can change a trajectory, besides those common to all worlds: the simulator of
-    the suite, such as ("gymnasium-robotics",)."""
+    """Distributions whose version can change a trajectory, besides those common to all worlds: the simulator
+    of the suite, such as ("gymnasium-robotics",)."""
     seed_name: str | None = None
     """Spelling of the suite in seeds and data set ids, where it differs from `suite`: it may never change, or
     demonstrations and measurements would change with it."""

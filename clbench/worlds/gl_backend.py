@@ -1,4 +1,4 @@
-"""Rendering: which back end of MuJoCo draws here, without a screen."""
+"""Rendering back ends of MuJoCo: finds one that draws on this machine without a screen."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from collections.abc import Iterable
 from clbench.base.errors import ClbenchError
 
 DEBIAN_PACKAGES = {"egl": "libegl1 libgl1-mesa-dri", "osmesa": "libosmesa6"}
-"""What makes each headless back end of MuJoCo work on Debian and Ubuntu."""
+"""Packages that make each headless back end of MuJoCo work on Debian and Ubuntu."""
 
 _BACK_ENDS = tuple(DEBIAN_PACKAGES) if sys.platform == "linux" else ("glfw",)
-"""What is tried, in this order. EGL draws a Fetch world in 0.03 s on one core, OSMesa in 0.14 s."""
+"""Back ends in the order of trial. EGL draws a Fetch world in 0.03 s on one core, OSMesa in 0.14 s."""
 
 _DRAW = """
 import sys
@@ -28,17 +28,17 @@ _MAKE_CONTEXT = "import mujoco; mujoco.GLContext(8, 8).make_current()"
 
 
 class RenderingError(ClbenchError):
-    """Nothing here can draw a world."""
+    """No back end of this machine can draw a world."""
 
 
 def rendering_fault(back_end: str, world: str | None = None) -> str | None:
-    """Return why a back end cannot draw, or None if it can.
+    """Return the reason why a back end cannot draw, None if it can.
 
-    It is tried in a process of its own, as a failure may kill it.
+    The trial has its own process, which a failure may kill.
 
     Args:
-        back_end: What the variable `MUJOCO_GL` is set to.
-        world: Entry point of an environment; if None, MuJoCo only makes ready to draw.
+        back_end: Value for the variable `MUJOCO_GL`.
+        world: Entry point of an environment to draw; None only creates a rendering context.
     """
     command = [sys.executable, "-c", *((_MAKE_CONTEXT,) if world is None else (_DRAW, world))]
     try:
@@ -49,13 +49,13 @@ def rendering_fault(back_end: str, world: str | None = None) -> str | None:
         return "no answer in two minutes"
     if result.returncode == 0:
         return None
-    # what is said after the error comes from half-made objects that are taken down
+    # the lines after the error come from the destructors of incomplete objects
     lines = result.stderr.partition("Exception ignored")[0].strip().splitlines()
     return lines[-1] if lines else f"exit code {result.returncode}"
 
 
 def environment_of(back_end: str) -> dict[str, str]:
-    """Return the variables of a process that draws with a back end, and finds what this one can import."""
+    """Return the environment of a process that draws with a back end and imports from the same places."""
     path = os.pathsep.join(entry for entry in sys.path if entry)
     return {**os.environ, "MUJOCO_GL": back_end, "PYTHONPATH": path}
 
@@ -63,13 +63,13 @@ def environment_of(back_end: str) -> dict[str, str]:
 def choose_back_end(worlds: Iterable[str]) -> str:
     """Set `MUJOCO_GL` to the first back end that draws all worlds, and return it.
 
-    It must happen before MuJoCo is imported.
+    Call it before MuJoCo is imported.
 
     Args:
         worlds: Entry points of environments.
 
     Raises:
-        RenderingError: None of them does; the message says what to install.
+        RenderingError: No back end draws them all; the message names the packages to install.
     """
     back_end = working_back_end(worlds, os.environ.get("MUJOCO_GL"))
     os.environ["MUJOCO_GL"] = back_end
@@ -77,14 +77,14 @@ def choose_back_end(worlds: Iterable[str]) -> str:
 
 
 def working_back_end(worlds: Iterable[str], chosen: str | None) -> str:
-    """Return the first back end that draws all worlds: EGL or OSMesa, GLFW where there is no Linux.
+    """Return the first back end that draws all worlds: EGL or OSMesa on Linux, GLFW elsewhere.
 
     Args:
         worlds: Entry points of environments.
-        chosen: What the user has set `MUJOCO_GL` to, if he has: it is obeyed.
+        chosen: The user's value of `MUJOCO_GL`, the only back end to try; None or empty tries all.
 
     Raises:
-        RenderingError: None of them does; the message says what to install.
+        RenderingError: No back end draws them all; the message names the packages to install.
     """
     faults = []
     for back_end in (chosen,) if chosen else _BACK_ENDS:

@@ -94,8 +94,8 @@ def check_perturbable(tasks: Iterable[Task]) -> None:
         if not getattr(own or world, "perturbable", False):
             what = f"the vector world of {task.world}" if own else task.world
             raise InputError(
-                f"The task {task.name!r} cannot be perturbed: {what} does not declare `perturbable = True`. Run "
-                "without --perturb, or perturb its episodes as docs/guide/your_scenario.md shows."
+                f"The task {task.name!r} cannot be perturbed: {what} does not declare `perturbable = True`. "
+                "Run without --perturb, or perturb its episodes as docs/guide/your_scenario.md shows."
             )
 
 

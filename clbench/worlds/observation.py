@@ -1,7 +1,7 @@
-"""Observers: they show the states of a world to a policy, and draw the pictures that belong to them.
+"""Observers: they show the states of a world to a policy, with pictures where the task has a camera.
 
-Pictures are drawn in processes of their own. Each is started with the back end of MuJoCo that works here,
-whatever this process has imported, and a driver that fails takes no run with it unsaid.
+Separate processes draw the pictures. Each starts with the back end of MuJoCo that works on this machine,
+whatever the main process has imported. If a driver crashes, the run reports it.
 """
 
 from __future__ import annotations
@@ -31,16 +31,16 @@ from clbench.worlds.gl_backend import RenderingError, environment_of, working_ba
 from clbench.worlds.render_worker import HEADER
 
 TOGETHER = 256
-"""Pictures that a drawing process is asked for at once: 3 MB of 64 x 64 pixels, and half a second of work."""
+"""Pictures per request to a drawing process: 3 MB of 64 x 64 pixels, and half a second of work."""
 
 
 class Observer:
-    """Shows the states of a world to a policy: as they are, or as a camera shows them.
+    """Shows the states of a world to a policy, directly or through a camera.
 
     Args:
         world: Entry point of the world.
         camera: Entry point of the camera, or None.
-        processes: How many draw; none is started before there is something to draw.
+        processes: Number of drawing processes, which start with the first picture.
     """
 
     def __init__(self, world: str, camera: str | None, processes: int = 1) -> None:
@@ -50,14 +50,14 @@ class Observer:
 
     @property
     def image_size(self) -> int:
-        """Width and height of a picture in pixels; 0 if there is none."""
+        """Width and height of a picture in pixels; 0 without a camera."""
         return 0 if self._camera is None else self._camera.image_size
 
     def spaces(self, state: spaces.Box) -> dict[str, spaces.Box]:
-        """Return the spaces of what is shown, by name: `state`, and `image` if there is one.
+        """Return the spaces of an observation by name: `state`, and `image` if there is a camera.
 
         Args:
-            state: Of the world's own states.
+            state: Space of the world's own states.
         """
         if self._camera is None:
             return {"state": state}
@@ -68,14 +68,14 @@ class Observer:
         }
 
     def observe(self, states: States, views: Views | None = None) -> tuple[States, Images]:
-        """Return what is shown of the states (N, S): numbers (N, P), and pictures (N, size, size, 3).
+        """Return the observations of the states (N, S): numbers (N, P) and pictures (N, size, size, 3).
 
         Args:
-            states: Of the world.
-            views: How the pictures are disturbed, (N, 4); none is if None.
+            states: States of the world, (N, S).
+            views: Perturbations of the pictures, (N, 4); None perturbs none.
 
         Raises:
-            RenderingError: Nothing here can draw the world; the message says what to install.
+            RenderingError: No back end can draw the world; the message names the packages to install.
             TypeError: The camera returns numbers of another shape.
         """
         if self._camera is None:
@@ -129,7 +129,7 @@ class _DrawingProcess:
         )
 
     def ask(self, rows: States) -> None:
-        """Send views and states (N, 4 + S); whoever sends waits until those before are drawn."""
+        """Send views and states (N, 4 + S); this waits until the earlier ones are drawn."""
         assert self._process.stdin is not None
         self._asked = len(rows)
         try:
@@ -139,7 +139,7 @@ class _DrawingProcess:
             raise self._end() from error
 
     def answer(self) -> Images:
-        """Return the pictures of what was sent, (N, size, size, 3)."""
+        """Return the pictures of the rows that were sent, (N, size, size, 3)."""
         assert self._process.stdout is not None
         shape = (self._asked, self._image_size, self._image_size, 3)
         answer = self._process.stdout.read(int(np.prod(shape)))
@@ -148,7 +148,7 @@ class _DrawingProcess:
         return np.frombuffer(answer, np.uint8).reshape(shape)
 
     def _end(self) -> RenderingError:
-        """Return the error for a process that has ended too early, with the last line that it left."""
+        """Return the error for a process that ended too early, with the last line of its output."""
         code = self._process.wait()
         self._complaints.seek(0)
         lines = self._complaints.read().decode(errors="replace").strip().splitlines()
@@ -166,24 +166,24 @@ class _DrawingProcess:
         self._complaints.close()
 
     def __del__(self) -> None:
-        """End the process with whoever forgot to close it."""
+        """End the process of an observer that nobody closed."""
         if not self._complaints.closed:
             self.close()
 
 
 @functools.cache
 def _back_end(world: str, chosen: str) -> str:
-    """Return what draws a world here; to find out takes seconds."""
+    """Return the back end that draws a world on this machine; the search takes seconds."""
     return working_back_end([world], chosen)
 
 
 def observed(task: Task, states: States) -> tuple[States, Images]:
-    """Return what a policy is shown of a data set's states (N, S): numbers (N, P) and pictures.
+    """Return the observations of a data set's states (N, S): numbers (N, P) and pictures.
 
-    Pictures are drawn on first use, by all cores, and kept in the cache.
+    All cores draw the pictures on first use; the cache keeps them.
 
     Raises:
-        RenderingError: Nothing here can draw the world; the message says what to install.
+        RenderingError: No back end can draw the world; the message names the packages to install.
     """
     if task.camera is None:
         return Observer(task.world, None).observe(states)
@@ -208,12 +208,12 @@ def observed(task: Task, states: States) -> tuple[States, Images]:
 
 
 def frame_hash(task: Task) -> str | None:
-    """Return the hash of a picture of a task's world, None without camera: it differs where what draws does.
+    """Return the hash of a picture of a task's world, None without a camera; it changes with the renderer.
 
-    The picture is of what the world's `reset(seed=0)` leads to, for all tasks of the world the same.
+    The picture shows the world after `reset(seed=0)`, and is the same for all tasks of the world.
 
     Raises:
-        RenderingError: Nothing here can draw the world.
+        RenderingError: No back end of this machine can draw the world.
     """
     if task.camera is None:
         return None

@@ -1,9 +1,9 @@
-"""Perturbations: what is disturbed in the world of a perturbed episode.
+"""Perturbations: the changes to the world in a perturbed episode.
 
-A perturbed episode begins with the seed, the instruction and the policy's draws of the test episode of its
-number; only the start pose, the mass of what is moved and, where a policy sees pictures, camera and light
-differ. What these become follows from that seed alone, in a stream of its own: no other draw of the episode
-moves. Each suite says how far it displaces a start, and each camera how far its view, and why.
+A perturbed episode has the seed, the instruction and the policy's draws of the test episode of its number.
+Only the start pose, the mass of the moved object and, where a policy sees pictures, camera and light differ.
+They follow from that seed alone, in their own random stream: all other draws of the episode stay the same.
+Each suite gives the scale of a displaced start, and each camera the scale of its view, with reasons.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ if TYPE_CHECKING:
     import mujoco
 
 MASSES = (0.5, 2.0)
-"""How many times as heavy a thing is as in the plain world, and as hard to turn. Policies have met the plain
-mass alone, and experts succeed with either of these. Two values rather than a range: no episode is nearly
-undisturbed, and episodes of one mass share a compiled model; Fetch's takes 9 MB, one of Meta-World's 18."""
+"""Factors on the mass and the moments of inertia of an object. Policies have met the plain mass alone, and
+experts succeed with both factors. Two values rather than a range: no episode is nearly plain, and all
+episodes of one mass share a compiled model, of 9 MB in Fetch and 18 MB in Meta-World."""
 
 
 @dataclass(frozen=True)
@@ -30,15 +30,15 @@ class Perturbation:
     """How the world of one episode differs from the plain one."""
 
     mass: float
-    """What masses and moments of inertia are multiplied by, one of `MASSES`."""
+    """Factor on masses and moments of inertia, one of `MASSES`."""
     start: tuple[float, float, float]
-    """Displacement of the start pose, from -1 to 1 along each axis; the suite gives it a scale."""
+    """Displacement of the start pose, from -1 to 1 along each axis; the suite gives the scale."""
     view: tuple[float, ...]
-    """Displacement of camera and light, `VIEW_SIZE` numbers from -1 to 1; the camera gives them scales."""
+    """Displacement of camera and light, `VIEW_SIZE` numbers from -1 to 1; the camera gives the scales."""
 
 
 def draw_perturbation(seed: int) -> Perturbation:
-    """Return what is disturbed in the episode whose initial state has this seed."""
+    """Return the perturbation of the episode whose initial state has this seed."""
     generator = numpy_generator("perturbation", seed)
     mass = MASSES[int(generator.integers(len(MASSES)))]
     x, y, z = generator.uniform(-1.0, 1.0, 3).tolist()
@@ -48,7 +48,12 @@ def draw_perturbation(seed: int) -> Perturbation:
 def with_mass(model: mujoco.MjModel, bodies: Sequence[int], mass: float) -> mujoco.MjModel:
     """Return a copy of a model in which some bodies are `mass` times as heavy and as hard to turn.
 
-    What MuJoCo derives from masses, as the weights of constraints, is computed again.
+    MuJoCo recomputes the values that it derives from masses, such as the weights of constraints.
+
+    Args:
+        model: Compiled scene.
+        bodies: Ids of the bodies.
+        mass: Factor on their masses and moments of inertia.
     """
     import mujoco
 

@@ -1,6 +1,6 @@
-"""A process that draws: it reads views and states and writes pictures, for an observer (`clbench.worlds.observation`).
+"""Drawing process of an observer (`clbench.worlds.observation`): reads views and states, writes pictures.
 
-It is started as `python -m clbench.worlds.render_worker CAMERA`.
+It starts as `python -m clbench.worlds.render_worker CAMERA`.
 """
 
 from __future__ import annotations
@@ -16,16 +16,16 @@ from clbench.base.errors import WrongTypeError
 from clbench.worlds.camera import VIEW_SIZE, Camera
 
 HEADER = struct.Struct("<II")
-"""How many rows come, and how many numbers each has: those of a view, then those of the state."""
+"""Number of rows, and numbers per row: first the view, then the state."""
 
 
 def main(entry_point: str) -> None:
-    """Draw what comes on standard input, as bare numbers after a header, until it ends.
+    """Draw the rows from standard input, bare numbers after a header, until the input ends.
 
     Args:
-        entry_point: Of the camera.
+        entry_point: Entry point of the camera.
     """
-    # what a library prints must not come between the pictures
+    # the output of a library must not come between the pictures
     pictures = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)
     camera: Camera = resolve(entry_point)()

@@ -26,24 +26,23 @@ class ScenarioEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
     """A sequence of tasks as one environment.
 
     `reset()` begins the next episode of the schedule: `episodes_per_stage` episodes of stage 0, in which the
-    retained tasks take turns, if there are any, then as many of each target task; the last target goes on for
-    ever.
-    `reset(seed=...)` begins the schedule anew. `reset(options={"stage": k})` goes on from the start of a stage,
-    and `reset(options={"task": name})` chooses any task for one episode.
+    retained tasks take turns, if there are any, then as many of each target task. The last one never ends.
+    `reset(seed=...)` restarts the schedule. `reset(options={"stage": k})` continues from the start of a
+    stage, and `reset(options={"task": name})` chooses any task for one episode.
 
-    Observation: a dictionary of `state`, float32 (S,), as the task's world gives it, and `instruction`, text,
-    or with `instruction="tokens"` the word ids, int64 (L,), for agents that want numbers. Where the task has
-    a camera, `state` is what it leaves of the numbers, and `image`, uint8 (N, N, 3), what it sees.
+    Observation: a dictionary of `state`, float32 (S,), from the task's world, and `instruction`, text, or
+    with `instruction="tokens"` the word ids, int64 (L,), for agents that need numbers. Where the task has a
+    camera, `state` holds only the numbers that a policy may see, and `image`, uint8 (N, N, 3), the picture.
     Reward: the task's dense reward. An episode is terminated by success and truncated at the task's horizon.
     Info: `task`, `stage`, `instruction`, `success`.
 
     Args:
-        scenario: The sequence, or its entry point "module:attribute".
-        instruction: How the observation gives the instruction.
+        scenario: Scenario, or its entry point "module:attribute".
+        instruction: Form of the instruction in observations, "text" or "tokens".
         episodes_per_stage: Episodes after which `reset()` goes on to the next stage.
-        stage: The stage to stay in, for an agent that is trained stage by stage; all of them if None.
-        order: In which order the targets come, as `Scenario.in_order` says; 0 is the published one.
-        render_mode: "rgb_array" or None; handed to the worlds.
+        stage: Stage to stay in, for an agent that is trained stage by stage; None goes through all stages.
+        order: Order of the targets, see `Scenario.in_order`; 0 is the published order.
+        render_mode: "rgb_array" or None, passed on to the worlds.
 
     Raises:
         LookupError: A package that the tasks need is not installed; the message says how to get it.
@@ -65,9 +64,9 @@ class ScenarioEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         self.instruction: InstructionFormat = instruction
         self.stage, self.order = stage, order
         self.steps_taken = 0
-        """Steps since it was made."""
+        """Steps since the environment was made."""
         self.begun_at: float | None = None
-        """When the first episode began, by `time.perf_counter`."""
+        """Start of the first episode in seconds, by `time.perf_counter`."""
         self._schedule = Schedule(self.scenario, episodes_per_stage, instruction, stage)
         self._worlds: dict[str, World] = {}
         self._observers: dict[str, Observer] = {}
@@ -81,7 +80,7 @@ class ScenarioEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         self.observation_space = spaces.Dict({**shown, "instruction": self._schedule.instruction_space})
 
     def _world(self, task: Task) -> World:
-        """Return the world of a task; each is made when first needed."""
+        """Return the world of a task, which is made on first use."""
         if task.world not in self._worlds:
             self._worlds[task.world] = resolve(task.world)(render_mode=self.render_mode)
             self._observers[task.world] = Observer(task.world, task.camera)
@@ -90,7 +89,7 @@ class ScenarioEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
-        """Begin an episode; see the class for what `seed` and `options` choose.
+        """Begin an episode; the class documents `seed` and `options`.
 
         Raises:
             LookupError: The scenario has no such task.
@@ -107,7 +106,7 @@ class ScenarioEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
 
     @property
     def _start(self) -> Start:
-        """How the current episode began."""
+        """Start of the current episode."""
         if self._begun is None:
             raise gymnasium.error.ResetNeeded(f"{self.scenario.id} has no episode yet: call reset().")
         return self._begun
@@ -126,7 +125,7 @@ class ScenarioEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         return {"state": shown[0], **image, "instruction": copy(self._start.observed_instruction)}
 
     def render(self) -> Any:
-        """Return what the current world renders."""
+        """Return the rendering of the current world."""
         return self._world(self._start.task).render()
 
     def close(self) -> None:

@@ -1,4 +1,4 @@
-"""Many environments of a scenario side by side: what `gymnasium.make_vec` makes."""
+"""Many environments of a scenario side by side, made by `gymnasium.make_vec`."""
 
 from __future__ import annotations
 
@@ -29,19 +29,19 @@ Outcome = tuple[Observation, NDArray[np.float64], Flags, Flags, dict[str, Any]]
 
 
 class ScenarioVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]]):
-    """As many `ScenarioEnv` as asked for, each on its own schedule, stepped together by the suite's vector world.
+    """Many `ScenarioEnv`, each with its own schedule, stepped together by the suite's vector world.
 
-    It does bit for bit what a `gymnasium.vector.SyncVectorEnv` of them does: an environment whose episode has
-    ended begins the next one at the next step, which takes no notice of its action.
+    It equals a `gymnasium.vector.SyncVectorEnv` of them bit for bit: an environment whose episode has ended
+    begins the next one at the next step, which ignores its action.
 
     Args:
-        scenario: The sequence, or its entry point "module:attribute".
-        num_envs: How many environments.
-        instruction: How the observations give the instruction, "text" or "tokens".
+        scenario: Scenario, or its entry point "module:attribute".
+        num_envs: Number of environments.
+        instruction: Form of the instruction in observations, "text" or "tokens".
         episodes_per_stage: Episodes after which an environment goes on to the next stage.
-        stage: The stage to stay in, for an agent that is trained stage by stage; all of them if None.
-        order: In which order the targets come, as `Scenario.in_order` says; 0 is the published one.
-        threads: Threads that step the worlds, by default one for each core. Results do not depend on it.
+        stage: Stage to stay in, for an agent that is trained stage by stage; None goes through all stages.
+        order: Order of the targets, see `Scenario.in_order`; 0 is the published order.
+        threads: Threads that step the worlds, by default one per core. Results do not depend on it.
 
     Raises:
         LookupError: A package that the tasks need is not installed; the message says how to get it.
@@ -64,9 +64,9 @@ class ScenarioVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]
         self.instruction: InstructionFormat = instruction
         self.stage, self.order = stage, order
         self.steps_taken = 0
-        """Steps since it was made, of all environments together."""
+        """Steps of all environments together since they were made."""
         self.begun_at: float | None = None
-        """When the first episodes began, by `time.perf_counter`."""
+        """Start of the first episodes in seconds, by `time.perf_counter`."""
         self._schedules = [
             Schedule(self.scenario, episodes_per_stage, instruction, stage) for _ in range(num_envs)
         ]
@@ -97,12 +97,12 @@ class ScenarioVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]
         """Begin an episode in every environment.
 
         Args:
-            seed: A number, from which on the environments' seeds count up, or a seed or None for each.
-            options: As `ScenarioEnv` takes them, for all.
+            seed: Seed of the first environment, from which the others count up, or a seed or None for each.
+            options: Options of `ScenarioEnv.reset`, for all environments.
 
         Raises:
             LookupError: The scenario has no such task.
-            ValueError: It has no such stage, an option is unknown, or there are more or fewer seeds.
+            ValueError: It has no such stage, an option is unknown, or the number of seeds is wrong.
         """
         self.begun_at = self.begun_at or time.perf_counter()
         seeds = self._seeds(seed)
@@ -170,7 +170,7 @@ class ScenarioVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]
         self._tell()
 
     def _tell(self) -> None:
-        """Put together what is said of the present episodes at each of their steps."""
+        """Collect the instructions and infos of the current episodes, which every step repeats."""
         self._tasks = [start.task for start in self._starts]
         instructions = [start.observed_instruction for start in self._starts]
         self._instructions = tuple(instructions) if self.instruction == "text" else np.stack(instructions)
@@ -188,7 +188,7 @@ class ScenarioVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]
         return {"state": state.copy(), **images, "instruction": copy(self._instructions)}
 
     def _info(self, successes: Flags) -> dict[str, Any]:
-        """Return the infos as Gymnasium's vector environments do: a column of each, and where it is known."""
+        """Return the infos as columns with masks, in the form of Gymnasium's vector environments."""
         info: dict[str, Any] = {}
         for name, column in {**self._told, "success": successes}.items():
             info[name], info[f"_{name}"] = column.copy(), self._known.copy()

@@ -1,4 +1,4 @@
-"""The schedule: which episode of a scenario comes next."""
+"""The schedule: it chooses the next episode of a scenario."""
 
 from __future__ import annotations
 
@@ -20,20 +20,20 @@ InstructionFormat = Literal["text", "tokens"]
 
 @dataclass(frozen=True)
 class Start:
-    """How an episode begins."""
+    """Start of an episode."""
 
     task: Task
     stage: int
-    """The stage that trains the task; 0 for retained and held-out tasks."""
+    """Stage that trains the task; 0 for retained and held-out tasks."""
     instruction: str
     """One of the task's wordings."""
     observed_instruction: Any
-    """The same as the observation gives it: text, or word ids (L,)."""
+    """The same wording in the form of the observation: text, or word ids (L,)."""
     seed: int
-    """Of the world."""
+    """Seed for the world's `reset`."""
 
     def info(self, success: bool) -> dict[str, Any]:
-        """Return what `step` and `reset` tell besides."""
+        """Return the info dictionary of `step` and `reset`."""
         return {
             "task": self.task.name,
             "stage": self.stage,
@@ -43,13 +43,13 @@ class Start:
 
 
 class Schedule:
-    """The way of one environment through the stages of a scenario, as `ScenarioEnv` tells.
+    """Sequence of episodes of one environment through the stages of a scenario, see `ScenarioEnv`.
 
     Args:
-        scenario: The sequence.
+        scenario: Scenario with its tasks.
         episodes_per_stage: Episodes after which the next stage begins.
-        instruction: How observations give the instruction.
-        stage: The stage that it never leaves; it goes through all of them if None.
+        instruction: Form of the instruction in observations, "text" or "tokens".
+        stage: Stage that it never leaves; None goes through all stages.
     """
 
     def __init__(
@@ -71,7 +71,7 @@ class Schedule:
 
     @property
     def instruction_space(self) -> spaces.Space[Any]:
-        """Of the observation's instruction."""
+        """Space of the instruction in observations."""
         if self._format == "tokens":
             return spaces.Box(0, VOCABULARY_SIZE - 1, (TEXT_LENGTH,), np.int64)
         longest = max(len(words) for task in self._scenario.tasks for words in task.instructions)
@@ -82,7 +82,7 @@ class Schedule:
         self._episode = -1
 
     def next(self, generator: np.random.Generator, options: Mapping[str, Any]) -> Start:
-        """Return the next episode, or the one that `options` choose.
+        """Return the start of the next episode, or of the episode that `options` choose.
 
         Raises:
             LookupError: The scenario has no such task.
@@ -111,7 +111,7 @@ class Schedule:
         return scenario.target[stage - 1] if stage else retained[self._episode % len(retained)], stage
 
     def _check_stage(self, stage: Any) -> None:
-        """Refuse a stage that the scenario does not have, or that this schedule never comes to."""
+        """Refuse a stage that the scenario does not have, or that this schedule never reaches."""
         last = len(self._scenario.target)
         if stage not in range(self._first, last + 1):
             raise InputError(f"{self._scenario.id} has stages {self._first} to {last}, not {stage!r}.")
@@ -122,5 +122,5 @@ class Schedule:
 
 
 def observed(words: str, form: InstructionFormat) -> Any:
-    """Return an instruction as observations give it: text, or word ids (L,)."""
+    """Return an instruction in the form of observations: text, or word ids (L,)."""
     return np.array(word_ids([words])[0]) if form == "tokens" else words

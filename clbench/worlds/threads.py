@@ -11,8 +11,8 @@ from typing import TypeVar
 Item = TypeVar("Item")
 
 _PATIENCE = 5.0
-"""Longest wait in seconds for the threads of a team that nobody closed. The garbage collector ends such a team
-at any moment, even while its thread holds a lock that an ending thread needs."""
+"""Longest wait in seconds for the threads of a team that nobody closed. The garbage collector ends such a
+team at any moment, even while its thread holds a lock that an ending thread needs."""
 
 
 class Team:
@@ -50,7 +50,7 @@ class Team:
             raise errors[0]
 
     def close(self) -> None:
-        """End the threads, and wait until they have ended. A closed team works with the calling thread alone."""
+        """End the threads and wait for them. A closed team works with the calling thread alone."""
         if self._ending.detach() is not None:
             _end(self._helpers, None)
 

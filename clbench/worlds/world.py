@@ -31,9 +31,9 @@ class VectorWorld(Protocol):
     """Many episodes of one world side by side, each in a lane.
 
     A suite has its own where many episodes step faster together than one after the other: the attribute
-    `vector_world` of its world makes it from the number of lanes and the number of threads. Each episode equals
-    the plain world's bit for bit, whatever the other lanes do. The caller resets a lane before stepping it,
-    counts the steps, and stops stepping a lane once its episode has succeeded.
+    `vector_world` of its world makes it from the number of lanes and the number of threads. Each episode
+    equals the plain world's bit for bit, whatever the other lanes do. The caller resets a lane before it
+    steps it, counts the steps, and leaves a lane alone once its episode has succeeded.
 
     The class that makes the episodes, this one or a plain world without vector world, declares
     `perturbable: ClassVar[bool] = True` if it also takes the keyword argument `perturbed`. Its episodes are

@@ -1,11 +1,10 @@
-"""Stable-Baselines3's SAC learns a scenario by trial, stage by stage, and leaves a record for the board.
+"""Stable-Baselines3's SAC learns a scenario by trial and error, stage by stage, and leaves a record.
 
     python docs/guide/online_sac.py clbench/Fetch-v0 --seeds 3
 
-It is the plainest of baselines: SAC with its default settings goes on with each task where the last one left
-it, and its replay buffer is emptied at each stage, so that nothing but its weights remembers. Words are names
-and no amounts: their ids go through an embedding. A seed that has a record is skipped, one that was stopped
-begins anew.
+This is the simplest baseline: SAC with its default settings continues to train from task to task. Its replay
+buffer is emptied at each stage, so that only its weights remember. Word ids are names, not amounts, and go
+through an embedding. A seed that has a record is skipped; a seed that was stopped starts again.
 """
 
 from __future__ import annotations
@@ -25,7 +24,7 @@ from clbench.scoring.scores import Scores
 
 
 class StateAndWords(BaseFeaturesExtractor):
-    """The state, and the mean of the learned vectors of the instruction's words."""
+    """Features: the state, and the mean of the learned vectors of the instruction's words."""
 
     def __init__(self, space: spaces.Dict, width: int = 16) -> None:
         state, words = space["state"], space["instruction"]
@@ -72,8 +71,8 @@ def learn(scenario: str, seed: int, steps: int, records: Path) -> None:
         env.close()
         success = Scores.from_record(record).success[stage].mean(axis=-1)
         tasks = Scores.from_record(record).layout.tasks
-        told = ", ".join(f"{task} {rate:.2f}" for task, rate in zip(tasks, success, strict=True))
-        print(f"seed {seed}, stage {stage}: {told}", flush=True)
+        rates = ", ".join(f"{task} {rate:.2f}" for task, rate in zip(tasks, success, strict=True))
+        print(f"seed {seed}, stage {stage}: {rates}", flush=True)
 
 
 def main() -> None:
@@ -81,10 +80,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("scenario", help="Gymnasium id of the scenario, as clbench/Fetch-v0")
-    parser.add_argument("--seeds", type=int, default=3, help="how many seeds")
-    parser.add_argument("--first-seed", type=int, default=0, help="the first of them")
-    parser.add_argument("--steps", type=int, default=6000, help="environment steps of a stage")
+    parser.add_argument("scenario", help="Gymnasium id of the scenario, for example clbench/Fetch-v0")
+    parser.add_argument("--seeds", type=int, default=3, help="number of seeds")
+    parser.add_argument("--first-seed", type=int, default=0, help="first seed")
+    parser.add_argument("--steps", type=int, default=6000, help="environment steps per stage")
     parser.add_argument("--records", type=Path, default=RECORDS, help="folder of the records")
     wanted = parser.parse_args()
     torch.set_num_threads(1)  # small networks: more threads gain nothing, and may add up in another order

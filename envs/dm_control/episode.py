@@ -1,4 +1,4 @@
-"""One episode of a task of the dm_control world: its physics, unpadded and unjudged."""
+"""One episode of a task of the dm_control world: the physics, without padding and without success."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from numpy.typing import NDArray
 from clbench.base.entry_points import unknown
 from clbench.worlds.perturbation import Perturbation
 
-from .bodies import Start, start, start_with_mass
 from .rules import RULES, Rule
+from .scene import Start, start, start_with_mass
 from .state import Observation
 
 
 class Episode:
-    """A place for episodes, one after the other, of any tasks. It keeps the physics of each body it had."""
+    """Runs episodes of any tasks, one after the other, and keeps the physics of each body that it has had."""
 
     rule: Rule
     task: str
@@ -26,10 +26,15 @@ class Episode:
         self._kept: dict[Start, tuple[mujoco.MjData, Callable[[], Observation]]] = {}
 
     def reset(self, task: str, seed: int, perturbation: Perturbation | None = None) -> Observation:
-        """Begin an episode of a task, perturbed if that is given, and return what dm_control observes (K,).
+        """Begin an episode of a task and return dm_control's observation (K,).
+
+        Args:
+            task: Name of the task.
+            seed: Seed of the initial state.
+            perturbation: Perturbation of the episode; None for a plain episode.
 
         Raises:
-            LookupError: No task has this name; the nearest one is named.
+            UnknownNameError: No task has this name; the error names the nearest one.
         """
         if task not in RULES:
             raise unknown("task of the dm_control world", task, RULES)
@@ -49,21 +54,21 @@ class Episode:
         return self._observe()
 
     def _push(self, start: tuple[float, float, float]) -> None:
-        """Give the body's joints a share `start` of their speeds, from -1 to 1 along an axis of the plane."""
+        """Add a share, from -1 to 1 for each of two axes, of the largest speeds to the body's joints."""
         for joint, speed in enumerate(self.start.body.starts):
             self.data.qvel[joint] += speed * start[joint % 2]
         mujoco.mj_forward(self.start.model, self.data)
 
     def step(self, action: NDArray[np.float32]) -> Observation:
-        """Move by an action in [-1, 1], of which the motors of the body take the first numbers."""
+        """Move by an action in [-1, 1]; the motors of the body take its first numbers."""
         self.control[:] = action[: len(self.control)]
         self.start.advance(self.data)
         return self._observe()
 
     def reward(self, observation: Observation) -> float:
-        """Return what the step that led to `observation` (K,) was worth."""
+        """Return the reward of the step that led to `observation` (K,)."""
         return float(self.rule.reward(observation, self.control))
 
     def training_reward(self, observation: Observation) -> float:
-        """Return what an expert that trains is told that step was worth."""
+        """Return the reward of that step in the training of experts."""
         return float(self.rule.training_reward(observation, self.control))

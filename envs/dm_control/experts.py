@@ -1,4 +1,4 @@
-"""The experts of the dm_control world: small networks trained by SAC, read from files that hold no code."""
+"""The experts of the dm_control world: small networks trained with SAC, read from files without code."""
 
 from __future__ import annotations
 
@@ -21,23 +21,23 @@ from clbench.base.strict_json import StrictJSONError, read_json
 from .rules import RULES
 from .state import ACTION_SIZE, Observation, State
 
-FOLDER = Path(__file__).parent / "experts"
-"""Where the experts lie that are part of the project."""
+FOLDER = Path(__file__).parent / "weights"
+"""Folder of the experts that are part of the project."""
 
 Layer = tuple[NDArray[np.float32], NDArray[np.float32]]
 """Weights (out, in) and biases (out,)."""
 
 
 class ExpertError(ClbenchError):
-    """The files of an expert cannot be used; the message says why, and how to get others."""
+    """The files of an expert are unusable; the message gives the reason and the way to get others."""
 
 
 @dataclass(frozen=True)
 class Expert:
-    """A policy without memory: the mean action of a SAC actor, squashed by tanh."""
+    """A policy without memory: the mean action of an actor of SAC, squashed by tanh."""
 
     layers: tuple[Layer, ...]
-    """From the observation to the action, with rectifiers between them."""
+    """Layers from the observation to the action, with rectifiers between them."""
 
     def act(self, observation: Observation | NDArray[np.float32]) -> NDArray[np.float32]:
         """Map an observation (K,) of the body to an action (A,) of its motors, in [-1, 1]."""
@@ -49,14 +49,14 @@ class Expert:
         return action
 
     def __call__(self, state: State) -> NDArray[np.float32]:
-        """Map a state (19,) to an action (2,), zero where the body has no motor."""
+        """Map a state (19,) to an action (2,), with zero where the body has no motor."""
         action = np.zeros(ACTION_SIZE, np.float32)
         moved = self.act(state[: self.layers[0][0].shape[1]])
         action[: len(moved)] = moved
         return action
 
     def to_bytes(self) -> bytes:
-        """Return the content of a safetensors file, always the same for the same weights."""
+        """Return the content of a safetensors file; equal weights give equal bytes."""
         return save(
             {
                 f"{number}.{name}": np.ascontiguousarray(values)
@@ -67,11 +67,11 @@ class Expert:
 
 
 def expert(task: str) -> Expert:
-    """Return the expert of the task that is part of the project.
+    """Return the task's expert that is part of the project.
 
     Raises:
-        LookupError: No task has this name; the nearest one is named.
-        ExpertError: Its files are missing, torn, or not those of this task.
+        UnknownNameError: No task has this name; the error names the nearest one.
+        ExpertError: The expert's files are missing, damaged or of another task.
     """
     if task not in RULES:
         raise unknown("expert of the dm_control world", task, RULES)
@@ -79,7 +79,7 @@ def expert(task: str) -> Expert:
 
 
 def expert_return(task: str) -> float:
-    """Return the mean return of the expert's episodes, which says what success is.
+    """Return the mean return of the expert's episodes, which defines success.
 
     Raises:
         ExpertError: As `expert`.
@@ -93,20 +93,20 @@ def _shipped(task: str) -> tuple[Expert, float]:
 
 
 def read_expert(folder: Path, task: str) -> tuple[Expert, float]:
-    """Return an expert that lies in `folder` and the mean return of its episodes.
+    """Return the task's expert in `folder` and the mean return of its episodes.
 
     Raises:
-        ExpertError: Its files are missing, torn, or not those of this task.
+        ExpertError: The expert's files are missing, damaged or of another task.
     """
     weights, card = folder / f"{task}.safetensors", folder / f"{task}.json"
-    way_out = f"`clbench experts train {task}` makes it; if it came with clbench, install clbench again."
+    way_out = f"`clbench experts train {task}` makes it; if it came with clbench, reinstall clbench."
     try:
         said = read_json(card)
         content = weights.read_bytes()
         if said["task"] != task:
-            raise InputError(f"is that of the task {said['task']!r}")
+            raise InputError(f"belongs to the task {said['task']!r}")
         if hashlib.sha256(content).hexdigest() != said["sha256"]:
-            raise InputError("has another hash than its JSON says")
+            raise InputError("has another hash than its JSON states")
         layers = _layers(load(content), tuple(said["sizes"]))
         mean = float(said["return"])
     except (OSError, KeyError, TypeError, ValueError, SafetensorError, StrictJSONError) as error:
@@ -115,10 +115,14 @@ def read_expert(folder: Path, task: str) -> tuple[Expert, float]:
 
 
 def _layers(tensors: dict[str, NDArray[np.float32]], sizes: Sequence[int]) -> tuple[Layer, ...]:
-    """Return the layers of a network whose values have `sizes`, from its input to its output.
+    """Return the layers of a network.
+
+    Args:
+        tensors: Weights and biases by name.
+        sizes: Number of values at the input and after each layer.
 
     Raises:
-        ValueError: The tensors are not those of such a network.
+        InputError: The tensors do not belong to a network of these sizes, or are not finite.
     """
     expected: dict[str, tuple[int, ...]] = {}
     for number, (width, height) in enumerate(itertools.pairwise(sizes)):
@@ -127,5 +131,5 @@ def _layers(tensors: dict[str, NDArray[np.float32]], sizes: Sequence[int]) -> tu
     if found != expected or any(values.dtype != np.float32 for values in tensors.values()):
         raise InputError(f"has tensors {found} where float32 of {expected} are expected")
     if not all(np.isfinite(values).all() for values in tensors.values()):
-        raise InputError("holds values that are not finite")
+        raise InputError("contains values that are not finite")
     return tuple((tensors[f"{number}.weight"], tensors[f"{number}.bias"]) for number in range(len(sizes) - 1))

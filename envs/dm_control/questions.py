@@ -1,4 +1,4 @@
-"""What can be asked about a state of the dm_control world, answered from the state alone.
+"""Questions about a state of the dm_control world, answered from the state alone.
 
 A question about one body has no answer (-1) in the states of the others.
 """
@@ -15,13 +15,13 @@ from clbench.data.questions import Answers, QuestionKind, Truths, which
 from .state import BODIES, BODY, State
 
 SIDE_MARGIN = 0.02
-"""Metres that things must lie apart along an axis before one is called left of, or above, the other."""
+"""Smallest distance in metres along an axis at which one thing counts as left of, or above, the other."""
 
 Values = NDArray[np.float32]
 
 
 def _about(body: str, states: State, first: Truths, second: Truths) -> Answers:
-    """Return 0 where `first` holds, else 1 where `second` holds, else -1; and -1 for all other bodies."""
+    """Return 0 where `first` holds, else 1 where `second` holds, else -1; always -1 for other bodies."""
     asked = states[:, BODY][:, BODIES.index(body)] > 0.5
     return which(asked & first, asked & second)
 
@@ -29,7 +29,7 @@ def _about(body: str, states: State, first: Truths, second: Truths) -> Answers:
 def _sign(
     body: str, value: Callable[[State], Values], margin: float = SIDE_MARGIN
 ) -> Callable[[State], Answers]:
-    """Return what answers 0 where a value (N,) of a body is below minus the margin, 1 where it is above."""
+    """Return a rule that answers 0 where a value (N,) is below minus the margin, 1 where it is above it."""
 
     def answer(states: State) -> Answers:
         values = value(states)
@@ -39,7 +39,7 @@ def _sign(
 
 
 def _number(place: int) -> Callable[[State], Values]:
-    """Return what takes number `place` of the observation."""
+    """Return a function that takes number `place` of the observation."""
 
     def take(states: State) -> Values:
         values: Values = states[:, place]
@@ -58,7 +58,7 @@ def _pole_up(states: State) -> Answers:
 
 
 def _ball_height(states: State) -> Values:
-    """Return how far the ball is above the middle of the cup (N,); at rest the cup's is 0.35 m above it."""
+    """Return the height (N,) of the ball above the middle of the cup, which hangs 0.35 m above it at rest."""
     height: Values = states[:, 3] - states[:, 1] - np.float32(0.35)
     return height
 

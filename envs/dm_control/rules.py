@@ -1,7 +1,7 @@
-"""What each task of the dm_control world asks for: its body, how it begins, and what a step is worth.
+"""The tasks of the dm_control world: the body, the initial states and the rewards of each.
 
-Rewards are those of dm_control where a task bears the name of one of its tasks; the others are variants of
-it on the same body, with the same initial states, that only the words tell apart.
+A task named after one of dm_control's has dm_control's rewards. The others are variants on the same body with
+the same initial states; only the instruction tells them apart.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ from numpy.typing import NDArray
 from .state import Observation
 
 HORIZON = 100
-"""Steps of an episode: of 0.04 s, of the slow point mass 0.16 s. dm_control's episodes last 10 s or 20 s."""
+"""Steps of an episode, of 0.04 s, or 0.16 s for the slow point mass. dm_control's last 10 s or 20 s."""
 SUCCESS_SHARE = 0.8
-"""An episode succeeds if its return is at least this share of the mean return of the expert's episodes."""
+"""Share of the expert's mean return that an episode must reach to succeed."""
 
 POINT_TARGET = 0.015
-"""Radius of the point mass's target."""
+"""Radius of the point mass's target, in metres."""
 CUP_HALF_SIZE, BALL_RADIUS = 0.05, 0.025
 
 Rewards: TypeAlias = NDArray[np.float64]
@@ -31,32 +31,32 @@ Reward: TypeAlias = Callable[[Observation, NDArray[np.float64]], Rewards]
 
 @dataclass(frozen=True)
 class Rule:
-    """What one task asks for."""
+    """The definition of one task."""
 
     body: str
     """Domain of dm_control."""
     start: str
-    """Task of the domain whose initial states the episodes have."""
+    """Task of the domain that the initial states come from."""
     reward: Reward
     """Maps observations (N, K) after a step and the actions (N, A) that led there to rewards (N,), 0 to 1."""
     guide: Reward | None = None
-    """Says in the same way how near a state is to being worth something. Experts train on the mean of both
-    where the reward alone is nearly always 0; nothing else knows of it."""
+    """Maps the same arrays to the closeness (N,) of each state to a reward. Experts train on the mean of both
+    where the reward alone is nearly always 0; nothing else uses it."""
     mark: tuple[float, float] | None = None
-    """Where the body's mark of a target is drawn, in metres."""
+    """Place of the drawn target (x, y) in metres, if the body has one."""
     batched: bool = False
-    """Whether rewards computed together have the bits of each computed alone. Where a power is taken they may
-    not: that of one number is C's, that of an array is a product."""
+    """Whether rewards computed together have the same bits as each computed alone. A power may differ: NumPy
+    takes the C library's pow for one number, and a product for an array."""
 
     def rewards(self, observations: Observation, actions: NDArray[np.float64]) -> Rewards:
-        """Return the rewards (N,) of observations (N, K) after actions (N, A), each as if it were alone."""
+        """Return the rewards (N,) of observations (N, K) after actions (N, A), with single calls' bits."""
         if self.batched:
             return self.reward(observations, actions)
         pairs = zip(observations, actions, strict=True)
         return np.array([self.reward(observation, action) for observation, action in pairs])
 
     def training_reward(self, observation: Observation, action: NDArray[np.float64]) -> Rewards:
-        """Return what experts train on."""
+        """Return the reward that experts train on."""
         worth = self.reward(observation, action)
         return worth if self.guide is None else (worth + self.guide(observation, action)) / 2
 
@@ -69,13 +69,13 @@ def _tolerance(*values: Any, **options: Any) -> Rewards:
 
 
 def _length(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the lengths of vectors (..., K): a sum of squares need not have the bits of their norm."""
+    """Return the lengths of vectors (..., K), with the bits of `norm`; a sum of squares may differ."""
     length: NDArray[np.float64] = np.sqrt(np.vecdot(vectors, vectors))
     return length
 
 
 def _near(distance: NDArray[np.float64], radius: float, margin: float) -> Rewards:
-    """Return 1 within a radius, less and less outside, and 0 from `margin` further away."""
+    """Return 1 within a radius, decreasing linearly to 0 at `margin` beyond it."""
     return _tolerance(distance, (0.0, radius), margin=margin, sigmoid="linear", value_at_margin=0.0)
 
 
@@ -86,13 +86,13 @@ def _small_control(action: NDArray[np.float64]) -> Rewards:
 
 
 def _move_to(observation: Observation, action: Rewards, *, place: tuple[float, float]) -> Rewards:
-    """As point_mass easy, with the target at `place`."""
+    """Return the reward of point_mass easy, with the target at `place`."""
     away = _length(np.array(place) - observation[..., :2])
     return _tolerance(away, bounds=(0, POINT_TARGET), margin=POINT_TARGET) * _small_control(action)
 
 
 def _upright(observation: Observation, action: Rewards) -> Rewards:
-    """The part of cartpole's smooth reward that does not depend on the place of the cart."""
+    """Return the factor of cartpole's smooth reward that does not depend on the place of the cart."""
     upright = (observation[..., 1] + 1) / 2
     small_velocity = (1 + _tolerance(observation[..., 4], margin=5)) / 2
     worth: Rewards = upright * _small_control(action) * small_velocity
@@ -105,12 +105,12 @@ def _balance(observation: Observation, action: Rewards) -> Rewards:
 
 
 def _balance_at(observation: Observation, action: Rewards, *, place: float, margin: float) -> Rewards:
-    """As cartpole balance, but with the cart at `place`, and worth nothing a margin further away."""
+    """Return the reward of cartpole balance with the cart at `place`, and 0 from a margin beyond it."""
     return _upright(observation, action) * _near(abs(observation[..., 0] - place), 0.25, margin)
 
 
 def _catch(observation: Observation, _: Rewards) -> Rewards:
-    """Whether the ball is in the cup, whose inside lies 0.55 m up at rest, and the ball's rest at 0.2 m."""
+    """Return whether the ball is in the cup, at rest 0.55 m high with the ball at 0.2 m."""
     x = abs(observation[..., 0] - observation[..., 2])
     z = abs(0.55 + observation[..., 1] - (0.2 + observation[..., 3]))
     inside: Rewards = (np.maximum(x, z) < CUP_HALF_SIZE - BALL_RADIUS).astype(np.float64)
@@ -124,7 +124,7 @@ def _catch_guide(observation: Observation, _: Rewards) -> Rewards:
 
 
 def _hold_cup(place: float) -> Rule:
-    """Return the rule of a cup that is to be within 2 cm of a place beside the one where it hangs at rest."""
+    """Return the rule for holding the cup within 2 cm of a place left or right of its rest."""
 
     def reward(observation: Observation, _: Rewards, *, margin: float) -> Rewards:
         return _near(_length(observation[..., :2] - np.array([place, 0.0])), 0.02, margin)
@@ -139,7 +139,7 @@ def _hold_cup(place: float) -> Rule:
 
 
 def _point(x: float, y: float) -> Rule:
-    """Return the rule of a point mass whose target lies at (x, y)."""
+    """Return the rule for a point mass with its target at (x, y)."""
     return Rule(
         "point_mass",
         "easy",

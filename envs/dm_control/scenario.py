@@ -1,4 +1,4 @@
-"""The dm_control scenario: three bodies in padded spaces; words tell the tasks of a body apart."""
+"""The scenario clbench/DMControl-v0: three bodies in padded spaces, with several tasks for each."""
 
 from __future__ import annotations
 
@@ -8,8 +8,6 @@ from clbench.spec.task import Task
 
 from .rules import HORIZON
 
-__all__ = ["SCENARIO"]
-
 
 def _task(name: str, *instructions: str) -> Task:
     return Task(
@@ -18,8 +16,8 @@ def _task(name: str, *instructions: str) -> Task:
         instructions=instructions,
         horizon=HORIZON,
         world="clbench.envs.dm_control.world:DMControlWorld",
-        expert="clbench.envs.dm_control.expert:expert",
-        # three times in 100 steps: with ten, few episodes reach the return that counts as success
+        expert="clbench.envs.dm_control.experts:expert",
+        # three bursts in 100 steps: with ten, few episodes reach the return required for success
         action_noise=0.03,
         packages=("dm-control",),
     )
@@ -27,7 +25,7 @@ def _task(name: str, *instructions: str) -> Task:
 
 SCENARIO = Scenario(
     id="clbench/DMControl-v0",
-    description="Three bodies of dm_control learn to do elsewhere what they did, or the opposite.",
+    description="Three bodies of dm_control learn variants of their skills, at other places or mirrored.",
     retained=(
         _task(
             "point_mass_easy",
@@ -107,4 +105,4 @@ SCENARIO = Scenario(
     questions="clbench.envs.dm_control.questions:QUESTIONS",
     budget=Budget(),
 )
-"""Five skills of dm_control to keep, four variants to learn in order, and one that mirrors one of these."""
+"""Five skills to keep, four variants of them to learn in order, and one held-out mirror image."""

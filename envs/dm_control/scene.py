@@ -1,4 +1,4 @@
-"""The bodies of dm_control, stepped and observed without its Python code, bit for bit as it does."""
+"""The bodies of dm_control, stepped and observed with the same bits as its Python code, but without it."""
 
 from __future__ import annotations
 
@@ -21,39 +21,39 @@ from .state import ACTION_SIZE, OBSERVATION_SIZE, Observation
 
 @dataclass(frozen=True)
 class Body:
-    """One domain of dm_control with the length of a step that we give it."""
+    """One domain of dm_control, with the step length of this suite."""
 
     name: str
     """Name of the domain."""
     substeps: int
-    """Steps of the physics in one step of ours, which has one action."""
+    """Physics steps per action."""
     scale: tuple[float, ...]
-    """Usual size of each number that is observed: experts train on numbers of about 1."""
+    """Typical size of each observed number: experts train on numbers of about 1."""
     thing: str
-    """Body of its model that is heavier or lighter when perturbed."""
+    """Name of the part of the model that is heavier or lighter in perturbed episodes."""
     starts: tuple[float, ...]
-    """Most speed of each joint at a perturbed start, in m/s or rad/s and below what is usual on the way:
-    dm_control's bodies start nearly at rest, wherever they start."""
+    """Largest speed of each joint at a perturbed start, in m/s or rad/s, below the usual speeds of an
+    episode. dm_control's bodies start nearly at rest."""
     camera: dict[str, Any]
-    """From where it is drawn."""
+    """Settings of the camera, see `clbench.worlds.world.Drawable`."""
     observer: Callable[[mujoco.MjModel, mujoco.MjData], Callable[[], Observation]]
-    """Takes the physics of one episode and returns what says what dm_control observes of it (K,): views of
-    the physics are made once, as each takes 0.3 us."""
+    """Takes the physics of one episode and returns a function that reads dm_control's observation (K,) from
+    it: the views of the physics, 0.3 us each, are made once."""
 
 
 @dataclass(frozen=True, eq=False)
 class Start:
-    """A task of dm_control, which says how episodes begin; all worlds of a process share it."""
+    """A task of dm_control, from which episodes begin; all worlds of a process share it."""
 
     body: Body
     physics: Any
-    """The `dm_control.mujoco.Physics` that an episode begins in, and is copied from."""
+    """The `dm_control.mujoco.Physics` in which an episode is initialised, and from which it is copied."""
     task: Any
     """The `dm_control.suite.base.Task`."""
     model: mujoco.MjModel
 
     def begin(self, seed: int, data: mujoco.MjData) -> None:
-        """Put `data` into the initial state that dm_control draws for a seed."""
+        """Set `data` to the initial state that dm_control draws for a seed."""
         self.task.random.seed(seed)
         with self.physics.reset_context():
             self.task.initialize_episode(self.physics)
@@ -64,7 +64,7 @@ class Start:
         return bool(self.model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4)
 
     def advance(self, data: mujoco.MjData) -> None:
-        """Move `data` by one step, in dm_control's order of calls, which leaves all positions up to date."""
+        """Advance `data` by one step in dm_control's order of calls, which keeps all positions current."""
         substeps = self.body.substeps
         if self._takes_whole_steps:
             mujoco.mj_step(self.model, data, substeps)
@@ -77,10 +77,10 @@ class Start:
 
 @functools.cache
 def start(body: str, task: str) -> Start:
-    """Return the task of dm_control's domain `body` that is called `task`; it takes 0.1 s, once per process.
+    """Return the task `task` of dm_control's domain `body`; this takes 0.1 s, once per process.
 
     Raises:
-        ValueError: The body has more motors, or is observed in more numbers, than there are places for.
+        InputError: The body has more motors or more observed numbers than actions and states have places.
     """
     environment = original_environment(body, task)
     observed = sum(int(np.prod(spec.shape)) for spec in environment.observation_spec().values())
@@ -96,7 +96,7 @@ def start(body: str, task: str) -> Start:
 
 @functools.cache
 def start_with_mass(body: str, task: str, mass: float) -> Start:
-    """Return the same with a thing that is `mass` times as heavy; all perturbed worlds share it."""
+    """Return the same with the body's `thing` `mass` times as heavy; all perturbed worlds share it."""
     plain = start(body, task)
     thing = int(plain.model.body(plain.body.thing).id)
     return replace(plain, model=with_mass(plain.model, [thing], mass))
@@ -110,7 +110,7 @@ def original_environment(domain: str, task: str) -> Any:
 
 @contextlib.contextmanager
 def _without_dm_control_renderer() -> Iterator[None]:
-    """Keep dm_control from looking for a screen when it is imported: it warns of each that is not there."""
+    """Keep dm_control from looking for a screen on import: it warns of each renderer that fails."""
     before = os.environ.get("MUJOCO_GL")
     os.environ["MUJOCO_GL"] = "off"
     try:

@@ -1,9 +1,9 @@
 """Layout of the state vector of the dm_control world: 19 numbers, the same for every body.
 
-The first 8 are the observation of the body's dm_control environment, in its order and units, followed by
-zeros; the next 8 say which of these are numbers of the body (1) and which fill up (0); the last 3 say which
-body it is, 1 at its place in `BODIES`. Actions are filled up with zeros to 2: what a body has no motor for is
-ignored. Lengths are in metres, angles in radians, speeds per second.
+The first 8 are the observation of the body's dm_control environment, in its order and units, padded with
+zeros. The next 8 mark observed numbers with 1 and padding with 0. The last 3 are a one-hot code of the body,
+in the order of `BODIES`. Actions have 2 numbers: a body with one motor ignores the second. Lengths are in
+metres, angles in radians, speeds per second.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ from clbench.base.errors import InputError
 State: TypeAlias = NDArray[np.float32]
 """One state (19,), or many (N, 19)."""
 Observation: TypeAlias = NDArray[np.float64]
-"""What dm_control observes of one body, (K,), or of many alike, (N, K)."""
+"""dm_control's observation of one body, (K,), or of many of the same kind, (N, K)."""
 
 BODIES = ("point_mass", "cartpole", "ball_in_cup")
-"""Domains of dm_control, in the order of the indicator."""
+"""Domains of dm_control, in the order of the one-hot code."""
 
 ACTION_SIZE = 2
 OBSERVATION_SIZE = 8
@@ -32,10 +32,10 @@ BODY = slice(2 * OBSERVATION_SIZE, SIZE)
 
 
 def padded(body: str, observation: Observation) -> State:
-    """Return the state of a body that dm_control observes as `observation` (K,), or many (N, K).
+    """Return the state of a body from dm_control's observation (K,), or the states from many (N, K).
 
     Raises:
-        ValueError: The observation has more numbers than a state has places for.
+        InputError: The observation has more numbers than the state has places.
     """
     size = observation.shape[-1]
     if size > OBSERVATION_SIZE:

@@ -1,7 +1,7 @@
-"""The camera of the pixel scenario: what a policy is shown of a state, and how that is drawn.
+"""The camera of the pixel scenario: the numbers and the picture that a policy gets from a state.
 
-The scene is that of the Fetch world, edited with MjSpec: two coloured things lie on the table. They are drawn
-and no more, nothing touches them: experts and physics are those of the Fetch world, bit for bit.
+The scene is the Fetch world's, edited with MjSpec: two coloured things lie on the table. They exist in
+pictures only, and nothing touches them, so experts and physics are bit for bit those of the Fetch world.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ from .state import (
 )
 
 JOINTS = slice(SIZE, SIZE + 22)
-"""Positions of all joints, the block's too: with the target and the things they are the whole picture."""
+"""Positions of all joints, including the block's: with target and things they define the whole picture."""
 THINGS = slice(JOINTS.stop, JOINTS.stop + 6)
-"""Place x, y and number of the colour of each of two things, in metres."""
+"""For each of two things: its place x and y in metres, and the number of its colour."""
 PIXEL_SIZE = THINGS.stop
-"""Length of a state: that of the Fetch world, then `JOINTS` and `THINGS`. No policy is shown it."""
+"""Length of a state: the Fetch world's state, then `JOINTS` and `THINGS`. No policy sees it."""
 
 COLOURS = {
     "green": (0.05, 0.60, 0.10),
@@ -40,32 +40,32 @@ COLOURS = {
     "yellow": (0.95, 0.85, 0.05),
     "purple": (0.60, 0.10, 0.75),
 }
-"""Red, green and blue of what a thing may have; the target is red, the block black, the arm grey."""
+"""Possible colours of a thing as red, green and blue; the target is red, the block black, the arm grey."""
 
 PROPRIOCEPTION = np.r_[GRIPPER, FINGERS, GRIPPER_VELOCITY, FINGERS_VELOCITY]
-"""What a policy is shown of the state as numbers: what a robot knows of itself."""
+"""Indices of the numbers that a policy gets: measurements of the robot itself."""
 
 LOOK_AT = (1.34, 0.75, 0.42)
 VIEW = {"azimuth": 180.0, "elevation": -65.0, "distance": 0.60}
-"""From the front, high up: the width of the table is that of the picture, and a pixel is a centimetre."""
+"""A high view from the front: the table fills the width of the picture, and a pixel is a centimetre."""
 
 PERTURBATION = {"azimuth": 5.0, "elevation": 5.0, "distance": 0.04}
-"""How far a perturbed view is displaced at most, in degrees and metres, as after a touch of the camera: what
-lies on the table moves by up to 3 of the 64 pixels, which are centimetres there."""
+"""Largest displacement of a perturbed view in degrees and metres, as after a touch of the camera: objects on
+the table move by up to 3 of the 64 pixels, or 3 cm."""
 LIGHT = 0.4
-"""By what share a perturbed scene is lighter or darker at most."""
+"""Largest share by which a perturbed scene is lighter or darker."""
 
 ARM = (0.75, 0.75, 0.75, 1.0)
-"""Colour of the fingers. They are all of the arm that is drawn: the rest would hide the table."""
+"""Colour of the fingers, the only drawn part of the arm: the rest would hide the table."""
 
 
 class FetchCamera:
-    """Draws states of the pixel scenario, each by itself: no picture depends on those before.
+    """Draws states of the pixel scenario; a picture does not depend on earlier ones.
 
     Args:
-        size: Width and height of a picture.
-        scale: Pixels that are drawn for each that is kept, along each side; their mean smooths edges.
-            MuJoCo's own way to do so is ten times slower where there is no graphics card.
+        size: Width and height of a picture in pixels.
+        scale: Number of drawn pixels per pixel of the picture along each side; averaging smooths edges.
+            MuJoCo's own antialiasing is ten times slower without a graphics card.
     """
 
     image_size: ClassVar[int] = 64
@@ -89,27 +89,27 @@ class FetchCamera:
 
     @staticmethod
     def proprioception(states: State) -> State:
-        """Return the part of the states (N, 56) that a policy is shown as numbers, (N, 10)."""
+        """Return the numbers (N, 10) of the states (N, 56) that a policy gets."""
         return states[:, PROPRIOCEPTION]
 
     @staticmethod
     def pictured(states: State) -> State:
-        """Return where block, target, and the right and the left thing are, (N, 9), in metres."""
+        """Return the places of block, target, right and left thing, (N, 9), in metres."""
         things = states[:, THINGS].reshape(-1, 2, 3)[:, :, :2]
         from_the_right = np.take_along_axis(things, things[:, :, 1:].argsort(axis=1), axis=1)
         places = [states[:, BLOCK], states[:, TARGET][:, :2], from_the_right.reshape(-1, 4)]
         return np.concatenate(places, axis=1)
 
     def draw(self, states: State, views: Views) -> NDArray[np.uint8]:
-        """Return pictures of the states (N, 56), as `views` (N, 4) disturb them, (N, size, size, 3)."""
+        """Return pictures (N, size, size, 3) of the states (N, 56), perturbed by `views` (N, 4)."""
         pictures = np.empty((len(states), self._size, self._size, 3), np.uint8)
         for picture, state, view in zip(pictures, states, views, strict=True):
-            self._disturb(view)
+            self._perturb(view)
             picture[:] = self._draw(state)
         return pictures
 
-    def _disturb(self, view: Views) -> None:
-        """Put the camera in its place and light the scene, both displaced by the shares of a view (4,)."""
+    def _perturb(self, view: Views) -> None:
+        """Set the camera and the light, changed by the shares of a view (4,)."""
         for (name, value), share in zip(VIEW.items(), view, strict=False):
             setattr(self._view, name, value + PERTURBATION[name] * float(share))
         for light, plain in zip(self._lights, self._plain_lights, strict=True):
@@ -133,12 +133,12 @@ class FetchCamera:
         return ((total + scale**2 // 2) // scale**2).astype(np.uint8)
 
     def close(self) -> None:
-        """Free what draws."""
+        """Free the renderer."""
         self._renderer.close()
 
 
 def _model(pixels: int) -> mujoco.MjModel:
-    """Return the scene with two things more, and with no more of the robot than its fingers."""
+    """Return the scene with two added things and only the fingers of the robot."""
     spec = mujoco.MjSpec.from_file(str(scene_file()))
     spec.visual.global_.offwidth = spec.visual.global_.offheight = pixels
     spec.visual.quality.offsamples = 0

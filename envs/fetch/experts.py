@@ -1,4 +1,4 @@
-"""The experts of the Fetch world: each acts on the state alone, and so can label perturbed episodes."""
+"""The experts of the Fetch world: each acts on the state alone, and so can label noisy episodes."""
 
 from __future__ import annotations
 
@@ -19,22 +19,22 @@ Action: TypeAlias = NDArray[np.float32]
 Vector: TypeAlias = NDArray[np.float64]
 
 GAIN = 10.0
-"""Action per metre of error. At 20 the hand would ask for all of it at once; slower is easier to clone."""
+"""Action per metre of error: 20 would correct all of it in one step; slower is easier to clone."""
 CLOSE, OPEN_UP = -1.0, 1.0
 PRESS_DEPTH = 0.035
-"""Height above the block's centre that a press aims at: the fingers touch at 0.0435."""
+"""Height in metres above the block's centre that a press aims at: the fingers touch at 0.0435."""
 TRAVEL_HEIGHT = 0.11
-"""How far above the table's level the closed gripper travels: as at its start, clear of the block."""
+"""Height in metres at which the closed gripper travels above a place, clear of the block, as at its start."""
 UP = np.array([0.0, 0.0, 1.0])
 BEHIND = 0.07
-"""Distance from the block at which the closed gripper comes down: it touches at 0.040 to 0.056."""
+"""Distance in metres from the block at which the closed gripper comes down: it touches at 0.040 to 0.056."""
 
 
 def expert(task: str) -> Callable[[State], Action]:
-    """Return the expert of the task: it maps a state (28,) to an action (4,).
+    """Return the expert of the task, which maps a state (28,) to an action (4,).
 
     Raises:
-        LookupError: No task has this name; the nearest one is named.
+        UnknownNameError: No task has this name; the error names the nearest one.
     """
     if task not in _EXPERTS:
         raise unknown("expert of the Fetch world", task, _EXPERTS)
@@ -54,8 +54,8 @@ def _toward(state: State, place: Vector, fingers: float) -> Action:
 def _descend(state: State, place: Vector, clearance: float, fingers: float) -> Action:
     """Return the action that brings the gripper down on a place (3,) from `clearance` metres above.
 
-    The way leads along a funnel: the further from the place in the plane, the higher. Where the gripper is
-    below it, it rises first, so that it passes over the block and not through it.
+    The gripper follows a funnel: the further from the place in the plane, the higher. Below the funnel it
+    rises first, so that it passes over the block and not through it.
     """
     error = place - state[GRIPPER]
     height = min(max(4.0 * (math.hypot(error[0], error[1]) - 0.012), 0.0), clearance)
@@ -73,12 +73,12 @@ def _reach(state: State) -> Action:
 
 
 def _press(state: State) -> Action:
-    """Come down on the top of the block, a little deeper than its surface."""
+    """Return the action that presses on the top of the block, aiming a little below its surface."""
     return _descend(state, state[BLOCK].astype(np.float64) + PRESS_DEPTH * UP, 0.06, CLOSE)
 
 
 def _grasp(state: State) -> Action | None:
-    """Return the action that takes hold of the block, or None if the gripper holds it."""
+    """Return the action that grasps the block, or None if the gripper holds it."""
     block = state[BLOCK].astype(np.float64)
     x, y, z = (block - state[GRIPPER]).tolist()
     apart = opening(state.tolist())
@@ -86,13 +86,13 @@ def _grasp(state: State) -> Action | None:
         return None if apart < 0.06 else _toward(state, block, CLOSE)
     clearance = 0.06 if apart > OPEN else 0.08
     if apart < OPEN and math.hypot(x, y) < 0.04:
-        # Fingers that are not open yet would come down on the block.
+        # fingers that are not open yet would come down on the block
         return _toward(state, block + clearance * UP, OPEN_UP)
     return _descend(state, block, clearance, OPEN_UP)
 
 
 def _pick_and_place(state: State) -> Action:
-    """Take the block and carry it to the target, over the table rather than along it."""
+    """Return the action that carries the block to the target, above the table rather than along it."""
     action = _grasp(state)
     if action is not None:
         return action
@@ -102,13 +102,13 @@ def _pick_and_place(state: State) -> Action:
 
 
 def _lift(state: State) -> Action:
-    """Take the block and raise it."""
+    """Return the action that grasps the block and raises it."""
     action = _grasp(state)
     return _action(UP, CLOSE) if action is None else action
 
 
 def _push(state: State, direction: Vector) -> Action:
-    """Push the block along a direction (2,) of length 1 with the closed gripper."""
+    """Return the action that pushes the block along a direction (2,) of length 1 with the closed gripper."""
     block, gripper = state[BLOCK].astype(np.float64), state[GRIPPER].astype(np.float64)
     offset = gripper[:2] - block[:2]
     along = float(offset @ direction)

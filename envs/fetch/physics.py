@@ -1,9 +1,9 @@
-"""The physics of the Fetch world: many episodes side by side, advanced by a pool of threads."""
+"""The physics of the Fetch world: many episodes side by side, advanced by threads."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import gymnasium
 import mujoco
@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 from clbench.base.entry_points import unknown
 from clbench.worlds.perturbation import draw_perturbation
 from clbench.worlds.threads import Team
-from clbench.worlds.world import checked_actions, no_episode
+from clbench.worlds.world import Drawable, checked_actions, lane_at
 
 from .rules import RULES, Numbers, Rule
-from .scene import Scene, mat2euler, scene, scene_with_mass
+from .scene import CAMERA, Scene, mat2euler, scene, scene_with_mass
 from .state import (
     BLOCK,
     BLOCK_ANGLES,
@@ -34,39 +34,39 @@ from .state import (
 )
 
 REACH_AWAY = 0.09
-"""How far in front of the gripper the block may start: else a push away would end beside the table."""
+"""Largest distance in metres of the block in front of the gripper: a push away must end on the table."""
 SPREAD = 0.15
-"""Half the side of the square around the gripper in which block and target lie, as in FetchPickAndPlace."""
+"""Half the side in metres of the square around the gripper for block and target, as in FetchPickAndPlace."""
 TARGET_HEIGHTS = (0.08, 0.30)
-"""How far above the table, from the centre of a block at rest, a target in the air lies."""
+"""Lowest and highest target in the air, in metres above the centre of a block at rest."""
 APART = 0.10
-"""Least distance from block to gripper, and from target to both: no task is nearly done at the start."""
+"""Smallest distance in metres between block, gripper and target: no task is nearly done at the start."""
 NEARBY = 0.20
-"""Most distance from target to block in the plane: on a longer way a block slips sideways off the fingers."""
+"""Largest horizontal distance in metres from target to block: on longer ways the block slips away."""
 
 START = 0.025
-"""Metres along each axis that a perturbed gripper starts beside its place, 4.3 cm at most: the target, from
-`APART` on, is still farther away than the 5 cm that count as there."""
+"""Largest displacement in metres of a perturbed gripper along each axis, 4.3 cm in all. As a target is at
+least `APART` away, it stays farther than the 5 cm that count as success."""
 SETTLE = 10
-"""Steps in which it gets there and comes to rest, as many as FetchPickAndPlace-v4 takes for its own start."""
+"""Steps until the displaced gripper is at rest, as many as FetchPickAndPlace-v4 takes for its own start."""
 
 REACH = 0.05
-"""Metres along an axis that an action of 1 moves the goal of the hand."""
+"""Distance in metres along an axis by which an action of 1 moves the goal of the hand."""
 HAND_TURN = np.array([1.0, 0.0, 1.0, 0.0])
-"""What gymnasium-robotics adds to the hand's quaternion for its goal, which keeps the hand pointing down."""
+"""Added by gymnasium-robotics to the quaternion of the hand's goal, to keep the hand pointing down."""
 
 BLOCK_AXES, HAND, HAND_QUATERNION, MARKER = slice(6, 15), slice(15, 18), slice(18, 22), slice(22, 25)
-"""Where they are in what is measured, after the places of the gripper (3,) and the block (3,)."""
+"""Their places in a lane's measurements, after the positions of the gripper (3,) and the block (3,)."""
 JOINTS = 25
-"""Where the positions of all joints begin there, which their speeds follow."""
+"""First place of the joint positions in the measurements; the joint speeds follow."""
 
 Vectors = NDArray[np.float64]
 
 
 class _Lane:
-    """The physics of one episode, with views of what is read and set at each step.
+    """The physics of one episode, with views of all arrays that a step reads and sets.
 
-    Asking MjData for a view costs 0.2 to 0.4 us each time.
+    Each request to MjData for a view takes 0.2 to 0.4 us.
     """
 
     def __init__(self, number: int, scene: Scene) -> None:
@@ -80,11 +80,11 @@ class _Lane:
         gripper, block, hand = scene.gripper_site, scene.block_site, scene.hand_body
         places, axes = (data.site_xpos[gripper], data.site_xpos[block]), data.site_xmat[block]
         self.parts = *places, axes, data.xpos[hand], data.xquat[hand], self.target, data.qpos, data.qvel
-        """What is measured: places of the gripper and the block, the block's axes, place and quaternion of
-        the hand, the target, positions and speeds of all joints."""
+        """The measurements: positions of the gripper and the block, the block's axes, position and quaternion
+        of the hand, the target, positions and speeds of all joints."""
 
     def __deepcopy__(self, _: dict[int, Any]) -> _Lane:
-        """Return a lane whose views are of its own physics."""
+        """Return a lane with its own physics and views of it."""
         lane = _Lane(self.number, self.scene)
         mujoco.mj_copyData(lane.data, self.scene.model, self.data)
         lane.rule, lane.start = self.rule, self.start
@@ -95,17 +95,19 @@ class _Lane:
 class FetchVectorWorld:
     """The scene, the physics and the observation of FetchPickAndPlace-v4, with the tasks of `RULES`.
 
-    An action (4,) in [-1, 1] moves the gripper by up to 5 cm along x, y and z, of which the arm makes about
-    3 cm a step, and opens (+1) or closes (-1) the fingers. The reward is that of `Rule.judge`. An episode
-    ends with success only; whoever uses the world counts its steps. It is a `clbench.worlds.world.VectorWorld`.
+    It is a `clbench.worlds.world.VectorWorld`. An action (4,) in [-1, 1] moves the goal of the gripper by up
+    to 5 cm along x, y and z, of which the arm covers about 3 cm per step, and opens (+1) or closes (-1) the
+    fingers. The reward comes from `Rule.judge`. Only success ends an episode; the caller counts its steps.
 
     Args:
-        lanes: Places for episodes. A lane takes its memory when it is first reset.
-        threads: Threads that advance the physics; MuJoCo releases the interpreter lock. Results do not depend
-            on it.
+        lanes: Number of lanes. A lane allocates its memory at its first reset.
+        threads: Number of threads that advance the physics; MuJoCo releases the interpreter lock. Results do
+            not depend on it.
         perturbed: Whether the block is heavier or lighter, and the gripper starts elsewhere.
-        rules: What each task asks for, by name.
+        rules: Definition of each task by name.
     """
+
+    perturbable: ClassVar[bool] = True
 
     def __init__(
         self, lanes: int, threads: int = 1, perturbed: bool = False, rules: Mapping[str, Rule] = RULES
@@ -118,18 +120,18 @@ class FetchVectorWorld:
         self._team = Team(threads)
         model = self._scene.model
         self._measured = np.zeros((lanes, JOINTS + model.nq + model.nv))
-        """What is measured of each lane, see `_Lane.parts`."""
+        """Measurements of each lane, see `_Lane.parts`."""
         self._jacobians = np.zeros((lanes, 3, 3, model.nv))
-        """Of the gripper's and the block's place, and of the block's rotation, in each lane."""
+        """Jacobians of the gripper's position, the block's position and the block's rotation in each lane."""
 
     def reset(self, lanes: Sequence[int], seeds: Sequence[int], tasks: Sequence[str]) -> State:
         """Start an episode in each of `lanes` and return the states (N, 28).
 
-        The place of the block follows from the seed alone; it is that of FetchPickAndPlace-v4 where the block
-        lies within reach there.
+        The seed alone determines the place of the block; it is FetchPickAndPlace-v4's if that is within
+        reach.
 
         Raises:
-            LookupError: No task has this name; the nearest one is named.
+            UnknownNameError: No task has this name; the error names the nearest one.
         """
         for number, seed, task in zip(lanes, seeds, tasks, strict=True):
             if task not in self._rules:
@@ -154,10 +156,11 @@ class FetchVectorWorld:
     ) -> tuple[State, NDArray[np.float64], NDArray[np.bool_]]:
         """Move each of `lanes` for one step of 0.04 s by its row of actions (N, 4).
 
-        Returns the states (N, 28), the rewards (N,) and which of the episodes succeeded (N,).
+        Returns:
+            The states (N, 28), the rewards (N,), and which episodes succeeded (N,).
 
         Raises:
-            ValueError: An action has another shape than (4,), or a number in it is not finite.
+            InputError: An action has another shape than (4,), or contains a number that is not finite.
         """
         actions = checked_actions(actions, self.single_action_space, "Fetch")
         moved = [self._lane(number) for number in lanes]
@@ -168,32 +171,29 @@ class FetchVectorWorld:
         rewards, successes = zip(*judged, strict=True)
         return states, np.array(rewards), np.array(successes)
 
-    def picture_data(self, lane: int) -> mujoco.MjData:
-        """Return the physics of a lane, with the target marker at its place, to draw it and no more."""
-        data = self._lane(lane).data
+    def drawable(self, lane: int) -> Drawable:
+        """Return the scene of a lane with its target marker; the next step does not depend on this call."""
+        drawn = self._lane(lane)
         # The place of a site is an output of the physics: the next step computes it again and never reads it.
-        data.site_xpos[self._scene.target_site] = self._lane(lane).target
-        return data
+        drawn.data.site_xpos[drawn.scene.target_site] = drawn.target
+        return Drawable(drawn.scene.model, drawn.data, CAMERA)
 
     def close(self) -> None:
         """End the threads."""
         self._team.close()
 
     def _lane(self, number: int) -> _Lane:
-        lane = self._lanes[number]
-        if lane is None:
-            raise no_episode(number, "Fetch")
-        return lane
+        return lane_at(self._lanes, number, "Fetch")
 
     def _lane_of(self, number: int, scene: Scene) -> _Lane:
-        """Return a lane that has the physics of a scene; it is made anew if it had that of another one."""
+        """Return a lane with the physics of a scene, and make it anew if it had another scene."""
         lane = self._lanes[number]
         if lane is None or lane.scene is not scene:
             self._lanes[number] = lane = _Lane(number, scene)
         return lane
 
     def _place_block(self, generator: np.random.Generator) -> Vectors:
-        """Return a place (2,) on the table, drawn as FetchPickAndPlace-v4 does, but within reach."""
+        """Draw a place (2,) on the table as FetchPickAndPlace-v4 does, but within reach."""
         gripper = self._scene.gripper[:2]
         block = gripper
         while np.linalg.norm(block - gripper) < APART or block[0] > gripper[0] + REACH_AWAY:
@@ -201,7 +201,7 @@ class FetchVectorWorld:
         return block
 
     def _place_target(self, block: Vectors, rule: Rule, generator: np.random.Generator) -> Vectors:
-        """Return a place (3,) for the marker: apart from the gripper, and beside the block (2,)."""
+        """Draw a place (3,) for the marker, apart from the gripper and from the block (2,)."""
         gripper = self._scene.gripper
         while True:
             target = gripper + generator.uniform(-SPREAD, SPREAD, size=3)
@@ -213,9 +213,9 @@ class FetchVectorWorld:
                 return target
 
     def _reset_physics(self, lane: _Lane, block: Vectors) -> None:
-        """Put the arm at its start and the block at `block` (2,), and forget all that was before."""
+        """Reset the physics, with the arm at its start and the block at `block` (2,)."""
         scene, data = lane.scene, lane.data
-        # Clears controls, mocap, and the solver's warm start too.
+        # also clears controls, mocap and the warm start of the solver
         mujoco.mj_resetData(scene.model, data)
         data.time = scene.time
         data.qpos[:] = scene.qpos
@@ -225,7 +225,7 @@ class FetchVectorWorld:
         self._measure(lane)
 
     def _displace(self, lane: _Lane, start: tuple[float, float, float]) -> None:
-        """Move the gripper by a share `start` of `START` along each axis, and let it come to rest."""
+        """Move the gripper by a share `start` (3,) of `START` along each axis, until it is at rest."""
         self._act([lane], np.array([[*(START / REACH * one for one in start), 0.0]], np.float32))
         mujoco.mj_step(lane.scene.model, lane.data, nstep=SETTLE * lane.scene.substeps)
         self._measure(lane)
@@ -245,7 +245,7 @@ class FetchVectorWorld:
         self._measure(lane)
 
     def _measure(self, lane: _Lane) -> None:
-        """Note all that is read of a lane: a thread that has just advanced it has it in its caches."""
+        """Copy the measurements of a lane, still in the caches of the thread that has advanced it."""
         model, number = lane.scene.model, lane.number
         np.concatenate(lane.parts, out=self._measured[number])
         gripper, block, rotation = self._jacobians[number]
@@ -253,7 +253,7 @@ class FetchVectorWorld:
         mujoco.mj_jacSite(model, lane.data, block, rotation, lane.scene.block_site)
 
     def _observe(self, lanes: Sequence[_Lane]) -> State:
-        """Return the states (N, 28): gymnasium-robotics' arithmetic in double precision, then rounded."""
+        """Return the states (N, 28), by gymnasium-robotics' arithmetic in double precision, then rounded."""
         scene, seconds = self._scene, self._scene.step_seconds
         numbers = [lane.number for lane in lanes]
         now, jacobians = self._measured[numbers], self._jacobians[numbers]

@@ -1,4 +1,4 @@
-"""What can be asked about a picture of the Fetch world: answered from the state, which no policy is shown."""
+"""Questions about a picture of the Fetch world, answered from the state, which no policy sees."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from .questions import QUESTIONS
 from .state import BLOCK, TARGET, State
 
 MARGIN = 0.04
-"""Metres by which one thing must lie further left, or nearer, than the other."""
+"""Smallest difference in metres at which one thing counts as further left, or nearer, than the other."""
 
 Answers = NDArray[np.int64]
 Measures = NDArray[np.float32]
@@ -28,11 +28,11 @@ SEEN = (
     "nearest",
     "farthest",
 )
-"""Kinds of the Fetch world that a still picture answers, and what a robot knows of itself does not."""
+"""Kinds of the Fetch world whose answers need a still picture, not just the robot's own measurements."""
 
 
 def _colour(measure: Callable[[State, NDArray[np.float32]], Measures]) -> Callable[[State], Answers]:
-    """Return the rule that tells the colour of the thing with the smaller measure.
+    """Return a rule that answers with the colour of the thing with the smaller measure.
 
     Args:
         measure: Maps states (N, 56) and places of things (N, 2, 2), in metres, to numbers (N, 2).
@@ -50,7 +50,7 @@ def _colour(measure: Callable[[State, NDArray[np.float32]], Measures]) -> Callab
 
 
 def _distance_to(thing: slice) -> Callable[[State, NDArray[np.float32]], Measures]:
-    """Return the measure of how far the places lie from a thing, in the plane."""
+    """Return a measure: the distance in the plane from each place to a thing."""
 
     def distance(states: State, places: NDArray[np.float32]) -> Measures:
         distances: Measures = np.linalg.norm(places - states[:, None, thing][:, :, :2], axis=2)
@@ -94,4 +94,4 @@ PIXEL_QUESTIONS: tuple[QuestionKind, ...] = (
         "the thing nearest to the target has what colour",
     ),
 )
-"""Everything that can be asked about a picture."""
+"""All kinds of questions about a picture."""

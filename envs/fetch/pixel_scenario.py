@@ -1,4 +1,4 @@
-"""The pixel scenario: the tasks of the Fetch scenario, of which a policy sees a camera's picture."""
+"""The scenario clbench/FetchPixels-v0: the tasks of clbench/Fetch-v0, seen in camera pictures."""
 
 from __future__ import annotations
 
@@ -8,17 +8,16 @@ from clbench.spec.budget import Budget
 from clbench.spec.scenario import Scenario
 from clbench.spec.task import Task
 
-from . import SCENARIO as FETCH
-
-__all__ = ["SCENARIO"]
+from .scenario import SCENARIO as FETCH
 
 
 def _seen(tasks: tuple[Task, ...]) -> tuple[Task, ...]:
-    """Return the tasks with the pixel scenario's world, where no target hangs in the air, and its camera."""
+    """Return the tasks with the pixel world, where every target is on the table, and with its camera."""
     return tuple(
         dataclasses.replace(
             task,
-            suite="fetch-pixels",
+            suite="fetch_pixels",
+            seed_name="fetch-pixels",
             world="clbench.envs.fetch.pixel_world:FetchPixelsWorld",
             camera="clbench.envs.fetch.camera:FetchCamera",
         )
@@ -28,11 +27,11 @@ def _seen(tasks: tuple[Task, ...]) -> tuple[Task, ...]:
 
 SCENARIO = Scenario(
     id="clbench/FetchPixels-v0",
-    description="The tasks of Fetch, seen in a picture: only the robot itself is known in numbers.",
+    description="The tasks of Fetch, seen by a camera: a policy gets numbers about the robot itself only.",
     retained=_seen(FETCH.retained),
     target=_seen(FETCH.target),
     held_out=_seen(FETCH.held_out),
     questions="clbench.envs.fetch.pixel_questions:PIXEL_QUESTIONS",
     budget=Budget(demonstrations=500, question_episodes=1200, pretraining_steps=4000),
 )
-"""The sequence of `clbench/Fetch-v0`; nothing tells a policy where block and target are but the picture."""
+"""The sequence of clbench/Fetch-v0; only the picture shows a policy where the block and the target are."""

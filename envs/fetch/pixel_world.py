@@ -1,4 +1,4 @@
-"""The Fetch world of the pixel scenario: two coloured things lie about, and a camera looks at the scene."""
+"""The Fetch world of the pixel scenario: the scene with two coloured things, seen by a camera."""
 
 from __future__ import annotations
 
@@ -13,34 +13,34 @@ from numpy.typing import NDArray
 from clbench.worlds.camera import VIEW_SIZE
 
 from .camera import COLOURS, JOINTS, PIXEL_SIZE, THINGS, FetchCamera
+from .physics import FetchVectorWorld
 from .rules import RULES
 from .state import BLOCK, SIZE, TARGET, State
-from .vector_world import FetchVectorWorld
 from .world import FetchWorld
 
 PIXEL_RULES = {name: dataclasses.replace(rule, target_on_table=True) for name, rule in RULES.items()}
-"""Those of the Fetch world with every target on the table: one camera does not tell how high a ball hangs."""
+"""The Fetch world's rules with every target on the table: one camera does not show the height of a target."""
 
 THING_PLACES = np.array([[1.12, 0.52], [1.50, 0.96]])
-"""Corners of the part of the table that things lie on, x and y in metres."""
+"""Corners of the area of the table for things, x and y in metres."""
 THINGS_APART = 0.10
-"""Least distance of a thing to the block, to the target and to the other thing."""
+"""Smallest distance in metres of a thing to the block, the target and the other thing."""
 
 PLAIN = np.zeros((1, VIEW_SIZE), np.float32)
-"""The view of a camera that nothing disturbs."""
+"""The view of an unperturbed camera."""
 
 Vectors = NDArray[np.float64]
 
 
 class FetchPixelsVectorWorld(FetchVectorWorld):
-    """Episodes as those of `FetchVectorWorld`, with targets on the table, and two things in each.
+    """The episodes of `FetchVectorWorld`, with all targets on the table and two things in each episode.
 
-    States (N, 56) have all that the experts, the questions and the camera need. A policy is shown the numbers
-    that `FetchCamera.proprioception` leaves of them, and pictures.
+    States (N, 56) contain everything that the experts, the questions and the camera need. A policy gets only
+    pictures and the numbers that `FetchCamera.proprioception` returns.
 
     Args:
-        lanes: Places for episodes.
-        threads: Threads that advance the physics.
+        lanes: Number of lanes.
+        threads: Number of threads that advance the physics.
         perturbed: Whether the block is heavier or lighter, and the gripper starts elsewhere.
     """
 
@@ -53,7 +53,7 @@ class FetchPixelsVectorWorld(FetchVectorWorld):
         """Start an episode in each of `lanes` and return the states (N, 56).
 
         Raises:
-            LookupError: No task has this name; the nearest one is named.
+            UnknownNameError: No task has this name; the error names the nearest one.
         """
         states = super().reset(lanes, seeds, tasks)
         for lane, seed, state in zip(lanes, seeds, states, strict=True):
@@ -68,12 +68,12 @@ class FetchPixelsVectorWorld(FetchVectorWorld):
         return self._complete(lanes, states), rewards, successes
 
     def state(self, lane: int) -> State:
-        """Return the state (56,) that a lane is in."""
+        """Return the current state (56,) of a lane."""
         state: State = self._states[lane]
         return state
 
     def _complete(self, lanes: Sequence[int], states: State) -> State:
-        """Return the states (N, 28) with joints and things, (N, 56)."""
+        """Extend the states (N, 28) by joints and things to (N, 56)."""
         for lane, state in zip(lanes, states, strict=True):
             self._states[lane, :SIZE] = state
             self._states[lane, JOINTS] = self._lane(lane).data.qpos
@@ -82,7 +82,7 @@ class FetchPixelsVectorWorld(FetchVectorWorld):
 
 
 def _things(state: State, generator: np.random.Generator) -> Vectors:
-    """Return places and colours of the two things (6,), apart from each other, block and target."""
+    """Return places and colours (6,) of the two things, apart from each other, the block and the target."""
     taken = [state[BLOCK][:2], state[TARGET][:2]]
     things: list[float] = []
     for colour in generator.permutation(len(COLOURS))[:2]:
@@ -96,14 +96,14 @@ def _things(state: State, generator: np.random.Generator) -> Vectors:
 
 
 class FetchPixelsWorld(FetchWorld):
-    """A `FetchPixelsVectorWorld` of one lane, which experts know and policies see by `FetchCamera`."""
+    """A `FetchPixelsVectorWorld` with one lane; policies see it through `FetchCamera`."""
 
     vector_world: ClassVar[type[FetchVectorWorld]] = FetchPixelsVectorWorld
     _world: FetchPixelsVectorWorld
     _camera: FetchCamera | None = None
 
     def picture(self) -> NDArray[np.uint8]:
-        """Draw what the camera sees, (480, 480, 3)."""
+        """Draw the view of the camera, (480, 480, 3)."""
         if self._camera is None:
             self._camera = FetchCamera(480, scale=1)
         picture: NDArray[np.uint8] = self._camera.draw(self._world.state(0)[None], PLAIN)[0]

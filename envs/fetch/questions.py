@@ -1,4 +1,4 @@
-"""What can be asked about a state of the Fetch world, answered from the state alone."""
+"""Questions about a state of the Fetch world, answered from the state alone."""
 
 from __future__ import annotations
 
@@ -20,19 +20,19 @@ from .state import (
 )
 
 SIDE_MARGIN = 0.015
-"""Metres that two things must lie apart along an axis before one is called left, nearer or farther."""
+"""Smallest distance in metres along an axis at which one thing counts as left, nearer or farther."""
 DISTANCE_MARGIN = 0.02
-"""Metres by which two distances must differ before one thing is called the nearer one."""
+"""Smallest difference in metres at which one of two distances counts as the shorter."""
 
 
 def _opening(states: State) -> NDArray[np.float32]:
-    """Return the sum of both fingers (N,) in metres."""
+    """Return the opening of both fingers (N,) in metres."""
     opening: NDArray[np.float32] = states[:, FINGERS].sum(axis=1)
     return opening
 
 
 def _height(states: State, thing: slice) -> NDArray[np.float32]:
-    """Return how far above a block at rest a thing is (N,) in metres."""
+    """Return the height (N,) of a thing above a block at rest, in metres."""
     return states[:, thing][:, 2] - np.float32(REST_HEIGHT)
 
 
@@ -56,7 +56,7 @@ def _gripper_above(states: State) -> Answers:
 
 
 def _gripper_opening(states: State) -> Answers:
-    """Around the block, at 0.05, the gripper is neither open nor closed."""
+    """Answer whether the gripper is open; around the block, at 0.05, it is neither open nor closed."""
     return which(_opening(states) > 0.08, _opening(states) < 0.02)
 
 
@@ -247,4 +247,4 @@ QUESTIONS: tuple[QuestionKind, ...] = (
         _farthest,
     ),
 )
-"""Everything that can be asked about a state of the Fetch world."""
+"""All kinds of questions about a state of the Fetch world."""

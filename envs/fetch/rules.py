@@ -1,4 +1,4 @@
-"""What each task of the Fetch world asks for: where its target may lie, what success is, how far it is."""
+"""The tasks of the Fetch world: the target's places, the condition of success and the distance to it."""
 
 from __future__ import annotations
 
@@ -12,57 +12,59 @@ import numpy as np
 from .state import BLOCK, BLOCK_FROM_GRIPPER, FINGERS, GRIPPER, GRIPPER_VELOCITY, REST_HEIGHT, TARGET
 
 SUCCESS_BONUS = 1.0
-"""Added to the reward of the step that succeeds; the rest of the reward is minus the metres to go."""
+"""Added to the reward of the successful step; the rest of the reward is minus the remaining metres."""
 
 HOVER_HEIGHT = 0.12
-"""How far above a thing the gripper hovers. A grasp comes down from less, so it does not hover by chance."""
+"""Height in metres at which the gripper hovers above a thing. A grasp comes down from a lower place, so it
+does not hover by chance."""
 PRESS_HEIGHT = 0.047
-"""The finger tips reach 0.0185 below the gripper: at 0.0435 above the block's centre they touch its top."""
+"""Largest height in metres of the gripper above the block's centre in a press. The finger tips reach 0.0185
+below the gripper, and touch the top of the block at 0.0435."""
 LIFT_HEIGHT = 0.10
 PUSH_DISTANCE = 0.10
 PUSH_CONE = 0.4
-"""How far a push may stray, per metre of way: +-21.8 degrees, so that a diagonal push is no straight one."""
+"""Largest sideways error of a push per metre, 21.8 degrees, so that a diagonal push is not a straight one."""
 NEAR = 0.05
-"""How near to the target the gripper or the block counts as there, as in the tasks of Fetch."""
+"""Largest distance in metres at which the gripper or the block is at the target, as in the tasks of Fetch."""
 CLOSED = 0.02
-"""Sum of both fingers below which the gripper is closed; an empty gripper closes to 0.00."""
+"""Opening of both fingers in metres below which the gripper is closed; an empty one closes to 0.00."""
 OPEN = 0.08
-"""Sum of both fingers above which the gripper is open; it opens to 0.10."""
+"""Opening of both fingers in metres above which the gripper is open; it opens to 0.10."""
 
 Numbers: TypeAlias = list[float]
-"""A state (28,) as plain numbers: NumPy takes three times as long for as few."""
+"""A state (28,) as plain numbers: NumPy takes three times as long for so few."""
 Condition: TypeAlias = Callable[[Numbers, Numbers], bool]
 Distance: TypeAlias = Callable[[Numbers, Numbers], float]
 
 
 @dataclass(frozen=True)
 class Rule:
-    """What one task asks for. The functions take a state and the state at the start."""
+    """The definition of one task. The functions take a state and the state at the start."""
 
     success: Condition
-    """Whether the task is done."""
+    """Returns whether the task is done."""
     distance: Distance
-    """How far it is from being done, in metres: what the gripper and the block still have to move."""
+    """Returns the distance in metres that the gripper and the block still have to move."""
     target_on_table: bool = False
-    """Whether the target lies on the table always; else it does in half of the episodes."""
+    """Whether the target is always on the table; otherwise it is in half of the episodes."""
 
     def judge(self, state: Numbers, start: Numbers) -> tuple[float, bool]:
         """Return the reward and whether the task is done.
 
-        The reward is minus the distance to go, in metres, and `SUCCESS_BONUS` more on success.
+        The reward is minus the remaining distance in metres, plus `SUCCESS_BONUS` on success.
         """
         success = self.success(state, start)
         return SUCCESS_BONUS * success - self.distance(state, start), success
 
 
 def opening(state: Numbers) -> float:
-    """Return the sum of both fingers in metres: 0 closed, 0.05 around the block, 0.10 open."""
+    """Return the opening of both fingers in metres: 0 closed, 0.05 around the block, 0.10 open."""
     right, left = state[FINGERS]
     return right + left
 
 
 def _gripper_to(state: Numbers, thing: slice, height: float) -> float:
-    """Return how far the gripper is from the point `height` above a thing, in metres."""
+    """Return the distance from the gripper to the point `height` above a thing, in metres."""
     x, y, z = state[thing]
     return math.dist(state[GRIPPER], (x, y, z + height))
 
@@ -76,7 +78,7 @@ def _held(state: Numbers) -> bool:
 
 
 def _still(state: Numbers) -> bool:
-    """Return whether the gripper moves less than 1 cm a step, a third of its full speed."""
+    """Return whether the gripper moves less than 1 cm per step, a third of its full speed."""
     return math.hypot(*state[GRIPPER_VELOCITY]) < 0.01
 
 
@@ -149,7 +151,7 @@ def _lift() -> Rule:
     return Rule(
         lambda state, _: height(state) > LIFT_HEIGHT and _held(state),
         lambda state, _: _gripper_to(state, BLOCK, 0.0) + max(0.0, LIFT_HEIGHT - height(state)),
-        # Who carries the block to a target on the table stays below 0.06, and so does not lift it.
+        # carrying the block to a target on the table stays below 0.06, and so does not lift it
         target_on_table=True,
     )
 

@@ -1,11 +1,9 @@
-"""The Fetch scenario: one robot arm, one block and one target marker; only the words tell the tasks apart."""
+"""The scenario clbench/Fetch-v0: all tasks share one scene, and only the instruction tells them apart."""
 
 from __future__ import annotations
 
 from clbench.spec.scenario import Scenario
 from clbench.spec.task import Task
-
-__all__ = ["SCENARIO"]
 
 
 def _task(name: str, *instructions: str) -> Task:
@@ -115,4 +113,4 @@ SCENARIO = Scenario(
     ),
     questions="clbench.envs.fetch.questions:QUESTIONS",
 )
-"""Six skills to keep, four tasks to learn in order, and two that combine what was learned."""
+"""Six skills to keep, four tasks to learn in order, and two held-out combinations of learned skills."""

@@ -1,4 +1,4 @@
-"""The scene of the Fetch world: that of FetchPickAndPlace-v4 with its arm moved to the start."""
+"""The scene of the Fetch world: FetchPickAndPlace-v4 with its arm moved to the start."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ from numpy.typing import NDArray
 
 from clbench.worlds.perturbation import with_mass
 
-# Else each worker prints a notice about Adroit's hand, which is not used here.
+# otherwise each worker prints a notice about Adroit's hand, which is not used here
 with contextlib.redirect_stderr(io.StringIO()):
     import gymnasium_robotics
     from gymnasium_robotics.envs.fetch.pick_and_place import MujocoFetchPickAndPlaceEnv
     from gymnasium_robotics.utils.rotations import mat2euler
 
 CAMERA = {"distance": 1.2, "azimuth": 60.0, "elevation": -25.0, "lookat": np.array([1.3, 0.75, 0.56])}
-"""From the robot's right, behind it: left is left, away goes right, and small pictures show the block."""
+"""A view from the right behind the robot: left is left, away goes right, small pictures show the block."""
 
 __all__ = ["CAMERA", "Scene", "mat2euler", "scene", "scene_file", "scene_with_mass"]
 
 
 @dataclass(frozen=True)
 class Scene:
-    """The compiled scene and what is fixed in it. All worlds of a process share it and only read."""
+    """The compiled scene with its constants. All worlds of a process share it and only read it."""
 
     model: mujoco.MjModel
     time: float
@@ -53,14 +53,14 @@ class Scene:
 
 @functools.cache
 def scene() -> Scene:
-    """Return the scene; it takes 0.2 s, once per process."""
+    """Return the scene; this takes 0.2 s, once per process."""
     original = MujocoFetchPickAndPlaceEnv()
     model = original.model
 
     def site(name: str) -> int:
         return int(model.site(name).id)
 
-    # green beams, 2 m long, that only show where the hand is to go
+    # hide the green beams, 2 m long, that mark the goal of the hand
     model.geom_rgba[model.body_mocapid[model.geom_bodyid] >= 0, 3] = 0.0
     fingers = [model.joint(f"robot0:{side}_gripper_finger_joint") for side in ("r", "l")]
     return Scene(
@@ -85,11 +85,11 @@ def scene() -> Scene:
 
 @functools.cache
 def scene_with_mass(mass: float) -> Scene:
-    """Return the scene with a block that is `mass` times as heavy; all perturbed worlds share it."""
+    """Return the scene whose block is `mass` times as heavy; all perturbed worlds share it."""
     model = scene().model
     return replace(scene(), model=with_mass(model, [int(model.body("object0").id)], mass))
 
 
 def scene_file() -> Path:
-    """Return the file that the scene is compiled from."""
+    """Return the source file of the scene."""
     return Path(gymnasium_robotics.__file__).parent / "envs/assets/fetch/pick_and_place.xml"

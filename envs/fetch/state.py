@@ -16,17 +16,17 @@ State: TypeAlias = NDArray[np.float32]
 
 SIZE = 28
 GRIPPER = slice(0, 3)
-"""Position of the point between the finger tips."""
+"""Position of the midpoint between the finger tips."""
 BLOCK = slice(3, 6)
 """Position of the centre of the block."""
 BLOCK_FROM_GRIPPER = slice(6, 9)
-"""Position of the block less that of the gripper."""
+"""Position of the block relative to the gripper."""
 FINGERS = slice(9, 11)
-"""How far each finger is out: 0 closed, 0.05 open; about 0.025 with the block between them."""
+"""Opening of each finger: 0 closed, 0.05 open, about 0.025 with the block between them."""
 BLOCK_ANGLES = slice(11, 14)
 """Euler angles of the block in radians."""
 BLOCK_FROM_GRIPPER_VELOCITY = slice(14, 17)
-"""Velocity of the block less that of the gripper."""
+"""Velocity of the block relative to the gripper."""
 BLOCK_SPIN = slice(17, 20)
 """Angular velocity of the block in radians per step."""
 GRIPPER_VELOCITY = slice(20, 23)
@@ -38,4 +38,4 @@ TARGET = slice(25, 28)
 
 BLOCK_HALF_SIZE = 0.025
 REST_HEIGHT = 0.425
-"""Height of the centre of a block that lies on the table."""
+"""Height of the centre of a block at rest on the table."""

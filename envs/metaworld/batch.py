@@ -1,7 +1,7 @@
-"""Episodes side by side: what `Episode.advance` does, computed for all of them at once.
+"""Episodes side by side: the work of `Episode.advance`, done for all of them at once.
 
-Each number has the bits that it has there; `rewards` says what that takes. Rewards and successes depend on
-the task, and are computed in groups of episodes of one task.
+Each number has the same bits as there; the module `rewards` explains how. Rewards and successes depend on the
+task, so they are computed in groups of episodes of one task.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ Verdict: TypeAlias = tuple[Vector, NDArray[np.bool_]]
 """The rewards (N,) and which of the episodes succeeded (N,)."""
 
 NOW = 18
-"""How many numbers of an observation say how things are: as many follow of the step before, then the goal."""
+"""Size of the current part of an observation; as many numbers of the previous step follow, then the goal."""
 _PARTS = (slice(4, 7), slice(7, 11)), (slice(11, 14), slice(14, 18))
-"""Where an observation has the place and the rotation of its first part, and of its second."""
+"""Places in an observation of the position and the rotation of its first and its second part."""
 _ARM: tuple[Look, ...] = (
     ("body", "hand", "xpos"),
     ("body", "rightclaw", "xpos"),
@@ -35,88 +35,88 @@ _ARM: tuple[Look, ...] = (
     ("site", "rightEndEffector", "xpos"),
     ("site", "leftEndEffector", "xpos"),
 )
-"""What is looked at of the robot."""
+"""Positions of the robot that observations and rewards need."""
 _FINGERS = np.array([1.0, -1.0], np.float32)
-"""The share of an action's last number that each finger gets."""
+"""Factor of an action's last number for each finger."""
 
 
 @dataclass(frozen=True)
 class Part:
-    """A thing that is part of the observation: its place, and its rotation as a quaternion."""
+    """An object in the observation: its position, and its rotation as a quaternion."""
 
     place: Look
-    """What has its place."""
+    """Source of the position."""
     offset: tuple[float, float, float] | None = None
-    """Added to the place, in metres."""
+    """Offset added to the position, in metres."""
     rotation: Look | None = None
-    """What has its rotation, as a quaternion or a matrix; zeros stand for it if this is None."""
+    """Source of the rotation, a quaternion or a matrix; the observation has zeros if None."""
 
 
 @dataclass(frozen=True)
 class Rule:
-    """What Meta-World shows and rewards in a task."""
+    """Meta-World's observation and reward of a task."""
 
     judge: Callable[[Group], Verdict]
     """Computes rewards and successes."""
     parts: tuple[Part, ...]
-    """What the observation is about, one thing or two."""
+    """The one or two objects in the observation."""
 
 
 class Group:
-    """Episodes of one task, which take their steps together: what its rule asks for.
+    """Episodes of one task that take their steps together, with everything that the task's rule reads.
 
     Args:
-        rule: Of the task.
-        episodes: Begun, and not begun again while this is used.
+        rule: Rule of the task.
+        episodes: Running episodes; none may begin anew while the group is in use.
     """
 
     actions: Numbers
-    """What was asked for in this step (N, 4)."""
+    """Actions of this step (N, 4)."""
     observation: Vector
-    """What is observed after it (N, 39), within its bounds."""
+    """Observations after the step (N, 39), clipped to their bounds."""
     arm: Vector
-    """Places of the parts of the robot (N, 7, 3), as `_ARM` names them."""
+    """Positions of the robot (N, 7, 3), in the order of `_ARM`."""
     tcp: Vector
-    """Places between the fingers (N, 3)."""
+    """Midpoints between the fingers (N, 3)."""
 
     def __init__(self, rule: Rule, episodes: Sequence[Episode]) -> None:
         self.rule, self.episodes = rule, episodes
         self._starts: dict[str, Vector] = {}
         self.goal = self.start("_target_pos")
-        """Where the thing is to go (N, 3): not as it is observed, which is within bounds."""
+        """Goal positions (N, 3), not clipped as in the observation."""
 
     @property
     def hand(self) -> Vector:
-        """Places of the hand (N, 3), as they are observed."""
+        """Observed positions of the hand (N, 3)."""
         return self.observation[:, :3]
 
     @property
     def opening(self) -> Vector:
-        """How far the fingers are apart (N,), from 0 to 1."""
+        """Openings of the fingers (N,), from 0 to 1."""
         return self.observation[:, 3]
 
     @property
     def thing(self) -> Vector:
-        """Places (N, 3) of the first thing that is part of the observation."""
+        """Positions (N, 3) of the first object in the observation."""
         return self.observation[:, 4:7]
 
     @property
     def pads(self) -> Vector:
-        """Places of the pads of the fingers along y (2, N), first that of the right one."""
+        """Positions of the finger pads along y (2, N), the right one first."""
         return self.arm[:, 3:5, 1].T
 
     def closed(self, effort: float = 1.0, counts: NDArray[np.bool_] | bool = True) -> Mixed:
-        """Return how far actions close the fingers, as a share of an effort; 0 where that does not count."""
+        """Return the share of an effort by which actions close the fingers; 0 where it does not count."""
         return closed(self.actions[:, 3], effort, counts)
 
     def start(self, name: str) -> Vector:
-        """Return what Meta-World's reset measured, as `obj_init_pos` or `init_tcp`, of each episode."""
+        """Return a measurement of Meta-World's reset in each episode, such as `init_tcp` (N, K)."""
         if name not in self._starts:
             self._starts[name] = np.array([getattr(episode, name) for episode in self.episodes], np.float64)
         return self._starts[name]
 
     def look(self, look: Look) -> Vector:
-        """Return something of the physics (N, its size) as it is now."""
+        """Return the present values of an array of the physics (N, size)."""
         return _rows([episode.look(look) for episode in self.episodes])
 
 
@@ -124,13 +124,13 @@ class Batch:
     """Episodes that take their steps together.
 
     Args:
-        groups: Of the tasks; their episodes are those of the batch, in this order.
+        groups: One group per task; the batch has their episodes in this order.
     """
 
     def __init__(self, groups: Sequence[Group]) -> None:
         self._groups, self.episodes = groups, [episode for group in groups for episode in group.episodes]
         self._mocaps = [episode.data.mocap_pos[0] for episode in self.episodes]
-        # carried from step to step, rather than read again: while a batch stands, nothing else sets them
+        # carried from step to step instead of read again: nothing else sets them while the batch is in use
         self._hands, self._before = np.stack(self._mocaps), np.stack([one.before for one in self.episodes])
         self._controls = [episode.data.ctrl for episode in self.episodes]
         self._reach = [
@@ -142,11 +142,11 @@ class Batch:
         parts = [group.rule.parts for group in groups for _ in group.episodes]
         self._parts = [_Parts(self.episodes, parts, number) for number in range(max(map(len, parts)))]
         arms = [episode.look(look) for episode in self.episodes for look in _ARM]
-        # read all at once: whatever comes after the physics finds the processor's caches full of that
+        # read all at once: after the physics, its data fill the processor's caches
         self._views = [view for views in (arms, *(part.views for part in self._parts)) for view in views]
 
     def aim(self, actions: Numbers) -> None:
-        """Set what the physics is to do in the next step, by actions (N, 4) in [-1, 1]."""
+        """Set the controls of the next physics step from actions (N, 4) in [-1, 1]."""
         self._actions = actions
         low, high = self._reach
         hands = self._hands + actions[:, :3] * self.episodes[0].action_scale
@@ -158,14 +158,14 @@ class Batch:
             mocap[:], control[:] = hand, effort
 
     def outcome(self) -> tuple[Vector, Vector, NDArray[np.bool_]]:
-        """Return observations (N, 39), rewards (N,) and successes (N,), once the physics has advanced."""
+        """Return observations (N, 39), rewards (N,) and successes (N,) after the physics has advanced."""
         numbers, arms = np.concatenate(self._views), len(self.episodes) * len(_ARM) * 3
         arm = numbers[:arms].reshape(len(self.episodes), -1, 3)
         observation = self._observe(arm, numbers[arms:])
         tcp = (arm[:, 5] + arm[:, 6]) / 2.0
         rewards, successes = np.empty(len(tcp)), np.empty(len(tcp), np.bool_)
         first = 0
-        # beyond a margin of 0, as may happen by chance, the reward is 0: that of an infinite distance
+        # a margin can be 0 by chance: beyond it the reward is 0, as at an infinite distance
         with np.errstate(divide="ignore", invalid="ignore"):
             for group in self._groups:
                 rows = slice(first, first + len(group.episodes))
@@ -176,7 +176,7 @@ class Batch:
         return observation, rewards, successes
 
     def _observe(self, arm: Vector, numbers: Vector) -> Vector:
-        """Return observations (N, 39), from the places of the arm (N, 7, 3) and the numbers of the parts."""
+        """Return observations (N, 39) from the positions of the arm (N, 7, 3) and the values of the parts."""
         observation = np.zeros((len(self.episodes), SIZE))
         observation[:, :3] = arm[:, 0]
         apart = norm(arm[:, 1] - arm[:, 2]) / 0.1
@@ -195,12 +195,12 @@ class Batch:
 
 
 class _Parts:
-    """What observations show of their first parts, or of their second."""
+    """The first objects in all observations, or the second ones."""
 
     views: list[Vector]
-    """All that is looked at: places (P, 3), then quaternions (Q, 4), then matrices (M, 9)."""
+    """Views of positions (P, 3), then quaternions (Q, 4), then matrices (M, 9)."""
     size: int
-    """How many numbers that is."""
+    """Total number of values in the views."""
 
     def __init__(self, episodes: Sequence[Episode], parts: Sequence[tuple[Part, ...]], number: int) -> None:
         self._place, self._rotation = _PARTS[number]
@@ -219,7 +219,7 @@ class _Parts:
         self.size = sum(view.size for view in self.views)
 
     def show(self, numbers: Vector, observation: Vector) -> None:
-        """Write them into observations (N, 39), from the numbers that the views hold."""
+        """Write the objects into observations (N, 39), from the values of the views."""
         places, turns = self._ends
         observation[self._rows, self._place] = numbers[:places].reshape(-1, 3)
         if self._moved:
@@ -227,11 +227,11 @@ class _Parts:
         if self._quaternions:
             observation[self._quaternions, self._rotation] = numbers[places:turns].reshape(-1, 4)
         if self._matrices:
-            # MuJoCo's are rotations: what is skipped is to make them so
+            # MuJoCo's matrices are rotations already: skip the orthogonalisation
             rotations = Rotation.from_matrix(numbers[turns:].reshape(-1, 3, 3), assume_valid=True)
             observation[self._matrices, self._rotation] = rotations.as_quat()
 
 
 def _rows(views: Sequence[Vector]) -> Vector:
-    """Return what views of one size are of, (N, size)."""
+    """Return the values of views of one size, (N, size)."""
     return np.concatenate(views).reshape(len(views), -1)

@@ -1,10 +1,9 @@
-"""One episode of Meta-World: its own environments, on a model that all episodes of a task share."""
+"""One episode of Meta-World: its own environment, on a model that all episodes of a task share."""
 
 from __future__ import annotations
 
 import copy
 import functools
-from dataclasses import dataclass, field, replace
 from typing import Any, TypeAlias
 
 import mujoco
@@ -15,74 +14,31 @@ from metaworld.sawyer_xyz_env import SawyerXYZEnv
 from numpy.typing import NDArray
 
 from clbench.base.entry_points import unknown
-from clbench.worlds.perturbation import with_mass
 
+from .scene import Scene, Vector, scene_of
 from .state import State
 
-Vector = NDArray[np.float64]
 Look: TypeAlias = tuple[str, str, str]
-"""Something in the physics: of what kind it is, what it is called, and which of its arrays is asked for."""
+"""An array in the physics: the kind of an element, its name, and the name of one of its arrays."""
 
 START = 0.03
-"""Metres along each axis that a perturbed hand starts beside its place, three steps of it."""
+"""Largest displacement in metres of a perturbed hand along each axis, three steps' worth."""
 SETTLE = 20
-"""Steps, of 0.0125 s, in which it gets there and comes to rest."""
+"""Steps of 0.0125 s for this displacement, until the hand is at rest."""
 
 PHYSICS = ("model", "data", "mujoco_renderer", "init_left_pad", "init_right_pad", "_looks")
-"""Attributes of an episode that are its physics or views of it: also what Meta-World calls initial pads."""
-
-
-class Models:
-    """A model, and copies of it: threads that step at the same time move things in one of their own.
-
-    Args:
-        model: Used by whichever asks first; a copy takes 19 MB, so none is made before it is needed.
-    """
-
-    def __init__(self, model: mujoco.MjModel) -> None:
-        self._model = model
-        self._free = [(model, model.body_pos, model.site_pos)]
-
-    def take(self) -> tuple[mujoco.MjModel, Vector, Vector]:
-        """Return a model that no other thread has, with its places of bodies and sites."""
-        try:
-            return self._free.pop()
-        except IndexError:
-            model = copy.copy(self._model)
-            return model, model.body_pos, model.site_pos
-
-    def give_back(self, taken: tuple[mujoco.MjModel, Vector, Vector]) -> None:
-        """Let others take a model."""
-        self._free.append(taken)
-
-
-@dataclass(frozen=True)
-class Scene:
-    """The compiled scene of a task. All its episodes in a process share it."""
-
-    model: mujoco.MjModel
-    body_pos: Vector
-    """Places of the bodies as compiled, (bodies, 3): an episode begins by moving some."""
-    site_pos: Vector
-    """Places of the sites as compiled, (sites, 3)."""
-    start: mujoco.MjData
-    """The physics once the hand has gone to where it starts."""
-    models: Models = field(init=False)
-    """The model, for threads that advance episodes at the same time."""
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "models", Models(self.model))
+"""Attributes of an episode that are physics or views of it, including Meta-World's so-called initial pads."""
 
 
 class Episode(SawyerXYZEnv):
-    """What an episode does otherwise than Meta-World's environment, of which it is a subclass for each task.
+    """The differences of an episode from Meta-World's environment; each task has a subclass of both.
 
-    1. The goal is part of the state: Meta-World's experts look at it.
-    2. All follows from the seed. In Meta-World the first state can still show things where they stood in the
-       episode before.
-    3. The hand's way to its start, 50 steps, is made once for each task.
-    4. The model is shared: an episode takes its own places of bodies and sites with it, see `place`.
-    5. Parts of the physics are looked up by name once, and contacts all together.
+    1. The goal is part of the state: Meta-World's experts need it.
+    2. The seed determines everything. In Meta-World the first state can still show objects where they were in
+       the previous episode.
+    3. The hand moves to its start, 50 steps, only once per task.
+    4. Episodes share the model: each keeps its own places of bodies and sites, see `place`.
+    5. Parts of the physics are looked up by name once, and contacts are tested together.
     """
 
     scene: Scene
@@ -93,7 +49,7 @@ class Episode(SawyerXYZEnv):
         super().__init__()
         self._set_task_called = True
         self._partially_observable = False
-        del self.sawyer_observation_space  # that of a hidden goal
+        del self.sawyer_observation_space  # cached with a hidden goal
         self._places = self.scene.body_pos.copy(), self.scene.site_pos.copy()
         self._hand_place = np.array(self.hand_init_pos)
 
@@ -101,21 +57,21 @@ class Episode(SawyerXYZEnv):
         return self.scene.model, mujoco.MjData(self.scene.model)
 
     def begin(self, seed: int, start: tuple[float, float, float] | None = None) -> State:
-        """Draw the places of things from the seed, and return the first state (39,).
+        """Draw the places of objects from the seed, and return the first state (39,).
 
         Args:
-            seed: Of the places.
-            start: Share of `START`, from -1 to 1 along each axis, by which the hand of a perturbed episode
-                starts beside its place; None in a plain one.
+            seed: Seed of the places.
+            start: Displacement of the hand in a perturbed episode, as shares of `START` from -1 to 1 along
+                each axis; None in a plain episode.
         """
         if start is not None:
             self._settle, self.hand_init_pos = SETTLE, self._hand_place + START * np.array(start)
         self.np_random = np_random(seed)[0]
         self.seeded_rand_vec, self._freeze_rand_vec = True, False
         self.model.body_pos[:], self.model.site_pos[:] = self.scene.body_pos, self.scene.site_pos
-        self.reset_model()  # draws, and moves what is drawn
+        self.reset_model()  # draws places and moves objects there
         self._freeze_rand_vec = True
-        self.reset_model()  # with the same draw: now all is measured where it stands
+        self.reset_model()  # with the same draw: measures all objects in place
         self._places = self.model.body_pos.copy(), self.model.site_pos.copy()
         mujoco.mj_forward(self.model, self.data)
         self._prev_obs = self._get_curr_obs_combined_no_goal()
@@ -123,21 +79,21 @@ class Episode(SawyerXYZEnv):
         return self._get_obs().astype(np.float32)
 
     def place(self) -> None:
-        """Give the shared model this episode's places of bodies and sites."""
+        """Set the places of bodies and sites in the shared model to this episode's."""
         self.model.body_pos[:], self.model.site_pos[:] = self._places
 
     def advance(self, action: NDArray[np.float32]) -> tuple[State, float, bool]:
-        """Move by an action (4,) in [-1, 1]; return the state (39,), Meta-World's reward, and the success."""
+        """Move by an action (4,) in [-1, 1]; return the state (39,), Meta-World's reward and the success."""
         self.place()
-        self.curr_path_length = 0  # whoever uses the world counts the steps
+        self.curr_path_length = 0  # the caller counts the steps
         state, reward, _, _, info = self.step(action)
         return state.astype(np.float32), float(reward), bool(info["success"])
 
     def move(self) -> None:
         """Advance the physics by one step, as far as observations and rewards depend on it.
 
-        Many threads may do so at once, each with an episode of its own. What Meta-World computes in addition,
-        forces in joints and contacts as they are after the step, is in nothing that is returned.
+        Several threads may call it at once, each for another episode. Meta-World also computes forces in
+        joints and contacts after the step, which no result depends on.
         """
         taken = self.scene.models.take()
         model, body_pos, site_pos = taken
@@ -148,7 +104,7 @@ class Episode(SawyerXYZEnv):
 
     @property
     def before(self) -> Vector:
-        """How things were after the last step, (18,)."""
+        """The current part of the last observation, (18,)."""
         return self._prev_obs
 
     @before.setter
@@ -169,35 +125,35 @@ class Episode(SawyerXYZEnv):
         mujoco.mj_forward(self.model, self.data)
         super()._reset_hand(steps=self._settle)
 
-    # ---- what is looked up by name ---------------------------------------------------------------------
+    # ---- lookups by name -------------------------------------------------------------------------------
 
     def look(self, look: Look) -> Vector:
-        """Return a view of something in the physics."""
+        """Return a view of an array in the physics."""
         if look not in self._looks:
             kind, name, array = look
             self._looks[look] = getattr(getattr(self.data, kind)(name), array)
         return self._looks[look]
 
     def get_body_com(self, body_name: str) -> Vector:
-        """Return the place of a body (3,), as a view of the physics."""
+        """Return the position of a body (3,), a view of the physics."""
         return self.look(("body", body_name, "xpos"))
 
     def _get_site_pos(self, site_name: str) -> Vector:
         return self.look(("site", site_name, "xpos")).copy()
 
     def get_endeff_pos(self) -> Vector:
-        """Return the place of the hand (3,), as a view of the physics."""
+        """Return the position of the hand (3,), a view of the physics."""
         return self.get_body_com("hand")
 
     @property
     def tcp_center(self) -> Vector:
-        """Place between the fingers (3,)."""
+        """Midpoint between the fingers (3,)."""
         right, left = self._get_site_pos("rightEndEffector"), self._get_site_pos("leftEndEffector")
         center: Vector = (right + left) / 2.0
         return center
 
     def touching_object(self, object_geom_id: int) -> bool:
-        """Return whether both fingers press on a geom; Meta-World looks at each contact twice, in Python."""
+        """Return whether both fingers press on a geom; Meta-World tests each contact twice, in Python."""
         contact, force = self.data.contact, self.data.efc_force
         of_object = (contact.geom == object_geom_id).any(axis=1)
         for pad in ("leftpad_geom", "rightpad_geom"):
@@ -223,36 +179,23 @@ class Episode(SawyerXYZEnv):
 def _episode_class(task: str, mass: float | None) -> type[Episode]:
     if mass is not None:
         plain = _episode_class(task, None)
-        scene, model = plain.scene, plain.scene.model
-        model.body_pos[:], model.site_pos[:] = scene.body_pos, scene.site_pos  # an episode has moved them
-        scene = replace(scene, model=with_mass(model, _things(model), mass))
-        return type(f"Perturbed{plain.__name__}", (plain,), {"scene": scene})
+        return type(f"Perturbed{plain.__name__}", (plain,), {"scene": plain.scene.with_mass(mass)})
     name = f"{task.replace('_', '-')}-v3"
     if name not in ALL_V3_ENVIRONMENTS:
         known = (entry.removesuffix("-v3").replace("-", "_") for entry in ALL_V3_ENVIRONMENTS)
         raise unknown("task of the Meta-World world", task, known)
     original = ALL_V3_ENVIRONMENTS[name]
-    env: Any = original()
-    env._reset_hand()
-    model = env.model
-    scene = Scene(model, model.body_pos.copy(), model.site_pos.copy(), env.data)
-    return type(f"Episode{original.__name__}", (Episode, original), {"scene": scene})
-
-
-def _things(model: mujoco.MjModel) -> list[int]:
-    """Return the bodies that can be moved and are no part of the robot."""
-    robot, moved = model.body("base").id, model.body_weldid != 0
-    return [int(body) for body in np.flatnonzero(moved & (model.body_rootid != robot))]
+    return type(f"Episode{original.__name__}", (Episode, original), {"scene": scene_of(original)})
 
 
 def new_episode(task: str, mass: float | None = None) -> Episode:
-    """Return a place for episodes of a task, as "drawer_open"; its scene is compiled when first needed.
+    """Return an object that runs episodes of a task; the first one of a task compiles its scene.
 
     Args:
-        task: What to do.
-        mass: How many times as heavy things are in perturbed episodes; those of a plain place if None.
+        task: Name of the task, such as "drawer_open".
+        mass: Factor on the masses of objects in perturbed episodes; None for plain episodes.
 
     Raises:
-        LookupError: No task has this name; the nearest one is named.
+        UnknownNameError: No task has this name; the error names the nearest one.
     """
     return _episode_class(task, mass)()

@@ -1,6 +1,6 @@
 """The experts of the Meta-World world: Meta-World's own scripted policies, which act on the state alone.
 
-The expert of push_back is ours: Meta-World's closes the fingers on its way down, and stays on top of the
+The expert of push_back is our own: Meta-World's closes the fingers on its way down, and ends up on top of the
 block in half of the episodes.
 """
 
@@ -21,14 +21,14 @@ from .state import GOAL, HAND, OBJECT, OPENING, State
 Action: TypeAlias = NDArray[np.float32]
 
 ABOVE = np.array([0.0, 0.0, 0.12])
-"""From a block to where the hand is clear of it."""
+"""Offset in metres from a block to a place where the hand is clear of it."""
 
 
 def expert(task: str) -> Callable[[State], Action]:
-    """Return the expert of the task: it maps a state (39,) to an action (4,).
+    """Return the expert of the task, which maps a state (39,) to an action (4,).
 
     Raises:
-        LookupError: No task has this name; the nearest one is named.
+        UnknownNameError: No task has this name; the error names the nearest one.
     """
     if task == "push_back":
         return _push_back
@@ -41,7 +41,7 @@ def expert(task: str) -> Callable[[State], Action]:
 
     def act(state: State) -> Action:
         with warnings.catch_warnings():
-            # it asks for more than an action can do, and says so each time
+            # it exceeds the bounds of actions, and warns each time
             warnings.filterwarnings("ignore", "Constant")
             wished = policy.get_action(state.astype(np.float64))
         action: Action = np.clip(wished, -1.0, 1.0).astype(np.float32)
@@ -51,7 +51,7 @@ def expert(task: str) -> Callable[[State], Action]:
 
 
 def _push_back(state: State) -> Action:
-    """Come down on the block with open fingers, close them around it, and drag it to the goal."""
+    """Return the action that comes down on the block, grasps it and drags it to the goal."""
     hand, block, goal = (state[part].astype(np.float64) for part in (HAND, OBJECT, GOAL))
     low = hand[2] - block[2] < 0.05
     way, fingers = goal - hand, 0.6
@@ -59,8 +59,8 @@ def _push_back(state: State) -> Action:
         way, fingers = block + ABOVE - hand, -1.0
     elif not low:
         way, fingers = block - hand, -1.0
-    elif state[OPENING] > 0.62:  # around the block they are at 0.5
+    elif state[OPENING] > 0.62:  # 0.5 around the block
         way = np.zeros(3)
-    way[2] *= not low or fingers < 0.0  # what is held is dragged at the height at which it was taken
+    way[2] *= not low or fingers < 0.0  # drag a held block at the height of the grasp
     action: Action = np.clip(np.append(10.0 * way, fingers), -1.0, 1.0).astype(np.float32)
     return action

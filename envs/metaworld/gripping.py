@@ -1,4 +1,4 @@
-"""What Meta-World rewards in tasks in which something is grasped, of many episodes: part of `rules`."""
+"""Meta-World's rewards in tasks with a grasp, for many episodes at once: part of `rules`."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ def _caging(
     effort: float = 1.0,
     dense: bool = True,
 ) -> Mixed:
-    """Return how well the fingers are around things (N, 3), and close: sawyer_xyz_env.py's caging reward.
+    """Return how well the fingers surround and grip objects: the caging reward of sawyer_xyz_env.py.
 
     Args:
-        group: Of the things.
-        thing: Where they are.
-        radius: Of a ball around one (`obj_radius`).
-        pads_apart: Distance of a finger's pad along y that is near enough (`pad_success_thresh`).
-        close: Distance in the plane of x and z that is (`xz_thresh`).
-        effort: Action of the fingers that is enough (`desired_gripper_effort`).
-        dense: Whether there is a reward before they close (`high_density`).
+        group: Episodes with the objects.
+        thing: Positions of the objects (N, 3).
+        radius: Radius of a ball around an object (`obj_radius`).
+        pads_apart: Distance of a finger pad along y that is near enough (`pad_success_thresh`).
+        close: Distance in the plane of x and z that is near enough (`xz_thresh`).
+        effort: Sufficient action of the fingers (`desired_gripper_effort`).
+        dense: Whether there is a reward before the fingers close (`high_density`).
     """
     first, tcp_first = group.start("obj_init_pos"), group.start("init_tcp")
     margins = np.abs(np.abs(group.pads - first[:, 1]) - pads_apart)
@@ -47,13 +47,13 @@ def _dense(gripping: Floats, caging: Floats) -> Floats:
 
 
 def _straddling(group: Group, radius: float, close: float) -> tuple[Vector, Vector, Vector]:
-    """Return how well the fingers are around the things, as push_back and pick_place have it of their own.
+    """Return how well the fingers surround the objects, in the variant of push_back and pick_place.
 
-    What they call the initial places of the pads are those that the pads have now.
+    These tasks use the current positions of the pads as their initial ones.
 
     Returns:
-        That (N,), how far the things are from the right pad and from the left one along y (2, N), and the
-        margins of that (2, N).
+        The caging (N,), the distances of the objects from the right and the left pad along y (2, N), and the
+        margins of these distances (2, N).
     """
     (right, left), y = group.pads, group.thing[:, 1]
     aside = np.stack([y - right, left - y])
@@ -69,10 +69,10 @@ def _checked(margin: Vector) -> Vector:
     """Return a margin (N,).
 
     Raises:
-        ValueError: It is negative, for which Meta-World has no reward.
+        InputError: A margin is negative, which Meta-World's reward does not allow.
     """
     if (margin < 0).any():
-        raise InputError("The hand begins so near to a thing that Meta-World has no reward for reaching it.")
+        raise InputError("The hand starts too near to an object: Meta-World has no reward for reaching it.")
     return margin
 
 
@@ -91,7 +91,7 @@ def _push(group: Group) -> Verdict:
 
 
 def _push_wall(group: Group) -> Verdict:
-    """Reward of sawyer_push_wall_v3.py: first to the middle of the way around the wall, then to the goal."""
+    """Reward of sawyer_push_wall_v3.py: first for the midpoint of the way round the wall, then the goal."""
     thing, first = group.thing, group.start("obj_init_pos")
     middle, scale = np.full_like(thing, (-0.05, 0.77, 0.0)), np.array([3.0, 1.0, 1.0])
     middle[:, 2] = thing[:, 2]
@@ -144,7 +144,7 @@ def _pick_place(group: Group) -> Verdict:
 
 
 def _shelf_place(group: Group) -> Verdict:
-    """Reward of sawyer_shelf_place_v3.py: less where a way straight on would end below the shelf."""
+    """Reward of sawyer_shelf_place_v3.py: lower where a straight way would end below the shelf."""
     thing, goal, first = group.thing, group.goal, group.start("obj_init_pos")
     to_goal = norm(thing - goal)
     in_place = near(to_goal, 0.05, norm(first - goal))
@@ -157,7 +157,7 @@ def _shelf_place(group: Group) -> Verdict:
     in_place = np.where(before, np.clip(in_place - loss, 0.0, 1.0), in_place)
     in_place = np.where(low & (y > goal[:, 1]), 0.0, in_place)
     held = (norm(thing - group.tcp) < 0.025) & (group.opening > 0) & (z - 0.01 > first[:, 2])
-    # what a loss was taken from is a number of NumPy, not of Python: with it, single precision becomes double
+    # subtracting a loss yields a number of NumPy, not of Python, which turns single precision into double
     lifted = Mixed(reward.numbers, reward.single & ~before).into(np.add, 1.0 + 5.0 * in_place)
     return np.where(to_goal < 0.05, 10.0, np.where(held, lifted.numbers, reward.numbers)), to_goal <= 0.07
 
@@ -241,4 +241,4 @@ GRIPPING_RULES: Mapping[str, Rule] = {
         ),
     ),
 }
-"""By task."""
+"""Rule of each task with a grasp."""

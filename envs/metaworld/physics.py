@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, TypeAlias
+from typing import Any, ClassVar, TypeAlias
 
 import gymnasium
 import mujoco
@@ -14,38 +14,36 @@ from numpy.typing import NDArray
 
 from clbench.worlds.perturbation import draw_perturbation
 from clbench.worlds.threads import Team
-from clbench.worlds.world import checked_actions, no_episode
+from clbench.worlds.world import Drawable, checked_actions, lane_at, rows_by_task
 
 from .batch import Batch, Group
 from .episode import Episode, new_episode
 from .rules import RULES
+from .scene import CAMERA
 from .state import SIZE, State
 
 _Kind: TypeAlias = tuple[str, float | None]
-"""A task, and how many times as heavy its things are if they are perturbed: what a place for episodes is made
-for."""
+"""The kind of an episode: its task, and the factor on the masses of objects if it is perturbed."""
 
 
 @dataclass(eq=False)
 class _Lane:
-    """An episode in its place; the next one there is another lane."""
+    """An episode in its lane; the next episode there is another object."""
 
     kind: _Kind
     episode: Episode
 
 
 class _Order:
-    """Lanes in the order in which they take a step: first those whose task has a rule, task by task.
+    """Lanes in the order of their steps: first those whose task has a rule, task by task.
 
     Args:
-        lanes: That take the step.
-        known: Groups of lanes as they were before, of which some may not have changed.
+        lanes: The lanes that take the step.
+        known: Groups of the previous order; unchanged ones are used again.
     """
 
     def __init__(self, lanes: Sequence[_Lane], known: Mapping[tuple[_Lane, ...], Group]) -> None:
-        by_task: defaultdict[str, list[int]] = defaultdict(list)
-        for row, lane in enumerate(lanes):
-            by_task[lane.kind[0]].append(row)
+        by_task = rows_by_task(lane.kind[0] for lane in lanes)
         self.lanes = lanes
         self.others = [(row, lane.episode) for row, lane in enumerate(lanes) if lane.kind[0] not in RULES]
         self.rows = [row for task, rows in by_task.items() if task in RULES for row in rows]
@@ -59,23 +57,25 @@ class _Order:
         self.batch = Batch(list(self.groups.values())) if self.groups else None
 
     def __deepcopy__(self, _: dict[int, Any]) -> None:
-        """Return nothing: a copy of a world makes its own, of its own physics."""
+        """Return None: a copied world makes an order of its own physics."""
 
 
 class MetaWorldVectorWorld:
-    """Meta-World's tasks with their own physics, observations, rewards and rules of success, bit for bit.
+    """Meta-World's tasks with their own physics, observations, rewards and success conditions, bit for bit.
 
-    An action (4,) in [-1, 1] moves the hand by up to 1 cm along x, y and z, and closes (+1) or opens (-1) the
-    fingers; a step takes 0.0125 s. The state is Meta-World's observation with the goal in it, the reward its
-    own from 0 to 10. An episode ends with success only; whoever uses the world counts its steps. It is a
-    `clbench.worlds.world.VectorWorld`.
+    It is a `clbench.worlds.world.VectorWorld`. An action (4,) in [-1, 1] moves the hand by up to 1 cm along
+    x, y and z, and closes (+1) or opens (-1) the fingers; a step takes 0.0125 s. The state is Meta-World's
+    observation including the goal, and the reward is Meta-World's own, from 0 to 10. Only success ends an
+    episode; the caller counts its steps.
 
     Args:
-        lanes: Places for episodes. A task's scene is compiled when it is first reset to.
-        threads: Threads that advance the physics; MuJoCo releases the interpreter lock. Results do not depend
-            on it. Each thread but one makes copies of the models that it needs, of 19 MB.
-        perturbed: Whether things are heavier or lighter, and the hand starts elsewhere.
+        lanes: Number of lanes. The first reset to a task compiles its scene.
+        threads: Number of threads that advance the physics; MuJoCo releases the interpreter lock. Results do
+            not depend on it. Each thread but one copies the models that it needs, of 19 MB.
+        perturbed: Whether objects are heavier or lighter, and the hand starts elsewhere.
     """
+
+    perturbable: ClassVar[bool] = True
 
     def __init__(self, lanes: int, threads: int = 1, perturbed: bool = False) -> None:
         self.single_observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (SIZE,), np.float32)
@@ -87,10 +87,10 @@ class MetaWorldVectorWorld:
         self._team = Team(threads)
 
     def reset(self, lanes: Sequence[int], seeds: Sequence[int], tasks: Sequence[str]) -> State:
-        """Start an episode in each of `lanes` and return the states (N, 39); all follows from the seed alone.
+        """Start an episode in each of `lanes` and return the states (N, 39), which the seeds alone determine.
 
         Raises:
-            LookupError: No task has this name; the nearest one is named.
+            UnknownNameError: No task has this name; the error names the nearest one.
         """
         return np.stack([self._begin(*start) for start in zip(lanes, seeds, tasks, strict=True)])
 
@@ -109,10 +109,11 @@ class MetaWorldVectorWorld:
     ) -> tuple[State, NDArray[np.float64], NDArray[np.bool_]]:
         """Move each of `lanes` for one step of 0.0125 s by its row of actions (N, 4).
 
-        Returns the states (N, 39), the rewards (N,) and which of the episodes succeeded (N,).
+        Returns:
+            The states (N, 39), the rewards (N,), and which episodes succeeded (N,).
 
         Raises:
-            ValueError: An action has another shape than (4,), or a number in it is not finite.
+            InputError: An action has another shape than (4,), or contains a number that is not finite.
         """
         actions = checked_actions(actions, self.single_action_space, "Meta-World")
         order = self._order_of([self._lane(lane) for lane in lanes])
@@ -128,27 +129,24 @@ class MetaWorldVectorWorld:
         return states, rewards, successes
 
     def _order_of(self, lanes: Sequence[_Lane]) -> _Order:
-        """Return in which order lanes take their steps; it is kept while they are the same."""
+        """Return the order in which lanes take their steps; the same lanes keep their order."""
         if self._order is None or self._order.lanes != lanes:
             self._order = _Order(lanes, {} if self._order is None else self._order.groups)
         return self._order
 
-    def picture_of(self, lane: int) -> tuple[mujoco.MjModel, mujoco.MjData]:
-        """Return the scene of a lane, with things where they stand in its episode, and its physics."""
+    def drawable(self, lane: int) -> Drawable:
+        """Return the scene of a lane with the objects in place; the next step is independent of this call."""
         episode = self._lane(lane).episode
         episode.place()
-        mujoco.mj_forward(episode.model, episode.data)  # what is drawn is more than what a step computes
-        return episode.model, episode.data
+        mujoco.mj_forward(episode.model, episode.data)  # a picture needs more than a step computes
+        return Drawable(episode.model, episode.data, CAMERA)
 
     def close(self) -> None:
-        """Forget all episodes, and end the threads."""
+        """Release all episodes, and end the threads."""
         self._team.close()
         self._order = None
         self._lanes = [None] * len(self._lanes)
         self._idle.clear()
 
     def _lane(self, number: int) -> _Lane:
-        lane = self._lanes[number]
-        if lane is None:
-            raise no_episode(number, "Meta-World")
-        return lane
+        return lane_at(self._lanes, number, "Meta-World")

@@ -1,4 +1,4 @@
-"""What can be asked about a state of the Meta-World world, answered from the state alone."""
+"""Questions about a state of the Meta-World world, answered from the state alone."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from clbench.data.questions import Answers, QuestionKind, sign, which
 from .state import GOAL, HAND, HAND_BEFORE, OBJECT, OBJECT_BEFORE, OPENING, State
 
 MARGIN = 0.02
-"""Metres by which two things must differ along an axis, or two distances, before an answer is asked for."""
+"""Smallest difference in metres, of places along an axis or of distances, at which there is an answer."""
 
 Numbers = NDArray[np.float32]
 
@@ -23,12 +23,12 @@ def _outside(value: Numbers, high: float, low: float) -> Answers:
 
 
 def _between(first: slice, second: slice, axis: int) -> Callable[[State], Answers]:
-    """Return the rule that tells whether the first thing is further along an axis than the second."""
+    """Return a rule that answers whether the first thing is further along an axis than the second."""
     return lambda states: sign(states[:, first][:, axis] - states[:, second][:, axis], MARGIN)
 
 
 def _distance(states: State, first: slice, second: slice) -> Numbers:
-    """Return the distances (N,) of two things."""
+    """Return the distances (N,) between two things."""
     distance: Numbers = np.linalg.norm(states[:, first] - states[:, second], axis=1)
     return distance
 
@@ -54,7 +54,7 @@ def _object_moving(states: State) -> Answers:
 
 
 def _gripper_motion(axis: int) -> Callable[[State], Answers]:
-    """Return the rule that tells which way the hand moves along an axis."""
+    """Return a rule that answers which way the hand moves along an axis."""
     return lambda states: sign(states[:, HAND][:, axis] - states[:, HAND_BEFORE][:, axis], 0.002)
 
 
@@ -202,4 +202,4 @@ QUESTIONS: tuple[QuestionKind, ...] = (
         "how high is the object high or low",
     ),
 )
-"""Everything that can be asked about a state of the Meta-World world."""
+"""All kinds of questions about a state of the Meta-World world."""

@@ -1,7 +1,7 @@
-"""What Meta-World shows and rewards in the tasks of our scenarios, computed for many episodes at once.
+"""Meta-World's observations and rewards in the tasks of our scenarios, computed for many episodes at once.
 
-Numbers and formulas are those of `compute_reward` in `metaworld/envs/sawyer_<task>_v3.py`, in the order of
-its operations. Tasks that are not in `RULES` can be done all the same, by Meta-World's own code.
+Numbers and formulas come from `compute_reward` in `metaworld/envs/sawyer_<task>_v3.py`, in the same order of
+operations. Tasks without an entry in `RULES` work too, with Meta-World's own code.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ def _door_close(group: Group) -> Verdict:
 
 
 def _door_unlock(group: Group) -> Verdict:
-    """Reward of sawyer_door_unlock_v3.py, where the lock's initial place is the one it has now."""
+    """Reward of sawyer_door_unlock_v3.py, which uses the lock's current place as its initial one."""
     shoulder, scale = np.array([0.0, 0.055, 0.07]), np.array([0.25, 1.0, 0.5])
     to_lock = norm((group.hand + shoulder - group.thing) * scale)
     to_lock_first = norm(
@@ -70,7 +70,7 @@ def _drawer_close(group: Group) -> Verdict:
 
 
 def _faucet(offset: tuple[float, float, float] | None = None) -> Callable[[Group], Verdict]:
-    """Return the reward of sawyer_faucet_close_v3.py, or with an offset that of sawyer_faucet_open_v3.py."""
+    """Return the reward of sawyer_faucet_close_v3.py, or, with an offset, of sawyer_faucet_open_v3.py."""
 
     def judge(group: Group) -> Verdict:
         first = group.start("obj_init_pos")
@@ -89,8 +89,8 @@ def _window(first_place: str, sigmoid: Callable[[Vector], Vector]) -> Callable[[
     """Return the reward of sawyer_window_open_v3.py or sawyer_window_close_v3.py.
 
     Args:
-        first_place: What the way along x is measured from.
-        sigmoid: By which reaching is rewarded.
+        first_place: Name of the place from which the way along x is measured.
+        sigmoid: Sigmoid of the reward for reaching.
     """
 
     def judge(group: Group) -> Verdict:
@@ -201,4 +201,4 @@ RULES: Mapping[str, Rule] = {
     "window_open": Rule(_window("obj_init_pos", long_tail), (Part(("site", "handleOpenStart", "xpos")),)),
     **GRIPPING_RULES,
 }
-"""By task."""
+"""Rule of each task."""

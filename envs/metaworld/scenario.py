@@ -1,8 +1,4 @@
-"""The Meta-World scenarios: one arm before drawers, windows, faucets, buttons and blocks.
-
-`SCENARIO` keeps eight skills while four tasks are learned. `CONTINUAL_WORLD` has the ten tasks of Continual
-World in their order and retains nothing.
-"""
+"""The scenarios clbench/MetaWorld-v0, with eight skills to keep, and clbench/MetaWorldCW-v0, with none."""
 
 from __future__ import annotations
 
@@ -11,8 +7,6 @@ import dataclasses
 from clbench.spec.budget import Budget
 from clbench.spec.scenario import Scenario
 from clbench.spec.task import Task
-
-__all__ = ["CONTINUAL_WORLD", "SCENARIO"]
 
 
 def _task(name: str, horizon: int, *instructions: str) -> Task:
@@ -56,7 +50,7 @@ _HANDLE_PRESS_SIDE = _task(
 
 SCENARIO = Scenario(
     id="clbench/MetaWorld-v0",
-    description="Meta-World's arm learns to close and press things, after eight skills on other things.",
+    description="Meta-World's arm learns to close and press objects, after eight other skills.",
     retained=(
         _task(
             "door_close",
@@ -157,7 +151,7 @@ SCENARIO = Scenario(
     questions="clbench.envs.metaworld.questions:QUESTIONS",
     budget=Budget(demonstrations=100),
 )
-"""Eight skills to keep, four tasks to learn in order, each with the thing of a skill, and two variants."""
+"""Eight skills to keep, four tasks to learn in order with their objects, and two held-out variants."""
 
 _CW10 = (
     _task(
@@ -225,7 +219,7 @@ CONTINUAL_WORLD = Scenario(
     id="clbench/MetaWorldCW-v0",
     description="The ten tasks of Continual World in their order, from Meta-World v3: not comparable to v1.",
     retained=(),
-    target=tuple(dataclasses.replace(task, suite="metaworld-cw") for task in _CW10),
+    target=tuple(dataclasses.replace(task, suite="metaworld_cw", seed_name="metaworld-cw") for task in _CW10),
     held_out=(),
     questions="clbench.envs.metaworld.questions:QUESTIONS",
     scenes=(
@@ -246,4 +240,4 @@ CONTINUAL_WORLD = Scenario(
         test_episodes=10,
     ),
 )
-"""Ten tasks to learn in order, and none to keep but those: CW10 of Wolczyk et al. 2021 (arXiv 2105.10919)."""
+"""The ten tasks of CW10 in their order, without retained skills: Wolczyk et al. 2021 (arXiv 2105.10919)."""

@@ -1,7 +1,7 @@
 """Layout of the state of the Meta-World world: Meta-World's observation, 39 numbers, lengths in metres.
 
-The robot stands at the origin and looks along y: x grows to its right, y away from it, z up. The first 18
-numbers say how things are, the next 18 are the same one step before, the last 3 the goal.
+The robot is at the origin and faces along y: x grows to its right, y away from it, z up. The first 18 numbers
+describe the current step, the next 18 the previous step, and the last 3 the goal.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ SIZE = 39
 HAND = slice(0, 3)
 """Position of the hand: of its palm, 4.5 cm above the tips of the fingers."""
 OPENING = 3
-"""How far the fingers are apart: 1 open, about 0.2 closed on nothing."""
+"""Opening of the fingers: 1 open, about 0.2 when closed on nothing."""
 OBJECT = slice(4, 7)
-"""Position of what the task is about, as a block or the handle of a drawer."""
+"""Position of the object of the task, such as a block or the handle of a drawer."""
 HAND_BEFORE = slice(18, 21)
-"""Position of the hand one step before."""
+"""Position of the hand in the previous step."""
 OBJECT_BEFORE = slice(22, 25)
 GOAL = slice(36, 39)
-"""Where the object, or in a reach the hand, is to go."""
+"""Goal position of the object, or of the hand in a reach."""

@@ -1,4 +1,4 @@
-"""The expert of the PointMaze world: it acts on the state alone, and so can label perturbed episodes."""
+"""The expert of the PointMaze world: it acts on the state alone, and so can label noisy episodes."""
 
 from __future__ import annotations
 
@@ -10,26 +10,27 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from .mazes import MAZES, goal_of
+from .mazes import MAZES
+from .rules import goal_of
 from .state import COLOUR, PLACE, VELOCITY, State
 
 Action: TypeAlias = NDArray[np.float32]
 
 SPEED = 2.5
-"""Metres per second on the way: a quarter of a cell a step, and slow enough to turn within a cell."""
+"""Speed on the way, in metres per second: a quarter of a cell per step, slow enough to turn within a cell."""
 APPROACH = 2.5
-"""Speed per metre that is left to go, near the goal."""
+"""Speed near the goal, per metre of remaining way, in 1/s."""
 GAIN = 0.25
-"""Action per metre per second of error: 0.42 would ask for all of it in one step; less is easier to clone."""
+"""Action per metre per second of error: 0.42 would correct all of it in one step; less is easier to clone."""
 
 
 def expert(task: str) -> Callable[[State], Action]:
-    """Return the expert of the task: it maps a state (11,) to an action (2,).
+    """Return the expert of the task, which maps a state (11,) to an action (2,).
 
-    It goes to the task's room by the shortest way through the maze that the state shows.
+    It takes the shortest way to the task's room, through the maze that the state shows.
 
     Raises:
-        LookupError: No task has this name; the nearest one is named.
+        UnknownNameError: No task has this name; the error names the nearest one.
     """
     return functools.partial(_act, goal_of(task).room)
 

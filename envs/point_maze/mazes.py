@@ -1,9 +1,9 @@
-"""The mazes: nine rooms each, on a square, and the passages between them.
+"""The mazes: nine rooms each, in a square, and the passages between them.
 
-All have a hub in the middle with a passage to each side. They differ in how the corners are reached: in the
-red maze by way of the upper and the lower room, in the blue one by way of the left and the right room; in the
-green one the upper corners as in the blue maze, the lower ones as in the red. So a room lies at the same
-place in every maze, but the way to it begins in another direction.
+All have a hub in the middle with a passage to each side. They differ in the ways to the corners: in the red
+maze these lead through the upper and the lower room, in the blue maze through the left and the right room.
+The green maze has the upper corners of the blue one and the lower corners of the red one. So a room has the
+same place in every maze, but the way to it begins in another direction.
 """
 
 from __future__ import annotations
@@ -14,14 +14,12 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import TypeAlias
 
-from clbench.base.entry_points import unknown
-
 Place: TypeAlias = tuple[float, float]
 Cell: TypeAlias = tuple[int, int]
 """Row, from the top, and column, from the left."""
 
 SIZE = 5
-"""Cells along a side, each 1 m: rooms stand at the even ones, passages between them."""
+"""Cells along a side, each 1 m wide: rooms have even rows and columns, passages connect them."""
 
 ROOMS: dict[str, Cell] = {
     "upper_left": (0, 0),
@@ -36,7 +34,7 @@ ROOMS: dict[str, Cell] = {
 }
 
 DIRECTIONS: tuple[Cell, ...] = ((0, 1), (0, -1), (-1, 0), (1, 0))
-"""Steps of a cell to the right, to the left, up and down."""
+"""Steps of one cell to the right, to the left, up and down."""
 
 
 def centre(cell: Cell) -> Place:
@@ -46,16 +44,16 @@ def centre(cell: Cell) -> Place:
 
 @dataclass(frozen=True)
 class Maze:
-    """Where one can be in a maze, and the ways through it."""
+    """The free cells of a maze and the ways through it."""
 
     colour: str
-    """Of its walls, which is its name."""
+    """Colour of the walls, also the name of the maze."""
     drawing: tuple[str, ...]
-    """One character a cell, row by row from the top: "o" is a room, "-" and "|" a passage, " " a wall."""
+    """One character per cell, row by row from the top: "o" is a room, "-" and "|" a passage, " " a wall."""
 
     @cached_property
     def free(self) -> tuple[Cell, ...]:
-        """The cells without a wall, row by row."""
+        """Cells without a wall, row by row."""
         return tuple(
             (row, column)
             for row, line in enumerate(self.drawing)
@@ -65,13 +63,13 @@ class Maze:
 
     @cached_property
     def _nearest(self) -> dict[Cell, Cell]:
-        """The free cell that is nearest to each cell: itself, unless it is a wall."""
+        """Nearest free cell to each cell: the cell itself, unless it is a wall."""
         cells = [(row, column) for row in range(SIZE) for column in range(SIZE)]
         return {cell: min(self.free, key=lambda free: math.dist(free, cell)) for cell in cells}
 
     @cached_property
     def _ways(self) -> dict[str, dict[Cell, tuple[Cell, int]]]:
-        """The next cell on the shortest way to each room, and how many steps of a cell it takes."""
+        """For each room and cell: the next cell on the shortest way to the room, and the cells to go."""
         return {room: self._ways_to(goal) for room, goal in ROOMS.items()}
 
     def _ways_to(self, goal: Cell) -> dict[Cell, tuple[Cell, int]]:
@@ -87,7 +85,7 @@ class Maze:
 
     @cached_property
     def _reach(self) -> dict[Cell, tuple[int, ...]]:
-        """How many cells one can go straight on from each cell, in each of the `DIRECTIONS`."""
+        """Number of free cells straight ahead of each cell, in each of the `DIRECTIONS`."""
         return {
             cell: tuple(self._straight(cell, direction) for direction in DIRECTIONS) for cell in self.free
         }
@@ -99,18 +97,18 @@ class Maze:
         return steps
 
     def cell(self, place: Place) -> Cell:
-        """Return the cell that a place lies in, or the nearest one without a wall."""
+        """Return the cell of a place, or the nearest free cell if that is a wall."""
         column, row = round(place[0]) + SIZE // 2, SIZE // 2 - round(place[1])
         return self._nearest[min(max(row, 0), SIZE - 1), min(max(column, 0), SIZE - 1)]
 
     def steps(self, cell: Cell, room: str) -> int:
-        """Return how many steps of a cell it takes from a free cell to a room."""
+        """Return the length of the shortest way from a free cell to a room, in cells."""
         return self._ways[room][cell][1]
 
     def way(self, place: Place, room: str) -> tuple[Place, float]:
-        """Return the next point (x, y) on the shortest way to a room, and the metres to the room's centre.
+        """Return the next point (x, y) on the shortest way to a room, and the distance to the room's centre.
 
-        The points are the centres of cells; in the room it is its own.
+        Points are centres of cells, distances are in metres; in the room, the point is the room's own centre.
         """
         ways = self._ways[room]
         following = ways[self.cell(place)][0]
@@ -118,7 +116,7 @@ class Maze:
         return point, math.dist(place, point) + ways[following][1]
 
     def room_ahead(self, place: Place) -> tuple[float, float, float, float]:
-        """Return the metres to the wall on the right, on the left, above and below."""
+        """Return the distances in metres to the wall on the right, on the left, above and below."""
         cell = self.cell(place)
         right, left, above, below = self._reach[cell]
         x, y = centre(cell)
@@ -134,29 +132,4 @@ MAZES: dict[str, Maze] = {
         Maze("green", ("o o o", "| | |", "o-o-o", "  |  ", "o-o-o")),
     )
 }
-"""The mazes by colour, in the order of the state's `COLOUR`."""
-
-
-@dataclass(frozen=True)
-class Goal:
-    """What a task asks for: to stop in a room of a maze."""
-
-    maze: Maze
-    room: str
-
-
-GOALS: dict[str, Goal] = {
-    f"{colour}_{room}": Goal(maze, room) for colour, maze in MAZES.items() for room in ROOMS
-}
-"""What each task of the world asks for, by name: every room of every maze is one."""
-
-
-def goal_of(task: str) -> Goal:
-    """Return what a task asks for.
-
-    Raises:
-        LookupError: No task has this name; the nearest one is named.
-    """
-    if task not in GOALS:
-        raise unknown("task of the PointMaze world", task, GOALS)
-    return GOALS[task]
+"""Mazes by colour, in the order of the state's `COLOUR`."""

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
+from typing import ClassVar
 
 import gymnasium
 import mujoco
@@ -12,30 +12,26 @@ from gymnasium.utils.seeding import np_random
 from numpy.typing import NDArray
 
 from clbench.worlds.perturbation import Perturbation, draw_perturbation
-from clbench.worlds.world import checked_actions, no_episode
+from clbench.worlds.world import Drawable, checked_actions, lane_at
 
-from .mazes import MAZES, ROOMS, Goal, Place, centre, goal_of
-from .scene import SUBSTEPS, TARGET, scene, scene_with_mass
+from .mazes import MAZES, ROOMS, Place, centre
+from .rules import Goal, goal_of
+from .scene import CAMERA, SUBSTEPS, TARGET, scene, scene_with_mass
 from .state import COLOUR, PLACE, ROOM_AHEAD, SIZE, VELOCITY, State
 
 TOP_SPEED = 5.0
-"""Metres per second that PointMaze allows the ball along an axis."""
+"""Speed limit of the ball along each axis in metres per second, as in PointMaze."""
 APART = 3
-"""Least way from the start to the goal, in cells: no task is nearly done at the start."""
+"""Shortest way from the start to the goal, in cells, so that no task is nearly done at the start."""
 SPREAD = 0.25
-"""How far from the centre of a cell the ball may start along an axis, as in PointMaze."""
+"""Largest distance in metres from the start to the centre of its cell along each axis, as in PointMaze."""
 START = 0.1
-"""How much farther a perturbed ball may start: its radius is 0.1 m, and walls are 0.5 m from the centre."""
-NEAR = 0.45
-"""How near to the centre of the room the ball counts as there, as in PointMaze."""
-SLOW = 0.5
-"""Metres per second below which the ball stops: who only passes through a room does not."""
-SUCCESS_BONUS = 1.0
-"""Added to the reward of the step that succeeds; the rest of the reward is minus the metres to go."""
+"""Largest extra displacement of a perturbed start along each axis, in metres. The ball still fits: its radius
+is 0.1 m, and walls are 0.5 m from the centre of a cell."""
 
 
 class _Lane:
-    """The physics of one episode after the other in one maze, with a ball of one mass."""
+    """The physics of successive episodes in one maze, with a ball of one mass."""
 
     goal: Goal
 
@@ -44,18 +40,18 @@ class _Lane:
         self.data = mujoco.MjData(model)
 
     def begin(self, goal: Goal, place: Place) -> None:
-        """Put the ball at rest at a place, and forget all that was before."""
+        """Reset the physics, with the ball at rest at a place."""
         self.goal = goal
         mujoco.mj_resetData(self.model, self.data)
         self.data.qpos[:] = place
         mujoco.mj_forward(self.model, self.data)
 
     def advance(self, action: NDArray[np.float32]) -> None:
-        """Move for one step as PointMaze does that repeats the action: it limits the speed, then steps."""
+        """Move for one step, as PointMaze does when it repeats the action: limit the speed, then step."""
         self.data.ctrl[:] = action
         velocity = self.data.qvel
         for _ in range(SUBSTEPS):
-            if max(map(abs, velocity.tolist())) > TOP_SPEED:  # to ask takes a tenth of the time of np.clip
+            if max(map(abs, velocity.tolist())) > TOP_SPEED:  # takes a tenth of the time of np.clip
                 velocity.clip(-TOP_SPEED, TOP_SPEED, out=velocity)
             mujoco.mj_step(self.model, self.data)
 
@@ -67,27 +63,21 @@ class _Lane:
         state[ROOM_AHEAD] = self.goal.maze.room_ahead((x, y))
         state[COLOUR] = [self.goal.maze.colour == colour for colour in MAZES]
 
-    def judge(self, state: State) -> tuple[float, bool]:
-        """Return the reward in a state, and whether the ball has stopped in the room."""
-        x, y = state[PLACE].tolist()
-        there = math.dist((x, y), centre(ROOMS[self.goal.room])) < NEAR
-        success = there and math.hypot(*state[VELOCITY].tolist()) < SLOW
-        _, metres = self.goal.maze.way((x, y), self.goal.room)
-        return SUCCESS_BONUS * success - metres, success
-
 
 class PointMazeVectorWorld:
-    """The ball, the physics and the observation of PointMaze, in three mazes, with the tasks of `GOALS`.
+    """The ball, the physics and the observation of PointMaze in three mazes, with the tasks of `GOALS`.
 
-    An action (2,) in [-1, 1] pushes the ball to the right and upwards for 0.1 s, by up to 24 m/s^2. The
-    reward is minus the metres to go by the shortest way, and `SUCCESS_BONUS` more on success. An episode
-    ends with success only; whoever uses the world counts its steps. It is a `clbench.worlds.world.VectorWorld`.
+    It is a `clbench.worlds.world.VectorWorld`. An action (2,) in [-1, 1] pushes the ball to the right and
+    upwards for 0.1 s, by up to 24 m/s^2. The reward is minus the length of the shortest way to the goal in
+    metres, plus `SUCCESS_BONUS` on success. Only success ends an episode; the caller counts its steps.
 
     Args:
-        lanes: Places for episodes. A lane takes its memory when it is reset into another maze than before.
-        threads: Not used: the steps of a ball are too short to share out.
-        perturbed: Whether the ball is heavier or lighter, and starts beside its place.
+        lanes: Number of lanes. A lane allocates its memory when it first enters a maze.
+        threads: Ignored: the steps of a ball are too short to share among threads.
+        perturbed: Whether the ball is heavier or lighter, and starts at a displaced place.
     """
+
+    perturbable: ClassVar[bool] = True
 
     def __init__(self, lanes: int, threads: int = 1, perturbed: bool = False) -> None:
         self.single_observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (SIZE,), np.float32)
@@ -98,10 +88,10 @@ class PointMazeVectorWorld:
     def reset(self, lanes: Sequence[int], seeds: Sequence[int], tasks: Sequence[str]) -> State:
         """Start an episode in each of `lanes` and return the states (N, 11).
 
-        The ball starts anywhere in the task's maze that is `APART` cells or more from the goal.
+        The ball starts anywhere in the task's maze, at least `APART` cells from the goal.
 
         Raises:
-            LookupError: No task has this name; the nearest one is named.
+            UnknownNameError: No task has this name; the error names the nearest one.
         """
         for number, seed, task in zip(lanes, seeds, tasks, strict=True):
             goal, lane = goal_of(task), self._lanes[number]
@@ -118,34 +108,32 @@ class PointMazeVectorWorld:
     ) -> tuple[State, NDArray[np.float64], NDArray[np.bool_]]:
         """Move each of `lanes` for one step of 0.1 s by its row of actions (N, 2).
 
-        Returns the states (N, 11), the rewards (N,) and which of the episodes succeeded (N,).
+        Returns:
+            The states (N, 11), the rewards (N,), and which episodes succeeded (N,).
 
         Raises:
-            ValueError: An action has another shape than (2,), or a number in it is not finite.
+            InputError: An action has another shape than (2,), or contains a number that is not finite.
         """
         actions = checked_actions(actions, self.single_action_space, "PointMaze")
         for number, action in zip(lanes, actions, strict=True):
             self._lane(number).advance(action)
         states = self._observe(lanes)
-        judged = [self._lane(number).judge(state) for number, state in zip(lanes, states, strict=True)]
+        judged = [self._lane(number).goal.judge(state) for number, state in zip(lanes, states, strict=True)]
         rewards, successes = zip(*judged, strict=True)
         return states, np.array(rewards), np.array(successes)
 
-    def picture_data(self, lane: int) -> tuple[mujoco.MjModel, mujoco.MjData]:
-        """Return scene and physics of a lane, with the mark at its goal, to draw them and no more."""
+    def drawable(self, lane: int) -> Drawable:
+        """Return the maze of a lane with the mark at its goal; the next step does not depend on this call."""
         drawn = self._lane(lane)
         # The place of a site is an output of the physics: the next step computes it again and never reads it.
         drawn.data.site(TARGET).xpos[:2] = centre(ROOMS[drawn.goal.room])
-        return drawn.model, drawn.data
+        return Drawable(drawn.model, drawn.data, CAMERA)
 
     def close(self) -> None:
         """Do nothing: there is nothing to free."""
 
     def _lane(self, number: int) -> _Lane:
-        lane = self._lanes[number]
-        if lane is None:
-            raise no_episode(number, "PointMaze")
-        return lane
+        return lane_at(self._lanes, number, "PointMaze")
 
     def _observe(self, lanes: Sequence[int]) -> State:
         states = np.empty((len(lanes), SIZE), np.float32)
@@ -155,7 +143,7 @@ class PointMazeVectorWorld:
 
 
 def _start(goal: Goal, seed: int, perturbation: Perturbation | None) -> Place:
-    """Return the place at which the ball starts."""
+    """Return the place where the ball starts."""
     generator, _ = np_random(seed)
     cells = [cell for cell in goal.maze.free if goal.maze.steps(cell, goal.room) >= APART]
     x, y = centre(cells[int(generator.integers(len(cells)))])

@@ -1,4 +1,4 @@
-"""What can be asked about a state of the PointMaze world, answered from the state alone."""
+"""Questions about a state of the PointMaze world, answered from the state alone."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from .mazes import MAZES
 from .state import COLOUR, PLACE, ROOM_AHEAD, VELOCITY, State
 
 SIDE_MARGIN = 0.25
-"""Metres off the middle of the maze below which the ball is on neither side of it."""
+"""Distance in metres to the middle of the maze below which the ball is on neither side."""
 EDGE_MARGIN = 0.1
-"""Metres from the edge of a cell below which the ball is in neither of two."""
+"""Distance in metres to the edge of a cell below which the ball is in neither of the two cells."""
 NEARER_MARGIN = 0.2
-"""Metres by which two distances must differ before one is called the nearer."""
+"""Smallest difference in metres at which one of two distances counts as the shorter."""
 SPEED_MARGIN = 0.3
-"""Metres per second along an axis below which the ball moves neither way."""
+"""Speed along an axis in metres per second below which the ball moves neither way."""
 OPEN, CLOSED = 1.05, 0.95
-"""Metres to a wall: a ball of radius 0.1 is at most 0.9 from one beside its cell, else at least 1.1."""
+"""Distances in metres: a ball of radius 0.1 is at most 0.9 from a wall of its cell, or at least 1.1."""
 
 Numbers = NDArray[np.float32]
 
@@ -45,7 +45,7 @@ def _middle(states: State) -> Answers:
 
 
 def _edge(states: State) -> Answers:
-    """Left, right, top or bottom: the side of the maze that is nearest by a margin."""
+    """Answer with the nearest side of the maze, if it is nearest by a margin: left, right, top or bottom."""
     x, y = states[:, PLACE].T
     towards = np.stack([-x, x, y, -y])
     second, first = np.sort(towards, axis=0)[-2:]
@@ -54,7 +54,7 @@ def _edge(states: State) -> Answers:
 
 
 def _part(states: State) -> Answers:
-    """A room is where both rows and columns are even; the ball is in the cell that its centre is in."""
+    """Answer room or corridor: rooms have even rows and columns, and the ball's centre decides its cell."""
     offset = states[:, PLACE] - np.round(states[:, PLACE])
     clear = (abs(offset) < 0.5 - EDGE_MARGIN).all(axis=1)
     room = (np.round(states[:, PLACE]) % 2 == 0).all(axis=1)
@@ -83,7 +83,7 @@ def _heading_height(states: State) -> Answers:
 
 
 def _way(direction: int, states: State) -> Answers:
-    """Open or closed: whether the next cell in a direction, an index of `ROOM_AHEAD`, is free."""
+    """Answer whether the next cell in a direction, an index of `ROOM_AHEAD`, is free: open or closed."""
     metres = states[:, ROOM_AHEAD][:, direction]
     return which(metres > OPEN, metres < CLOSED)
 
@@ -237,4 +237,4 @@ QUESTIONS: tuple[QuestionKind, ...] = (
         _nearer_height_wall,
     ),
 )
-"""Everything that can be asked about a state of the PointMaze world."""
+"""All kinds of questions about a state of the PointMaze world."""

@@ -1,11 +1,9 @@
-"""The PointMaze scenario: a ball, three mazes of nine rooms, and words that say in which room to stop."""
+"""The scenario clbench/PointMaze-v0: the instruction names the maze and the room where the ball must stop."""
 
 from __future__ import annotations
 
 from clbench.spec.scenario import Scenario
 from clbench.spec.task import Task
-
-__all__ = ["SCENARIO"]
 
 _WORDS = {
     "upper_left": ("upper left", "top left", "north west"),
@@ -17,14 +15,14 @@ _WORDS = {
     "lower": ("lower middle", "bottom middle", "south"),
     "lower_right": ("lower right", "bottom right", "south east"),
 }
-"""What each room is called."""
+"""Names of each room in the instructions: plain, by the sides of the maze, and by compass."""
 
 
 def _task(colour: str, room: str) -> Task:
     plain, edge, compass = _WORDS[room]
     return Task(
         name=f"{colour}_{room}",
-        suite="point-maze",
+        suite="point_maze",
         instructions=(
             f"go to the {plain} room of the {colour} maze",
             f"roll into the {edge} room of the {colour} maze",
@@ -35,12 +33,13 @@ def _task(colour: str, room: str) -> Task:
         world="clbench.envs.point_maze.world:PointMazeWorld",
         expert="clbench.envs.point_maze.experts:expert",
         packages=("gymnasium-robotics",),
+        seed_name="point-maze",
     )
 
 
 SCENARIO = Scenario(
     id="clbench/PointMaze-v0",
-    description="A ball learns the way to four rooms of two mazes, after eight rooms of three.",
+    description="A ball learns the way to four rooms in two mazes, after eight rooms in three mazes.",
     retained=(
         _task("red", "upper_left"),
         _task("red", "lower_right"),
@@ -63,4 +62,4 @@ SCENARIO = Scenario(
     ),
     questions="clbench.envs.point_maze.questions:QUESTIONS",
 )
-"""Eight rooms to keep, four to learn the way to, and two whose words are known, but not in their maze."""
+"""Eight rooms to keep, four to learn, and two held-out rooms whose names were learned in other mazes."""

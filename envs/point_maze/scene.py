@@ -1,4 +1,4 @@
-"""The scenes of the PointMaze world: the ball of gymnasium-robotics' PointMaze with a maze around it."""
+"""The scenes of the PointMaze world: the ball of gymnasium-robotics' PointMaze inside a maze."""
 
 from __future__ import annotations
 
@@ -7,27 +7,31 @@ import importlib.util
 from pathlib import Path
 
 import mujoco
+import numpy as np
 
 from clbench.worlds.perturbation import with_mass
 
 from .mazes import MAZES, SIZE, Cell, centre
 
 TARGET = "target"
-"""Site that marks the goal in pictures."""
+"""Name of the site that marks the goal in pictures."""
 
 SUBSTEPS = 10
-"""Steps of the physics, each of 0.01 s, that an action lasts: PointMaze is made for 10 Hz."""
+"""Physics steps of 0.01 s per action: PointMaze is made for 10 Hz."""
 
 WALL_HEIGHT = 0.4
 WALL_COLOURS = {"red": (0.70, 0.20, 0.15), "blue": (0.15, 0.30, 0.65), "green": (0.12, 0.45, 0.22)}
+CAMERA = {"distance": 9.2, "azimuth": 90.0, "elevation": -90.0, "lookat": np.zeros(3)}
+"""A view from above that shows the whole maze: left is left, and up is up."""
+
 FLOOR, BALL, GOAL = (0.75, 0.75, 0.72), (0.10, 0.10, 0.10), (0.95, 0.75, 0.10)
 
 
 @functools.cache
 def scene(colour: str) -> mujoco.MjModel:
-    """Return the compiled scene of a maze. All worlds of a process share it and only read.
+    """Return the compiled scene of a maze. All worlds of a process share it and only read it.
 
-    It is what gymnasium-robotics makes of the same map, which it does by way of a file that it leaves behind.
+    It equals gymnasium-robotics' scene of the same map. That library leaves a file behind when it builds it.
     """
     specification = mujoco.MjSpec.from_file(str(_point_file()))
     for cell in _walls(colour):
@@ -57,20 +61,13 @@ def scene(colour: str) -> mujoco.MjModel:
 
 @functools.cache
 def scene_with_mass(colour: str, mass: float) -> mujoco.MjModel:
-    """Return the scene of a maze with a ball that is `mass` times as heavy; all perturbed worlds share it."""
+    """Return the scene of a maze whose ball is `mass` times as heavy; all perturbed worlds share it."""
     model = scene(colour)
     return with_mass(model, [int(model.body("particle").id)], mass)
 
 
-def camera() -> mujoco.MjvCamera:
-    """Return a camera above the maze: left is left, up is up, and all of it is in the picture."""
-    above = mujoco.MjvCamera()
-    above.distance, above.azimuth, above.elevation = 9.2, 90.0, -90.0
-    return above
-
-
 def _point_file() -> Path:
-    """Return the description of the ball. The package is not imported: it would load all its robots."""
+    """Return the file that describes the ball. Importing its package would load all its robots."""
     specification = importlib.util.find_spec("gymnasium_robotics")
     assert specification is not None
     assert specification.origin is not None
@@ -78,6 +75,6 @@ def _point_file() -> Path:
 
 
 def _walls(colour: str) -> list[Cell]:
-    """Return the cells that are walls, row by row, those around the maze included."""
+    """Return the cells with walls, row by row, including those around the maze."""
     around = range(-1, SIZE + 1)
     return [(row, column) for row in around for column in around if (row, column) not in MAZES[colour].free]

@@ -1,7 +1,8 @@
 """Layout of the state vector of the PointMaze world: 11 numbers, in metres and metres per second.
 
-The first 4 are the observation of gymnasium-robotics' PointMaze. The goal is not among them: only the words
-of the instruction tell it. x grows to the right, y upwards, as seen from above; (0, 0) is the maze's middle.
+The first 4 are the observation of gymnasium-robotics' PointMaze. The state does not contain the goal: only
+the instruction names it. Seen from above, x grows to the right and y upwards; (0, 0) is the middle of the
+maze.
 """
 
 from __future__ import annotations
@@ -20,6 +21,6 @@ PLACE = slice(0, 2)
 VELOCITY = slice(2, 4)
 """Velocity of the ball."""
 ROOM_AHEAD = slice(4, 8)
-"""Distance from the ball's centre to the wall on the right, on the left, above and below."""
+"""Distances from the ball's centre to the wall on the right, on the left, above and below."""
 COLOUR = slice(8, 11)
-"""1 for the colour of the walls, else 0: red, blue, green. Each maze has its own."""
+"""1 for the colour of the walls, else 0, in the order red, blue, green. Each maze has its own colour."""

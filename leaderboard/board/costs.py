@@ -1,4 +1,7 @@
-"""What a method costs, beside plain fine-tuning."""
+"""The costs of a method: from its records, and from the speed benchmark for the time of a step.
+
+All but `relative_cost` is made from the records alone.
+"""
 
 from __future__ import annotations
 
@@ -9,11 +12,8 @@ from pathlib import Path
 
 from clbench.scoring.intervals import Estimate
 
+from .places import STEP_TIME
 from .runs import Run, is_number
-
-STEP_TIME = Path("benchmarks/results/step_time.json")
-"""What the speed benchmark left, seen from the working directory."""
-
 
 COSTS = {
     "steps": "optimiser_steps",
@@ -22,16 +22,16 @@ COSTS = {
     "parameters_added": "parameters_added",
     "environment_steps": "environment_steps",
 }
-"""Column of the table, and where a record's costs have it."""
+"""Fields of `Record.costs` by column of the table."""
 
 
 def step_time_of(records: Path) -> Path:
-    """Return where it lies, seen from a folder of records: the same wherever the table is drawn."""
+    """Return the path of the benchmark's result for a folder of records, from any working directory."""
     return records.resolve().parents[1] / STEP_TIME
 
 
 def read_step_times(path: Path) -> dict[str, Estimate]:
-    """Return the time of a step divided by that of sft, by method; none if the file is not there or torn."""
+    """Return the time of a step over the baseline's, by method; empty if the file is missing or torn."""
     try:
         ratios = json.loads(path.read_text(encoding="utf-8"))["ratios"]
         found = {
@@ -50,15 +50,16 @@ def read_step_times(path: Path) -> dict[str, Estimate]:
 def costs_of(
     runs: Sequence[Run], baseline: Sequence[Run], times: Mapping[str, Estimate]
 ) -> dict[str, float | None]:
-    """Return what the runs of a method cost, each a mean over seeds.
+    """Return the costs of the runs of a method, each a mean over seeds.
 
-    `relative_cost` is the time of all its optimiser steps, those of its preparation included, divided by that
-    of sft: steps from the records, the time of one from the speed benchmark.
+    `relative_cost` is the time of all optimiser steps, preparation included, divided by the baseline's. The
+    number of steps comes from the records, the time of one step from the speed benchmark. Without a result of
+    that benchmark `relative_cost` is None, unless the method takes no steps.
 
     Args:
-        runs: The runs of the method.
-        baseline: Those of sft on the same scenario; there may be none.
-        times: Time of a step divided by that of sft, by method.
+        runs: Runs of the method.
+        baseline: Runs of plain fine-tuning on the same scenario; may be empty.
+        times: Time of a step divided by the baseline's, by method.
     """
     costs = {column: _mean(runs, name) for column, name in COSTS.items()}
     steps, usual = costs["steps"], _mean(baseline, "optimiser_steps")
@@ -72,7 +73,7 @@ def costs_of(
 
 
 def _mean(runs: Sequence[Run], name: str) -> float | None:
-    """Return the mean of a cost, None if a run does not say it as a number."""
-    values = [run.record.costs.get(name) for run in runs]
+    """Return the mean of a cost over runs, None if a run does not state it."""
+    values = [getattr(run.record.costs, name) for run in runs]
     numbers = [value for value in values if value is not None and is_number(value)]
     return math.fsum(numbers) / len(numbers) if numbers and len(numbers) == len(values) else None

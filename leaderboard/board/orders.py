@@ -1,4 +1,4 @@
-"""Order sensitivity: how much of a method's final average depends on the order that the targets come in."""
+"""Order sensitivity: how much a method's final average depends on the order of the targets."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from clbench.scoring.metrics import measure
 from .runs import Run
 
 LEAST_ORDERS = 3
-"""With fewer a range says next to nothing."""
+"""Fewest orders for a range; over fewer it means little."""
 
 
 @dataclass(frozen=True)
@@ -19,11 +19,11 @@ class Order:
     """One order of the targets."""
 
     number: int
-    """0 is the published one."""
+    """Number of the order; 0 is the published one."""
     targets: tuple[str, ...]
     """Names in the order in which they were learned."""
     final_average: float | None
-    """Mean over the seeds that all orders have."""
+    """Mean over the seeds that all orders share."""
 
 
 @dataclass(frozen=True)
@@ -31,13 +31,13 @@ class Orders:
     """One method with the targets in several orders: same pretrained policies, same initial states."""
 
     seeds: tuple[int, ...]
-    """Those that all orders have."""
+    """Seeds that all orders share."""
     orders: tuple[Order, ...]
-    """By number."""
+    """Orders by number."""
 
     @property
     def sensitivity(self) -> float | None:
-        """Greatest less least final average; None with fewer than `LEAST_ORDERS`, or where one is missing."""
+        """Greatest less least final average; None with fewer than `LEAST_ORDERS`, or if one is missing."""
         values = [order.final_average for order in self.orders if order.final_average is not None]
         if len(values) < max(LEAST_ORDERS, len(self.orders)):
             return None
@@ -45,7 +45,7 @@ class Orders:
 
 
 def orders_of(runs: Iterable[Run]) -> Orders:
-    """Return what came of the runs of one method, whatever their orders."""
+    """Return the orders among the runs of one method."""
     by_order: dict[int, dict[int, Run]] = {}
     for run in runs:
         by_order.setdefault(run.order, {})[run.seed] = run

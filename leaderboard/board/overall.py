@@ -22,7 +22,7 @@ class OverallRow:
     division: str
     """One of `DIVISIONS`."""
     ranks: tuple[int | None, ...]
-    """Its rank in each scenario, by the scenario's id."""
+    """Ranks in the scenarios, sorted by the scenario's id."""
     estimates: Mapping[str, Estimate]
     """Mean over scenarios and interval of every metric."""
 
@@ -56,7 +56,7 @@ def _overall_row(found: Mapping[str, Row]) -> OverallRow:
 def mean_estimate(parts: Sequence[Estimate]) -> Estimate:
     """Return the mean of independent estimates; a missing one leaves none.
 
-    The interval is recovered from those of the parts, whose distances from their values add up in squares:
+    The interval is recovered from the parts' intervals, whose distances from their values add up in squares:
     Zou and Donner 2008, doi 10.1002/sim.3095 (MOVER). Scenarios share neither policies nor episodes.
     """
     values = [one.value for one in parts if one.value is not None]

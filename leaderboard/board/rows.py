@@ -1,4 +1,7 @@
-"""Rows: what the leaderboard says of each method, in the order that it shows them."""
+"""Rows of the leaderboard, one for each method and scenario, in the order of the table.
+
+They are made from the records alone, but for `relative_cost`: see `costs`.
+"""
 
 from __future__ import annotations
 
@@ -7,11 +10,12 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
-from typing import Any
 
+from clbench.records.record import ScenarioInfo
 from clbench.scoring.intervals import Estimate, Runs, estimate, row_generator
 from clbench.scoring.metrics import METRICS
 from clbench.scoring.ranks import tie_groups
+from clbench.spec.references import BASELINE
 
 from .costs import COSTS, costs_of, read_step_times, step_time_of
 from .orders import Orders, orders_of
@@ -33,18 +37,19 @@ class Row:
     division: str
     """One of `DIVISIONS`."""
     rank: int | None
-    """Place inside its scenario and division, shared by rows that cannot be told apart. None for a reference,
+    """Rank inside its scenario and division, shared by rows that cannot be told apart. None for a reference,
     which does not compete, and for a row without a final average."""
     runs: tuple[Run, ...]
-    """Its runs by rising seed, with the targets in the published order: all but `orders` is of these."""
+    """Its runs with the targets in the published order, by rising seed. All but `orders` is made from
+    them."""
     tier: str
-    """The least of `TIERS` that its runs have: how far anyone but the submitter has checked them."""
+    """The lowest of `TIERS` among its runs: how far others than the submitter have checked them."""
     estimates: Mapping[str, Estimate]
     """Value and interval of every metric."""
     costs: Mapping[str, float | None]
     """Mean over seeds by column of the table."""
     orders: Orders
-    """What came of it with the targets in this and in other orders."""
+    """Its results with the targets in this and in other orders."""
 
     @property
     def seeds(self) -> tuple[int, ...]:
@@ -59,21 +64,21 @@ class Row:
 
 @dataclass(frozen=True)
 class Table:
-    """All that the leaderboard shows."""
+    """Everything that the leaderboard shows."""
 
-    scenarios: Mapping[str, Mapping[str, Any]]
-    """What the rows of each scenario have in common: `Record.scenario`."""
+    scenarios: Mapping[str, ScenarioInfo]
+    """`Record.scenario`, which the rows of a scenario share, by its id."""
     rows: tuple[Row, ...]
-    """By scenario, division and falling final average."""
+    """Rows by scenario, division and falling final average."""
     not_shown: tuple[NotShown, ...]
-    """By path."""
+    """Files that make no row, by path."""
 
 
 def read_table(records: Path) -> Table:
     """Return the table of the records anywhere below the folder `records`.
 
     Raises:
-        FileNotFoundError: There is no such folder.
+        FileNotFoundError: The folder does not exist.
     """
     if not records.is_dir():
         raise FileNotFoundError(f"There is no folder of records at {records}.")
@@ -113,7 +118,7 @@ def _scenario_rows(runs: list[Run], times: Mapping[str, Estimate]) -> list[Row]:
         ranks = tie_groups(RANKED_BY, competing)
         order = sorted(members, key=lambda method: (_falling(estimates[method][RANKED_BY]), method))
         for method in order:
-            costs = costs_of(members[method], by_method.get("sft", []), times)
+            costs = costs_of(members[method], by_method.get(BASELINE, []), times)
             scenario = members[method][0].scenario
             rows.append(
                 Row(
@@ -136,7 +141,7 @@ def _falling(one: Estimate) -> float:
 
 
 def _estimates(method: str, by_method: Mapping[str, list[Run]]) -> dict[str, Estimate]:
-    """Return every metric of a method, compared with the references among the methods of its scenario."""
+    """Return the estimates of every metric of a method, compared with the references of its scenario."""
     never_itself = {
         name for metric in METRICS.values() if not metric.compares_itself for name in metric.references
     }
@@ -154,7 +159,7 @@ def _scores(runs: Iterable[Run]) -> Runs:
 
 
 def rank_mates(row: Row, rows: Iterable[Row]) -> tuple[int, list[str]]:
-    """Return how many of `rows` are in the division of `row`, and the methods that share its rank there."""
+    """Return the number of `rows` in the division of `row`, and the methods that share its rank there."""
     division = [other for other in rows if other.division == row.division]
     return len(division), [other.method for other in division if other.rank == row.rank and other is not row]
 

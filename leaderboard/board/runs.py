@@ -1,4 +1,4 @@
-"""Runs from records: which of them may be compared, and why the others may not."""
+"""Runs from records: which may be compared, and why the others may not."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from typing import Any
 
 from clbench.records.paths import label_of, record_name
 from clbench.records.reader import RecordError, read_record
-from clbench.records.record import Record
+from clbench.records.record import Record, RunInfo, ScenarioInfo
 from clbench.scoring.layout import Layout
 from clbench.scoring.scores import Scores
 from clbench.spec.identifiers import built_in_methods
@@ -23,17 +23,18 @@ from clbench.spec.scenario import target_order
 from .tiers import tier_of
 
 DIVISIONS = ("prior-data-free", "prior questions", "prior demonstrations", "online", "reference")
-"""In the order of the table: what a method may look at again; agents that learned by trial and not from
-demonstrations, with which no method is compared; guides that do not compete."""
+"""Divisions in the order of the table: the first three by the prior data that a method may use; "online" for
+agents that learned by trial instead of from demonstrations, with which no method is compared; "reference" for
+guides that do not compete."""
 
 METHODS = DIVISIONS[:3]
-"""Divisions of methods: they start from the same policy and learn from the same demonstrations."""
+"""Divisions of methods, which start from the same policy and learn from the same demonstrations."""
 
 ACCESS = ("never", "prepare", "throughout")
-"""When a method may touch prior data."""
+"""Values of `Record.run.uses`: when a method may use prior data."""
 
 LONGEST_REASON = 300
-"""Characters of a reason that are shown: an error's message may be a page."""
+"""Characters of a reason that are shown; an error's message may be a page long."""
 
 
 @dataclass(frozen=True)
@@ -41,9 +42,9 @@ class NotShown:
     """A file that makes no row."""
 
     path: str
-    """Relative to the folder of records."""
+    """Path from the folder of records."""
     reason: str
-    """Why, in words."""
+    """Reason, in words."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,28 +52,36 @@ class Run:
     """A record that may become part of a row."""
 
     path: str
+    """Path of its record from the folder of records."""
     record: Record
+    """The record."""
     scores: Scores
+    """Scores of the record."""
     scenario: str
+    """Gymnasium id."""
     method: str
+    """The method with its changed hyper-parameters, see `label_of`."""
     seed: int
+    """Seed of the run."""
     division: str
+    """One of `DIVISIONS`."""
     tier: str
     """One of `TIERS`."""
     order: int
-    """In which the targets were learned; 0 is the published one."""
-    published: dict[str, Any]
+    """Order in which the targets were learned; 0 is the published one."""
+    published: ScenarioInfo
     """`Record.scenario` with the targets in their published order."""
 
 
 Sifted = tuple[list[Run], list[NotShown]]
+"""Runs that may be compared, and the files that may not."""
 
 Sift = Callable[[list[Run]], Sifted]
-"""What tells runs that may be compared from those that may not."""
+"""Function that keeps the runs that may be compared with each other."""
 
 
 def read_runs(folder: Path, read: Callable[[Path, Path], Run], sifts: Iterable[Sift]) -> Sifted:
-    """Return the runs of the records below `folder`, sifted, and the files that are none."""
+    """Return the runs of the records below `folder` that pass all sifts, and the files that are refused."""
     runs: list[Run] = []
     refused: list[NotShown] = []
     for path in sorted(_files(folder), key=lambda path: path.relative_to(folder).as_posix()):
@@ -88,7 +97,7 @@ def read_runs(folder: Path, read: Callable[[Path, Path], Run], sifts: Iterable[S
 
 
 def _files(folder: Path) -> Iterator[Path]:
-    """Yield what has the name of a record, and symbolic links to folders: they are not followed."""
+    """Yield files named like records, and symbolic links to folders, which are not followed."""
     for parent, folders, names in os.walk(folder):
         for name in (*folders, *names):
             path = Path(parent, name)
@@ -99,16 +108,16 @@ def _files(folder: Path) -> Iterator[Path]:
 def read_run(folder: Path, path: Path, split: Split = "test", changed: bool | None = False) -> Run:
     """Return the run of the record at `path`, below `folder`.
 
-    It must lie where a run writes it: the names of files tell which rows they can change.
+    The file must have the path that a run gives it, so that its name shows which row it can change.
 
     Args:
         folder: Folder of the records.
-        path: The file.
-        split: Episodes that it must have been evaluated on: those of a tuning run are of "validation".
-        changed: Whether it must be of changed settings; None if it may.
+        path: Path of the file.
+        split: Split that the run must have been evaluated on: "validation" for a tuning run.
+        changed: Whether its settings must have been changed; None if they may.
 
     Raises:
-        RecordError: It cannot be read, failed, is not of what is compared, or claims what cannot be.
+        RecordError: It cannot be read, its run failed or is of another kind, or it contradicts itself.
     """
     record = read_record(path)
     if record.error is not None:
@@ -116,54 +125,53 @@ def read_run(folder: Path, path: Path, split: Split = "test", changed: bool | No
         raise RecordError(f"the run failed ({what}).")
     run, name = record.run, path.relative_to(folder).as_posix()
     _check_kind(run, split, changed)
-    label = label_of(run["method"], run["changes"])
+    label = label_of(run.method, run.changes)
     home = _home(run, label)
-    if record.scenario["id"] != run["scenario"]:
-        raise RecordError(f"scenario: its id is {record.scenario['id']!r}, but {run['scenario']!r} was run.")
+    if record.scenario.id != run.scenario:
+        raise RecordError(f"scenario: its id is {record.scenario.id!r}, but {run.scenario!r} was run.")
     _check_settings(run)
-    division = division_of(run["uses"])
+    division = division_of(run.uses)
     if name != home:
         raise RecordError(f"it is the record of {home}, and must lie there.")
-    scores, order, published = Scores.from_record(record), run.get("order", 0), _published(record)
+    scores, published = Scores.from_record(record), _published(record)
     return Run(
-        name, record, scores, run["scenario"], label, run["seed"], division, tier_of(path), order, published
+        name, record, scores, run.scenario, label, run.seed, division, tier_of(path), run.order, published
     )
 
 
-def _published(record: Record) -> dict[str, Any]:
+def _published(record: Record) -> ScenarioInfo:
     """Return `Record.scenario` with the targets in their published order."""
-    targets = record.scenario["target"]
+    targets = record.scenario.target
     try:
-        places = target_order(len(targets), record.run.get("order", 0))
+        places = target_order(len(targets), record.run.order)
     except ValueError as error:
         raise RecordError(f"run: {error}") from error
-    return {**record.scenario, "target": [name for _, name in sorted(zip(places, targets, strict=True))]}
+    target = [name for _, name in sorted(zip(places, targets, strict=True))]
+    return dataclasses.replace(record.scenario, target=target)
 
 
-def _home(run: dict[str, Any], label: str) -> str:
-    """Return the place of the record of `run`, seen from the folder of records."""
-    if run["seed"] < 0:
-        raise RecordError(f"run: {run['seed']} cannot be a seed.")
+def _home(run: RunInfo, label: str) -> str:
+    """Return the path of the record of `run` from the folder of records."""
+    if run.seed < 0:
+        raise RecordError(f"run: {run.seed} cannot be a seed.")
     try:
-        return record_name(run["scenario"], label, run["seed"], run.get("order", 0)).as_posix()
+        return record_name(run.scenario, label, run.seed, run.order).as_posix()
     except ValueError as error:
         raise RecordError(f"run: {error}") from error
 
 
-def _check_settings(run: dict[str, Any]) -> None:
-    """Refuse settings that cannot be: a built-in method has its own, but for the changed ones."""
-    method, settings, changes = run["method"], run["settings"], run["changes"]
+def _check_settings(run: RunInfo) -> None:
+    """Refuse impossible settings: a built-in method has its defaults, but for the changes."""
+    method, settings, changes = run.method, run.settings, run.changes
     lost = [name for name in changes if name not in settings or settings[name] != changes[name]]
     if lost:
         raise RecordError(f"run: changes and settings differ in {', '.join(lost)}.")
     if method not in built_in_methods():
         return
     uses, defaults = _declared(method)
-    if run["uses"] != uses:
-        raise RecordError(
-            f"run: uses are not those of {method}: {', '.join(differences(run['uses'], uses))}."
-        )
-    # one that is missing here came later, with a default that changes nothing
+    if run.uses != uses:
+        raise RecordError(f"run: uses are not those of {method}: {', '.join(differences(run.uses, uses))}.")
+    # a setting that is missing here was added later, with a default that changes nothing
     wrong = [
         name
         for name, value in settings.items()
@@ -175,28 +183,28 @@ def _check_settings(run: dict[str, Any]) -> None:
 
 @cache
 def _declared(method: str) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return what a built-in method uses, and its hyper-parameters with their defaults."""
+    """Return the prior data that a built-in method uses, and its hyper-parameters with their defaults."""
     cls = built_in_methods()[method].load()
     return dataclasses.asdict(cls.uses), dataclasses.asdict(cls())
 
 
-def _check_kind(run: dict[str, Any], split: Split, changed: bool | None) -> None:
-    """Refuse a run of another split, or with other settings than asked for."""
-    if split == "test" and run.get("split") == "validation":
+def _check_kind(run: RunInfo, split: Split, changed: bool | None) -> None:
+    """Refuse a run of another split, or with changed settings where none are expected, or the reverse."""
+    if split == "test" and run.split == "validation":
         raise RecordError("it is a tuning run: its episodes may be chosen on.")
-    if split == "validation" and run.get("split") == "test":
+    if split == "validation" and run.split == "test":
         raise RecordError("it is no tuning run: its episodes are reported.")
-    if changed is False and run["changes"]:
-        raise RecordError(f"settings were changed: {', '.join(run['changes'])}.")
-    if changed is True and not run["changes"]:
+    if changed is False and run.changes:
+        raise RecordError(f"settings were changed: {', '.join(run.changes)}.")
+    if changed is True and not run.changes:
         raise RecordError("no setting was changed: its place is among the records of the board.")
 
 
 def division_of(uses: dict[str, Any]) -> str:
-    """Return what a method that declares `uses` competes with.
+    """Return the division of a method that declares `uses`.
 
     Raises:
-        RecordError: It is no declaration.
+        RecordError: `uses` is no valid declaration.
     """
     kinds = ("demonstrations", "questions")
     if "online" in uses:
@@ -217,6 +225,7 @@ def division_of(uses: dict[str, Any]) -> str:
 
 
 def no_row(path: str, reason: str) -> NotShown:
+    """Return a file that makes no row, with printable texts of limited length."""
     reason = printable(reason)
     reason = reason if len(reason) <= LONGEST_REASON else f"{reason[:LONGEST_REASON]}…"
     return NotShown(printable(path), reason)
@@ -229,17 +238,21 @@ def printable(text: str) -> str:
 
 
 def same_scenario(runs: list[Run]) -> Sifted:
+    """Keep the runs whose scenario is the usual one, targets compared in their published order."""
+
     def reason(run: Run, other: Run) -> str:
-        fields = differences(run.published, other.published)
+        fields = differences(vars(run.published), vars(other.published))
         if fields == ["budget"]:
-            ours, theirs = run.published["budget"], other.published["budget"]
+            ours, theirs = run.published.budget, other.published.budget
             fields = [f"budget ({', '.join(differences(ours, theirs))})"]
         return f"its scenario is not that of most records: {', '.join(fields)} differ."
 
-    return _most(runs, lambda run: run.scenario, lambda run: _text(run.published), reason)
+    return _most(runs, lambda run: run.scenario, lambda run: _text(vars(run.published)), reason)
 
 
 def same_simulator(runs: list[Run]) -> Sifted:
+    """Keep the runs whose worlds move in the usual way, by the hashes of their rollouts."""
+
     def rollouts(run: Run) -> Any:
         return run.record.fingerprint.get("rollouts")
 
@@ -251,8 +264,10 @@ def same_simulator(runs: list[Run]) -> Sifted:
 
 
 def same_layout(runs: list[Run]) -> Sifted:
+    """Keep the runs that were evaluated on the usual episodes, points and questions."""
+
     def layout(run: Run) -> Layout:
-        return dataclasses.replace(run.scores.layout, target=tuple(run.published["target"]))
+        return dataclasses.replace(run.scores.layout, target=tuple(run.published.target))
 
     def reason(run: Run, other: Run) -> str:
         fields = differences(vars(layout(run)), vars(layout(other)))
@@ -262,11 +277,13 @@ def same_layout(runs: list[Run]) -> Sifted:
 
 
 def same_settings(runs: list[Run]) -> Sifted:
+    """Keep the runs of each method whose settings, uses and device are the usual ones."""
+
     def parts(run: Run) -> list[dict[str, Any]]:
-        told = run.record.run
-        # one that is missing in an older record came later, with a default that changes nothing
-        defaults = _declared(told["method"])[1] if told["method"] in built_in_methods() else {}
-        return [{**defaults, **told["settings"]}, told["uses"], {"device": told["device"]}]
+        info = run.record.run
+        # a setting that an older record lacks was added later, with a default that changes nothing
+        defaults = _declared(info.method)[1] if info.method in built_in_methods() else {}
+        return [{**defaults, **info.settings}, info.uses, {"device": info.device}]
 
     def reason(run: Run, other: Run) -> str:
         both = zip(parts(run), parts(other), strict=True)
@@ -277,7 +294,7 @@ def same_settings(runs: list[Run]) -> Sifted:
 
 
 ALIKE: tuple[Sift, ...] = (same_scenario, same_simulator, same_layout, same_settings)
-"""What runs must have in common to be compared."""
+"""What runs must share to be compared."""
 
 
 def _most(
@@ -288,8 +305,8 @@ def _most(
 ) -> Sifted:
     """Keep the runs that have the usual trait of their group.
 
-    That is the one which most runs of built-in methods have, then most runs: no number of records of other
-    methods moves those off the board. Of equally frequent ones it is the first met.
+    The usual trait is the one that most runs of built-in methods have, then most runs: no number of records
+    of other methods can move theirs off the board. Among equally frequent traits the first one counts.
     """
     members: dict[Hashable, dict[Hashable, list[Run]]] = {}
     for run in runs:
@@ -301,7 +318,7 @@ def _most(
 
 
 def _weight(runs: list[Run]) -> tuple[int, int]:
-    built_in = [run for run in runs if run.record.run["method"] in built_in_methods()]
+    built_in = [run for run in runs if run.record.run.method in built_in_methods()]
     return len(built_in), len(runs)
 
 

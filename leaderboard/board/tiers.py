@@ -1,7 +1,7 @@
 """Tiers: how far a record was checked, and by whom.
 
-A record itself is never touched. `clbench verify` writes what it found into a file beside it, which holds for
-the bytes that it saw: the tier of a record that was changed afterwards is lost.
+The record itself is never touched. `clbench verify` writes its findings into a file next to the record. They
+hold for the bytes that it read: a record that is changed afterwards loses its tier.
 """
 
 from __future__ import annotations
@@ -12,12 +12,12 @@ from pathlib import Path
 from clbench.base.strict_json import read_json
 
 TIERS = ("self-reported", "recomputed", "replayed", "retrained")
-"""What was done to believe a record: nothing; its metrics were computed again from its episodes; some of its
-episodes were run again; the whole run was."""
+"""Checks of a record, from none: its metrics were computed again from its episodes; some of its episodes were
+run again; the whole run was repeated."""
 
 
 def verification_path(record: Path) -> Path:
-    """Return where the verification of the record at `record` lies."""
+    """Return the path of the verification of the record at `record`."""
     return record.with_suffix(".verified")
 
 

@@ -1,1 +1,1 @@
-"""The claims of the papers, judged from records: evidence -> figures -> judges -> page."""
+"""The claims of the papers, judged from records: evidence -> figures -> claims -> judges."""

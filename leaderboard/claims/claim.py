@@ -1,8 +1,8 @@
-"""What a claim is: words of a paper, and a rule that judges them from records.
+"""A claim: the words of a paper, and a rule that judges them from records.
 
-A new claim is one function with the decorator `claim`; the page, the table and the tests find it by itself.
-Its docstring is the claim in our words. A comparison with a missing figure is never true, so that what is
-missing makes a claim "cannot be told".
+A new claim is one function with the decorator `claim` in the module of its paper; its docstring is the claim
+in our words. A comparison with a missing figure is never true, so a missing figure leaves a claim
+undecided.
 """
 
 from __future__ import annotations
@@ -14,35 +14,35 @@ from typing import Literal
 
 from .evidence import Evidence, Figure
 
-Verdict = Literal["holds", "does not hold", "cannot be told"]
+Verdict = Literal["holds", "does not hold", "undecided"]
 
 
 @dataclass(frozen=True)
 class Paper:
-    """Where claims come from."""
+    """Source of claims."""
 
     name: str
-    """Of its method."""
+    """Name of its method."""
     arxiv: tuple[str, ...]
-    """Identifiers."""
+    """Identifiers on arXiv."""
 
 
 @dataclass(frozen=True)
 class Finding:
-    """What the records say to a claim."""
+    """What the records show about a claim."""
 
     verdict: Verdict
-    """By the claim's rule."""
+    """Verdict by the claim's rule."""
     figures: tuple[Figure, ...] = ()
-    """What was measured; the first one stands for all in short tables."""
+    """Measured figures; short tables show the first one."""
     controls: tuple[Figure, ...] = ()
-    """The same of what could explain it."""
+    """The same figures of methods that could explain the result."""
     sentences: tuple[str, ...] = ()
-    """What follows from the figures."""
+    """Conclusions from the figures."""
     about: tuple[str, ...] = ()
-    """Methods that it is about, besides the first of each figure."""
+    """Methods of the claim, besides the first method of each figure."""
     missing: tuple[str, ...] = ()
-    """What no record can tell yet, in words."""
+    """What no record can show yet, in words."""
 
 
 @dataclass(frozen=True)
@@ -50,65 +50,60 @@ class Claim:
     """A claim of a paper, with the rule that judges it."""
 
     id: str
-    """As C1."""
+    """Identifier on the page, for example "C1"."""
     paper: Paper
-    """Where it comes from."""
+    """Paper that makes the claim."""
     words: str
     """The claim in our words."""
     reported: str
     """The paper's figure."""
     rule: str
-    """When it holds and when it does not; otherwise it cannot be told."""
+    """When the claim holds and when it does not; in all other cases it is undecided."""
     judge: Callable[[Evidence], Finding]
-    """The rule."""
-
-
-CLAIMS: dict[str, Claim] = {}
-"""All claims by id, in the order of the page."""
+    """Function that applies the rule."""
 
 
 def claim(
     identifier: str, paper: Paper, *, reported: str, rule: str
-) -> Callable[[Callable[[Evidence], Finding]], Callable[[Evidence], Finding]]:
-    """Return a decorator that enters a function as the judge of a claim; its docstring is the claim."""
+) -> Callable[[Callable[[Evidence], Finding]], Claim]:
+    """Return a decorator that makes a claim of the function that judges it; its docstring is the claim."""
 
-    def enter(judge: Callable[[Evidence], Finding]) -> Callable[[Evidence], Finding]:
+    def enter(judge: Callable[[Evidence], Finding]) -> Claim:
         words = " ".join((judge.__doc__ or "").split())
-        CLAIMS[identifier] = Claim(identifier, paper, words, reported, rule, judge)
-        return judge
+        return Claim(identifier, paper, words, reported, rule, judge)
 
     return enter
 
 
-# ---- what rules are made of --------------------------------------------------------------------------------
+# ---- parts of rules ----------------------------------------------------------------------------------------
 
 
 def decided(*, holds: bool, fails: bool) -> Verdict:
     """Return the verdict of a rule."""
-    return "holds" if holds else "does not hold" if fails else "cannot be told"
+    return "holds" if holds else "does not hold" if fails else "undecided"
 
 
 def either(
     figures: Sequence[Figure], *, holds: Callable[[Figure], bool], fails: Callable[[Figure], bool]
 ) -> tuple[Verdict, tuple[str, ...]]:
-    """Return the verdict of a claim that holds for any of the figures, and the sentence that says which."""
+    """Return the verdict of a claim that holds for any of the figures, and the sentence that names which."""
     holding = [figure.methods[0] for figure in figures if holds(figure)]
     verdict = decided(holds=bool(holding), fails=all(map(fails, figures)))
     return verdict, (f"It holds for {' and '.join(holding)}.",) if holding else ()
 
 
 def compared(control: Figure, method: Figure, *, does_as_well: str) -> str:
-    """Return the sentence that a control gives to the figure that it is to explain; higher is better."""
+    """Return the sentence that compares a control with a method's figure; higher is better."""
     name, subject = control.methods[0], method.methods[0]
     if math.isnan(control.high) or math.isnan(method.low):
-        return f"Whether {name} does the same as {subject} cannot be told."
+        return f"The records cannot show whether {name} does as well as {subject}."
     if control.high >= method.low:
-        return f"{name} does the same as {subject}: {does_as_well}."
-    return f"{name} does not reach {subject}: that does not explain it."
+        return f"{name} does as well as {subject}: {does_as_well}."
+    return f"{name} does not reach {subject}, so it does not explain the result."
 
 
 def compared_gains(control: Figure, method: Figure, *, does_as_well: str) -> str:
-    """Return the same where the figures are gains over sft, and there may be none to explain."""
+    """Return the same sentence for gains over sft, where there may be no gain to explain."""
     if method.low <= 0:
         return f"{method.methods[0]} has no certain gain over sft that {control.methods[0]} could explain."
     return compared(control, method, does_as_well=does_as_well)

@@ -1,4 +1,4 @@
-"""Evidence: the runs of a scenario, those with changed settings included, and figures that compare them."""
+"""Evidence: the runs of a scenario, including runs with changed settings, and figures that compare them."""
 
 from __future__ import annotations
 
@@ -31,23 +31,18 @@ from ..board.runs import (
     read_run,
     read_runs,
 )
-from ..views.table import title_of
-
-SCENARIO = "clbench/Fetch-v0"
-CONTROLS = Path("leaderboard/controls")
-"""Where things lie, seen from the working directory. Pages name these, wherever they were read from."""
 
 LEAST_SEEDS = 2
-"""With one seed an interval says nothing of other seeds: it is shown, but decides nothing."""
+"""An interval of one seed does not cover other seeds: it is shown but decides nothing."""
 
 NO_ESTIMATE = Estimate(None, None, None)
 
 Of = Mapping[str, Rates]
-"""Rates by label of the method: the same seeds and the same draws of them, batch axes (..., runs)."""
+"""Rates by label of the method: same seeds, same draws, batch axes (..., runs)."""
 Quantity = Callable[[Of], Array]
-"""What is measured: rates with batch axes (..., runs) become values (...)."""
+"""Maps rates with batch axes (..., runs) to values (...)."""
 Table = Callable[[Rates], Array]
-"""What a policy is at the points of each stage: rates (...) become values (..., targets, points)."""
+"""Maps rates (...) to values at the points of each stage (..., targets, points)."""
 
 
 @dataclass(frozen=True)
@@ -55,33 +50,33 @@ class Figure:
     """One measured number."""
 
     what: str
-    """What was measured, and of which methods."""
+    """Name of the figure, with its methods."""
     methods: tuple[str, ...]
-    """Labels of the methods: the one it is about, then what that is compared with, then references."""
+    """Labels of the methods: the subject first, then the methods it is compared with, then references."""
     estimate: Estimate
-    """The number with its interval."""
+    """Value with its interval."""
     seeds: tuple[int, ...] = ()
-    """Seeds that it is from; none if it is no matter of seeds."""
+    """Seeds of the figure; empty if it does not depend on seeds."""
     missing: tuple[str, ...] = ()
-    """Labels that there are no runs of, or "step time"."""
+    """Labels without runs, or "step time"."""
     note: str = ""
-    """What restricts it."""
+    """Restriction of the figure, in words."""
     form: str = ".2f"
-    """How the number is written."""
+    """Format of the number."""
 
     @property
     def value(self) -> float:
-        """The number, NaN if it is missing: no comparison with it is true."""
+        """The value, NaN if it is missing, so that no comparison with it is true."""
         return math.nan if self.estimate.value is None else self.estimate.value
 
     @property
     def low(self) -> float:
-        """Lower end of the interval, NaN if there is none that counts."""
+        """Lower end of the interval, NaN if no interval counts."""
         return self._end(self.estimate.low)
 
     @property
     def high(self) -> float:
-        """Upper end of the interval, NaN if there is none that counts."""
+        """Upper end of the interval, NaN if no interval counts."""
         return self._end(self.estimate.high)
 
     def _end(self, end: float | None) -> float:
@@ -90,16 +85,16 @@ class Figure:
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """All runs of one scenario that may be compared, and what each step of a method takes."""
+    """All comparable runs of one scenario, and the time that a step of each method takes."""
 
     scenario: str
     """Gymnasium id."""
     runs: Mapping[str, Mapping[int, Run]]
-    """By label of the method, as "lora" and "lora+rank=4", and by seed."""
+    """Runs by label of the method ("lora", "lora+rank=4") and by seed."""
     step_times: Mapping[str, Estimate]
     """Median time of a step divided by that of sft, by method."""
     not_used: tuple[NotShown, ...]
-    """Records that stand for nothing here."""
+    """Records that are left out, with their reasons."""
 
     # ---- figures of scores -------------------------------------------------------------------------
 
@@ -112,14 +107,14 @@ class Evidence:
         span: tuple[float, float] = (-math.inf, math.inf),
         **rest: Any,
     ) -> Figure:
-        """Return `quantity` with its interval, from the seeds that all methods have.
+        """Return `quantity` with its interval, over the seeds that all methods have.
 
         Args:
-            what: Name of the figure.
-            quantity: What is measured.
-            methods: Labels of all methods that it looks at, the one that it is about first.
-            seeds: Those to take of the common ones; all if None.
-            span: Least and greatest possible value.
+            what: Name of the figure; it seeds the interval.
+            quantity: Function of the rates.
+            methods: Labels of all methods that `quantity` reads, the subject first.
+            seeds: Seeds to use; all common seeds if None.
+            span: Smallest and largest possible value.
             rest: Further fields of the figure.
         """
         methods = tuple(dict.fromkeys(methods))
@@ -130,49 +125,49 @@ class Evidence:
             generator = row_generator(self.scenario, what)
             found = bootstrap(quantity, self._scores(methods, common), generator, span=span)
         if not missing and not common:
-            rest.setdefault("note", "no seed that all of them have")
+            rest.setdefault("note", "the methods have no seed in common")
         elif not missing and found.value is None:
             rest.setdefault("note", "not measured in these records")
         elif not missing and len(common) < LEAST_SEEDS:
-            rest.setdefault("note", "one seed: the interval says nothing of others and decides nothing")
+            rest.setdefault("note", "one seed: the interval does not cover other seeds and decides nothing")
         return Figure(what, methods, found, common, missing, **rest)
 
     def _scores(self, methods: Iterable[str], seeds: Iterable[int]) -> dict[str, list[Scores]]:
         return {label: [self.runs[label][seed].scores for seed in seeds] for label in methods}
 
     def common_seeds(self, methods: Iterable[str]) -> tuple[int, ...]:
-        """Return the seeds that all methods have a run of."""
+        """Return the seeds for which all methods have a run."""
         seeds = [set(self.runs.get(label, {})) for label in methods]
         return tuple(sorted(set.intersection(*seeds))) if seeds else ()
 
     def rates(self, methods: Iterable[str], seeds: Iterable[int]) -> Of:
-        """Return the rates of the runs as they are, batch axes (runs,)."""
+        """Return the rates of the runs, batch axes (runs,)."""
         return {label: rates_of(runs, {}) for label, runs in self._scores(methods, seeds).items()}
 
     def metric(self, name: str, method: str, **rest: Any) -> Figure:
         """Return a metric of one method."""
         metric = load_metric(name)
-        what, span = f"{title_of(name)} of {method}", (metric.low, metric.high)
+        what, span = f"{_words(name)} of {method}", (metric.low, metric.high)
         return self.figure(what, measured(name, method), method, *metric.references, span=span, **rest)
 
     def difference(self, name: str, method: str, other: str, **rest: Any) -> Figure:
-        """Return a metric of one method minus that of another."""
+        """Return the difference of a metric between two methods."""
         one, two = measured(name, method), measured(name, other)
         metric = load_metric(name)
         methods, reach = (method, other, *metric.references), metric.high - metric.low
-        what = f"{title_of(name)}, {method} - {other}"
+        what = f"{_words(name)}, {method} - {other}"
         return self.figure(what, lambda of: one(of) - two(of), *methods, span=(-reach, reach), **rest)
 
     def matched_difference(self, name: str, table: Table, method: str, other: str, **rest: Any) -> Figure:
         """Return the difference of two methods where each has learned the target about as well as sft.
 
-        The mean is over the stages in which both do, for each seed, then over the seeds that have any.
+        The mean is over the stages in which both reach such a point, for each seed, then over seeds.
 
         Args:
-            name: What the table holds.
-            table: What is compared.
-            method: The one that it is about.
-            other: What it is compared with.
+            name: Name of the compared values.
+            table: Function that gives the compared values.
+            method: Label of the method.
+            other: Label of the method it is compared with.
             rest: Further fields of the figure.
         """
         methods = tuple(dict.fromkeys((method, other, "sft")))
@@ -194,7 +189,7 @@ class Evidence:
 
     def cost(self, name: str, method: str, what: str, form: str = ",.0f") -> Figure:
         """Return the mean of a cost over seeds."""
-        return self._mean_of(method, what, lambda run: [run.record.costs.get(name)], form)
+        return self._mean_of(method, what, lambda run: [getattr(run.record.costs, name)], form)
 
     def diagnostic(self, name: str, method: str, what: str, form: str = ".2f") -> Figure:
         """Return the mean of a diagnostic over stages and seeds, with its interval over seeds."""
@@ -209,8 +204,9 @@ class Evidence:
         """Return the share of a run's optimiser steps that its preparation took, mean over seeds."""
 
         def share(run: Run) -> Sequence[Any]:
-            steps, taken = (run.record.costs.get(name) for name in ("optimiser_steps", "preparation_steps"))
-            return [taken / steps] if is_number(taken) and is_number(steps) and steps else []
+            costs = run.record.costs
+            steps, taken = costs.optimiser_steps, costs.preparation_steps
+            return [taken / steps] if taken is not None and steps else []
 
         return self._mean_of(method, f"share of the optimiser steps that prepare {method}", share, ".1%")
 
@@ -226,7 +222,7 @@ class Evidence:
         return Figure(what, (method,), estimate, tuple(runs), (), "", form)
 
     def step_time(self, method: str) -> Figure:
-        """Return how much longer a step of the method takes than one of sft."""
+        """Return the time of a step of the method, divided by that of sft."""
         found = self.step_times.get(method)
         missing = () if found else ("step time",)
         what = f"time of a step of {method} divided by sft's"
@@ -234,23 +230,28 @@ class Evidence:
 
 
 def number_mean(values: Sequence[Any]) -> float:
-    """Return the mean of `values`, NaN if there is none or one is no number that can be."""
+    """Return the mean of `values`, NaN if there are none or one is not a usable number."""
     if not values or not all(is_number(value) for value in values):
         return math.nan
     return math.fsum(values) / len(values)
+
+
+def _words(name: str) -> str:
+    """Return a metric in the name of a figure, which seeds its interval: a title of the pages may change."""
+    return name.replace("_", " ")
 
 
 # ---- quantities --------------------------------------------------------------------------------------------
 
 
 def measured(name: str, method: str) -> Quantity:
-    """Return the quantity that is a metric of `method`, whose references are the methods beside it."""
+    """Return a metric of `method` as a quantity; the other methods are its references."""
     metric = load_metric(name)
     return lambda of: metric.over_runs(replace(of[method], references=of))
 
 
 def at_matched_points(table: Table, of: Of, method: str) -> Array:
-    """Return the values (..., targets) where each target is first learned about as well as by sft."""
+    """Return the values (..., targets) where each target is first learned about as well as with sft."""
     rates = replace(of[method], references=of)
     points = matched_points(rates)
     chosen = np.nan_to_num(points).astype(np.int64)[..., None]
@@ -259,7 +260,7 @@ def at_matched_points(table: Table, of: Of, method: str) -> Array:
 
 
 def _mean(values: Array) -> Array:
-    """Return the mean along the last axis of what is not NaN, NaN where nothing is."""
+    """Return the mean of the finite values along the last axis, NaN where there are none."""
     known = np.isfinite(values)
     counts = known.sum(axis=-1)
     total = np.where(known, values, 0.0).sum(axis=-1)
@@ -270,7 +271,7 @@ def _mean(values: Array) -> Array:
 
 
 def read_evidence(scenario: str, records: Path, controls: Path, step_time: Path) -> Evidence:
-    """Return what there is; folders and files that are not there hold nothing."""
+    """Return the evidence in the folders and files; missing ones count as empty."""
     scored, refused = read_runs(records, read_run, ALIKE)
     changed, refused_controls = read_runs(controls, partial(read_run, changed=True), (_like(scored), *ALIKE))
     runs: dict[str, dict[int, Run]] = {}
@@ -287,13 +288,13 @@ def read_evidence(scenario: str, records: Path, controls: Path, step_time: Path)
 
 
 def _like(scored: Sequence[Run]) -> Sift:
-    """Return what keeps the runs that were made and evaluated as those of the board were."""
+    """Return the sift that keeps runs that were made and evaluated like those of the board."""
     examples = {run.scenario: run for run in scored}
 
     def traits(run: Run) -> dict[str, Any]:
         return {
             **vars(run.scores.layout),
-            **run.published,
+            **vars(run.published),
             "rollouts": run.record.fingerprint.get("rollouts"),
         }
 

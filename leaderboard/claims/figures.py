@@ -1,4 +1,4 @@
-"""Figures that several claims look at."""
+"""Figures that several claims use."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def sparsity(rates: Rates) -> Array:
 
 
 def retention_drop(evidence: Evidence, method: str) -> Figure:
-    """Return what is lost of the success on the retained skills from the pretrained policy to the end."""
+    """Return the drop in success on the retained skills from the pretrained policy to the end."""
 
     def drop(of: Of) -> Array:
         kept = average(of[method].retained)
@@ -33,7 +33,7 @@ def retention_drop(evidence: Evidence, method: str) -> Figure:
 
 
 def question_drop(evidence: Evidence, method: str) -> Figure:
-    """Return what is lost of the accuracy on questions from the pretrained policy to the end."""
+    """Return the drop in question accuracy from the pretrained policy to the end."""
 
     def drop(of: Of) -> Array:
         return average(_accuracy(of[method], 0) - _accuracy(of[method], -1))
@@ -43,7 +43,7 @@ def question_drop(evidence: Evidence, method: str) -> Figure:
 
 
 def answer_curve(evidence: Evidence, method: str) -> list[Figure]:
-    """Return the same after each evaluated step of the first target."""
+    """Return the drop in question accuracy after each evaluated step of the first target."""
     runs = evidence.runs.get(method, {})
     steps = next(iter(runs.values())).scores.layout.steps if runs else ()
 
@@ -61,7 +61,7 @@ def answer_curve(evidence: Evidence, method: str) -> list[Figure]:
 
 
 def _accuracy(rates: Rates, stage: int) -> Array:
-    """Return the share of right answers at the end of a stage, NaN where nothing was asked."""
+    """Return the share of correct answers at the end of a stage, NaN where no question was asked."""
     asked, correct = rates.asked[..., stage, :].sum(axis=-1), rates.correct[..., stage, :].sum(axis=-1)
     return np.where(asked > 0, correct / np.maximum(asked, 1), np.nan)
 
@@ -82,7 +82,7 @@ def sparsity_after(evidence: Evidence, method: str) -> tuple[Figure, Figure]:
 
 
 def matched_retention(evidence: Evidence, method: str, other: str) -> Figure:
-    """Return the difference of retention where both have learned the target about as well as sft."""
+    """Return the difference in retention where both methods have learned the target about as well as sft."""
     return evidence.matched_difference("retention", retained, method, other)
 
 
@@ -97,5 +97,5 @@ def drift_ratio(evidence: Evidence, method: str) -> Figure:
 
 
 def gain_over_random(evidence: Evidence) -> Figure:
-    """Return what the vector adds to forward transfer that a random one of equal norms does not."""
+    """Return the gain in forward transfer of the vector over a random vector of equal norms."""
     return evidence.difference("forward_transfer", "fast_dvla", "fast_dvla+direction=random", form=".3f")

@@ -1,6 +1,6 @@
-"""What a scenario's card shows of its tasks: how often experts succeed, and a picture of each.
+"""The tasks on a scenario's card: success rates of the experts and pictures.
 
-Both are made once and kept beside the card, until a task has another version.
+Both are made once and kept in the folder of the card until the version of a task changes.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ from typing import Any
 
 from rich.console import Console
 
-from clbench.base.errors import ClbenchError
 from clbench.base.dependencies import require
 from clbench.base.entry_points import resolve
+from clbench.base.errors import ClbenchError
 from clbench.base.seeding import derive_seed
 from clbench.data.demonstrations import demonstrate
 from clbench.data.expert_rates import measure
@@ -27,37 +27,37 @@ from clbench.spec.task import Task
 from clbench.worlds.gl_backend import choose_back_end
 from clbench.worlds.world import World
 
-from ..views.table import write_if_changed
+from ..views.format import write_if_changed
 
 EXPERTS = "experts.json"
-"""What was measured of the experts, in the folder of the card."""
+"""File with the measurements of the experts, in the folder of the card."""
 
 WIDTH = 240
-"""Pixels across a picture."""
+"""Width of a picture in pixels."""
 
 QUALITY = 80
-"""Of a picture: one of Fetch takes 6 kB."""
+"""WebP quality of a picture; a picture of Fetch takes 6 kB."""
 
 Progress = Callable[[float], None]
 
 
 @dataclass(frozen=True)
 class Experts:
-    """How often experts succeeded."""
+    """Measured success of the experts."""
 
     episodes: int
-    """Of each task."""
+    """Number of episodes of each task."""
     successes: Mapping[str, int]
-    """By task."""
+    """Number of successes by task."""
 
 
 def picture_path(folder: Path, task: Task) -> Path:
-    """Return where the picture of a task lies."""
+    """Return the path of the picture of a task."""
     return folder / f"{task.name}.webp"
 
 
 def undrawn(scenario: Scenario, folder: Path) -> list[Task]:
-    """Return the tasks without a picture in the folder of the card, or with that of another version."""
+    """Return the tasks without a picture of their present version in the folder of the card."""
     kept = _read(folder)
     return [
         task
@@ -68,7 +68,7 @@ def undrawn(scenario: Scenario, folder: Path) -> list[Task]:
 
 
 def choose_renderer(tasks: Sequence[Task]) -> str | None:
-    """Choose what draws `tasks`, and return why nothing can, or None. MuJoCo must not be imported before."""
+    """Choose the renderer of `tasks`; return why none works, or None. MuJoCo must not be imported before."""
     try:
         if tasks:
             require("PIL", "film", "A picture")
@@ -81,14 +81,14 @@ def choose_renderer(tasks: Sequence[Task]) -> str | None:
 def make_missing(
     scenario: Scenario, folder: Path, episodes: int, *, drawing: bool, console: Console
 ) -> Experts:
-    """Measure the experts and draw the pictures that the folder of the card does not have yet.
+    """Measure the experts and draw the pictures that are missing from the folder of the card.
 
     Args:
-        scenario: Where the tasks come from.
-        folder: Of the card.
-        episodes: How many of each task. They are used for nothing else, and the same each time.
+        scenario: Scenario with the tasks.
+        folder: Folder of the card.
+        episodes: Number of episodes of each task. They are the same each time and have no other use.
         drawing: Whether pictures can be drawn.
-        console: Where progress is shown.
+        console: Console that shows the progress.
     """
     kept, bare = _read(folder), undrawn(scenario, folder) if drawing else []
     asked = {task.name: {"version": task.version, "episodes": episodes} for task in scenario.tasks}
@@ -109,14 +109,14 @@ def make_missing(
 
 
 def _draw(tasks: Sequence[Task], folder: Path, progress: Progress) -> None:
-    """Draw each task when its expert is halfway through an episode that is the same each time."""
+    """Draw each task with its expert halfway through an episode that is the same each time."""
     if not tasks:
         return
     from clbench.runs.film import picture  # Pillow is an extra
 
     with _worlds(render_mode="rgb_array") as world:
         for task in tasks:
-            seed = derive_seed("picture", task.suite, task.name)
+            seed = derive_seed("picture", task.seed_suite, task.name)
             actions = demonstrate(world(task), task, seed, noisy=False).executed
             world(task).reset(seed=seed, options={"task": task.name})
             for action in actions[: len(actions) // 2]:
@@ -129,7 +129,7 @@ def _draw(tasks: Sequence[Task], folder: Path, progress: Progress) -> None:
 
 @contextmanager
 def _worlds(**options: Any) -> Iterator[Callable[[Task], World]]:
-    """Give a function that returns the world of a task; each is made when needed, and closed in the end."""
+    """Yield a function that returns the world of a task; worlds are made on demand and closed at the end."""
     made: dict[str, World] = {}
 
     def world(task: Task) -> World:
@@ -145,7 +145,7 @@ def _worlds(**options: Any) -> Iterator[Callable[[Task], World]]:
 
 
 def _read(folder: Path) -> dict[str, dict[str, int]]:
-    """Return what was measured, nothing where it is not there or torn: it is measured again."""
+    """Return the kept measurements, none if the file is missing or torn: they are made again."""
     try:
         values = json.loads((folder / EXPERTS).read_text(encoding="utf-8"))
         return {name: {**entry} for name, entry in values.items()}

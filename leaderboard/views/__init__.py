@@ -1,1 +1,1 @@
-"""Views of the board: the terminal, Markdown, CSV and the page for a browser."""
+"""The forms of the leaderboard: terminal, Markdown, CSV and, in `page`, HTML."""

@@ -1,16 +1,17 @@
-"""What the code says of a method: its docstrings, its hyper-parameters, the prior data it may touch."""
+"""Descriptions of methods from their code: docstrings, hyper-parameters, the prior data that they may use."""
 
 from __future__ import annotations
 
-import ast
 import dataclasses
 import inspect
 import re
 import sys
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from itertools import groupby, pairwise
+from itertools import groupby
 from typing import Any
+
+from docstring_parser import parse_from_object
 
 from clbench.learning.method import Method
 from clbench.learning.registry import load_method, method_names
@@ -25,11 +26,11 @@ class HyperParameter:
     """A field of a method's dataclass."""
 
     name: str
-    """Of the field."""
+    """Name of the field."""
     default: str
-    """As Python writes it."""
+    """Default value, as Python writes it."""
     meaning: str
-    """The docstring under it; where a subclass has one of its own, after that of its base."""
+    """Docstring under the field; a subclass's own docstring follows that of its base class."""
 
 
 @dataclass(frozen=True)
@@ -37,25 +38,25 @@ class Text:
     """The parts of a module's docstring."""
 
     idea: str
-    """Its first line."""
+    """First line."""
     rule: tuple[str, ...]
-    """Paragraphs before the line "Details:", and what follows the list after it."""
+    """Paragraphs before the line "Details:", and those after the list that follows it."""
     details: tuple[str, ...]
     """Items of that list."""
 
 
 @dataclass(frozen=True)
 class Description:
-    """All that a page says of a method without a record."""
+    """Description of a method, without any record."""
 
     name: str
-    """As it is installed."""
+    """Name under which the method is installed."""
     cls: type[Method]
-    """Its class."""
+    """Class of the method."""
     text: Text
-    """Of its module."""
+    """Parts of the docstring of its module."""
     hyper_parameters: tuple[HyperParameter, ...]
-    """In the order of the fields."""
+    """Hyper-parameters in the order of the fields."""
 
     @property
     def summary(self) -> str:
@@ -64,16 +65,16 @@ class Description:
 
     @property
     def division(self) -> str:
-        """What it competes with."""
+        """Division in which the method competes."""
         return division_of(dataclasses.asdict(self.cls.uses))
 
     @property
     def defaults(self) -> dict[str, Any]:
-        """Its hyper-parameters by name."""
+        """Default hyper-parameters by name."""
         return dataclasses.asdict(self.cls())  # type: ignore[call-overload, no-any-return]
 
     def hook(self, name: str) -> list[str]:
-        """Return the paragraphs on what a hook returns, none if the method does not override it."""
+        """Return the paragraphs on what a hook returns, none if the method does not override the hook."""
         function = getattr(self.cls, name)
         if function is getattr(Method, name):
             return []
@@ -82,7 +83,7 @@ class Description:
 
 
 def built_in_methods() -> list[Description]:
-    """Return the descriptions of the installed methods that are ours, by name."""
+    """Return the descriptions of the methods that come with clbench, by name."""
     return [describe(name, load_method(name)) for name in method_names() if "/" not in name]
 
 
@@ -110,7 +111,7 @@ def read_docstring(docstring: str) -> Text:
 
 
 def paragraphs(lines: Iterable[str]) -> list[str]:
-    """Return the paragraphs that blank lines part, each on one line."""
+    """Return the paragraphs between blank lines, each on one line."""
     groups = groupby(lines, key=lambda line: bool(line.strip()))
     return [" ".join(line.strip() for line in group) for filled, group in groups if filled]
 
@@ -128,25 +129,12 @@ def _hyper_parameters(cls: type[Method]) -> list[HyperParameter]:
 
 
 def field_docstrings(cls: type) -> dict[str, str]:
-    """Return the texts that stand under the fields of a class, by field; Python itself forgets them."""
-    tree = ast.parse(inspect.getsource(sys.modules[cls.__module__]))
-    bodies = [
-        node.body for node in ast.walk(tree) if isinstance(node, ast.ClassDef) and node.name == cls.__name__
-    ]
+    """Return the docstrings under the fields of a class, by field; Python itself drops them."""
+    own = inspect.get_annotations(cls)
+    documented = parse_from_object(cls).params
     return {
-        field.target.id: " ".join(inspect.cleandoc(text).split())
-        for body in bodies
-        for field, below in pairwise(body)
-        if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name)
-        if (text := _text_of(below)) is not None
+        one.arg_name: " ".join((one.description or "").split()) for one in documented if one.arg_name in own
     }
-
-
-def _text_of(node: ast.stmt) -> str | None:
-    """Return the text that a statement consists of, if it does."""
-    if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant):
-        return node.value.value if isinstance(node.value.value, str) else None
-    return None
 
 
 def _default(field: dataclasses.Field[Any]) -> str:
@@ -158,5 +146,5 @@ def _default(field: dataclasses.Field[Any]) -> str:
 
 
 def of_one_module(descriptions: Sequence[Description], one: Description) -> list[Description]:
-    """Return the methods that share their docstring with `one`, itself included."""
+    """Return the methods in the module of `one`, including `one`; they share its docstring."""
     return [other for other in descriptions if other.cls.__module__ == one.cls.__module__]

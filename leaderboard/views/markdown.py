@@ -1,25 +1,116 @@
-"""Markdown that pages are made of: the same content gives the same bytes."""
+"""The leaderboard as Markdown, and the environment of all templates of Markdown pages.
+
+The same content gives the same bytes. A template escapes every value unless it is of the type `Markdown`.
+"""
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterable, Sequence
+from functools import cache
+from itertools import groupby
+from pathlib import Path
+from typing import Any
 
-from ..claims.evidence import CONTROLS
-from .table import escaped, table_line
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
+
+from clbench.scoring.intervals import Estimate
+from clbench.scoring.metric import Metric
+
+from ..board.overall import overall
+from ..board.rows import Table
+from ..board.runs import printable
+from .format import MISSING, format_interval, number_text, shown, title_of
 
 _ARXIV = re.compile(r"arXiv (\d{4}\.\d{5})")
 
 
-def prose(text: str) -> str:
-    """Return words of ours for Markdown: code in backticks as it is, links for arXiv identifiers."""
+class Markdown(str):
+    """Text that is Markdown already: templates do not escape it."""
+
+
+def markdown(table: Table) -> str:
+    """Return the leaderboard as a page of Markdown."""
+    template = templates(Path(__file__).with_name("templates")).get_template("leaderboard.md.jinja")
+    averages = overall(table.rows)
+    by_scenario = {
+        scenario: list(rows) for scenario, rows in groupby(table.rows, key=lambda row: row.scenario)
+    }
+    return template.render(
+        table=table,
+        averages=averages,
+        by_scenario=by_scenario,
+        shown=shown,
+        direction=_direction,
+        ends=_ends,
+    )
+
+
+def _direction(metric: Metric) -> str:
+    words = {True: "higher is better", False: "lower is better", None: "neither high nor low is better"}
+    return words[metric.higher_is_better]
+
+
+def _ends(metric: Metric) -> list[str]:
+    return ["unbounded" if math.isinf(end) else f"{end:g}" for end in (metric.low, metric.high)]
+
+
+# ---- templates ---------------------------------------------------------------------------------------------
+
+
+@cache
+def templates(folder: Path) -> Environment:
+    """Return the templates in `folder`, with the filters that Markdown pages need."""
+    environment = Environment(
+        loader=FileSystemLoader(folder),
+        autoescape=False,  # it would escape HTML; `finalize` escapes Markdown
+        finalize=_escaped_unless_markdown,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
+    )
+    environment.filters.update(
+        code=code,
+        interval=_interval,
+        lines=_lines,
+        links=links,
+        number=number_text,
+        prose=prose,
+        raw=Markdown,
+        title_of=title_of,
+    )
+    environment.globals.update(MISSING=MISSING)
+    return environment
+
+
+def _escaped_unless_markdown(value: object) -> str:
+    return value if isinstance(value, Markdown) else escaped(str(value))
+
+
+def escaped(text: str) -> Markdown:
+    """Return `text`, which a stranger may have written, so that Markdown shows it as it is.
+
+    Backslashes go before every character that can open markup, HTML, a mention or a table cell, and into web
+    addresses.
+    """
+    return Markdown(
+        re.sub(
+            r"([\\`*_{}\[\]<>|~&@#]|(?<=:)/(?=/)|(?<=www)\.)", r"\\\1", printable(text), flags=re.IGNORECASE
+        )
+    )
+
+
+def prose(text: str) -> Markdown:
+    """Return words of ours for Markdown: code in backticks stays, arXiv identifiers become links."""
     parts = re.split(r"(`[^`]+`)", text)
-    return "".join(part if part.startswith("`") else linked(escaped(part)) for part in parts)
+    return Markdown("".join(part if part.startswith("`") else linked(escaped(part)) for part in parts))
 
 
-def linked(text: str) -> str:
+def linked(text: str) -> Markdown:
     """Return `text` with links for the arXiv identifiers in it."""
-    return _ARXIV.sub(r"[arXiv \1](https://arxiv.org/abs/\1)", text)
+    return Markdown(_ARXIV.sub(r"[arXiv \1](https://arxiv.org/abs/\1)", text))
 
 
 def arxiv_ids(text: str) -> list[str]:
@@ -27,16 +118,26 @@ def arxiv_ids(text: str) -> list[str]:
     return list(dict.fromkeys(_ARXIV.findall(text)))
 
 
-def grid(head: Sequence[str], rows: Iterable[Sequence[str]], numbers: int = 0) -> list[str]:
-    """Return the lines of a table whose last `numbers` columns are numbers."""
+def links(ids: Iterable[str]) -> Markdown:
+    """Return links to papers, given their arXiv identifiers."""
+    return Markdown(", ".join(linked(f"arXiv {one}") for one in ids))
+
+
+def code(text: str) -> Markdown:
+    """Return `text`, of ours, as code."""
+    return Markdown(f"`{text}`")
+
+
+def table_lines(head: Sequence[str], rows: Iterable[Sequence[str]], numbers: int = 0) -> list[str]:
+    """Return the lines of a table of Markdown whose last `numbers` columns are numbers."""
     under = ["---"] * (len(head) - numbers) + ["--:"] * numbers
-    return [table_line(list(head)), table_line(under), *(table_line(list(row)) for row in rows)]
+    return [f"| {' | '.join(cells)} |" for cells in (head, under, *rows)]
 
 
-def run_command(scenario: str, *labels: str) -> str:
-    """Return the command that makes the records of labels that differ from their method alike."""
-    methods = [label.partition("+")[0] for label in labels]
-    changes = labels[0].split("+")[1:]
-    settings = [f"--set.{name} {value}" for name, _, value in (change.partition("=") for change in changes)]
-    folder = [f"--records {CONTROLS.as_posix()}"] if changes else []
-    return " ".join(["clbench run", scenario, *methods, *settings, *folder])
+def _interval(estimate: Estimate, form: str = ".2f") -> Markdown:
+    return Markdown(format_interval(estimate, form))
+
+
+def _lines(texts: Iterable[Any]) -> Markdown:
+    """Return texts below each other in one cell."""
+    return Markdown("<br>".join(map(escaped, texts)))

@@ -1,4 +1,5 @@
-"""Hashes of source code: a cache key covers all code that a stage runs, and names nothing that does not exist."""
+"""Hashes of source code: a cache key covers all code that a stage runs, and names nothing that does not
+exist."""
 
 import subprocess
 import sys

@@ -57,6 +57,10 @@ def _clbench(*arguments: str, folder: Path | None = None) -> subprocess.Complete
         (["demonstrations", "clbench/Fetch-v0", "--workers", "0"], "Must be >= 1."),
         (["pretrain", "clbench/Fetch"], "Did you mean 'clbench/Fetch-v0'"),
         (["pretrain", "clbench/Fetch-v0", "--seed", "-1"], "Must be >= 0."),
+        (["submit", "sft", "--seeds", "0"], 'Invalid value "0" for --seeds. Must be >= 1.'),
+        (["submit", "sft", "--first-seed", "-1"], "Must be >= 0."),
+        (["verify", "x.json", "--episodes", "0"], 'Invalid value "0" for --episodes. Must be >= 1.'),
+        (["scenario-card", "--episodes", "0"], 'Invalid value "0" for --episodes. Must be >= 1.'),
         (["cache", "--older-than", "-1"], "Must be >= 0."),
         (
             ["film", "clbench/Fetch-v0", "sft", "--size", "20"],

@@ -106,7 +106,7 @@ def _methods(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         ("Chooser", "runs test episodes of right: nothing may be chosen on them"),
         ("RobustChooser", "runs perturbed episodes of right: nothing may be chosen on them"),
         ("EarlyChooser", "runs episodes of down, which its stage must not know yet"),
-        ("Asker", "loads questions by itself, those of the report too"),
+        ("Asker", "loads questions by itself, the test questions too"),
         ("Normaliser", "changes state_mean: the normalisation comes from the retained skills alone"),
         ("Talker", "changes the vocabulary or a size of the policy"),
     ],

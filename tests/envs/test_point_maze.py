@@ -350,8 +350,10 @@ def test_seeds_and_data_set_ids_keep_the_old_spelling_of_the_suite(monkeypatch: 
     assert seeds == [1642424505, 688404758]
 
 
-def test_only_this_suite_has_another_spelling_in_seeds() -> None:
+def test_suites_have_one_spelling_and_seeds_keep_the_old_one() -> None:
     names = ("Fetch", "FetchPixels", "DMControl", "MetaWorld", "MetaWorldCW")
     scenarios = [load_scenario(f"clbench:clbench/{name}-v0") for name in names]
     spellings = [{task.seed_suite for task in scenario.target} for scenario in scenarios]
     assert spellings == [{"fetch"}, {"fetch-pixels"}, {"dm_control"}, {"metaworld"}, {"metaworld-cw"}]
+    suites = [{task.suite for task in scenario.tasks} for scenario in scenarios]
+    assert suites == [{"fetch"}, {"fetch_pixels"}, {"dm_control"}, {"metaworld"}, {"metaworld_cw"}]

@@ -23,7 +23,7 @@ FETCH = load_scenario("clbench/Fetch-v0")
 
 @pytest.fixture(scope="module")
 def fetch_policy() -> Policy:
-    """A policy for Fetch that was never trained: it waves the arm about."""
+    """An untrained policy for Fetch: it waves the arm about."""
     return Policy(policy_config(FETCH), seed=3).eval()
 
 
@@ -42,7 +42,7 @@ def _with_episodes(**numbers: int) -> Scenario:
     )
 
 
-def test_an_outcome_does_not_depend_on_what_else_is_evaluated(fetch_policy: Policy) -> None:
+def test_an_outcome_does_not_depend_on_other_episodes(fetch_policy: Policy) -> None:
     scenario = _with_episodes(validation_episodes=4)
     evaluator = Evaluator(scenario, seed=0)
     with deterministic():
@@ -76,7 +76,7 @@ def _played_alone(policy: Policy, task: Task, number: int, seed: int) -> Episode
     return Episode(task.name, "validation", number, success, total_reward, step + 1)
 
 
-def test_an_outcome_is_bit_for_bit_that_of_the_plain_world(fetch_policy: Policy) -> None:
+def test_an_outcome_equals_the_outcome_in_the_plain_world_bit_for_bit(fetch_policy: Policy) -> None:
     trained, _ = pretrained_policy(TOY, 0)
     cases = [(FETCH, fetch_policy, ["push", "pull"]), (TOY, trained, ["left", "right", "up_left"])]
     for scenario, policy, names in cases:
@@ -89,7 +89,7 @@ def test_an_outcome_is_bit_for_bit_that_of_the_plain_world(fetch_policy: Policy)
                 assert Evaluator(scenario, seed=4, threads=threads).play(policy, trials) == alone
 
 
-def test_rows_of_a_forward_do_not_depend_on_their_place_or_their_neighbours(fetch_policy: Policy) -> None:
+def test_a_row_of_a_forward_pass_does_not_depend_on_its_place_or_its_neighbours(fetch_policy: Policy) -> None:
     generator = torch.Generator().manual_seed(0)
     config = fetch_policy.config
     state = torch.randn(LANES, config.state_size, generator=generator)
@@ -104,7 +104,7 @@ def test_rows_of_a_forward_do_not_depend_on_their_place_or_their_neighbours(fetc
         assert fetch_policy.act(state, words, noise)[:7].equal(straight[:7])
 
 
-def test_selection_and_report_episodes_and_seeds_have_different_initial_states(fetch_policy: Policy) -> None:
+def test_validation_and_test_episodes_and_seeds_have_different_initial_states(fetch_policy: Policy) -> None:
     task = FETCH.task("reach")
     scenario = _with_episodes(validation_episodes=2, test_episodes=3, curve_episodes=1)
     runs = [
@@ -116,14 +116,14 @@ def test_selection_and_report_episodes_and_seeds_have_different_initial_states(f
     assert len(set(values)) == len(values)
 
 
-def test_a_perturbed_episode_begins_with_the_seed_and_the_words_of_the_report_episode() -> None:
+def test_a_perturbed_episode_begins_with_the_seed_and_the_words_of_the_test_episode() -> None:
     task = FETCH.task("push")
     for number in range(3):
         assert start_of((task, "perturbed", number), 5) == start_of((task, "test", number), 5)
     assert FETCH.budget.episodes("perturbed") == FETCH.budget.test_episodes
 
 
-def test_perturbed_outcomes_do_not_depend_on_what_else_is_evaluated_nor_change_it(
+def test_perturbed_outcomes_neither_depend_on_other_episodes_nor_change_them(
     fetch_policy: Policy,
 ) -> None:
     tasks = [FETCH.task("push"), FETCH.task("reach")]
@@ -142,7 +142,7 @@ def test_perturbed_outcomes_do_not_depend_on_what_else_is_evaluated_nor_change_i
     assert all(one.total_reward != other.total_reward for one, other in zip(*alone, strict=True))
 
 
-def test_a_pretrained_toy_policy_does_its_skills_and_not_the_targets() -> None:
+def test_a_pretrained_toy_policy_masters_its_skills_and_not_the_targets() -> None:
     policy, _ = pretrained_policy(TOY, 0)
     with deterministic():
         episodes = Evaluator(TOY, 0).evaluate(policy, TOY.tasks)
@@ -151,7 +151,7 @@ def test_a_pretrained_toy_policy_does_its_skills_and_not_the_targets() -> None:
     assert rates["right"] == rates["down"] == 0.0
 
 
-def test_a_policy_that_acts_in_nan_fails_its_episodes_and_stops_nothing(fetch_policy: Policy) -> None:
+def test_a_policy_that_returns_nan_fails_its_episodes_and_stops_nothing(fetch_policy: Policy) -> None:
     broken = Policy(fetch_policy.config)
     next(broken.head.parameters()).data.fill_(float("nan"))
     episodes = Evaluator(_with_episodes(validation_episodes=2), 0).evaluate(broken, [FETCH.task("lift")])

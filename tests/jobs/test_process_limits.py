@@ -1,5 +1,6 @@
 """Limits: a process that takes too much is ended with a reason, and the others go on."""
 
+import importlib
 import os
 import time
 from collections.abc import Callable
@@ -52,16 +53,15 @@ def _jobs_module(write_module: Callable[[str, str], None]) -> None:
 
 @pytest.fixture
 def done(bars: Bars) -> Done:
-    """Return a function that does jobs, each its function and limits, and returns what went wrong."""
+    """Return a function that does jobs, given as functions with limits, and returns the failures."""
 
     def done(*jobs: tuple[str, Limits | None], **arguments: Any) -> dict[str, str]:
+        module = importlib.import_module("limited_jobs")
         made = [
-            Job(
-                name, f"limited_jobs:{name}", arguments if name in ("writer", "parent") else {}, 1, (), limits
-            )
+            Job(name, getattr(module, name), arguments if name in ("writer", "parent") else {}, 1, (), limits)
             for name, limits in jobs
         ]
-        return run_jobs(made, Processes(2), bars)
+        return {str(job): message for job, message in run_jobs(made, Processes(2), bars).items()}
 
     return done
 
@@ -88,12 +88,21 @@ def test_a_job_that_writes_too_much_is_stopped(tmp_path: Path, done: Done) -> No
 
 def test_what_a_stopped_job_started_is_stopped_too(tmp_path: Path, done: Done) -> None:
     path = tmp_path / "child"
-    done(("parent", Limits(seconds=2.0)), path=os.fspath(path))
+    assert done(("short", None)) == {}  # the first job waits for the imports of the server, for seconds
+    done(("parent", Limits(seconds=4.0)), path=os.fspath(path))
     child = int(path.read_text())
     deadline = time.monotonic() + 10
-    while psutil.pid_exists(child) and psutil.Process(child).status() != psutil.STATUS_ZOMBIE:
+    while _is_alive(child):
         assert time.monotonic() < deadline
         time.sleep(0.1)
+
+
+def _is_alive(process: int) -> bool:
+    try:
+        status: str = psutil.Process(process).status()
+    except psutil.NoSuchProcess:
+        return False
+    return bool(status != psutil.STATUS_ZOMBIE)
 
 
 def test_a_process_that_is_gone_is_beyond_no_limit() -> None:

@@ -14,7 +14,7 @@ from clbench.learning.registry import build_method, describe_method, load_method
 
 @pytest.fixture
 def module(monkeypatch: pytest.MonkeyPatch) -> types.ModuleType:
-    """A module of a stranger, as `stranger`."""
+    """A third-party module named `stranger`."""
     module = types.ModuleType("stranger")
     monkeypatch.setitem(sys.modules, "stranger", module)
 
@@ -31,7 +31,7 @@ def module(monkeypatch: pytest.MonkeyPatch) -> types.ModuleType:
     return module
 
 
-def test_the_built_in_methods_are_found_as_any_submitted_one() -> None:
+def test_the_built_in_methods_are_found_like_submitted_methods() -> None:
     assert {"experience_replay", "from_scratch", "frozen", "joint", "sft"} <= set(method_names())
 
 
@@ -43,7 +43,7 @@ def test_an_installed_method_loads_and_is_built_from_its_defaults(name: str) -> 
     assert all(field.default is not dataclasses.MISSING for field in dataclasses.fields(method))  # type: ignore[arg-type]
 
 
-def test_a_method_is_found_as_module_and_class(module: types.ModuleType) -> None:
+def test_a_method_can_be_named_by_module_and_class(module: types.ModuleType) -> None:
     assert load_method("stranger:Acme") is module.Acme
 
 
@@ -58,13 +58,13 @@ def test_a_method_is_found_as_module_and_class(module: types.ModuleType) -> None
     ],
 )
 @pytest.mark.usefixtures("module")
-def test_what_is_no_method_is_refused_by_name(spec: str, error: type[Exception], message: str) -> None:
+def test_an_object_that_is_not_a_method_is_refused_by_name(spec: str, error: type[Exception], message: str) -> None:
     with pytest.raises(error, match=message):
         load_method(spec)
 
 
 @pytest.mark.usefixtures("module")
-def test_changes_from_the_command_line_take_the_fields_own_types() -> None:
+def test_changes_from_the_command_line_take_the_types_of_the_fields() -> None:
     method = build_method("stranger:Acme", {"strength": "0.25", "rounds": "7", "gentle": "true"})
     assert dataclasses.asdict(method) == {"strength": 0.25, "rounds": 7, "gentle": True}  # type: ignore[call-overload]
 
@@ -86,17 +86,17 @@ def test_a_wrong_change_is_refused_by_name(
 
 
 @pytest.mark.parametrize("name", ["demonstrations", "questions"])
-def test_undeclared_prior_data_cannot_be_touched(name: str) -> None:
-    with pytest.raises(UndeclaredAccessError, match=f"touches prior {name} that it does not declare"):
+def test_a_method_cannot_use_prior_data_that_it_does_not_declare(name: str) -> None:
+    with pytest.raises(UndeclaredAccessError, match=f"uses prior {name} that it does not declare"):
         getattr(Prior({}), name)
 
 
-def test_declared_prior_data_counts_in_bytes() -> None:
+def test_declared_prior_data_is_counted_in_bytes() -> None:
     data = Demonstrations(*(torch.zeros(4, 2) for _ in range(7)))
     prior = Prior({"demonstrations": Source(data, torch.Generator(), 8)})
     assert prior.bytes == 6 * 4 * 2 * 4
     prior.close()
-    with pytest.raises(UndeclaredAccessError, match="after the hooks that it was handed to"):
+    with pytest.raises(UndeclaredAccessError, match="after the hooks that received it"):
         prior.demonstrations.sample(1)
 
 
@@ -113,7 +113,7 @@ def test_declared_prior_data_counts_in_bytes() -> None:
         {"link": "http://example.org:8080/a/b?c=d&e=%20#f"},
     ],
 )
-def test_metadata_may_be_left_out_or_be_of_its_kind(values: dict[str, str]) -> None:
+def test_metadata_may_be_missing_or_valid(values: dict[str, str]) -> None:
     assert {name: value for name, value in vars(Metadata(**values)).items() if value} == values
 
 
@@ -139,7 +139,7 @@ def test_metadata_may_be_left_out_or_be_of_its_kind(values: dict[str, str]) -> N
         ("version", "v" * 51),
     ],
 )
-def test_metadata_of_another_kind_are_refused_by_name(name: str, value: object) -> None:
+def test_invalid_metadata_is_refused_by_name(name: str, value: object) -> None:
     with pytest.raises(ValueError, match=f"{name} in the metadata must be "):
         Metadata(**{name: value})  # type: ignore[arg-type]
 

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from clbench.learning.optimise import MethodError, deterministic, learning_rate_factor, optimise
 
 
-def test_the_step_size_warms_up_and_falls_by_a_cosine_to_a_tenth() -> None:
+def test_the_step_size_warms_up_and_then_follows_a_cosine_down_to_a_tenth() -> None:
     factors = [learning_rate_factor(step, 400) for step in range(400)]
     assert factors[:20] == pytest.approx(np.arange(1, 21) / 20)
     assert max(factors) == 1.0
@@ -18,7 +18,7 @@ def test_the_step_size_warms_up_and_falls_by_a_cosine_to_a_tenth() -> None:
     assert factors[-1] == pytest.approx(0.1, abs=1e-3)
 
 
-def test_a_first_adamw_step_moves_every_weight_by_the_step_size() -> None:
+def test_the_first_step_of_adamw_moves_every_weight_by_the_step_size() -> None:
     weight = nn.Parameter(torch.tensor([1.0, -2.0]))
     steps = optimise([weight], 0.1, 1, lambda _: (weight * torch.tensor([3.0, -0.5])).sum(), Tensor.backward)
     assert steps == 1
@@ -26,7 +26,7 @@ def test_a_first_adamw_step_moves_every_weight_by_the_step_size() -> None:
     assert weight.tolist() == pytest.approx([0.9, -1.9])
 
 
-def test_gradients_are_clipped_after_the_method_set_them() -> None:
+def test_gradients_are_clipped_after_the_method_has_set_them() -> None:
     weight = nn.Parameter(torch.zeros(4))
     seen: list[float] = []
 
@@ -43,7 +43,7 @@ def test_gradients_are_clipped_after_the_method_set_them() -> None:
     assert seen == pytest.approx([1.0])
 
 
-def test_a_group_may_have_a_step_size_of_its_own() -> None:
+def test_a_group_may_have_its_own_step_size() -> None:
     slow, fast = nn.Parameter(torch.zeros(1)), nn.Parameter(torch.zeros(1))
     groups: list[dict[str, Any]] = [{"params": [slow], "lr": 0.01}, {"params": [fast]}]
     optimise(groups, 0.1, 1, lambda _: (slow + fast - 1).square().sum(), Tensor.backward)
@@ -51,7 +51,7 @@ def test_a_group_may_have_a_step_size_of_its_own() -> None:
     assert fast.item() == pytest.approx(0.1)
 
 
-def test_without_parameters_no_step_is_done_but_the_points_are_passed() -> None:
+def test_without_parameters_no_step_is_done_but_the_callback_is_called_for_each() -> None:
     seen: list[int] = []
     assert optimise([], 0.1, 3, lambda _: torch.tensor(float("nan")), Tensor.backward, seen.append) == 0
     assert seen == [1, 2, 3]
@@ -67,14 +67,14 @@ def test_without_parameters_no_step_is_done_but_the_points_are_passed() -> None:
         (lambda weight: weight.sum().detach(), "step 0: loss has no gradient"),
     ],
 )
-def test_a_loss_that_cannot_be_descended_stops_the_run_and_says_where(loss: object, message: str) -> None:
+def test_a_loss_that_cannot_be_minimised_stops_the_run_with_the_step_in_the_error(loss: object, message: str) -> None:
     weight = nn.Parameter(torch.ones(2))
     with pytest.raises(MethodError, match=message):
         optimise([weight], 0.1, 1, lambda _: loss(weight), Tensor.backward)  # type: ignore[operator]
     assert weight.tolist() == [1.0, 1.0]
 
 
-def test_the_deterministic_block_puts_the_threads_back() -> None:
+def test_the_deterministic_block_restores_the_number_of_threads() -> None:
     before = torch.get_num_threads(), torch.are_deterministic_algorithms_enabled()
     with deterministic():
         assert torch.get_num_threads() == 1
@@ -82,7 +82,7 @@ def test_the_deterministic_block_puts_the_threads_back() -> None:
     assert (torch.get_num_threads(), torch.are_deterministic_algorithms_enabled()) == before
 
 
-def test_the_step_size_may_be_changed_at_every_step_once_the_gradient_is_known() -> None:
+def test_the_step_size_can_change_at_every_step_once_the_gradient_is_known() -> None:
     weight = nn.Parameter(torch.zeros(1))
     seen: list[tuple[float, int, bool]] = []
 
@@ -96,7 +96,7 @@ def test_the_step_size_may_be_changed_at_every_step_once_the_gradient_is_known()
 
 
 @pytest.mark.parametrize("rate", [-0.1, float("nan"), float("inf"), "0.1"])
-def test_a_step_size_that_is_none_is_refused(rate: Any) -> None:
+def test_an_invalid_step_size_is_refused(rate: Any) -> None:
     weight = nn.Parameter(torch.zeros(1))
-    with pytest.raises(MethodError, match="step 0: the step size must be a number from 0"):
+    with pytest.raises(MethodError, match="step 0: the step size must be a finite float of at least 0, not"):
         optimise([weight], 0.1, 1, lambda _: (weight - 1).square().sum(), rate=lambda *_: rate)

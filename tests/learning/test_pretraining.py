@@ -24,7 +24,7 @@ def _made_from(folder: Path) -> dict[str, object]:
     return found
 
 
-def test_the_policies_that_ship_are_those_that_this_source_makes() -> None:
+def test_this_source_makes_the_policies_that_ship() -> None:
     shipped = sorted(SHIPPED.glob("*/clbench.json"))
     assert [path.parent for path in shipped] == [SHIPS]
     made_from, present = _made_from(SHIPS), json.loads(json.dumps(pretraining_inputs(FETCH, 0)))
@@ -35,7 +35,7 @@ def test_the_policies_that_ship_are_those_that_this_source_makes() -> None:
     assert is_pretrained(FETCH, 0)
 
 
-def test_the_committed_records_of_its_seed_started_from_the_policy_that_ships() -> None:
+def test_the_committed_records_of_a_seed_started_from_the_policy_that_ships() -> None:
     files = json.loads((SHIPS / "clbench.json").read_text(encoding="utf-8"))["files"]
     records = Path(__file__).parents[2] / "leaderboard" / "records" / "Fetch-v0"
     record = json.loads((records / "sft" / "seed-0.json").read_text(encoding="utf-8"))
@@ -46,7 +46,7 @@ def test_other_seeds_are_pretrained_in_the_cache() -> None:
     assert pretrained_folder(FETCH, 1).parent == cache_folder() / "pretrained"
 
 
-def test_a_torn_policy_that_ships_is_not_used(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_torn_shipped_policy_is_not_used(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     torn = Path(shutil.copytree(SHIPS, tmp_path / SHIPS.name))
     weights = torn / "policy.safetensors"
     weights.write_bytes(weights.read_bytes()[:-1])

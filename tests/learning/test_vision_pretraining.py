@@ -1,4 +1,4 @@
-"""Eyes that learn to tell what pictures show, before a policy learns to act."""
+"""Vision that learns to describe pictures, before a policy learns to act."""
 
 import dataclasses
 
@@ -21,7 +21,7 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 @pytest.fixture(scope="module")
 def questions() -> tuple[Questions, Questions]:
-    """What is asked about pictures of the toy, for training and for reports."""
+    """Questions about pictures of the toy, for training and for the test."""
     return load_questions(SEEN_TOY)
 
 
@@ -45,7 +45,7 @@ def _pretrained(questions: Questions, steps: int) -> Vision:
 
 @torch.no_grad()
 def _error(eyes: Vision, train: Questions, report: Questions) -> float:
-    """Return how far off a least-squares fit on the tokens places what new pictures show."""
+    """Return the error of a least-squares fit on the tokens that locates the objects in new pictures."""
 
     def inputs(part: Questions) -> Tensor:
         return torch.nn.functional.pad(eyes(part.image).flatten(1), (0, 1), value=1.0).double()
@@ -55,17 +55,17 @@ def _error(eyes: Vision, train: Questions, report: Questions) -> float:
     return float(np.abs(told - report.scenes[:, :4].numpy()).mean())
 
 
-def test_eyes_learn_to_place_what_a_picture_shows(questions: tuple[Questions, Questions]) -> None:
+def test_the_vision_learns_to_locate_the_objects_in_a_picture(questions: tuple[Questions, Questions]) -> None:
     train, report = questions
     assert _error(_pretrained(train, 150), train, report) < 0.6 * _error(_eyes(), train, report)
 
 
-def test_the_same_generator_gives_the_same_eyes(questions: tuple[Questions, Questions]) -> None:
+def test_the_same_generator_gives_the_same_vision(questions: tuple[Questions, Questions]) -> None:
     first, second = (_pretrained(questions[0], 5).state_dict() for _ in range(2))
     assert all(torch.equal(first[name], second[name]) for name in first)
 
 
-def test_numbers_are_of_about_one_and_answers_those_of_the_questions(
+def test_numbers_are_about_one_and_answers_match_the_questions(
     questions: tuple[Questions, Questions],
 ) -> None:
     train, report = questions
@@ -79,7 +79,7 @@ def test_numbers_are_of_about_one_and_answers_those_of_the_questions(
         assert pictures[1].answers[:, column].tolist() == kind.answer(report.scenes.numpy()).tolist()
 
 
-def test_what_is_far_off_does_not_outweigh_the_rest(questions: tuple[Questions, Questions]) -> None:
+def test_an_outlier_does_not_outweigh_the_other_pictures(questions: tuple[Questions, Questions]) -> None:
     train = questions[0]
     scenes = train.scenes.clone()
     scenes[0, 0] = 1000.0
@@ -87,7 +87,7 @@ def test_what_is_far_off_does_not_outweigh_the_rest(questions: tuple[Questions, 
     assert pictures.numbers.abs().max() == 5.0
 
 
-def test_a_question_that_no_picture_of_a_step_answers_does_no_harm(
+def test_a_question_without_an_answer_in_any_picture_of_a_step_does_no_harm(
     questions: tuple[Questions, Questions],
 ) -> None:
     (pictures,) = _pictures(questions[0])
@@ -98,7 +98,7 @@ def test_a_question_that_no_picture_of_a_step_answers_does_no_harm(
 
 
 @pytest.mark.usefixtures("empty_caches")
-def test_progress_counts_the_steps_of_the_eyes_too() -> None:
+def test_progress_includes_the_steps_of_the_vision() -> None:
     scenario = dataclasses.replace(
         SEEN_TOY, budget=dataclasses.replace(SEEN_TOY.budget, demonstrations=4, pretraining_steps=8)
     )

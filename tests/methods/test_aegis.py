@@ -1,4 +1,4 @@
-"""AEGIS: the anchor, and what is left of a gradient that leads away from it."""
+"""AEGIS: the anchor, and the projection of gradients that lead away from it."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -32,7 +32,7 @@ def _stage(steps: int) -> Stage:
 
 
 def _moved(config: PolicyConfig = CONFIG, seed: int = 0, **changes: Any) -> tuple[Any, Policy]:
-    """Return a method that has begun a stage, and its policy, which is no longer where the anchor lies."""
+    """Return a method that has begun a stage, and its policy, which has moved away from the anchor."""
     method, policy = build_method("aegis", {"samples": 64, **changes}), Policy(config, seed=1)
     method.prepare(policy, Prior({"questions": toy_questions()}))
     generator = torch.Generator().manual_seed(seed)
@@ -119,10 +119,12 @@ def test_a_step_sets_the_gradients_of_two_separate_passes_projected_layer_by_lay
         np.testing.assert_allclose(_block(found, layer), expected, rtol=1e-3, atol=1e-5)
         projected += int(product < 0)
         energy, removed = energy + float(gradient @ gradient), removed + min(product, 0.0) ** 2 / norm
-    told = method.diagnostics()
-    assert told["layers_projected_mean"] == projected / CONFIG.layers
-    assert told["energy_shed_mean"] == pytest.approx(removed / energy, rel=1e-3)
-    assert told["anchor_distance"] == pytest.approx([_distance(policy, batch, method.anchor).item()] * 11)
+    diagnostics = method.diagnostics()
+    assert diagnostics["layers_projected_mean"] == projected / CONFIG.layers
+    assert diagnostics["energy_shed_mean"] == pytest.approx(removed / energy, rel=1e-3)
+    assert diagnostics["anchor_distance"] == pytest.approx(
+        [_distance(policy, batch, method.anchor).item()] * 11
+    )
 
 
 def test_the_steps_above_project_some_layers_and_leave_others() -> None:
@@ -192,10 +194,10 @@ def test_two_layers_worked_by_hand() -> None:
     method, found = _by_hand([[1.0, 2.0], [2.0, 1.0]], [[-3.0, 1.0], [1.0, 1.0]])
     assert found[0] == pytest.approx([0.7, 2.1])
     assert found[1] == [2.0, 1.0]
-    told = method.diagnostics()
-    assert told["layers_projected_mean"] == 0.5
-    assert told["energy_shed_mean"] == pytest.approx(0.01)  # 1 / 10 of 5 + 5
-    assert told["energy_shed_highest"] == pytest.approx(0.01)
+    diagnostics = method.diagnostics()
+    assert diagnostics["layers_projected_mean"] == 0.5
+    assert diagnostics["energy_shed_mean"] == pytest.approx(0.01)  # 1 / 10 of 5 + 5
+    assert diagnostics["energy_shed_highest"] == pytest.approx(0.01)
 
 
 def test_opposite_gradients_leave_nothing_and_orthogonal_or_absent_ones_everything() -> None:
@@ -266,9 +268,9 @@ def test_the_diagnostics_tell_the_distance_at_eleven_steps_from_the_first_to_the
     method.prepare(policy, Prior({"questions": toy_questions(3)}))
     assert method.diagnostics() == {}
     adapt(policy, method, _stage(31), Budget(learning_rate=1e-3))
-    told, distances = method.diagnostics(), method.distances  # type: ignore[attr-defined]
-    assert told["anchor_distance"] == [float(distances[step]) for step in range(0, 31, 3)]
-    assert 0.0 <= told["energy_shed_mean"] <= told["energy_shed_highest"] < 1.0
+    diagnostics, distances = method.diagnostics(), method.distances  # type: ignore[attr-defined]
+    assert diagnostics["anchor_distance"] == [float(distances[step]) for step in range(0, 31, 3)]
+    assert 0.0 <= diagnostics["energy_shed_mean"] <= diagnostics["energy_shed_highest"] < 1.0
     adapt(policy, method, _stage(2), Budget(learning_rate=1e-3))
     again = method.diagnostics()["anchor_distance"]
     assert len(set(again)) == 2

@@ -1,4 +1,4 @@
-"""Buffered replay: what is kept, what is replayed of it, and what that costs."""
+"""Buffered replay: the contents of the buffer, the replayed share, and the cost."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""ConSFT and its control: the weights of the samples, and the gradient that they make."""
+"""ConSFT and its controls: the weights of the samples, and the gradient that they make."""
 
 import dataclasses
 import math
@@ -92,7 +92,7 @@ def test_published_constants_give_the_weights_of_the_table(done: float, omegas: 
 def test_temperature_follows_the_formula_and_never_falls(changes: dict[str, float]) -> None:
     method: Any = build_method("consft", changes)
     found = [method.temperature(Progress(step, 80)) for step in range(81)]
-    # the temperature is told by the weight of one sample: tau = -kappa L / log omega
+    # the temperature follows from the weight of one sample: tau = -kappa L / log omega
     kappa = changes.get("kappa", 25.0)
     weights = [_omega(1e-4, step / 80, omega_min=0.0, **changes) for step in range(81)]
     assert found == pytest.approx([-kappa * 1e-4 / math.log(weight) for weight in weights], rel=1e-4)
@@ -138,7 +138,7 @@ def test_the_gradient_is_the_mean_of_the_weighted_gradients_of_the_samples(step:
     parts = [omega * _gradient(policy, loss) for omega, loss in zip(omegas, losses, strict=True)]
     expected = torch.stack(parts).sum(dim=0) / 8
     torch.testing.assert_close(found, expected, rtol=1e-3, atol=1e-6)
-    # what is usually done with weights, and would cancel most of the method
+    # the usual way with weights, which would cancel most of the method
     normalised = torch.stack(parts).sum(dim=0) / sum(omegas)
     assert (found - normalised).norm() > 0.5 * found.norm()
 
@@ -155,7 +155,7 @@ def test_no_gradient_flows_through_the_weights() -> None:
 
 @pytest.mark.parametrize("seed", range(3))
 def test_one_sample_disrupts_what_was_known_by_the_square_of_its_weight(seed: int) -> None:
-    """The paper's claim (Eq. 7): g'Fg of the weighted gradient is omega^2 that of the plain one."""
+    """The paper's claim (Eq. 7): g'Fg of the weighted gradient is omega^2 times g'Fg of the plain one."""
     policy, batch = Policy(SMALL, seed=seed), toy_source("right", seed=seed).sample(1)
     method = _started("consft", kappa=1.0, tau_start=1.0)
     weighted = _set_gradient(method, policy, batch, Progress(0, 100)).double()
@@ -174,10 +174,10 @@ def test_the_histogram_counts_each_sample_of_each_step_in_its_part_of_the_stage(
     method, policy = build_method("consft", {}), Policy(SMALL)
     assert method.diagnostics() == {}
     adapt(policy, method, _stage(25), Budget(learning_rate=1e-3))
-    told = method.diagnostics()
-    assert told["omega_edges"] == [0.0, 0.01, 0.1, 0.5, 0.9, 1.0]
+    diagnostics = method.diagnostics()
+    assert diagnostics["omega_edges"] == [0.0, 0.01, 0.1, 0.5, 0.9, 1.0]
     steps = np.bincount([10 * step // 25 for step in range(25)])
-    assert [sum(counts) for counts in told["omega_counts"]] == (16 * steps).tolist()
+    assert [sum(counts) for counts in diagnostics["omega_counts"]] == (16 * steps).tolist()
     method.start_task(policy, _stage(25))
     assert not np.any(method.diagnostics()["omega_counts"])  # a new stage counts anew
 
@@ -187,11 +187,11 @@ def test_the_histogram_is_that_of_the_weights() -> None:
     method = _started("consft", kappa=2.0, tau_start=1.0)
     method.loss(policy, batch, Progress(7, 10))
     omegas = [_omega(loss, 0.7, kappa=2.0, tau_start=1.0) for loss in policy.action_loss(batch).tolist()]
-    told = method.diagnostics()
-    expected = np.histogram(omegas, told["omega_edges"])[0].tolist()
+    diagnostics = method.diagnostics()
+    expected = np.histogram(omegas, diagnostics["omega_edges"])[0].tolist()
     assert len([count for count in expected if count]) > 1
-    assert told["omega_counts"][7] == expected
-    assert not np.any(np.delete(told["omega_counts"], 7, axis=0))
+    assert diagnostics["omega_counts"][7] == expected
+    assert not np.any(np.delete(diagnostics["omega_counts"], 7, axis=0))
 
 
 def test_the_calibrated_variant_changes_only_what_the_authors_tune() -> None:
@@ -242,7 +242,7 @@ def test_shuffled_weights_are_those_of_consft_in_another_order() -> None:
 
 
 class _Reduced(Policy):
-    """A policy that does not tell its samples apart."""
+    """A policy with one loss for all samples together."""
 
     def action_loss(self, batch: Batch, hidden: list[Tensor] | None = None) -> Tensor:
         return super().action_loss(batch, hidden).mean()

@@ -162,7 +162,7 @@ def test_a_stronger_penalty_leaves_the_weights_nearer_to_where_they_were() -> No
 
 
 class _Reduced(Policy):
-    """A policy that does not tell its samples apart."""
+    """A policy with one loss for all samples together."""
 
     def action_loss(self, batch: Batch, hidden: list[Tensor] | None = None) -> Tensor:
         return super().action_loss(batch, hidden).mean()

@@ -14,7 +14,7 @@ from clbench.scoring.scores import Scores
 
 HISTORIC = Path(__file__).parent / "historic"
 
-VALUES = {
+VALUES: dict[str, dict[str, float | None]] = {
     "schema-1/Fetch-v0-sft-seed-0.json": {
         "final_average": 0.1,
         "adaptation": 0.9875,
@@ -64,7 +64,8 @@ def test_words_of_schema_2_are_those_of_today() -> None:
     tuning = read_record(HISTORIC / "schema-2" / "Fetch-v0-weight_interpolation-tuning.json")
     assert (tuning.run.split, set(tuning.episodes["split"])) == ("validation", {"validation"})
     budget = tuning.scenario.budget
-    assert (budget["validation_episodes"], budget["test_episodes"], budget["test_questions"]) == (10, 20, 1000)
+    assert (budget["validation_episodes"], budget["test_episodes"]) == (10, 20)
+    assert budget["test_questions"] == 1000
     assert budget["noisy_demonstrations"] == 0.5
     assert not {"selection_episodes", "report_episodes", "report_questions", "perturbation"} & set(budget)
 

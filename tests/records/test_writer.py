@@ -107,7 +107,7 @@ def test_the_middle_of_a_long_error_is_left_out(record: Record, tmp_path: Path) 
         ({"1": [0] * MOST_DIAGNOSTICS}, "diagnostics have 6,291,463 bytes, more than 2,097,152"),
     ],
 )
-def test_diagnostics_that_could_not_be_read_are_refused_by_name_before_a_file_is_touched(
+def test_diagnostics_that_could_not_be_read_are_refused_by_name_before_a_file_is_made(
     diagnostics: dict[str, Any], words: str, record: Record, tmp_path: Path
 ) -> None:
     with pytest.raises(InputError, match=words):
@@ -134,6 +134,14 @@ def damage_columns(record: Record) -> None:
     record.episodes["stage"].pop()
 
 
+def damage_diagnostics(record: Record) -> None:
+    record.diagnostics = {"1": {1: "a number", "1": "a text"}}
+
+
+def damage_size(record: Record) -> None:
+    record.fingerprint["texts"] = ["x" * 100_000] * 90
+
+
 def damage_timing(record: Record) -> None:
     record.timing["x" * 201] = 1
 
@@ -145,6 +153,8 @@ def damage_timing(record: Record) -> None:
         (damage_scenario, "'<b>' cannot be the name of a task"),
         (damage_status, "error must be an object"),
         (damage_columns, "the columns of episodes have different lengths"),
+        (damage_diagnostics, "the name '1' is there twice in one object"),
+        (damage_size, "bytes, more than 8,388,608"),
         (damage_timing, "timing: a name of 201 characters"),
     ],
 )

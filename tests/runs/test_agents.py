@@ -1,4 +1,4 @@
-"""Agents that learn by trial: what they are asked, the record that they leave, and its row on the board."""
+"""Agents that learn by trial and error: their observations, their records, and their rows on the board."""
 
 import importlib
 import json
@@ -30,7 +30,7 @@ EXPERTS = {words: resolve(task.expert)(task.name) for task in TOY.tasks for word
 
 
 class Knowing:
-    """An agent that does what experts do, told which instructions it knows."""
+    """An agent that acts like the experts of the tasks that it knows."""
 
     def __init__(self, *tasks: str) -> None:
         self.words = {words for name in tasks for words in TOY.task(name).instructions}
@@ -47,7 +47,7 @@ def stage_env(stage: int, **options: Any) -> gymnasium.Env[Any, Any]:
 
 
 class Looking:
-    """An agent that keeps what it was shown."""
+    """An agent that keeps its observations."""
 
     def __init__(self) -> None:
         self.shown: list[Observation] = []
@@ -58,7 +58,7 @@ class Looking:
 
 
 def trained(stage: int, steps: int) -> gymnasium.Env[Any, Any]:
-    """Return the environment of a stage in which so many steps were taken."""
+    """Return the environment of a stage after `steps` steps."""
     env = stage_env(stage)
     env.reset(seed=0)
     for _ in range(steps):
@@ -69,7 +69,7 @@ def trained(stage: int, steps: int) -> gymnasium.Env[Any, Any]:
 
 @pytest.fixture
 def evaluate(tmp_path: Path, empty_caches: Path) -> Callable[..., Any]:
-    """Return `evaluate_agent` for the method me/knows, with records and caches of the test's own."""
+    """Return `evaluate_agent` for the method me/knows, with separate records and caches for the test."""
 
     def evaluate(agent: Any, env: Any, **options: Any) -> Any:
         return evaluate_agent(
@@ -80,10 +80,10 @@ def evaluate(tmp_path: Path, empty_caches: Path) -> Callable[..., Any]:
 
 
 LEARNED = (("left", "up"), ("up", "right"), ("up", "right", "down"))
-"""What an agent knows after each stage: it forgets "left" when it learns "right"."""
+"""Tasks that an agent knows after each stage: it forgets "left" when it learns "right"."""
 
 
-def test_an_agent_is_shown_what_the_environment_shows_and_nothing_else(evaluate: Callable[..., Any]) -> None:
+def test_an_agent_observes_exactly_what_the_environment_returns(evaluate: Callable[..., Any]) -> None:
     env = gymnasium.make("clbench.testing.seen_toy:clbench/SeenToy-v0", stage=0)
     agent = Looking()
     evaluate(agent, env)
@@ -91,7 +91,7 @@ def test_an_agent_is_shown_what_the_environment_shows_and_nothing_else(evaluate:
     assert any(shown["image"].any() for shown in agent.shown)
 
 
-def test_an_agent_leaves_a_record_of_what_it_knew_after_each_stage(
+def test_an_agent_leaves_a_record_of_its_success_after_each_stage(
     evaluate: Callable[..., Any], tmp_path: Path
 ) -> None:
     for stage, known in enumerate(LEARNED):
@@ -119,7 +119,7 @@ def test_an_agent_leaves_a_record_of_what_it_knew_after_each_stage(
     assert [one["training"] is not None for one in record.timing["stages"]] == [True] * 3
 
 
-def test_it_meets_the_initial_states_that_every_method_meets(
+def test_an_agent_has_the_same_initial_states_as_every_method(
     evaluate: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from clbench.evaluation.rollouts import Evaluator
@@ -144,7 +144,7 @@ def test_it_meets_the_initial_states_that_every_method_meets(
     assert {(name, seed) for seeds, names in seen for seed, name in zip(seeds, names, strict=True)} == starts
 
 
-def test_a_function_is_an_agent_and_sees_what_its_environment_gives(evaluate: Callable[..., Any]) -> None:
+def test_a_function_is_an_agent_and_observes_what_its_environment_returns(evaluate: Callable[..., Any]) -> None:
     env = stage_env(0, instruction="tokens")
     seen: list[bool] = []
 
@@ -158,7 +158,7 @@ def test_a_function_is_an_agent_and_sees_what_its_environment_gives(evaluate: Ca
     assert dict(zip(Scores.from_record(record).layout.tasks, rates, strict=True))["left"] == 1.0
 
 
-def test_an_agent_with_a_memory_gets_it_back_and_none_at_the_beginning(evaluate: Callable[..., Any]) -> None:
+def test_an_agent_receives_its_memory_except_at_the_first_step_of_an_episode(evaluate: Callable[..., Any]) -> None:
     class Counting:
         longest = 0
 
@@ -180,7 +180,7 @@ def test_an_agent_that_returns_nan_fails_its_episodes(evaluate: Callable[..., An
     assert set(record.episodes["length"]) == {12}
 
 
-def test_what_an_agent_draws_leaves_no_trace_and_repeats_itself(evaluate: Callable[..., Any]) -> None:
+def test_random_draws_of_an_agent_leave_no_trace_and_repeat_themselves(evaluate: Callable[..., Any]) -> None:
     agent = lambda _: np.random.uniform(-1, 1, 2)  # noqa: E731, NPY002 - as agents of other libraries draw
     np.random.seed(3)  # noqa: NPY002
     one = evaluate(agent, stage_env(0)).episodes
@@ -190,7 +190,7 @@ def test_what_an_agent_draws_leaves_no_trace_and_repeats_itself(evaluate: Callab
     assert evaluate(agent, stage_env(0)).episodes == one
 
 
-def test_steps_that_were_taken_elsewhere_are_told_and_unknown_ones_are_missing(
+def test_steps_taken_elsewhere_are_recorded_if_given_and_missing_if_unknown(
     evaluate: Callable[..., Any],
 ) -> None:
     assert evaluate(Knowing(), stage_env(0), steps=500).costs.environment_steps == 500
@@ -200,7 +200,7 @@ def test_steps_that_were_taken_elsewhere_are_told_and_unknown_ones_are_missing(
     assert record.timing["seconds"] is None
 
 
-def test_many_environments_side_by_side_count_their_steps_together(evaluate: Callable[..., Any]) -> None:
+def test_the_steps_of_parallel_environments_are_added_up(evaluate: Callable[..., Any]) -> None:
     env = gymnasium.make_vec(ID, num_envs=3, stage=2)
     _, info = env.reset(seed=0)
     assert list(info["task"]) == ["down"] * 3
@@ -220,10 +220,10 @@ def test_many_environments_side_by_side_count_their_steps_together(evaluate: Cal
         (lambda _: None, ValueError, r"action has the shape \(\), not \(2,\)"),
         (lambda _: {"arm": 1}, ValueError, "must be 2 numbers, not a dict"),
         (lambda _: "left", ValueError, "must be 2 numbers, not a str"),
-        (3, TypeError, "A int is no agent"),
+        (3, TypeError, "int is not an agent"),
     ],
 )
-def test_what_cannot_act_is_refused_and_the_stage_can_be_evaluated_again(
+def test_an_agent_that_cannot_act_is_refused_and_the_stage_can_be_evaluated_again(
     agent: Any, error: type[Exception], message: str, evaluate: Callable[..., Any]
 ) -> None:
     with pytest.raises(error, match=message):
@@ -240,7 +240,7 @@ def test_a_prediction_without_a_state_is_refused(evaluate: Callable[..., Any]) -
         evaluate(Plain(), stage_env(0))
 
 
-def test_stages_have_their_turn_once(evaluate: Callable[..., Any]) -> None:
+def test_stages_are_evaluated_once_and_in_order(evaluate: Callable[..., Any]) -> None:
     with pytest.raises(ValueError, match="Stage 0 of me/knows, seed 0, on clbench/Toy-v0 comes first, not 1"):
         evaluate(Knowing(), stage_env(1))
     evaluate(Knowing(), stage_env(0))
@@ -268,11 +268,11 @@ def test_a_finished_record_is_never_edited(evaluate: Callable[..., Any]) -> None
         ({"method": "../sac"}, "cannot be the name of a method"),
         ({"steps": -1}, "steps must be a whole number from 0, not -1"),
         ({"seed": -1}, "seed must be a whole number from 0, not -1"),
-        ({"settings": {"speed": float("nan")}}, "settings cannot be in a record"),
-        ({"settings": {"net": object()}}, "settings cannot be in a record"),
+        ({"settings": {"speed": float("nan")}}, "record cannot hold the settings"),
+        ({"settings": {"net": object()}}, "record cannot hold the settings"),
     ],
 )
-def test_names_seeds_and_settings_that_cannot_be_are_refused(
+def test_invalid_names_seeds_and_settings_are_refused(
     options: dict[str, Any], message: str, evaluate: Callable[..., Any]
 ) -> None:
     with pytest.raises(ValueError, match=message):
@@ -285,14 +285,14 @@ def test_targets_in_another_order_are_refused(evaluate: Callable[..., Any]) -> N
 
 
 def test_an_environment_without_a_scenario_or_a_stage_is_refused(evaluate: Callable[..., Any]) -> None:
-    with pytest.raises(TypeError, match="is not of a scenario"):
+    with pytest.raises(TypeError, match="does not belong to a scenario"):
         evaluate(Knowing(), gymnasium.make("CartPole-v1"))
     with pytest.raises(ValueError, match=r"goes through all stages: .*'clbench/Toy-v0', stage=0\)"):
         evaluate(Knowing(), gymnasium.make(ID))
 
 
 @pytest.mark.parametrize("stage", [-1, 3, "1"])
-def test_an_environment_of_a_stage_that_is_not_there_is_refused(stage: Any) -> None:
+def test_an_environment_of_a_missing_stage_is_refused(stage: Any) -> None:
     with pytest.raises(ValueError, match=f"clbench/Toy-v0 has stages 0 to 2, not {stage!r}"):
         ScenarioEnv(TOY, stage=stage)
 
@@ -316,7 +316,7 @@ for stage in range(clbench.next_stage("{id}", method="me/still", records="record
 """
 
 
-def test_a_killed_program_goes_on_with_the_stage_that_it_was_in(empty_caches: Path) -> None:
+def test_a_killed_program_continues_with_the_stage_that_was_running(empty_caches: Path) -> None:
     environment = {**os.environ, "CLBENCH_CACHE": str(empty_caches / "cache")}
 
     def run(last: int) -> int:
@@ -340,7 +340,7 @@ def test_a_killed_program_goes_on_with_the_stage_that_it_was_in(empty_caches: Pa
 
 @pytest.fixture(scope="module")
 def board(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Folder of a board that has a run of sft and one of an agent."""
+    """Folder of a board with a run of sft and a run of an agent."""
     from clbench.runs.run import execute
     from clbench.runs.spec import RunSpec
 
@@ -351,7 +351,7 @@ def board(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_it_has_a_division_of_its_own_and_takes_no_part_in_others(board: Path) -> None:
+def test_an_agent_has_its_own_division_and_takes_no_part_in_others(board: Path) -> None:
     table = importlib.import_module("clbench.leaderboard").load(board / "records").set_index("method")
     assert dict(table["division"]) == {"sft": "prior-data-free", "me/knows": "online"}
     assert list(table["rank"]) == [1, 1]
@@ -368,7 +368,7 @@ def test_it_has_a_division_of_its_own_and_takes_no_part_in_others(board: Path) -
         assert np.isnan(row[missing]), missing
 
 
-def test_the_page_marks_it_and_names_no_command_that_does_not_make_it(
+def test_the_page_marks_an_agent_and_shows_no_run_command_for_it(
     board: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     importlib.import_module("clbench.leaderboard.cli").show(records=board / "records")
@@ -380,7 +380,7 @@ def test_the_page_marks_it_and_names_no_command_that_does_not_make_it(
     assert "| 1 | me/knows | online |" in (board / "site" / "LEADERBOARD.md").read_text(encoding="utf-8")
 
 
-def test_its_record_is_recomputed_and_cannot_be_replayed(board: Path) -> None:
+def test_the_record_of_an_agent_is_recomputed_and_cannot_be_replayed(board: Path) -> None:
     verify = importlib.import_module("clbench.leaderboard.submission.verify")
     path = board / "records/Toy-v0/me--knows/seed-0.json"
     request = verify.Request("replayed", 10, 0, None, ID, None)
@@ -388,7 +388,7 @@ def test_its_record_is_recomputed_and_cannot_be_replayed(board: Path) -> None:
     assert all(check.passed for check in passed)
     assert (last.passed, last.found) == (
         False,
-        "an agent that learned online leaves none: it is recomputed at best",
+        "an agent that learned online has none, so its highest tier is recomputed",
     )
     assert importlib.import_module("clbench.leaderboard.board.tiers").tier_of(path) == "recomputed"
 
@@ -401,7 +401,7 @@ def test_its_record_is_recomputed_and_cannot_be_replayed(board: Path) -> None:
         {"online": True},
     ],
 )
-def test_a_record_that_claims_to_be_online_and_more_is_refused(
+def test_a_record_that_claims_online_learning_and_prior_data_is_refused(
     uses: dict[str, Any], board: Path, tmp_path: Path
 ) -> None:
     values = json.loads((board / "records/Toy-v0/me--knows/seed-0.json").read_text(encoding="utf-8"))

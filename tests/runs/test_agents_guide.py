@@ -1,4 +1,4 @@
-"""The guide to online agents: its own lines, as they stand."""
+"""The guide to online agents: its code runs unchanged."""
 
 import os
 import re
@@ -33,7 +33,7 @@ Flat(Shown(), env).predict(env.reset()[0], deterministic=True)
 
 
 def _output(command: list[str], folder: Path) -> str:
-    """Return what a program prints; threads would only get in each other's way here."""
+    """Return the output of a program; several threads would only slow each other down here."""
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
     done = subprocess.run(command, cwd=folder, env=environment, check=False, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
@@ -41,7 +41,7 @@ def _output(command: list[str], folder: Path) -> str:
 
 
 @pytest.mark.slow
-def test_the_page_s_own_lines_make_a_row(tmp_path: Path) -> None:
+def test_the_code_of_the_page_makes_a_row(tmp_path: Path) -> None:
     learning, flat = _blocks("python")
     small = learning.replace("clbench/Fetch-v0", ID).replace("range(5)", "range(3)").replace("5_000", "120")
     command = [sys.executable, "-c", small + flat + SHOW_FLAT]
@@ -59,7 +59,7 @@ def test_the_page_s_own_lines_make_a_row(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_the_program_of_the_page_makes_a_record_of_each_seed_and_skips_those_it_has(tmp_path: Path) -> None:
+def test_the_program_of_the_page_makes_a_record_for_each_seed_and_skips_existing_ones(tmp_path: Path) -> None:
     (line,) = _blocks("shell")
     python, script, scenario, *seeds = line.split()
     assert (python, script, scenario, seeds) == (

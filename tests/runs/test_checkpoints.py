@@ -1,4 +1,4 @@
-"""The policies of all stages: kept by a run, or made again; they are the same to the last bit."""
+"""The policies of all stages: kept by a run or made again, they are equal to the last bit."""
 
 import dataclasses
 import logging
@@ -85,7 +85,7 @@ def test_a_run_keeps_a_folder_for_each_stage(kept: Path) -> None:
     assert all({path.name for path in folder.iterdir()} == files for folder in folders)
 
 
-def test_kept_policies_are_those_that_are_made_again(kept: Path) -> None:
+def test_policies_that_are_made_again_equal_the_kept_ones(kept: Path) -> None:
     amounts: list[float] = []
     again = stage_policies(SPEC.resolve(), progress=amounts.append)
     _assert_equal(stage_policies(SPEC.resolve(), kept), again)
@@ -99,7 +99,7 @@ def test_kept_policies_are_those_that_are_made_again(kept: Path) -> None:
     assert not any(first[name].equal(last[name]) for name in changed)
 
 
-def test_policies_of_a_run_of_the_same_settings_that_is_evaluated_otherwise_count(kept: Path) -> None:
+def test_policies_of_the_same_run_with_another_evaluation_count(kept: Path) -> None:
     assert has_stages(dataclasses.replace(SPEC, split="validation").resolve(), kept)
     assert has_stages(dataclasses.replace(SPEC, perturb=True).resolve(), kept)
     assert not has_stages(dataclasses.replace(SPEC, seed=1).resolve(), kept)
@@ -115,7 +115,7 @@ def test_a_method_that_draws_from_global_generators_makes_the_same_policies_agai
     _assert_equal(stage_policies(spec.resolve(), tmp_path), stage_policies(spec.resolve()))
 
 
-def test_a_run_that_was_killed_keeps_all_stages_in_the_end(
+def test_a_killed_run_keeps_all_stages_once_it_has_finished(
     tmp_path: Path, execute_and_kill: Callable[..., None]
 ) -> None:
     spec = RunSpec(TOY, "sft", seed=0)
@@ -125,7 +125,7 @@ def test_a_run_that_was_killed_keeps_all_stages_in_the_end(
     _assert_equal(stage_policies(spec.resolve(), tmp_path), stage_policies(spec.resolve()))
 
 
-def test_what_another_version_of_the_code_kept_is_replaced(kept: Path, tmp_path: Path) -> None:
+def test_policies_kept_by_another_version_of_the_code_are_replaced(kept: Path, tmp_path: Path) -> None:
     stale = tmp_path / "Toy-v0" / "lora" / "seed-0" / "stage-2"
     stale.mkdir(parents=True)
     (stale / "policy.safetensors").write_bytes(b"stale")
@@ -146,7 +146,7 @@ def test_the_command_keeps_the_policies_of_a_run_that_has_a_record(
     assert "policies" not in capsys.readouterr().err  # they are there now
 
 
-def test_a_torn_policy_is_not_taken_and_the_log_says_so(
+def test_a_torn_policy_is_not_used_and_the_log_says_so(
     kept: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     keep_stages(SPEC.resolve(), tmp_path)
@@ -168,7 +168,7 @@ def test_a_torn_policy_is_not_taken_and_the_log_says_so(
         ("[1]", "cannot be read as the state of a method"),
     ],
 )
-def test_a_state_that_a_stranger_wrote_is_read_within_limits_and_refused_by_name(
+def test_an_untrusted_state_is_read_within_limits_and_refused_by_name(
     kept: Path, tmp_path: Path, text: str, reason: str
 ) -> None:
     folder = shutil.copytree(kept / "Toy-v0" / "lora" / "seed-0", tmp_path / "stages")
@@ -186,7 +186,7 @@ class Boundless(Method):
         return {"best": float("inf")}
 
 
-def test_a_state_that_could_not_be_read_again_is_refused_when_it_is_kept(
+def test_a_state_that_cannot_be_read_again_is_refused_when_it_is_written(
     stranger: Callable[[type[Method]], str],
 ) -> None:
     message = r"failed in state\(\) after stage 0: .*best: a number that is not finite"
@@ -194,6 +194,6 @@ def test_a_state_that_could_not_be_read_again_is_refused_when_it_is_kept(
         stage_policies(RunSpec(TOY, stranger(Boundless), seed=0).resolve())
 
 
-def test_a_method_that_fails_says_where(stranger: Callable[[type[Method]], str]) -> None:
+def test_the_error_of_a_failing_method_names_the_stage(stranger: Callable[[type[Method]], str]) -> None:
     with pytest.raises(MethodError, match=r"failed in stage 1 \(right\): RuntimeError: cannot merge right"):
         stage_policies(RunSpec(TOY, stranger(Stumbling), seed=0).resolve())

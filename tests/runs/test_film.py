@@ -1,4 +1,4 @@
-"""Films: they end as the recorded episodes do, and say so in colour and in words."""
+"""Films: they end like the recorded episodes, and show the outcome in colour and in words."""
 
 import dataclasses
 import os
@@ -32,21 +32,21 @@ COLUMNS = ("stage", "step", "task", "split", "episode", "success", "length")
 
 @pytest.fixture(autouse=True)
 def _own_process_state(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Take back what a command sets in its process."""
+    """Restore what a command sets in its process."""
     monkeypatch.setenv("MUJOCO_GL", os.environ.get("MUJOCO_GL", ""))
     monkeypatch.setattr(sys, "path", sys.path.copy())
 
 
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> tuple[Record, Path]:
-    """A run that is evaluated on validation episodes: its record, and the folder of the kept policies."""
+    """A run evaluated on validation episodes: its record, and the folder of its kept policies."""
     folder = tmp_path_factory.mktemp("recorded")
     return execute(SPEC, folder / "records", checkpoints=folder), folder
 
 
 @pytest.fixture
 def drawn() -> Film:
-    """A film without a policy: a success after two steps beside a failure after four."""
+    """A film without a policy: a success after two steps next to a failure after four."""
     pictures = [Image.fromarray(np.full((100, 140, 3), shade, np.uint8)) for shade in (40, 80, 120, 160, 200)]
     good = Take(pictures[:3], Episode("reach", "validation", 0, True, 1.0, 2))
     bad = Take(pictures, Episode("reach", "validation", 0, False, -1.0, 4))
@@ -56,13 +56,13 @@ def drawn() -> Film:
 
 
 def _colours(frame: Image.Image) -> set[str]:
-    """Return the colours that take at least a line of a frame."""
+    """Return the colours that fill at least a line of a frame."""
     counts = frame.getcolors(frame.width * frame.height)
     assert counts is not None
     return {"#{:02x}{:02x}{:02x}".format(*colour) for count, colour in counts if count > 100}  # type: ignore[misc]
 
 
-def test_an_episode_that_has_ended_stands_still_in_the_colour_of_its_end(drawn: Film) -> None:
+def test_an_episode_that_has_ended_holds_its_picture_in_the_colour_of_its_outcome(drawn: Film) -> None:
     assert len(drawn) == 5
     seen = [_colours(drawn.frame(time)) for time in range(5)]
     assert [SUCCESS in colours for colours in seen] == [False, False, True, True, True]
@@ -73,7 +73,7 @@ def test_an_episode_that_has_ended_stands_still_in_the_colour_of_its_end(drawn: 
 
 @pytest.fixture
 def written(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """The lines of text that are drawn."""
+    """Lines of text that are drawn."""
     lines: list[str] = []
     draw = ImageDraw.ImageDraw.text
 
@@ -85,7 +85,7 @@ def written(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     return lines
 
 
-def test_captions_and_ends_are_told_in_words(drawn: Film, written: list[str]) -> None:
+def test_a_film_has_captions_and_outcomes_in_words(drawn: Film, written: list[str]) -> None:
     drawn.frame(1)
     assert written[:2] == ["a film", "reach: go there"]
     assert written[-2:] == ["step 1", "step 1"]
@@ -95,14 +95,14 @@ def test_captions_and_ends_are_told_in_words(drawn: Film, written: list[str]) ->
     assert written[-2:] == ["success, 2 steps", "failure, 4 steps"]
 
 
-def test_what_does_not_fit_is_cut_off(drawn: Film, written: list[str]) -> None:
+def test_a_text_that_does_not_fit_is_cut_off(drawn: Film, written: list[str]) -> None:
     Film("word " * 100, drawn.rows, drawn.columns, drawn.takes).frame(0)
     assert written[0].startswith("word word")
     assert written[0].endswith("...")
     assert len(written[0]) < 60
 
 
-def test_a_gif_has_every_step_and_holds_its_end(drawn: Film, tmp_path: Path) -> None:
+def test_a_gif_has_every_step_and_holds_its_last_frame(drawn: Film, tmp_path: Path) -> None:
     for name in ("one.gif", "two.gif"):
         drawn.save(tmp_path / "films" / name, 20)
     one, two = ((tmp_path / "films" / name).read_bytes() for name in ("one.gif", "two.gif"))
@@ -119,7 +119,7 @@ def test_a_gif_has_every_step_and_holds_its_end(drawn: Film, tmp_path: Path) -> 
 
 
 @pytest.mark.skipif(find_spec("imageio_ffmpeg") is None, reason="the extra film is not installed")
-def test_an_mp4_has_every_step_and_holds_its_end(drawn: Film, tmp_path: Path) -> None:
+def test_an_mp4_has_every_step_and_holds_its_last_frame(drawn: Film, tmp_path: Path) -> None:
     from imageio_ffmpeg import count_frames_and_secs, read_frames
 
     for name in ("one.mp4", "two.mp4"):
@@ -133,7 +133,7 @@ def test_an_mp4_has_every_step_and_holds_its_end(drawn: Film, tmp_path: Path) ->
     frames.close()
 
 
-def test_a_film_ends_as_the_recorded_episodes_do(recorded: tuple[Record, Path]) -> None:
+def test_a_film_ends_like_the_recorded_episodes(recorded: tuple[Record, Path]) -> None:
     record, folder = recorded
     policies = stage_policies(SPEC.resolve(), folder)
     tasks = [*SCENARIO.retained, *SCENARIO.target]
@@ -172,13 +172,13 @@ def test_all_columns_of_a_row_begin_alike(recorded: tuple[Record, Path]) -> None
 
 
 class Unsteady(ToyWorld):
-    """A world that does something else whenever it is drawn."""
+    """A world that behaves differently when it is drawn."""
 
     def step(self, action: Any) -> Any:
         return super().step(action if self.render_mode is None else 0 * action)
 
 
-def test_a_world_that_does_not_repeat_itself_is_no_film(
+def test_a_world_that_does_not_repeat_an_episode_is_refused(
     recorded: tuple[Record, Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     module = types.ModuleType("stranger")
@@ -190,7 +190,7 @@ def test_a_world_that_does_not_repeat_itself_is_no_film(
         shoot(SCENARIO, 0, policies, [(task, "validation", 0)], 32)
 
 
-def test_the_command_writes_the_film_that_it_is_asked_for(
+def test_the_command_writes_the_requested_film(
     recorded: tuple[Record, Path], tmp_path: Path
 ) -> None:
     path = tmp_path / "toy.gif"
@@ -247,7 +247,7 @@ print(take.episode.length, len({picture.tobytes() for picture in take.pictures})
 
 
 @pytest.mark.slow
-def test_the_fetch_world_is_drawn_where_anything_can_draw() -> None:
+def test_the_fetch_world_is_drawn_on_machines_that_can_draw() -> None:
     try:
         choose_back_end([load_scenario("clbench/Fetch-v0").tasks[0].world])
     except RenderingError as error:
@@ -259,6 +259,6 @@ def test_the_fetch_world_is_drawn_where_anything_can_draw() -> None:
     assert (width, height) == (96, 96)
 
 
-def test_a_film_shows_no_more_steps_in_a_second_than_a_gif_can() -> None:
+def test_a_film_shows_at_most_as_many_steps_per_second_as_a_gif_can() -> None:
     assert steps_per_second(load_scenario("clbench/Fetch-v0").target[0]) == 25
     assert steps_per_second(load_scenario("clbench/MetaWorld-v0").target[0]) == FASTEST == 50

@@ -17,7 +17,7 @@ def test_a_rollout_hash_is_the_same_in_another_process_and_differs_between_tasks
     assert rollout_hash(world, "lift") != rollout_hash(world, "reach")
 
 
-def test_a_fingerprint_names_the_simulator_of_its_own_suite_alone() -> None:
+def test_a_fingerprint_names_only_the_simulator_of_its_suite() -> None:
     assert fingerprint(FETCH)["versions"]["gymnasium-robotics"] == version("gymnasium-robotics")
     assert "gymnasium-robotics" not in fingerprint(TOY)["versions"]
 

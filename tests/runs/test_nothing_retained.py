@@ -1,4 +1,4 @@
-"""A scenario that retains no tasks, as Continual World: from the walk over a run to the page."""
+"""A scenario that retains no tasks, such as Continual World: its schedule, its runs and its page."""
 
 import dataclasses
 import importlib
@@ -62,7 +62,7 @@ def run(method: str, folder: Path) -> Record:
     return execute(RunSpec(SCENARIO.id, method, 0), folder)
 
 
-def test_the_walk_begins_with_the_first_target() -> None:
+def test_the_schedule_begins_with_the_first_target() -> None:
     env = ScenarioEnv(SCENARIO, episodes_per_stage=2)
     walk = [env.reset()[1] for _ in range(5)]
     assert [info["stage"] for info in walk] == [1, 1, 2, 2, 2]
@@ -75,7 +75,7 @@ def test_the_walk_begins_with_the_first_target() -> None:
     many.close()
 
 
-def test_agents_that_learn_by_trial_are_told_that_there_is_no_stage_0(tmp_path: Path) -> None:
+def test_online_agents_are_refused_because_there_is_no_stage_0(tmp_path: Path) -> None:
     env = gymnasium.make(SCENARIO.id, stage=1)
     with pytest.raises(ValueError, match="clbench/ToyUnretained-v0 retains nothing"):
         evaluate_agent(lambda _: np.zeros(2), env, method="me/still", records=tmp_path)
@@ -83,7 +83,7 @@ def test_agents_that_learn_by_trial_are_told_that_there_is_no_stage_0(tmp_path: 
         next_stage(SCENARIO.id, method="me/still", records=tmp_path)
 
 
-def test_the_policy_knows_answers_alone_and_its_actions_are_not_normalised() -> None:
+def test_the_policy_learns_only_answers_and_its_actions_are_not_normalised() -> None:
     policy, _ = pretrained_policy(SCENARIO, 0)
     train, _ = load_questions(SCENARIO)
     torch.testing.assert_close(policy.state_mean, train.scenes.mean(dim=0))
@@ -97,7 +97,7 @@ def test_questions_ask_about_the_scenes_of_other_tasks() -> None:
     assert len(train) > SCENARIO.budget.question_episodes
 
 
-# one of each way to use prior demonstrations; where there are none yet, each is plain fine-tuning
+# one method for each use of prior demonstrations; without demonstrations each is plain fine-tuning
 @pytest.mark.parametrize("method", ["experience_replay", "joint", "a_gem", "buffered_replay", "ewc"])
 def test_a_method_that_replays_begins_with_the_first_target(method: str, tmp_path: Path) -> None:
     record = run(method, tmp_path)
@@ -105,7 +105,7 @@ def test_a_method_that_replays_begins_with_the_first_target(method: str, tmp_pat
     assert record.costs.optimiser_steps == 20
 
 
-def test_a_method_that_cannot_do_without_says_so(tmp_path: Path) -> None:
+def test_a_method_that_needs_prior_demonstrations_fails_with_the_reason(tmp_path: Path) -> None:
     record = run("fast_dvla", tmp_path)
     assert record.status == "failed"
     assert record.error is not None
@@ -115,7 +115,7 @@ def test_a_method_that_cannot_do_without_says_so(tmp_path: Path) -> None:
 
 @pytest.fixture
 def record(make_record: Callable[..., Record]) -> Record:
-    """Return a record of three targets, of which the first is half forgotten."""
+    """Return a record of three targets; the first one is half forgotten."""
     success = [[0.0, 0.0, 0.0], [0.9, 0.0, 0.0], [0.6, 0.8, 0.0], [0.4, 0.8, 0.7]]
     curves = [[0.2, 0.5, 0.7], [0.1, 0.4, 0.8], [0.3, 0.5, 0.6]]
     answers = {(stage, "side"): (100, 90) for stage in range(4)}
@@ -124,7 +124,7 @@ def record(make_record: Callable[..., Record]) -> Record:
     )
 
 
-def test_retention_is_missing_and_forgetting_is_of_earlier_targets(record: Record) -> None:
+def test_retention_is_missing_and_forgetting_covers_earlier_targets(record: Record) -> None:
     scores = Scores.from_record(record)
     assert measure("retention", scores) is None
     assert measure("minimum_retention", scores) is None

@@ -1,4 +1,4 @@
-"""Runs of the toy: they repeat themselves, resume, and fail with a record that says where."""
+"""Runs of the toy: they repeat themselves, resume, and fail with a record that names the place."""
 
 import dataclasses
 import json
@@ -37,7 +37,7 @@ def _lasting(path: Path) -> dict[str, Any]:
 
 @dataclasses.dataclass
 class Counting(Method):
-    """A method with a state: it counts its steps and keeps the mean of what it saw."""
+    """A method with a state: it counts its steps and keeps the mean of its data."""
 
     uses = Uses(demonstrations="prepare")
 
@@ -117,7 +117,7 @@ def test_a_record_holds_every_episode_and_answer_once(tmp_path: Path) -> None:
     assert read_record(tmp_path / "Toy-v0" / "sft" / "seed-0.json") == record
 
 
-def test_all_methods_meet_the_same_initial_states_and_the_same_pretrained_policy(tmp_path: Path) -> None:
+def test_all_methods_have_the_same_initial_states_and_the_same_pretrained_policy(tmp_path: Path) -> None:
     records = [execute(RunSpec(TOY, method, seed=0), tmp_path) for method in ("sft", "experience_replay")]
     first, second = (
         [row for row in zip(*record.episodes.values(), strict=True) if row[0] == 0] for record in records
@@ -128,7 +128,7 @@ def test_all_methods_meet_the_same_initial_states_and_the_same_pretrained_policy
     assert records[0].fingerprint == records[1].fingerprint
 
 
-def test_in_another_order_a_run_begins_with_the_same_policy_states_and_simulator(tmp_path: Path) -> None:
+def test_a_run_in_another_order_begins_with_the_same_policy_states_and_simulator(tmp_path: Path) -> None:
     specs = [RunSpec(TOY, "frozen", seed=0, order=order) for order in range(2)]
     published, other = (execute(spec, tmp_path) for spec in specs)
     assert (published.scenario.target, other.scenario.target) == (["right", "down"], ["down", "right"])
@@ -143,7 +143,7 @@ def test_in_another_order_a_run_begins_with_the_same_policy_states_and_simulator
     assert starts == others
 
 
-def test_perturbed_episodes_of_the_skills_stand_beside_all_that_a_plain_run_has(tmp_path: Path) -> None:
+def test_a_run_with_perturbed_episodes_has_everything_that_a_plain_run_has(tmp_path: Path) -> None:
     plain, perturbed = (
         execute(RunSpec(TOY, "sft", 0, perturb=perturb), tmp_path) for perturb in (False, True)
     )
@@ -162,7 +162,7 @@ def test_perturbed_episodes_of_the_skills_stand_beside_all_that_a_plain_run_has(
     assert np.isfinite(retained).all()
 
 
-def test_a_record_with_perturbed_episodes_counts_as_one_without_and_not_the_other_way_round(
+def test_a_record_with_perturbed_episodes_counts_as_a_plain_one_but_not_vice_versa(
     tmp_path: Path,
 ) -> None:
     plain, perturbed = (RunSpec(TOY, "frozen", 0, perturb=perturb) for perturb in (False, True))
@@ -174,7 +174,7 @@ def test_a_record_with_perturbed_episodes_counts_as_one_without_and_not_the_othe
     assert not has_record(RunSpec(TOY, "frozen", 0, perturb=True, order=1).resolve(), tmp_path)
 
 
-def test_a_scenario_without_anything_that_can_be_perturbed_is_refused_before_any_work(
+def test_a_scenario_that_cannot_be_perturbed_is_refused_before_any_work(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     from clbench.cli.runs import run
@@ -212,7 +212,7 @@ def test_frozen_forgets_nothing_and_costs_nothing(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("cls", "perturb"), [pytest.param(Counting, False, marks=pytest.mark.slow), (Adapting, True)]
 )
-def test_a_run_killed_anywhere_resumes_to_the_same_record(
+def test_a_run_killed_at_any_point_resumes_to_the_same_record(
     tmp_path: Path,
     stranger: Callable[[type[Method]], str],
     execute_and_kill: Callable[..., None],
@@ -233,12 +233,12 @@ def test_a_run_killed_anywhere_resumes_to_the_same_record(
 
 
 def _unfinished() -> set[str]:
-    """Return the folders of checkpoints of runs that are not done."""
+    """Return the folders with checkpoints of unfinished runs."""
     folder = cache_folder() / "runs"
     return {path.name for path in folder.iterdir()} if folder.exists() else set()
 
 
-def test_what_a_method_keeps_counts_in_bytes(tmp_path: Path, stranger: Callable[[type[Method]], str]) -> None:
+def test_the_state_of_a_method_is_counted_in_bytes(tmp_path: Path, stranger: Callable[[type[Method]], str]) -> None:
     record = execute(RunSpec(TOY, stranger(Counting), seed=0), tmp_path)
     assert record.costs.bytes_kept == 4 * 4  # the anchor: four float32
     assert record.diagnostics == {"0": {"steps": 0}, "1": {"steps": 60}, "2": {"steps": 120}}
@@ -248,7 +248,7 @@ def test_what_a_method_keeps_counts_in_bytes(tmp_path: Path, stranger: Callable[
 
 @dataclasses.dataclass
 class Merging(Method):
-    """A method whose policy is not ready before the end of a stage."""
+    """A method whose policy is ready only at the end of a stage."""
 
     whole_stages = True
 
@@ -259,7 +259,7 @@ class Merging(Method):
         return 0.0
 
 
-def test_a_method_of_whole_stages_is_evaluated_at_their_ends_only(
+def test_a_method_of_whole_stages_is_evaluated_only_at_their_ends(
     tmp_path: Path, stranger: Callable[[type[Method]], str]
 ) -> None:
     record = execute(RunSpec(TOY, stranger(Merging), seed=0), tmp_path)
@@ -269,23 +269,23 @@ def test_a_method_of_whole_stages_is_evaluated_at_their_ends_only(
     assert set(record.policy["update_sparsity"]) == {1.0}  # with a step size of 0 nothing moves
 
 
-def test_the_steps_of_preparing_count(tmp_path: Path, stranger: Callable[[type[Method]], str]) -> None:
+def test_the_steps_of_the_preparation_count(tmp_path: Path, stranger: Callable[[type[Method]], str]) -> None:
     record = execute(RunSpec(TOY, stranger(Merging), seed=0), tmp_path)
     assert (record.costs.preparation_steps, record.costs.optimiser_steps) == (7, 7 + 120)
 
 
-def test_a_tuning_run_never_meets_a_report_episode(tmp_path: Path) -> None:
+def test_a_tuning_run_never_plays_a_test_episode(tmp_path: Path) -> None:
     record = execute(RunSpec(TOY, "sft", seed=3, split="validation", targets=1), tmp_path)
     assert set(record.episodes["split"]) == {"validation"}
     assert record.run.split == "validation"
     assert not has_record(RunSpec(TOY, "sft", seed=3, targets=1).resolve(), tmp_path)
     report = execute(RunSpec(TOY, "sft", seed=3, targets=1), tmp_path / "test")
     assert record.fingerprint["pretrained"] == report.fingerprint["pretrained"]
-    # the same training: what both evaluate alike ends alike
+    # the training is the same: both runs end with the same policy
     assert record.policy["update_sparsity"] == report.policy["update_sparsity"]
 
 
-def test_changes_are_recorded_and_lie_beside_the_unchanged_run(tmp_path: Path) -> None:
+def test_a_run_with_changes_has_its_own_record_next_to_the_unchanged_run(tmp_path: Path) -> None:
     record = execute(RunSpec(TOY, "experience_replay", 0, {"replay": "0.25"}), tmp_path)
     assert record.run.settings == record.run.changes == {"replay": 0.25}
     assert [path.name for path in (tmp_path / "Toy-v0").iterdir()] == ["experience_replay+replay=0.25"]
@@ -366,16 +366,16 @@ class _Boasts(Method):
         (_Prepares, "prepare", "no anchor"),
         (_Diverges, "stage 1 (right)", "step 7: loss is nan, not finite."),
         (_Shapeless, "stage 1 (right)", "loss must be a scalar, shape (), not (16,)"),
-        (_Sneaks, "stage 1 (right)", "touches prior demonstrations that it does not declare"),
-        (_Peeks, "stage 1 (right)", "touches prior questions that it does not declare"),
+        (_Sneaks, "stage 1 (right)", "uses prior demonstrations that it does not declare"),
+        (_Peeks, "stage 1 (right)", "uses prior questions that it does not declare"),
         (_Boasts, "diagnostics() after stage 0", "not JSON compliant"),
-        (_Hoards, "stage 2 (down)", "draws from data after the hooks that it was handed to"),
+        (_Hoards, "stage 2 (down)", "draws from data after the hooks that received it"),
         (_Explodes, "stage 1 (right)", "step 0: a gradient is not finite"),
         (_Poisons, "stage 1 (right)", "The parameter head.position is not finite after 'right'"),
         (_Forgetful, "stage 1 (right)", "cannot merge right"),
     ],
 )
-def test_a_method_that_fails_leaves_a_record_that_says_where(
+def test_a_method_that_fails_leaves_a_record_that_names_the_place(
     tmp_path: Path, stranger: Callable[[type[Method]], str], cls: type[Method], where: str, message: str
 ) -> None:
     spec = RunSpec(TOY, stranger(cls), seed=0)
@@ -388,7 +388,7 @@ def test_a_method_that_fails_leaves_a_record_that_says_where(
     assert "Traceback" in record.error["traceback"]
 
 
-def test_a_record_of_another_budget_device_or_setting_and_a_failed_or_torn_one_do_not_count(
+def test_a_record_of_another_budget_device_or_setting_or_a_failed_or_torn_one_does_not_count(
     tmp_path: Path,
 ) -> None:
     spec = RunSpec(TOY, "experience_replay", 0)

@@ -1,4 +1,4 @@
-"""Run specifications: names are looked up once, and everything that follows is handed what was found."""
+"""Run specifications: names are looked up once, and later code receives the resolved run."""
 
 import sys
 from pathlib import Path
@@ -32,7 +32,7 @@ def test_a_run_looks_up_one_scenario_and_one_method(tmp_path: Path, monkeypatch:
     assert counts == {"scenario_at": 1, "load_method": 1}
 
 
-def test_a_resolved_run_has_everything_that_its_record_says() -> None:
+def test_a_resolved_run_has_all_settings_of_its_record() -> None:
     run = RunSpec(TOY, "experience_replay", 3, {"replay": "0.25"}, order=1, targets=1).resolve()
     assert (run.info.scenario, run.info.method, run.info.seed) == ("clbench/Toy-v0", "experience_replay", 3)
     assert (run.info.changes, run.info.order) == ({"replay": 0.25}, 1)

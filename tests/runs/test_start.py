@@ -15,7 +15,7 @@ TOY = "clbench.testing:clbench/Toy-v0"
 
 @pytest.fixture
 def reports() -> Path:
-    """Return the folder that keeps the evaluations of pretrained policies; there is none yet."""
+    """Return the folder for the evaluations of pretrained policies, which does not exist yet."""
     kept = cache_folder() / "reports"
     shutil.rmtree(kept, ignore_errors=True)
     return kept
@@ -23,14 +23,14 @@ def reports() -> Path:
 
 @pytest.mark.parametrize("perturb", [False, True])
 def test_progress_adds_up_to_the_length_of_the_run(perturb: bool, tmp_path: Path, reports: Path) -> None:
-    for _ in range(2):  # the second time the report of the pretrained policy is there already
+    for _ in range(2):  # the second time the cache has the evaluation of the pretrained policy
         amounts: list[float] = []
         run = RunSpec(TOY, "sft", seed=0, perturb=perturb).resolve()
         execute(run, tmp_path, amounts.append)
         assert sum(amounts) == pytest.approx(run_length(run.scenario, run.protocol))
 
 
-def test_the_report_of_the_pretrained_policy_is_made_once(tmp_path: Path, reports: Path) -> None:
+def test_the_pretrained_policy_is_evaluated_once(tmp_path: Path, reports: Path) -> None:
     first = execute(RunSpec(TOY, "sft", seed=0), tmp_path)
     (folder,) = reports.iterdir()
     before = (folder / "report.json").stat().st_mtime_ns
@@ -45,11 +45,11 @@ def test_the_report_of_the_pretrained_policy_is_made_once(tmp_path: Path, report
     assert len(list(reports.iterdir())) == 2  # it has more in it
 
 
-def test_a_report_that_another_run_makes_at_the_same_time_is_taken(
+def test_an_evaluation_that_another_run_makes_at_the_same_time_is_used(
     tmp_path: Path, reports: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     first = execute(RunSpec(TOY, "frozen", seed=0), tmp_path)
-    # what was looked for was not there yet; when it is to be made, it is
+    # it is missing at the first look, but exists when this run would make it
     monkeypatch.setattr("clbench.runs.run.is_cached", lambda *_: False)
     second = execute(RunSpec(TOY, "sft", seed=0), tmp_path)
     starts = [[stage for stage in one.episodes["stage"] if stage == 0] for one in (first, second)]

@@ -1,4 +1,4 @@
-"""Logs for TensorBoard: they show what the record holds, and change nothing."""
+"""Logs for TensorBoard: they show the contents of the record, and change nothing."""
 
 import dataclasses
 import sys
@@ -19,7 +19,7 @@ pytest.importorskip("tensorboard", reason="the extra tensorboard is not installe
 
 
 def _points(folder: Path) -> dict[str, list[tuple[int, float]]]:
-    """Return step and value of every point that TensorBoard shows, by tag."""
+    """Return step and value of every point in TensorBoard, by tag."""
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
     events: Any = EventAccumulator(str(folder))
@@ -31,7 +31,7 @@ def _points(folder: Path) -> dict[str, list[tuple[int, float]]]:
 
 @pytest.fixture(scope="module")
 def logged(tmp_path_factory: pytest.TempPathFactory) -> tuple[Any, Path]:
-    """A run that was logged: its record, and the folder of its log."""
+    """A logged run: its record, and the folder of its log."""
     folder = tmp_path_factory.mktemp("logged")
     record = execute(SPEC, folder / "records", tensorboard=folder / "logs")
     return record, folder / "logs" / "Toy-v0" / "aegis" / "seed-0"
@@ -44,7 +44,7 @@ def test_a_log_changes_no_bit_of_the_record(logged: tuple[Any, Path], tmp_path: 
     assert dataclasses.replace(plain, timing={}) == dataclasses.replace(record, timing={})
 
 
-def test_a_log_shows_what_the_record_holds(logged: tuple[Any, Path]) -> None:
+def test_a_log_shows_the_contents_of_the_record(logged: tuple[Any, Path]) -> None:
     record, folder = logged
     points = _points(folder)
     loss, rate = points["training/loss"], points["training/learning_rate"]
@@ -89,7 +89,7 @@ def test_a_log_shows_the_success_in_perturbed_episodes(tmp_path: Path) -> None:
     assert "success_perturbed/right" not in points
 
 
-def test_a_run_that_goes_on_has_no_point_twice(
+def test_a_resumed_run_logs_no_point_twice(
     logged: tuple[Any, Path], tmp_path: Path, execute_and_kill: Callable[..., None]
 ) -> None:
     execute_and_kill(SPEC, tmp_path, 0.75, tensorboard=tmp_path)

@@ -9,20 +9,15 @@ from scipy import stats
 from clbench.scoring.intervals import (
     Estimate,
     bootstrap,
-    episodes_needed,
     estimate,
-    expected_precision,
     half_width,
     interval,
     paired_difference,
     row_generator,
-    student_quantile,
-    studentised_range_quantile,
 )
 from clbench.scoring.layout import Layout
 from clbench.scoring.metrics import METRICS, load_metric, measure
 from clbench.scoring.scores import Scores
-from clbench.testing import TOY
 
 NOTHING = Estimate(None, None, None)
 
@@ -291,23 +286,6 @@ def test_a_quantity_without_value_for_some_seeds_has_no_interval() -> None:
     assert interval(1.0, np.zeros(0), lambda: np.array([1.0, np.nan])) == Estimate(1.0, None, None)
 
 
-@pytest.mark.parametrize("degrees", [1, 2, 3, 4, 9, 50, 10**6])
-def test_students_quantile_is_that_of_scipy(degrees: int) -> None:
-    assert student_quantile(degrees) == pytest.approx(stats.t.ppf(0.975, degrees), rel=1e-4)
-
-
-@pytest.mark.parametrize(("count", "degrees"), [(2, 1), (3, 2), (5, 8), (15, 28), (15, 10**6), (60, 4)])
-def test_the_quantile_of_the_studentised_range_is_that_of_scipy(count: int, degrees: int) -> None:
-    expected = stats.studentized_range.ppf(0.95, count, min(degrees, 10**5))
-    assert studentised_range_quantile(count, degrees) == pytest.approx(expected, rel=1e-4)
-
-
-def test_the_width_to_expect_with_one_seed_is_that_of_a_binomial() -> None:
-    expected = 1.96 * np.sqrt(0.25 / 120)
-    assert half_width(1, 20, 6) == pytest.approx(expected, rel=0.01)
-    assert half_width(1, 20, 6, seed_deviation=0.3) == half_width(1, 20, 6)
-
-
 @pytest.mark.parametrize(("seeds", "deviation"), [(3, 0.05), (5, 0.0), (5, 0.1)])
 def test_the_width_to_expect_is_that_of_simulated_rows(seeds: int, deviation: float) -> None:
     generator = np.random.default_rng(0)
@@ -318,32 +296,6 @@ def test_the_width_to_expect_is_that_of_simulated_rows(seeds: int, deviation: fl
     ]
     root_mean_square = np.sqrt(np.mean(np.square(widths))) / 2
     assert half_width(seeds, 20, 6, seed_deviation=deviation) == pytest.approx(root_mean_square, rel=0.1)
-
-
-def test_the_episodes_needed_are_the_fewest_that_are_enough() -> None:
-    for seeds, tasks, wished in ((1, 6, 0.05), (5, 6, 0.08), (10, 4, 0.05), (10, 10, 0.04), (30, 1, 0.1)):
-        needed = episodes_needed(wished, seeds, tasks)
-        assert needed is not None
-        assert half_width(seeds, needed, tasks) <= wished + 1e-9
-        assert needed == 1 or half_width(seeds, needed - 1, tasks) > wished
-    assert episodes_needed(half_width(5, 20, 6), 5, 6) == 20
-
-
-def test_no_number_of_episodes_makes_up_for_seeds_that_differ() -> None:
-    # Three seeds of a standard deviation of 0.05 alone: 4.30 * 0.05 / sqrt(3) is 0.12.
-    assert episodes_needed(0.12, 3, 6) is None
-    assert episodes_needed(0.13, 3, 6) is not None
-    assert episodes_needed(0.01, 3, 6, seed_deviation=0.0) is not None
-
-
-def test_a_scenario_has_a_sentence_on_the_intervals_to_expect() -> None:
-    three, one = (expected_precision(TOY, seeds) for seeds in (3, 1))
-    episodes = TOY.budget.test_episodes
-    widths = [half_width(3, episodes, count) for count in (len(TOY.retained), len(TOY.target))]
-    assert three.startswith(f"3 seeds x {episodes} episodes: ")
-    assert f"± {widths[0]:.2f} for retention, ± {widths[1]:.2f} for adaptation, ± " in three
-    assert one.startswith("1 seed x ")
-    assert "this seed alone" in one
 
 
 def test_a_metric_without_value_has_no_interval() -> None:

@@ -2,7 +2,6 @@
 
 import ast
 import importlib.util
-import itertools
 import json
 import re
 import sys
@@ -231,7 +230,7 @@ def test_a_whole_board_falls_into_several_groups() -> None:
     assert 1 < len(set(found.values())) < 23
 
 
-# ---- the page docs/guide/statistics.md ---------------------------------------------------------------------------
+# ---- the page docs/guide/statistics.md ---------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")

@@ -166,7 +166,7 @@ def test_perturbed_episodes_are_drawn_with_those_of_their_numbers(scores: Callab
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({}, "119 are perturbed, not 120: each retained skill has perturbed test episodes at the end of each stage"),
+        ({}, "119 are perturbed, not 120: each retained skill has perturbed test episodes at the end of"),
         (
             {"task": "target_0"},
             "the perturbed episode 19 of target_0 at stage 2, step 400, must not be there",

@@ -106,13 +106,13 @@ def episode(lanes: Lanes, lane: int, seed: int, task: Task, perturbed: bool) -> 
 def test_perturbed_episodes_run_beside_plain_ones_which_they_do_not_change(other_task: Task) -> None:
     for task in (LEFT, other_task):
         plain = episode(Lanes(1), 0, 3, task, perturbed=False)
-        disturbed = episode(Lanes(1), 0, 3, task, perturbed=True)
-        assert plain != disturbed
+        changed = episode(Lanes(1), 0, 3, task, perturbed=True)
+        assert plain != changed
         lanes = Lanes(3)
         for lane, perturbed in ((0, True), (1, False), (1, True), (0, False), (2, True)):
-            assert episode(lanes, lane, 3, task, perturbed) == (disturbed if perturbed else plain)
+            assert episode(lanes, lane, 3, task, perturbed) == (changed if perturbed else plain)
         seeds, flags = [3, 3, 3], [False, True, False]
-        first = [np.frombuffer(one, np.float32)[:4] for one in (plain, disturbed, plain)]
+        first = [np.frombuffer(one, np.float32)[:4] for one in (plain, changed, plain)]
         np.testing.assert_array_equal(lanes.reset([0, 1, 2], seeds, [task] * 3, flags), first)
 
 

@@ -123,16 +123,16 @@ def test_processes_draw_what_the_camera_draws_in_the_order_of_the_states() -> No
     views[::2] = np.random.default_rng(1).uniform(-1.0, 1.0, views[::2].shape)
     observer = Observer(TASK.world, TASK.camera, processes=2)
     numbers, images = observer.observe(states)
-    disturbed = observer.observe(states, views)[1]
+    perturbed = observer.observe(states, views)[1]
     one = observer.observe(states[:1])[1]
     observer.close()
     assert np.array_equal(numbers, states[:, :1])
     assert np.array_equal(images, ToyCamera().draw(states, np.zeros_like(views)))
-    assert np.array_equal(disturbed, ToyCamera().draw(states, views))
+    assert np.array_equal(perturbed, ToyCamera().draw(states, views))
     assert np.array_equal(one, images[:1])
 
 
-def test_what_is_seen_is_disturbed_in_perturbed_episodes_alone() -> None:
+def test_pictures_change_in_perturbed_episodes_alone() -> None:
     lanes = Lanes(3)
     seeds, tasks = [3, 3, 3], [TASK] * 3
     states = lanes.reset(range(3), seeds, tasks, [True, False, True])

@@ -1,8 +1,8 @@
 """SAC of stable-baselines3 with its gradient step written out: the same update at a fifth of the cost.
 
-Networks of two layers of 64 units cost next to nothing to compute; what PyTorch takes for one gradient step,
-11 ms on one slow core, is what it takes to record and to call 700 operations. Here the same numbers are
-computed in NumPy, on the memory of stable-baselines3's own parameters. Everything else is its.
+Networks of two layers of 64 units cost next to nothing to compute. PyTorch's 11 ms for a gradient step, on
+one slow core, are the overhead of recording and calling 700 operations. This module computes the same numbers
+in NumPy, in the memory of stable-baselines3's own parameters. Everything else is stable-baselines3's.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ from stable_baselines3 import SAC
 Array = NDArray[np.float32]
 
 EPSILON = np.float32(1e-6)
-"""What SAC adds inside the logarithm of a squashed action's density."""
+"""Constant that SAC adds inside the logarithm of a squashed action's density."""
 
 
 class _Adam:
-    """Parameters of things alike, put into one piece of memory, and Adam's moments of them.
+    """The parameters of networks of the same shape in one block of memory, with Adam's moments.
 
     Args:
-        alike: The parameters of each; those in the same place become parts of one array (things, ...).
+        alike: Parameters of each network; those at the same position become one array (networks, ...).
         rate: Step size.
     """
 
@@ -59,11 +59,11 @@ class _Adam:
 
 @dataclass
 class _Pass:
-    """What a forward through networks alike leaves for the way back; first axis: which network."""
+    """Values that a forward pass keeps for the backward pass; the first axis is the network."""
 
     inputs: Array
     hidden: list[Array]
-    """After each rectifier."""
+    """Values after each rectifier."""
     output: Array
 
 
@@ -79,9 +79,9 @@ def _forward(parts: list[Array], inputs: Array) -> _Pass:
 
 
 def _backward(parts: list[Array], run: _Pass, slope: Array, gradients: list[Array] | None) -> Array:
-    """Return the slope by the inputs (networks, B, in) for that by the outputs (networks, B, out).
+    """Return the gradient of the inputs (networks, B, in) from that of the outputs (networks, B, out).
 
-    Where `gradients` are given, those of the parameters are written there.
+    If `gradients` is given, the gradients of the parameters are written there.
     """
     for layer in range(len(parts) - 2, -1, -2):
         below = run.hidden[layer // 2 - 1] if layer else None
@@ -103,10 +103,8 @@ class WrittenOutSAC(SAC):
         super()._setup_model()
         assert self.log_ent_coef is not None
         rate, size = float(self.lr_schedule(1)), self.action_space.shape[0]  # type: ignore[index]
-        # one head of both outputs: the mean, then the logarithm of the deviation
-        deviations = cast(
-            torch.nn.Module, self.actor.log_std
-        )  # declared as a parameter, which it is elsewhere
+        # one head for both outputs: the mean, then the logarithm of the deviation
+        deviations = cast(torch.nn.Module, self.actor.log_std)  # declared as a parameter
         heads = list(zip(self.actor.mu.parameters(), deviations.parameters(), strict=True))
         joined = [torch.cat([mean.data, deviation.data]) for mean, deviation in heads]
         self._actor_adam = _Adam([[*self.actor.latent_pi.parameters(), *joined]], rate)
@@ -118,19 +116,19 @@ class WrittenOutSAC(SAC):
         self._target = _Adam([list(network.parameters()) for network in self.critic_target.q_networks], 0.0)
 
     def moments(self) -> Iterator[tuple[str, Array]]:
-        """Yield what the optimisers remember beside their numbers of steps, which are `_n_updates`."""
+        """Yield the moments of the optimisers by name; their numbers of steps are `_n_updates`."""
         for name, adam in zip(("actor", "critic", "entropy"), self._adams, strict=True):
             yield f"{name}.first", adam.first
             yield f"{name}.second", adam.second
 
     def resumed(self, updates: int) -> None:
-        """Count the gradient steps that were taken before a training was interrupted."""
+        """Restore the number of gradient steps after an interruption."""
         self._n_updates = updates
         for adam in self._adams:
             adam.step_count = updates
 
     def train(self, gradient_steps: int, batch_size: int = 64) -> None:
-        """Take gradient steps, each on a batch of what happened."""
+        """Take gradient steps, each on a batch from the replay buffer."""
         assert self.replay_buffer is not None
         for _ in range(gradient_steps):
             data = self.replay_buffer.sample(batch_size)
@@ -143,7 +141,7 @@ class WrittenOutSAC(SAC):
         self._n_updates += gradient_steps
 
     def _act(self, observations: Array) -> tuple[_Pass, Array, Array, Array, Array]:
-        """Return the forward, then deviation, noise, action (B, A) and logarithm of its density (B,)."""
+        """Return the forward pass, deviation, noise and action (B, A), and the action's log density (B,)."""
         run = _forward(self._actor_adam.parts, observations)
         size = run.output.shape[2] // 2
         deviation = np.exp(np.clip(run.output[0, :, size:], -20, 2))

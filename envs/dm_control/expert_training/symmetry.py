@@ -1,4 +1,4 @@
-"""Tasks that are other tasks seen in a mirror or from another place: one training serves them all."""
+"""Tasks that are mirrored or shifted versions of others, so that one training serves both."""
 
 from __future__ import annotations
 
@@ -6,14 +6,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .expert import Expert
+from ..experts import Expert
 
 
 @dataclass(frozen=True)
 class Symmetry:
-    """How the expert of a task follows from that of another task of the same body.
+    """Derives the expert of a task from the expert of another task of the same body.
 
-    What the other expert is shown is the observation less `shift`, times `signs`; what it does counts times
+    The other expert acts on the observation minus `shift`, times `signs`; its action is multiplied by
     `action_signs`.
     """
 
@@ -24,7 +24,7 @@ class Symmetry:
     action_signs: tuple[float, ...]
 
     def apply(self, expert: Expert) -> Expert:
-        """Return the expert that follows; tanh is odd, so that its weights alone can hold the symmetry."""
+        """Return the derived expert. As tanh is odd, changed weights are enough."""
         layers = list(expert.layers)
         weight, bias = layers[0]
         seen = weight * np.array(self.signs, np.float32)
@@ -40,7 +40,7 @@ SYMMETRIES: dict[str, Symmetry] = {
     "point_mass_left": Symmetry("point_mass_right", (-1.0, 1.0, -1.0, 1.0), (0.0,) * 4, (-1.0, 1.0)),
     "ball_in_cup_left": Symmetry("ball_in_cup_right", (-1.0, 1.0) * 4, (0.0,) * 8, (-1.0, 1.0)),
     "cartpole_right": Symmetry("cartpole_left", (-1.0, 1.0, -1.0, -1.0, -1.0), (0.0,) * 5, (-1.0,)),
-    # The rail looks alike everywhere, but for its ends.
+    # the rail is the same everywhere except at its ends
     "cartpole_balance": Symmetry("cartpole_left", (1.0,) * 5, (0.8, 0.0, 0.0, 0.0, 0.0), (1.0,)),
 }
-"""The tasks whose experts follow from that of another."""
+"""Tasks whose experts are derived from the expert of another task."""

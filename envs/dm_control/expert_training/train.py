@@ -1,4 +1,4 @@
-"""Training of experts by the SAC of stable-baselines3, which a kill cannot set back by more than a minute."""
+"""Training of experts with the SAC of stable-baselines3; a kill loses at most a minute of work."""
 
 from __future__ import annotations
 
@@ -27,24 +27,23 @@ from clbench.base.errors import InputError
 from clbench.base.seeding import SPLIT_LABELS, derive_seed, seeded
 from clbench.base.source import source_hash
 
-from .episode import Episode
-from .expert import Expert, ExpertError
-from .rules import HORIZON, SUCCESS_SHARE
+from ..episode import Episode
+from ..experts import Expert, ExpertError
+from ..rules import HORIZON, SUCCESS_SHARE
 from .sac import WrittenOutSAC
 from .symmetry import SYMMETRIES
 
 TEST_EPISODES = 100
-"""Episodes that the mean return and the success of an expert are measured on."""
+"""Number of episodes that measure the mean return and the success of an expert."""
 VALIDATION_EPISODES = 10
-"""Other episodes, after each segment: the actor that does best on them is kept, of equals the latest."""
+"""Number of other episodes after each segment, which choose the best actor, the latest of equals."""
 ROUND = 8
-"""Decisions between gradient steps, which are taken by half as many at once."""
+"""Decisions between updates; each update takes half as many gradient steps."""
 REPLAY_SIZE = 100_000
-"""Decisions that are kept, and the most of a training."""
+"""Decisions that the replay buffer keeps, and the longest training."""
 PACKAGES = ("dm-control", "mujoco", "numpy", "stable-baselines3", "torch")
-SOURCES = ("bodies", "episode", "expert", "rules", "sac", "state", "symmetry")
-"""Modules beside this one that a training depends on."""
-
+SOURCES = ("episode", "expert_training", "experts", "rules", "scene", "state")
+"""Modules and packages of the suite that a training depends on."""
 
 STEPS = {
     "point_mass_easy": 10_000,
@@ -54,28 +53,28 @@ STEPS = {
     "ball_in_cup_catch": 36_000,
     "ball_in_cup_right": 6_000,
 }
-"""Decisions after which each does what it is to, found by training."""
+"""Decisions after which each expert does its task, found by training."""
 
 
 @dataclass(frozen=True)
 class Settings:
-    """What the weights of an expert follow from."""
+    """The inputs that determine the weights of an expert."""
 
     task: str
     seed: int = 0
     steps: int = 20_000
-    """Decisions, with one gradient step for every two after the first segment, which is at random."""
+    """Decisions, with one gradient step for every two after the first segment, whose actions are random."""
     segment: int = 1_000
-    """Decisions between two checkpoints. All draws of a segment follow from its number, so that a training
-    that was killed ends in the same bits as one that was not."""
+    """Decisions between two checkpoints. The number of a segment seeds all its draws, so that a killed
+    training ends with the same bits as an uninterrupted one."""
     width: int = 64
     """Units of each of the two hidden layers, of actor and critics."""
     batch_size: int = 128
     learning_rate: float = 1e-3
     discount: float = 0.98
-    """Per step of 0.04 s: the future counts for some 2 s."""
+    """Discount per step of 0.04 s: a horizon of about 2 s."""
     target_rate: float = 0.01
-    """Share of the critics that their slow copies take over at each step."""
+    """Share of the critics' weights that the target critics adopt at each step."""
 
     def __post_init__(self) -> None:
         whole = self.steps % self.segment == self.segment % HORIZON == self.segment % ROUND == 0
@@ -87,11 +86,11 @@ class Settings:
 
 
 class TrainingWorld(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
-    """A task of the dm_control world as SAC meets it: its body's own observation, to scale, and action.
+    """A task of the dm_control world for SAC, with the body's own scaled observation and action.
 
     Args:
         task: Name of the task.
-        seeds: Seed of each episode.
+        seeds: Maps the number of an episode to its seed.
     """
 
     def __init__(self, task: str, seeds: Callable[[int], int]) -> None:
@@ -105,7 +104,7 @@ class TrainingWorld(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[NDArray[np.float32], dict[str, Any]]:
-        """Begin the next episode; its seed follows from its number."""
+        """Begin the next episode, seeded by its number."""
         observation = self._episode.reset(self._task, self._seeds(self.number))
         self.number, self._steps = self.number + 1, 0
         return observation.astype(np.float32) / self.scale, {}
@@ -113,7 +112,7 @@ class TrainingWorld(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
     def step(
         self, action: NDArray[np.float32]
     ) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
-        """Move for one step; the episode is cut at the horizon."""
+        """Move for one step; the horizon truncates the episode."""
         observation = self._episode.step(action)
         self._steps += 1
         reward = self._episode.training_reward(observation)
@@ -121,7 +120,7 @@ class TrainingWorld(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
 
 
 def returns(expert: Expert, task: str, purpose: str, episodes: int) -> NDArray[np.float64]:
-    """Return what an expert's episodes (N,) return; the initial states follow from `purpose` and number."""
+    """Return the returns (N,) of an expert's episodes; `purpose` and number seed the initial states."""
     episode, sums = Episode(), np.zeros(episodes)
     for number in range(episodes):
         observation = episode.reset(task, derive_seed("expert", task, SPLIT_LABELS[purpose], number))
@@ -132,17 +131,17 @@ def returns(expert: Expert, task: str, purpose: str, episodes: int) -> NDArray[n
 
 
 def steps_of(task: str) -> int:
-    """Return for how many steps the expert of a task is trained that comes with clbench."""
+    """Return the number of training steps of the included expert of a task."""
     symmetry = SYMMETRIES.get(task)
     return STEPS[symmetry.of if symmetry else task]
 
 
 def checkpoint_path(settings: Settings) -> Path:
-    """Return where the checkpoint of a training lies, or will lie; a longer training goes on from it."""
+    """Return the path of a training's checkpoint, from which a longer training continues."""
     inputs = {
         **{name: value for name, value in asdict(settings).items() if name != "steps"},
         "source": source_hash(
-            __name__, *(f"{__package__}.{part}" for part in SOURCES), "clbench.base.seeding"
+            *(f"clbench.envs.dm_control.{part}" for part in SOURCES), "clbench.base.seeding"
         ),
         "versions": versions(PACKAGES),
     }
@@ -152,30 +151,30 @@ def checkpoint_path(settings: Settings) -> Path:
 
 @dataclass
 class _Best:
-    """The actor that did best so far, and how each did."""
+    """The best actor so far, and the results of all."""
 
     actor: dict[str, Tensor]
     value: float
     curve: list[list[float]]
-    """After how many steps the actor returned how much, on average of the validation episodes."""
+    """Pairs of a number of steps and the mean return of the actor in the validation episodes."""
 
 
 def train(
     settings: Settings, folder: Path, progress: Callable[[float, str], None] = lambda _, __: None
 ) -> dict[str, Any]:
-    """Train an expert, write its weights and its JSON to `folder`, and return what the JSON says.
+    """Train an expert, write its weights and its JSON to `folder`, and return the content of the JSON.
 
-    A training that was interrupted goes on from its checkpoint, which lies in the cache. Where an expert
-    follows from that of another task by a symmetry, that one is trained, and measured on the task asked for.
+    An interrupted training continues from its checkpoint in the cache. If a symmetry derives the expert from
+    that of another task, the other expert is trained, and the derived one is measured on its own task.
 
     Args:
-        settings: What the weights follow from.
-        folder: Where to write.
-        progress: Called after each segment with the number of steps and how it stands.
+        settings: Inputs that determine the weights.
+        folder: Folder for both files.
+        progress: Called after each segment with the number of new steps and a line of text.
 
     Raises:
-        LookupError: No task has this name; the nearest one is named.
-        ExpertError: The checkpoint cannot be read; the message names it.
+        UnknownNameError: No task has this name; the error names the nearest one.
+        ExpertError: The checkpoint is unreadable; the message names it.
     """
     torch.set_num_threads(1)
     symmetry = SYMMETRIES.get(settings.task)
@@ -186,46 +185,46 @@ def train(
 
 
 def _train(settings: Settings, progress: Callable[[float, str], None]) -> _Best:
-    """Return the best actor of a training, begun or gone on with."""
+    """Start or continue a training, and return its best actor."""
     world = TrainingWorld(
         settings.task, lambda number: derive_seed("expert", settings.task, "training", settings.seed, number)
     )
     path = checkpoint_path(settings)
     with seeded("expert", settings.task, settings.seed, "weights"):
-        learner = _learner(settings, world)
-    best = _Best(_actor(learner, world), -math.inf, [])
+        trainer = _sac(settings, world)
+    best = _Best(_actor(trainer, world), -math.inf, [])
     if path.exists():
-        best = _read_checkpoint(learner, path)
-        progress(learner.num_timesteps, f"goes on after {learner.num_timesteps:,} steps, from {path}")
-        if learner.num_timesteps > settings.steps:
+        best = _read_checkpoint(trainer, path)
+        progress(trainer.num_timesteps, f"continues after {trainer.num_timesteps:,} steps, from {path}")
+        if trainer.num_timesteps > settings.steps:
             raise ExpertError(
-                f"{path} has {learner.num_timesteps:,} steps, more than {settings.steps:,}. Ask for as many, "
-                "or delete it, and the training begins again."
+                f"{path} has {trainer.num_timesteps:,} steps, more than {settings.steps:,}. Ask for at least "
+                "as many, or delete it to start again."
             )
-    while learner.num_timesteps < settings.steps:
+    while trainer.num_timesteps < settings.steps:
         begin = time.monotonic()
-        world.number = learner.num_timesteps // HORIZON
-        learner._last_obs = None  # so that `learn` resets the world: segments are whole episodes
-        with seeded("expert", settings.task, settings.seed, learner.num_timesteps):
-            learner.action_space.seed(derive_seed("explore", settings.seed, learner.num_timesteps))
-            learner.learn(settings.segment, reset_num_timesteps=False)
+        world.number = trainer.num_timesteps // HORIZON
+        trainer._last_obs = None  # `learn` then resets the world: segments are whole episodes
+        with seeded("expert", settings.task, settings.seed, trainer.num_timesteps):
+            trainer.action_space.seed(derive_seed("explore", settings.seed, trainer.num_timesteps))
+            trainer.learn(settings.segment, reset_num_timesteps=False)
         value = float(
-            returns(_expert(_actor(learner, world)), settings.task, "validation", VALIDATION_EPISODES).mean()
+            returns(_expert(_actor(trainer, world)), settings.task, "validation", VALIDATION_EPISODES).mean()
         )
-        best.curve.append([learner.num_timesteps, round(value, 3)])
+        best.curve.append([trainer.num_timesteps, round(value, 3)])
         if value >= best.value:
-            best = _Best(_actor(learner, world), value, best.curve)
-        _write_checkpoint(learner, best, path)
+            best = _Best(_actor(trainer, world), value, best.curve)
+        _write_checkpoint(trainer, best, path)
         pace = settings.segment / (time.monotonic() - begin)
         progress(
             settings.segment,
-            f"{learner.num_timesteps:,} of {settings.steps:,} steps, return {value:.1f} of {HORIZON}, "
+            f"{trainer.num_timesteps:,} of {settings.steps:,} steps, return {value:.1f} of {HORIZON}, "
             f"best {best.value:.1f}, {pace:.0f} steps/s",
         )
     return best
 
 
-def _learner(settings: Settings, world: TrainingWorld) -> WrittenOutSAC:
+def _sac(settings: Settings, world: TrainingWorld) -> WrittenOutSAC:
     return WrittenOutSAC(
         "MlpPolicy",
         world,
@@ -243,9 +242,9 @@ def _learner(settings: Settings, world: TrainingWorld) -> WrittenOutSAC:
     )
 
 
-def _actor(learner: WrittenOutSAC, world: TrainingWorld) -> dict[str, Tensor]:
-    """Return a copy of the layers that lead from what dm_control observes to the mean action."""
-    state = learner.policy.actor.state_dict()
+def _actor(trainer: WrittenOutSAC, world: TrainingWorld) -> dict[str, Tensor]:
+    """Return a copy of the layers that map dm_control's observation to the mean action."""
+    state = trainer.policy.actor.state_dict()
     names = ("latent_pi.0", "latent_pi.2", "mu")
     actor = {
         f"{number}.{kind}": state[f"{name}.{kind}"].clone()
@@ -264,44 +263,44 @@ def _expert(actor: dict[str, Tensor]) -> Expert:
     )
 
 
-def _tensors(learner: WrittenOutSAC) -> Iterator[tuple[str, Tensor]]:
-    """Yield all that a training goes on from, by name, in memory that is shared with it."""
-    yield from ((f"policy.{name}", value) for name, value in learner.policy.state_dict().items())
-    assert learner.log_ent_coef is not None
-    assert learner.replay_buffer is not None
-    yield "log_ent_coef", learner.log_ent_coef.data
-    yield from ((f"moments.{name}", torch.from_numpy(values)) for name, values in learner.moments())
+def _tensors(trainer: WrittenOutSAC) -> Iterator[tuple[str, Tensor]]:
+    """Yield the whole state of a training by name, in the training's own memory."""
+    yield from ((f"policy.{name}", value) for name, value in trainer.policy.state_dict().items())
+    assert trainer.log_ent_coef is not None
+    assert trainer.replay_buffer is not None
+    yield "log_ent_coef", trainer.log_ent_coef.data
+    yield from ((f"moments.{name}", torch.from_numpy(values)) for name, values in trainer.moments())
     for name in ("observations", "next_observations", "actions", "rewards", "dones", "timeouts"):
         yield (
             f"replay.{name}",
-            torch.from_numpy(getattr(learner.replay_buffer, name)[: learner.num_timesteps]),
+            torch.from_numpy(getattr(trainer.replay_buffer, name)[: trainer.num_timesteps]),
         )
 
 
-def _write_checkpoint(learner: WrittenOutSAC, best: _Best, path: Path) -> None:
-    """Write one file in one step, so that a kill leaves the old one or the new one."""
-    tensors = {name: value.clone() for name, value in _tensors(learner)}  # none may share memory
+def _write_checkpoint(trainer: WrittenOutSAC, best: _Best, path: Path) -> None:
+    """Replace the checkpoint atomically, so that a kill leaves the old or the new one."""
+    tensors = {name: value.clone() for name, value in _tensors(trainer)}  # safetensors refuses shared memory
     tensors |= {f"best.{name}": value for name, value in best.actor.items()}
-    words = {"steps": learner.num_timesteps, "updates": learner._n_updates, "value": best.value}
+    words = {"steps": trainer.num_timesteps, "updates": trainer._n_updates, "value": best.value}
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
     save_file(tensors, partial, metadata={"training": json.dumps(words | {"curve": best.curve})})
     partial.replace(path)
 
 
-def _read_checkpoint(learner: WrittenOutSAC, path: Path) -> _Best:
-    """Put a learner into the state that was written, and return the best actor so far.
+def _read_checkpoint(trainer: WrittenOutSAC, path: Path) -> _Best:
+    """Restore the state of a training, and return its best actor so far.
 
     Raises:
-        ExpertError: The file is torn, or not one of such a training.
+        ExpertError: The file is damaged, or not a checkpoint of such a training.
     """
     try:
         with safe_open(path, "pt") as file:
             words = json.loads(file.metadata()["training"])
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - no mapping
-        learner.num_timesteps = int(words["steps"])
-        learner.resumed(int(words["updates"]))
-        for name, value in _tensors(learner):
+        trainer.num_timesteps = int(words["steps"])
+        trainer.resumed(int(words["updates"]))
+        for name, value in _tensors(trainer):
             value.copy_(tensors[name])
         actor = {
             f"{number}.{kind}": tensors[f"best.{number}.{kind}"]
@@ -311,15 +310,15 @@ def _read_checkpoint(learner: WrittenOutSAC, path: Path) -> _Best:
         best = _Best(actor, float(words["value"]), list(words["curve"]))
     except (OSError, KeyError, TypeError, ValueError, RuntimeError, SafetensorError) as error:
         raise ExpertError(
-            f"{path} is no checkpoint of this training ({error}). Delete it, and the training begins again."
+            f"{path} is not a checkpoint of this training ({error}). Delete it to start again."
         ) from error
-    assert learner.replay_buffer is not None
-    learner.replay_buffer.pos = learner.num_timesteps
+    assert trainer.replay_buffer is not None
+    trainer.replay_buffer.pos = trainer.num_timesteps
     return best
 
 
 def _ship(settings: Settings, expert: Expert, curve: list[list[float]], folder: Path) -> dict[str, Any]:
-    """Measure an expert, write its files, and return what the JSON says."""
+    """Measure an expert, write its files, and return the content of the JSON."""
     task = settings.task
     sums = returns(expert, task, "test", TEST_EPISODES)
     content = expert.to_bytes()

@@ -1,4 +1,4 @@
-"""The page: all of the leaderboard in one file that needs no network, and the pictures of the README."""
+"""The HTML page: the whole leaderboard in one file that needs no network, and the pictures of the README."""
 
 from .html import page, pictures
 

@@ -1,7 +1,7 @@
-"""The charts as Vega-Lite: the plane of retention and adaptation, and the curves along a run.
+"""The charts as Vega-Lite: the plane of retention and adaptation, and the curves of a run.
 
-Colours are names of `PALETTE`, written as CSS variables: a chart follows the theme of the page without being
-drawn again. In a picture they are replaced by the colours of one theme.
+Colours are names of `PALETTE`, written as CSS variables, so that a chart follows the theme of the page
+without a new drawing. In a picture, the colours of one theme replace them.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import Any
 
 from ...board.rows import Row
 from ...board.runs import DIVISIONS
-from ..table import interval
+from ..format import format_interval
 from .labels import LONGEST, Mark, place
 
 PALETTE: Mapping[str, tuple[str, str]] = {
@@ -30,28 +30,29 @@ PALETTE: Mapping[str, tuple[str, str]] = {
     "mark-3": ("#a0527f", "#cc79a7"),
     "mark-4": ("#6b7480", "#9aa4b0"),
 }
-"""Colours in the light and in the dark theme. Those of marks are of Okabe and Ito, which the colour-blind
-tell apart, or near them where the contrast to the paper was below 3."""
+"""Colours in the light and in the dark theme. Marks have the colours of Okabe and Ito, which colour-blind
+readers can distinguish, or similar ones where the contrast to the paper was below 3."""
 
 SHAPES = ("circle", "square", "triangle-up", "cross", "diamond")
-"""Of the marks of a division, by its place in `DIVISIONS`: colour is never the only sign."""
+"""Shape of the marks of each of `DIVISIONS`: colour is never the only sign."""
 
 FONT = "Liberation Sans, Arial, Helvetica, sans-serif"
-"""Of pictures: the first comes with the converter, so that a text is as wide on every machine."""
+"""Fonts of pictures: the converter includes the first, so that texts have the same width on every machine."""
 
 SYSTEM_FONT = "system-ui, sans-serif"
-"""Of the page."""
+"""Font of the page."""
 
 Spec = dict[str, Any]
 """A specification of Vega-Lite."""
 
 
 def colour(name: str) -> str:
+    """Return the CSS variable of a colour of `PALETTE`."""
     return f"var(--{name})"
 
 
 def in_theme(svg: str, dark: bool) -> str:
-    """Return a picture with the colours of one theme in place of their names."""
+    """Return a picture with the colours of one theme instead of their names."""
     for name, colours in PALETTE.items():
         svg = svg.replace(colour(name), colours[dark])
     return svg
@@ -94,13 +95,13 @@ def _spec(layers: Sequence[Spec], font: str, **rest: Any) -> Spec:
 
 
 def _axis(name: str, title: str, **rest: Any) -> Spec:
-    """Return the encoding of a place on an axis from 0 to 1, unless `rest` says otherwise."""
+    """Return the encoding of a position on an axis, from 0 to 1 unless `rest` changes it."""
     axis = {"values": [0, 0.25, 0.5, 0.75, 1], "format": ".2~f"}
     return {"field": name, "type": "quantitative", "title": title, "axis": axis, **rest}
 
 
 def rounded(value: float | None) -> float | None:
-    """Return a number as a chart needs it. Rounded twice, so that the last bit of a sum does not show."""
+    """Return a number for a chart. Rounded twice, so that the last bit of a sum does not show."""
     known = finite(value)
     return None if known is None else round(round(known, 9), 3) + 0.0
 
@@ -115,14 +116,14 @@ def finite(value: float | None) -> float | None:
 
 @dataclass(frozen=True)
 class Size:
-    """Pixels that the plane takes; axes, legend and the labels on the right come on top."""
+    """Size of the plane in pixels, without axes, legend and the labels on the right."""
 
     width: int
     height: int
     columns: int
-    """Of the legend."""
+    """Number of columns of the legend."""
     titles: tuple[str, str]
-    """Of the axes."""
+    """Titles of the axes."""
 
 
 WIDE = Size(
@@ -130,17 +131,17 @@ WIDE = Size(
     400,
     4,
     (
-        "adaptation: success on each target right after it was learned",
+        "adaptation: success on each target right after learning it",
         "retention: success on the old skills at the end",
     ),
 )
-"""For a desktop."""
+"""Size on a desktop."""
 
 NARROW = Size(205, 320, 2, ("adaptation", "retention"))
-"""For a phone."""
+"""Size on a phone."""
 
 LOW, HIGH = -0.02, 1.02
-"""Ends of either axis: a mark at 0 or 1 is whole."""
+"""Ends of both axes, so that a mark at 0 or 1 is not cut off."""
 
 
 def plane(
@@ -149,10 +150,10 @@ def plane(
     """Return the plane of retention and adaptation with the Pareto front of each division.
 
     Args:
-        rows: Those of one scenario.
-        size: Of the plane.
-        anchors: Where a mark leads, by method.
-        font: Of all texts.
+        rows: Rows of one scenario.
+        size: Size of the plane.
+        anchors: Anchors that the marks link to, by method.
+        font: Font of all texts.
     """
     points = [_point(row, (anchors or {}).get(row.method, "")) for row in rows if _is_in_plane(row)]
     fronts = {
@@ -211,12 +212,12 @@ def _point(row: Row, anchor: str) -> dict[str, Any]:
         point[axis] = rounded(one.value)
         point[f"{axis}_low"] = rounded(one.value if one.low is None else one.low)
         point[f"{axis}_high"] = rounded(one.value if one.high is None else one.high)
-        point[name] = interval(one)
+        point[name] = format_interval(one)
     return point
 
 
 def _front(points: Sequence[Mapping[str, Any]]) -> list[tuple[float, float]]:
-    """Return the corners of the line below and left of which a point is worse in both than another."""
+    """Return the corners of the Pareto front: a point below and left of it is worse in both values."""
     best: list[tuple[float, float]] = []
     for x, y in sorted(((one["x"], one["y"]) for one in points), reverse=True):
         if not best or y > best[-1][1]:
@@ -230,7 +231,7 @@ def _front(points: Sequence[Mapping[str, Any]]) -> list[tuple[float, float]]:
 
 
 def _labels(points: Sequence[Mapping[str, Any]], lines: Iterable[float], size: Size) -> list[Spec]:
-    """Return the layers of the labels and of the lines that lead to those on the right."""
+    """Return the layers of the labels and of the lines to the labels on the right."""
 
     def across(value: float) -> float:
         return (value - LOW) / (HIGH - LOW) * size.width
@@ -252,7 +253,7 @@ def _labels(points: Sequence[Mapping[str, Any]], lines: Iterable[float], size: S
     leaders = [
         {"x": _pixel(one.mark.x), "y": _pixel(one.mark.y), "to": _pixel(one.y)} for one in labels if one.mark
     ]
-    # In pixels, since some lie beside the plane.
+    # In pixels, since some labels are outside the plane.
     x, y = ({"field": name, "type": "quantitative", "scale": None, "axis": None} for name in "xy")
     rule = {"type": "rule", "color": colour("line")}
     layers = [_layer(leaders, rule, x=x, y=y, x2={"value": size.width + 10}, y2={"field": "to"})]
@@ -275,19 +276,19 @@ def _pixel(value: float) -> float:
 # ---- along a run -------------------------------------------------------------------------------------------
 
 SERIES = ("old skills", "target of the stage", "old skills under sft")
-"""What the lines of the chart of a run are: the last one stands beside the others for comparison."""
+"""Lines in the chart of a run; the last one is for comparison."""
 
 
 def along_a_run(targets: Sequence[str], steps: int) -> Spec:
-    """Return the chart of a run without its points, which the page fills in for each row.
+    """Return the chart of a run without its points, which the page adds for each row.
 
     The points are the named data `points`: `x` (steps since the first stage), `y` with `low` and `high`, one
-    of `SERIES`, and the `stage`, by which the curves of a target are told from the next one's; the parameter
-    `shown` lists the series that there are.
+    of `SERIES`, and the `stage`, which separates the curve of a target from the next; the parameter `shown`
+    lists the series that have points.
 
     Args:
-        targets: Names of the tasks that are learned, in order.
-        steps: Of a stage.
+        targets: Names of the targets in order.
+        steps: Optimiser steps of a stage.
     """
     stages = [
         {"begin": number * steps, "end": (number + 1) * steps, "name": f"{number + 1} {name}"}

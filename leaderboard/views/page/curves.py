@@ -1,4 +1,4 @@
-"""Curves along a run with their intervals: how targets are learned while the old skills are forgotten."""
+"""Curves of a run with their intervals: success on the targets and on the old skills."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from clbench.scoring.rates import Rates
 from clbench.scoring.scores import Scores
 
 REPLICATES = 300
-"""Draws behind an interval of episodes: with 2000 its ends move by less than a line is wide."""
+"""Bootstrap draws of episodes: with 2000, the ends move by less than the width of a line."""
 
 Curve = Callable[[Rates], Array]
 """Maps rates with batch axes (...) to the points of a curve, (..., points)."""
@@ -36,9 +36,9 @@ def target_curves(rates: Rates) -> Array:
 def estimated(
     curves: Mapping[str, Curve], runs: Sequence[Scores], generator: np.random.Generator
 ) -> dict[str, list[Estimate]]:
-    """Return every point of `curves`, averaged over `runs`, with its interval as in `clbench.scoring.intervals`.
+    """Return the points of `curves`, means over `runs`, with intervals as in `clbench.scoring.intervals`.
 
-    Where an interval is of episodes, all points of all curves get the same ones.
+    Where an interval is over episodes, all points of all curves share the same draws.
     """
 
     @cache
@@ -56,7 +56,7 @@ def estimated(
 
 
 def _estimate(values: Array, point: int, drawn: Callable[[], Array]) -> Estimate:
-    """Return a point of a curve, given its value for each run and all points with other episodes."""
+    """Return a point of a curve, given its value for each run and all points with redrawn episodes."""
     count = len(values)
     others = (values.sum() - values) / (count - 1) if count > 1 else np.zeros(0)
     return interval(float(values.mean()), others, lambda: drawn()[:, point], (0.0, 1.0))

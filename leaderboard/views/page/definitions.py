@@ -1,4 +1,4 @@
-"""Rank under each definition: whether it depends on whose forgetting, or whose transfer, is meant."""
+"""Ranks under each definition of forgetting, transfer or final average."""
 
 from __future__ import annotations
 
@@ -11,38 +11,38 @@ from clbench.scoring.metric import Metric
 from clbench.scoring.metrics import METRICS
 
 from ...board.rows import Row
-from ..table import title_of
+from ..format import title_of
 
 FAMILIES: Mapping[str, tuple[str, ...]] = {
     "forgetting": ("forgetting", "backward_transfer", "remembering"),
     "transfer": ("forward_transfer", "zero_shot"),
     "final average": ("average", "accuracy", "performance", "area_under_curve"),
 }
-"""What definitions are about, and the words in their names that tell it; the first that fits counts."""
+"""Subjects of definitions, and the words that identify them in names; the first match counts."""
 
 EQUAL = 1e-9
-"""Values nearer than this are equal: rates are quotients of whole numbers, whose last bit may differ."""
+"""Values closer than this are equal: rates are quotients of integers whose last bit may differ."""
 
 
 @dataclass(frozen=True)
 class Family:
-    """Definitions of one thing, side by side."""
+    """Definitions of one subject, side by side."""
 
     name: str
     """Key of `FAMILIES`."""
     metrics: tuple[Metric, ...]
-    """Those of which any row has a value."""
+    """Definitions for which a row has a value."""
     ranks: Mapping[str, tuple[int | None, ...]]
-    """Rank of each method under each of them, by method; equal values share one, None without a value."""
+    """Ranks under each definition by method; equal values share a rank, None without a value."""
     depends: frozenset[str]
-    """Methods whose place depends on the definition and not on chance: two definitions put them and another
-    one in opposite orders, and under neither do the intervals overlap."""
+    """Methods whose rank depends on the definition and not on chance: two definitions put the method and
+    another one in opposite orders, and the intervals overlap under neither."""
     disagreement: str
-    """Which two definitions disagree most, in a sentence."""
+    """Sentence on the two definitions that disagree most."""
 
 
 def families(rows: Sequence[Row]) -> list[Family]:
-    """Return the families of definitions with the ranks of `rows`, which stand for one scenario."""
+    """Return the families of definitions with the ranks of `rows` of one scenario."""
     found = []
     for name in FAMILIES:
         metrics = [metric for metric in METRICS.values() if _family_of(metric) == name]
@@ -56,7 +56,7 @@ def families(rows: Sequence[Row]) -> list[Family]:
 
 
 def _family_of(metric: Metric) -> str | None:
-    """Return what a metric is a definition of, None if of nothing that others define too."""
+    """Return the family of a metric, None if it has none."""
     if metric.higher_is_better is None:
         return None
     fits = (name for name, words in FAMILIES.items() if any(word in metric.name for word in words))
@@ -71,7 +71,7 @@ def _better(metric: Metric, one: Estimate, other: Estimate) -> int:
 
 
 def _ranks(metric: Metric, rows: Sequence[Row]) -> dict[str, int | None]:
-    """Return the rank of each method: one more than there are better ones."""
+    """Return the rank of each method: one more than the number of better methods."""
     values = {row.method: row.estimates[metric.name] for row in rows}
     return {
         method: None
@@ -97,10 +97,10 @@ def _disagreements(metrics: Iterable[Metric], rows: Sequence[Row]) -> tuple[froz
         if len(opposed) > worst:
             worst, clear, names = len(opposed), len(apart), (first.name, second.name)
     if not worst:
-        return frozenset(), "All of them put the methods in the same order."
+        return frozenset(), "All definitions put the methods in the same order."
     return frozenset(depends), (
         f"“{title_of(names[0])}” and “{title_of(names[1])}” disagree most. They put {worst} of {len(pairs)} "
-        f"pairs of methods in opposite orders, {clear} of these with intervals that overlap under neither."
+        f"pairs of methods in opposite orders; in {clear} of these the intervals overlap under neither."
     )
 
 

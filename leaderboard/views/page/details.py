@@ -1,6 +1,6 @@
-"""What a record says besides scores, for a reader: how to make it again, what with, what its method tells.
+"""Contents of a record besides scores: commands to repeat it, settings, machine, diagnostics.
 
-All of it was written by whoever ran it: any value may be of any type, size and content.
+A stranger may have written the record: any value may have any type, size and content.
 """
 
 from __future__ import annotations
@@ -17,45 +17,45 @@ import numpy as np
 
 from ...board.rows import Row
 from ...board.runs import Run, is_number, printable
-from ..table import number_text
+from ..format import number_text
 
 LONGEST = 160
-"""Characters of a value that are shown."""
+"""Maximum length of a value in characters."""
 
 MOST = 60
-"""Entries of one kind that are shown."""
+"""Maximum number of entries of one kind."""
 
 _COMMIT = re.compile(r"[0-9a-f]{40}")
 
 
 class Entry(NamedTuple):
-    """A name and what stands beside it."""
+    """A name and its text."""
 
     name: str
     text: str
 
 
 @dataclass(frozen=True)
-class Told:
-    """One thing that a method tells about itself, stage after stage."""
+class Diagnostic:
+    """One diagnostic of a method, by stage."""
 
     name: str
     texts: tuple[str, ...]
-    """For each stage."""
+    """Text by stage."""
     lines: tuple[str, ...]
-    """For each stage, if it is a series of numbers: points of a line in a box of 100 by 20."""
+    """By stage, the points of a line in a box of 100 by 20; empty if it is not a series of numbers."""
 
 
 @dataclass(frozen=True)
 class Diagnostics:
-    """What a method tells about itself, means over seeds."""
+    """Diagnostics of a method, means over seeds."""
 
     stages: tuple[str, ...]
-    told: tuple[Told, ...]
+    values: tuple[Diagnostic, ...]
 
 
 def text_of(value: Any) -> str:
-    """Return any value in words, not too many."""
+    """Return any value as text of limited length."""
     if isinstance(value, bool) or value is None:
         text = {True: "yes", False: "no", None: "none"}[value]
     elif is_number(value):
@@ -67,7 +67,7 @@ def text_of(value: Any) -> str:
 
 
 def flat(values: Mapping[str, Any], prefix: str = "") -> list[Entry]:
-    """Return the entries of nested dictionaries as "outer inner"."""
+    """Return the entries of nested dictionaries, with names such as "outer inner"."""
     entries: list[Entry] = []
     for key, value in values.items():
         name = f"{prefix}{key}"
@@ -79,7 +79,7 @@ def flat(values: Mapping[str, Any], prefix: str = "") -> list[Entry]:
 
 
 def same_or_each(of_runs: Sequence[tuple[int, Sequence[Entry]]]) -> list[Entry]:
-    """Return entries of several seeds: a text once if all have it, else each with its seeds."""
+    """Return entries of several seeds: one text if all seeds share it, otherwise each text with its seeds."""
     names = dict.fromkeys(entry.name for _, entries in of_runs for entry in entries)
     found = []
     for name in names:
@@ -99,12 +99,12 @@ def _seeds(seeds: Sequence[int]) -> str:
 
 
 def commands(row: Row) -> list[str]:
-    """Return what makes the records of a row again, quoted: a reader may paste it into a shell."""
+    """Return the commands that make the records of a row again, quoted for the shell."""
     lines = []
     for commit, runs in groupby(row.runs, key=_commit):
         lines += [f"git checkout {commit}", "pip install -c constraints.txt -e ."] if commit else []
         if row.division == "online":
-            lines.append(f"# {printable(row.method)}: a program of its own, docs/guide/online.md")
+            lines.append(f"# {printable(row.method)} is a separate program: docs/guide/online.md")
             continue
         for (device, perturb), members in groupby(runs, key=_how):
             for first, count in _in_a_row([run.seed for run in members]):
@@ -117,8 +117,8 @@ def commands(row: Row) -> list[str]:
 
 
 def _how(run: Run) -> tuple[str, bool]:
-    """Return where a run was computed, and whether its skills met perturbed episodes."""
-    return str(run.record.run.get("device", "cpu")), run.record.run.get("perturb", False)
+    """Return the device of a run, and whether it has perturbed episodes."""
+    return run.record.run.device, run.record.run.perturb
 
 
 def _commit(run: Run) -> str:
@@ -128,7 +128,7 @@ def _commit(run: Run) -> str:
 
 
 def _in_a_row(seeds: Iterable[int]) -> list[tuple[int, int]]:
-    """Return rising seeds as the first and the number of those that follow one another."""
+    """Return rising seeds as ranges: first seed and number of consecutive seeds."""
     found: list[tuple[int, int]] = []
     for seed in seeds:
         if found and sum(found[-1]) == seed:
@@ -142,21 +142,23 @@ def _in_a_row(seeds: Iterable[int]) -> list[tuple[int, int]]:
 
 
 def diagnostics(runs: Sequence[Run]) -> Diagnostics:
-    """Return what the method of `runs` tells about itself in each stage."""
-    told = [run.record.diagnostics for run in runs]
-    by_stage = [{key: value for key, value in values.items() if isinstance(value, dict)} for values in told]
+    """Return the diagnostics of the method of `runs` by stage."""
+    recorded = [run.record.diagnostics for run in runs]
+    by_stage = [
+        {key: value for key, value in values.items() if isinstance(value, dict)} for values in recorded
+    ]
     stages = sorted({key for values in by_stage for key in values}, key=lambda key: (len(key), key))[:MOST]
     names = dict.fromkeys(name for values in by_stage for stage in values.values() for name in stage)
     found = []
     for name in list(names)[:MOST]:
         series = [[values.get(stage, {}).get(name) for values in by_stage] for stage in stages]
         texts, lines = zip(*map(_mean, series), strict=True)
-        found.append(Told(text_of(name), texts, lines))
+        found.append(Diagnostic(text_of(name), texts, lines))
     return Diagnostics(tuple(map(text_of, stages)), tuple(found))
 
 
 def _mean(values: Sequence[Any]) -> tuple[str, str]:
-    """Return the mean of what seeds tell in words and as a line; of what is no number the first."""
+    """Return the mean over seeds as text and as a line; for other values than numbers, the first one."""
     if all(map(is_number, values)):
         return text_of(float(np.mean(values))), ""
     lengths = {

@@ -1,4 +1,4 @@
-"""The page as HTML, and the pictures as SVG: the same table gives the same bytes."""
+"""The page as HTML, and its pictures as SVG. The same table gives the same bytes."""
 
 from __future__ import annotations
 
@@ -17,26 +17,26 @@ from markupsafe import Markup
 from ...board.overall import overall
 from ...board.rows import Row, Table
 from ...board.tiers import TIERS
-from ..table import title_of
+from ..format import title_of
 from .charts import FONT, NARROW, PALETTE, SERIES, SHAPES, WIDE, along_a_run, colour, in_theme, plane
 from .view import OTHERS, SHADES, ScenarioView, columns, grouped, number, scenarios
 
 FOLDER = Path(__file__).parent
-"""Where the templates, the style and the script are."""
+"""Folder of the templates, the style and the script."""
 
-GROUPS = {"retained": "old skills, to be kept", "target": "new tasks, in order", "held out": "never trained"}
+GROUPS = {"retained": "old skills to keep", "target": "new tasks, in order", "held out": "never trained"}
 """Titles of the groups of tasks."""
 
 TIER_RULES = (
-    "Nobody but the submitter has checked the runs.",
-    "The metrics were computed again from the episodes.",
-    "Some of the episodes were run again.",
-    "The whole runs were done again.",
+    "Only the submitter has checked the runs.",
+    "The metrics were recomputed from the episodes.",
+    "Some of the episodes were replayed.",
+    "The whole runs were repeated.",
 )
-"""What was done to believe the rows of each tier."""
+"""How the rows of each tier were verified."""
 
 VEGA_LITE = "6.4"
-"""Version that charts are written for."""
+"""Version of Vega-Lite that the charts are written for."""
 
 CIVIDIS = (
     "#00204d",
@@ -50,8 +50,8 @@ CIVIDIS = (
     "#e4cf5b",
     "#ffea46",
 )
-"""Colours of a success from 0 to 1: Nuñez et al. 2018, doi 10.1371/journal.pone.0199239, alike for the
-colour-blind and rising in lightness, so that numbers on them are read in either theme."""
+"""Colours of a success rate from 0 to 1: Nuñez et al. 2018, doi 10.1371/journal.pone.0199239. They look the
+same to colour-blind readers and rise in lightness, so that numbers on them are legible in both themes."""
 
 
 def page(table: Table) -> str:
@@ -90,7 +90,7 @@ def pictures(table: Table) -> dict[str, str]:
 
 @cache
 def _templates() -> Environment:
-    """Return the templates, which escape whatever they are given."""
+    """Return the templates, which escape all values."""
     templates = Environment(
         loader=FileSystemLoader(FOLDER / "templates"),
         autoescape=True,
@@ -111,13 +111,13 @@ def _templates() -> Environment:
 
 
 def _shade_of_rank(rank: int, count: int) -> int:
-    """Return the colour of a rank: that of a success of 1 for the first of `count`, of 0 for the last."""
+    """Return the shade of a rank: that of success 1 for the first of `count`, of success 0 for the last."""
     return SHADES - (rank - 1) * SHADES // max(count - 1, 1)
 
 
 @cache
 def _library() -> str:
-    """Return what draws the charts: it takes seconds to put together."""
+    """Return the library that draws the charts; bundling it takes seconds."""
     return vl_convert.javascript_bundle("window.vegaEmbed = vegaEmbed;", VEGA_LITE)
 
 
@@ -126,7 +126,7 @@ def _source(name: str) -> str:
 
 
 def _policy(scripts: Sequence[str], style: str) -> str:
-    """Return a content security policy that allows these scripts and this style and nothing else."""
+    """Return a content security policy that allows only these scripts and this style."""
     sources = " ".join(map(_hash, scripts))
     others = "default-src 'none'; base-uri 'none'; form-action 'none'"
     return f"{others}; script-src {sources}; style-src {_hash(style)}"
@@ -138,14 +138,14 @@ def _hash(text: str) -> str:
 
 
 def _colours() -> str:
-    """Return the colours of both themes, and those of the shades."""
+    """Return the colours of both themes and of the shades."""
     names = (f"--{name}:light-dark({light},{dark})" for name, (light, dark) in PALETTE.items())
     shades = (f".s{number}{{{_shade(number / SHADES)}}}" for number in range(SHADES + 1))
     return f":root{{{';'.join(names)}}}\n" + "\n".join(shades) + "\n"
 
 
 def _shade(share: float) -> str:
-    """Return the colours of a cell: of black and white the one that is read better."""
+    """Return the colours of a cell, with black or white text, whichever is more legible."""
     place = min(share * (len(CIVIDIS) - 1), len(CIVIDIS) - 1.000001)
     low, high = (_rgb(CIVIDIS[int(place) + step]) for step in (0, 1))
     mixed = [round(a + (b - a) * (place % 1)) for a, b in zip(low, high, strict=True)]
@@ -160,7 +160,7 @@ def _rgb(colour: str) -> tuple[int, ...]:
 
 
 def _data(views: Sequence[ScenarioView]) -> dict[str, Any]:
-    """Return what the charts are drawn from."""
+    """Return the data of the charts."""
     return {
         "rows": {view.anchor: {**view.data, "scenario": one.id} for one in views for view in one.rows},
         "scenarios": {one.id: _scenario_data(one) for one in views},
@@ -183,6 +183,6 @@ def _scenario_data(one: ScenarioView) -> dict[str, Any]:
 
 
 def _embedded(values: Any) -> str:
-    """Return JSON that cannot end the element it stands in, whatever a stranger wrote."""
+    """Return JSON that cannot close its script element, whatever a stranger wrote."""
     text = json.dumps(values, sort_keys=True, separators=(",", ":"), allow_nan=False)
     return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")

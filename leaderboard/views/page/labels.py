@@ -1,6 +1,6 @@
-"""Places for the labels of the plane, where a dozen marks may lie on one spot.
+"""Positions of the labels of the plane, where a dozen marks may share one spot.
 
-All lengths are pixels from the upper left corner of the plane.
+All lengths are in pixels, from the upper left corner of the plane.
 """
 
 from __future__ import annotations
@@ -10,22 +10,22 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 HEIGHT = 14.0
-"""From one label to the next."""
+"""Distance from one label to the next."""
 
 LETTER = 6.2
-"""Width of a letter at a size of 11, on average."""
+"""Mean width of a letter at font size 11."""
 
 LONGEST = 160
-"""Width of a label: what is longer is cut, and stands in the tooltip."""
+"""Maximum width of a label: longer text is cut, and the tooltip has all of it."""
 
 BESIDE = ((9, 0), (8, -9), (8, 10), (-8, -9), (-8, 10), (-9, 0))
-"""Where a label may lie, seen from its mark: those in the corners keep clear of the intervals."""
+"""Possible offsets of a label from its mark: the corners avoid the intervals."""
 
 OBSTACLE = 5.0
 """Half the width of a mark."""
 
 CROWD = 14.0
-"""Marks nearer than this have their labels in the list: beside them nobody could tell whose is whose."""
+"""Marks closer than this have their labels in the list: next to the marks, labels would be ambiguous."""
 
 
 @dataclass(frozen=True)
@@ -43,15 +43,15 @@ class Mark:
 
 @dataclass(frozen=True)
 class Label:
-    """The place of a label: the middle of its left or right side."""
+    """The position of a label: the middle of its left or right side."""
 
     name: str
     x: float
     y: float
     align: str
-    """left or right: which side `x` is."""
+    """Side at `x`: left or right."""
     mark: Mark | None = None
-    """What a line leads to, if it is not beside it."""
+    """Mark that a line connects to the label, if the label is not next to it."""
 
 
 Box = tuple[float, float, float, float]
@@ -59,15 +59,15 @@ Box = tuple[float, float, float, float]
 
 
 def place(marks: Sequence[Mark], rows: Sequence[float], width: float, height: float) -> list[Label]:
-    """Return the labels: beside the mark where nothing is in the way, else in a list on the right.
+    """Return the labels: next to the mark where there is room, otherwise in a list on the right.
 
-    As many as fit are in the list, the uppermost first; the others have no label.
+    The list holds as many labels as fit, the uppermost first; the other marks have no label.
 
     Args:
-        marks: What to label.
-        rows: Heights of the lines from side to side that no label should lie on.
-        width: Of the plane.
-        height: Of the plane.
+        marks: Marks to label.
+        rows: Heights of horizontal lines that labels must avoid.
+        width: Width of the plane.
+        height: Height of the plane.
     """
     taken = [box for mark in marks for box in _boxes(mark)] + [(0.0, width, row, row) for row in rows]
     labels: list[Label] = []
@@ -88,7 +88,7 @@ def place(marks: Sequence[Mark], rows: Sequence[float], width: float, height: fl
 
 
 def _boxes(mark: Mark) -> list[Box]:
-    """Return what a mark and its intervals cover."""
+    """Return the boxes that a mark and its intervals cover."""
     return [
         (mark.x - OBSTACLE, mark.x + OBSTACLE, mark.y - OBSTACLE, mark.y + OBSTACLE),
         (mark.left, mark.right, mark.y, mark.y),
@@ -107,7 +107,7 @@ def _is_near(mark: Mark, other: Mark) -> bool:
 
 
 def _beside(mark: Mark, taken: Sequence[Box], width: float, height: float) -> Label | None:
-    """Return the first place beside the mark that is inside the plane and free, None if there is none."""
+    """Return the first free position next to the mark inside the plane, None if there is none."""
     for dx, dy in BESIDE:
         label = Label(mark.name, mark.x + dx, mark.y + dy, "left" if dx > 0 else "right")
         box = _box(label)
@@ -122,7 +122,7 @@ def _overlap(one: Box, other: Box) -> bool:
 
 
 def _spread(wished: Sequence[float], height: float) -> list[float]:
-    """Return places near those wished, which rise, `HEIGHT` apart or more, from the top to the bottom."""
+    """Return positions near the wished ones, in rising order, at least `HEIGHT` apart."""
     places: list[float] = []
     for wish in wished:
         places.append(max(wish, places[-1] + HEIGHT if places else 0.0))

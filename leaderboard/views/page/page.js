@@ -5,7 +5,7 @@
   const narrow = () => window.innerWidth < 720;
   root.classList.remove("no-script");
 
-  // ---- theme: the reader's own choice, else that of the system ---------------------------------------------
+  // ---- theme: the reader's choice, otherwise the system's ---------------------------------------------------
 
   const dark = matchMedia("(prefers-color-scheme: dark)");
   const button = document.getElementById("theme");
@@ -15,7 +15,7 @@
     button.textContent = theme() === "dark" ? "Light theme" : "Dark theme";
   }
 
-  // A file that is opened from disk may have no storage.
+  // A file opened from disk may have no storage.
   try { root.dataset.theme = localStorage.getItem("theme") || ""; } catch { /* the system's theme */ }
   button.addEventListener("click", () => {
     root.dataset.theme = theme() === "dark" ? "light" : "dark";
@@ -38,7 +38,7 @@
 
     function compare(a, b) {
       const [x, y] = [a, b].map(({ row }) => row.cells[column].dataset.order);
-      if (!x || !y) return (x ? 0 : 1) - (y ? 0 : 1); // what is missing comes last either way
+      if (!x || !y) return (x ? 0 : 1) - (y ? 0 : 1); // missing values come last in both directions
       const order = isNaN(x) || isNaN(y) ? x.localeCompare(y, "en") : x - y;
       return direction === "ascending" ? order : -order;
     }
@@ -111,9 +111,9 @@
   }
 
   async function draw(element, spec) {
-    // The interpreter of expressions, since the page's policy forbids to make code of text.
+    // `ast` interprets expressions: the policy of the page forbids code made from text.
     const options = { actions: false, ast: true, renderer: "svg", defaultStyle: false, tooltip: showTip };
-    // Vega writes names of its own on what it draws in.
+    // Vega sets its own class names on the element that it draws in.
     const { view } = await vegaEmbed(element.appendChild(document.createElement("div")), spec, options);
     view.addEventListener("click", (event, item) => {
       if (item?.datum?.anchor) location.hash = `#${item.datum.anchor}`;
@@ -128,7 +128,7 @@
   const words = ([value, low, high]) =>
     value === null ? "–" : value.toFixed(2) + (low === null ? "" : ` [${low.toFixed(2)}, ${high.toFixed(2)}]`);
 
-  /* The evaluations of a run in order: stage and step of the curve of the old skills, and of those of the targets. */
+  /* The evaluations of a run in order: stage and step of each point of the curves of old skills and targets. */
   function places({ steps, targets }) {
     const each = (from) => targets.flatMap((_, stage) => from.map((step) => [stage, step]));
     return { retained: [[0, 0], ...each(steps)], target: each([0, ...steps]) };
@@ -163,7 +163,7 @@
     draw(element, { ...one.run, params: [{ name: "shown", value: shown }], datasets: { points: all } });
   }
 
-  // ---- tables that are long and made when they are opened -------------------------------------------------
+  // ---- tables that are long and made when they open -------------------------------------------------
 
   function table(label, heads, rows) {
     const region = document.createElement("div");
@@ -270,7 +270,7 @@
   }
 
   document.addEventListener("close", ({ target: dialog }) => {
-    // Closed by a key or a click: the address is the scenario's again, and the focus on the row.
+    // Closed by a key or a click: restore the address of the scenario, and the focus on the row.
     if (dialog.returnValue !== "moved") {
       const part = dialog.closest(".part");
       history.replaceState(null, "", `#${part.id}`);

@@ -1,4 +1,4 @@
-"""What the page shows of scenarios and rows, ready for the templates: texts, bars and shades."""
+"""Scenarios and rows as the templates need them: texts, bars and shades."""
 
 from __future__ import annotations
 
@@ -19,49 +19,49 @@ from clbench.spec.identifiers import built_in_methods
 
 from ...board.rows import Row, Table, rank_mates
 from ...board.runs import DIVISIONS, METHODS, printable
-from ...pages.descriptions import Description, describe
+from ..descriptions import Description, describe
+from ..format import SHOWN, Rows, format_interval, number_text, scaled, shown, title_of
 from ..markdown import arxiv_ids
-from ..table import SHOWN, Rows, interval, number_text, scaled, shown, title_of
 from .charts import finite, rounded
 from .curves import estimated, retained_curve, target_curves
 from .definitions import Family, families
 from .details import Diagnostics, Entry, commands, diagnostics, flat, same_or_each
 
 MISSING = "\N{EN DASH}"
-"""What stands for a value that could not be computed."""
+"""Text for a value that could not be computed."""
 
 NAMED = 3
-"""Methods that share a rank and are named; of more only the number is told."""
+"""Number of methods with the same rank that are named; further ones are only counted."""
 
 OTHERS = tuple(metric for metric in METRICS.values() if metric not in SHOWN)
-"""Metrics that a row's section has besides."""
+"""Further metrics in the section of a row."""
 
 SHADES = 20
-"""Steps between a success of 0 and of 1 that have a colour of their own."""
+"""Number of shades between success 0 and success 1."""
 
 RULES: Mapping[str, str] = dict(
     zip(
         DIVISIONS,
         (
-            "see nothing of what came before",
-            "may look at questions from before, but at no demonstrations",
-            "may look at demonstrations from before",
-            "learn by trial, without the pretrained policy and demonstrations: no method compares with them",
-            "do not compete: they show what could be had at best, and what doing nothing gives",
+            "may reuse no earlier data",
+            "may reuse earlier questions, but no demonstrations",
+            "may reuse earlier demonstrations",
+            "learn by trial and error, without pretrained policy and demonstrations: not comparable",
+            "do not compete: they show the best that is possible, and the result of doing nothing",
         ),
         strict=True,
     )
 )
-"""What the methods of each division do."""
+"""What the methods of each division may do."""
 
 
 Item = TypeVar("Item")
 Group = tuple[int, str, str, list[Item]]
-"""Number, name and rule of a division, and the rows in it."""
+"""Number, name and rule of a division, and its rows."""
 
 
 def grouped(rows: Iterable[Item], divisions: Iterable[str]) -> list[Group[Item]]:
-    """Return sorted rows by division, given that of each."""
+    """Return sorted rows by division, given the division of each row."""
     groups = groupby(zip(divisions, rows, strict=True), key=lambda pair: pair[0])
     return [(DIVISIONS.index(name), name, RULES[name], [row for _, row in pairs]) for name, pairs in groups]
 
@@ -71,13 +71,13 @@ class Number:
     """A number in a cell."""
 
     text: str
-    """As it is shown."""
+    """Text in the cell."""
     order: str = ""
-    """What it is sorted by; nothing if it is missing."""
+    """Sort key; empty if the number is missing."""
     note: str = ""
-    """Its interval, or why it is missing."""
+    """Its interval, or the reason why it is missing."""
     bar: tuple[float, ...] = ()
-    """Low end, value and high end in per cent of a bar from 0 to 1; nothing without an interval."""
+    """Low end, value and high end in per cent of a bar from 0 to 1; empty without an interval."""
 
 
 @dataclass(frozen=True)
@@ -88,7 +88,7 @@ class MetricView:
     number: Number
     interval: str
     seeds: tuple[str, ...]
-    """Value of each seed."""
+    """Values by seed."""
 
     @property
     def title(self) -> str:
@@ -98,15 +98,15 @@ class MetricView:
 
 @dataclass(frozen=True)
 class Stage:
-    """A line of the success matrix: mean over seeds."""
+    """A row of the success matrix, mean over seeds."""
 
     name: str
     texts: tuple[str, ...]
-    """Success on each task."""
+    """Success rates by task."""
     shades: tuple[int | None, ...]
-    """Number of its colour, from 0 to `SHADES`."""
+    """Shades by task, from 0 to `SHADES`."""
     learned: int | None
-    """Column of the task that was learned in this stage."""
+    """Column of the task that this stage learned."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,22 +115,22 @@ class RowView:
 
     row: Row
     rank: str
-    """As it is shown, = where it is shared."""
+    """Rank as text, with = if it is shared."""
     place: str
-    """Its rank in words."""
+    """Rank in words."""
     cells: tuple[Number, ...]
-    """Of the table's `columns`, then the relative cost and the bytes kept."""
+    """Cells of the table's `columns`, then the relative cost and the bytes kept."""
     metrics: tuple[MetricView, ...]
-    """What is shown of this row alone."""
+    """Metrics in the section of the row."""
     stages: tuple[Stage, ...]
     data: Mapping[str, Any]
-    """What the page draws when the section is opened."""
+    """Data that the page draws when the section opens."""
     description: Description | None
-    """What the code says of its method, if it is one of ours."""
+    """Description of its method, if it is built in."""
 
     @property
     def anchor(self) -> str:
-        """Its place on the page."""
+        """Anchor on the page."""
         return f"{self.row.scenario}/{self.row.method}"
 
     @property
@@ -140,7 +140,7 @@ class RowView:
 
     @property
     def summary(self) -> str:
-        """What its method does, nothing if that is not known here."""
+        """One sentence about its method, empty if the method is not built in."""
         return self.description.summary if self.description else ""
 
     @property
@@ -171,34 +171,34 @@ class RowView:
 
     @property
     def order_sensitivity(self) -> str:
-        """How far these lie apart, nothing if they are too few."""
+        """Range of these final averages, empty if there are too few orders."""
         return number_text(self.row.orders.sensitivity, ".2f", "")
 
     @property
     def commands(self) -> str:
-        """What makes its records again."""
+        """Commands that make its records again."""
         return "\n".join(commands(self.row))
 
     @property
     def diagnostics(self) -> Diagnostics:
-        """What its method tells about itself."""
+        """Diagnostics of its method."""
         return diagnostics(self.row.runs)
 
     @property
     def settings(self) -> list[Entry]:
-        """Hyper-parameters, and the prior data that its method may touch."""
+        """Hyper-parameters, and the prior data that its method may use."""
         run = self.row.runs[0].record.run
-        uses = {f"prior {kind}": run["uses"][kind] for kind in ("demonstrations", "questions")}
-        return [*flat(run["settings"]), *flat(uses)]
+        uses = {f"prior {kind}": run.uses[kind] for kind in ("demonstrations", "questions")}
+        return [*flat(run.settings), *flat(uses)]
 
     @property
     def fingerprint(self) -> list[Entry]:
-        """What its runs were made with."""
+        """Machine and software of its runs."""
         return same_or_each([(run.seed, flat(run.record.fingerprint)) for run in self.row.runs])
 
 
 def columns(rows: Rows) -> tuple[Metric, ...]:
-    """Return the metrics of a table of `rows`; a row's own section has all."""
+    """Return the metrics in a table of `rows`; the section of a row has all metrics."""
     return tuple(metric for metric in shown(rows) if metric.name != "zero_shot")
 
 
@@ -208,7 +208,7 @@ class ScenarioView:
 
     id: str
     tasks: Mapping[str, tuple[str, ...]]
-    """Names by group."""
+    """Names of the tasks by group."""
     steps: tuple[int, ...]
     """Evaluation points of a stage."""
     rows: tuple[RowView, ...]
@@ -226,17 +226,17 @@ class ScenarioView:
 
     @property
     def runs(self) -> int:
-        """How many there are."""
+        """Number of runs."""
         return sum(len(view.row.runs) for view in self.rows)
 
     @property
     def competing(self) -> list[RowView]:
-        """Rows of the methods that are no reference."""
+        """Rows of the methods that compete."""
         return [view for view in self.rows if view.row.division in METHODS]
 
 
 def scenarios(table: Table) -> list[ScenarioView]:
-    """Return what the page shows of each scenario."""
+    """Return the view of each scenario."""
     found = []
     for scenario, members in groupby(table.rows, key=lambda row: row.scenario):
         rows = list(members)
@@ -275,7 +275,7 @@ def _description(method: str) -> Description:
 
 
 def _drawn(row: Row, seeds: Mapping[str, Sequence[float | None]]) -> dict[str, Any]:
-    """Return the curves, the matrix of each seed, and `OTHERS` with the values of each seed."""
+    """Return the curves, the success matrix of each seed, and the values of `OTHERS` by seed."""
     curves = estimated(
         {"retained": retained_curve, "target": target_curves},
         [run.scores for run in row.runs],
@@ -299,7 +299,7 @@ def _triple(one: Estimate) -> list[float | None]:
 
 
 def number(one: Estimate, metric: Metric) -> Number:
-    """Return the value of a metric for a cell."""
+    """Return the cell of a metric."""
     if one.value is None:
         return Number(MISSING, note=f"missing: {metric.missing}")
     text, order = number_text(one.value, ".2f"), number_text(one.value, ".6f")
@@ -313,8 +313,8 @@ def number(one: Estimate, metric: Metric) -> Number:
 def _costs(row: Row) -> tuple[Number, Number]:
     """Return the relative cost and the bytes kept."""
     relative, kept = row.costs["relative_cost"], row.costs["bytes_kept"]
-    cost = Number(MISSING, note="missing: the time of a step, or the steps of sft, are not known")
-    size = Number(MISSING, note="missing: a record does not say it")
+    cost = Number(MISSING, note="missing: there is no step time, or no run of sft")
+    size = Number(MISSING, note="missing: a record has no value")
     if relative is not None:
         cost = Number(number_text(relative, ".2f") + "\N{MULTIPLICATION SIGN}", number_text(relative, ".6f"))
     if kept is not None:
@@ -325,10 +325,10 @@ def _costs(row: Row) -> tuple[Number, Number]:
 
 
 def _rank(row: Row, rows: Sequence[Row]) -> tuple[str, str]:
-    """Return the rank of a row as it is shown, and in words."""
+    """Return the rank of a row as text, and in words."""
     if row.rank is None:
         reference = row.division == DIVISIONS[-1]
-        return MISSING, "no rank: a reference does not compete" if reference else "no rank"
+        return MISSING, "no rank: references do not compete" if reference else "no rank"
     count, same = rank_mates(row, rows)
     place = f"rank {row.rank} of {count}"
     if not same:
@@ -338,14 +338,14 @@ def _rank(row: Row, rows: Sequence[Row]) -> tuple[str, str]:
 
 
 def _metric(metric: Metric, one: Estimate, seeds: Sequence[float | None]) -> MetricView:
-    words = "" if one.value is None else interval(one)
+    words = "" if one.value is None else format_interval(one)
     return MetricView(
         metric, number(one, metric), words, tuple(number_text(value, ".2f", MISSING) for value in seeds)
     )
 
 
 def _of_seeds(row: Row, rows: Sequence[Row]) -> dict[str, list[float | None]]:
-    """Return the value of every metric for each seed, None where the row has none either."""
+    """Return the values of every metric by seed, None where the row has no value."""
     scores = {other.method: other.scores for other in rows}
     references = needed_references(METRICS.values(), row.seeds, scores)
     rates = rates_of([run.scores for run in row.runs], references)

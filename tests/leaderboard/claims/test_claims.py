@@ -1,4 +1,4 @@
-"""The page of the claims: every verdict follows from records by its rule, and nothing makes it fail."""
+"""The page of the claims: every verdict follows from records by its rule, and no input breaks it."""
 
 import dataclasses
 import json
@@ -22,7 +22,7 @@ IDS += [f"F{number}" for number in range(1, 6)]
 
 
 class Bench:
-    """Folders of records, and the page that comes of them."""
+    """Folders of records, and the page made from them."""
 
     def __init__(self, folder: Path, make_record: Callable[..., Record]) -> None:
         self.folder = folder
@@ -141,11 +141,11 @@ Given = dict[str, dict[str, Any]]
 CASES: list[tuple[str, str, Given]] = [
     ("C1", "holds", {"sft": {"kept": 0.2}}),
     ("C1", "does not hold", {"sft": {"kept": 1.0}}),
-    ("C1", "cannot be told", {"sft": {"kept": 0.95}}),
+    ("C1", "undecided", {"sft": {"kept": 0.95}}),
     ("C2", "holds", {"sft": {}, "consft": {"kept": 0.8}, "consft_calibrated": {}}),
     ("C2", "does not hold", {"sft": {}, "consft": {}, "consft_calibrated": {}}),
-    ("C2", "cannot be told", {"sft": {}, "consft": {"kept": 0.4}, "consft_calibrated": {}}),
-    ("C2", "cannot be told", {"sft": {}, "consft": {}}),
+    ("C2", "undecided", {"sft": {}, "consft": {"kept": 0.4}, "consft_calibrated": {}}),
+    ("C2", "undecided", {"sft": {}, "consft": {}}),
     (
         "C3",
         "holds",
@@ -170,34 +170,34 @@ CASES: list[tuple[str, str, Given]] = [
     ),
     ("C4", "holds", {"sft": {"sparsity": 0.3}, "consft": {"sparsity": (0.45, 0.5, 0.55)}}),
     ("C4", "does not hold", {"sft": {"sparsity": 0.3}, "consft": {"sparsity": 0.3}}),
-    ("C4", "cannot be told", {"sft": {"sparsity": 0.5}, "consft": {"sparsity": (0.4, 0.5, 0.6)}}),
-    ("C4", "cannot be told", {"sft": {"sparsity": 0.3, "seeds": 1}, "consft": {"sparsity": 0.9, "seeds": 1}}),
+    ("C4", "undecided", {"sft": {"sparsity": 0.5}, "consft": {"sparsity": (0.4, 0.5, 0.6)}}),
+    ("C4", "undecided", {"sft": {"sparsity": 0.3, "seeds": 1}, "consft": {"sparsity": 0.9, "seeds": 1}}),
     ("C6", "does not hold", {"sft": {}, "consft": {"costs": {"bytes_kept": 8}}}),
-    ("C6", "cannot be told", {"sft": {}, "consft": {}}),
+    ("C6", "undecided", {"sft": {}, "consft": {}}),
     ("C7", "holds", {"consft": {"earlier": 0.5}, "consft_calibrated": {}}),
     ("C7", "does not hold", {"consft": {"earlier": 0.5}, "consft_calibrated": {"earlier": 0.4}}),
     ("A1", "holds", {"sft": {"right": (500, 400)}}),
     ("A1", "does not hold", {"sft": {"right": (500, 500)}}),
-    ("A1", "cannot be told", {"sft": {"right": (490, 485)}}),
+    ("A1", "undecided", {"sft": {"right": (490, 485)}}),
     ("A2", "holds", {"sft": {}, "stop_gradient": {"right": (490, 490), "learned": 0.5}}),
     ("A2", "does not hold", {"sft": {}, "stop_gradient": {"right": (490, 490)}}),
     ("A2", "does not hold", {"sft": {}, "stop_gradient": {"right": (490, 300), "learned": 0.5}}),
-    ("A2", "cannot be told", {"stop_gradient": {"right": (490, 490), "learned": 0.5}}),
+    ("A2", "undecided", {"stop_gradient": {"right": (490, 490), "learned": 0.5}}),
     ("A3", "holds", {"frozen": {"kept": 1.0}, "lora": {}, "lora+rank=4": {}}),
     ("A3", "does not hold", {"frozen": {}, "lora": {"right": (500, 500)}, "lora+rank=4": {"kept": 0.1}}),
-    ("A3", "cannot be told", {"lora": {}}),
+    ("A3", "undecided", {"lora": {}}),
     ("A4", "holds", {"frozen": {"right": (500, 500)}, "aegis": {"right": (500, 500)}}),
     ("A4", "does not hold", {"frozen": {"right": (500, 500)}, "aegis": {"right": (500, 450)}}),
-    ("A4", "cannot be told", {"frozen": {"right": (500, 490)}, "aegis": {"right": (500, 486)}}),
+    ("A4", "undecided", {"frozen": {"right": (500, 490)}, "aegis": {"right": (500, 486)}}),
     ("A5", "holds", {"aegis": {"diagnostics": {"1": {"energy_shed_mean": 0.006}}}}),
     ("A5", "does not hold", {"aegis": {"diagnostics": {"1": {"energy_shed_mean": 0.06}}}}),
-    ("A5", "cannot be told", {"aegis": {"diagnostics": {"1": {"energy_shed_mean": "little"}}}}),
+    ("A5", "undecided", {"aegis": {"diagnostics": {"1": {"energy_shed_mean": "little"}}}}),
     ("A6", "holds", {"sft": {"drift": (8, 9, 10)}, "aegis": {"drift": 1.0}}),
     ("A6", "does not hold", {"sft": {"drift": (8, 9, 10)}, "aegis": {"drift": 7.0}}),
-    ("A6", "cannot be told", {"sft": {"drift": 0.0}, "aegis": {"drift": 1.0}}),
+    ("A6", "undecided", {"sft": {"drift": 0.0}, "aegis": {"drift": 1.0}}),
     ("F1", "holds", {"from_scratch": {}, "sft": {}, "co_training": {"curve": 0.9}}),
     ("F1", "does not hold", {"from_scratch": {}, "sft": {}, "co_training": {"curve": 0.2}}),
-    ("F1", "cannot be told", {"sft": {}, "co_training": {"curve": 0.9}}),
+    ("F1", "undecided", {"sft": {}, "co_training": {"curve": 0.9}}),
     (
         "F2",
         "holds",
@@ -213,7 +213,7 @@ CASES: list[tuple[str, str, Given]] = [
             "fast_dvla+direction=random": {"curve": 0.9},
         },
     ),
-    ("F2", "cannot be told", {"from_scratch": {}, "sft": {}, "fast_dvla": {"curve": 0.9}}),
+    ("F2", "undecided", {"from_scratch": {}, "sft": {}, "fast_dvla": {"curve": 0.9}}),
     (
         "F3",
         "holds",
@@ -251,7 +251,7 @@ def test_claims_of_costs_are_judged_by_the_time_of_a_step(
 ) -> None:
     bench.add("sft")
     bench.add(method, costs={"optimiser_steps": 400, "preparation_steps": 40})
-    assert verdicts(bench.page())[identifier] == "cannot be told"
+    assert verdicts(bench.page())[identifier] == "undecided"
     bench.step_times(**{method: limit})
     assert verdicts(bench.page())[identifier] == "holds"
     bench.step_times(**{method: limit + 0.01})
@@ -265,13 +265,13 @@ def test_claims_of_costs_are_judged_by_the_time_of_a_step(
 )
 def test_a_torn_file_of_step_times_counts_as_missing(content: str, bench: Bench) -> None:
     (bench.folder / "step_time.json").write_text(content, encoding="utf-8")
-    assert verdicts(bench.page())["A7"] == "cannot be told"
+    assert verdicts(bench.page())["A7"] == "undecided"
 
 
 def test_without_any_record_every_claim_says_which_command_is_missing(bench: Bench) -> None:
     page = bench.page()
     assert list(verdicts(page)) == IDS
-    assert {one for identifier, one in verdicts(page).items() if identifier != "C5"} == {"cannot be told"}
+    assert {one for identifier, one in verdicts(page).items() if identifier != "C5"} == {"undecided"}
     for identifier in IDS:
         assert "clbench run" in section(page, identifier)
     assert f"`clbench run {SCENARIO} aegis frozen sft`" in section(page, "A4")
@@ -305,18 +305,18 @@ def test_a_claim_says_for_which_variant_it_holds(bench: Bench) -> None:
     assert "It holds for consft_calibrated." in section(bench.page(), "C2")
 
 
-def test_a_control_that_does_the_same_is_said_to_explain_the_gain(bench: Bench) -> None:
+def test_a_control_that_does_as_well_explains_the_gain(bench: Bench) -> None:
     bench.add("sft")
     for method in ("consft", "consft_calibrated", "constant_weight"):
         bench.add(method, kept=0.9)
     for method in ("low_rate_sft", "finch"):
         bench.add(method)
     told = section(bench.page(), "C2")
-    assert "constant_weight does the same as consft: the gain is not from weighing samples." in told
-    assert "low_rate_sft does not reach consft: that does not explain it." in told
+    assert "constant_weight does as well as consft: the gain does not come from weighting samples." in told
+    assert "low_rate_sft does not reach consft, so it does not explain the result." in told
 
 
-def test_without_a_gain_no_control_is_said_to_explain_it(bench: Bench) -> None:
+def test_without_a_gain_no_control_explains_it(bench: Bench) -> None:
     for method in ("sft", "consft", "consft_calibrated", "constant_weight"):
         bench.add(method)
     told = section(bench.page(), "C2")
@@ -347,7 +347,7 @@ def test_a_seed_that_one_of_two_methods_lacks_is_left_out(bench: Bench) -> None:
 def test_one_seed_is_shown_and_decides_nothing(bench: Bench) -> None:
     bench.add("sft", seeds=1)
     page = bench.page()
-    assert verdicts(page)["C1"] == "cannot be told"
+    assert verdicts(page)["C1"] == "undecided"
     assert re.search(r"\| 0\.80 \[0\.\d+, 0\.\d+\] \| 0 \| one seed", section(page, "C1"))
 
 
@@ -361,9 +361,7 @@ def test_the_curve_of_the_answers_is_shown_over_the_steps(bench: Bench) -> None:
 def test_a_control_that_was_not_evaluated_like_the_board_is_left_out_with_its_reason(bench: Bench) -> None:
     bench.add("frozen", right=(500, 500))
     bench.add("aegis", right=(500, 500))
-    bench.add(
-        "aegis+direction=random", edit=lambda record: record.scenario.budget.update(adaptation_steps=9)
-    )
+    bench.add("aegis+direction=random", edit=lambda record: record.scenario.budget.update(adaptation_steps=9))
     page = bench.page()
     assert "--set.direction random" in section(page, "A4")
     assert (
@@ -375,7 +373,7 @@ def test_records_among_the_controls_that_changed_nothing_are_left_out(bench: Ben
     bench.add("sft")
     (bench.folder / "records").rename(bench.folder / "controls")
     page = bench.page()
-    assert verdicts(page)["C1"] == "cannot be told"
+    assert verdicts(page)["C1"] == "undecided"
     assert "no setting was changed" in page
 
 
@@ -397,7 +395,7 @@ def test_words_of_strangers_stay_on_their_line_and_are_no_markup(bench: Bench) -
     assert "\x1b" not in page
     assert "<b>" not in page.replace("\\<", "")
     assert "https://x" not in page
-    assert verdicts(page)["A3"] == "cannot be told"
+    assert verdicts(page)["A3"] == "undecided"
 
 
 def test_any_damage_to_a_record_leaves_a_page(bench: Bench) -> None:

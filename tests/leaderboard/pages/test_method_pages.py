@@ -1,4 +1,4 @@
-"""The pages of the methods: everything from the code and the records, the same headings each."""
+"""The pages of the methods: the same headings for each, all contents from the code and the records."""
 
 import dataclasses
 import re
@@ -34,7 +34,7 @@ BUILT_IN = [name for name in method_names() if "/" not in name]
 
 
 class Bench:
-    """Folders of records, and the pages that come of them."""
+    """Folders of records, and the pages made from them."""
 
     def __init__(self, folder: Path, make_record: Callable[..., Record]) -> None:
         self.folder = folder
@@ -87,7 +87,7 @@ def bench(tmp_path: Path, make_record: Callable[..., Record]) -> Bench:
 
 
 def part(page: str, heading: str) -> str:
-    """Return what stands under a heading, without the backslashes of Markdown."""
+    """Return the text under a heading, without the backslashes of Markdown."""
     found = re.search(rf"^## {heading}\n(.*?)(?=^## |\Z)", page, re.MULTILINE | re.DOTALL)
     assert found
     return found[1].replace("\\", "").strip()
@@ -124,10 +124,10 @@ def test_every_hyper_parameter_has_its_default_and_its_meaning(bench: Bench) -> 
 def test_a_docstring_is_taken_apart_into_idea_rule_and_details(bench: Bench) -> None:
     page = bench.pages()["aegis"]
     link = "[arXiv 2604.16067](https://arxiv.org/abs/2604.16067)"
-    assert part(page, "Idea").startswith("AEGIS: the backbone's gradient may not lead away")
+    assert part(page, "Idea").startswith("AEGIS: the backbone's gradient must not move its hidden states")
     assert link in part(page, "Idea")
     assert part(page, "Paper") == f"{link}."
-    assert part(page, "Rule").startswith("Before training, questions are read")
+    assert part(page, "Rule").startswith("Before training, the pretrained policy reads questions.")
     assert '`direction="random"` is the control' in part(page, "Rule").splitlines()[-1]
     details = part(page, "Implementation details").splitlines()
     assert [line.partition(".")[0] for line in details] == [
@@ -154,14 +154,14 @@ def test_what_is_stored_comes_from_the_declaration_and_the_records(bench: Bench)
     for seed in range(2):
         bench.add("ewc", seed=seed, costs={"bytes_kept": 8000, "parameters_added": 12})
     stored = part(bench.pages()["ewc"], "Stored")
-    assert "It reads prior demonstrations before the first target only." in stored
-    assert "It never touches prior questions." in stored
+    assert "It reads prior demonstrations only before the first target." in stored
+    assert "It never uses prior questions." in stored
     assert "Division: prior demonstrations." in stored
     assert "Bytes kept: 8,000." in stored
     assert "Parameters added: 12." in stored
 
 
-def test_the_row_of_the_board_stands_beside_those_of_three_others(bench: Bench) -> None:
+def test_the_row_of_the_board_is_next_to_three_others(bench: Bench) -> None:
     for method in ("consft", "sft", "experience_replay", "frozen"):
         for seed in range(2):
             bench.add(method, kept={"consft": 0.6, "sft": 0.2}.get(method, 1.0), seed=seed)
@@ -189,7 +189,7 @@ def test_the_claims_on_a_method_are_linked_with_their_verdicts(bench: Bench) -> 
         assert f"[{identifier}](../claims.md#{identifier.lower()})" in part(pages["consft"], "Results here")
     told = part(pages["low_rate_sft"], "Results here")
     assert "[C2]" in told
-    assert "It stands beside." in next(line for line in told.splitlines() if "[C2]" in line)
+    assert "(Comparison only.)" in next(line for line in told.splitlines() if "[C2]" in line)
     assert "### Claims" not in pages["lwf"]
 
 
@@ -198,7 +198,7 @@ def test_scalar_diagnostics_are_averaged_over_stages_and_seeds(bench: Bench) -> 
         stages = {str(stage): {"energy_shed_mean": shed, "anchor_distance": [1.0]} for stage in (1, 2)}
         bench.add("aegis", seed=seed, diagnostics={"0": "none", **stages})
     told = part(bench.pages()["aegis"], "Diagnostics")
-    assert told.startswith("What was projected")
+    assert told.startswith("How much was projected out")
     assert "| energy_shed_mean | 0.02 [0.01752, 0.02248] |" in told
     assert "| anchor_distance" not in told
 
@@ -221,7 +221,7 @@ def test_settings_that_were_tried_are_compared_on_validation_episodes(bench: Ben
         assert rows[0] == (
             "| settings | seed | targets | adaptation | retention | matched retention | question retention |"
         )
-        assert rows[1] == "| sft, as it is | 100 | 2 | 1.00 | 0.20 | 0.40 | 0.90 |"
+        assert rows[1] == "| sft, unchanged | 100 | 2 | 1.00 | 0.20 | 0.40 | 0.90 |"
         assert [row.split(" | ")[4] for row in rows[2:]] == ["0.30", "0.40", "0.60"]  # by rising tau_start
         assert "(consft_calibrated)" in rows[3]
     command = part(pages["consft"], "Command")
@@ -288,12 +288,12 @@ class Toy(Method):
 def test_docstrings_of_any_shape_are_read(
     docstring: str, idea: str, rule: tuple[str, ...], details: tuple[str, ...]
 ) -> None:
-    text = resolve("clbench.leaderboard.pages.descriptions:read_docstring")(docstring)
+    text = resolve("clbench.leaderboard.views.descriptions:read_docstring")(docstring)
     assert (text.idea, text.rule, text.details) == (idea, rule, details)
 
 
-def test_fields_are_read_with_the_texts_under_them() -> None:
-    described = resolve("clbench.leaderboard.pages.descriptions:describe")("toy", Toy)
+def test_fields_are_read_with_the_docstrings_under_them() -> None:
+    described = resolve("clbench.leaderboard.views.descriptions:describe")("toy", Toy)
     assert [(one.name, one.default, one.meaning) for one in described.hyper_parameters] == [
         ("first", "1.0", "Of the two fields."),
         ("second", "'x|y'", ""),

@@ -82,7 +82,7 @@ def test_perturbed_retention_has_a_column_only_where_a_row_has_it(
     section = by_id(document, "clbench/Toy-v0")
     heads = [words(one) for one in section.iterfind(".//table/thead/tr/th")]
     assert heads[heads.index("retention") + 1] == "perturbed retention"
-    assert ", missing: The run did not meet perturbed episodes" in words(section)
+    assert ", missing: The run has no perturbed episodes" in words(section)
     assert "perturbed retention 0.30 [" in words(by_id(document, "clbench/Toy-v0/sft"))
     assert "clbench run clbench/Toy-v0 sft --seeds 2 --perturb" in words(
         by_id(document, "clbench/Toy-v0/sft")

@@ -16,12 +16,12 @@ DAY = 24 * 60 * 60
 def _make(kind: str, days: float = 0.0, code: str = "a", purpose: str = "a") -> Path:
     """Make an entry of the cache that was last used a number of days ago, and return its folder."""
     inputs = {"purpose": purpose, "nested": {"source": code, "versions": {"torch": code}}}
-    folder = cached(
-        cache_folder() / kind / hash_of([inputs, days]),
-        inputs,
-        lambda partial: _write(partial / "data", 2_000_000),
-    )
-    return _age(folder, days)
+    folder = cache_folder() / kind / hash_of([inputs, days])
+    return _age(cached(folder, inputs, lambda partial: _fill(partial / "data", 2_000_000)), days)
+
+
+def _fill(path: Path, size: int) -> None:
+    _write(path, size)
 
 
 def _write(path: Path, size: int = 1) -> Path:
@@ -130,7 +130,7 @@ def test_only_what_clbench_has_made_is_deleted(capsys: pytest.CaptureFixture[str
 @pytest.mark.usefixtures("empty_caches")
 def test_datasets_that_clbench_collected_are_entries() -> None:
     folder = minari_folder() / "clbench" / "toy" / "left-v0"
-    cached(folder, {"task": "left"}, lambda partial: _write(partial / "data" / "main_data.hdf5") and None)
+    cached(folder, {"task": "left"}, lambda partial: _fill(partial / "data" / "main_data.hdf5", 1))
     (entry,) = entries()
     assert (entry.kind, entry.path) == ("demonstrations", folder)
     assert list(find_stale([entry], 30, time.time() + 31 * DAY)) == [entry]

@@ -1,0 +1,80 @@
+"""The scenes of the Meta-World world: one compiled model per task, shared by all its episodes."""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import mujoco
+import numpy as np
+from metaworld.sawyer_xyz_env import SawyerXYZEnv
+from numpy.typing import NDArray
+
+from clbench.worlds.perturbation import with_mass
+
+Vector = NDArray[np.float64]
+
+CAMERA = {"distance": 1.4, "azimuth": 135.0, "elevation": -30.0, "lookat": np.array([0.0, 0.6, 0.15])}
+"""A view from the front left, above the table."""
+
+
+class Models:
+    """A model and copies of it: each thread moves bodies in a copy of its own.
+
+    Args:
+        model: Used by the first thread; further threads get copies of 19 MB, made when needed.
+    """
+
+    def __init__(self, model: mujoco.MjModel) -> None:
+        self._model = model
+        self._free = [(model, model.body_pos, model.site_pos)]
+
+    def take(self) -> tuple[mujoco.MjModel, Vector, Vector]:
+        """Return a model that no other thread uses, with views of its body and site places."""
+        try:
+            return self._free.pop()
+        except IndexError:
+            model = copy.copy(self._model)
+            return model, model.body_pos, model.site_pos
+
+    def give_back(self, taken: tuple[mujoco.MjModel, Vector, Vector]) -> None:
+        """Make a model available to other threads."""
+        self._free.append(taken)
+
+
+@dataclass(frozen=True)
+class Scene:
+    """The compiled scene of a task, shared by all its episodes in a process."""
+
+    model: mujoco.MjModel
+    body_pos: Vector
+    """Compiled places of the bodies, (bodies, 3); an episode begins by moving some of them."""
+    site_pos: Vector
+    """Compiled places of the sites, (sites, 3)."""
+    start: mujoco.MjData
+    """The physics with the hand at its start."""
+    models: Models = field(init=False)
+    """The model, for threads that advance episodes at the same time."""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "models", Models(self.model))
+
+    def with_mass(self, mass: float) -> Scene:
+        """Return the scene with all movable objects `mass` times as heavy."""
+        self.model.body_pos[:], self.model.site_pos[:] = self.body_pos, self.site_pos  # episodes move them
+        return replace(self, model=with_mass(self.model, _things(self.model), mass))
+
+
+def scene_of(original: type[SawyerXYZEnv]) -> Scene:
+    """Compile the scene of Meta-World's environment of a task, and move the hand to its start."""
+    env: Any = original()
+    env._reset_hand()
+    model = env.model
+    return Scene(model, model.body_pos.copy(), model.site_pos.copy(), env.data)
+
+
+def _things(model: mujoco.MjModel) -> list[int]:
+    """Return the movable bodies that are not part of the robot."""
+    robot, moved = model.body("base").id, model.body_weldid != 0
+    return [int(body) for body in np.flatnonzero(moved & (model.body_rootid != robot))]

@@ -1,0 +1,1 @@
+"""The PointMaze suite: a ball and three mazes of nine rooms."""

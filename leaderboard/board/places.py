@@ -1,0 +1,14 @@
+"""Defaults of the commands and pages of the leaderboard, relative to the working directory."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+SCENARIO = "clbench/Fetch-v0"
+"""Scenario whose records judge the claims and describe the methods."""
+
+CONTROLS = Path("leaderboard/controls")
+"""Folder of records with changed settings. Commands on pages name it."""
+
+STEP_TIME = Path("benchmarks/results/step_time.json")
+"""Results of the speed benchmark."""

@@ -1,0 +1,90 @@
+"""The leaderboard for the terminal."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import groupby
+
+from rich.box import SIMPLE_HEAD
+from rich.console import Group, RenderableType
+from rich.table import Table as TextTable
+from rich.text import Text
+
+from clbench.scoring.intervals import Estimate
+
+from ..board.overall import OverallRow, overall
+from ..board.rows import Row, Table
+from ..board.tiers import TIERS
+from .format import FITTING, MISSING, number_text, scaled, title_of
+
+LEGEND = (
+    "Rows of a division that are statistically indistinguishable share a rank. "
+    "± is half the width of a 95 % confidence interval. "
+    "Higher is better, except for {lower}. Cost: training time relative to sft. Tier: {tiers}.\n"
+)
+"""Legend below the tables."""
+
+
+def terminal(table: Table) -> RenderableType:
+    """Return the table for a terminal of 108 columns."""
+    # Text and not str: rich would obey markup in a stranger's words.
+    parts: list[RenderableType] = []
+    for scenario, rows in groupby(table.rows, key=lambda row: row.scenario):
+        parts.append(_scenario(scenario, list(rows)))
+    over_scenarios = overall(table.rows)
+    if over_scenarios:
+        parts.append(_all_scenarios(over_scenarios))
+    if parts:
+        lower = ", ".join(title_of(metric.name) for metric in FITTING if metric.higher_is_better is False)
+        tiers = ", ".join(f"{number} {tier}" for number, tier in enumerate(TIERS))
+        parts.append(Text(LEGEND.format(lower=lower, tiers=tiers)))
+    if table.not_shown:
+        parts.append(Text("Not shown", style="bold"))
+        parts += [Text(f"  {entry.path}: {entry.reason}", overflow="fold") for entry in table.not_shown]
+    return Group(*parts)
+
+
+def _scenario(scenario: str, rows: list[Row]) -> TextTable:
+    """Return the table of one scenario, with a section for each division."""
+    table = TextTable(title=Text(scenario, style="bold"), box=SIMPLE_HEAD, padding=0, title_justify="left")
+    table.add_column("", justify="right", min_width=2)
+    table.add_column("method", overflow="fold", min_width=20)
+    for name in ("seeds", *(title_of(metric.name) for metric in FITTING), "cost", "bytes kept", "tier"):
+        # One word a line: a header must not make its column wider than the numbers.
+        table.add_column(name.replace(" ", "\n"), justify="right")
+    for division, members in groupby(rows, key=lambda row: row.division):
+        table.add_section()
+        table.add_row("", Text(division, style="italic"))
+        for row in members:
+            cells = [number_text(row.rank, ".0f", ""), row.method, str(len(row.seeds))]
+            cells += [_compact(row.estimates[metric.name]) for metric in FITTING]
+            kept = row.costs["bytes_kept"]
+            size = MISSING if kept is None else "".join(scaled(kept))
+            cells += [number_text(row.costs["relative_cost"], ".1f"), size]
+            table.add_row(*map(Text, cells), str(TIERS.index(row.tier)))
+    return table
+
+
+def _all_scenarios(rows: Sequence[OverallRow]) -> TextTable:
+    """Return the table over scenarios, with a section for each division."""
+    title = Text("All scenarios", style="bold")
+    table = TextTable(title=title, box=SIMPLE_HEAD, padding=0, title_justify="left")
+    table.add_column("method", overflow="fold", min_width=20)
+    for name in ("ranks", *(title_of(metric.name) for metric in FITTING)):
+        table.add_column(name.replace(" ", "\n"), justify="right")
+    for division, members in groupby(rows, key=lambda row: row.division):
+        table.add_section()
+        table.add_row(Text(division, style="italic"))
+        for row in members:
+            ranks = ",".join(number_text(rank, ".0f") for rank in row.ranks)
+            cells = [_compact(row.estimates[metric.name]) for metric in FITTING]
+            table.add_row(*map(Text, [row.method, ranks, *cells]))
+    return table
+
+
+def _compact(estimate: Estimate) -> str:
+    value = number_text(estimate.value, ".2f")
+    if estimate.low is None or estimate.high is None:
+        return value
+    half = number_text((estimate.high - estimate.low) / 2, ".2f")
+    return f"{value}±{half.removeprefix('0')}"

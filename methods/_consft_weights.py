@@ -1,0 +1,88 @@
+"""ConSFT's weights of samples, which its variants and controls share."""
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from clbench.learning.method import Metadata, Method, Progress, Stage
+from clbench.learning.prior import Prior
+from clbench.policy.batch import Batch
+from clbench.policy.policy import Policy
+
+from ._requirements import in_range, require_loss_per_sample
+
+BINS = (0.0, 0.01, 0.1, 0.5, 0.9, 1.0)
+"""Edges of the histogram of weights in the diagnostics."""
+SLICES = 10
+"""Number of equal parts of a stage. Each part has its own histogram."""
+
+
+@dataclass
+class WeightedSFT(Method, ABC):
+    """Fine-tune on a weighted loss. A subclass decides how ConSFT's weights are assigned to samples."""
+
+    tau_start: float = 0.003
+    """Temperature at the start (Table 5)."""
+    tau_end: float = 5.0
+    """Highest temperature (Table 5)."""
+    kappa: float = 25.0
+    """Factor of the loss inside the weight (Table 5)."""
+    decay: float = 0.8
+    """Rate lambda of the schedule (Table 5)."""
+    curvature: float = 3.5
+    """Exponent c of the schedule (Table 5)."""
+    omega_min: float = 0.001
+    """Smallest weight (Table 5)."""
+    schedule: float = 1.0
+    """Length T of the schedule, as a share of the stage's steps."""
+
+    metadata = Metadata(link="https://arxiv.org/abs/2605.08879")
+
+    def __post_init__(self) -> None:
+        for name in ("tau_start", "tau_end", "kappa", "decay", "curvature", "schedule"):
+            in_range(name, getattr(self, name), 1e-9)
+        in_range("omega_min", self.omega_min, 0.0, 1.0)
+
+    def prepare(self, policy: Policy, prior: Prior) -> None:
+        """Refuse a policy that has no loss per sample."""
+        require_loss_per_sample(policy, type(self).__name__)
+
+    def start_task(self, policy: Policy, stage: Stage) -> Iterable[nn.Parameter]:
+        """Return all parameters, and clear the histograms."""
+        self.counts = torch.zeros(SLICES, len(BINS) - 1, dtype=torch.int64)
+        return policy.parameters()
+
+    def temperature(self, progress: Progress) -> float:
+        """Return tau at this step (Eq. 11 and 12)."""
+        done = min(progress.step / (self.schedule * progress.steps), 1.0)
+        least = math.exp(-self.decay)
+        rho = (math.exp(-self.decay * done**self.curvature) - least) / (1.0 - least)
+        return min(self.tau_start / max(rho, 1e-8), self.tau_end)
+
+    def confidence(self, losses: Tensor, progress: Progress) -> Tensor:
+        """Return ConSFT's weights (Eq. 5): the confidence in each sample (B,), from its loss (B,)."""
+        confidence = torch.exp(-self.kappa / self.temperature(progress) * losses.detach())
+        return confidence.clamp(min=self.omega_min)
+
+    @abstractmethod
+    def weights(self, losses: Tensor, progress: Progress) -> Tensor:
+        """Return the weight of each sample (B,), from its loss (B,)."""
+
+    def loss(self, policy: Policy, batch: Batch, progress: Progress) -> Tensor:
+        """Return the mean of the weighted losses."""
+        losses = policy.action_loss(batch)
+        weights = self.weights(losses, progress)
+        counts = torch.histogram(weights.cpu(), torch.tensor(BINS)).hist
+        self.counts[SLICES * progress.step // progress.steps] += counts.long()
+        return (weights * losses).mean()
+
+    def diagnostics(self) -> dict[str, Any]:
+        """Return the histogram of the weights, with the bins `omega_edges`, for each tenth of the stage."""
+        if not hasattr(self, "counts"):
+            return {}
+        return {"omega_edges": list(BINS), "omega_counts": self.counts.tolist()}

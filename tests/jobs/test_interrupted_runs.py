@@ -1,0 +1,73 @@
+"""Ctrl-C at any moment of a run: the command ends with 130, leaves no process, and continues when asked
+again."""
+
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+TOY = "clbench.testing:clbench/Toy-v0"
+MOMENTS = 50
+GONE = 10.0
+"""Seconds within which every process of an interrupted command must be gone."""
+
+
+def _command(records: Path) -> list[str]:
+    return [sys.executable, "-m", "clbench", "run", TOY, "sft", "--seeds", "1", "--records", str(records)]
+
+
+def _start(records: Path) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        _command(records), stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, start_new_session=True
+    )
+
+
+def _is_gone(group: int) -> bool:
+    deadline = time.monotonic() + GONE
+    while time.monotonic() < deadline:
+        try:
+            os.killpg(group, 0)
+        except ProcessLookupError:
+            return True
+        time.sleep(0.05)
+    return False
+
+
+@pytest.mark.slow
+def test_ctrl_c_at_fifty_random_moments_ends_a_run_with_130_and_the_same_command_completes_it(
+    tmp_path: Path, empty_caches: Path, lasting_records: Callable[[Path], dict[str, Any]]
+) -> None:
+    subprocess.run(
+        _command(tmp_path / "whole"), check=True, capture_output=True
+    )  # collects and pretrains too
+    begin = time.monotonic()
+    subprocess.run(_command(tmp_path / "again"), check=True, capture_output=True)
+    seconds = time.monotonic() - begin
+    whole = lasting_records(tmp_path / "whole")
+    moments = random.Random(0)
+    stopped = 0
+    for number in range(MOMENTS):
+        records = tmp_path / str(number)
+        process = _start(records)
+        time.sleep(moments.uniform(0.0, 0.95 * seconds))
+        over = process.poll() is not None
+        os.killpg(process.pid, signal.SIGINT)
+        output, _ = process.communicate(timeout=60)
+        # before Python handles signals the system ends the process: shells report that as 130 too
+        assert over or process.returncode in (130, -signal.SIGINT), (
+            f"{number}: {process.returncode}\n{output}"
+        )
+        assert over or "Traceback" not in output or "site.py" in output, f"{number}: {output}"
+        assert _is_gone(process.pid), f"{number}: a process is left"
+        stopped += not over
+        if number % 10 == 0:
+            subprocess.run(_command(records), check=True, capture_output=True)
+            assert lasting_records(records) == whole
+    assert stopped >= MOMENTS - 2

@@ -1,0 +1,76 @@
+"""The command `clbench leaderboard`: the same records give the same files."""
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import cyclopts
+import pytest
+
+from clbench.base.entry_points import resolve
+
+load = resolve("clbench.leaderboard:load")
+
+
+def test_showing_twice_changes_no_byte_and_writes_no_file_again(
+    four_methods: Path, shown_with_page: Callable[[], tuple[str, str]]
+) -> None:
+    (four_methods / "torn.json").write_text("{", encoding="utf-8")
+    first = shown_with_page()
+    files = [four_methods.parent / "site" / name for name in ("LEADERBOARD.md", "leaderboard.csv")]
+    stamps = [(path.read_bytes(), path.stat().st_mtime_ns, path.stat().st_ino) for path in files]
+    assert shown_with_page() == first
+    assert [(path.read_bytes(), path.stat().st_mtime_ns, path.stat().st_ino) for path in files] == stamps
+    made = ["LEADERBOARD.md", "index.html", "leaderboard.csv", "pareto-dark.svg", "pareto.svg"]
+    assert sorted(os.listdir(four_methods.parent)) == ["records", "site"]
+    assert sorted(os.listdir(four_methods.parent / "site")) == made
+
+
+def test_the_files_do_not_depend_on_where_the_records_lie(
+    four_methods: Path, shown: Callable[[], tuple[str, str]], tmp_path: Path
+) -> None:
+    (four_methods / "folder.json").mkdir()
+    (four_methods / "torn.json").write_text("{", encoding="utf-8")
+    _, here = shown()
+    table = (four_methods.parent / "site" / "leaderboard.csv").read_bytes()
+    (tmp_path / "elsewhere").mkdir()
+    moved = four_methods.rename(tmp_path / "elsewhere" / "records")
+    resolve("clbench.leaderboard.cli:show")(records=moved)
+    assert (moved.parent / "site" / "LEADERBOARD.md").read_text(encoding="utf-8") == here
+    assert (moved.parent / "site" / "leaderboard.csv").read_bytes() == table
+    assert str(tmp_path) not in here
+
+
+def test_a_folder_without_rows_lists_why(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "records").mkdir()
+    (tmp_path / "records" / "torn.json").write_text("{", encoding="utf-8")
+    resolve("clbench.leaderboard.cli:show")(records=tmp_path / "records")
+    assert "torn.json: cannot be read as JSON" in capsys.readouterr().out
+    assert load(tmp_path / "records").empty
+    assert "retention_low" in load(tmp_path / "records")
+
+
+@pytest.mark.parametrize("exists", [True, False])
+def test_without_records_the_command_says_what_to_run(
+    exists: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "records"
+    if exists:
+        folder.mkdir()
+    with pytest.raises(SystemExit) as exit_info:
+        resolve("clbench.leaderboard.cli:show")(records=folder)
+    assert exit_info.value.code == 2
+    captured = capsys.readouterr()
+    assert not captured.out
+    assert str(folder) in captured.err
+    assert "clbench run clbench/Fetch-v0 sft" in captured.err
+    assert not (tmp_path / "LEADERBOARD.md").exists()
+
+
+def test_the_command_takes_the_folder_as_an_option(
+    four_methods: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    app = cyclopts.App(result_action="return_value")
+    app.command(resolve("clbench.leaderboard.cli:show"), name="leaderboard")
+    app(["leaderboard", "--records", str(four_methods)])
+    assert "from_scratch" in capsys.readouterr().out

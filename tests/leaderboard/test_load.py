@@ -1,0 +1,108 @@
+"""The table as a data frame: one row for each scenario and method, with every metric and cost."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas
+import pytest
+
+from clbench.base.entry_points import resolve
+from clbench.records.paths import record_path
+from clbench.records.record import Record
+from clbench.scoring.metrics import METRICS
+
+load = resolve("clbench.leaderboard:load")
+
+
+def test_there_is_one_row_for_each_method_sorted_by_division_and_final_average(
+    four_methods: Path, add_full: Callable[..., Path]
+) -> None:
+    add_full("better", 0, np.ones((3, 5)))
+    frame = load(four_methods)
+    assert list(frame.method) == ["better", "sft", "asks", "replay", "from_scratch"]
+    assert list(frame.division) == [
+        "prior-data-free",
+        "prior-data-free",
+        "prior questions",
+        "prior demonstrations",
+        "reference",
+    ]
+    assert list(frame.seeds) == [1, 2, 2, 2, 2]
+
+
+def test_a_row_has_every_metric_with_its_interval_and_the_costs(four_methods: Path) -> None:
+    row = load(four_methods).set_index("method").loc["sft"]
+    assert row.retention == pytest.approx(0.45)
+    assert row.forgetting == pytest.approx(1.6 / 3)
+    assert row.question_retention == pytest.approx(0.5)
+    assert row.retention_at_matched_adaptation == pytest.approx(0.7)
+    assert row.update_sparsity == pytest.approx(0.6)
+    assert row.activation_drift == pytest.approx(3.0)
+    assert row.steps == 800
+    assert row.parameters == 1000
+    assert np.isnan(row.intransigence)  # there is no joint
+    assert np.isnan(row.perturbed_retention)
+    for name in set(METRICS) - {"intransigence", "perturbed_retention"}:
+        assert row[f"{name}_low"] <= row[name] <= row[f"{name}_high"]
+
+
+def test_without_from_scratch_forward_transfer_is_missing(four_methods: Path) -> None:
+    assert load(four_methods).set_index("method").forward_transfer.notna().sum() == 3
+    record_path(four_methods, "clbench/Toy-v0", "from_scratch", 1).unlink()
+    assert load(four_methods).forward_transfer.isna().all()
+
+
+def test_without_plain_fine_tuning_matched_retention_is_missing(four_methods: Path) -> None:
+    assert load(four_methods).retention_at_matched_adaptation.notna().all()
+    record_path(four_methods, "clbench/Toy-v0", "sft", 1).unlink()
+    rows = load(four_methods).set_index("method")
+    assert rows.retention_at_matched_adaptation.dropna().index.tolist() == ["sft"]
+
+
+def test_a_row_does_not_depend_on_the_other_rows(four_methods: Path, add_full: Callable[..., Path]) -> None:
+    before = load(four_methods)
+    add_full("another", 0)
+    add_full("sft", 0, scenario="clbench/Other-v0")
+    after = load(four_methods)
+    kept = after[(after.scenario == "clbench/Toy-v0") & (after.method != "another")]
+    kept = kept.reset_index(drop=True).drop(columns="rank")
+    pandas.testing.assert_frame_equal(kept, before.drop(columns="rank"))
+
+
+def test_the_relative_cost_is_that_of_all_steps_with_the_time_of_one(
+    four_methods: Path, add_full: Callable[..., Path]
+) -> None:
+    for seed in range(2):
+        add_full("sft", seed, edit=set_in("costs", "optimiser_steps", 400))
+        add_full("slow", seed, edit=set_in("costs", "optimiser_steps", 600))
+        add_full("unknown", seed, edit=set_in("costs", "optimiser_steps", 400))
+        add_full("idle", seed, edit=set_in("costs", "optimiser_steps", 0))
+    assert load(four_methods).relative_cost.isna().sum() == len(load(four_methods)) - 1
+    ratios = {name: {"median_ratio": ratio} for name, ratio in (("sft", 1.0), ("slow", 1.4))}
+    path = four_methods.parents[1] / "benchmarks" / "results" / "step_time.json"
+    path.parent.mkdir(parents=True)
+    path.write_text(json.dumps({"ratios": ratios}), encoding="utf-8")
+    costs = load(four_methods).set_index("method").relative_cost
+    assert costs["sft"] == 1.0
+    assert costs["slow"] == pytest.approx(1.5 * 1.4)
+    assert costs["idle"] == 0.0
+    assert np.isnan(costs["unknown"])
+
+
+def test_loading_a_folder_that_is_not_there_is_an_error(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match="nowhere"):
+        load(tmp_path / "nowhere")
+
+
+def set_in(name: str, key: str, value: Any) -> Callable[[Record], None]:
+    def edit(record: Record) -> None:
+        part = getattr(record, name)
+        if isinstance(part, dict):
+            part[key] = value
+        else:
+            setattr(part, key, value)
+
+    return edit

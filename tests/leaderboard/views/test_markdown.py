@@ -1,0 +1,134 @@
+"""The leaderboard as Markdown: its contents, and strangers' words without markup."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas
+import pytest
+
+from clbench.base.entry_points import resolve
+from clbench.records.record import Record
+
+VALIDATION = [[0.3, 0.6, 0.9, 0.9], [0.1, 0.3, 0.8, 0.8]]
+ASKS = {"demonstrations": "never", "questions": "prepare", "reference": False}
+PERTURBED = [[0.9, 0.8], [0.5, 0.7], [0.4, 0.2]]
+load = resolve("clbench.leaderboard:load")
+
+
+def test_a_method_that_does_not_learn_as_well_as_plain_fine_tuning_has_no_matched_retention(
+    four_methods: Path, add_full: Callable[..., Path], shown: Callable[[], tuple[str, str]]
+) -> None:
+    add_full("slow", 0, validation=np.array(VALIDATION) / 2)
+    assert np.isnan(load(four_methods).set_index("method").retention_at_matched_adaptation["slow"])
+    _, page = shown()
+    assert "**matched retention** (higher is better; from 0 to 1; version 0)" in page
+
+
+def test_the_markdown_has_values_with_intervals_and_says_what_they_are(
+    shown: Callable[[], tuple[str, str]],
+) -> None:
+    _, page = shown()
+    row = next(line for line in page.splitlines() if line.startswith("| 1 | sft |"))
+    assert "| prior-data-free | self-reported | 2 | 0.50 [0." in row
+    assert "**forgetting** (lower is better" in page
+    assert "## clbench/Toy-v0" in page
+    assert "Not shown" not in page
+    assert len({line.count("|") for line in page.splitlines() if line.startswith("|")}) == 1
+
+
+def test_perturbed_retention_follows_retention_where_a_row_has_it(
+    four_methods: Path, add_full: Callable[..., Path], shown: Callable[[], tuple[str, str]]
+) -> None:
+    before, (_, page) = load(four_methods), shown()
+    assert "perturbed retention" not in page
+    for seed in range(2):
+        add_full("sft", seed, perturbed=PERTURBED)
+    add_full("asks", 1, uses=ASKS, perturbed=PERTURBED)  # one of its two seeds alone
+    after, (_, page) = load(four_methods), shown()
+    head = next(line for line in page.splitlines() if line.startswith("| rank |"))
+    place = [cell.strip() for cell in head.split("|")].index("perturbed retention")
+    assert head.split("|")[place - 1].strip() == "retention"
+    cells = {
+        method: next(line for line in page.splitlines() if f"| {method} |" in line).split("|")[place].strip()
+        for method in ("sft", "asks", "replay")
+    }
+    assert cells["sft"].startswith("0.30 [")
+    assert (cells["asks"], cells["replay"]) == ("-", "-")
+    assert "**perturbed retention** (higher is better" in page
+    changed = [f"perturbed_retention{end}" for end in ("", "_low", "_high")]
+    pandas.testing.assert_frame_equal(after.drop(columns=changed), before.drop(columns=changed))
+    assert before.perturbed_retention.isna().all()
+    assert after.set_index("method").perturbed_retention["sft"] == pytest.approx(0.3)
+
+
+def test_what_is_missing_is_a_dash_in_markdown_and_empty_in_csv(
+    four_methods: Path, shown: Callable[[], tuple[str, str]]
+) -> None:
+    _, page = shown()
+    assert " | - | " in next(line for line in page.splitlines() if line.startswith("| - | from\\_scratch |"))
+    frame = pandas.read_csv(four_methods.parent / "site" / "leaderboard.csv")
+    assert frame.set_index("method").forward_transfer.isna().to_dict() == {
+        "sft": False,
+        "asks": False,
+        "replay": False,
+        "from_scratch": True,
+    }
+
+
+def test_rows_in_every_scenario_are_averaged_over_them(
+    four_methods: Path, add_full: Callable[..., Path], shown: Callable[[], tuple[str, str]]
+) -> None:
+    assert all("All scenarios" not in text for text in shown())
+    for seed in range(2):
+        add_full("sft", seed, np.zeros((3, 5)), scenario="clbench/Other-v0")
+        add_full("elsewhere", seed, scenario="clbench/Other-v0")
+    printed, page = shown()
+    assert "All scenarios" in printed
+    section = page.partition("## All scenarios")[2].partition("\n## ")[0]
+    rows = [line for line in section.splitlines() if line.startswith("| ") and "division" not in line]
+    (row,) = [line for line in rows if "---" not in line]
+    frame = load(four_methods)
+    here = frame[(frame.scenario == "clbench/Toy-v0") & (frame.method == "sft")].iloc[0]
+    there = frame[(frame.scenario == "clbench/Other-v0") & (frame.method == "sft")].iloc[0]
+    assert there.final_average == 0.0
+    mean = here.final_average / 2
+    low = mean - np.hypot(here.final_average - here.final_average_low, 0.0) / 2
+    assert row.startswith("| sft | prior-data-free | 1, 1 | ")
+    assert f"| {mean:.2f} [{low:.2f}, " in row
+
+
+def test_hostile_task_names_are_refused(
+    add_full: Callable[..., Path], shown: Callable[[], tuple[str, str]]
+) -> None:
+    def rename(record: Record) -> None:
+        name = "x\n## y <b>\ud800"
+        record.scenario.retained[0] = name
+        tasks = record.episodes["task"]
+        record.episodes["task"] = [name if task == "skill_0" else task for task in tasks]
+
+    add_full("sft", 0, scenario="strange/Toy-v0", edit=rename)
+    _, page = shown()
+    assert "## strange/Toy-v0" not in page
+    assert r"'x\\n\#\# y \<b\>\\ud800' cannot be the name of a task" in page
+
+
+def test_web_addresses_of_strangers_are_no_links(
+    add_full: Callable[..., Path], shown: Callable[[], tuple[str, str]]
+) -> None:
+    add_full("sft", 7, edit=set_in("run", "changes", {"https://x.example www.x.example": 1}))
+    _, page = shown()
+    assert "://" not in page
+    assert "www." not in page
+
+
+def set_in(name: str, key: str, value: Any) -> Callable[[Record], None]:
+    def edit(record: Record) -> None:
+        part = getattr(record, name)
+        if isinstance(part, dict):
+            part[key] = value
+        else:
+            setattr(part, key, value)
+
+    return edit

@@ -1,0 +1,206 @@
+"""Files that make no row: each is listed with its reason, and none hides another."""
+
+import itertools
+import json
+import os
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas
+import pytest
+
+from clbench.base.entry_points import resolve
+from clbench.records.content import sealed
+from clbench.records.paths import record_path
+from clbench.records.record import Record
+from clbench.records.writer import write_record
+
+ASKS = {"demonstrations": "never", "questions": "prepare", "reference": False}
+load = resolve("clbench.leaderboard:load")
+
+
+def table_of_four_methods(records: Path, shown: Callable[[], Any]) -> bytes:
+    """Return the CSV file of `records` as the fixture leaves them: each test has the same, made once."""
+    if not _TABLE:
+        shown()
+        _TABLE.append((records.parent / "site" / "leaderboard.csv").read_bytes())
+    return _TABLE[0]
+
+
+_TABLE: list[bytes] = []
+
+
+def flat(text: str) -> str:
+    """Return `text` without the line breaks of the terminal and the backslashes of Markdown."""
+    return " ".join(text.replace("\\", "").split())
+
+
+def set_in(name: str, key: str, value: Any) -> Callable[[Record], None]:
+    def edit(record: Record) -> None:
+        part = getattr(record, name)
+        if isinstance(part, dict):
+            part[key] = value
+        else:
+            setattr(part, key, value)
+
+    return edit
+
+
+def test_a_record_that_is_not_of_its_schema_is_listed_and_hides_no_other(
+    four_methods: Path, add_full: Callable[..., Path], shown: Callable[[], tuple[str, str]]
+) -> None:
+    before = load(four_methods)
+    path = add_full("old", 0)
+    path.write_text(path.read_text(encoding="utf-8").replace('"schema": 3', '"schema": 1'), encoding="utf-8")
+    pandas.testing.assert_frame_equal(load(four_methods), before)
+    for text in shown():
+        assert "old/seed-0.json: a record: schema 1 has no policy" in flat(text)
+
+
+def fail(record: Record) -> None:
+    record.status = "failed"
+    record.error = {"where": "loss", "type": "ValueError", "message": "no | [bold]way\n", "traceback": ""}
+
+
+def cut_answers(record: Record) -> None:
+    record.answers = {name: column[:-1] for name, column in record.answers.items()}
+    record.answers["kind"][-1] = "right"
+
+
+def lose(record: Record, lost: Callable[..., bool]) -> None:
+    rows = [row for row in zip(*record.episodes.values(), strict=True) if not lost(*row)]
+    record.episodes = {name: [row[n] for row in rows] for n, name in enumerate(record.episodes)}
+
+
+def lose_curve_episode(record: Record) -> None:
+    lose(record, lambda stage, step, task, split, episode, *_: 0 < step < 400 and episode == 9)
+
+
+def lose_validation_episode(record: Record) -> None:
+    lose(record, lambda stage, step, task, split, episode, *_: split == "validation" and episode == 9)
+
+
+@pytest.mark.parametrize(
+    ("edit", "reason"),
+    [
+        (fail, "the run failed (loss: ValueError: no | [bold]way"),
+        (set_in("run", "changes", {"strength": 2}), "settings were changed: strength"),
+        (set_in("run", "changes", 5), "run: changes must be an object with named entries, not 5."),
+        (set_in("run", "method", "[red]x[/red] | `y` | <b>"), "cannot be the name of a method"),
+        (set_in("run", "method", "x\n| best | 1.00 |"), "cannot be the name of a method"),
+        (set_in("run", "method", "\x1b[31mred\u202e\ud800"), "cannot be the name of a method"),
+        (set_in("run", "method", None), "run: method must be a text, not null."),
+        (set_in("run", "scenario", "../Toy\n"), "cannot be the id of a scenario"),
+        (set_in("run", "scenario", "clbench/Toy-v9"), "was run"),
+        (set_in("run", "seed", "0"), 'run: seed must be a whole number, not "0".'),
+        (set_in("run", "uses", {}), "uses must say"),
+        (set_in("scenario", "retained", "all"), 'scenario: retained must be a list, not "all".'),
+        (
+            lambda record: record.scenario.budget.update(adaptation_steps=9),
+            "budget (adaptation_steps)",
+        ),
+        (set_in("scenario", "target", ["target_1", "target_0"]), "target differ"),
+        (set_in("fingerprint", "rollouts", {"toy:world": "4567"}), "rollouts of toy:world differ"),
+        (set_in("fingerprint", "rollouts", None), "rollouts of all worlds differ"),
+        (set_in("episodes", "success", [0.5]), "different lengths"),
+        (cut_answers, "kinds differ"),
+        (lose_curve_episode, "curve_episodes differ"),
+        (lose_validation_episode, "validation_episodes differ"),
+        (set_in("policy", "step", []), "the columns of policy have different lengths"),
+        (set_in("run", "split", "validation"), "it is a tuning run: its episodes may be chosen on."),
+        (set_in("run", "split", "all"), "split must be test or validation"),
+        (set_in("run", "settings", {"strength": 2}), "settings are not those of most seeds: strength"),
+        (set_in("run", "device", "cuda"), "settings are not those of most seeds: device"),
+    ],
+)
+def test_a_record_that_cannot_be_a_row_is_listed_with_its_reason_and_hides_no_other(
+    edit: Callable[[Record], None],
+    reason: str,
+    four_methods: Path,
+    add_full: Callable[..., Path],
+    shown: Callable[[], tuple[str, str]],
+) -> None:
+    before = table_of_four_methods(four_methods, shown)
+    add_full("asks", 2, edit=edit, uses=ASKS, place="Toy-v0/asks/seed-2.json")
+    texts = shown()
+    assert (four_methods.parent / "site" / "leaderboard.csv").read_bytes() == before
+    for text in texts:
+        assert "Toy-v0/asks/seed-2.json: " in flat(text)
+        assert reason in flat(text)
+        assert "Not shown" in text
+        assert "\x1b" not in text
+        assert "\n| best" not in text
+
+
+@pytest.mark.parametrize("content", ["", "{", "[]", '{"a": 1}', '{"schema": 99}', "[" * 99_999, "\x00"])
+def test_a_file_that_is_no_record_is_listed_and_hides_no_other(
+    content: str, four_methods: Path, shown: Callable[[], tuple[str, str]]
+) -> None:
+    before = table_of_four_methods(four_methods, shown)
+    (four_methods / "a_torn_*file*.json").write_text(content, encoding="utf-8")
+    printed, page = shown()
+    assert (four_methods.parent / "site" / "leaderboard.csv").read_bytes() == before
+    assert "a_torn_*file*.json: " in printed
+    assert r"a\_torn\_\*file\*.json: " in page
+
+
+def test_a_file_name_with_control_characters_is_shown_without_them(
+    four_methods: Path, shown: Callable[[], tuple[str, str]]
+) -> None:
+    (four_methods / "x\n## y\x1b[31m.json").write_text("{", encoding="utf-8")
+    (four_methods / os.fsdecode(b"\xff.json")).write_text("{", encoding="utf-8")
+    for text in shown():
+        assert "\x1b" not in text
+        assert "\n## y" not in text
+
+
+def test_a_record_that_lies_elsewhere_is_refused_though_its_run_has_no_other(
+    four_methods: Path, add_full: Callable[..., Path], shown: Callable[[], tuple[str, str]]
+) -> None:
+    before = load(four_methods)
+    add_full("sft", 1, np.ones((3, 5)), place="a/copy.json")
+    add_full("sft", 2, np.ones((3, 5)), place="a/more.json")
+    pandas.testing.assert_frame_equal(load(four_methods), before)
+    for text in shown():
+        assert "a/copy.json: it is the record of Toy-v0/sft/seed-1.json, and must lie there." in flat(text)
+        assert "a/more.json: it is the record of Toy-v0/sft/seed-2.json, and must lie there." in flat(text)
+
+
+def test_any_damage_to_a_record_ends_in_a_row_or_a_reason(
+    make_record: Callable[..., Record], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    records = tmp_path / "records"
+    whole_record = make_record(
+        [[1.0, 0.0], [0.5, 1.0]], groups=(1, 1, 0), episodes=2, steps=(1, 2), sparsity=[[0.5, 0.4]]
+    )
+    path = record_path(records, "clbench/Toy-v0", "sft", 0)
+    write_record(whole_record, path)
+    whole = json.loads(path.read_text(encoding="utf-8"))
+    damages: tuple[Any, ...] = (None, -1, 1e999, "x", [None], {"x": []}, 10**300)
+    parts = {name: values for name, values in whole.items() if name != "schema"}
+    places = [
+        (name, key)
+        for name, values in parts.items()
+        for key in (None, *(values if isinstance(values, dict) else ()))
+    ]
+    places.remove(("run", "method"))
+    for number, (damage, (field, key)) in enumerate(itertools.product(damages, places)):
+        damaged = json.loads(json.dumps(whole))
+        damaged["run"]["method"] = f"damaged_{number}"
+        if key is None:
+            damaged[field] = damage
+        else:
+            damaged[field][key] = damage
+        damaged = damaged if field == "content" else sealed(damaged)
+        text = json.dumps(damaged).replace("Infinity", "1e999")
+        place = records / "Toy-v0" / f"damaged_{number}" / "seed-0.json"
+        place.parent.mkdir()
+        place.write_text(text, encoding="utf-8")
+    rows = load(records)
+    resolve("clbench.leaderboard.cli:show")(records=records)
+    listed = re.findall(r"^  Toy-v0/damaged_\d+/seed-0\.json: ", capsys.readouterr().out, re.MULTILINE)
+    assert "sft" in set(rows.method)
+    assert len(rows) + len(listed) == 1 + len(damages) * len(places)

@@ -1,0 +1,295 @@
+"""The metrics of the leaderboard against matrices worked by hand and against plain loops."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.integrate import trapezoid
+
+from clbench.scoring.metrics import METRICS, measure
+from clbench.scoring.ours import matched_points
+from clbench.scoring.scores import Scores, rates_of
+
+MODULE = "clbench.scoring.ours"
+
+# Two skills, two targets, one task held out; the rows are the pretrained policy and the ends of two stages.
+MATRIX = [
+    [1.0, 0.8, 0.1, 0.0, 0.2],
+    [0.6, 0.9, 0.9, 0.2, 0.3],
+    [0.5, 0.4, 0.3, 0.8, 0.1],
+]
+BY_HAND = {
+    "final_average": (0.5 + 0.4 + 0.3 + 0.8) / 4,
+    "adaptation": (0.9 + 0.8) / 2,
+    "retention": (0.5 + 0.4) / 2,
+    "forgetting": ((1.0 - 0.5) + (0.9 - 0.4) + (0.9 - 0.3)) / 3,
+    "backward_transfer": 0.3 - 0.9,
+    "zero_shot": 0.1,
+}
+
+
+@pytest.mark.parametrize("name", BY_HAND)
+def test_a_metric_has_the_value_worked_out_by_hand(name: str, scores: Callable[..., Scores]) -> None:
+    assert measure(name, scores(MATRIX)) == pytest.approx(BY_HAND[name])
+
+
+def test_every_metric_of_the_leaderboard_is_worked_out_by_hand() -> None:
+    others = {"forward_transfer", "question_retention", "retention_at_matched_adaptation"}
+    others |= {"perturbed_retention", "update_sparsity", "activation_drift"}
+    found = {name for name, metric in METRICS.items() if metric.function.__module__ == MODULE}
+    assert {*BY_HAND, *others} == found
+
+
+def test_perturbed_retention_has_the_value_worked_out_by_hand(scores: Callable[..., Scores]) -> None:
+    run = scores(MATRIX, perturbed=[[0.9, 0.7], [0.5, 0.8], [0.4, 0.2]])
+    assert measure("perturbed_retention", run) == pytest.approx((0.4 + 0.2) / 2)
+    assert measure("retention", run) == pytest.approx(BY_HAND["retention"])
+    assert measure("perturbed_retention", scores(MATRIX)) is None
+
+
+def test_forward_transfer_has_the_value_worked_out_by_hand(scores: Callable[..., Scores]) -> None:
+    steps = (200, 400)
+    run = scores(MATRIX, curves=[[0.7], [0.6]], steps=steps)
+    scratch = scores([[0.0] * 5, [0, 0, 0.6, 0, 0], [0, 0, 0, 0.4, 0]], curves=[[0.2], [0.0]], steps=steps)
+    # The curves start with what the stage before left: 0.1 for the first target, 0.2 for the second.
+    areas = (0.1 / 4 + 0.7 / 2 + 0.9 / 4, 0.2 / 4 + 0.6 / 2 + 0.8 / 4)
+    from_scratch = (0.2 / 2 + 0.6 / 4, 0.4 / 4)
+    expected = np.mean([(a - b) / (1 - b) for a, b in zip(areas, from_scratch, strict=True)])
+    assert measure("forward_transfer", run, {"from_scratch": scratch}) == pytest.approx(expected)
+
+
+def test_questions_of_all_kinds_count_together_at_the_end_alone(scores: Callable[..., Scores]) -> None:
+    answers = {(0, "left"): (10, 10), (2, "left"): (30, 15), (2, "above"): (10, 9)}
+    assert measure("question_retention", scores(MATRIX, answers=answers)) == pytest.approx(24 / 40)
+
+
+# Two stages with three points each: what plain fine-tuning and a gentler method do on the way.
+MATCHED_STEPS = (100, 200, 400)
+PLAIN = {"validation": [[0.4, 0.9, 1.0], [0.0, 0.7, 0.8]], "retained_curves": [[[0.9, 0.7], [0.5, 0.6]]] * 2}
+GENTLE = {
+    "validation": [[0.1, 0.6, 0.9], [0.3, 0.8, 0.9]],
+    "retained_curves": [[[1.0, 1.0], [0.9, 0.9]], [[0.8, 0.9], [0.7, 0.6]]],
+}
+
+
+def test_retention_at_matched_adaptation_has_the_value_worked_out_by_hand(
+    scores: Callable[..., Scores],
+) -> None:
+    sft = scores(MATRIX, steps=MATCHED_STEPS, **PLAIN)
+    run = scores(MATRIX, steps=MATCHED_STEPS, **GENTLE)
+    # The goals are 0.9 x 1.0, reached at the end of its stage, and 0.9 x 0.8, reached in the middle.
+    np.testing.assert_array_equal(matched_points(rates_of([run], {"sft": [sft]})), [[2, 1]])
+    expected = ((0.6 + 0.9) / 2 + (0.7 + 0.6) / 2) / 2
+    assert measure("retention_at_matched_adaptation", run, {"sft": sft}) == pytest.approx(expected)
+
+
+def test_plain_fine_tuning_is_matched_with_its_own_end(scores: Callable[..., Scores]) -> None:
+    sft = scores(MATRIX, steps=MATCHED_STEPS, **PLAIN)
+    # 0.9 of 1.0 after 200 steps, 0.72 of 0.8 not before the end
+    expected = ((0.5 + 0.6) / 2 + (0.5 + 0.4) / 2) / 2
+    assert measure("retention_at_matched_adaptation", sft, {"sft": sft}) == pytest.approx(expected)
+
+
+def test_a_method_that_never_learns_a_target_as_well_has_no_matched_point(
+    scores: Callable[..., Scores],
+) -> None:
+    sft = scores(MATRIX, steps=MATCHED_STEPS, **PLAIN)
+    run = scores(MATRIX, steps=MATCHED_STEPS, **{**GENTLE, "validation": [[0.1, 0.6, 0.8], [0.9, 0.9, 0.9]]})
+    np.testing.assert_array_equal(matched_points(rates_of([run], {"sft": [sft]})), [[np.nan, 0]])
+    assert measure("retention_at_matched_adaptation", run, {"sft": sft}) is None
+
+
+def test_the_matched_point_is_chosen_on_validation_episodes_whatever_the_report_ones_say(
+    scores: Callable[..., Scores],
+) -> None:
+    sft = scores(MATRIX, steps=MATCHED_STEPS, curves=np.ones((2, 2)), **PLAIN)
+    first, last = (
+        scores(MATRIX, steps=MATCHED_STEPS, curves=curves, **GENTLE)
+        for curves in (np.ones((2, 2)), np.zeros((2, 2)))
+    )
+    points = matched_points(rates_of([first, last], {"sft": [sft, sft]}))
+    np.testing.assert_array_equal(points, [[2, 1], [2, 1]])
+
+
+def test_a_rate_that_just_reaches_the_goal_is_matched_whatever_its_last_bit(
+    scores: Callable[..., Scores],
+) -> None:
+    assert 36 / 50 < 0.9 * (40 / 50)
+    sft, run = (
+        scores(
+            [[1.0, 0.0, 0.0], [0.5, 1.0, 0.0]],
+            steps=(100,),
+            validation=[[right / 50]],
+            validation_episodes=50,
+        )
+        for right in (40, 36)
+    )
+    np.testing.assert_array_equal(matched_points(rates_of([run], {"sft": [sft]})), [[0]])
+
+
+@pytest.mark.parametrize(
+    ("method", "point", "points"),
+    [("run", 0, [np.nan, 1]), ("run", 2, [np.nan, 1]), ("sft", 2, [np.nan, 1]), ("sft", 0, [2, 1])],
+)
+def test_a_missing_selection_rate_leaves_no_point_that_could_be_another(
+    method: str, point: int, points: list[float], scores: Callable[..., Scores]
+) -> None:
+    selection = {"sft": np.array(PLAIN["validation"]), "run": np.array(GENTLE["validation"])}
+    selection[method][0, point] = np.nan
+    sft, run = (scores(MATRIX, steps=MATCHED_STEPS, validation=selection[name]) for name in ("sft", "run"))
+    np.testing.assert_array_equal(matched_points(rates_of([run], {"sft": [sft]})), [points])
+
+
+def test_a_missing_success_at_the_matched_point_leaves_no_value_and_elsewhere_does_not_matter(
+    scores: Callable[..., Scores],
+) -> None:
+    sft = scores(MATRIX, steps=MATCHED_STEPS, **PLAIN)
+    values = []
+    for point in (0, 1):
+        retained = np.array(GENTLE["retained_curves"])
+        retained[1, point, 0] = np.nan
+        run = scores(MATRIX, steps=MATCHED_STEPS, **{**GENTLE, "retained_curves": retained})
+        values.append(measure("retention_at_matched_adaptation", run, {"sft": sft}))
+    assert values == [pytest.approx(0.7), None]
+
+
+def test_without_plain_fine_tuning_there_is_no_matched_retention(scores: Callable[..., Scores]) -> None:
+    run = scores(MATRIX, steps=MATCHED_STEPS, **GENTLE)
+    assert measure("retention_at_matched_adaptation", run) is None
+    np.testing.assert_array_equal(matched_points(run.rates()), [np.nan, np.nan])
+
+
+@pytest.mark.parametrize(("name", "table"), [("update_sparsity", "sparsity"), ("activation_drift", "drift")])
+def test_what_has_become_of_the_policy_counts_after_the_last_target(
+    name: str, table: str, scores: Callable[..., Scores]
+) -> None:
+    values = np.array([[0.9, 0.8, 0.7, 0.6], [0.5, 0.4, 0.3, 0.2]])
+    assert measure(name, scores(MATRIX, **{table: values})) == 0.2
+    values[1, 2] = np.nan
+    assert measure(name, scores(MATRIX, **{table: values})) == 0.2
+    values[1, 3] = np.nan
+    assert measure(name, scores(MATRIX, **{table: values})) is None
+
+
+def test_forward_transfer_weighs_uneven_steps_by_their_length(scores: Callable[..., Scores]) -> None:
+    steps = (50, 100, 200, 400)
+    success = [[0.0, 0.0, 0.0], [0.0, 1.0, 0.0]]
+    run = scores(success, curves=[[0.2, 0.4, 0.8]], steps=steps)
+    scratch = scores(success, curves=[[0.0, 0.0, 0.0]], steps=steps)
+    area = (50 * 0.1 + 50 * 0.3 + 100 * 0.6 + 200 * 0.9) / 400
+    expected = (area - 0.25) / (1 - 0.25)
+    assert measure("forward_transfer", run, {"from_scratch": scratch}) == pytest.approx(expected)
+
+
+def test_metrics_agree_with_plain_loops_on_random_matrices(scores: Callable[..., Scores]) -> None:
+    generator = np.random.default_rng(0)
+    for _ in range(200):
+        retained, targets, held_out = (int(generator.integers(1, 4)) for _ in range(3))
+        shape = (targets + 1, retained + targets + held_out)
+        rates = generator.integers(0, 6, size=(2, *shape)) / 5
+        curves = generator.integers(0, 6, size=(2, targets, 3)) / 5
+        disturbed = generator.integers(0, 6, size=(targets + 1, retained)) / 5
+        run, scratch = (
+            scores(one, curves=curve, perturbed=disturbed, groups=(retained, targets, held_out), episodes=5)
+            for one, curve in zip(rates, curves, strict=True)
+        )
+        expected = plain_loops(rates[0], rates[1], curves, retained, targets)
+        expected["perturbed_retention"] = sum(disturbed[targets][s] for s in range(retained)) / retained
+        for name, value in expected.items():
+            assert measure(name, run, {"from_scratch": scratch}) == (
+                None if value is None else pytest.approx(value)
+            ), name
+
+
+def plain_loops(
+    matrix: Any, scratch: Any, curves: Any, retained: int, targets: int
+) -> dict[str, float | None]:
+    """Return the metrics of a matrix (stages + 1, tasks) as their papers write them."""
+    end = targets
+    column = {k: retained + k - 1 for k in range(1, targets + 1)}
+    drops = [max(matrix[stage][s] for stage in range(end)) - matrix[end][s] for s in range(retained)]
+    changes = []
+    for k in range(1, targets):
+        drops.append(max(matrix[stage][column[k]] for stage in range(k, end)) - matrix[end][column[k]])
+        changes.append(matrix[end][column[k]] - matrix[k][column[k]])
+    transfers = []
+    for k in range(1, targets + 1):
+        points = [0.0, 0.25, 0.5, 0.75, 1.0]
+        own = trapezoid([matrix[k - 1][column[k]], *curves[0][k - 1], matrix[k][column[k]]], points)
+        base = trapezoid([0.0, *curves[1][k - 1], scratch[k][column[k]]], points)
+        transfers.append((own - base) / (1 - base))
+    return {
+        "final_average": sum(matrix[end][s] for s in range(retained + targets)) / (retained + targets),
+        "adaptation": sum(matrix[k][column[k]] for k in column) / targets,
+        "retention": sum(matrix[end][s] for s in range(retained)) / retained,
+        "forgetting": sum(drops) / len(drops),
+        "backward_transfer": sum(changes) / len(changes) if changes else None,
+        "forward_transfer": sum(transfers) / len(transfers),
+        "zero_shot": float(np.mean(matrix[end][retained + targets :])),
+    }
+
+
+def test_without_the_reference_forward_transfer_is_none(scores: Callable[..., Scores]) -> None:
+    assert measure("forward_transfer", scores(MATRIX, curves=[[0.5] * 3] * 2)) is None
+
+
+def test_without_questions_question_retention_is_none(scores: Callable[..., Scores]) -> None:
+    assert measure("question_retention", scores(MATRIX, answers={(0, "left"): (10, 9)})) is None
+
+
+def test_without_held_out_tasks_zero_shot_is_none(scores: Callable[..., Scores]) -> None:
+    assert measure("zero_shot", scores(np.array(MATRIX)[:, :4], groups=(2, 2, 0))) is None
+
+
+def test_with_one_target_backward_transfer_is_none(scores: Callable[..., Scores]) -> None:
+    run = scores([[1.0, 0.0, 0.0], [0.5, 1.0, 0.0]])
+    assert measure("backward_transfer", run) is None
+    assert measure("forgetting", run) == 0.5
+
+
+def test_a_record_of_the_pretrained_policy_alone_has_no_value_that_needs_a_target(
+    scores: Callable[..., Scores],
+) -> None:
+    run = scores([[1.0, 0.5]], groups=(1, 0, 1))
+    values = {name: measure(name, run) for name in METRICS}
+    assert {name for name, value in values.items() if value is not None} == {
+        "final_average",
+        "retention",
+        "zero_shot",
+    }
+
+
+@pytest.mark.parametrize(
+    ("stage", "task", "missing"),
+    [
+        (2, 0, {"final_average", "retention", "forgetting"}),
+        (1, 2, {"adaptation", "forgetting", "backward_transfer"}),
+        (0, 0, {"forgetting"}),
+        (0, 2, set()),
+        (2, 4, {"zero_shot"}),
+    ],
+)
+def test_what_needs_a_missing_cell_is_none_and_the_rest_is_not(
+    stage: int, task: int, missing: set[str], scores: Callable[..., Scores]
+) -> None:
+    matrix = np.array(MATRIX)
+    matrix[stage, task] = np.nan
+    values = {name: measure(name, scores(matrix)) for name in BY_HAND}
+    assert {name for name, value in values.items() if value is None} == missing
+
+
+def test_a_cell_that_lacks_an_episode_is_missing(scores: Callable[..., Scores]) -> None:
+    outcomes = np.ones((2, 3, 20))
+    outcomes[1, 0, 19] = np.nan
+    assert measure("retention", scores(outcomes)) is None
+    assert measure("adaptation", scores(outcomes)) == 1.0
+
+
+def test_a_missing_point_of_a_curve_takes_forward_transfer_only(scores: Callable[..., Scores]) -> None:
+    curves = np.full((2, 3), 0.5)
+    scratch = scores(MATRIX, curves=curves)
+    curves[1, 1] = np.nan
+    run = scores(MATRIX, curves=curves)
+    assert measure("forward_transfer", run, {"from_scratch": scratch}) is None
+    assert measure("adaptation", run) == pytest.approx(BY_HAND["adaptation"])
