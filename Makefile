@@ -61,8 +61,8 @@ check: .venv/installed-dev
 # What a wheel may do otherwise than the checkout, against a built one outside of it: its files, the parts that are
 # found by name, the commands; and all that strangers type.
 WALKS := tests/cli tests/test_readme.py tests/test_submission.py tests/test_your_scenario.py tests/runs/test_agents_guide.py
-WHEEL_TESTS := $(WALKS) tests/test_package.py tests/methods/test_methods.py tests/leaderboard/views/test_table.py \
-	tests/leaderboard/views/test_page.py tests/leaderboard/submission tests/leaderboard/claims tests/leaderboard/pages
+WHEEL_TESTS := $(WALKS) tests/test_package.py tests/methods/test_methods.py \
+	$(addprefix tests/leaderboard/,views/test_page.py views/test_markdown.py submission claims pages)
 wheel-test: .venv/installed-dev
 	rm -rf build/wheel && mkdir -p build/wheel
 	$(BIN)/python -m build --wheel --outdir build/wheel . >/dev/null

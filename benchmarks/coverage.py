@@ -103,7 +103,7 @@ def outcomes(
 
 
 def level_of(rate: float, deviation: float, tasks: int) -> float:
-    """Return the level at which the mean rate over seeds and tasks is `rate`."""
+    """Return the level that gives a mean rate of `rate` over seeds and tasks."""
     nodes, weights = np.polynomial.hermite_e.hermegauss(61)
     low, high = -15.0, 15.0
     for _ in range(60):
@@ -231,7 +231,7 @@ def power(generator: np.random.Generator, boards: int) -> Iterator[dict[str, Any
 
 
 def board_ranks(success: Outcomes, single: int = 0) -> NDArray[np.int64]:
-    """Return the ranks of methods by mean success, (methods,); the first `single` have one seed only."""
+    """Return the ranks of methods by mean success, (methods,); the first `single` have only one seed."""
     values = success.mean(axis=(2, 3))
     values[:single, 1:] = np.nan
     without_episode = (success.sum(axis=3, keepdims=True) - success).mean(axis=2) / (EPISODES - 1)
@@ -326,7 +326,7 @@ def _coverages(found: list[Row]) -> str:
 
 
 def _kinds(rows: list[Row], *kinds: str) -> Lines:
-    """Return a column for each number of seeds and deviation among the rows of these kinds."""
+    """Return a column for each pair of a number of seeds and a deviation in the rows of these kinds."""
     pairs = {(row["seeds"], row["deviation"]) for row in rows if row.get("kind") in (kinds or (None,))}
     return {f"{_seeds(a)}, {b:.2f}": {"seeds": a, "deviation": b} for a, b in sorted(pairs)}
 
@@ -338,7 +338,7 @@ def _table(
     columns: Lines,
     cell: Callable[[list[Row]], str],
 ) -> str:
-    """Return a table of Markdown; a cell is made of the rows that have the values of its line and column."""
+    """Return a Markdown table; a cell shows the rows that have the values of its line and column."""
     text = [f"| {' | '.join([corner, *columns])} |", f"| --- |{' --: |' * len(columns)}"]
     for name, line in lines.items():
         cells = []

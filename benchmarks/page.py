@@ -61,9 +61,9 @@ def main() -> None:
     if arguments.output:
         arguments.output.write_text(text, encoding="utf-8")
     print(f"{len(table.rows)} rows, {len(text.encode()) / 1e6:.2f} MB")
-    for what, first, last in (("table", begin, read), ("page and pictures", read, end), ("all", begin, end)):
+    for part, first, last in (("table", begin, read), ("page and pictures", read, end), ("all", begin, end)):
         wall, processor = (late - early for early, late in zip(first, last, strict=True))
-        print(f"{what}: {wall:.1f} s, of the processor {processor:.1f} s")
+        print(f"{part}: {wall:.1f} s, {processor:.1f} s of processor time")
 
 
 def make_records(folder: Path, methods: int, seeds: int, scenarios: int) -> None:

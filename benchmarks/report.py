@@ -65,7 +65,7 @@ def _read(name: str) -> Any:
 
 
 def _ratio(ratio: dict[str, float]) -> str:
-    if ratio["low"] == ratio["high"]:  # of one round, or of a thing to itself
+    if ratio["low"] == ratio["high"]:  # one round only, or a ratio to itself
         return f"{ratio['median_ratio']:.2f}"
     return f"{ratio['median_ratio']:.2f} [{ratio['low']:.2f}, {ratio['high']:.2f}]"
 
@@ -179,7 +179,7 @@ def _scaling() -> Iterator[str]:
 
 
 def _milliseconds(seconds: float) -> str:
-    """Return a duration with two digits; a slope that is nothing but noise is shown as 0."""
+    """Return a duration with two digits; a slope of pure noise is shown as 0."""
     milliseconds = round(1000 * seconds, 2)
     return f"{float(f'{milliseconds:.2g}') + 0.0:g} ms"
 

@@ -1,4 +1,4 @@
-"""Results of benchmarks: one file each in results/, with the version and the machine that they are of."""
+"""Results of benchmarks: one file each in results/, with clbench's version and the hardware."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ def write_results(name: str, scenario: str, values: Mapping[str, Any]) -> None:
     """Write results/`name`.json.
 
     Args:
-        name: Of the benchmark.
-        scenario: Whose fingerprint names the machine.
-        values: What was measured.
+        name: Name of the benchmark.
+        scenario: Id of the scenario whose fingerprint names the hardware.
+        values: Measured values by name.
     """
     hardware = fingerprint(load_scenario(scenario))["hardware"]
     result = {"clbench": clbench.__version__, "hardware": hardware, **values}

@@ -1,10 +1,10 @@
-"""How fast environments step, by suite, against the vector environments of others and the physics alone.
+"""Speed of environments by suite, compared with other vector environments and with the physics alone.
 
-Contenders take turns in blocks of steps, in a new order each round, so that what else the machine does meets
-all of them alike. A ratio is that of two blocks of one round; reported are the median over rounds and a 95 %
-bootstrap interval of it. All take the same random actions and begin episodes anew as they end. The peers
-step the suite's own environment, whose physics ours has, for as much simulated time a step; the physics alone
-is as many threads that do nothing but `mujoco.mj_step` on it.
+Contenders take turns in blocks of steps, in a new order each round, so that other work on the machine affects
+all of them equally. A ratio compares two blocks of one round; the results are the median over rounds and its
+95 % bootstrap interval. All take the same random actions and start a new episode when one ends. The peers
+step the suite's own environment, which has our physics, with the same simulated time per step; the physics
+alone is the same number of threads that only call `mujoco.mj_step` on it.
 
     python benchmarks/rollouts.py fetch
 """
@@ -41,36 +41,36 @@ Env = gymnasium.Env[Any, Any]
 
 @dataclass(frozen=True)
 class Physics:
-    """A scene, as an episode begins in it."""
+    """A scene at the start of an episode."""
 
     model: mujoco.MjModel
     start: mujoco.MjData
     substeps: int
     move: Callable[[mujoco.MjData, Actions], None]
-    """Sets what an action (A,) asks for."""
+    """Sets the inputs of the physics for an action (A,)."""
 
 
 @dataclass(frozen=True)
 class Suite:
-    """What a suite's environments are compared on."""
+    """The environments of a suite that are compared."""
 
     ours: str
-    """Our scenario."""
+    """Id of our scenario."""
     stage: int | None
-    """The stage that ours stays in, where the peer has but one task."""
+    """Stage of our environment if the peer has only one task; None goes through all stages."""
     task: str
-    """What the peer does, in words."""
+    """Name of the peer's task."""
     peer: Callable[[], Env]
     """Makes an environment of the peer; called in its own process."""
     physics: Callable[[Env], Physics]
-    """Takes an environment of the peer, reset, and returns what is left if all else costs nothing."""
+    """Returns the physics of an environment of the peer that has been reset."""
 
 
 # ---- the peers -----------------------------------------------------------------------------------------
 
 
 def _fetch_peer() -> Env:
-    with contextlib.redirect_stderr(io.StringIO()):  # else each process prints a notice about Adroit's hand
+    with contextlib.redirect_stderr(io.StringIO()):  # otherwise each process prints a notice about Adroit's hand
         import gymnasium_robotics
 
     gymnasium.register_envs(gymnasium_robotics)
@@ -94,7 +94,7 @@ def _fetch_physics(env: Env) -> Physics:
 
 
 class DMControlEnv(gymnasium.Env[NDArray[np.float64], NDArray[np.float32]]):
-    """A task of dm_control as Gymnasium has it, whose steps last as long as ours."""
+    """A task of dm_control as a Gymnasium environment, with steps as long as ours."""
 
     def __init__(self, domain: str, task: str, seconds: float) -> None:
         from dm_control import suite
@@ -233,13 +233,13 @@ class Subproc:
 
 
 class Raw:
-    """The physics alone, on as many threads: the limit.
+    """The physics alone, on the same number of threads: the limit.
 
     Args:
-        physics: Of the suite.
-        num_envs: How many copies of the scene.
-        threads: How many threads share them.
-        horizon: Steps after which an episode begins anew.
+        physics: Physics of the suite.
+        num_envs: Number of copies of the scene.
+        threads: Number of threads that share them.
+        horizon: Number of steps after which a new episode starts.
     """
 
     def __init__(self, physics: Physics, num_envs: int, threads: int, horizon: int) -> None:
@@ -267,7 +267,7 @@ class Raw:
 
 
 def contenders(suite: Suite, num_envs: int, threads: int) -> dict[str, Contender]:
-    """Return all that is compared, by name; `clbench` is ours."""
+    """Return all contenders by name; `clbench` is ours."""
     options: dict[str, Any] = {"instruction": "tokens"}
     if suite.stage is not None:
         options["stage"] = suite.stage

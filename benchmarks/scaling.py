@@ -1,9 +1,9 @@
 """How cost grows with tasks, episodes, environments and demonstrations: `python benchmarks/scaling.py`.
 
-Each is measured at several sizes in turns, in a new order each round; reported are the medians, the straight
-line through them and how far they lie off it. Tasks are those of Meta-World, each with a scene of its own,
-and episodes those of Fetch, both with a policy as it was drawn: its episodes last to their horizons. Sizes
-are multiples of the 40 episodes that are stepped together: fewer take a forward of as many rows.
+Each quantity is measured at several sizes in turns, in a new order each round; the results are the medians, the
+straight line through them and their distance from it. Tasks come from Meta-World, each with its own scene, and
+episodes from Fetch, both with an untrained policy, whose episodes last to their horizons. Numbers of episodes
+are multiples of the 40 that step together, because fewer episodes need a forward pass of as many rows.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ FETCH, META_WORLD = "clbench/Fetch-v0", "clbench/MetaWorld-v0"
 
 
 def evaluation_of_tasks() -> Callable[[int], float]:
-    """Return what evaluates 4 episodes of 50 steps of each of a number of tasks."""
+    """Return a function that times 4 episodes of 50 steps on each of a number of tasks."""
     scenario = load_scenario(META_WORLD)
     names = [name.removesuffix("-v3").replace("-", "_") for name in ALL_V3_ENVIRONMENTS]
     tasks = [dataclasses.replace(scenario.target[0], name=name, horizon=50) for name in names]
@@ -53,7 +53,7 @@ def evaluation_of_tasks() -> Callable[[int], float]:
 
 
 def evaluation_of_episodes() -> Callable[[int], float]:
-    """Return what evaluates a number of episodes of one task."""
+    """Return a function that times a number of episodes of one task."""
     scenario = load_scenario(FETCH)
     policy = Policy(policy_config(scenario), seed=0)
     evaluator = Evaluator(scenario, seed=0)
@@ -68,7 +68,7 @@ def evaluation_of_episodes() -> Callable[[int], float]:
 
 
 def steps_of_environments() -> Callable[[int], float]:
-    """Return what steps a number of environments 20 times."""
+    """Return a function that times 20 steps of a number of environments."""
     made: dict[int, gymnasium.vector.VectorEnv[Any, Any, Any]] = {}
 
     def seconds(count: int) -> float:
@@ -85,7 +85,7 @@ def steps_of_environments() -> Callable[[int], float]:
 
 
 def steps_on_demonstrations() -> Callable[[int], float]:
-    """Return what takes 10 optimiser steps on so many demonstrations."""
+    """Return a function that times 10 optimiser steps on a number of demonstrations."""
     scenario = load_scenario(FETCH)
     policy = Policy(policy_config(scenario), seed=0)
     data = load_demonstrations(scenario.target[0], scenario, policy.config)
@@ -118,11 +118,11 @@ MEASURES: dict[str, tuple[Callable[[], Callable[[int], float]], tuple[int, ...]]
     "environments": (steps_of_environments, (4, 8, 16, 32, 64)),
     "demonstrations": (steps_on_demonstrations, (200, 400, 800, 1600, 3200)),
 }
-"""What is measured, and at which sizes."""
+"""Measured quantities with their sizes."""
 
 
 def line(sizes: Sequence[int], seconds: Sequence[float]) -> dict[str, float]:
-    """Return the straight line by least squares, and the largest relative distance of a point from it."""
+    """Return the least-squares line, and the largest relative distance of a point from it."""
     slope, offset = np.polyfit(sizes, seconds, 1)
     fitted = slope * np.array(sizes) + offset
     return {
@@ -141,7 +141,7 @@ def main() -> None:
     found: dict[str, Any] = {}
     for name, (prepare, sizes) in MEASURES.items():
         measure = prepare()
-        for size in sizes:  # makes what is made once: scenes, memory
+        for size in sizes:  # prepares everything that is made once, such as scenes
             measure(size)
         rounds = [
             {int(size): measure(int(size)) for size in generator.permutation(sizes)}

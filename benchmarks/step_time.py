@@ -1,10 +1,10 @@
-"""What an adaptation step of each method costs, as a ratio to plain fine-tuning: `make benchmark`.
+"""Cost of an adaptation step of each method, as a ratio to plain fine-tuning: `make benchmark`.
 
-Methods take turns in blocks of steps, in a new order each round, so that what else the machine does meets all
-of them alike. A ratio is that of two blocks of one round; reported are the median over rounds and a 95 %
-bootstrap interval of it. The policy, the data and the batches are those of a real run's first target.
-The limit is a bare PyTorch loop of the same model on batches that are there already: what plain fine-tuning
-takes beyond it is the price of hooks, sources and checks.
+Methods take turns in blocks of steps, in a new order each round, so that other work on the machine affects all
+of them equally. A ratio compares two blocks of one round; the results are the median over rounds and its 95 %
+bootstrap interval. The policy, the data and the batches come from the first target of a real run. The limit is
+a bare PyTorch loop of the same model on batches in memory: the additional time of plain fine-tuning is the
+cost of hooks, sources and checks.
 """
 
 from __future__ import annotations
@@ -41,13 +41,13 @@ LIMIT = "bare loop"
 
 
 class Bench:
-    """One method, prepared, that can be asked for a block of steps.
+    """One prepared method, which can run blocks of steps.
 
     Args:
-        name: The method.
-        scenario: Where budget and tasks come from.
-        policy: The pretrained policy; it is copied.
-        data: `target`, `demonstrations` and `questions` to draw from.
+        name: Name of the method.
+        scenario: Scenario of the budget and the tasks.
+        policy: Pretrained policy; it is copied.
+        data: Data to draw from, by the names `target`, `demonstrations` and `questions`.
     """
 
     def __init__(self, name: str, scenario: Scenario, policy: Policy, data: Mapping[str, Any]) -> None:
@@ -65,7 +65,7 @@ class Bench:
         return Prior({name: self._source(name) for name in names})
 
     def seconds(self, steps: int) -> float:
-        """Return what `steps` steps take; the one before them, which makes the optimiser, is not counted."""
+        """Return the time of `steps` steps in seconds, after a first step that makes the optimiser."""
         stage = Stage(
             1, self.scenario.target[0], 0, steps + 1, self._source("target"), self._prior("throughout")
         )
@@ -82,10 +82,10 @@ class Bench:
 
 
 class BareLoop:
-    """The same steps as plain fine-tuning takes, with nothing around them: the limit.
+    """The bare steps of plain fine-tuning: the limit.
 
     Args:
-        bench: Plain fine-tuning, prepared; its policy is copied.
+        bench: Prepared plain fine-tuning; its policy is copied.
     """
 
     def __init__(self, bench: Bench) -> None:
@@ -93,7 +93,7 @@ class BareLoop:
         self.target = bench.data["target"]
 
     def seconds(self, steps: int) -> float:
-        """Return what `steps` steps take; the one before them is not counted."""
+        """Return the time of `steps` steps in seconds, after a first step."""
         generator = torch_generator("benchmark", "target")
         size = self.budget.batch_size
         batches = [self.target.sample(size, generator) for _ in range(steps + 1)]

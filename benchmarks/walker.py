@@ -1,6 +1,6 @@
 """dm_control's walker, with episodes side by side as in our scenarios.
 
-No scenario has it: its six motors and 24 numbers do not fit the shared spaces of `DMControl-v0`. The
+No scenario includes it: its six motors and 24 numbers do not fit the shared spaces of `DMControl-v0`. The
 benchmarks use it because it is the usual body for measuring vector environments.
 """
 

@@ -1,9 +1,9 @@
-"""Where the time of a whole run goes, and how much memory it takes: `python benchmarks/whole_run.py ID`.
+"""Time and memory of a whole run, by its parts: `python benchmarks/whole_run.py ID`.
 
-One run of plain fine-tuning with one thread, as `clbench run` does it, with its data and its pretrained
-policy in the cache. The clock is read around the physics, the pictures and the policy of the evaluation;
-training is what the loop takes beside evaluations. A bare number says how fast the machine is at the moment:
-matrix products of a policy's size, in GFLOPS, before and after.
+It times one run of plain fine-tuning with one thread, as in `clbench run`, with its data and its pretrained
+policy in the cache. Clocks measure the physics, the pictures and the policy of the evaluation; training is the
+time of the loop without evaluations. The current speed of the machine is given too: matrix products of a
+policy's size, in GFLOPS, before and after.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ PARTS = {
 def main() -> None:
     """Measure, print a table and write results/whole_run.json."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("scenario", help="one for each process, as its memory is that of the process")
+    parser.add_argument("scenario", help="Gymnasium id; one per process, because the peak memory is the process's")
     parser.add_argument("--method", default="sft")
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
@@ -64,7 +64,7 @@ def main() -> None:
 
 @contextmanager
 def _cache_without_reports() -> Iterator[None]:
-    """Hide the evaluations before any target that other runs left: a run would take them for its own."""
+    """Hide the evaluations before the first target that other runs cached: the run would reuse them."""
     with tempfile.TemporaryDirectory() as folder:
         for kept in cache_folder().iterdir():
             if kept.name != "reports":
@@ -81,7 +81,7 @@ def _cache_without_reports() -> Iterator[None]:
 
 
 def measure(run: ResolvedRun) -> dict[str, Any]:
-    """Return how long a run takes, and its parts."""
+    """Return the duration of a run and of its parts."""
     clocks: defaultdict[str, float] = defaultdict(float)
     for part, (owner, names) in PARTS.items():
         for name in names:
@@ -119,7 +119,7 @@ def _clocked(function: Callable[..., Any], clocks: defaultdict[str, float], part
 
 
 def _gigaflops() -> float:
-    """Return how fast one thread multiplies matrices (1088, 96) x (96, 192): a layer of the policy's."""
+    """Return the speed of one thread at matrix products (1088, 96) x (96, 192), a layer of the policy."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     left, right = torch.randn(1088, 96), torch.randn(96, 192)

@@ -1,9 +1,9 @@
-"""What a second worker brings to a grid, and what Ray costs: `python benchmarks/workers.py`.
+"""Gain from a second worker, and cost of Ray: `python benchmarks/workers.py`.
 
-The same runs, methods that take as long as plain fine-tuning on the first target, by one worker, by one for
-each core and by a Ray cluster of this machine, in turns. What they need is in the cache before, and what
-starts once, a cluster and the process of each of its workers that has imported all, starts before the clock
-does; how long that took is told. The records of all ways must be the same, but for their times.
+One worker, one worker per core and a Ray cluster on this machine take turns at the same runs: methods that take
+as long as plain fine-tuning, on the first target. Everything that the runs need is in the cache before. The
+cluster, and the process of each of its workers that has imported everything, start before the clock; the time
+of the start is reported separately. The records must be equal except for their times.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ def main() -> None:
         f"Ray, {count} workers": lambda: RayWorkers("local", count),
     }
     with tempfile.TemporaryDirectory() as folder:
-        _seconds(specs, Path(folder), ways[f"{count} workers"])  # makes what runs need
+        _seconds(specs, Path(folder), ways[f"{count} workers"])  # fills the cache
     rounds, starts, generator = [], [], np.random.default_rng(0)
     for number in range(arguments.rounds):
         started, taken, found = {}, {}, []
@@ -58,7 +58,7 @@ def main() -> None:
             with tempfile.TemporaryDirectory() as folder:
                 started[str(way)], taken[str(way)] = _seconds(specs, Path(folder), ways[str(way)])
                 found.append(_outcomes(specs, Path(folder)))
-        assert all(outcomes == found[0] for outcomes in found), "ways differ in their records"
+        assert all(outcomes == found[0] for outcomes in found), "the records differ"
         print(f"round {number + 1}:", ", ".join(f"{way} {seconds:.0f} s" for way, seconds in taken.items()))
         rounds.append(taken)
         starts.append(started)
@@ -78,13 +78,13 @@ def main() -> None:
 
 
 def _seconds(specs: list[RunSpec], records: Path, make: Callable[[], Workers]) -> tuple[float, float]:
-    """Return how long workers take to be ready, and how long the runs take then."""
+    """Return the time until the workers are ready, and the time of the runs after that, in seconds."""
     plan, begin = Plan(), time.perf_counter()
     for spec in specs:
         plan.add_run(spec.resolve(), records)
     workers = make()
     count, arguments = workers.free(), {"scenario": specs[0].scenario}
-    for number in range(count):  # what it makes is in the cache: it takes as long as to import all
+    for number in range(count):  # its result is in the cache: it takes only the time of the imports
         workers.start(Job(f"first job {number}", collect_scenes, arguments, 1))
     while workers.free() < count:
         assert all(event.kind in ("progress", "done") for event in workers.events())
@@ -95,7 +95,7 @@ def _seconds(specs: list[RunSpec], records: Path, make: Callable[[], Workers]) -
 
 
 def _outcomes(specs: list[RunSpec], records: Path) -> list[dict[str, Any]]:
-    """Return what the records say was seen."""
+    """Return the results in the records."""
     kept = (read_record(spec.path(records)) for spec in specs)
     return [{"episodes": one.episodes, "answers": one.answers, "policy": one.policy} for one in kept]
 

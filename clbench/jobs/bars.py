@@ -1,4 +1,4 @@
-"""Progress of long work: bars with the time left on a terminal, a line now and then without one."""
+"""Progress of long work: bars with the time left on a terminal, otherwise a line now and then."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from rich.progress import BarColumn, Progress, TaskID, TaskProgressColumn, TextC
 from rich.progress import TimeRemainingColumn as TimeLeftColumn
 
 LINE_SECONDS = 30.0
-"""How often a line is printed where there is no terminal."""
+"""Seconds between two lines without a terminal."""
 
 
 class Bars:
-    """One bar for all work and one for each piece that is under way.
+    """One bar for all work and one for each running piece.
 
     Args:
         total: Length of all work, in any unit.
-        console: Where to draw.
-        clock: Seconds; for tests.
+        console: Console that shows the bars; standard error if None.
+        clock: Returns the time in seconds; for tests.
     """
 
     def __init__(
@@ -69,19 +69,19 @@ class Bars:
         if not self.console.is_terminal and now - self._last_line >= LINE_SECONDS:
             self._last_line = now
             share = min(1.0, self._done / self._total)
-            # before anything is done nobody knows how long the rest takes
+            # the time left is unknown before any work is done
             left = f", about {_minutes((now - self._started) * (1 - share) / share)} left" if share else ""
             self.say(f"{share:4.0%}{left}: {', '.join(map(str, self._bars))}")
 
     def finish(self, piece: Hashable, text: str) -> None:
-        """Remove the bar of a piece, whatever was left of it, and print the outcome."""
+        """Complete and remove the bar of a piece, and print the outcome."""
         self.advance(piece, self._left[piece])
         del self._left[piece]
         self._progress.remove_task(self._bars.pop(piece))
         self.say(f"{piece}: {text}")
 
     def say(self, line: str) -> None:
-        """Print a line as it is: names may look like markup, and a log is not to be wrapped."""
+        """Print a line unchanged: names may look like markup, and the lines of a log must not wrap."""
         self.console.print(line, highlight=False, markup=False, soft_wrap=True)
 
 

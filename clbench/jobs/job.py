@@ -20,13 +20,13 @@ class Job:
     title: str
     """Name of the job on bars and in logs."""
     function: Callable[..., str]
-    """Function of a module, called with the arguments and `progress`. The text that it returns is shown."""
+    """Function of a module, called with the arguments and `progress`. It returns a text to show."""
     arguments: dict[str, Any]
     """Arguments by name; they travel to another process."""
     length: float
-    """Length in optimiser steps, for the time left."""
+    """Length in optimiser steps, to estimate the time left."""
     needs: tuple[Job, ...] = ()
-    """Jobs that must have succeeded before."""
+    """Jobs that must succeed first."""
     limits: Limits | None = None
     """Limits of the process; None sets none."""
     device: str = "cpu"
@@ -52,7 +52,7 @@ class Workers(Protocol):
     """Workers that do jobs."""
 
     def free(self) -> int:
-        """Return the number of jobs that can be started now."""
+        """Return the number of jobs that can start now."""
         ...
 
     def start(self, job: Job) -> None:
@@ -60,9 +60,9 @@ class Workers(Protocol):
         ...
 
     def events(self) -> Iterator[Event]:
-        """Yield the events since the last call; wait for one at most a second."""
+        """Yield the events since the last call; wait at most a second for one."""
         ...
 
     def close(self) -> None:
-        """End all jobs that are running: no process stays behind."""
+        """End all running jobs, and leave no process behind."""
         ...

@@ -1,4 +1,4 @@
-"""The plan of a benchmark: its jobs, with what each of them needs."""
+"""The plan of a benchmark: its jobs, and the jobs that each of them needs."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ from clbench.spec.scenario import Scenario
 from clbench.spec.task import Task
 
 REPLAY_PACE = 0.75
-"""Pace of runs that replay demonstrations. They keep their skills, and an episode ends with success: on
-Fetch-v0 such a run takes 170 s, where plain fine-tuning, which forgets, takes 232 s."""
+"""Pace of runs that replay demonstrations. They keep their skills, and success ends an episode: on Fetch-v0
+such a run takes 170 s, and plain fine-tuning, which forgets, takes 232 s."""
 
 
 class Plan:
-    """The jobs of a benchmark. What several runs need is one job; what is in the cache has none.
+    """The jobs of a benchmark. Runs share jobs for common needs; a result in the cache needs no job.
 
     Scenarios are named by their ids, which travel to the processes of the jobs: "module:id" imports the
-        module there.
+    module there.
 
     Args:
         first: A job that all others wait for.
@@ -60,7 +60,7 @@ class Plan:
         checkpoints: Path | None = None,
         tensorboard: Path | None = None,
     ) -> Job:
-        """Add a run with all that it needs, and return its job.
+        """Add a run with all jobs that it needs, and return its job.
 
         Args:
             run: The run.
@@ -97,7 +97,7 @@ class Plan:
         """Add jobs that collect the demonstrations of tasks, and return them.
 
         Args:
-            name: Id of the scenario, as it was typed.
+            name: Id of the scenario, as the user typed it.
             scenario: The scenario.
             tasks: Tasks of the scenario.
         """
@@ -119,10 +119,10 @@ class Plan:
         self._runs.append(job)
         return job
 
-    # ---- what runs need ----------------------------------------------------------------------------
+    # ---- needs of runs -----------------------------------------------------------------------------
 
     def _needs(self, run: ResolvedRun) -> tuple[Job, ...]:
-        """Return the jobs that a run waits for, but for the evaluation of its start."""
+        """Return the jobs that a run waits for, except the evaluation of its start."""
         name, scenario = run.spec.scenario, run.scenario
         policy = self._policy(name, scenario, run.spec.seed)
         targets = self.add_demonstrations(name, scenario, scenario.target)
@@ -149,7 +149,7 @@ class Plan:
         return Job(title, work.pretrain, {"scenario": name, "seed": seed}, steps, needs)
 
     def _start(self, run: ResolvedRun) -> Job | None:
-        """Return the job that evaluates the policy that a run starts with, None if the cache has that."""
+        """Return the job that evaluates the start of a run, None if the cache has the evaluation."""
         spec = run.spec
         key = spec.scenario, spec.seed, spec.order, spec.targets, spec.split, spec.perturb, spec.device
         if key not in self._starts:

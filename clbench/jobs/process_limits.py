@@ -1,4 +1,4 @@
-"""Measure the memory and the writes of a process against its limits, and kill it with all that it started."""
+"""Compare the memory and the writes of a process with its limits, and kill it with its children."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from clbench.spec.limits import Limits
 
 
 def exceeded(limits: Limits, process: int, seconds: float) -> str | None:
-    """Return in words which limit a process exceeds, None if it exceeds none.
+    """Return a description of the limit that a process exceeds, None if it exceeds none.
 
     Args:
         limits: Limits of the process.

@@ -1,4 +1,4 @@
-"""Workers: processes of this machine, each of which does one job with one thread."""
+"""Workers on this machine: processes that each do one job with one thread."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from clbench.jobs.job import Event, Job, JobError
 from clbench.jobs.process_limits import end, exceeded
 
 SEND_SECONDS = 0.2
-"""How often a worker tells how far it is, at most."""
+"""Least time between two progress reports of a worker, in seconds."""
 
 _LOOK_SECONDS = 0.5
 _LEAVE_SECONDS = 5.0
@@ -35,14 +35,14 @@ class _Worker:
     started: float = field(default_factory=time.monotonic)
     looked: float = field(default_factory=time.monotonic)
     broken: str | None = None
-    """Why its process was ended, if it was beyond a limit."""
+    """Limit that its process exceeded, in words; None if it exceeded none."""
 
 
 class Processes:
-    """Workers of this machine.
+    """Workers on this machine.
 
     Args:
-        count: How many jobs are under way at once; one for each core if None.
+        count: Number of jobs that run at once; one per core if None.
     """
 
     def __init__(self, count: int | None = None) -> None:
@@ -50,17 +50,17 @@ class Processes:
         self._running: dict[Connection, _Worker] = {}
 
     def free(self) -> int:
-        """Return how many more jobs can be under way."""
+        """Return the number of jobs that can start now."""
         return self._count - len(self._running)
 
     def start(self, job: Job) -> None:
-        """Begin a job in a process of its own."""
+        """Start a job in its own process."""
         with _undisturbed():
             worker = _start(job)
             self._running[worker.connection] = worker
 
     def events(self) -> Iterator[Event]:
-        """Give what was told since the last call; wait for it, but no longer than a second."""
+        """Yield the events since the last call; wait at most a second for one."""
         self._hold_to_limits()
         for connection in wait(list(self._running), timeout=1.0):
             assert isinstance(connection, Connection)
@@ -79,7 +79,7 @@ class Processes:
         self._running.clear()
 
     def _hold_to_limits(self) -> None:
-        """End the processes that are beyond their limits."""
+        """End the processes that exceed their limits."""
         for worker in self._running.values():
             limits, now = worker.job.limits, time.monotonic()
             if limits is None or worker.broken or now - worker.looked < _LOOK_SECONDS:
@@ -92,7 +92,7 @@ class Processes:
 
 
 def _leave(process: BaseProcess) -> None:
-    """Wait until a process that has told how it ended is gone; what a thread of it still does is cut off."""
+    """Wait until a process that has sent its outcome is gone; kill it if one of its threads keeps running."""
     process.join(_LEAVE_SECONDS)
     if process.is_alive():
         assert process.pid is not None
@@ -102,7 +102,7 @@ def _leave(process: BaseProcess) -> None:
 
 @contextmanager
 def _undisturbed() -> Iterator[None]:
-    """Hold Ctrl-C and SIGTERM back inside: a start that is cut short leaves half a process behind."""
+    """Hold back Ctrl-C and SIGTERM inside: an interrupted start would leave half a process behind."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -119,13 +119,13 @@ def _undisturbed() -> Iterator[None]:
 
 
 def _context() -> Any:
-    """Return how processes are started: from one that has imported all once (50 ms), or anew (2 s)."""
+    """Return how processes start: forked from one that has imported everything (50 ms), or new (2 s)."""
     if "forkserver" not in multiprocessing.get_all_start_methods():
         return multiprocessing.get_context("spawn")
     from multiprocessing import forkserver, resource_tracker  # cannot be imported where there is none
 
     context = multiprocessing.get_context("forkserver")
-    # the second takes a second too, and asking PyTorch for deterministic algorithms imports it
+    # the second module also takes a second, and PyTorch's deterministic algorithms import it
     context.set_forkserver_preload(["clbench.runs.run", "torch._inductor.config"])
     # else the server starts it, and unblocks Ctrl-C for itself on the way
     resource_tracker.ensure_running()
@@ -168,15 +168,15 @@ def _work(
     environment: dict[str, str],
 ) -> None:
     """Do one job in this process and send its outcome."""
-    os.environ.update(environment)  # the process that this one was forked from may have an older one
+    os.environ.update(environment)  # this process may be forked from one with an older environment
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the parent, which ends its workers
-    if hasattr(signal, "pthread_sigmask"):  # what a job starts does not inherit the mask of the server
+    if hasattr(signal, "pthread_sigmask"):  # children of a job must not inherit the mask of the server
         signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
 
     def send(amount: float) -> None:
         try:
             connection.send(("progress", amount))
-        except OSError:  # nobody listens any more: stop as if killed, so that the run can be resumed
+        except OSError:  # the parent is gone: stop as if killed, so that the run can be resumed
             sys.exit(1)
 
     connection.send(_do_job(function, arguments, send))
@@ -190,7 +190,7 @@ def _do_job(
     Args:
         function: Function of the job.
         arguments: Arguments by name.
-        send: Called now and then with the length done since its last call.
+        send: Called at intervals with the length done since its last call.
     """
     owed, sent = 0.0, time.monotonic()
 

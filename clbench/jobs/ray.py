@@ -1,4 +1,4 @@
-"""Workers of a Ray cluster: each job is a task, and what a lost worker had under way is done again."""
+"""Workers of a Ray cluster: each job is a task, and the job of a lost worker is done again."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from clbench.records.record import Record
 from clbench.records.writer import write_record
 
 RETRIES = 3
-"""How often a job begins again after its worker was lost. A run goes on with its last finished stage."""
+"""How often a job starts again after its worker was lost. A run continues from its last finished stage."""
 
 _INSTRUCTIONS = (
     "ATEN_CPU_CAPABILITY",
@@ -31,27 +31,29 @@ _INSTRUCTIONS = (
     "OPENBLAS_CORETYPE",
     "NPY_DISABLE_CPU_FEATURES",
 )
-"""What decides which of its instructions a processor uses, and so the bits of what is trained."""
+"""Variables that select the instructions of the processor, and so affect the bits of trained weights."""
 _PASSED_ON = ("CLBENCH_CACHE", "MINARI_DATASETS_PATH", "MUJOCO_GL", *_INSTRUCTIONS)
 
 
 class LostProcessError(Exception):
-    """The process of a job ended and said nothing: it was killed, perhaps for want of memory."""
+    """The process of a job ended without a result: it was killed, perhaps because memory ran out."""
 
 
 class RayWorkers:
     """Workers of a Ray cluster.
 
-    A worker has one processor core, and a GPU if its job computes on one. Records come back to who asked and
-    are written here. What is made first, demonstrations and pretrained policies, stays in the cache of the
-    node: nodes that share a file system share it by `CLBENCH_CACHE`, others make it once each.
+    A worker has one processor core, and a GPU if its job computes on one. Records return to the driver, which
+    writes them. Demonstrations and pretrained policies stay in the cache of the node: nodes with a common
+    file system share them through `CLBENCH_CACHE`, other nodes make them once each.
 
     Args:
-        address: "local" starts Ray on this machine, "auto" finds one that runs, else as `ray.init` takes it.
-        count: How many jobs are under way at once; one for each core of the cluster if None.
+        address: "local" starts Ray on this machine, "auto" finds a running cluster; other addresses are
+            passed to `ray.init`.
+        count: Number of jobs that run at once; one per core of the cluster if None.
 
     Raises:
-        LookupError: Ray is not installed, or no cluster answers at the address.
+        MissingPackageError: Ray is not installed.
+        UnknownNameError: No cluster answers at the address.
     """
 
     def __init__(self, address: str, count: int | None = None) -> None:
@@ -62,7 +64,7 @@ class RayWorkers:
         self._count = count
         options: dict[str, Any] = {"runtime_env": {"env_vars": _environment()}}
         if address == "local":
-            # else they are nicer, by 15, than whatever else runs on this machine
+            # otherwise the workers yield to all other work on this machine, by a niceness of 15
             options |= {
                 "_system_config": {"worker_niceness": 0},
                 "num_cpus": count,
@@ -79,12 +81,12 @@ class RayWorkers:
         self._shown: defaultdict[Job, float] = defaultdict(float)
 
     def free(self) -> int:
-        """Return how many more jobs can be under way."""
+        """Return the number of jobs that can start now."""
         cores = int(self._ray.cluster_resources().get("CPU", 0))
         return min(self._count or cores, cores) - len(self._running)
 
     def start(self, job: Job) -> None:
-        """Begin a job as a task of the cluster."""
+        """Start a job as a task of the cluster."""
         gpus = 0 if job.device == "cpu" else 1
         options = {"max_retries": RETRIES, "retry_exceptions": [LostProcessError]}
         task = self._ray.remote(num_cpus=1, num_gpus=gpus, **options)(_do)
@@ -95,7 +97,7 @@ class RayWorkers:
         self._running[task.remote(self._progress_actor, replace(job, arguments=arguments, needs=()))] = job
 
     def events(self) -> Iterator[Event]:
-        """Give what was told since the last call; wait for it, but no longer than a second."""
+        """Yield the events since the last call; wait at most a second for one."""
         if not self._running:  # the cluster has no cores yet
             time.sleep(1.0)
             return
@@ -104,7 +106,7 @@ class RayWorkers:
         for job in self._running.values():
             amount = done.get(job.title, 0.0) - self._shown[job]
             self._shown[job] += amount
-            if amount:  # less than nothing after a worker was lost
+            if amount:  # negative after a worker was lost
                 yield Event(job, "progress", amount)
         for reference in ended:
             job = self._running.pop(reference)
@@ -118,14 +120,14 @@ class RayWorkers:
         self._ray.shutdown()
 
     def _end(self, job: Job, reference: Any) -> tuple[Literal["done", "failed"], str]:
-        """Write the records of a job that ended, and return how it did."""
+        """Write the records of a job that ended, and return its outcome."""
         lost = f"its worker was lost {RETRIES + 1} times: "
         try:
             result: _Result = self._ray.get(reference)
         except self._ray.exceptions.RayTaskError as error:
             if isinstance(error.cause, LostProcessError):
                 return "failed", f"{lost}{error.cause}"
-            return "failed", f"its worker could not do it: {str(error).strip().splitlines()[-1]}"
+            return "failed", f"its worker could not run it: {str(error).strip().splitlines()[-1]}"
         except self._ray.exceptions.RayError as error:
             first = str(error).strip().partition("\n")[0]
             return "failed", f"{lost}{type(error).__name__}: {first}"
@@ -135,39 +137,39 @@ class RayWorkers:
 
 
 class _Result(NamedTuple):
-    """What a task returns."""
+    """The result of a task."""
 
     kind: Literal["done", "failed"]
     value: str
     records: dict[str, Record]
-    """By their path below the folder of records."""
+    """Records by their path below the folder of records."""
 
 
 class _ProgressActor:
-    """Keeps how much of each job is done: an actor, which tasks tell and the driver asks."""
+    """An actor that keeps the progress of each job: tasks report to it, and the driver reads it."""
 
     def __init__(self) -> None:
         self._amounts: dict[str, float] = {}
 
     def begin(self, name: str) -> None:
-        """Begin a job, perhaps again."""
+        """Set the progress of a new or restarted job to 0."""
         self._amounts[name] = 0.0
 
     def add(self, name: str, amount: float) -> None:
-        """Add to what is done."""
+        """Add to the progress of a job."""
         self._amounts[name] += amount
 
     def amounts(self) -> dict[str, float]:
-        """Return how much of each job is done."""
+        """Return the progress of each job."""
         return self._amounts
 
 
 def _do(actor: Any, job: Job) -> _Result:
-    """Do a job on a node of the cluster. Its records are returned: the node may not see their folder."""
+    """Do a job on a node of the cluster, and return its records: the node may not see their folder."""
     actor.begin.remote(job.title)
     if "records" not in job.arguments:
         return _Result(*_do_apart(actor, job), {})
-    # the same on every attempt, for it is part of what a run goes on by
+    # the same folder on every attempt: a run finds its checkpoints by it
     folder = cache_folder() / "ray" / hash_of([job.title, str(job.arguments["records"])])
     shutil.rmtree(folder, ignore_errors=True)
     ended = _do_apart(actor, replace(job, arguments=job.arguments | {"records": folder}))
@@ -178,14 +180,15 @@ def _do(actor: Any, job: Job) -> _Result:
 
 
 def _do_apart(actor: Any, job: Job) -> tuple[Literal["done", "failed"], str]:
-    """Do a job in a process of its own, as on one machine: what a method leaves behind meets no other.
+    """Do a job in its own process, as on one machine, so that no method affects another.
 
-    It is forked from one that this worker keeps and that has imported all; a worker for each job takes 5 s.
+    The process is forked from one that this worker keeps and that has imported everything; a new worker for
+    each job would take 5 s.
 
     Raises:
         LostProcessError: The process was killed.
     """
-    # else the process reads the program of this one, which is Ray's, and imports Ray
+    # otherwise the process reads the main program of this one, which is Ray's, and imports Ray
     vars(sys.modules["__main__"]).pop("__file__", None)
     processes = Processes(1)
     processes.start(job)
@@ -203,7 +206,7 @@ def _do_apart(actor: Any, job: Job) -> tuple[Literal["done", "failed"], str]:
 
 
 def _environment() -> dict[str, str]:
-    """Return what workers need to find the same modules and caches as this process."""
+    """Return the environment in which workers find the same modules and caches as this process."""
     installed = (sys.prefix, sys.base_prefix)
     paths = [path for path in sys.path if path and not path.startswith(installed)]
     passed_on = {name: os.environ[name] for name in _PASSED_ON if name in os.environ}

@@ -1,4 +1,4 @@
-"""The scheduler: does many jobs that need each other, on all cores or on a cluster."""
+"""The scheduler: does many interdependent jobs, on all cores or on a cluster."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from clbench.jobs.job import Job, Workers
 def run_jobs(jobs: Sequence[Job], workers: Workers, bars: Bars) -> dict[Job, str]:
     """Do all jobs, and return the reason of each failure by job.
 
-    A job that fails, or whose process dies, does not stop the others; jobs that need it are left out. Nothing
-    stays behind, however this function ends, by Ctrl-C too.
+    A job that fails, or whose process dies, does not stop the others; jobs that need it are left out. This
+    function leaves no process behind, even after Ctrl-C.
 
     Args:
-        jobs: Jobs in any order, with all that they need. Jobs on the critical path start first.
+        jobs: Jobs in any order, with all jobs that they need. Jobs on the critical path start first.
         workers: Workers that do the jobs; they are closed at the end.
         bars: Bars that show the progress.
     """
@@ -57,9 +57,9 @@ def run_with_bars(jobs: Sequence[Job], workers: Workers, console: Console | None
 
 
 def _by_urgency(jobs: Sequence[Job]) -> list[Job]:
-    """Return the jobs by falling time of the longest chain that waits for them, their own time included.
+    """Return the jobs by decreasing time of the longest chain that begins with them.
 
-    The longest run starts first, so that no worker ends with it alone.
+    The longest run starts first, so that no worker is left alone with it at the end.
     """
     dependents: dict[Job, list[Job]] = {job: [] for job in jobs}
     for job in jobs:
@@ -74,7 +74,7 @@ def _by_urgency(jobs: Sequence[Job]) -> list[Job]:
 
 
 def _drop_hopeless(waiting: list[Job], failed: dict[Job, str]) -> list[Job]:
-    """Return the jobs that can still be done; the others fail because of a job that they need."""
+    """Return the jobs that can still be done; the others fail because a job that they need failed."""
     kept = []
     for job in waiting:
         missing = [needed for needed in job.needs if needed in failed]

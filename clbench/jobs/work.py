@@ -1,4 +1,4 @@
-"""The work of each kind of job: functions that a worker calls in a process of its own."""
+"""The work of each kind of job: functions that a worker calls in its own process."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from clbench.jobs.job import JobError
 from clbench.runs.spec import RunSpec
 from clbench.spec.registry import load_scenario
 
-# PyTorch and what needs it is imported inside: a plan names these functions without waiting for it.
+# PyTorch and modules that need it are imported inside: a plan names these functions without waiting for it.
 
 
 def collect_demonstrations(scenario: str, task: str, progress: ProgressCallback) -> str:
@@ -57,7 +57,7 @@ def do_run(
     """Do one run, write its record, and return its main scores.
 
     Raises:
-        JobError: The run failed; its record says where.
+        JobError: The run failed; its record names the place.
     """
     from clbench.runs.run import execute
     from clbench.scoring.metrics import measure

@@ -1,7 +1,7 @@
 """The policies of all stages of a run: kept by the run, or made again without evaluation.
 
-Stage 0 is the policy that the method's `prepare` left, stage k the policy after target k. A run repeats itself
-bit for bit, so policies that are made again equal the original ones.
+Stage 0 is the policy that the method's `prepare` left, stage k the policy after target k. A run repeats
+itself bit for bit, so policies that are made again equal the original ones.
 """
 
 from __future__ import annotations

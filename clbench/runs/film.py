@@ -173,7 +173,7 @@ class Film:
         return across + across % 2, down + down % 2
 
     def _corner(self, row: int, column: int) -> tuple[int, int]:
-        """Return the top left corner of a panel: a line for the policy, the picture, a line for the outcome."""
+        """Return the top left corner of a panel: a line for the policy, a picture, a line for the outcome."""
         sizes = [take.pictures[0].size for takes in self.takes for take in takes]
         width, height = (max(side) for side in zip(*sizes, strict=True))
         return GAP + column * (width + GAP), 2 * GAP + 2 * LINE + row * (3 * LINE + height + GAP)
@@ -310,7 +310,7 @@ def film_run(
 
 
 def steps_per_second(task: Task) -> int:
-    """Return the steps per second of a task's world, at most `FASTEST`; 25 if the world does not give them."""
+    """Return the steps per second of a task's world, at most `FASTEST`; 25 if the world has no rate."""
     world = resolve(task.world)()
     rate = world.metadata.get("render_fps", 25)
     world.close()

@@ -17,7 +17,6 @@ from clbench.base.cache import cache_folder, cached, hash_of, is_cached
 from clbench.base.errors import WrongTypeError
 from clbench.base.progress import ProgressCallback, no_progress
 from clbench.base.source import package_of
-from clbench.base.strict_json import check_json
 from clbench.data.training_data import TrainingData
 from clbench.evaluation.examiner import Examiner
 from clbench.learning.adaptation import Step
@@ -26,7 +25,7 @@ from clbench.learning.registry import describe_method
 from clbench.learning.trainer import Trainer, repeatable, sources
 from clbench.records.reader import read_record
 from clbench.records.record import Costs, Record
-from clbench.records.writer import write_record
+from clbench.records.writer import check_diagnostics, write_record
 from clbench.runs.checkpoints import drop_stages, has_stages, keep_stage
 from clbench.runs.fingerprint import fingerprint
 from clbench.runs.length import run_length
@@ -126,7 +125,7 @@ class _Run:
         kept: Path | None,
         tensorboard: Path | None,
     ) -> _Run:
-        """Return a run with everything it needs; the policy is pretrained, and data collected, on first use."""
+        """Return a run with all its parts; the policy is pretrained, and data collected, on first use."""
         scenario, spec = run.scenario, run.spec
         pretrained, folder = pretrained_policy(scenario, spec.seed)
         pretrained = pretrained.to(spec.device)
@@ -223,8 +222,11 @@ class _Run:
     def _diagnose(self, number: int) -> None:
         """Keep the method's report on stage `number`."""
         self.trainer.where = f"diagnostics() after stage {number}"
-        found = _checked(self.trainer.method.diagnostics())
+        found: Any = self.trainer.method.diagnostics()
+        if not isinstance(found, dict):
+            raise WrongTypeError(f"diagnostics() must return a dictionary, not {type(found).__name__}.")
         if found:
+            check_diagnostics({**self.record.diagnostics, str(number): found})
             self.record.diagnostics[str(number)] = found
             self.log.diagnostics(found, number)
 
@@ -295,11 +297,3 @@ def _inputs(run: ResolvedRun, number: int) -> dict[str, Any]:
         "stage": number,
         **sources(run.scenario, run.spec.seed, package_of(run.method.__module__)),
     }
-
-
-def _checked(diagnostics: Any) -> dict[str, Any]:
-    """Return a method's diagnostics, if a record can hold them."""
-    if not isinstance(diagnostics, dict):
-        raise WrongTypeError(f"diagnostics() must return a dictionary, not {type(diagnostics).__name__}.")
-    check_json(json.loads(json.dumps(diagnostics, allow_nan=False)))
-    return diagnostics

@@ -25,7 +25,7 @@ def require_tensorboard() -> None:
 
 
 class Log:
-    """The scalars of one run over the optimiser steps since the first target; without a folder it logs nothing.
+    """The scalars of one run over the optimiser steps since the first target. It needs a folder to log.
 
     `training/` has the loss and the step size every `LOG_STEPS` steps. At every evaluation point,
     `success_test/`, `success_validation/` and `success_perturbed/` have the success rate of each task,
@@ -33,7 +33,7 @@ class Log:
     distance from the pretrained policy. `diagnostics/` has the numbers among the method's diagnostics.
 
     Args:
-        folder: Folder of the event files.
+        folder: Folder of the event files; None logs nothing.
         stage_steps: Number of optimiser steps in a stage.
         resumed_after: Last stage whose points an interrupted run has written; TensorBoard hides all later
             points. None hides all earlier logs.

@@ -168,9 +168,9 @@ def forward_transfer(rates: Rates) -> Array:
 
     1. Trapezoid rule through the evaluation points and a point at step 0. A stage starts with the policy of
        the stage before, so that its point at step 0 is R[k-1][k]: success without a step counts as transfer.
-    2. The policy from scratch starts untrained and is not evaluated then: its success at step 0 is taken as
-       0. For manipulation this is true to a few in a thousand. Where it is not, the value is too high by at
-       most half the first interval's share of the stage times the untrained policy's success. Curves that
+    2. The policy from scratch starts untrained and is not evaluated then: it is taken to have no success at
+       step 0. For manipulation this is true to a few in a thousand. Where it is not, the value is too high by
+       at most half the first interval's share of the stage times the untrained policy's success. Curves that
        begin at the first common point instead would leave out the very part in which transfer shows.
     3. Curves are averaged over seeds before the ratio, as in the source's code.
     4. The value is capped by 1 and not bounded below. Point 2 keeps the divisor above 0.

@@ -384,7 +384,7 @@ def zero_shot_change(rates: Rates) -> Array:
     missing="There are no retained skills or no targets, or they were not evaluated at every point.",
 )
 def minimum_retention(rates: Rates) -> Array:
-    """The lowest success on a retained skill at any evaluation point, before the end of a stage too.
+    """The lowest success on a retained skill at any evaluation point, also before the end of a stage.
 
     The lowest of several noisy rates is too low by a part of their noise, all the more since fewer episodes
     are run before the end of a stage.

@@ -1,4 +1,4 @@
-"""For tests, ours and yours: a toy scenario on which a run takes seconds, and contract checks.
+"""Tools for tests, ours and yours: a toy scenario with runs of seconds, and contract checks.
 
 Importing this package registers the toy as `clbench/Toy-v0`; "clbench.testing:clbench/Toy-v0" names it in a
 command.
@@ -8,7 +8,7 @@ import lazy_loader
 
 from clbench.spec.registry import register
 
-# `__init__.pyi` says where each name is defined. A process that draws pictures imports no PyTorch.
+# `__init__.pyi` names the module of each name. A process that draws pictures imports no PyTorch.
 __getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
 
 register("clbench/Toy-v0", "clbench.testing:TOY")

@@ -1,4 +1,4 @@
-"""The public contract of a method, checked on the toy in seconds; `docs/guide/contract.md` has it in words.
+"""The public contract of a method, checked on the toy in seconds; `docs/guide/contract.md` describes it.
 
     def test_my_method() -> None:
         check_method(MyMethod)
@@ -36,43 +36,44 @@ from clbench.testing.toy import TOY
 from clbench.testing.toy_run import HOOKS, ToyRun, toy_data
 
 TARGETS, STEPS = 2, 2
-"""Length of the runs in which only what happens matters, and not what is learned."""
+"""Number of targets, and of optimiser steps on each, in runs whose learning does not matter."""
 
 LEARNING_STEPS = 40
-"""Optimiser steps in which the toy's first target is to be learned."""
+"""Number of optimiser steps within which a method must learn the toy's first target."""
 
 LEAST_GAIN = 1.0
-"""By how much the mean return must rise in them. Plain fine-tuning gains 16, from -17.6 to -1.3; the built-in
+"""Least rise of the mean return in these steps. Plain fine-tuning gains 16, from -17.6 to -1.3; the built-in
 method that moves least, `finch`, gains 2.1."""
 
 PRIOR = ("demonstrations", "questions")
 """Kinds of prior data, by the fields of `Uses`."""
 
 _KINDS = {"uses": Uses, "metadata": Metadata, "whole_stages": bool}
-"""What a class declares besides its hyper-parameters."""
+"""Types of the declarations of a class besides its hyper-parameters."""
 
 
 def check_method(cls: type[Method], **settings: Any) -> None:
     """Check on the toy that a method keeps the public contract.
 
     Args:
-        cls: The method's class.
+        cls: Class of the method.
         settings: Hyper-parameters that differ from its defaults, to shorten a long preparation.
 
     Raises:
-        ContractError: It breaks a clause; the message says what was expected, what was found, where to look.
+        ContractError: The method breaks a clause; the message shows the expected and the actual behaviour,
+            and the place to look at.
     """
     for check in method_checks(cls, **settings):
         check()
 
 
 def method_checks(cls: type[Method], **settings: Any) -> list[Check]:
-    """Return the clauses of the contract one by one, for `pytest.mark.parametrize(..., ids=str)`.
+    """Return a check for each clause of the contract, for `pytest.mark.parametrize(..., ids=str)`.
 
-    They share what they try: together they take no longer than `check_method`.
+    The checks share their runs: together they take no longer than `check_method`.
 
     Args:
-        cls: The method's class.
+        cls: Class of the method.
         settings: As for `check_method`.
     """
     subject = Subject(cls, settings)
@@ -81,15 +82,19 @@ def method_checks(cls: type[Method], **settings: Any) -> list[Check]:
 
 @dataclass(frozen=True, eq=False)
 class Check:
-    """One clause of the contract for one method, to be called."""
+    """One clause of the contract for one method; call it to check."""
 
     clause: Callable[[Subject], None]
-    """One of `CLAUSES`."""
+    """Clause, one of `CLAUSES`."""
     subject: Subject
-    """The method."""
+    """Method to check."""
 
     def __call__(self) -> None:
-        """Raise `ContractError` if the method breaks the clause."""
+        """Check the clause.
+
+        Raises:
+            ContractError: The method breaks the clause.
+        """
         self.clause(self.subject)
 
     def __str__(self) -> str:
@@ -97,10 +102,10 @@ class Check:
 
 
 class Subject:
-    """A method with the runs of it that several clauses look at.
+    """A method with its runs, which several clauses share.
 
     Args:
-        cls: The method's class.
+        cls: Class of the method.
         settings: Hyper-parameters that differ from its defaults.
     """
 
@@ -113,23 +118,23 @@ class Subject:
 
     @cached_property
     def first(self) -> ToyRun:
-        """A run that goes from stage to stage as a run does."""
+        """A run with a new object of the method for each stage, as in every run."""
         return ToyRun(self.build, TARGETS, STEPS)
 
     @cached_property
     def second(self) -> ToyRun:
-        """The same once more; what the method imports on first use is there now."""
+        """The same run again; modules that the method imports on first use are now loaded."""
         _ = self.first
         return ToyRun(self.build, TARGETS, STEPS)
 
     @cached_property
     def kept(self) -> ToyRun:
-        """The same with one object of the method for all stages."""
+        """The same run with one object of the method for all stages."""
         return ToyRun(self.build, TARGETS, STEPS, resumed=False)
 
     @cached_property
     def longer(self) -> ToyRun:
-        """A run that is long enough to learn the first target, with another seed."""
+        """A run with another seed, long enough to learn the first target."""
         return ToyRun(self.build, 1, LEARNING_STEPS, seed=1)
 
 
@@ -137,22 +142,22 @@ class Subject:
 
 
 def declaration(subject: Subject) -> None:
-    """A documented dataclass of its own, whose hooks are those of the loop."""
+    """The class is a documented dataclass whose hooks match those of the loop."""
     cls = subject.cls
     if not (isinstance(cls, type) and issubclass(cls, Method)):
         raise _breach(declaration, "a subclass of clbench.Method", repr(cls), "the class")
     if "__dataclass_fields__" not in vars(cls):
         found = f"{cls.__name__} is not decorated"
         raise _breach(declaration, "a dataclass: @dataclasses.dataclass above the class", found, "the class")
-    if not cls.__doc__ or cls.__doc__.startswith(f"{cls.__name__}("):  # that is dataclass's own
-        expected = "a docstring of the class that says in its first line what the method does"
+    if not cls.__doc__ or cls.__doc__.startswith(f"{cls.__name__}("):  # the default of dataclass
+        expected = "a class docstring whose first line describes the method"
         raise _breach(declaration, expected, "none", "the class")
     _check_declared(cls)
     _check_signatures(cls)
 
 
 def _check_declared(cls: type[Method]) -> None:
-    """Check what the class says of itself besides its hyper-parameters."""
+    """Check the declarations of the class besides its hyper-parameters."""
     fields = {field.name for field in dataclasses.fields(cls)}  # type: ignore[arg-type]
     for name, kind in _KINDS.items():
         value = getattr(cls, name)
@@ -169,7 +174,7 @@ def _check_declared(cls: type[Method]) -> None:
 
 
 def _check_signatures(cls: type[Method]) -> None:
-    """Check that the loop can call every hook, and that none is misspelt."""
+    """Check that the loop can call every hook, and that no hook is misspelt."""
     for name, value in vars(cls).items():
         if callable(value) and name not in HOOKS and not name.startswith("_"):
             near = difflib.get_close_matches(name, HOOKS, n=1, cutoff=0.85)
@@ -187,21 +192,21 @@ def _check_signatures(cls: type[Method]) -> None:
 
 
 def constructor(subject: Subject) -> None:
-    """A constructor that stores its hyper-parameters as they are given, and does nothing else."""
+    """The constructor stores its hyper-parameters unchanged, and does nothing else."""
     changes: list[str] = []
     with seeded("constructor"), watched(changes, generators=True):
         _check_fields(subject.cls)
         _check_stored(subject.cls)
     if changes:
-        raise _misbuilt("nothing to be done but storing", "; ".join(changes))
+        raise _misbuilt("a constructor that only stores values", "; ".join(changes))
 
 
 def _check_fields(cls: type[Method]) -> None:
-    """Check that the fields are hyper-parameters, and all that an object of the defaults has."""
+    """Check that the fields are hyper-parameters, and that an object has no other attributes."""
     fields = dataclasses.fields(cls)  # type: ignore[arg-type]
     for field in fields:
         if not field.init:
-            expected = "every field to be a hyper-parameter; what is learned is set by the hooks"
+            expected = "every field to be a hyper-parameter; the hooks set learned values"
             raise _misbuilt(expected, f"{field.name} has init=False")
         if field.default is field.default_factory is dataclasses.MISSING:
             raise _misbuilt("a default for every hyper-parameter", f"{field.name} has none")
@@ -209,10 +214,10 @@ def _check_fields(cls: type[Method]) -> None:
         method = cls()
     except Exception as error:
         words = f"{type(error).__name__}: {error}"
-        raise _misbuilt("an object of the defaults to be made", words) from error
+        raise _misbuilt("the defaults to make an object", words) from error
     more = sorted(vars(method).keys() - {field.name for field in fields})
     if more:
-        expected = "only hyper-parameters to be stored; what is learned is set by the hooks"
+        expected = "only hyper-parameters to be stored; the hooks set learned values"
         raise _misbuilt(expected, f"it sets {', '.join(more)}")
     for field in fields:
         value = getattr(method, field.name)
@@ -220,13 +225,13 @@ def _check_fields(cls: type[Method]) -> None:
             expected = "numbers, truth values, text, None, or lists of them as hyper-parameters"
             raise _misbuilt(expected, f"{field.name} is a {type(value).__name__}")
     if method != cls():
-        expected = "equal objects from equal arguments, as a dataclass has them"
-        raise _misbuilt(expected, "two objects of the defaults differ")
+        expected = "equal objects from equal arguments, as in any dataclass"
+        raise _misbuilt(expected, "two objects with the defaults differ")
 
 
 def _check_stored(cls: type[Method]) -> None:
-    """Check that values are kept: the defaults, and others unless they are refused."""
-    expected = "hyper-parameters to be kept as they are given, or refused with a ValueError"
+    """Check that objects keep their values: the defaults, and other values unless they are refused."""
+    expected = "hyper-parameters to be kept unchanged, or refused with a ValueError"
     method = cls()
     for field in dataclasses.fields(cls):  # type: ignore[arg-type]
         name = field.name
@@ -251,7 +256,7 @@ def _misbuilt(expected: str, found: str) -> ContractError:
 
 
 def sound_hooks(subject: Subject) -> None:
-    """Hooks that return what the loop can go on with, and at most a batch of the target in a step."""
+    """Hooks return values that the loop can use, and draw at most a batch of the target per step."""
     size, drawn = TOY.budget.batch_size, subject.first.target_rows
     if drawn > size:
         expected = (
@@ -261,7 +266,7 @@ def sound_hooks(subject: Subject) -> None:
 
 
 def declared_data(subject: Subject) -> None:
-    """Prior data that `uses` declares, and all of it: divisions are made of these declarations."""
+    """The method uses exactly the prior data that `uses` declares: divisions rest on these declarations."""
     for name in PRIOR:
         access: Access = getattr(subject.cls.uses, name)
         if access == "never" or _drawn_as(access, subject.first.hooks_that_draw(name)):
@@ -277,55 +282,55 @@ def declared_data(subject: Subject) -> None:
 
 
 def _drawn_as(access: Access, hooks: set[str]) -> bool:
-    """Return whether data that are drawn in `hooks` are declared as they should be."""
+    """Return whether `access` is the right declaration for data that `hooks` draw."""
     return bool(hooks if access == "prepare" else hooks - {"prepare"})
 
 
 def same_numbers(subject: Subject) -> None:
-    """Two runs with one seed that are equal, bit for bit."""
+    """Two runs with the same seed are equal, bit for bit."""
     difference = _difference(subject.first, subject.second)
     if difference:
         raise _breach(
             same_numbers,
             "two runs with one seed to be equal: draw from the sources, from the global generators, which "
-            "are seeded for each hook, or from a generator that is seeded with stage.seed",
+            "are seeded for each hook, or from a generator seeded with stage.seed",
             difference,
             "every hook that draws, measures time, or iterates over a set",
         )
 
 
 def state(subject: Subject) -> None:
-    """MethodState that survives: an object that is given it goes on as the one that returned it."""
+    """The state is complete: an object that loads it continues like the object that returned it."""
     difference = _difference(subject.second, subject.kept)
     if difference:
         raise _breach(
             state,
-            "state() to return all that later stages need, and load_state() to take it back",
-            f"a run with a new object for each stage differs from one that keeps the old: {difference}",
+            "state() to return everything that later stages need, and load_state() to restore it",
+            f"a run with a new object for each stage differs from a run with one object: {difference}",
             "state() and load_state()",
         )
 
 
 def global_state(subject: Subject) -> None:
-    """Nothing that is left behind: settings of the process stay as they were, files are written nowhere."""
+    """Hooks leave nothing behind: they change no setting of the process and write no files."""
     for hook, change in subject.second.changes:
-        expected = "the process to be left as it was, and files to be written in clbench's cache alone"
+        expected = "the process to stay as it was, and files to be written only in clbench's cache"
         raise _breach(global_state, expected, f"after {hook}() {change}", f"{hook}()")
 
 
 def seeding(subject: Subject) -> None:
-    """Random generators that are left to the run: with another seed it draws otherwise."""
+    """The run seeds the random generators: draws differ with another seed."""
     first, other = subject.first.generators, subject.longer.generators
     for hook in [hook for hook in first if hook in other]:
         for name in GENERATORS:
             if same(first[hook][name], other[hook][name]):
-                expected = "the global generators to be as the run's seed left them: draw, but do not seed"
-                found = f"after {hook}() {name} stands alike in runs of two seeds"
+                expected = "the global generators to keep the run's seed: draw, but do not seed"
+                found = f"after {hook}() {name} is in the same state in runs with two seeds"
                 raise _breach(seeding, expected, found, f"{hook}()")
 
 
 def learning(subject: Subject) -> None:
-    """A target that is learned: guides excepted, the policy acts better than one that was left alone."""
+    """The method learns a target: the policy acts better than the pretrained one. Guides are exempt."""
     if subject.cls.uses.reference:
         return
     before, after = _frozen_return(), _mean_return(subject.longer.trainer.policy)
@@ -350,7 +355,7 @@ CLAUSES = (
     seeding,
     learning,
 )
-"""The contract, in the order in which it is checked."""
+"""The clauses of the contract, in the order of the checks."""
 
 
 def _breach(clause: Callable[[Subject], None], expected: str, found: str, look: str) -> ContractError:
@@ -367,7 +372,7 @@ def _is_plain(value: Any) -> bool:
 
 
 def _difference(one: ToyRun, other: ToyRun) -> str | None:
-    """Return in words the first outcome that differs, or None."""
+    """Return a description of the first outcome that differs, or None."""
     for stage, name in {**one.outcomes, **other.outcomes}:
         values = [run.outcomes.get((stage, name)) for run in (one, other)]
         if same(*values):

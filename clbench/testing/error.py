@@ -1,19 +1,19 @@
-"""The error of the contract: it says what was expected, what was found, and where to look."""
+"""The error of the contract: it shows the expectation, the finding, and the place to look at."""
 
 from __future__ import annotations
 
 PAGE = "docs/guide/contract.md"
-"""The contract in words, a heading for each clause."""
+"""Page that describes the contract, with a heading for each clause."""
 
 
 class ContractError(AssertionError):
     """A method breaks the public contract.
 
     Args:
-        clause: What it breaks, as "same numbers": a heading of `docs/guide/contract.md`.
-        expected: What would have been right.
-        found: What there is instead.
-        look: Where in the method's class to look, as "loss()".
+        clause: Name of the clause, for example "same numbers": a heading of `docs/guide/contract.md`.
+        expected: Expected behaviour.
+        found: Actual behaviour.
+        look: Place in the method's class to look at, for example "loss()".
     """
 
     def __init__(self, clause: str, expected: str, found: str, look: str) -> None:

@@ -1,6 +1,6 @@
-"""A Fetch scenario of a minute: real worlds, experts and runs, and a budget that teaches next to nothing.
+"""A Fetch scenario that takes a minute: real worlds, experts and runs with a budget too small to learn.
 
-It walks the whole way from a class to a row; its scores mean nothing. Ask for it as
+It covers the whole path from a method class to a table row; its scores mean nothing. Its name in a command is
 "clbench.testing.fetch_toy:clbench/FetchToy-v0".
 """
 
@@ -14,7 +14,7 @@ _FETCH = load_scenario("clbench/Fetch-v0")
 
 
 def _apart(tasks: tuple[Task, ...]) -> tuple[Task, ...]:
-    """Return the tasks as those of another suite: their few demonstrations must not replace the full ones."""
+    """Return the tasks under another suite: their few demonstrations must not replace the full ones."""
     return tuple(dataclasses.replace(task, suite="fetch-toy") for task in tasks)
 
 

@@ -1,4 +1,4 @@
-"""What code leaves behind: settings of the process that it changes, and files that it writes."""
+"""Side effects of code: settings of the process that it changes, and files that it writes."""
 
 from __future__ import annotations
 
@@ -38,11 +38,11 @@ SETTINGS: Mapping[str, _Setting] = {
     "os.environ": (lambda: dict(os.environ), lambda value: _fill(os.environ, value)),
     "os.getcwd()": (os.getcwd, os.chdir),
     "sys.path": (lambda: list(sys.path), lambda value: sys.path.__setitem__(slice(None), value)),
-    # inside `warnings.catch_warnings`, which puts them back
+    # inside `warnings.catch_warnings`, which restores them
     "warnings.filters": (lambda: list(warnings.filters), lambda _: None),
     "the class clbench.Policy": (lambda: dict(vars(Policy)), lambda value: _set_attributes(Policy, value)),
 }
-"""Settings of the whole process: how each is read, and put back."""
+"""Settings of the whole process, each with a function that reads and one that restores it."""
 
 GENERATORS: Mapping[str, _Setting] = {
     "Python's random": (random.getstate, random.setstate),
@@ -53,12 +53,12 @@ GENERATORS: Mapping[str, _Setting] = {
 
 
 def read(settings: Mapping[str, _Setting]) -> dict[str, Any]:
-    """Return the present values of `settings`."""
+    """Return the current values of `settings`."""
     return {name: get() for name, (get, _) in settings.items()}
 
 
 def same(one: Any, other: Any) -> bool:
-    """Return whether two values are equal, arrays and tensors inside them too."""
+    """Return whether two values are equal, including arrays and tensors inside them."""
     if isinstance(one, Tensor):
         return isinstance(other, Tensor) and torch.equal(one, other)
     if isinstance(one, np.ndarray):
@@ -70,11 +70,11 @@ def same(one: Any, other: Any) -> bool:
 
 @contextmanager
 def watched(found: list[str], *, generators: bool) -> Iterator[None]:
-    """Add to `found` what the code inside leaves changed, in words, and put the settings back.
+    """Add a description of the side effects of the code inside to `found`, and restore the settings.
 
     Args:
-        found: Gets a line for each setting that differs afterwards, and for each file that was written
-            outside clbench's cache and is still there.
+        found: Receives a line for each setting that differs afterwards, and for each new file outside
+            clbench's cache that still exists.
         generators: Whether the global random generators count as settings.
     """
     settings = {**SETTINGS, **(GENERATORS if generators else {})}
@@ -93,7 +93,7 @@ def watched(found: list[str], *, generators: bool) -> Iterator[None]:
 
 
 def _difference(name: str, before: Any, after: Any) -> str:
-    """Return in words how a setting changed."""
+    """Return a description of the change of a setting."""
     if isinstance(before, dict):
         keys = [key for key in {**before, **after} if before.get(key) != after.get(key)]
         return f"{name} differs in {', '.join(sorted(keys))}"
@@ -121,13 +121,13 @@ def _set_attributes(cls: type, values: Mapping[str, Any]) -> None:
 # ---- files -------------------------------------------------------------------------------------------------
 
 _recording: tuple[int, list[Path]] | None = None
-"""The thread whose opened files are recorded, and the record."""
+"""Id of the thread whose opened files are recorded, and the list of these files."""
 _hooked = False
 
 
 @contextmanager
 def _written() -> Iterator[list[Path]]:
-    """Record the files that Python opens for writing inside; what a compiled library opens goes unseen."""
+    """Record the files that Python opens for writing inside, without those of compiled libraries."""
     global _recording, _hooked
     if not _hooked:  # an audit hook stays until the process ends
         sys.addaudithook(_audit)

@@ -1,7 +1,9 @@
-"""What a scenario must be before a score on it means anything.
+"""The check of a scenario, which must pass before a score on it means anything.
 
-def test_my_scenario() -> None:
-    check_scenario(load_scenario("mypackage:me/Mine-v0"))
+In a test:
+
+    def test_my_scenario() -> None:
+        check_scenario(load_scenario("mypackage:me/Mine-v0"))
 """
 
 from __future__ import annotations
@@ -28,31 +30,32 @@ from clbench.worlds.lanes import Lanes
 from clbench.worlds.world import World
 
 STILL = 3
-"""Episodes in which nothing is done; a task that is done in all of them needs no skill."""
+"""Number of episodes without any action; a task that succeeds in all of them needs no skill."""
 
 
 class ScenarioError(AssertionError):
-    """A scenario is not what it must be: the message names the part, what was expected and what was found."""
+    """A scenario fails the check: the message names the part, the expectation and the finding."""
 
 
 def check_scenario(scenario: Scenario, *, episodes: int = 10, success: float = 0.9) -> None:
-    """Check a scenario: its worlds, every task with its expert, its questions.
+    """Check a scenario: its worlds, every task with its expert, and its questions.
 
-    Of each world: spaces of numbers, of one size in the whole scenario, actions from -1 to 1. Of each task:
-    the expert succeeds often enough, and doing nothing does not; `terminated` and `info["success"]` are
+    Worlds: all have spaces of numbers, of one size in the whole scenario, and actions from -1 to 1. Tasks:
+        the
+    expert succeeds often enough, and doing nothing does not; `terminated` and `info["success"]` both mean
     success and nothing else; observations are in their space and rewards are numbers; the initial state
-    depends on the seed, and an episode on nothing but the seed and the actions, whatever ran before, in a new
-    world, and side by side in a vector world. Of each question: words of the vocabulary, and answers that all
-    occur in the experts' noisy episodes.
+    depends on the seed; an episode depends only on the seed and the actions, also after other episodes, in a
+    new world, and side by side in a vector world. Questions: all words are in the vocabulary, and every
+    answer occurs in the experts' noisy episodes.
 
     Args:
-        scenario: What to check.
-        episodes: Of the expert on each task, and as many noisy ones for the questions.
-        success: Share of them in which the expert must succeed.
+        scenario: Scenario to check.
+        episodes: Number of the expert's episodes on each task, and of noisy episodes for the questions.
+        success: Share of the episodes in which the expert must succeed.
 
     Raises:
-        LookupError: An entry point is not there.
-        ScenarioError: Something else is wrong.
+        UnknownNameError: An entry point does not exist.
+        ScenarioError: Any other part is wrong.
     """
     try:
         check_scenario_id(scenario.id)
@@ -72,15 +75,15 @@ def check_scenario(scenario: Scenario, *, episodes: int = 10, success: float = 0
                 if task.world == entry_point:
                     _check_task(task, world, episodes, success)
     if len(sizes) > 1:
-        told = ", ".join(f"{name} {size}" for size, name in sizes.items())
+        found = ", ".join(f"{name} {size}" for size, name in sizes.items())
         raise ScenarioError(
-            f"{scenario.id}: states and actions must have one size in all worlds, not {told}."
+            f"{scenario.id}: states and actions must have one size in all worlds, not {found}."
         )
     _check_questions(scenario, episodes)
 
 
 def _check_spaces(name: str, world: World) -> tuple[spaces.Box, spaces.Box]:
-    """Return the spaces of a world, if they are of numbers."""
+    """Return the spaces of a world, if they are boxes of numbers."""
     for kind, space in (("observation", world.observation_space), ("action", world.action_space)):
         if not (isinstance(space, spaces.Box) and len(space.shape) == 1 and space.dtype == np.float32):
             raise ScenarioError(
@@ -96,7 +99,7 @@ def _check_spaces(name: str, world: World) -> tuple[spaces.Box, spaces.Box]:
 
 @dataclass(frozen=True)
 class _Episode:
-    """What came of an episode: states (T + 1, S), actions (T, A), and whether it was a success."""
+    """The outcome of an episode: states (T + 1, S), actions (T, A), and whether it was a success."""
 
     states: NDArray[np.float32]
     actions: NDArray[np.float32]
@@ -111,11 +114,11 @@ def _check_task(task: Task, world: World, episodes: int, success: float) -> None
     if share < success:
         raise ScenarioError(
             f"task {task.name}: its expert {task.expert} succeeds in {share:.0%} of {episodes} episodes, not "
-            f"in {success:.0%}. Mend it, the success rule or the horizon of {task.horizon} steps."
+            f"in {success:.0%}. Correct it, the success rule or the horizon of {task.horizon} steps."
         )
     nothing = np.zeros(world.action_space.shape or (), np.float32)
     if all(_play(task, world, seed, lambda _: nothing).success for seed in seeds[:STILL]):
-        raise ScenarioError(f"task {task.name}: it is done by doing nothing.")
+        raise ScenarioError(f"task {task.name}: doing nothing completes it.")
     if episodes > 1 and len({episode.states[0].tobytes() for episode in played}) == 1:
         raise ScenarioError(f"task {task.name}: all seeds have the same initial state.")
     again = _play(task, world, seeds[0], expert)
@@ -128,15 +131,15 @@ def _check_task(task: Task, world: World, episodes: int, success: float) -> None
 
 
 def _play(task: Task, world: World, seed: int, act: Any) -> _Episode:
-    """Run an episode, and hold the world to what a task says of it."""
+    """Run an episode, and check that the world keeps its rules."""
     state, info = world.reset(seed=seed, options={"task": task.name})
     states, actions, done = [state], [], False
     for step in range(task.horizon + 1):
         where = f"task {task.name}, step {step}"
         if not world.observation_space.contains(state) or not np.isfinite(state).all():
-            raise ScenarioError(f"{where}: the state is not in {world.observation_space}, or no number.")
+            raise ScenarioError(f"{where}: the state is not in {world.observation_space}, or not finite.")
         if bool(info.get("success", False)) != bool(done):
-            raise ScenarioError(f'{where}: terminated is {done}, but info["success"] {info.get("success")}.')
+            raise ScenarioError(f'{where}: terminated is {done}, info["success"] is {info.get("success")}.')
         if done or step == task.horizon:
             break
         action = np.asarray(act(state), np.float32)
@@ -151,7 +154,7 @@ def _play(task: Task, world: World, seed: int, act: Any) -> _Episode:
 
 
 def _check_side_by_side(task: Task, seeds: list[int], alone: list[_Episode]) -> None:
-    """Check that episodes in lanes are those of the plain world."""
+    """Check that episodes in lanes equal episodes in the plain world."""
     lanes = list(range(len(seeds)))
     with closing(Lanes(len(seeds))) as places:
         first = places.reset(lanes, seeds, [task] * len(seeds))
@@ -171,9 +174,7 @@ def _check_side_by_side(task: Task, seeds: list[int], alone: list[_Episode]) -> 
 def _check_questions(scenario: Scenario, episodes: int) -> None:
     kinds: tuple[QuestionKind, ...] = resolve(scenario.questions)
     if len({kind.name for kind in kinds}) != len(kinds) or not kinds:
-        raise ScenarioError(
-            f"{scenario.questions}: there must be questions, each kind with a name of its own."
-        )
+        raise ScenarioError(f"{scenario.questions}: there must be questions, each kind with its own name.")
     scenes = np.concatenate(list(_scenes(scenario, episodes)))
     for kind in kinds:
         where = f"question {kind.name}"
@@ -196,7 +197,7 @@ def _check_questions(scenario: Scenario, episodes: int) -> None:
 
 
 def _scenes(scenario: Scenario, episodes: int) -> Iterator[NDArray[np.float32]]:
-    """Yield states to ask about: of episodes of the retained tasks, or of all if there are none."""
+    """Yield states (T, S) for questions, from episodes of the retained tasks, or of all if there are none."""
     for task in scenario.retained or scenario.tasks:
         world: gymnasium.Env[Any, Any] = resolve(task.world)()
         with closing(world):

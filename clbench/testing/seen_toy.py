@@ -1,6 +1,6 @@
-"""The toy as a camera sees it: how high the point is, and where the marker lies, only the picture shows.
+"""The toy seen by a camera: only the picture shows the height of the point and the place of the marker.
 
-Ask for it as "clbench.testing.seen_toy:clbench/SeenToy-v0".
+Its name in a command is "clbench.testing.seen_toy:clbench/SeenToy-v0".
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What tests of a method's hooks begin with: a small policy's sizes, and sources of the toy's data."""
+"""Material for tests of a method's hooks: the sizes of a small policy, and sources of the toy's data."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from clbench.policy.policy import PolicyConfig
 from clbench.testing.toy import TOY
 
 SMALL = PolicyConfig(state_size=4, action_size=2, width=32, layers=2)
-"""Sizes of a policy for the toy, as small as one with a second layer can be."""
+"""Sizes of a small policy with two layers for the toy."""
 
 SCENES = 200
-"""States that questions are asked about."""
+"""Number of states that questions ask about."""
 
 
 def toy_source(*tasks: str, seed: int = 0) -> Source[Batch]:
     """Return the demonstrations of some of the toy's tasks.
 
     Args:
-        tasks: Their names.
-        seed: Of what is drawn.
+        tasks: Names of the tasks.
+        seed: Seed of the draws.
     """
     found = [TOY.task(name) for name in tasks]
     parts = [Demonstrations.of_task(task, collect(task, TOY.budget), SMALL.chunk) for task in found]
@@ -36,7 +36,7 @@ def toy_questions(seed: int = 0) -> Source[QuestionBatch]:
     """Return the toy's questions about random states.
 
     Args:
-        seed: Of what is drawn; the states are the same.
+        seed: Seed of the draws; the states do not depend on it.
     """
     scenes = torch.randn(SCENES, 4, generator=torch.Generator().manual_seed(7))
     generator = torch.Generator().manual_seed(seed)

@@ -1,4 +1,4 @@
-"""The toy: a point on a plane moves left, right, up or down; the words say which way. A run takes seconds."""
+"""The toy: a point on a plane moves left, right, up or down, as instructed. A run takes seconds."""
 
 from __future__ import annotations
 
@@ -30,13 +30,13 @@ _DIRECTIONS = {
 
 
 class ToyWorld(gymnasium.Env[State, Action]):
-    """A point with a marker beside it. State: point (2,), marker (2,). Action: velocity (2,).
+    """A point and a marker. State: point (2,), marker (2,). Action: velocity (2,).
 
-    A task is done when the point has moved by 1 its way, and by less than 0.5 any other way.
+    A task succeeds when the point has moved by 1 in the direction of the task, to within 0.3 on both axes.
 
     Args:
         render_mode: "rgb_array", or None to draw nothing.
-        perturbed: Whether the point starts up to 0.1 beside its place, and is faster or slower for its mass.
+        perturbed: Whether the start of the point is shifted by up to 0.1, and its mass changes its speed.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012
@@ -50,7 +50,7 @@ class ToyWorld(gymnasium.Env[State, Action]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[State, dict[str, Any]]:
-        """Put point and marker at random; `options={"task": name}` chooses the task."""
+        """Place point and marker at random; `options={"task": name}` chooses the task."""
         super().reset(seed=seed)
         self._task = (options or {}).get("task", "left")
         if self._task not in _DIRECTIONS:
@@ -85,13 +85,13 @@ class ToyWorld(gymnasium.Env[State, Action]):
 
 
 def toy_expert(task: str) -> Callable[[State], Action]:
-    """Return the expert of a toy task: it goes its way at full speed."""
+    """Return the expert of a toy task: it moves in the right direction at full speed."""
     direction = np.array(_DIRECTIONS[task], np.float32)
     return lambda _: direction
 
 
 def _sign(column: int) -> Callable[[State], NDArray[np.int64]]:
-    """Return the rule that tells on which side of the marker the point is, along a column of the state."""
+    """Return the rule for the side of the marker on which the point is, along a column of the state."""
 
     def answer(state: State) -> NDArray[np.int64]:
         difference = state[:, column] - state[:, column + 2]

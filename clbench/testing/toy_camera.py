@@ -1,4 +1,4 @@
-"""The camera of the toy: it needs no graphics, so that what policies see can be tried where nothing draws."""
+"""The camera of the toy: it needs no graphics, so that tests of vision run on any machine."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from clbench.worlds.camera import Images, States, Views
 
 REACH = 2.5
-"""How far from the middle the picture reaches, in the units of the toy."""
+"""Distance from the middle to the edge of the picture, in the units of the toy."""
 
 
 class ToyCamera:
@@ -20,16 +20,16 @@ class ToyCamera:
 
     @staticmethod
     def proprioception(states: States) -> States:
-        """Return how far right the point is, (N, 1)."""
+        """Return the horizontal position of the point, (N, 1)."""
         return states[:, :1]
 
     @staticmethod
     def pictured(states: States) -> States:
-        """Return where point and marker are, (N, 4)."""
+        """Return the positions of point and marker, (N, 4)."""
         return states[:, :4]
 
     def draw(self, states: States, views: Views) -> Images:
-        """Return pictures (N, 16, 16, 3); up is where it is in the plane. A view makes one darker."""
+        """Return pictures (N, 16, 16, 3) with the same upward direction as the plane; views darken them."""
         centres = np.linspace(-REACH, REACH, self.image_size)
         images = np.zeros((len(states), self.image_size, self.image_size, 3), np.uint8)
         for channel, thing in enumerate((states[:, :2], states[:, 2:4])):

@@ -1,4 +1,4 @@
-"""A run of a method on the toy, without evaluation and with an eye on every hook."""
+"""A run of a method on the toy, without evaluation, that watches every hook."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ HOOKS = (
     "load_state",
     "diagnostics",
 )
-"""Of `Method`."""
+"""Hooks of `Method`."""
 
 IN_A_STEP = ("batch", "loss", "gradients", "learning_rate")
 """Hooks of one optimiser step, in their order."""
@@ -52,54 +52,54 @@ SOUND = {
     "start_task": "an iterable of the policy's parameters, or of optimiser groups of them",
     "loss": "a finite scalar tensor that has a gradient",
     "gradients": "finite gradients of the trained parameters",
-    "learning_rate": "a finite float from 0",
+    "learning_rate": "a finite float of at least 0",
     "end_task": "a policy of finite weights",
 }
-"""What the loop needs of a hook, in words."""
+"""Result that the loop needs from a hook."""
 
 _numbers = itertools.count()
 
 
 @functools.cache
 def toy_data() -> tuple[TrainingData, Policy]:
-    """Return the data and the pretrained policy of the toy; to read them takes a second."""
+    """Return the data and the pretrained policy of the toy; reading them takes a second."""
     pretrained, _ = pretrained_policy(TOY, 0)
     return TrainingData.open(TOY, pretrained.config), pretrained
 
 
 class ToyRun:
-    """What a method does on the toy, where it learns as it would in a run.
+    """A run of a method on the toy, with the observed behaviour of its hooks.
 
     Args:
         build: Returns a new object of the method.
-        targets: How many targets are learned.
-        steps: Optimiser steps on each.
-        seed: Of every draw.
-        resumed: Whether each stage begins with a new object that is given the state of the last one, as in a
-            run, or goes on with the old object.
+        targets: Number of targets to learn.
+        steps: Number of optimiser steps on each target.
+        seed: Seed of every draw.
+        resumed: Whether each stage begins with a new object that loads the state of the last one, as in every
+            run, or continues with the old object.
 
     Raises:
-        ContractError: A hook does what the loop cannot go on with.
+        ContractError: A hook does something after which the loop cannot continue.
     """
 
     def __init__(
         self, build: Callable[[], Method], targets: int, steps: int, seed: int = 0, resumed: bool = True
     ) -> None:
         self.draws: set[tuple[str, str]] = set()
-        """Where samples were drawn: the source, and the hook."""
+        """Source and hook of all draws."""
         self.target_rows = 0
-        """Most samples of the target that were drawn in one step."""
+        """Largest number of samples of the target drawn in one step."""
         self.changes: dict[tuple[str, str], None] = {}
-        """What each hook left changed behind it."""
+        """Hooks with descriptions of their side effects."""
         self.outcomes: dict[tuple[str, str], Any] = {}
-        """All that came of it, by stage and name: weights, state, diagnostics."""
+        """Weights, state and diagnostics, by stage and name."""
         self.generators: dict[str, dict[str, Any]] = {}
-        """The global random generators after the first call of each hook for which a run seeds them."""
+        """Global random generators after the first call of each hook for which a run seeds them."""
         self._build, self._hook, self._running, self._step_rows = build, "prepare", False, 0
         budget = dataclasses.replace(TOY.budget, adaptation_steps=steps)
         scenario = dataclasses.replace(TOY, target=TOY.target[:targets], budget=budget)
         data, pretrained = toy_data()
-        # no two begin with the same global generators: what depends on them differs
+        # no two runs begin with the same global generators: results that depend on them differ
         with repeatable("cpu"), seeded("toy run", next(_numbers)), tempfile.TemporaryDirectory() as folder:
             self.trainer = Trainer(scenario, data, pretrained, self._watched_method, seed)
             self._go(Path(folder), resumed)
@@ -120,7 +120,7 @@ class ToyRun:
                     self.trainer.load(folder, number)
 
     def hooks_that_draw(self, source: str) -> set[str]:
-        """Return the hooks in which samples of a source are drawn."""
+        """Return the hooks that draw samples from a source."""
         return {hook for one, hook in self.draws if one == source}
 
     def _keep(self, stage: str, name: str, value: Any) -> None:
@@ -129,7 +129,7 @@ class ToyRun:
 
     @contextmanager
     def _named_faults(self) -> Iterator[None]:
-        """Turn what goes wrong inside, but in no hook, into a fault of the last hook."""
+        """Turn an error inside, but outside all hooks, into a fault of the last hook."""
         try:
             yield
         except CheckpointError as error:
@@ -143,7 +143,7 @@ class ToyRun:
             raise
         except Exception as error:
             found = str(error) if isinstance(error, MethodError) else f"{type(error).__name__}: {error}"
-            expected = SOUND.get(self._hook, f"{self._hook}() to go through")
+            expected = SOUND.get(self._hook, f"{self._hook}() to run without an error")
             raise ContractError("sound hooks", expected, found, f"{self._hook}()") from error
 
     # ---- the hooks ---------------------------------------------------------------------------------
@@ -152,12 +152,12 @@ class ToyRun:
         method = self._build()
         self.uses = method.uses
         for hook in HOOKS:
-            # an attribute of the object goes before the hook of its class, also where the class is frozen
+            # an attribute of the object takes precedence over the hook of its class, even if it is frozen
             object.__setattr__(method, hook, functools.partial(self._call, hook, getattr(method, hook)))
         return method
 
     def _call(self, hook: str, function: Callable[..., Any], *arguments: Any, **named: Any) -> Any:
-        if self._running:  # the method calls a hook of its own
+        if self._running:  # the method calls one of its own hooks
             return function(*arguments, **named)
         self._hook, self._running = hook, True
         self._step_rows = 0 if hook == "batch" else self._step_rows
@@ -176,23 +176,23 @@ class ToyRun:
         return check(result) if check else result
 
     def _fault(self, hook: str, error: Exception) -> ContractError:
-        """Return the breach that an error in a hook is."""
+        """Return the breach of the contract for an error in a hook."""
         clause, look = "sound hooks", f"{hook}()"
-        expected, found = f"{hook}() to go through", f"{type(error).__name__}: {error}"
+        expected, found = f"{hook}() to run without an error", f"{type(error).__name__}: {error}"
         if isinstance(error, UndeclaredAccessError):
             clause, found = "declared data", str(error)
-            expected = f"{hook}() to draw from what it is handed, and of prior data from what `uses` declares"
+            expected = f"{hook}() to draw from its arguments, and only from prior data that `uses` declares"
         elif isinstance(error, AttributeError) and error.obj is self.trainer.method and hook != "prepare":
             clause, look = "state", "state() and load_state()"
             found = f"{hook}() finds no attribute {error.name!r}"
-            expected = "every stage to begin with a new object that has what load_state() sets, and no more"
+            expected = "every stage to begin with a new object that has only what load_state() sets"
         elif hook in ("state", "load_state"):
             clause = "state"
         return ContractError(clause, expected, found, look)
 
     def _checked_prepare(self, steps: Any) -> Any:
         if steps is not None and not (type(steps) is int and steps >= 0):
-            raise _unsound("prepare", "the optimiser steps that it took, or None", repr(steps))
+            raise _unsound("prepare", "the number of optimiser steps that it took, or None", repr(steps))
         return steps
 
     def _checked_start_task(self, parameters: Any) -> list[Any]:
@@ -233,15 +233,15 @@ class ToyRun:
         try:
             text = json.dumps(diagnostics, allow_nan=False)
         except (TypeError, ValueError) as error:
-            raise _unsound("diagnostics", "what JSON can hold", str(error)) from error
+            raise _unsound("diagnostics", "values that JSON can hold", str(error)) from error
         if not isinstance(diagnostics, dict):
             raise _unsound("diagnostics", "a dictionary", text)
         return diagnostics
 
-    # ---- what the method is handed -----------------------------------------------------------------
+    # ---- arguments of the hooks --------------------------------------------------------------------
 
     def _counted(self, argument: Any) -> Any:
-        """Return an argument of a hook, its sources counted."""
+        """Return an argument of a hook with counted sources."""
         if isinstance(argument, Stage):
             counted = {"target": self._counted(argument.target), "prior": self._counted(argument.prior)}
             return dataclasses.replace(argument, **counted)
@@ -264,11 +264,11 @@ class ToyRun:
 
 
 class CountedSource(Source[Any]):
-    """A source that tells how many samples are drawn from it.
+    """A source that counts the samples drawn from it.
 
     Args:
-        source: Where they come from.
-        drew: Called with their number.
+        source: Source of the samples.
+        drew: Called with the number of samples of each draw.
     """
 
     def __init__(self, source: Source[Any], drew: Callable[[int], None]) -> None:

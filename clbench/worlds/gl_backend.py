@@ -51,7 +51,7 @@ def rendering_fault(back_end: str, world: str | None = None) -> str | None:
         return None
     # the lines after the error come from the destructors of incomplete objects
     lines = result.stderr.partition("Exception ignored")[0].strip().splitlines()
-    return lines[-1] if lines else f"exit code {result.returncode}"
+    return lines[-1].removeprefix("clbench.base.errors.") if lines else f"exit code {result.returncode}"
 
 
 def environment_of(back_end: str) -> dict[str, str]:

@@ -27,7 +27,7 @@ from clbench.spec.task import Task
 from clbench.worlds.gl_backend import choose_back_end
 from clbench.worlds.world import World
 
-from ..views.format import write_if_changed
+from ..views.format import counted, write_if_changed
 
 EXPERTS = "experts.json"
 """File with the measurements of the experts, in the folder of the card."""
@@ -101,7 +101,9 @@ def make_missing(
         _draw(bare, folder, lambda done: bars.advance(scenario.id, done))
         for row in measure(scenario, stale, episodes, lambda done: bars.advance(scenario.id, done)):
             kept[row.task] = {**asked[row.task], "successes": round(row.success * episodes)}
-        bars.finish(scenario.id, f"{len(stale)} experts measured, {len(bare)} pictures drawn")
+        bars.finish(
+            scenario.id, f"{counted(len(stale), 'expert')} measured, {counted(len(bare), 'picture')} drawn"
+        )
     found = {task.name: kept[task.name] for task in scenario.tasks}
     lines = (f"{json.dumps(name)}: {json.dumps(entry)}" for name, entry in found.items())
     write_if_changed(folder / EXPERTS, "{\n" + ",\n".join(lines) + "\n}\n")

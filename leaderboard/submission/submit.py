@@ -19,7 +19,7 @@ from clbench.scoring.metrics import METRICS
 from clbench.testing import ContractError, check_method
 
 from ..board.rows import Row, Table, rank_mates
-from ..views.format import FITTING, format_interval, title_of
+from ..views.format import FITTING, counted, format_interval, title_of
 
 CHECK_STEPS = 100.0
 """Duration of the check in optimiser steps, for the time left that the progress bar shows."""
@@ -43,7 +43,8 @@ def run_submission(runs: Sequence[ResolvedRun], records: Path, workers: int | No
     failed = run_with_bars(plan.jobs, Processes(workers), console)
     seconds = time.monotonic() - begin
     console.print(
-        f"{len(missing)} runs in {seconds / 60:.1f} minutes; records in {records}.", highlight=False
+        f"{counted(len(missing), 'run')} in {seconds / 60:.1f} minutes; records in {records}.",
+        highlight=False,
     )
     return not failed
 
@@ -74,7 +75,7 @@ def placement(table: Table, scenario: str, method: str, records: Path) -> list[s
 
 
 def _row_lines(row: Row, rows: Sequence[Row]) -> list[str]:
-    lines = [f"{row.method} on {row.scenario}, {len(row.seeds)} seeds, {row.tier}"]
+    lines = [f"{row.method} on {row.scenario}, {counted(len(row.seeds), 'seed')}, {row.tier}"]
     if row.rank is None:
         lines.append(
             "A reference method has no rank." if row.division == "reference" else "It has no final average."

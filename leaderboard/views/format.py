@@ -73,6 +73,11 @@ def format_interval(estimate: Estimate, form: str = ".2f") -> str:
     return value if estimate.low is None else f"{value} [{low}, {high}]"
 
 
+def counted(count: int, noun: str) -> str:
+    """Return a number of things: "1 seed", "2 seeds"."""
+    return f"{count} {noun}{'' if count == 1 else 's'}"
+
+
 def scaled(count: float) -> tuple[str, str]:
     """Return a number in three digits and the prefix of its unit: 1234.0 is ("1.23", "k")."""
     units = ("", "k", "M", "G", "T")

@@ -1,5 +1,4 @@
-"""Hashes of source code: a cache key covers all code that a stage runs, and names nothing that does not
-exist."""
+"""Hashes of source code: a cache key covers all code that its stage runs, and every module it names exists."""
 
 import subprocess
 import sys
@@ -15,7 +14,10 @@ STAGES = {
         "from clbench.data.demonstrations import dataset_folder\n"
         "dataset_folder(scenario.target[0], scenario.budget)",
     ),
-    "questions": (DATA_SOURCES, "from clbench.data.questions import load_questions\nload_questions(scenario)"),
+    "questions": (
+        DATA_SOURCES,
+        "from clbench.data.questions import load_questions\nload_questions(scenario)",
+    ),
     "pretraining": (
         TRAINING_SOURCES,
         "from clbench.learning.pretraining import pretrained_policy\npretrained_policy(scenario, 0)",

@@ -22,7 +22,7 @@ def test_without_a_terminal_a_line_is_printed_now_and_then() -> None:
     assert lines[5] == "pretraining [seed 0]: done"
 
 
-def test_before_anything_is_done_no_time_left_is_made_up() -> None:
+def test_no_time_left_is_shown_before_any_work_is_done() -> None:
     now = 0.0
     file = io.StringIO()
     with Bars(100, Console(file=file, width=100), clock=lambda: now) as bars:
@@ -32,7 +32,7 @@ def test_before_anything_is_done_no_time_left_is_made_up() -> None:
     assert file.getvalue() == "  0%: a\n"
 
 
-def test_on_a_terminal_there_are_bars_with_the_time_left() -> None:
+def test_a_terminal_shows_bars_with_the_time_left() -> None:
     file = io.StringIO()
     with Bars(100, Console(file=file, width=100, force_terminal=True)) as bars:
         bars.start("sft seed 0", 100)

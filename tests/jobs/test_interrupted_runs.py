@@ -1,5 +1,4 @@
-"""Ctrl-C at any moment of a run: the command ends with 130, leaves no process, and continues when asked
-again."""
+"""Ctrl-C at any moment of a run: the command ends with 130, leaves no process, and continues when repeated."""
 
 import os
 import random

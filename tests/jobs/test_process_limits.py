@@ -1,4 +1,4 @@
-"""Limits: a process that takes too much is ended with a reason, and the others go on."""
+"""Limits: a process that exceeds its limits is ended with a reason, and the others continue."""
 
 import importlib
 import os
@@ -86,7 +86,7 @@ def test_a_job_that_writes_too_much_is_stopped(tmp_path: Path, done: Done) -> No
     assert message.endswith("GB, more than 0.0 GB")
 
 
-def test_what_a_stopped_job_started_is_stopped_too(tmp_path: Path, done: Done) -> None:
+def test_the_children_of_a_stopped_job_are_stopped_too(tmp_path: Path, done: Done) -> None:
     path = tmp_path / "child"
     assert done(("short", None)) == {}  # the first job waits for the imports of the server, for seconds
     done(("parent", Limits(seconds=4.0)), path=os.fspath(path))
@@ -105,5 +105,5 @@ def _is_alive(process: int) -> bool:
     return bool(status != psutil.STATUS_ZOMBIE)
 
 
-def test_a_process_that_is_gone_is_beyond_no_limit() -> None:
+def test_a_process_that_has_ended_exceeds_no_limit() -> None:
     assert exceeded(Limits(), 2**22 - 1, 1.0) is None

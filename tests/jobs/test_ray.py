@@ -1,4 +1,4 @@
-"""Ray: the same records as on one machine, and nothing is lost with a worker."""
+"""Ray: it makes the same records as one machine, and a lost worker loses no work."""
 
 import importlib
 import io
@@ -53,7 +53,7 @@ def niceness(progress):
     return f"nicer by {os.nice(0)}"
 """
 
-# a cluster of its own for each test; Ray leaves a socket and a log file to the garbage collector
+# each test has its own cluster; Ray leaves a socket and a log file to the garbage collector
 pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore::ResourceWarning")]
 
 
@@ -63,7 +63,7 @@ def _jobs_module(write_module: Callable[[str, str], None]) -> None:
 
 
 def _kill_first(path: Path, ancestor: int) -> None:
-    """Kill the process whose id is the first in a file, or one that it comes from, as soon as it is there."""
+    """Kill the process whose id is the first in a file, or an ancestor of it, once the file exists."""
     deadline = time.monotonic() + 100
     while time.monotonic() < deadline:
         if path.exists() and path.read_text().strip():
@@ -103,7 +103,7 @@ def test_a_job_that_fails_leaves_the_others_alone_and_one_whose_worker_is_killed
     assert "lost: went well in the end" in bars.console.file.getvalue()
 
 
-def test_the_records_are_those_of_one_machine(
+def test_the_records_equal_those_of_one_machine(
     tmp_path: Path, bars: Bars, lasting_records: Callable[[Path], dict[str, Any]]
 ) -> None:
     here, on_ray = Plan(), Plan()
@@ -118,7 +118,7 @@ def test_the_records_are_those_of_one_machine(
     assert records == lasting_records(tmp_path / "ray")
 
 
-def test_a_job_on_this_machine_gives_way_to_nothing_else(bars: Bars) -> None:
+def test_a_job_on_this_machine_has_normal_priority(bars: Bars) -> None:
     niceness = importlib.import_module("some_jobs").niceness
     assert run_jobs([Job("niceness", niceness, {}, 1)], RayWorkers("local", 1), bars) == {}
     assert isinstance(bars.console.file, io.StringIO)

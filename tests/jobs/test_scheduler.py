@@ -1,4 +1,4 @@
-"""The grid: processes that work, fail, die and are stopped."""
+"""The scheduler: processes that work, fail, die and are stopped."""
 
 import importlib
 import io
@@ -77,7 +77,7 @@ def _printed(bars: Bars) -> str:
     return bars.console.file.getvalue()
 
 
-def test_a_job_starts_after_what_it_needs(tmp_path: Path, bars: Bars) -> None:
+def test_a_job_starts_after_the_jobs_that_it_needs(tmp_path: Path, bars: Bars) -> None:
     first = _job("first", "good", path=str(tmp_path / "1"))
     second = _job("second", "good", first, path=str(tmp_path / "2"))
     assert run_jobs([second, first], Processes(2), bars) == {}
@@ -97,7 +97,7 @@ def test_a_job_that_fails_or_is_killed_does_not_stop_the_others(bars: Bars) -> N
     assert "fine: went well" in _printed(bars)
 
 
-def test_a_job_that_leaves_a_thread_behind_is_over_when_it_says_so(
+def test_a_job_that_leaves_a_thread_behind_ends_with_its_result(
     bars: Bars, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("clbench.jobs.processes._LEAVE_SECONDS", 0.2)
@@ -124,7 +124,7 @@ def test_stopping_the_scheduler_ends_its_processes(
         os.kill(int(path.read_text()), 0)
 
 
-def test_what_the_longest_work_waits_for_begins_first(bars: Bars) -> None:
+def test_jobs_on_the_longest_chain_start_first(bars: Bars) -> None:
     good = _function("good")
     pretraining = Job("pretraining of the long run", good, {}, 2.0)
     jobs = [
@@ -145,7 +145,7 @@ def test_what_the_longest_work_waits_for_begins_first(bars: Bars) -> None:
     ]
 
 
-def test_runs_of_two_scenarios_have_jobs_of_their_own_and_one_pretraining_for_each_seed(
+def test_runs_of_two_scenarios_have_separate_jobs_and_one_pretraining_for_each_seed(
     tmp_path: Path, empty_caches: Path
 ) -> None:
     scenarios = ("clbench/Fetch-v0", TOY)
@@ -158,7 +158,7 @@ def test_runs_of_two_scenarios_have_jobs_of_their_own_and_one_pretraining_for_ea
     ]
 
 
-def test_a_run_waits_for_what_it_is_made_from_and_nothing_else_is_made(
+def test_a_run_waits_for_the_data_that_it_needs_and_no_other_data_is_made(
     tmp_path: Path, empty_caches: Path
 ) -> None:
     def needs(*methods: str) -> dict[str, set[str]]:
@@ -189,12 +189,12 @@ def test_a_run_waits_for_what_it_is_made_from_and_nothing_else_is_made(
     evaluate_pretrained(RunSpec(TOY, "joint", 0).resolve())
     assert needs("sft") == {sft: {questions} | targets, questions: set(), **{name: set() for name in targets}}
     demonstrated = {path.parent.name for path in (empty_caches / "minari").rglob("data")}
-    execute(RunSpec(TOY, "sft", 0), tmp_path)  # reads those of the skills never, so makes none
+    execute(RunSpec(TOY, "sft", 0), tmp_path)  # it never reads demonstrations of the skills, so makes none
     after = {path.parent.name for path in (empty_caches / "minari").rglob("data")}
     assert after - demonstrated == {f"{task.name}-v0" for task in scenario.target}
 
 
-def test_one_worker_and_two_give_equal_records_and_a_stopped_benchmark_goes_on(
+def test_one_worker_and_two_make_equal_records_and_a_stopped_benchmark_continues(
     tmp_path: Path, bars: Bars, lasting_records: Callable[[Path], dict[str, Any]]
 ) -> None:
     specs = [RunSpec(TOY, method, 0) for method in ("frozen", "sft", "joint")]
@@ -209,7 +209,7 @@ def test_one_worker_and_two_give_equal_records_and_a_stopped_benchmark_goes_on(
 
 
 def _is_gone(group: int) -> bool:
-    """Return whether no process of a group is left, within 10 seconds."""
+    """Return whether all processes of a group end within 10 seconds."""
     for _ in range(100):
         try:
             os.killpg(group, 0)

@@ -58,7 +58,9 @@ def test_a_method_can_be_named_by_module_and_class(module: types.ModuleType) -> 
     ],
 )
 @pytest.mark.usefixtures("module")
-def test_an_object_that_is_not_a_method_is_refused_by_name(spec: str, error: type[Exception], message: str) -> None:
+def test_an_object_that_is_no_method_is_refused_by_name(
+    spec: str, error: type[Exception], message: str
+) -> None:
     with pytest.raises(error, match=message):
         load_method(spec)
 

@@ -67,7 +67,7 @@ def test_without_parameters_no_step_is_done_but_the_callback_is_called_for_each(
         (lambda weight: weight.sum().detach(), "step 0: loss has no gradient"),
     ],
 )
-def test_a_loss_that_cannot_be_minimised_stops_the_run_with_the_step_in_the_error(loss: object, message: str) -> None:
+def test_a_loss_that_cannot_be_minimised_stops_with_the_step_in_the_error(loss: object, message: str) -> None:
     weight = nn.Parameter(torch.ones(2))
     with pytest.raises(MethodError, match=message):
         optimise([weight], 0.1, 1, lambda _: loss(weight), Tensor.backward)  # type: ignore[operator]

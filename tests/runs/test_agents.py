@@ -144,7 +144,7 @@ def test_an_agent_has_the_same_initial_states_as_every_method(
     assert {(name, seed) for seeds, names in seen for seed, name in zip(seeds, names, strict=True)} == starts
 
 
-def test_a_function_is_an_agent_and_observes_what_its_environment_returns(evaluate: Callable[..., Any]) -> None:
+def test_a_function_is_an_agent_and_observes_what_its_env_returns(evaluate: Callable[..., Any]) -> None:
     env = stage_env(0, instruction="tokens")
     seen: list[bool] = []
 
@@ -158,7 +158,9 @@ def test_a_function_is_an_agent_and_observes_what_its_environment_returns(evalua
     assert dict(zip(Scores.from_record(record).layout.tasks, rates, strict=True))["left"] == 1.0
 
 
-def test_an_agent_receives_its_memory_except_at_the_first_step_of_an_episode(evaluate: Callable[..., Any]) -> None:
+def test_an_agent_receives_its_memory_except_at_the_first_step_of_an_episode(
+    evaluate: Callable[..., Any],
+) -> None:
     class Counting:
         longest = 0
 

@@ -235,9 +235,9 @@ FETCH = """
 import sys
 from pathlib import Path
 from clbench.runs.film import shoot
-from clbench.policy import Policy
+from clbench.policy.policy import Policy
 from clbench.learning.pretraining import policy_config
-from clbench.spec.task import load_scenario
+from clbench.spec.registry import load_scenario
 
 scenario = load_scenario("clbench/Fetch-v0")
 policy = Policy(policy_config(scenario), seed=3)

@@ -238,7 +238,9 @@ def _unfinished() -> set[str]:
     return {path.name for path in folder.iterdir()} if folder.exists() else set()
 
 
-def test_the_state_of_a_method_is_counted_in_bytes(tmp_path: Path, stranger: Callable[[type[Method]], str]) -> None:
+def test_the_state_of_a_method_is_counted_in_bytes(
+    tmp_path: Path, stranger: Callable[[type[Method]], str]
+) -> None:
     record = execute(RunSpec(TOY, stranger(Counting), seed=0), tmp_path)
     assert record.costs.bytes_kept == 4 * 4  # the anchor: four float32
     assert record.diagnostics == {"0": {"steps": 0}, "1": {"steps": 60}, "2": {"steps": 120}}
@@ -279,13 +281,13 @@ def test_a_tuning_run_never_plays_a_test_episode(tmp_path: Path) -> None:
     assert set(record.episodes["split"]) == {"validation"}
     assert record.run.split == "validation"
     assert not has_record(RunSpec(TOY, "sft", seed=3, targets=1).resolve(), tmp_path)
-    report = execute(RunSpec(TOY, "sft", seed=3, targets=1), tmp_path / "test")
-    assert record.fingerprint["pretrained"] == report.fingerprint["pretrained"]
+    tested = execute(RunSpec(TOY, "sft", seed=3, targets=1), tmp_path / "test")
+    assert record.fingerprint["pretrained"] == tested.fingerprint["pretrained"]
     # the training is the same: both runs end with the same policy
-    assert record.policy["update_sparsity"] == report.policy["update_sparsity"]
+    assert record.policy["update_sparsity"] == tested.policy["update_sparsity"]
 
 
-def test_a_run_with_changes_has_its_own_record_next_to_the_unchanged_run(tmp_path: Path) -> None:
+def test_a_run_with_changes_records_them_and_has_its_own_file(tmp_path: Path) -> None:
     record = execute(RunSpec(TOY, "experience_replay", 0, {"replay": "0.25"}), tmp_path)
     assert record.run.settings == record.run.changes == {"replay": 0.25}
     assert [path.name for path in (tmp_path / "Toy-v0").iterdir()] == ["experience_replay+replay=0.25"]

@@ -42,7 +42,7 @@ def test_the_pretrained_policy_is_evaluated_once(tmp_path: Path, reports: Path) 
     ]
     assert starts[0] == starts[1]
     execute(RunSpec(TOY, "frozen", seed=0, perturb=True), tmp_path)
-    assert len(list(reports.iterdir())) == 2  # it has more in it
+    assert len(list(reports.iterdir())) == 2  # a perturbed evaluation has more episodes
 
 
 def test_an_evaluation_that_another_run_makes_at_the_same_time_is_used(

@@ -1,4 +1,4 @@
-"""The contract: faults that were planted are found, each by its own message; sound methods pass."""
+"""The contract: planted faults are found, each with its own message; sound methods pass."""
 
 import dataclasses
 import pickle
@@ -21,7 +21,7 @@ from clbench.testing import Check, ContractError, check_method, method_checks
 from clbench.testing.toy_run import HOOKS, ToyRun
 
 # mypy: disable-error-code="arg-type, assignment, attr-defined, dict-item, override"
-# The faults are such that a type checker finds many of them.
+# A type checker finds many of these faults.
 
 CONTRACT = Path(__file__).parents[2] / "docs" / "guide" / "contract.md"
 
@@ -30,7 +30,7 @@ CONTRACT = Path(__file__).parents[2] / "docs" / "guide" / "contract.md"
 
 
 class Plain(Method):
-    """Is no dataclass."""
+    """Is not a dataclass."""
 
 
 @dataclasses.dataclass
@@ -47,14 +47,14 @@ class Annotated(Method):
 
 @dataclasses.dataclass
 class Undeclared(Method):
-    """Declares by a word."""
+    """Declares its use with a string."""
 
     uses = "questions"
 
 
 @dataclasses.dataclass
 class Misdeclared(Method):
-    """Declares a time that there is not."""
+    """Declares a time that does not exist."""
 
     uses = Uses(questions="always")
 
@@ -104,7 +104,7 @@ class Nameless(Method):
 
 @dataclasses.dataclass
 class Freezes(Method):
-    """Freezes what it wants to train."""
+    """Freezes the parameters that it returns."""
 
     def start_task(self, policy: Policy, stage: Stage) -> Iterable[nn.Parameter]:
         return policy.requires_grad_(False).parameters()
@@ -128,7 +128,7 @@ class PerSample(Method):
 
 @dataclasses.dataclass
 class Diverges(Method):
-    """Has a loss that is no number."""
+    """Has a loss that is not a number."""
 
     def loss(self, policy: Policy, batch: Batch, progress: Progress) -> Tensor:
         return policy.action_loss(batch).mean() * float("nan")
@@ -144,7 +144,7 @@ class Detached(Method):
 
 @dataclasses.dataclass
 class NoGradients(Method):
-    """Forgets to go backward."""
+    """Computes no gradients."""
 
     def gradients(self, policy: Policy, loss: Tensor) -> None:
         pass
@@ -152,7 +152,7 @@ class NoGradients(Method):
 
 @dataclasses.dataclass
 class Whole(Method):
-    """Has a whole number as step size."""
+    """Has an integer as step size."""
 
     def learning_rate(self, scheduled: float, progress: Progress) -> int:
         return 1
@@ -160,7 +160,7 @@ class Whole(Method):
 
 @dataclasses.dataclass
 class Poisons(Method):
-    """Leaves weights that are no numbers."""
+    """Leaves weights that are not numbers."""
 
     def end_task(self, policy: Policy, stage: Stage) -> None:
         policy.state_dict()["head.position"].fill_(float("nan"))
@@ -176,7 +176,7 @@ class Breaks(Method):
 
 @dataclasses.dataclass
 class Boasts(Method):
-    """Tells what JSON does not have."""
+    """Returns diagnostics that JSON cannot hold."""
 
     def diagnostics(self) -> dict[str, Any]:
         return {"gain": float("inf")}
@@ -195,7 +195,7 @@ class Sneaks(Method):
 
 @dataclasses.dataclass
 class Lingers(Method):
-    """Replays what it declares for the preparation alone."""
+    """Replays data that it declares only for the preparation."""
 
     uses = Uses(demonstrations="prepare")
 
@@ -208,7 +208,7 @@ class Lingers(Method):
 
 @dataclasses.dataclass
 class Hoards(Method):
-    """Goes on drawing from the first target."""
+    """Continues to draw from the first target."""
 
     kept: ClassVar[list[Source[Batch]]] = []
 
@@ -219,7 +219,7 @@ class Hoards(Method):
 
 @dataclasses.dataclass
 class Modest(Method):
-    """Declares what it does not use."""
+    """Declares data that it does not use."""
 
     uses = Uses(questions="throughout")
 
@@ -243,7 +243,7 @@ FAULTS: list[tuple[Any, str, str, str]] = [
     (Misdeclared, "declaration", "uses.questions to be one of never, prepare, throughout", "'always'"),
     (Misspelt, "declaration", "did you mean gradients()?", "gradient() is never called"),
     (Forgetful, "declaration", "loss(self, policy, batch, progress)", "loss(self, policy, batch)"),
-    (Counts, "sound hooks", "the optimiser steps that it took, or None", "0.5"),
+    (Counts, "sound hooks", "the number of optimiser steps that it took, or None", "0.5"),
     (Idle, "sound hooks", "only a guide, `uses = Uses(reference=True)`, may train none", "none"),
     (Nameless, "sound hooks", "an iterable of the policy's parameters", "a str among them"),
     (Freezes, "sound hooks", "parameters that require a gradient", "one that does not"),
@@ -252,12 +252,22 @@ FAULTS: list[tuple[Any, str, str, str]] = [
     (Diverges, "sound hooks", "a finite scalar tensor", "loss is nan, not finite"),
     (Detached, "sound hooks", "tensor that has a gradient", "loss has no gradient; was it detached?"),
     (NoGradients, "sound hooks", "finite gradients of the trained parameters", "no parameter"),
-    (Whole, "sound hooks", "a finite float of at least 0", "the step size must be a finite float of at least 0, not 1"),
+    (
+        Whole,
+        "sound hooks",
+        "a finite float of at least 0",
+        "the step size must be a finite float of at least 0, not 1",
+    ),
     (Poisons, "sound hooks", "a policy of finite weights", "head.position is not finite after 'right'"),
     (Breaks, "sound hooks", "end_task() to run without an error", "RuntimeError: cannot merge right"),
     (Boasts, "sound hooks", "values that JSON can hold", "not JSON compliant"),
-    (Sneaks, "declared data", "what `uses` declares", "prior demonstrations that it does not declare"),
-    (Lingers, "declared data", "what `uses` declares", "does not declare for this hook"),
+    (
+        Sneaks,
+        "declared data",
+        "prior data that `uses` declares",
+        "prior demonstrations that it does not declare",
+    ),
+    (Lingers, "declared data", "prior data that `uses` declares", "does not declare for this hook"),
     (Hoards, "declared data", "to draw from its arguments", "after the hooks that received it"),
     (Modest, "declared data", "prior questions to be drawn", "they are never drawn; leave them out"),
     (Early, "declared data", "prior demonstrations to be drawn", "in prepare() alone; declare 'prepare'"),
@@ -265,7 +275,7 @@ FAULTS: list[tuple[Any, str, str, str]] = [
 
 
 @pytest.mark.parametrize(("cls", "clause", "expected", "found"), FAULTS)
-def test_a_planted_fault_is_found_by_its_own_message(
+def test_a_planted_fault_is_found_with_its_own_message(
     cls: Any, clause: str, expected: str, found: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -281,7 +291,7 @@ def test_no_two_faults_have_the_same_message() -> None:
     assert len({(expected, found) for _, _, expected, found in FAULTS}) == len(FAULTS)
 
 
-def test_a_message_says_what_was_expected_what_was_found_and_where_to_look() -> None:
+def test_a_message_shows_the_expectation_the_finding_and_the_place() -> None:
     with pytest.raises(ContractError) as caught:
         check_method(Forgetful)
     assert str(caught.value).splitlines() == [
@@ -292,7 +302,7 @@ def test_a_message_says_what_was_expected_what_was_found_and_where_to_look() -> 
     ]
 
 
-def test_an_error_survives_the_way_from_another_process() -> None:
+def test_an_error_can_be_sent_from_another_process() -> None:
     error = ContractError("state", "one", "two", "three")
     assert str(pickle.loads(pickle.dumps(error))) == str(error)
 
@@ -305,7 +315,7 @@ def test_the_page_of_the_contract_has_a_heading_for_each_clause_in_order() -> No
 
 @dataclasses.dataclass(frozen=True)
 class Sound(Method):
-    """Draws from every generator, keeps a state, and uses all that it declares."""
+    """Draws from every generator, keeps a state, and uses all data that it declares."""
 
     share: float = 0.5
     words: str = "a text"
@@ -334,7 +344,7 @@ class Sound(Method):
 
 @dataclasses.dataclass
 class Seldom(Method):
-    """Asks a question at a few of the steps."""
+    """Asks questions at a few of the steps."""
 
     uses = Uses(questions="throughout")
 
@@ -368,27 +378,27 @@ def test_the_checks_have_names() -> None:
     assert [str(check) for check in CHECKS][:3] == ["declaration", "constructor", "sound_hooks"]
 
 
-def test_settings_shorten_a_preparation() -> None:
+def test_settings_can_shorten_a_preparation() -> None:
     ewc = load_method("ewc")
     (check,) = (check for check in method_checks(ewc, samples=1) if str(check) == "sound_hooks")
     assert check.subject.build() == ewc(samples=1)  # type: ignore[call-arg]
     check()
 
 
-def test_the_hooks_are_called_in_the_order_that_the_page_tells() -> None:
+def test_the_hooks_are_called_in_the_order_of_the_page() -> None:
     called: list[str] = []
 
-    def telling(hook: str) -> Any:
+    def recorded(hook: str) -> Any:
         def call(self: Method, *arguments: Any) -> Any:
             called.append(hook)
             return getattr(Method, hook)(self, *arguments)
 
         return call
 
-    telltale: type[Method] = dataclasses.dataclass(
-        type("Telltale", (Method,), {hook: telling(hook) for hook in HOOKS})
+    recording: type[Method] = dataclasses.dataclass(
+        type("Recording", (Method,), {hook: recorded(hook) for hook in HOOKS})
     )
-    ToyRun(telltale, targets=2, steps=2)
+    ToyRun(recording, targets=2, steps=2)
     step = ["batch", "loss", "gradients", "learning_rate"]
     stage = ["load_state", "start_task", *step, *step, "end_task", "diagnostics", "state"]
     assert called == ["prepare", "diagnostics", "state", *stage, *stage, "load_state"]

@@ -39,7 +39,7 @@ class Prepared(Method):
 
 @dataclasses.dataclass
 class Rounding(Method):
-    """Changes what it is given."""
+    """Changes its argument."""
 
     rate: float = 0.5
 
@@ -128,7 +128,7 @@ class Anchored(Method):
 
 @dataclasses.dataclass
 class Restarts(Method):
-    """Begins to count anew without a word."""
+    """Restarts its count silently."""
 
     def gradients(self, policy: Policy, loss: Tensor) -> None:
         self.count = getattr(self, "count", 0) + 1
@@ -148,7 +148,7 @@ class Structured(Method):
 
 @dataclasses.dataclass
 class OneWay(Method):
-    """Cannot take back its state."""
+    """Cannot load its state."""
 
     def state(self) -> MethodState:
         return {"count": 1}
@@ -164,13 +164,13 @@ class Grows(Method):
 
 @dataclasses.dataclass
 class Draws(Method):
-    """Draws while it tells."""
+    """Draws in its diagnostics."""
 
     def diagnostics(self) -> dict[str, Any]:
         return {"luck": bool(random.random() < 2)}
 
 
-# ---- faults that stay in the process -----------------------------------------------------------------------
+# ---- faults that persist in the process --------------------------------------------------------------------
 
 
 @dataclasses.dataclass
@@ -199,7 +199,7 @@ class Blind(Method):
 
 @dataclasses.dataclass
 class Careless(Method):
-    """Allows what does not repeat itself."""
+    """Allows nondeterministic algorithms."""
 
     def start_task(self, policy: Policy, stage: Stage) -> Iterable[nn.Parameter]:
         torch.use_deterministic_algorithms(False)
@@ -224,7 +224,7 @@ class Moves(Method):
 
 @dataclasses.dataclass
 class Paths(Method):
-    """Changes where modules are looked for."""
+    """Changes the search path of modules."""
 
     def prepare(self, policy: Policy, prior: Prior) -> None:
         sys.path.append("/nowhere")
@@ -248,7 +248,7 @@ class Writes(Method):
 
 @dataclasses.dataclass
 class Patches(Method):
-    """Changes what all policies are."""
+    """Changes the class of all policies."""
 
     def prepare(self, policy: Policy, prior: Prior) -> None:
         setattr(Policy, "predict", Policy.act)  # noqa: B010 - mypy minds an assignment
@@ -276,19 +276,24 @@ class Backwards(Method):
 FAULTS: list[tuple[Any, str, str, str]] = [
     (Demanding, "constructor", "a default for every hyper-parameter", "rate has none"),
     (Prepared, "constructor", "only hyper-parameters to be stored", "it sets buffer"),
-    (Rounding, "constructor", "to be kept as they are given", "rate=0.5 becomes 0"),
+    (Rounding, "constructor", "to be kept unchanged", "rate=0.5 becomes 0"),
     (Loaded, "constructor", "numbers, truth values, text", "weights is a Tensor"),
-    (Unequal, "constructor", "equal objects from equal arguments", "two objects of the defaults differ"),
+    (Unequal, "constructor", "equal objects from equal arguments", "two objects with the defaults differ"),
     (Learned, "constructor", "every field to be a hyper-parameter", "anchor has init=False"),
-    (Seeded, "constructor", "nothing to be done but storing", "torch's random generator was moved or set"),
-    (Picky, "constructor", "an object of the defaults to be made", "ValueError: never"),
+    (
+        Seeded,
+        "constructor",
+        "a constructor that only stores values",
+        "torch's random generator was moved or set",
+    ),
+    (Picky, "constructor", "the defaults to make an object", "ValueError: never"),
     (Timed, "same numbers", "two runs with one seed to be equal", "differs in stage 1 (right) by up to"),
     (Remembers, "same numbers", "two runs with one seed to be equal", "diagnostics differs in prepare"),
-    (Reseeds, "seeding", "draw, but do not seed", "after batch() numpy.random stands alike"),
-    (Anchored, "state", "a new object that has what load_state() sets", "no attribute 'anchor'"),
-    (Restarts, "state", "state() to return all that later stages need", "differs in stage 2 (down)"),
+    (Reseeds, "seeding", "draw, but do not seed", "after batch() numpy.random is in the same state"),
+    (Anchored, "state", "a new object that has only what load_state() sets", "no attribute 'anchor'"),
+    (Restarts, "state", "state() to return everything that later stages need", "differs in stage 2 (down)"),
     (Structured, "state", "tensors and plain values", "a list, 'losses'"),
-    (OneWay, "state", "load_state() to go through", "returns a state() but has no load_state()"),
+    (OneWay, "state", "load_state() to run without an error", "returns a state() but has no load_state()"),
     (Grows, "state", "load_state() to add to a plain policy what prepare() added", "scale"),
     (Draws, "global state", "as it was", "after diagnostics() Python's random generator was moved"),
     (Threads, "global state", "as it was", "after prepare() torch.get_num_threads() is 2, was 1"),
@@ -323,7 +328,7 @@ def test_no_two_faults_have_the_same_message() -> None:
     assert len({(expected, found) for _, _, expected, found in FAULTS}) == len(FAULTS)
 
 
-def test_what_a_faulty_method_leaves_behind_is_put_back(
+def test_changes_that_a_faulty_method_leaves_behind_are_undone(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)

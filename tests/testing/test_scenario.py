@@ -1,4 +1,4 @@
-"""`check_scenario`: it passes what is sound, and names the first thing that is not."""
+"""`check_scenario`: it accepts sound scenarios, and names the first fault of others."""
 
 import dataclasses
 from collections.abc import Callable
@@ -17,7 +17,7 @@ HERE = f"{__name__}:"
 
 
 class Rounded(ToyWorld):
-    """States are of another type than their space."""
+    """Its states have another type than their space."""
 
     def reset(self, **options: Any) -> tuple[Any, dict[str, Any]]:
         state, info = super().reset(**options)
@@ -25,7 +25,7 @@ class Rounded(ToyWorld):
 
 
 class Remembering(ToyWorld):
-    """An episode depends on how many were run before."""
+    """Its episodes depend on the number of earlier episodes."""
 
     episodes = 0
 
@@ -37,21 +37,21 @@ class Remembering(ToyWorld):
 
 
 class Alike(ToyWorld):
-    """All seeds begin alike."""
+    """Its initial state does not depend on the seed."""
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
         return super().reset(seed=0, options=options)
 
 
 class Mute(ToyWorld):
-    """Its info does not say success."""
+    """Its info does not report success."""
 
     def step(self, action: Any) -> Any:
         return *super().step(action)[:4], {}
 
 
 class Giving(ToyWorld):
-    """It is a success whatever is done."""
+    """It succeeds with any action."""
 
     def step(self, action: Any) -> Any:
         state, reward, *_ = super().step(action)
@@ -59,7 +59,7 @@ class Giving(ToyWorld):
 
 
 class Lost(ToyWorld):
-    """Its rewards are no numbers."""
+    """Its rewards are not numbers."""
 
     def step(self, action: Any) -> Any:
         state, _, *rest = super().step(action)
@@ -79,7 +79,7 @@ class Framed(ToyWorld):
 
 
 class Wide(ToyWorld):
-    """Its states are longer than those of the toy."""
+    """Its states are longer than the toy's."""
 
     observation_space = spaces.Box(-np.inf, np.inf, (5,), np.float32)
 
@@ -93,7 +93,7 @@ class Wide(ToyWorld):
 
 
 class Askew(ToyWorld):
-    """Side by side its episodes are others."""
+    """Its episodes differ side by side."""
 
     @staticmethod
     def vector_world(lanes: int, threads: int) -> PlainVectorWorld:
@@ -109,12 +109,12 @@ def long(task: str) -> Callable[[Any], Any]:
 
 
 def careless(task: str) -> Callable[[Any], Any]:
-    """It forgets how to go down."""
+    """It cannot go down."""
     return toy_expert("up" if task == "down" else task)
 
 
 def fractions(states: Any) -> Any:
-    """Answer with a number that is not whole."""
+    """Answer with a fraction."""
     return np.zeros(len(states))
 
 
@@ -151,14 +151,14 @@ def test_the_toy_passes() -> None:
         ("Remembering", "the same seed and actions give another episode after other episodes"),
         ("Alike", "all seeds have the same initial state"),
         ("Mute", r'terminated is True, but info\["success"\] None'),
-        ("Giving", "done by doing nothing"),
+        ("Giving", "doing nothing completes it"),
         ("Lost", "step 0: the reward is nan"),
         ("Strong", "actions must go from -1 to 1"),
         ("Framed", "observation space must be a Box of one axis"),
         ("Askew", "side by side its episodes differ"),
     ],
 )
-def test_a_world_that_is_not_sound_is_named(world: str, message: str) -> None:
+def test_a_faulty_world_is_named(world: str, message: str) -> None:
     with pytest.raises(ScenarioError, match=message):
         check_scenario(with_parts(world=world), episodes=3)
 
@@ -180,7 +180,7 @@ def test_an_expert_that_cannot_do_its_task_is_named(expert: str, message: str) -
     ("questions", "message"),
     [
         ("NO_QUESTIONS", "there must be questions"),
-        ("TWICE", "each kind with a name of its own"),
+        ("TWICE", "each kind with its own name"),
         ("ONE_ANSWER", "answers must be two words or more"),
         ("LONG_ANSWER", "answers must be two words or more"),
         ("STRANGE_WORD", "'wherefore' in 'wherefore is it' is not in the vocabulary"),
@@ -202,7 +202,7 @@ def test_worlds_of_different_sizes_are_named() -> None:
         check_scenario(dataclasses.replace(TOY, held_out=(wide,)), episodes=3)
 
 
-def test_an_entry_point_that_is_not_there_is_named() -> None:
+def test_a_missing_entry_point_is_named() -> None:
     with pytest.raises(LookupError, match=r"has no 'Giveing'\. Did you mean 'Giving'"):
         check_scenario(with_parts(world="Giveing"))
 

@@ -61,5 +61,5 @@ def test_who_has_chosen_is_obeyed(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_the_fault_is_the_last_line_of_the_process_that_tried() -> None:
     fault = rendering_fault("egl", "clbench.testing:NoWorld")
     assert fault is not None
-    error = "clbench.base.errors.UnknownNameError: No entry point 'clbench.testing:NoWorld': module"
+    error = "UnknownNameError: No entry point 'clbench.testing:NoWorld': module"
     assert fault.startswith(error)

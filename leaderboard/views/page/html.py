@@ -17,7 +17,7 @@ from markupsafe import Markup
 from ...board.overall import overall
 from ...board.rows import Row, Table
 from ...board.tiers import TIERS
-from ..format import title_of
+from ..format import counted, title_of
 from .charts import FONT, NARROW, PALETTE, SERIES, SHAPES, WIDE, along_a_run, colour, in_theme, plane
 from .view import OTHERS, SHADES, ScenarioView, columns, grouped, number, scenarios
 
@@ -104,6 +104,7 @@ def _templates() -> Environment:
         tiers=TIERS,
         tier_rules=TIER_RULES,
         title_of=title_of,
+        counted=counted,
         number_of=number,
         shade_of_rank=_shade_of_rank,
     )

@@ -107,7 +107,7 @@ def test_the_page_and_the_csv_show_every_order_and_the_range(add: Callable[..., 
     page = show(records)
     names = ", ".join(TARGETS[place] for place in target_order(3, 1))
     assert f'<th scope="row">1</th><td>{names}</td><td class="numeric">0.70</td>' in page
-    assert "Order sensitivity: 0.20, the greatest less the least." in page
+    assert "Order sensitivity: 0.20, the highest minus the lowest." in page
     head, line = (records.parent / "site" / "leaderboard.csv").read_text(encoding="utf-8").splitlines()
     assert dict(zip(head.split(","), line.split(","), strict=True))["order_sensitivity"] == "0.2000"
 

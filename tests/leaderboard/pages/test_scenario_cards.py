@@ -234,7 +234,7 @@ def test_a_card_that_is_made_again_has_the_same_bytes_and_nothing_is_measured_tw
     (bench.output / "Toy-v0" / "experts.json").write_text("[torn")
     (bench.output / "Toy-v0" / "up.webp").unlink()
     bench.card()
-    assert "5 experts measured, 1 pictures drawn" in capsys.readouterr().err
+    assert "5 experts measured, 1 picture drawn" in capsys.readouterr().err
     assert {path: path.read_bytes() for path in files} == files
     bench.card(episodes=4)
     assert "5 experts measured, 0 pictures drawn" in capsys.readouterr().err

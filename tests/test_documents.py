@@ -1,0 +1,72 @@
+"""The hand-written documents: their links, and the versions that several files repeat."""
+
+import re
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+DOCUMENTS = sorted(
+    [*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")], key=lambda path: path.relative_to(ROOT).as_posix()
+)
+
+
+def _links(text: str) -> Iterator[str]:
+    """Yield the targets of the links of a page that lead to files."""
+    plain = re.sub(r"```.*?```", "", text, flags=re.DOTALL)
+    yield from (link for link in re.findall(r"\]\(([^)\s]+)\)", plain) if not link.startswith("http"))
+
+
+def _anchors(text: str) -> set[str]:
+    """Return the anchors of a page's headings, as GitHub writes them."""
+    headings = re.findall(r"^#+ (.*)$", text, flags=re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
+@pytest.mark.parametrize("page", DOCUMENTS, ids=lambda page: page.relative_to(ROOT).as_posix())
+def test_every_link_of_a_document_leads_to_a_file_and_a_heading(page: Path) -> None:
+    broken = []
+    for link in _links(page.read_text(encoding="utf-8")):
+        path, _, anchor = link.partition("#")
+        target = (page.parent / path).resolve() if path else page
+        there = target.exists()
+        if there and anchor and target.suffix == ".md":
+            there = anchor in _anchors(target.read_text(encoding="utf-8"))
+        if not there:
+            broken.append(link)
+    assert broken == []
+
+
+def _text(name: str) -> str:
+    return (ROOT / name).read_text(encoding="utf-8")
+
+
+def test_the_citation_has_the_version_and_the_licence_of_the_package() -> None:
+    project = tomllib.loads(_text("pyproject.toml"))["project"]
+    citation = dict(re.findall(r"^(version|license): (.+)$", _text("CITATION.cff"), flags=re.MULTILINE))
+    assert citation == {"version": project["version"], "license": project["license"]}
+
+
+def test_the_pre_commit_hooks_use_the_same_ruff_as_the_tests() -> None:
+    development = tomllib.loads(_text("pyproject.toml"))["project"]["optional-dependencies"]["dev"]
+    (pinned,) = (one.removeprefix("ruff==") for one in development if one.startswith("ruff=="))
+    assert re.findall(r"rev: v(.+)", _text(".pre-commit-config.yaml")) == [pinned]
+
+
+def test_the_list_of_decisions_has_every_decision() -> None:
+    folder = ROOT / "docs" / "decisions"
+    listed = set(_links((folder / "README.md").read_text(encoding="utf-8")))
+    assert listed == {path.name for path in folder.glob("[0-9]*.md")}
+
+
+def test_the_architecture_page_has_a_row_for_every_package() -> None:
+    rows = set(re.findall(r"^\| `([\w.]+)` \|", _text("docs/architecture.md"), flags=re.MULTILINE))
+    core = {path.parent.name for path in (ROOT / "clbench").glob("*/__init__.py")}
+    parts = {
+        f"{part}.{path.parent.name}"
+        for part in ("envs", "leaderboard")
+        for path in (ROOT / part).glob("*/__init__.py")
+    }
+    assert core | parts | {"methods"} == rows
