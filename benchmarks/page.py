@@ -1,7 +1,7 @@
-"""How large the page is and how long it takes to make, from made records: `python benchmarks/page.py`.
+"""Size of the page, and time to make it from generated records: `python benchmarks/page.py`.
 
 The records have the shape of Fetch-v0's. A method is two numbers: how well it learns, and how much it keeps.
-Asked for are less than 3 MB and 20 s with 15 methods, 5 seeds and 4 scenarios.
+The goal is less than 3 MB and 20 s with 15 methods, 5 seeds and 4 scenarios.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ STEPS = (37, 75, 150, 300)
 EPISODES, ON_THE_WAY, VALIDATION, KINDS, ASKED = 20, 5, 10, 14, 72
 BUDGET = {"test_episodes": EPISODES, "curve_episodes": ON_THE_WAY, "validation_episodes": VALIDATION}
 REFERENCES = ("sft", "joint", "from_scratch", "frozen")
-"""Methods that others are compared with."""
+"""Methods with which others are compared."""
 
 
 def main() -> None:

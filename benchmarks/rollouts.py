@@ -70,7 +70,7 @@ class Suite:
 
 
 def _fetch_peer() -> Env:
-    with contextlib.redirect_stderr(io.StringIO()):  # otherwise each process prints a notice about Adroit's hand
+    with contextlib.redirect_stderr(io.StringIO()):  # hides a notice about Adroit's hand in each process
         import gymnasium_robotics
 
     gymnasium.register_envs(gymnasium_robotics)

@@ -1,10 +1,10 @@
 """Cost of an adaptation step of each method, as a ratio to plain fine-tuning: `make benchmark`.
 
-Methods take turns in blocks of steps, in a new order each round, so that other work on the machine affects all
-of them equally. A ratio compares two blocks of one round; the results are the median over rounds and its 95 %
-bootstrap interval. The policy, the data and the batches come from the first target of a real run. The limit is
-a bare PyTorch loop of the same model on batches in memory: the additional time of plain fine-tuning is the
-cost of hooks, sources and checks.
+Methods take turns in blocks of steps, in a new order each round, so that other work on the machine affects
+all of them equally. A ratio compares two blocks of one round; the results are the median over rounds and its
+95 % bootstrap interval. The policy, the data and the batches come from the first target of a real run. The
+limit is a bare PyTorch loop of the same model on batches in memory: the additional time of plain fine-tuning
+is the cost of hooks, sources and checks.
 """
 
 from __future__ import annotations

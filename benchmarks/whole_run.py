@@ -1,8 +1,8 @@
 """Time and memory of a whole run, by its parts: `python benchmarks/whole_run.py ID`.
 
 It times one run of plain fine-tuning with one thread, as in `clbench run`, with its data and its pretrained
-policy in the cache. Clocks measure the physics, the pictures and the policy of the evaluation; training is the
-time of the loop without evaluations. The current speed of the machine is given too: matrix products of a
+policy in the cache. Clocks measure the physics, the pictures and the policy of the evaluation; training is
+the time of the loop without evaluations. The current speed of the machine is given too: matrix products of a
 policy's size, in GFLOPS, before and after.
 """
 
@@ -43,7 +43,7 @@ PARTS = {
 def main() -> None:
     """Measure, print a table and write results/whole_run.json."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("scenario", help="Gymnasium id; one per process, because the peak memory is the process's")
+    parser.add_argument("scenario", help="one per process, because the memory is the whole process's")
     parser.add_argument("--method", default="sft")
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()

@@ -1,9 +1,9 @@
 """Gain from a second worker, and cost of Ray: `python benchmarks/workers.py`.
 
-One worker, one worker per core and a Ray cluster on this machine take turns at the same runs: methods that take
-as long as plain fine-tuning, on the first target. Everything that the runs need is in the cache before. The
-cluster, and the process of each of its workers that has imported everything, start before the clock; the time
-of the start is reported separately. The records must be equal except for their times.
+One worker, one worker per core and a Ray cluster on this machine take turns at the same runs: methods that
+take as long as plain fine-tuning, on the first target. Everything that the runs need is in the cache before.
+The cluster, and the process of each of its workers that has imported everything, start before the clock; the
+time of the start is reported separately. The records must be equal except for their times.
 """
 
 from __future__ import annotations

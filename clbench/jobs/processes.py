@@ -55,7 +55,7 @@ class Processes:
 
     def start(self, job: Job) -> None:
         """Start a job in its own process."""
-        with _undisturbed():
+        with _signals_held_back():
             worker = _start(job)
             self._running[worker.connection] = worker
 
@@ -101,7 +101,7 @@ def _leave(process: BaseProcess) -> None:
 
 
 @contextmanager
-def _undisturbed() -> Iterator[None]:
+def _signals_held_back() -> Iterator[None]:
     """Hold back Ctrl-C and SIGTERM inside: an interrupted start would leave half a process behind."""
     if threading.current_thread() is not threading.main_thread():
         yield

@@ -140,7 +140,7 @@ def _pretrain(scenario: Scenario, seed: int, progress: ProgressCallback) -> Poli
     else:
         policy.normalise_like(questions.state)
     if policy.backbone.vision is not None:
-        _open_eyes(
+        _pretrain_vision(
             policy.backbone.vision,
             scenario,
             seed,
@@ -167,7 +167,7 @@ def _pretrain(scenario: Scenario, seed: int, progress: ProgressCallback) -> Poli
     return policy
 
 
-def _open_eyes(
+def _pretrain_vision(
     vision: Vision,
     scenario: Scenario,
     seed: int,

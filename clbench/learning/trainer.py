@@ -134,7 +134,7 @@ class Trainer:
         return Prior(sources)
 
     def _source(self, name: str, number: int, data: Any) -> Source[Any]:
-        """Return data with its own random stream: draws from one source do not change those of another."""
+        """Return data with its own random stream: draws from one source do not affect another source."""
         generator = torch_generator(name, self.seed, number)
         return Source(data, generator, self.scenario.budget.batch_size, self.device)
 

@@ -95,7 +95,7 @@ def _parameters(trainer: Trainer) -> int:
 
 @dataclasses.dataclass
 class _Run:
-    """A running run: the trainer, the examiner, and the record so far.
+    """A run in progress: the trainer, the examiner, and the record so far.
 
     After each stage it writes a checkpoint of the trainer and of the record, and the next stage begins with
     it: an interrupted run therefore continues as if nothing had happened.

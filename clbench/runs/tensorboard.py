@@ -1,4 +1,4 @@
-"""Live logging: shows a running run in TensorBoard. The record does not depend on the log."""
+"""Live logging: shows a run in progress in TensorBoard. The record does not depend on the log."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def require_tensorboard() -> None:
 
 
 class Log:
-    """The scalars of one run over the optimiser steps since the first target. It needs a folder to log.
+    """A log of one run's scalars over the optimiser steps since the first target.
 
     `training/` has the loss and the step size every `LOG_STEPS` steps. At every evaluation point,
     `success_test/`, `success_validation/` and `success_perturbed/` have the success rate of each task,

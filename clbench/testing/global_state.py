@@ -127,7 +127,7 @@ _hooked = False
 
 @contextmanager
 def _written() -> Iterator[list[Path]]:
-    """Record the files that Python opens for writing inside, without those of compiled libraries."""
+    """Record the files that Python opens for writing inside; files of compiled libraries are missed."""
     global _recording, _hooked
     if not _hooked:  # an audit hook stays until the process ends
         sys.addaudithook(_audit)

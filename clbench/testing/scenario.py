@@ -165,7 +165,7 @@ def _check_side_by_side(task: Task, seeds: list[int], alone: list[_Episode]) -> 
             for lane, state in zip(going, states, strict=True):
                 found[lane].append(state)
     if any(not np.array_equal(np.array(found[lane]), alone[lane].states) for lane in lanes):
-        raise ScenarioError(f"task {task.name}: side by side its episodes differ from those of {task.world}.")
+        raise ScenarioError(f"task {task.name}: side by side its episodes differ from {task.world} alone.")
 
 
 # ---- questions ---------------------------------------------------------------------------------------------

@@ -161,10 +161,10 @@ def test_a_policy_that_returns_nan_fails_its_episodes_and_stops_nothing(fetch_po
 
 def test_answers_are_counted_by_kind() -> None:
     policy, _ = pretrained_policy(TOY, 0)
-    _, report = load_questions(TOY)
-    kind, questions = scored_questions(report, 90)
-    counts = answer(policy, report.kinds, kind, questions)
+    _, test = load_questions(TOY)
+    kind, questions = scored_questions(test, 90)
+    counts = answer(policy, test.kinds, kind, questions)
     assert [(name, asked) for name, asked, _ in counts] == [("side", 45), ("height", 45)]
     assert sum(correct for _, _, correct in counts) > 75
     swapped = dataclasses.replace(questions, answer=questions.answer.roll(1))
-    assert sum(c for _, _, c in answer(policy, report.kinds, kind, swapped)) < 75
+    assert sum(c for _, _, c in answer(policy, test.kinds, kind, swapped)) < 75

@@ -1,4 +1,4 @@
-"""Ctrl-C at any moment of a run: the command ends with 130, leaves no process, and continues when repeated."""
+"""Ctrl-C at any moment of a run: the command ends with 130, leaves no process, and continues if repeated."""
 
 import os
 import random

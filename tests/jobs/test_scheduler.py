@@ -168,7 +168,7 @@ def test_a_run_waits_for_the_data_that_it_needs_and_no_other_data_is_made(
     scenario = load_scenario(TOY)
     skills = {f"Toy-v0 demonstrations {task.name}" for task in scenario.retained}
     targets = {f"Toy-v0 demonstrations {task.name}" for task in scenario.target}
-    policy, questions, report, sft, joint = (
+    policy, questions, start, sft, joint = (
         f"Toy-v0 {name}"
         for name in (
             "pretraining seed 0",
@@ -180,12 +180,12 @@ def test_a_run_waits_for_the_data_that_it_needs_and_no_other_data_is_made(
     )
     found = needs("sft", "joint")
     assert found[policy] == {questions} | skills
-    assert found[report] == {policy, questions}
-    assert found[sft] == {policy, questions, report} | targets
-    assert found[joint] == {policy, questions, report} | targets | skills
+    assert found[start] == {policy, questions}
+    assert found[sft] == {policy, questions, start} | targets
+    assert found[joint] == {policy, questions, start} | targets | skills
     assert set(found) == {sft, joint} | found[joint]
     pretrained_policy(scenario, 0)
-    assert needs("sft")[report] == {questions}
+    assert needs("sft")[start] == {questions}
     evaluate_pretrained(RunSpec(TOY, "joint", 0).resolve())
     assert needs("sft") == {sft: {questions} | targets, questions: set(), **{name: set() for name in targets}}
     demonstrated = {path.parent.name for path in (empty_caches / "minari").rglob("data")}

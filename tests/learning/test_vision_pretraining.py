@@ -25,7 +25,7 @@ def questions() -> tuple[Questions, Questions]:
     return load_questions(SEEN_TOY)
 
 
-def _eyes() -> Vision:
+def _new_vision() -> Vision:
     config = policy_config(SEEN_TOY)
     with torch.random.fork_rng():
         torch.manual_seed(3)
@@ -37,27 +37,27 @@ def _pictures(questions: Questions) -> list[Pictures]:
 
 
 def _pretrained(questions: Questions, steps: int) -> Vision:
-    eyes = _eyes()
+    vision = _new_vision()
     generator = torch_generator("vision", 0)
-    pretrain_vision(eyes, _pictures(questions), questions.kinds, steps, generator)
-    return eyes
+    pretrain_vision(vision, _pictures(questions), questions.kinds, steps, generator)
+    return vision
 
 
 @torch.no_grad()
-def _error(eyes: Vision, train: Questions, report: Questions) -> float:
+def _error(vision: Vision, train: Questions, test: Questions) -> float:
     """Return the error of a least-squares fit on the tokens that locates the objects in new pictures."""
 
     def inputs(part: Questions) -> Tensor:
-        return torch.nn.functional.pad(eyes(part.image).flatten(1), (0, 1), value=1.0).double()
+        return torch.nn.functional.pad(vision(part.image).flatten(1), (0, 1), value=1.0).double()
 
     fit = np.linalg.lstsq(inputs(train).numpy(), train.scenes[:, :4].double().numpy(), rcond=1e-6)[0]
-    told = inputs(report).numpy() @ fit
-    return float(np.abs(told - report.scenes[:, :4].numpy()).mean())
+    predicted = inputs(test).numpy() @ fit
+    return float(np.abs(predicted - test.scenes[:, :4].numpy()).mean())
 
 
 def test_the_vision_learns_to_locate_the_objects_in_a_picture(questions: tuple[Questions, Questions]) -> None:
-    train, report = questions
-    assert _error(_pretrained(train, 150), train, report) < 0.6 * _error(_eyes(), train, report)
+    train, test = questions
+    assert _error(_pretrained(train, 150), train, test) < 0.6 * _error(_new_vision(), train, test)
 
 
 def test_the_same_generator_gives_the_same_vision(questions: tuple[Questions, Questions]) -> None:
@@ -68,15 +68,15 @@ def test_the_same_generator_gives_the_same_vision(questions: tuple[Questions, Qu
 def test_numbers_are_about_one_and_answers_match_the_questions(
     questions: tuple[Questions, Questions],
 ) -> None:
-    train, report = questions
-    sets = [(part.scenes, part.image) for part in (train, report)]
+    train, test = questions
+    sets = [(part.scenes, part.image) for part in (train, test)]
     pictures = pictures_of(sets, ToyCamera, train.kinds)
     numbers = torch.cat([one.numbers for one in pictures])
     low, middle, high = numbers.quantile(torch.tensor([0.25, 0.5, 0.75]), dim=0)
     torch.testing.assert_close(middle, torch.zeros(4), atol=0.01, rtol=0)
     torch.testing.assert_close(high - low, torch.full((4,), 1.35), atol=0.01, rtol=0)
     for column, kind in enumerate(train.kinds):
-        assert pictures[1].answers[:, column].tolist() == kind.answer(report.scenes.numpy()).tolist()
+        assert pictures[1].answers[:, column].tolist() == kind.answer(test.scenes.numpy()).tolist()
 
 
 def test_an_outlier_does_not_outweigh_the_other_pictures(questions: tuple[Questions, Questions]) -> None:
@@ -92,9 +92,9 @@ def test_a_question_without_an_answer_in_any_picture_of_a_step_does_no_harm(
 ) -> None:
     (pictures,) = _pictures(questions[0])
     silent = Pictures(pictures.image, pictures.numbers, torch.full_like(pictures.answers, -1))
-    eyes = _eyes()
-    pretrain_vision(eyes, [silent], questions[0].kinds, 3, torch_generator("vision", 0))
-    assert all(torch.isfinite(parameter).all() for parameter in eyes.parameters())
+    vision = _new_vision()
+    pretrain_vision(vision, [silent], questions[0].kinds, 3, torch_generator("vision", 0))
+    assert all(torch.isfinite(parameter).all() for parameter in vision.parameters())
 
 
 @pytest.mark.usefixtures("empty_caches")

@@ -265,7 +265,10 @@ def test_a_finished_record_is_never_edited(evaluate: Callable[..., Any]) -> None
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"method": "sft"}, "'sft' is a method of clbench: give the agent a name of its own, as 'me/sft'"),
+        (
+            {"method": "sft"},
+            "'sft' is a method of clbench: give the agent its own name, for example 'me/sft'",
+        ),
         ({"method": "SFT"}, "can be taken for the method 'sft'"),
         ({"method": "../sac"}, "cannot be the name of a method"),
         ({"steps": -1}, "steps must be a whole number from 0, not -1"),
@@ -377,7 +380,7 @@ def test_the_page_marks_an_agent_and_shows_no_run_command_for_it(
     lines = [" ".join(line.split()) for line in capsys.readouterr().out.splitlines()]
     assert lines[lines.index("online") + 1].startswith("1 me/knows 1 0.75")
     page = (board / "site" / "index.html").read_text(encoding="utf-8")
-    assert "# me/knows: a program of its own, docs/guide/online.md" in page
+    assert "# me/knows is a separate program: docs/guide/online.md" in page
     assert "clbench run clbench/Toy-v0 me/knows" not in page
     assert "| 1 | me/knows | online |" in (board / "site" / "LEADERBOARD.md").read_text(encoding="utf-8")
 

@@ -45,8 +45,8 @@ def test_the_code_of_the_page_makes_a_row(tmp_path: Path) -> None:
     learning, flat = _blocks("python")
     small = learning.replace("clbench/Fetch-v0", ID).replace("range(5)", "range(3)").replace("5_000", "120")
     command = [sys.executable, "-c", small + flat + SHOW_FLAT]
-    told = _output(command, tmp_path)
-    assert told == "(16,)\n"
+    output = _output(command, tmp_path)
+    assert output == "(16,)\n"
     record = read_record(tmp_path / "leaderboard/records/Toy-v0/me--sac/seed-0.json")
     assert record.costs.environment_steps == 360
     assert (record.costs.parameters or 0) > 0
@@ -54,8 +54,8 @@ def test_the_code_of_the_page_makes_a_row(tmp_path: Path) -> None:
     assert record.run.device == "cpu"
     (shown,) = _blocks("console")
     command = [sys.executable, "-m", *shown.split()]
-    told = _output(command, tmp_path)
-    assert "me/sac" in told
+    output = _output(command, tmp_path)
+    assert "me/sac" in output
 
 
 @pytest.mark.slow
@@ -70,7 +70,7 @@ def test_the_program_of_the_page_makes_a_record_for_each_seed_and_skips_existing
     )
     command = [sys.executable, str(DOCS.parents[1] / script), ID, "--seeds", "1", "--steps", "110"]
     for expected in ("seed 0, stage 2: left ", "seed 0 has a record already"):
-        told = _output(command, tmp_path)
-        assert expected in told
+        output = _output(command, tmp_path)
+        assert expected in output
     record = read_record(tmp_path / "leaderboard/records/Toy-v0/sac/seed-0.json")
     assert record.costs.environment_steps == 330

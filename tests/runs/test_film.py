@@ -162,7 +162,7 @@ def test_a_film_ends_like_the_recorded_episodes(recorded: tuple[Record, Path]) -
     assert made.rows[1:3] == ["up (retained): move up", "right (target): move to the right"]
 
 
-def test_all_columns_of_a_row_begin_alike(recorded: tuple[Record, Path]) -> None:
+def test_all_columns_of_a_row_begin_with_the_same_picture(recorded: tuple[Record, Path]) -> None:
     policies = stage_policies(SPEC.resolve(), recorded[1])
     trials: list[Trial] = [(SCENARIO.task("left"), "validation", 1), (SCENARIO.task("down"), "validation", 1)]
     takes = shoot(SCENARIO, 0, policies, trials, 32)
@@ -190,9 +190,7 @@ def test_a_world_that_does_not_repeat_an_episode_is_refused(
         shoot(SCENARIO, 0, policies, [(task, "validation", 0)], 32)
 
 
-def test_the_command_writes_the_requested_film(
-    recorded: tuple[Record, Path], tmp_path: Path
-) -> None:
+def test_the_command_writes_the_requested_film(recorded: tuple[Record, Path], tmp_path: Path) -> None:
     path = tmp_path / "toy.gif"
     film(
         TOY, "sft", tasks="left,down", stages="0,2", episode=1, size=96, output=path, checkpoints=recorded[1]

@@ -64,9 +64,9 @@ def run(method: str, folder: Path) -> Record:
 
 def test_the_schedule_begins_with_the_first_target() -> None:
     env = ScenarioEnv(SCENARIO, episodes_per_stage=2)
-    walk = [env.reset()[1] for _ in range(5)]
-    assert [info["stage"] for info in walk] == [1, 1, 2, 2, 2]
-    assert [info["task"] for info in walk] == ["right", "right", "down", "down", "down"]
+    schedule = [env.reset()[1] for _ in range(5)]
+    assert [info["stage"] for info in schedule] == [1, 1, 2, 2, 2]
+    assert [info["task"] for info in schedule] == ["right", "right", "down", "down", "down"]
     assert env.reset(options={"stage": 1})[1]["task"] == "right"
     with pytest.raises(ValueError, match="has stages 1 to 2, not 0"):
         env.reset(options={"stage": 0})

@@ -201,8 +201,8 @@ def test_a_scenario_that_cannot_be_perturbed_is_refused_before_any_work(
 def test_frozen_forgets_nothing_and_costs_nothing(tmp_path: Path) -> None:
     record = execute(RunSpec(TOY, "frozen", seed=0), tmp_path)
     rows = list(zip(*record.episodes.values(), strict=True))
-    reported = [row for row in rows if row[3] == "test"]
-    ends = [{row[2:]: row for row in reported if row[:2] == (stage, 60 * bool(stage))} for stage in range(3)]
+    tested = [row for row in rows if row[3] == "test"]
+    ends = [{row[2:]: row for row in tested if row[:2] == (stage, 60 * bool(stage))} for stage in range(3)]
     assert set(record.policy["update_sparsity"]) == {1.0}
     assert set(record.policy["activation_drift"]) == {0.0}
     assert [set(end) for end in ends] == [set(ends[0])] * 3

@@ -14,7 +14,7 @@ TOY = "clbench.testing:clbench/Toy-v0"
 
 
 def test_a_run_looks_up_one_scenario_and_one_method(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    counts = {"scenario_at": 0, "load_method": 0}
+    counts = {"_scenario_at": 0, "load_method": 0}
 
     def counted(name: str, function: Any) -> Any:
         def count(*arguments: Any) -> Any:
@@ -23,13 +23,13 @@ def test_a_run_looks_up_one_scenario_and_one_method(tmp_path: Path, monkeypatch:
 
         return count
 
-    execute(RunSpec(TOY, "sft", 0, targets=1), tmp_path / "first")  # makes what runs need
+    execute(RunSpec(TOY, "sft", 0, targets=1), tmp_path / "first")  # fills the cache
     for module in [one for name, one in sys.modules.items() if name.startswith("clbench.")]:
         for name in counts:
             if name in vars(module):
                 monkeypatch.setattr(module, name, counted(name, getattr(module, name)))
     execute(RunSpec(TOY, "sft", 0, targets=1), tmp_path / "second")
-    assert counts == {"scenario_at": 1, "load_method": 1}
+    assert counts == {"_scenario_at": 1, "load_method": 1}
 
 
 def test_a_resolved_run_has_all_settings_of_its_record() -> None:

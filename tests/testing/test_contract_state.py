@@ -304,7 +304,7 @@ FAULTS: list[tuple[Any, str, str, str]] = [
     (Moves, "global state", "as it was", "os.getcwd() is /"),
     (Paths, "global state", "as it was", "sys.path differs in /nowhere"),
     (Quiet, "global state", "as it was", "warnings.filters differs in"),
-    (Writes, "global state", "in clbench's cache alone", "losses.txt is written"),
+    (Writes, "global state", "only in clbench's cache", "losses.txt is written"),
     (Patches, "global state", "as it was", "the class clbench.Policy differs in predict"),
     (Standstill, "learning", "a mean return of -", "before"),
     (Backwards, "learning", "only a guide, `uses = Uses(reference=True)`, may learn nothing", "before"),
@@ -312,7 +312,7 @@ FAULTS: list[tuple[Any, str, str, str]] = [
 
 
 @pytest.mark.parametrize(("cls", "clause", "expected", "found"), FAULTS)
-def test_a_planted_fault_is_found_by_its_own_message(
+def test_a_planted_fault_is_found_with_its_own_message(
     cls: Any, clause: str, expected: str, found: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
