@@ -11,22 +11,14 @@ import tempfile
 import time
 from itertools import product
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from clbench.base.entry_points import resolve
 from clbench.records.paths import record_path
-from clbench.records.record import (
-    ANSWER_COLUMNS,
-    EPISODE_COLUMNS,
-    POLICY_COLUMNS,
-    Costs,
-    Record,
-    RunInfo,
-    ScenarioInfo,
-)
+from clbench.records.record import AnswerRow, Costs, EpisodeRow, PolicyRow, Record, RunInfo, ScenarioInfo
 from clbench.records.writer import write_record
+from clbench.spec.protocol import Split
 
 GROUPS = {
     "retained": ["reach", "hover", "pick_and_place", "push", "push_left", "push_away"],
@@ -83,7 +75,7 @@ def made_record(
     access = "throughout" if method == "joint" else "never"
     policy = generator.random((len(GROUPS["target"]) * len(STEPS), 2))
     points = list(product(range(1, len(GROUPS["target"]) + 1), STEPS))
-    return Record(
+    record = Record(
         status="success",
         run=RunInfo(
             scenario=scenario,
@@ -96,21 +88,6 @@ def made_record(
             uses={"demonstrations": access, "questions": access, "reference": method in REFERENCES[1:]},
         ),
         scenario=ScenarioInfo(scenario, **GROUPS, evaluation_steps=list(STEPS), budget=dict(BUDGET)),
-        episodes=_columns(EPISODE_COLUMNS, _episodes(learns, keeps, generator)),
-        answers=_columns(
-            ANSWER_COLUMNS,
-            [
-                (stage, step, f"kind_{kind}", ASKED, int(generator.binomial(ASKED, 0.95)))
-                for (stage, step), kind in product([(0, 0), *points], range(KINDS))
-            ],
-        ),
-        policy=_columns(
-            POLICY_COLUMNS,
-            [
-                (0, 0, 1.0, 0.0),
-                *((*point, *map(float, row)) for point, row in zip(points, policy, strict=True)),
-            ],
-        ),
         costs=Costs(optimiser_steps=1200, parameters=673700, parameters_added=0, bytes_kept=2304),
         diagnostics={
             str(stage): {
@@ -127,17 +104,26 @@ def made_record(
             "rollouts": {"world": "65ffb3394577ffdd"},
         },
     )
+    for row in _episodes(learns, keeps, generator):
+        record.add_episode(row)
+    for (stage, step), kind in product([(0, 0), *points], range(KINDS)):
+        correct = int(generator.binomial(ASKED, 0.95))
+        record.add_answers(AnswerRow(stage, step, f"kind_{kind}", ASKED, correct))
+    record.add_policy(PolicyRow(0, 0, 1.0, 0.0))
+    for point, row in zip(points, policy, strict=True):
+        record.add_policy(PolicyRow(*point, *map(float, row)))
+    return record
 
 
-def _episodes(learns: float, keeps: float, generator: np.random.Generator) -> list[tuple[Any, ...]]:
+def _episodes(learns: float, keeps: float, generator: np.random.Generator) -> list[EpisodeRow]:
     tasks = [name for names in GROUPS.values() for name in names]
     known = np.array([0.97] * 6 + [0.05] * 4 + [0.2] * 2)
-    rows: list[tuple[Any, ...]] = []
+    rows: list[EpisodeRow] = []
 
-    def evaluate(stage: int, step: int, names: list[str], split: str, count: int) -> None:
+    def evaluate(stage: int, step: int, names: list[str], split: Split, count: int) -> None:
         for task, episode in product(names, range(count)):
             success = int(generator.random() < known[tasks.index(task)])
-            rows.append((stage, step, task, split, episode, success, float(success), 50))
+            rows.append(EpisodeRow(stage, step, task, split, episode, success, float(success), 50))
 
     evaluate(0, 0, tasks, "test", EPISODES)
     for stage, target in enumerate(GROUPS["target"], 1):
@@ -149,10 +135,6 @@ def _episodes(learns: float, keeps: float, generator: np.random.Generator) -> li
                 evaluate(stage, step, [*GROUPS["retained"], target], "test", ON_THE_WAY)
         evaluate(stage, STEPS[-1], tasks, "test", EPISODES)
     return rows
-
-
-def _columns(names: tuple[str, ...], rows: list[tuple[Any, ...]]) -> dict[str, list[Any]]:
-    return {name: list(column) for name, column in zip(names, zip(*rows, strict=True), strict=True)}
 
 
 if __name__ == "__main__":

@@ -2,6 +2,7 @@
 
 Rehearsal as in Rolnick et al. 2019 (arXiv 1811.11682); arXiv 2603.03818 applies it to vision-language-action
 models.
+
 Details:
 1. Prior data are all demonstrations of the retained skills and of the earlier targets. All tasks are equally
    likely.

@@ -20,15 +20,7 @@ from clbench.learning.optimise import deterministic
 from clbench.learning.prior import Uses
 from clbench.learning.registry import load_method
 from clbench.records.paths import record_path
-from clbench.records.record import (
-    ANSWER_COLUMNS,
-    EPISODE_COLUMNS,
-    POLICY_COLUMNS,
-    Costs,
-    Record,
-    RunInfo,
-    ScenarioInfo,
-)
+from clbench.records.record import AnswerRow, Costs, EpisodeRow, PolicyRow, Record, RunInfo, ScenarioInfo
 from clbench.records.writer import record_text
 from clbench.runs.length import run_length
 from clbench.runs.run import execute
@@ -116,7 +108,7 @@ def stranger(monkeypatch: pytest.MonkeyPatch) -> Callable[[type[Method]], str]:
 
 
 class _Killed(BaseException):
-    """What no handler of the run catches, as when its process is killed."""
+    """An exception that no handler of the run catches, as if its process was killed."""
 
 
 @pytest.fixture
@@ -165,7 +157,7 @@ def add(make_record: Callable[..., Record], matrix: Any, tmp_path: Path) -> Call
         records = tmp_path / "leaderboard" / "records"
         path = records / place if place else record_path(records, record.run.scenario, method, seed)
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(record_text(record), encoding="utf-8")  # unlike write_record, whatever it is
+        path.write_text(record_text(record), encoding="utf-8")  # unlike write_record, it accepts anything
         return path
 
     return add
@@ -212,11 +204,11 @@ def _make_record(
         drift: Activation drift, (targets, points).
         steps: Steps of the evaluation points; the last one ends a stage.
         answers: Questions asked and answered rightly by stage and kind, at the end of the stage.
-        groups: How many tasks are retained, targets and held out; by default one is held out.
+        groups: Numbers of retained tasks, targets and held-out tasks; by default one is held out.
         episodes: Episodes per task, where rates are given.
         curve_episodes: Episodes per task on the way, where rates are given; as many as at the end if None.
         validation_episodes: Validation episodes, where rates are given.
-        run: What differs in `Record.run`, as method="ewc". With split="validation" all episodes are of that.
+        run: Fields of `Record.run`, for example method="ewc"; split="validation" holds for all episodes.
             A built-in method uses what it declares.
     """
     outcomes = _outcomes(success, 2, episodes)
@@ -259,7 +251,7 @@ def _make_record(
         "validation_episodes": validation_episodes,
     }
     given = answers or {}
-    return Record(
+    record = Record(
         status="success",
         run=RunInfo(**run),
         scenario=ScenarioInfo(
@@ -270,15 +262,16 @@ def _make_record(
             evaluation_steps=list(steps),
             budget=budget,
         ),
-        episodes=_columns(EPISODE_COLUMNS, rows),
-        answers=_columns(
-            ANSWER_COLUMNS,
-            [(stage, steps[-1] if stage else 0, kind, *value) for (stage, kind), value in given.items()],
-        ),
-        policy=_columns(POLICY_COLUMNS, _policy_rows(sparsity, drift, (stages, len(steps)), steps)),
         costs=Costs(optimiser_steps=stages * steps[-1], parameters=1000, parameters_added=0, bytes_kept=0),
         fingerprint={"rollouts": {"toy:world": "0123"}},
     )
+    for row in rows:
+        record.add_episode(EpisodeRow(*row))
+    for (stage, kind), value in given.items():
+        record.add_answers(AnswerRow(stage, steps[-1] if stage else 0, kind, *value))
+    for values in _policy_rows(sparsity, drift, (stages, len(steps)), steps):
+        record.add_policy(PolicyRow(*values))
+    return record
 
 
 def _outcomes(values: Any, axes: int, episodes: int) -> Any:
@@ -295,7 +288,7 @@ def _outcomes(values: Any, axes: int, episodes: int) -> Any:
 
 
 def _each(values: Any, axes: int, episodes: int) -> list[tuple[tuple[int, ...], Any]]:
-    """Return the outcomes that there are with their indices; none if `values` is None."""
+    """Return the outcomes with their indices, without NaN; none if `values` is None."""
     if values is None:
         return []
     outcomes = np.ndenumerate(_outcomes(values, axes, episodes))
@@ -305,7 +298,7 @@ def _each(values: Any, axes: int, episodes: int) -> list[tuple[tuple[int, ...], 
 def _policy_rows(
     sparsity: Any, drift: Any, shape: tuple[int, int], steps: tuple[int, ...]
 ) -> list[tuple[Any, ...]]:
-    """Return the rows of the policy table, that of the pretrained policy included; none without values."""
+    """Return the rows of the policy table, including the pretrained policy's; none without values."""
     if sparsity is None and drift is None:
         return []
     tables = [
@@ -316,7 +309,3 @@ def _policy_rows(
         both = (float(table[target, point]) for table in tables)
         rows.append((target + 1, steps[point], *(None if np.isnan(value) else value for value in both)))
     return rows
-
-
-def _columns(names: tuple[str, ...], rows: list[tuple[Any, ...]]) -> dict[str, list[Any]]:
-    return {name: [row[number] for row in rows] for number, name in enumerate(names)}

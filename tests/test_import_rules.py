@@ -38,7 +38,7 @@ SIDEWAYS: frozenset[tuple[str, str]] = frozenset()
 """Imports between two packages of one floor, (importing, imported). There are none."""
 
 PARTS = ("envs", "methods", "leaderboard")
-"""Packages beside the core, which import it and which it never imports."""
+"""Packages outside the core: they import it, and it never imports them."""
 
 USERS_OF_THE_COMMAND_LINE = (
     "clbench.cli",
@@ -77,12 +77,12 @@ class Module:
 
     @property
     def room(self) -> str:
-        """Package of the core, or part beside it, that holds the module; empty for the front door."""
+        """Package of the core, or part outside it, that holds the module; empty for the front door."""
         return (self.name + "..").split(".")[1]
 
 
 def _name(path: Path) -> str:
-    """Return the full name of a module; a wheel has the parts inside `clbench`, a checkout beside it."""
+    """Return the full name of a module; a wheel has the parts inside `clbench`, a checkout next to it."""
     relative = path.relative_to(ROOT).with_suffix("")
     parts = relative.parts if relative.parts[0] == "clbench" else ("clbench", *relative.parts)
     return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
@@ -124,7 +124,7 @@ def _imported(statement: ast.Import | ast.ImportFrom, package: str, known: froze
 def _modules() -> Mapping[str, Module]:
     """Return all modules of the core and its parts by name."""
     paths = [path for folder in ("clbench", *PARTS) for path in sorted((ROOT / folder).rglob("*.py"))]
-    paths = [path for path in paths if path.parent.name != "templates"]  # what `clbench new-method` copies
+    paths = [path for path in paths if path.parent.name != "templates"]  # `clbench new-method` copies them
     known = frozenset(map(_name, paths))
     modules = {}
     for path in paths:

@@ -1,4 +1,4 @@
-"""The package as a whole: its front door, what importing it does, what it brings along."""
+"""The package as a whole: its front door, the effects of its import, and its files."""
 
 import subprocess
 import sys
@@ -27,7 +27,7 @@ def test_importing_registers_the_scenarios_and_loads_nothing_heavy() -> None:
     assert _run(f"{code} print({heavy} & set(sys.modules))") == "set()"
 
 
-def test_the_help_of_run_and_who_sends_runs_to_ray_do_not_wait_for_pytorch() -> None:
+def test_the_help_of_run_and_the_driver_of_ray_jobs_do_not_wait_for_pytorch() -> None:
     code = "import clbench.cli.main, clbench.cli.runs, clbench.jobs.ray, clbench.runs.spec, sys;"
     assert _run(f"{code} print('torch' in sys.modules)") == "False"
 

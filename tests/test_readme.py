@@ -1,4 +1,4 @@
-"""The snippets of the README, run as they stand; the commands run on the toy, which takes seconds."""
+"""The snippets of the README, run unchanged; the commands run on the toy, which takes seconds."""
 
 import re
 import subprocess
@@ -39,7 +39,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.slow
-def test_the_first_snippet_walks_through_the_scenario(tmp_path: Path) -> None:
+def test_the_first_snippet_steps_through_the_scenario(tmp_path: Path) -> None:
     lines = _python(_blocks("python")[0], tmp_path).splitlines()
     assert lines[0].startswith("0 reach - ")
     assert lines[1].startswith("(28,)")
@@ -71,8 +71,10 @@ def test_three_commands_lead_from_nothing_to_a_row_on_the_board(tmp_path: Path) 
     test = check.removeprefix("python -m ").split()
     subprocess.run([*command, *test, *plain], cwd=tmp_path, check=True, capture_output=True)
     words = [*submit.split(), *toy.split()]
-    told = subprocess.run([*command, *words], cwd=tmp_path, check=True, capture_output=True, text=True).stdout
-    assert "Rank 1 of 1 in the division prior-data-free." in told
+    printed = subprocess.run(
+        [*command, *words], cwd=tmp_path, check=True, capture_output=True, text=True
+    ).stdout
+    assert "Rank 1 of 1 in the division prior-data-free." in printed
     assert (tmp_path / "try/records/FetchToy-v0/gentle_tuning.GentleTuning/seed-0.json").is_file()
     assert "gentle" in (tmp_path / "try/site/LEADERBOARD.md").read_text(encoding="utf-8")
 

@@ -1,4 +1,4 @@
-"""A submission as its own package, installed and walked as outsiders would, without a network."""
+"""A submission as its own package, installed and run as outsiders would, without a network."""
 
 import os
 import shutil

@@ -1,4 +1,4 @@
-"""The worked example of `docs/guide/your_scenario.md`, run as it stands by a stranger."""
+"""The worked example of `docs/guide/your_scenario.md`, run unchanged, as a stranger would."""
 
 import os
 import re
@@ -44,7 +44,7 @@ def test_its_scenario_is_an_environment_and_passes_the_check(folder: Path) -> No
     assert _python(folder, "-c", environments + check + shown) == "me/Mine-v0 (4, 4)\n"
 
 
-def test_its_world_is_perturbed_as_the_page_says(tmp_path: Path) -> None:
+def test_its_world_is_perturbed_as_the_page_shows(tmp_path: Path) -> None:
     """Insert the lines of the page into the world, each before or after a line that occurs once."""
     imported, declared, made, drawn, displaced = _fragments()
     world = _blocks("python")[0].replace("render_mode=None", "render_mode=None, perturbed=False")
@@ -86,8 +86,8 @@ def _fragments() -> list[str]:
 @pytest.mark.slow
 def test_its_commands_make_a_row_with_skills_that_are_forgotten(folder: Path) -> None:
     for line in _blocks("console")[0].strip().splitlines():
-        told = _python(folder, "-m", *line.split())
-    assert "me/Mine-v0" in told
+        printed = _python(folder, "-m", *line.split())
+    assert "me/Mine-v0" in printed
     scores = Scores.from_record(read_record(folder / "leaderboard/records/me--Mine-v0/sft/seed-0.json"))
     learned = scores.rates().learned.mean()
     before, after = scores.rates().retained[[0, -1]].mean(axis=-1)

@@ -1,4 +1,4 @@
-"""The cache: what takes long is made once, and used again if it is whole and made from the same inputs."""
+"""The cache: a slow result is made once, and used again if it is whole and made from the same inputs."""
 
 from __future__ import annotations
 
@@ -43,13 +43,13 @@ def hash_of_tensors(tensors: Mapping[str, Tensor]) -> str:
 
 
 def cached(folder: Path, inputs: Mapping[str, Any], make: Callable[[Path], None]) -> Path:
-    """Return `folder`, filled by `make` unless it already holds what the same `inputs` made.
+    """Return `folder`, filled by `make` unless it already holds the result of the same `inputs`.
 
     A folder that is torn, foreign or made from other inputs is named in the log and made again. The new one
     appears in one step, so that a reader, or a second maker, never meets half of it.
 
     Args:
-        folder: Where the result lies.
+        folder: Folder of the result.
         inputs: All that the result depends on, as JSON.
         make: Fills an empty folder.
     """
@@ -69,7 +69,7 @@ def cached(folder: Path, inputs: Mapping[str, Any], make: Callable[[Path], None]
             folder.rename(partial.with_suffix(".old"))
         try:
             partial.rename(folder)
-        except OSError:  # another process was faster: what it made from the same inputs is as good
+        except OSError:  # another process was faster: its result from the same inputs is as good
             if _fault(folder, key) is not None:
                 raise
     finally:
@@ -84,7 +84,7 @@ def is_cached(folder: Path, inputs: Mapping[str, Any]) -> bool:
 
 
 def _fault(folder: Path, key: str) -> str | None:
-    """Return what is wrong with `folder`, or None."""
+    """Return the fault of `folder`, or None."""
     try:
         manifest = json.loads((folder / _MANIFEST).read_text(encoding="utf-8"))
         if manifest["inputs"] != key:

@@ -7,7 +7,7 @@ import importlib
 from collections.abc import Iterable
 from typing import Any
 
-from clbench.base.errors import UnknownNameError
+from clbench.base.errors import ClbenchError, InputError, UnknownNameError
 
 
 def resolve(name: str) -> Any:
@@ -33,13 +33,22 @@ def import_module(module: str, needed_for: str) -> Any:
         needed_for: Name of the thing that needs it, for the message.
 
     Raises:
-        LookupError: The module, or a module that it imports, does not exist.
+        UnknownNameError: The module, or a module that it imports, does not exist.
+        InputError: A module that is not part of clbench raises an error while it is imported.
     """
     try:
         return importlib.import_module(module)
-    except (ModuleNotFoundError, ValueError) as error:  # ValueError: the name is empty
-        missing = getattr(error, "name", None) or module
-        raise UnknownNameError(f"No module {missing!r} can be imported for {needed_for!r}.") from error
+    except ClbenchError:
+        raise
+    except ModuleNotFoundError as error:
+        raise UnknownNameError(f"No module {error.name!r} can be imported for {needed_for!r}.") from error
+    except Exception as error:
+        if module.partition(".")[0] == "clbench":  # a bug of ours shows its traceback
+            raise
+        if not module:
+            raise UnknownNameError(f"No module '' can be imported for {needed_for!r}.") from error
+        what = f"{type(error).__name__}: {error}"
+        raise InputError(f"The module {module!r} cannot be imported for {needed_for!r}: {what}") from error
 
 
 def unknown(kind: str, name: str, known: Iterable[str]) -> UnknownNameError:

@@ -18,7 +18,7 @@ _AGAIN_SECONDS = 0.01
 
 
 def install() -> None:
-    """Remember each Ctrl-C, and raise again what a destructor or a callback dropped."""
+    """Remember each Ctrl-C, and raise it again if a destructor or a callback dropped it."""
     signal.signal(signal.SIGINT, _handle)
     sys.unraisablehook = _raise_again
 
@@ -41,7 +41,7 @@ def _handle(number: int, frame: FrameType | None) -> None:
 
 def _raise_again(unraisable: sys.UnraisableHookArgs) -> None:
     if isinstance(unraisable.exc_value, KeyboardInterrupt):
-        # a moment later, as Python drops what is raised here too
+        # a moment later, as Python drops exceptions raised here too
         threading.Timer(_AGAIN_SECONDS, _interrupt_main).start()
     else:
         sys.__unraisablehook__(unraisable)

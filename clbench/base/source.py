@@ -13,13 +13,13 @@ import sys
 from pathlib import Path
 
 DATA_SOURCES = ("clbench.base", "clbench.spec", "clbench.policy", "clbench.worlds", "clbench.data")
-"""What demonstrations and questions depend on, besides the suite of their tasks."""
+"""Code that demonstrations and questions depend on, besides the suite of their tasks."""
 
 TRAINING_SOURCES = (*DATA_SOURCES, "clbench.learning")
-"""What a pretrained policy depends on, besides the suites of its tasks and questions."""
+"""Code that a pretrained policy depends on, besides the suites of its tasks and questions."""
 
 RUN_SOURCES = (*TRAINING_SOURCES, "clbench.records", "clbench.evaluation", "clbench.runs")
-"""What a run depends on, besides the suites of its tasks and the package of its method."""
+"""Code that a run depends on, besides the suites of its tasks and the package of its method."""
 
 
 def source_hash(*modules: str) -> str:
@@ -67,4 +67,7 @@ def package_of(entry_point: str) -> str:
     """Return the package of "package.module:attribute", or the module if it is in no package."""
     module = entry_point.partition(":")[0]
     package = module.rpartition(".")[0]
-    return package if package and _origin(package) is not None else module
+    try:
+        return package if package and _origin(package) is not None else module
+    except ModuleNotFoundError:  # a class whose `__module__` was set by hand is in no package
+        return module

@@ -1,4 +1,4 @@
-"""Reader for JSON that a stranger wrote: it enforces limits, and names the fault of a refused file."""
+"""Reader for JSON from strangers: it enforces limits, and names the fault of a refused file."""
 
 from __future__ import annotations
 

@@ -136,7 +136,7 @@ class Entry:
 
     @cached_property
     def origin(self) -> tuple[str, str] | None:
-        """Hashes of what it was made for and of the code that made it; None if no manifest shows these."""
+        """Hashes of its inputs and of the code that made it; None if no manifest shows these."""
         manifests = sorted(path for path in self._stats if path.name == _MANIFEST)
         try:
             made_from = json.loads(manifests[0].read_text(encoding="utf-8"))["made_from"]

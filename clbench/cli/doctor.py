@@ -13,7 +13,7 @@ from rich.table import Table
 
 
 def doctor() -> None:
-    """Show package versions, threads, rendering and folders, and how to install what is missing."""
+    """Show package versions, threads, rendering and folders, and how to install missing parts."""
     from clbench.learning.registry import method_names
 
     console = Console()

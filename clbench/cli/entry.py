@@ -61,6 +61,6 @@ def _handle(number: signal.Signals, handler: Callable[[int, FrameType | None], o
 
 
 def _end_at_once_when_stopped() -> None:
-    """Let Ctrl-C and SIGTERM end the process at once, without what Python does at the end."""
+    """Let Ctrl-C and SIGTERM end the process at once, without Python's clean-up at the end."""
     for number in (signal.SIGINT, signal.SIGTERM):
         _handle(number, lambda number, _: os._exit(128 + number))

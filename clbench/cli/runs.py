@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from clbench.jobs.job import Workers
     from clbench.runs.spec import ResolvedRun
 
-# What imports PyTorch or SciPy is imported where it is needed: `--help` does not wait for it.
+# Modules with PyTorch or SciPy are imported where they are needed: `--help` does not wait for them.
 
 
 def run(
@@ -42,7 +42,7 @@ def run(
 ) -> None:
     """Run METHODS on SCENARIOS, once per seed, and write a record of each run.
 
-    The command first makes what is missing: demonstrations, then a pretrained policy for each seed. It skips
+    The command first makes missing inputs: demonstrations, then a pretrained policy for each seed. It skips
     runs that have a record, so the same command continues a stopped one.
 
     Args:
@@ -89,6 +89,8 @@ def run(
             for seed in range(first_seed, first_seed + seeds)
             for name in names
         ]
+        # one scenario may be named twice, once with its module
+        runs = list({run.path(records): run for run in runs}.values())
         chosen = _part(shard, runs)
     console = Console(stderr=True)
     for scenario in {run.spec.scenario: run.scenario for run in runs}.values():

@@ -246,7 +246,7 @@ class Demonstrations:
     action: Tensor
     """Next H actions of the expert, (N, H, A)."""
     valid: Tensor
-    """Which of these actions count, (N, H): 0 after the end of the episode and after action noise, else 1."""
+    """Mask of actions that count, (N, H): 0 after the end of the episode and after action noise, else 1."""
     words: Tensor
     """Word ids of the instructions, (tasks, wordings, L)."""
     rows: Tensor

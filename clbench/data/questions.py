@@ -36,7 +36,7 @@ from clbench.worlds.world import World
 Truths: TypeAlias = NDArray[np.bool_]
 """Whether something holds in each of the states (N,)."""
 Answers: TypeAlias = NDArray[np.int64]
-"""Index of the right answer in each of the states (N,), -1 where it is too close to tell."""
+"""Index of the right answer in each of the states (N,), -1 in close cases."""
 
 
 def which(*truths: Truths) -> Answers:

@@ -23,8 +23,7 @@ class TrainingData:
     """Training questions."""
     test_questions: Questions
     """Test questions; no method gets them."""
-    loaded: dict[str, Demonstrations] = field(default_factory=dict)
-    """Demonstrations read so far, by the name of their task."""
+    _loaded: dict[str, Demonstrations] = field(default_factory=dict, init=False, repr=False)
 
     @classmethod
     def open(cls, scenario: Scenario, config: PolicyConfig) -> TrainingData:
@@ -42,6 +41,6 @@ class TrainingData:
 
         Most methods never see the demonstrations of the retained skills.
         """
-        if task.name not in self.loaded:
-            self.loaded[task.name] = load_demonstrations(task, self.scenario, self.config)
-        return self.loaded[task.name]
+        if task.name not in self._loaded:
+            self._loaded[task.name] = load_demonstrations(task, self.scenario, self.config)
+        return self._loaded[task.name]

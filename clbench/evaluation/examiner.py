@@ -15,7 +15,7 @@ from clbench.evaluation.rollouts import Episode, Evaluator, Trial
 from clbench.policy.activations import Gaussian
 from clbench.policy.batch import QuestionBatch
 from clbench.policy.policy import Policy
-from clbench.records.record import EpisodeRow, Record, append_row
+from clbench.records.record import AnswerRow, EpisodeRow, PolicyRow, Record
 from clbench.spec.protocol import EPISODE_WEIGHT, Point, Protocol
 from clbench.spec.scenario import Scenario
 
@@ -66,11 +66,11 @@ class Examiner:
         episodes = self._evaluator.play(policy, trials, lambda count: self._progress(EPISODE_WEIGHT * count))
         policy.train()
         for episode in episodes:
-            append_row(record.episodes, episode_row(point, episode))
+            record.add_episode(episode_row(point, episode))
         for kind, asked, correct in answer(policy, self._data.questions.kinds, *self._asked):
-            append_row(record.answers, (*point, kind, asked, correct))
+            record.add_answers(AnswerRow(*point, kind, asked, correct))
         drift = float(self._activations(policy).distance(self._anchor).mean())
-        append_row(record.policy, (*point, update_sparsity(policy, self._pretrained), drift))
+        record.add_policy(PolicyRow(*point, update_sparsity(policy, self._pretrained), drift))
 
     def _activations(self, policy: Policy) -> Gaussian:
         return activations(policy, self._asked[1].to(self._pretrained.state_mean.device))

@@ -48,7 +48,13 @@ def load_method(spec: str) -> type[Method]:
 
 def describe_method(cls: type[Method]) -> dict[str, Any]:
     """Return a method's metadata, and as `source` the hash of its package or of its module."""
-    return {**dataclasses.asdict(cls.metadata), "source": source_hash(package_of(cls.__module__))}
+    return {**dataclasses.asdict(cls.metadata), "source": source_hash(*method_packages(cls))}
+
+
+def method_packages(cls: type[Method]) -> list[str]:
+    """Return the packages, or modules, of a method and of the methods that it derives from."""
+    classes = (base for base in cls.__mro__ if issubclass(base, Method) and base is not Method)
+    return sorted({package_of(base.__module__) for base in classes})
 
 
 def _guarded(spec: str, load: Callable[[], Any]) -> Any:

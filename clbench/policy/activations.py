@@ -27,7 +27,7 @@ class Gaussian:
 
         Args:
             hidden: Hidden states, one (B, P, W) per layer.
-            mask: Which tokens are read, the result of `Backbone.mask`, (B, 1, 1, P).
+            mask: Mask of the tokens that are read, the result of `Backbone.mask`, (B, 1, 1, P).
         """
         weight = (mask[:, 0, 0, :, None] / mask.sum()).to(hidden[0].dtype)
         states = torch.stack(list(hidden))

@@ -81,7 +81,7 @@ class Backbone(nn.Module):
         nn.init.normal_(self.words.weight, std=0.5)
 
     def mask(self, words: Tensor) -> Tensor:
-        """Return which prefix tokens are read, (B, 1, 1, P): all but the padding of the words (B, L)."""
+        """Return the mask of the tokens to read, (B, 1, 1, P): all but the padding of the words (B, L)."""
         always = torch.ones(len(words), self.observation_tokens + 1, dtype=torch.bool, device=words.device)
         return torch.cat([always, words != 0], dim=1)[:, None, None, :]
 

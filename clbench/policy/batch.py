@@ -59,7 +59,7 @@ class Batch(_Rows):
     action: Tensor
     """Next actions of the expert in the units of the world, (B, H, A)."""
     valid: Tensor
-    """Which of these actions count, (B, H): 0 after the end of the episode and after action noise, else 1."""
+    """Mask of actions that count, (B, H): 0 after the end of the episode and after action noise, else 1."""
     draw: Tensor
     """Uniform draws in [0, 1) for the action head, (B,)."""
     noise: Tensor

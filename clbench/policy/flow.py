@@ -60,11 +60,11 @@ class FlowHead(nn.Module):
 
         Args:
             action: Normalised action chunks, (B, H, A).
-            valid: Which steps of the chunk count, (B, H).
+            valid: Mask of the chunk's steps that count, (B, H).
             draw: Uniform draws in [0, 1), (B,), that choose the flow time.
             noise: Standard normal draws, (B, H, A).
             hidden: Hidden states of the backbone, one (B, P, W) per layer.
-            mask: Which prefix tokens are read, (B, 1, 1, P).
+            mask: Mask of the prefix tokens that are read, (B, 1, 1, P).
         """
         predicted = self.predict(action, draw, noise, hidden, mask)
         return mean_over_valid((predicted - (noise - action)).square(), valid)

@@ -30,9 +30,9 @@ def load_fields(cls: type[Any], values: Any, what: str, inside: str = "") -> Any
 
     Args:
         cls: Dataclass. Its fields are texts, numbers, lists, dictionaries, dataclasses, literals and unions.
-        values: What `json` read.
+        values: Value that `json` read.
         what: Name of the object in messages, for example "run".
-        inside: What precedes the name of a field in messages, for example "run: ".
+        inside: Prefix of the names of fields in messages, for example "run: ".
 
     Raises:
         InputError: A field is missing, unknown or of another type; the message names it.

@@ -28,8 +28,8 @@ class RecordError(ClbenchError, ValueError):
 def read_record(path: Path) -> Record:
     """Read the record at `path`, which a stranger may have written.
 
-    A record of an older schema is converted. The reader checks the form of a record. Whether its values agree
-    with each other is checked by `Scores.from_record`.
+    A record of an older schema is converted. The reader checks the form of a record. `Scores.from_record`
+    checks whether its values agree with each other.
 
     Raises:
         RecordError: The file is not a regular file of JSON within the limits, is of an unknown schema, has a

@@ -1,16 +1,15 @@
 """The record: the one file that a run leaves, written once and never edited.
 
-A record holds every evaluation episode, every answer count, and how far the policy moved. Whatever can be
-computed from these is not stored.
+A record holds every evaluation episode, every answer count, and how far the policy moved. Values that can
+be computed from these are not stored.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any, Literal, NamedTuple
 
-from clbench.spec.protocol import Point, Protocol, Split
+from clbench.spec.protocol import Point, Protocol, ScoredSplit, Split
 
 SCHEMA = 3
 """Version of the file format. A reader refuses a newer one, and converts older ones
@@ -28,8 +27,8 @@ POLICY_COLUMNS = ("stage", "step", "update_sparsity", "activation_drift")
 """One row for each evaluation point: how far the policy is from the pretrained one.
 
 `update_sparsity` is the share of its parameters whose relative change is below 1e-3. `activation_drift` is
-the squared 2-Wasserstein distance between its hidden states on the questions and those of the pretrained
-policy, mean over layers. Each may be None.
+the squared 2-Wasserstein distance between its and the pretrained policy's hidden states on the questions,
+averaged over layers. Each may be None.
 """
 
 
@@ -52,9 +51,28 @@ class EpisodeRow(NamedTuple):
         return Point(self.stage, self.step)
 
 
+class AnswerRow(NamedTuple):
+    """A row of `Record.answers`: the answers to one kind of question at one point."""
+
+    stage: int
+    step: int
+    kind: str
+    asked: int
+    correct: int
+
+
+class PolicyRow(NamedTuple):
+    """A row of `Record.policy`: how far the policy is from the pretrained one at one point."""
+
+    stage: int
+    step: int
+    update_sparsity: float | None
+    activation_drift: float | None
+
+
 @dataclass
 class RunInfo:
-    """What was run. Two runs with equal `RunInfo` and `ScenarioInfo` are the same run."""
+    """The run. Two runs with equal `RunInfo` and `ScenarioInfo` are the same run."""
 
     scenario: str
     """Gymnasium id of the scenario."""
@@ -64,7 +82,7 @@ class RunInfo:
     """Seed of the run."""
     device: str
     """Device on which the policy was computed."""
-    split: str
+    split: ScoredSplit
     """The split that is scored: "test", or "validation" for a tuning run."""
     settings: dict[str, Any]
     """All hyper-parameters by name."""
@@ -98,7 +116,6 @@ class ScenarioInfo:
 
     def protocol(self, run: RunInfo) -> Protocol:
         """Return the evaluation protocol of a run on this scenario."""
-        split: Split = "validation" if run.split == "validation" else "test"
         return Protocol(
             tuple(self.retained),
             tuple(self.target),
@@ -107,7 +124,7 @@ class ScenarioInfo:
             self.budget["validation_episodes"],
             self.budget["test_episodes"],
             self.budget["curve_episodes"],
-            split,
+            run.split,
             run.perturb,
         )
 
@@ -117,7 +134,7 @@ class Costs:
     """What a run cost. A cost that is not known is None: a failed run need not have all of them."""
 
     optimiser_steps: int | None = None
-    """Optimiser steps, those of the preparation included."""
+    """Optimiser steps, including the preparation."""
     parameters: int | None = None
     """Parameters of the pretrained policy, or of an agent's network."""
     preparation_steps: int | None = None
@@ -137,7 +154,7 @@ class Record:
     status: Literal["success", "failed"]
     """Whether the run completed."""
     run: RunInfo
-    """What was run."""
+    """The run: scenario, method, seed and settings."""
     scenario: ScenarioInfo
     """The scenario in full."""
     episodes: dict[str, list[Any]] = field(default_factory=lambda: {name: [] for name in EPISODE_COLUMNS})
@@ -162,8 +179,19 @@ class Record:
         """Return the rows of `episodes`."""
         return [EpisodeRow(*values) for values in zip(*self.episodes.values(), strict=True)]
 
+    def add_episode(self, row: EpisodeRow) -> None:
+        """Append a row to `episodes`."""
+        _append(self.episodes, row)
 
-def append_row(columns: dict[str, list[Any]], row: Iterable[Any]) -> None:
-    """Append a row to columns of a record."""
+    def add_answers(self, row: AnswerRow) -> None:
+        """Append a row to `answers`."""
+        _append(self.answers, row)
+
+    def add_policy(self, row: PolicyRow) -> None:
+        """Append a row to `policy`."""
+        _append(self.policy, row)
+
+
+def _append(columns: dict[str, list[Any]], row: tuple[Any, ...]) -> None:
     for column, value in zip(columns.values(), row, strict=True):
         column.append(value)

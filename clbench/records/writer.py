@@ -25,7 +25,7 @@ CUT = "\n[... clbench left out {count:,} characters ...]\n"
 def write_record(record: Record, path: Path) -> None:
     """Write `record` to `path` in one step: a reader sees the whole file or none.
 
-    Whatever is written can be read: texts of the error are cut to `LONGEST_TEXT` characters, and anything
+    Every written record can be read: texts of the error are cut to `LONGEST_TEXT` characters, and anything
     else that `read_record` would refuse is refused before `path` is touched. A symbolic link at `path` is
     replaced, and its target is left alone.
 

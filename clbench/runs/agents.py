@@ -40,7 +40,7 @@ from clbench.evaluation.rollouts import Episode, Trial, start_of
 from clbench.learning.trainer import sources
 from clbench.records.paths import RECORDS, record_path
 from clbench.records.reader import read_record
-from clbench.records.record import Record, RunInfo, append_row
+from clbench.records.record import AnswerRow, Record, RunInfo
 from clbench.records.writer import write_record
 from clbench.runs.fingerprint import fingerprint
 from clbench.runs.spec import describe_scenario
@@ -270,9 +270,9 @@ class _OnlineRun:
         point = protocol.end(stage)  # in optimiser steps, as if a method had trained
         for key in protocol.episodes(point):
             trial = self.scenario.task(key.task), key.split, key.number
-            append_row(record.episodes, episode_row(point, play(trial)))
+            record.add_episode(episode_row(point, play(trial)))
         for kind in resolve(self.scenario.questions):
-            append_row(record.answers, (*point, kind.name, 0, 0))
+            record.add_answers(AnswerRow(*point, kind.name, 0, 0))
 
     def count(
         self, record: Record, stage: int, steps: int | None, trained: float | None, evaluated: float

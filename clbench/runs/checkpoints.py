@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Any
 
 from clbench.base.cache import cache_folder, cached, hash_of, is_cached
 from clbench.base.progress import ProgressCallback, no_progress
-from clbench.base.source import package_of
 from clbench.learning.optimise import MethodError
+from clbench.learning.registry import method_packages
 from clbench.learning.trainer import STAGE_FILES, Trainer, load_stage, repeatable, sources
 from clbench.policy.policy import Policy
 
@@ -155,7 +155,7 @@ def _kept(run: ResolvedRun, checkpoints: Path) -> Path:
 
 def _made(run: ResolvedRun) -> Path:
     """Return the folder in the cache for policies that this version of the code made again."""
-    code = sources(run.scenario, run.spec.seed, package_of(run.method.__module__))
+    code = sources(run.scenario, run.spec.seed, *method_packages(run.method))
     return cache_folder() / "stages" / hash_of({**_identity(run, 0), **code})
 
 
@@ -176,7 +176,7 @@ def drop_stages(run: ResolvedRun, checkpoints: Path) -> None:
 
 
 def _identity(run: ResolvedRun, number: int) -> dict[str, Any]:
-    """Return what identifies the policy of a stage among all runs, in every version of the code."""
+    """Return what identifies the policy of a stage among all runs, whatever the source code."""
     info = dataclasses.asdict(run.info)
     for name in ("split", "perturb"):  # evaluation episodes make no difference
         del info[name]

@@ -16,12 +16,11 @@ import torch
 from clbench.base.cache import cache_folder, cached, hash_of, is_cached
 from clbench.base.errors import WrongTypeError
 from clbench.base.progress import ProgressCallback, no_progress
-from clbench.base.source import package_of
 from clbench.data.training_data import TrainingData
 from clbench.evaluation.examiner import Examiner
 from clbench.learning.adaptation import Step
 from clbench.learning.pretraining import pretrained_policy
-from clbench.learning.registry import describe_method
+from clbench.learning.registry import describe_method, method_packages
 from clbench.learning.trainer import Trainer, repeatable, sources
 from clbench.records.reader import read_record
 from clbench.records.record import Costs, Record
@@ -295,5 +294,5 @@ def _inputs(run: ResolvedRun, number: int) -> dict[str, Any]:
         "run": dataclasses.asdict(run.info),
         "scenario": dataclasses.asdict(run.scenario_info),
         "stage": number,
-        **sources(run.scenario, run.spec.seed, package_of(run.method.__module__)),
+        **sources(run.scenario, run.spec.seed, *method_packages(run.method)),
     }

@@ -14,7 +14,7 @@ from clbench.base.errors import InputError
 from clbench.records.paths import label_of, record_path
 from clbench.records.reader import RecordError, read_record
 from clbench.records.record import RunInfo, ScenarioInfo
-from clbench.spec.protocol import Protocol, Split
+from clbench.spec.protocol import Protocol, ScoredSplit
 from clbench.spec.registry import load_scenario
 from clbench.spec.scenario import Scenario
 from clbench.worlds.lanes import check_perturbable
@@ -40,7 +40,7 @@ class RunSpec:
     """Hyper-parameters that differ from the method's defaults, by name."""
     device: str = "cpu"
     """Device on which the policy is computed."""
-    split: Split = "test"
+    split: ScoredSplit = "test"
     """Split to score. Base choices only on "validation" episodes."""
     targets: int | None = None
     """Number of targets to learn, from the first; all if None."""

@@ -342,7 +342,7 @@ def studentised_range_quantile(count: int, degrees: int) -> float:
     degrees of freedom.
 
     Args:
-        count: How many numbers, two or more.
+        count: Number of normal numbers, two or more.
         degrees: Degrees of freedom, one or more.
     """
     from scipy import stats

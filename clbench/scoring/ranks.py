@@ -1,4 +1,4 @@
-"""Ranks: rows of the leaderboard in order, those that cannot be told apart together."""
+"""Ranks: rows of the leaderboard in order; rows that cannot be told apart share one."""
 
 from __future__ import annotations
 
@@ -128,7 +128,7 @@ def ranks(values: Array, without_episode: Array) -> list[int]:
 
 @dataclass(frozen=True, eq=False)
 class _Board:
-    """Rows to be told apart; the arrays are the arguments of `ranks`."""
+    """Rows to rank; the arrays are the arguments of `ranks`."""
 
     values: Array
     without_episode: Array

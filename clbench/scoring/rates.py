@@ -29,7 +29,7 @@ class Measured:
     update_sparsity: Array
     """Share of the parameters that have hardly changed since pretraining, (..., targets, points)."""
     activation_drift: Array
-    """Distance of the hidden states from those of the pretrained policy, (..., targets, points)."""
+    """Distance of the hidden states from the pretrained policy's, (..., targets, points)."""
 
 
 def _arrays(cls: type[Measured]) -> tuple[str, ...]:

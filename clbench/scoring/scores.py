@@ -44,7 +44,7 @@ class Scores(Measured):
         """Return the scores in `record`.
 
         Raises:
-            RecordError: The record contradicts itself: tasks, stages, steps or values that cannot be.
+            RecordError: The record contradicts itself: impossible tasks, stages, steps or values.
         """
         protocol = read_protocol(record)
         rows = read_episodes(record, protocol)
@@ -91,9 +91,9 @@ class Scores(Measured):
         weighted mean over the episodes that are run. If none of them was drawn, all weigh the same.
 
         Args:
-            counts: How often each episode is drawn, the same for all stages and points, (..., tasks,
-                episodes).
-                They add up to the number of episodes. Once each, without batch axes, if None.
+            counts: Number of draws of each episode, the same for all stages and points, (..., tasks,
+                episodes). They add up to the number of episodes. If None, each episode is drawn once,
+                without batch axes.
         """
         layout, number = self.layout, len(self.layout.episodes)
         if counts is None:

@@ -20,6 +20,9 @@ perturbed episode is the test episode of the same number in a perturbed world
 
 SPLITS: tuple[Split, ...] = ("validation", "test", "perturbed")
 
+ScoredSplit = Literal["validation", "test"]
+"""Split whose episodes are scored: "validation" in a tuning run, "test" otherwise."""
+
 
 EPISODE_WEIGHT = 0.3
 """Duration of an evaluation episode in optimiser steps, for the time left that a progress bar shows."""
@@ -35,7 +38,7 @@ class Point(NamedTuple):
 
 
 class EpisodeKey(NamedTuple):
-    """What identifies an episode of a scenario, besides the seed of the run."""
+    """The identity of an episode of a scenario, besides the seed of the run."""
 
     task: str
     split: Split
@@ -60,13 +63,13 @@ class Protocol:
     """Test episodes of a task, and as many perturbed ones."""
     curve_episodes: int
     """Test episodes of a task at the points before the end of a stage: the first ones."""
-    split: Split = "test"
+    split: ScoredSplit = "test"
     """The split that is scored: "test", or "validation" in a tuning run."""
     perturb: bool = False
     """Whether the retained skills also meet perturbed episodes at the end of each stage."""
 
     @classmethod
-    def of(cls, scenario: Scenario, split: Split = "test", perturb: bool = False) -> Protocol:
+    def of(cls, scenario: Scenario, split: ScoredSplit = "test", perturb: bool = False) -> Protocol:
         """Return the protocol of a run on `scenario`.
 
         Args:

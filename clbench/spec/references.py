@@ -1,4 +1,4 @@
-"""Methods that others are compared with, by name."""
+"""Names of the methods that serve others for comparison."""
 
 from __future__ import annotations
 
@@ -6,13 +6,13 @@ BASELINE = "sft"
 """Plain fine-tuning: the method that matched retention, relative cost and cards compare with."""
 
 JOINT = "joint"
-"""Training on everything met so far: what a method with all the data can reach."""
+"""Training on everything met so far: the limit of a method with all the data."""
 
 FROZEN = "frozen"
-"""The pretrained policy, never changed: what is there before any target."""
+"""The pretrained policy, never changed: the abilities before any target."""
 
 FROM_SCRATCH = "from_scratch"
-"""A policy without pretraining: what each target needs if nothing is transferred."""
+"""A policy without pretraining: the cost of each target without transfer."""
 
 REFERENCES = (BASELINE, JOINT, FROZEN, FROM_SCRATCH)
 """All of them, the baseline first."""

@@ -1,4 +1,4 @@
-"""The Gymnasium environment of a scenario: it schedules through the sequence of tasks."""
+"""The Gymnasium environment of a scenario: it goes through the sequence of tasks."""
 
 from __future__ import annotations
 

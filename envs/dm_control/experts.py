@@ -82,7 +82,7 @@ def expert_return(task: str) -> float:
     """Return the mean return of the expert's episodes, which defines success.
 
     Raises:
-        ExpertError: As `expert`.
+        ExpertError: The expert's files are missing, damaged or of another task.
     """
     return _shipped(task)[1]
 

@@ -1,7 +1,7 @@
 """The tasks of the dm_control world: the body, the initial states and the rewards of each.
 
 A task named after one of dm_control's has dm_control's rewards. The others are variants on the same body with
-the same initial states; only the instruction tells them apart.
+the same initial states; only the instruction distinguishes them.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """The camera of the pixel scenario: the numbers and the picture that a policy gets from a state.
 
-The scene is the Fetch world's, edited with MjSpec: two coloured things lie on the table. They exist in
-pictures only, and nothing touches them, so experts and physics are bit for bit those of the Fetch world.
+The scene is the Fetch world's, edited with MjSpec: two coloured things are on the table. They exist in
+pictures only, and nothing touches them, so experts and physics equal the Fetch world's bit for bit.
 """
 
 from __future__ import annotations

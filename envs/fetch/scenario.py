@@ -1,4 +1,4 @@
-"""The scenario clbench/Fetch-v0: all tasks share one scene, and only the instruction tells them apart."""
+"""The scenario clbench/Fetch-v0: all tasks share one scene, and only the instruction distinguishes them."""
 
 from __future__ import annotations
 

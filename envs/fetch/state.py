@@ -36,6 +36,5 @@ FINGERS_VELOCITY = slice(23, 25)
 TARGET = slice(25, 28)
 """Position of the target marker."""
 
-BLOCK_HALF_SIZE = 0.025
 REST_HEIGHT = 0.425
 """Height of the centre of a block at rest on the table."""

@@ -96,7 +96,7 @@ class Mixed:
     numbers: Vector
     """The numbers (N,)."""
     single: NDArray[np.bool_]
-    """Which of them have single precision (N,)."""
+    """Mask of the numbers with single precision (N,)."""
 
     def into(self, formula: Callable[..., Floats], *others: Vector) -> Mixed:
         """Apply a formula to these numbers and others (N,), which are numbers of Python in Meta-World."""

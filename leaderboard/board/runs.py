@@ -132,7 +132,7 @@ def read_run(folder: Path, path: Path, split: Split = "test", changed: bool | No
     _check_settings(run)
     division = division_of(run.uses)
     if name != home:
-        raise RecordError(f"it is the record of {home}, and must lie there.")
+        raise RecordError(f"it is the record of {home}, and must be there.")
     scores, published = Scores.from_record(record), _published(record)
     return Run(
         name, record, scores, run.scenario, label, run.seed, division, tier_of(path), run.order, published
@@ -170,7 +170,7 @@ def _check_settings(run: RunInfo) -> None:
         return
     uses, defaults = _declared(method)
     if run.uses != uses:
-        raise RecordError(f"run: uses are not those of {method}: {', '.join(differences(run.uses, uses))}.")
+        raise RecordError(f"run: uses do not match {method}: {', '.join(differences(run.uses, uses))}.")
     # a setting that is missing here was added later, with a default that changes nothing
     wrong = [
         name
@@ -178,7 +178,7 @@ def _check_settings(run: RunInfo) -> None:
         if name not in defaults or (name not in changes and value != defaults[name])
     ]
     if wrong:
-        raise RecordError(f"run: settings are not those of {method}: {', '.join(wrong)}.")
+        raise RecordError(f"run: settings do not match {method}: {', '.join(wrong)}.")
 
 
 @cache
@@ -245,7 +245,7 @@ def same_scenario(runs: list[Run]) -> Sifted:
         if fields == ["budget"]:
             ours, theirs = run.published.budget, other.published.budget
             fields = [f"budget ({', '.join(differences(ours, theirs))})"]
-        return f"its scenario is not that of most records: {', '.join(fields)} differ."
+        return f"its scenario does not match most records: {', '.join(fields)} differ."
 
     return _most(runs, lambda run: run.scenario, lambda run: _text(vars(run.published)), reason)
 
@@ -258,7 +258,7 @@ def same_simulator(runs: list[Run]) -> Sifted:
 
     def reason(run: Run, other: Run) -> str:
         worlds = ", ".join(differences(rollouts(run), rollouts(other)))
-        return f"its simulator is not that of most records: the rollouts of {worlds or 'all worlds'} differ."
+        return f"its simulator does not match most records: the rollouts of {worlds or 'all worlds'} differ."
 
     return _most(runs, lambda run: run.scenario, lambda run: _text(rollouts(run)), reason)
 
@@ -288,7 +288,7 @@ def same_settings(runs: list[Run]) -> Sifted:
     def reason(run: Run, other: Run) -> str:
         both = zip(parts(run), parts(other), strict=True)
         fields = [name for one, another in both for name in differences(one, another)]
-        return f"its settings are not those of most seeds: {', '.join(fields)} differ."
+        return f"its settings do not match most seeds: {', '.join(fields)} differ."
 
     return _most(runs, lambda run: (run.scenario, run.method), lambda run: _text(parts(run)), reason)
 

@@ -132,7 +132,7 @@ def stays_sparse(evidence: Evidence) -> Finding:
     CONSFT,
     reported="risk times omega squared (Eq. 7), no measurement",
     rule="Holds for one sample, where it is algebra, while the test "
-    "`test_one_sample_disrupts_what_was_known_by_the_square_of_its_weight` of `tests/methods/test_consft.py` "
+    "`test_one_sample_disrupts_old_knowledge_by_the_square_of_its_weight` of `tests/methods/test_consft.py` "
     "passes.",
 )
 def bounds_the_risk_of_a_step(evidence: Evidence) -> Finding:

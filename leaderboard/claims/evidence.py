@@ -92,7 +92,7 @@ class Evidence:
     runs: Mapping[str, Mapping[int, Run]]
     """Runs by label of the method ("lora", "lora+rank=4") and by seed."""
     step_times: Mapping[str, Estimate]
-    """Median time of a step divided by that of sft, by method."""
+    """Median time of a step divided by sft's, by method."""
     not_used: tuple[NotShown, ...]
     """Records that are left out, with their reasons."""
 
@@ -222,7 +222,7 @@ class Evidence:
         return Figure(what, (method,), estimate, tuple(runs), (), "", form)
 
     def step_time(self, method: str) -> Figure:
-        """Return the time of a step of the method, divided by that of sft."""
+        """Return the time of a step of the method, divided by sft's."""
         found = self.step_times.get(method)
         missing = () if found else ("step time",)
         what = f"time of a step of {method} divided by sft's"
@@ -288,7 +288,7 @@ def read_evidence(scenario: str, records: Path, controls: Path, step_time: Path)
 
 
 def _like(scored: Sequence[Run]) -> Sift:
-    """Return the sift that keeps runs that were made and evaluated like those of the board."""
+    """Return the sift that keeps runs that were made and evaluated like the board's."""
     examples = {run.scenario: run for run in scored}
 
     def traits(run: Run) -> dict[str, Any]:

@@ -87,7 +87,7 @@ def matched_retention(evidence: Evidence, method: str, other: str) -> Figure:
 
 
 def drift_ratio(evidence: Evidence, method: str) -> Figure:
-    """Return the activation drift divided by that of sft, seed by seed."""
+    """Return the activation drift divided by sft's, seed by seed."""
 
     def ratio(of: Of) -> Array:
         part, whole = (of[label].activation_drift[..., -1, -1] for label in (method, "sft"))

@@ -207,7 +207,7 @@ def _tried_row(settings: str, run: Run, baseline: Run | None) -> Tried:
 
 
 def _commands(method: Description, sources: Sources) -> list[str]:
-    """Return the commands that make the records, and those of the settings tried."""
+    """Return the commands that make the records, also for the settings tried."""
     scenario = sources.evidence.scenario
     lines = [run_command(scenario, method.name)]
     runs = [run for run in sources.tuning if run.record.run.method == method.name and _has_changes(run)]

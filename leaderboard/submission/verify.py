@@ -59,7 +59,7 @@ class Check:
     """The result of one check."""
 
     name: str
-    """What was checked."""
+    """Subject of the check."""
     found: str
     """Result in words."""
     passed: bool

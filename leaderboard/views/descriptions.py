@@ -30,7 +30,7 @@ class HyperParameter:
     default: str
     """Default value, as Python writes it."""
     meaning: str
-    """Docstring under the field; a subclass's own docstring follows that of its base class."""
+    """Docstring under the field; a subclass's own docstring follows its base class's."""
 
 
 @dataclass(frozen=True)

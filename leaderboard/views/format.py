@@ -49,7 +49,7 @@ Rows: TypeAlias = Sequence[Row] | Sequence[OverallRow]
 
 
 def shown(rows: Rows) -> tuple[Metric, ...]:
-    """Return the metrics in a table of `rows`: `SHOWN`, but those of `RARE` only if a row has a value."""
+    """Return the metrics in a table of `rows`: `SHOWN`, but metrics of `RARE` only if a row has a value."""
     found = {name for name in RARE if any(row.estimates[name].value is not None for row in rows)}
     return tuple(metric for metric in SHOWN if metric.name not in RARE or metric.name in found)
 

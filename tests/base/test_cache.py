@@ -20,7 +20,7 @@ def _value(folder: Path, inputs: dict[str, int], text: str, calls: list[str]) ->
     return (cached(folder, inputs, _make(text, calls)) / "value.txt").read_text()  # type: ignore[arg-type]
 
 
-def test_what_was_made_is_used_again(tmp_path: Path) -> None:
+def test_a_cached_result_is_used_again(tmp_path: Path) -> None:
     calls: list[str] = []
     assert _value(tmp_path / "x", INPUTS, "first", calls) == "first"
     assert _value(tmp_path / "x", INPUTS, "second", calls) == "first"
@@ -38,7 +38,7 @@ def test_what_was_made_is_used_again(tmp_path: Path) -> None:
         (lambda folder: (folder / "clbench.json").write_text("[]"), "torn or foreign"),
     ],
 )
-def test_a_torn_or_foreign_folder_is_named_and_made_again(
+def test_a_torn_or_foreign_folder_is_logged_and_made_again(
     tmp_path: Path, damage: object, fault: str, caplog: pytest.LogCaptureFixture
 ) -> None:
     calls: list[str] = []
@@ -53,7 +53,7 @@ def test_a_torn_or_foreign_folder_is_named_and_made_again(
     assert [path.name for path in tmp_path.iterdir()] == ["x"]
 
 
-def test_what_other_inputs_made_is_made_again(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_result_of_other_inputs_is_made_again(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     calls: list[str] = []
     _value(tmp_path / "x", INPUTS, "first", calls)
     assert _value(tmp_path / "x", {"seed": 1}, "second", calls) == "second"

@@ -1,4 +1,4 @@
-"""Hashes of source code: a cache key covers all code that its stage runs, and every module it names exists."""
+"""Hashes of source code: a cache key covers all code of its stage, and every module it names exists."""
 
 import subprocess
 import sys

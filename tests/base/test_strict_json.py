@@ -1,4 +1,4 @@
-"""JSON of strangers: limits on everything, and a plain word for each."""
+"""JSON from strangers: everything has a limit, and an error that names it."""
 
 import json
 import os
@@ -32,7 +32,7 @@ def nested(depth: int) -> Any:
         7,
     ],
 )
-def test_what_is_within_the_limits_is_read(value: Any, tmp_path: Path) -> None:
+def test_json_within_the_limits_is_read(value: Any, tmp_path: Path) -> None:
     (tmp_path / "a.json").write_text(json.dumps(value), encoding="utf-8")
     assert read_json(tmp_path / "a.json") == value
 
@@ -53,7 +53,7 @@ def test_what_is_within_the_limits_is_read(value: Any, tmp_path: Path) -> None:
         ("{} {}", "cannot be read as JSON"),
     ],
 )
-def test_what_is_beyond_the_limits_is_refused(text: str, words: str, tmp_path: Path) -> None:
+def test_json_beyond_the_limits_is_refused(text: str, words: str, tmp_path: Path) -> None:
     (tmp_path / "a.json").write_text(text, encoding="utf-8")
     with pytest.raises(StrictJSONError, match=words):
         read_json(tmp_path / "a.json")

@@ -1,4 +1,4 @@
-"""`clbench cache`: what it shows, and what it deletes."""
+"""`clbench cache`: the entries that it shows and deletes."""
 
 import os
 import time
@@ -62,7 +62,7 @@ def test_every_kind_is_shown_with_its_number_size_and_age(capsys: pytest.Capture
 
 
 @pytest.mark.usefixtures("empty_caches")
-def test_pruning_lists_and_deletes_what_has_not_been_used(capsys: pytest.CaptureFixture[str]) -> None:
+def test_pruning_lists_and_deletes_unused_entries(capsys: pytest.CaptureFixture[str]) -> None:
     old, young = _make("pretrained", 31), _make("pretrained", 29)
     out = _cache(capsys, "--dry-run")
     assert f"2.0 MB  {old}: not used for 31 days" in out
@@ -76,14 +76,14 @@ def test_pruning_lists_and_deletes_what_has_not_been_used(capsys: pytest.Capture
 
 
 @pytest.mark.usefixtures("empty_caches")
-def test_what_was_read_lately_is_not_stale(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_recently_read_entry_is_not_stale(capsys: pytest.CaptureFixture[str]) -> None:
     folder = _make("pretrained", 31)
     os.utime(folder / "data", (time.time(), time.time() - 31 * DAY))
     assert "stale entr" not in _cache(capsys)
 
 
 @pytest.mark.usefixtures("empty_caches")
-def test_what_newer_code_has_replaced_is_stale_unless_it_was_used_since(
+def test_an_entry_of_older_code_is_stale_unless_it_was_used_since(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     old, newer = _make("stages", 5), _make("stages", 2, code="b")
@@ -114,7 +114,7 @@ def test_leftovers_of_killed_processes_are_deleted_after_a_day(capsys: pytest.Ca
 
 
 @pytest.mark.usefixtures("empty_caches")
-def test_only_what_clbench_has_made_is_deleted(capsys: pytest.CaptureFixture[str]) -> None:
+def test_only_entries_made_by_clbench_are_deleted(capsys: pytest.CaptureFixture[str]) -> None:
     foreign = _write(cache_folder() / "runs" / "my thesis" / "record.json")
     dataset = _write(minari_folder() / "d4rl" / "door-v2" / "data" / "main_data.hdf5")
     linked = _write(cache_folder().parent / "elsewhere" / "data")

@@ -1,4 +1,4 @@
-"""The command line as people type it; what only a process shows, in one of its own."""
+"""The command line as people type it; some tests need a process of their own."""
 
 import subprocess
 import sys
@@ -96,11 +96,11 @@ def test_bad_input_ends_with_exit_code_2_and_the_nearest_right_name(
     monkeypatch.syspath_prepend(tmp_path)  # and take back what the command puts there
     with pytest.raises(SystemExit) as ended:
         app(arguments)
-    told = "".join(capsys.readouterr())
+    printed = "".join(capsys.readouterr())
     assert ended.value.code == 2
-    assert told.startswith("error: ")
-    assert len(told.splitlines()) == 1
-    assert message in told
+    assert printed.startswith("error: ")
+    assert len(printed.splitlines()) == 1
+    assert message in printed
     assert list(tmp_path.iterdir()) == []
 
 
@@ -214,7 +214,7 @@ def test_a_stranger_runs_a_class_from_the_working_directory_and_sees_it_on_the_b
     result = _clbench("run", TOY, "mine:Gentle", "mine:Broken", "sft", "--seeds", "1", folder=tmp_path)
     assert result.returncode == 1  # the broken one; the others went on
     assert "mine:Broken seed 0: failed in stage 1 (right): ValueError: no idea" in result.stderr
-    assert "Traceback" not in result.stderr  # it stands in the record
+    assert "Traceback" not in result.stderr  # it is in the record
     assert "1 failed: Toy-v0 mine:Broken seed 0" in result.stderr
     records = sorted(path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*.json"))
     assert records == [
@@ -232,7 +232,7 @@ def test_a_stranger_runs_a_class_from_the_working_directory_and_sees_it_on_the_b
 
 
 @pytest.mark.slow
-def test_tune_compares_settings_without_a_look_at_what_is_reported(tmp_path: Path) -> None:
+def test_tune_compares_settings_without_test_episodes(tmp_path: Path) -> None:
     arguments = ("tune", TOY, "low_rate_sft", "--values.speed", "0.2,1", "--seed", "3")
     result = _clbench(*arguments, folder=tmp_path)
     assert result.returncode == 0, result.stderr

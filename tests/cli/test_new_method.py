@@ -45,7 +45,7 @@ def test_a_fresh_template_is_linted_and_formatted_by_ruffs_own_settings(
     assert result.returncode == 0, result.stdout + result.stderr
 
 
-def test_the_command_says_what_to_do_next(tmp_path: Path) -> None:
+def test_the_command_prints_the_next_steps(tmp_path: Path) -> None:
     result = _python("clbench", "new-method", "freshly_written", folder=tmp_path)
     assert result.stdout.splitlines() == [
         "Wrote freshly_written.py and test_freshly_written.py. Make the method yours, then:",
@@ -62,7 +62,7 @@ def test_a_fresh_template_runs(fresh: str, tmp_path: Path) -> None:
     assert (record.status, record.run.settings) == ("success", {"share": 0.9})
 
 
-def test_another_folder_is_named_in_what_to_do_next(tmp_path: Path) -> None:
+def test_the_next_steps_name_another_folder(tmp_path: Path) -> None:
     (tmp_path / "mine").mkdir()
     result = _python("clbench", "new-method", "freshly_written", "--folder", "mine", folder=tmp_path)
     assert result.stdout.splitlines()[1] == "  cd mine"
@@ -91,7 +91,7 @@ def test_another_folder_is_named_in_what_to_do_next(tmp_path: Path) -> None:
         ("torch", "There is a module 'torch' already. Did you mean 'torch_method'?"),
     ],
 )
-def test_a_name_that_cannot_be_is_refused_with_the_reason_and_nothing_is_written(
+def test_an_impossible_name_is_refused_with_the_reason_and_nothing_is_written(
     name: str, message: str, tmp_path: Path
 ) -> None:
     with pytest.raises(ValueError, match=re.escape(message)):

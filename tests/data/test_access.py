@@ -1,4 +1,4 @@
-"""Leaks: a method that knows what its stage must not know is found, and said what it was."""
+"""Leaks: a method that uses data its stage must not know is caught, and the error names the data."""
 
 from pathlib import Path
 
@@ -46,7 +46,7 @@ class Chooser(Method):
 
 @dataclasses.dataclass
 class RobustChooser(Chooser):
-    """It chooses its checkpoint on perturbed episodes, which are those of the report."""
+    """It chooses its checkpoint on perturbed episodes, which repeat the test episodes."""
 
     split = "perturbed"
 
@@ -119,5 +119,5 @@ def test_a_planted_leak_ends_the_run_and_is_named(method: str, message: str, tmp
     assert message in record.error["message"]
 
 
-def test_what_a_stage_may_know_it_may_use(tmp_path: Path) -> None:
+def test_a_stage_may_use_everything_that_it_may_know(tmp_path: Path) -> None:
     assert execute(RunSpec(TOY, "leaky:FairChooser", 0, targets=1), tmp_path).status == "success"

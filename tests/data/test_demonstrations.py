@@ -104,9 +104,9 @@ def test_chunks_hold_the_experts_next_actions_up_to_the_end() -> None:
     assert data.valid.tolist() == [[1, 1, 1], [1, 1, 1], [1, 1, 0], [1, 0, 0]]
 
 
-def test_what_follows_action_noise_inside_a_chunk_does_not_count() -> None:
+def test_actions_after_action_noise_inside_a_chunk_do_not_count() -> None:
     data = Demonstrations.of_task(TASK, [_episode([False, True, True, False, False])], chunk=3)
-    # the first noisy step still shows what the expert would have done there; what comes after does not
+    # the first noisy step still shows what the expert would have done there; later steps do not
     assert data.valid.tolist() == [[1, 1, 0], [1, 0, 0], [1, 0, 0], [1, 1, 0], [1, 0, 0]]
 
 

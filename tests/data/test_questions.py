@@ -12,7 +12,7 @@ TOY = load_scenario("clbench.testing:clbench/Toy-v0")
 FETCH = load_scenario("clbench/Fetch-v0")
 
 
-def test_an_answer_is_the_first_truth_that_holds_and_none_where_it_is_too_close_to_tell() -> None:
+def test_an_answer_is_the_first_truth_that_holds_and_none_in_close_cases() -> None:
     first, second = np.array([True, False, True, False]), np.array([False, True, True, False])
     assert which(first, second).tolist() == [0, 1, 0, -1]
     assert sign(np.array([0.3, -0.3, 0.2, -0.2, 0.1], np.float32), 0.25).tolist() == [0, 1, -1, -1, -1]
@@ -31,7 +31,7 @@ def test_every_kind_and_every_answer_of_it_is_as_frequent_and_right() -> None:
     assert (batch.state[left, 0] < batch.state[left, 2]).all()
 
 
-def test_report_questions_ask_about_other_episodes_than_training() -> None:
+def test_test_questions_are_about_other_episodes_than_training() -> None:
     train, report = load_questions(TOY)
     markers = [{tuple(row) for row in questions.scenes[:, 2:].tolist()} for questions in (train, report)]
     assert len(markers[0]) == 40
@@ -39,7 +39,7 @@ def test_report_questions_ask_about_other_episodes_than_training() -> None:
     assert not markers[0] & markers[1]
 
 
-def test_every_report_asks_the_same_questions_as_many_of_each_kind() -> None:
+def test_every_evaluation_asks_the_same_questions_as_many_of_each_kind() -> None:
     _, report = load_questions(TOY)
     (kind, first), (_, second) = scored_questions(report, 50), scored_questions(report, 50)
     assert first.state.equal(second.state)
@@ -54,7 +54,7 @@ def test_an_answer_that_no_state_gives_is_named() -> None:
         Questions((kind,), torch.zeros(5, 4))
 
 
-def test_fetch_questions_have_balanced_answers_for_training_and_report() -> None:
+def test_fetch_questions_have_balanced_answers_for_training_and_test() -> None:
     few = dataclasses.replace(FETCH, budget=dataclasses.replace(FETCH.budget, question_episodes=48))
     for questions in load_questions(few):
         kind, batch = scored_questions(questions, 1400)

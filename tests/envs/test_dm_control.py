@@ -160,7 +160,7 @@ def test_every_expert_does_its_task(task: Task) -> None:
 
 
 def test_experts_of_retained_tasks_do_no_target_task_by_chance() -> None:
-    """Only the instruction tells tasks of one body apart: the expert of another task fails."""
+    """Only the instruction distinguishes tasks of one body: the expert of another task fails."""
     plain = world()
     for target in SCENARIO.target:
         for task in SCENARIO.retained:
@@ -240,7 +240,7 @@ def test_questions_describe_a_scene_correctly() -> None:
 
 def test_the_world_is_drawn_with_the_target_of_its_task() -> None:
     if not _draws():
-        pytest.skip("nothing renders here: clbench doctor says what is missing")
+        pytest.skip("nothing renders here: clbench doctor shows the missing parts")
     drawn: World = resolve(SCENARIO.tasks[0].world)(render_mode="rgb_array")
     pictures = []
     for task in ("point_mass_easy", "point_mass_right", "cartpole_balance", "ball_in_cup_catch"):

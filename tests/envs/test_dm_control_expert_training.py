@@ -112,7 +112,7 @@ def test_steps_that_are_not_whole_segments_are_refused(steps: int) -> None:
         tiny(steps=steps)
 
 
-def test_training_without_the_extra_says_how_to_get_it(tmp_path: Path) -> None:
+def test_training_without_the_extra_names_the_extra_to_install(tmp_path: Path) -> None:
     hide = "import sys; sys.modules['stable_baselines3'] = None; from importlib.util import find_spec"
     program = (
         f"{hide}; import clbench.base.dependencies as extras; extras.find_spec = lambda name: None; "
@@ -128,7 +128,7 @@ def test_training_without_the_extra_says_how_to_get_it(tmp_path: Path) -> None:
     )
 
 
-def test_the_written_out_gradient_step_is_that_of_stable_baselines3() -> None:
+def test_the_written_out_gradient_step_equals_stable_baselines3() -> None:
     trainers = []
     for kind in (SAC, sac.WrittenOutSAC):
         world = training.TrainingWorld("cartpole_left", lambda number: number)

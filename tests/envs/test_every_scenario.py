@@ -167,7 +167,7 @@ def test_an_episode_without_a_seed_continues_the_random_numbers(scenario: Scenar
 
 
 @every_scenario
-def test_episodes_side_by_side_are_bit_for_bit_those_of_the_plain_world(scenario: Scenario) -> None:
+def test_episodes_side_by_side_equal_the_plain_world_bit_for_bit(scenario: Scenario) -> None:
     tasks = [*scenario.tasks[:2], *scenario.tasks[-3:]]
     plain, lanes = [make(task.world) for task in tasks], Lanes(5, threads=2)
     states = lanes.reset([4, 2, 0], [4, 2, 0], [tasks[4], tasks[2], tasks[0]])
@@ -265,7 +265,7 @@ def test_an_unknown_task_is_an_error_that_names_the_nearest(scenario: Scenario) 
 
 
 @every_scenario
-def test_an_action_that_cannot_be_done_is_an_error_that_names_it(scenario: Scenario) -> None:
+def test_an_impossible_action_is_an_error_that_names_it(scenario: Scenario) -> None:
     for task in first_task_of_each_world(scenario):
         plain, lanes = make(task.world), Lanes(2)
         plain.reset(seed=0, options={"task": task.name})

@@ -76,7 +76,7 @@ def test_states_have_28_numbers_and_actions_4() -> None:
 
 # in these episodes of FetchPickAndPlace the block is within reach, so our world does not place it again
 @pytest.mark.parametrize("seed", [0, 1, 3])
-def test_physics_and_observation_are_those_of_fetch_pick_and_place(seed: int) -> None:
+def test_physics_and_observation_equal_fetch_pick_and_place(seed: int) -> None:
     import gymnasium_robotics
 
     gymnasium.register_envs(gymnasium_robotics)
@@ -203,7 +203,7 @@ def test_experts_of_retained_tasks_do_no_target_task_by_chance() -> None:
         ("farthest", None, scene()),
     ],
 )
-def test_questions_are_answered_as_one_sees_it(kind: str, expected: str | None, state: State) -> None:
+def test_answers_match_the_scene(kind: str, expected: str | None, state: State) -> None:
     question = QUESTIONS[kind]
     (index,) = question.answer(state)
     assert (None if index == -1 else question.answers[index]) == expected

@@ -102,7 +102,7 @@ def test_it_is_the_plain_world_and_gymnasium_robotics_bit_for_bit(task: str) -> 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("task", NAMES)
-def test_it_is_so_over_ten_thousand_steps_of_each_task(task: str) -> None:
+def test_it_stays_so_over_ten_thousand_steps_of_each_task(task: str) -> None:
     followed, successes = compare(task, steps=10_000, threads=2)
     assert followed > 5_000
     assert successes > 50

@@ -64,14 +64,14 @@ def _place(images: Images) -> NDArray[np.float64]:
     return np.array([np.mean(np.nonzero(_shown("red", image)), axis=1) for image in images]).T
 
 
-def test_the_tasks_are_those_of_fetch_with_the_target_on_the_table() -> None:
+def test_the_tasks_are_fetchs_with_the_target_on_the_table() -> None:
     assert [task.name for task in SCENARIO.tasks] == [task.name for task in FETCH.tasks]
     assert not {task.dataset_id for task in SCENARIO.tasks} & {task.dataset_id for task in FETCH.tasks}
     heights = [_start(seed, task.name)[TARGET][2] for seed in range(5) for task in SCENARIO.tasks]
     assert np.ptp(heights) < 1e-3
 
 
-def test_an_episode_is_bit_for_bit_that_of_fetch() -> None:
+def test_an_episode_equals_fetchs_bit_for_bit() -> None:
     plain, expert = resolve(FETCH.tasks[0].world)(), resolve(FETCH.tasks[0].expert)("push")
     world = World()
     state, other = (one.reset(seed=6, options={"task": "push"})[0] for one in (plain, world))
@@ -118,7 +118,7 @@ def test_eyes_learn_the_places_of_block_target_and_things() -> None:
     swapped[0, THINGS] = state[0, THINGS].reshape(2, 3)[::-1].ravel()
     camera = resolve(str(CAMERA))
     (places_seen,), (again,) = camera.pictured(state), camera.pictured(swapped)
-    assert np.array_equal(places_seen, again)  # only their places tell the things apart
+    assert np.array_equal(places_seen, again)  # the things differ only in their places
     places = state[0, THINGS].reshape(2, 3)[:, :2]
     right, left = places[places[:, 1].argsort()]
     np.testing.assert_array_equal(places_seen, [*state[0, BLOCK], *state[0, TARGET][:2], *right, *left])

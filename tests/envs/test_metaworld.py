@@ -124,7 +124,7 @@ def test_the_scenario_has_the_promised_parts() -> None:
     assert len(QUESTIONS) >= 8
 
 
-def test_the_ten_tasks_are_those_of_continual_world_in_their_order() -> None:
+def test_the_ten_tasks_are_continual_worlds_in_their_order() -> None:
     # Wolczyk et al. 2021, arXiv 2105.10919, CW10
     names = (
         "hammer push_wall faucet_close push_back stick_pull handle_press_side push shelf_place window_close"
@@ -232,7 +232,7 @@ def test_the_expert_does_its_task(task: Task) -> None:
         ("object_height", None, scene(thing=(0.0, 0.6, 0.1))),
     ],
 )
-def test_questions_are_answered_as_one_sees_it(kind: str, expected: str | None, state: State) -> None:
+def test_answers_match_the_scene(kind: str, expected: str | None, state: State) -> None:
     question = QUESTIONS[kind]
     (index,) = question.answer(state)
     assert (None if index == -1 else question.answers[index]) == expected

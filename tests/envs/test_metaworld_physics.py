@@ -61,7 +61,7 @@ class Peer:
 
 def check_start(episode: Any, original: Any) -> None:
     """Check that our start equals Meta-World's second reset of the same draw."""
-    # MuJoCo's positions are those before the last of the 250 steps of the hand's way; ours are up to date
+    # MuJoCo's positions date from before the last of the 250 steps of the hand's way; ours are up to date
     mujoco.mj_forward(original.model, original.data)
     np.testing.assert_allclose(episode.data.qpos, original.data.qpos, rtol=0, atol=1e-6)
     np.testing.assert_allclose(episode.data.xpos, original.data.xpos, rtol=0, atol=1e-6)
@@ -129,7 +129,7 @@ def test_it_is_the_plain_world_and_meta_world_bit_for_bit(task: str) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("task", list(TASKS))
-def test_it_is_so_over_ten_thousand_steps_of_each_task(task: str) -> None:
+def test_it_stays_so_over_ten_thousand_steps_of_each_task(task: str) -> None:
     assert compare(task, steps=10_000) > 5
 
 

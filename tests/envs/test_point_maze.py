@@ -85,7 +85,7 @@ def test_every_target_is_in_a_maze_of_a_skill_and_shares_its_states() -> None:
 
 # gymnasium-robotics writes the map into a file and leaves it behind
 @pytest.mark.parametrize("maze", MAZES.values(), ids=list(MAZES))
-def test_physics_and_observation_are_those_of_point_maze(
+def test_physics_and_observation_equal_point_maze(
     maze: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from gymnasium_robotics.envs.maze.point_maze import PointMazeEnv
@@ -114,7 +114,7 @@ def test_physics_and_observation_are_those_of_point_maze(
 
 
 @pytest.mark.parametrize("maze", MAZES.values(), ids=list(MAZES))
-def test_the_distances_to_the_walls_are_those_that_rays_find(maze: Any) -> None:
+def test_the_distances_to_the_walls_equal_ray_casts(maze: Any) -> None:
     model = scene(maze.colour)
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
@@ -272,13 +272,13 @@ def test_passing_through_the_room_without_a_stop_is_no_success() -> None:
         ("nearer_height_wall", None, state(above=0.6)),
     ],
 )
-def test_questions_are_answered_as_one_sees_it(kind: str, expected: str | None, seen: State) -> None:
+def test_answers_match_the_scene(kind: str, expected: str | None, seen: State) -> None:
     question = QUESTIONS[kind]
     (index,) = question.answer(seen)
     assert (None if index == -1 else question.answers[index]) == expected
 
 
-def test_questions_have_balanced_answers_for_training_and_report() -> None:
+def test_questions_have_balanced_answers_for_training_and_test() -> None:
     few = dataclasses.replace(SCENARIO, budget=dataclasses.replace(SCENARIO.budget, question_episodes=48))
     for questions in load_questions(few):
         kind, batch = scored_questions(questions, 1600)
@@ -315,7 +315,7 @@ print("drawn")
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_in_a_perturbed_episode_the_ball_is_heavier_and_beside_its_place(seed: int) -> None:
+def test_in_a_perturbed_episode_the_ball_is_heavier_and_displaced(seed: int) -> None:
     worlds = [vector_world(SCENARIO.tasks[0].world, 1, 1, perturbed) for perturbed in (False, True)]
     (plain,), (perturbed,) = (world.reset([0], [seed], [NAMES[0]]) for world in worlds)
     models = [world.drawable(0).model for world in worlds]  # type: ignore[attr-defined]

@@ -24,7 +24,13 @@ def _command(records: Path) -> list[str]:
 
 def _start(records: Path) -> subprocess.Popen[str]:
     return subprocess.Popen(
-        _command(records), stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, start_new_session=True
+        _command(records),
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        start_new_session=True,
+        # tests that run in the background of a shell ignore Ctrl-C, and so would this process
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )
 
 

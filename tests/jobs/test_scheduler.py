@@ -236,7 +236,14 @@ def test_stopping_the_command_ends_its_workers_and_keeps_finished_records(
 ) -> None:
     command = [sys.executable, "-m", "clbench", "run", TOY, "frozen", "sft", "joint", "--seeds", "1"]
     command += ["--workers", "1", "--records", str(tmp_path / "records")]
-    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, start_new_session=True)
+    process = subprocess.Popen(
+        command,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+        # tests that run in the background of a shell ignore Ctrl-C, and so would this process
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+    )
     first = tmp_path / "records" / "Toy-v0" / "frozen" / "seed-0.json"
     deadline = time.monotonic() + 100
     while not first.exists() and time.monotonic() < deadline:

@@ -37,7 +37,7 @@ def four_methods(add_full: Callable[..., Path], matrix: Any, tmp_path: Path) -> 
 
 @pytest.fixture
 def shown_with_page(four_methods: Path, capsys: pytest.CaptureFixture[str]) -> Callable[[], tuple[str, str]]:
-    """Return a function that shows the leaderboard and returns what is printed and the Markdown."""
+    """Return a function that shows the leaderboard and returns the printed text and the Markdown."""
 
     def shown() -> tuple[str, str]:
         resolve("clbench.leaderboard.cli:show")(records=four_methods)

@@ -51,7 +51,7 @@ def test_a_folder_without_rows_lists_why(tmp_path: Path, capsys: pytest.CaptureF
 
 
 @pytest.mark.parametrize("exists", [True, False])
-def test_without_records_the_command_says_what_to_run(
+def test_without_records_the_command_shows_what_to_run(
     exists: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     folder = tmp_path / "records"

@@ -72,7 +72,7 @@ def test_a_row_does_not_depend_on_the_other_rows(four_methods: Path, add_full: C
     pandas.testing.assert_frame_equal(kept, before.drop(columns="rank"))
 
 
-def test_the_relative_cost_is_that_of_all_steps_with_the_time_of_one(
+def test_the_relative_cost_counts_all_steps_with_the_time_of_one(
     four_methods: Path, add_full: Callable[..., Path]
 ) -> None:
     for seed in range(2):

@@ -92,7 +92,7 @@ def test_stop_gradient_keeps_every_answer(board: Any) -> None:
     assert abs(board.loc["stop_gradient", "question_retention"] - before) <= 0.01
 
 
-def test_what_a_row_may_touch_is_what_its_class_declares() -> None:
+def test_a_row_may_touch_the_data_that_its_class_declares() -> None:
     for path in (RECORDS / "Fetch-v0").rglob("*.json"):
         run = read_record(path).run
         if "online" in run.uses:  # an agent, not a method
@@ -103,13 +103,13 @@ def test_what_a_row_may_touch_is_what_its_class_declares() -> None:
 def test_aegis_sheds_little_energy_at_every_stage() -> None:
     for path in (RECORDS / "Fetch-v0" / "aegis").glob("*.json"):
         for stage in ("1", "2", "3", "4"):
-            told = read_record(path).diagnostics[stage]
-            assert 0 < told["energy_shed_mean"] <= told["energy_shed_highest"] < 1
-            assert 0 < told["layers_projected_mean"] <= 1
+            reported = read_record(path).diagnostics[stage]
+            assert 0 < reported["energy_shed_mean"] <= reported["energy_shed_highest"] < 1
+            assert 0 < reported["layers_projected_mean"] <= 1
 
 
 @pytest.mark.slow
-def test_the_committed_pages_are_those_of_the_committed_records(
+def test_the_committed_pages_show_the_committed_records(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     checkout = RECORDS.parents[1]

@@ -1,6 +1,7 @@
 import dataclasses
 import sys
 import types
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -9,7 +10,13 @@ import torch
 from clbench.data.demonstrations import Demonstrations
 from clbench.learning.method import Metadata, Method
 from clbench.learning.prior import Prior, Source, UndeclaredAccessError
-from clbench.learning.registry import build_method, describe_method, load_method, method_names
+from clbench.learning.registry import (
+    build_method,
+    describe_method,
+    load_method,
+    method_names,
+    method_packages,
+)
 
 
 @pytest.fixture
@@ -160,3 +167,14 @@ def test_a_method_is_described_with_the_hash_of_its_code(
         hashes.append(found["source"])
     del sys.modules["described"]
     assert len(set(hashes)) == 2
+
+
+def test_the_source_of_a_method_covers_the_methods_that_it_derives_from(
+    write_module: Callable[[str, str], None],
+) -> None:
+    write_module(
+        "derived",
+        "import dataclasses\nfrom clbench.methods.lora import LoRA\n"
+        "@dataclasses.dataclass\nclass Mine(LoRA):\n    '''Mine.'''\n",
+    )
+    assert method_packages(load_method("derived:Mine")) == ["clbench.methods", "derived"]

@@ -69,7 +69,7 @@ def _block(gradients: Mapping[str, NDArray[np.float64]], layer: int) -> NDArray[
 
 
 def _set(policy: Policy) -> dict[str, NDArray[np.float64]]:
-    """Return the gradients that are set, zeros where there is none."""
+    """Return the gradients, zeros where there is none."""
     return {
         name: (torch.zeros_like(weight) if weight.grad is None else weight.grad).double().numpy()
         for name, weight in policy.named_parameters()
@@ -157,7 +157,7 @@ def test_a_projected_layer_is_orthogonal_to_the_anchor_and_the_others_keep_every
     assert kinds == {True, False}
 
 
-def test_what_lies_outside_the_backbones_layers_keeps_the_plain_gradient() -> None:
+def test_parameters_outside_the_backbones_layers_keep_the_plain_gradient() -> None:
     method, policy = _moved()
     batch = toy_source("right").sample(16)
     policy.action_loss(batch).mean().backward()  # type: ignore[no-untyped-call]
@@ -174,7 +174,7 @@ def test_what_lies_outside_the_backbones_layers_keeps_the_plain_gradient() -> No
 def _by_hand(
     gradients: list[list[float]], against: list[list[float]], **changes: Any
 ) -> tuple[Any, list[list[float]]]:
-    """Return a method, and what it sets where loss and distance have these gradients, layer by layer."""
+    """Return a method, and the gradients that it sets if loss and distance have these, layer by layer."""
     layers = [nn.Linear(len(values), 1, bias=False) for values in gradients]
     policy: Any = SimpleNamespace(backbone=SimpleNamespace(layers=layers))
 
@@ -263,7 +263,7 @@ def test_the_anchor_survives_its_state() -> None:
     assert all(np.array_equal(found[0][name], found[1][name]) for name in found[0])
 
 
-def test_the_diagnostics_tell_the_distance_at_eleven_steps_from_the_first_to_the_last() -> None:
+def test_the_diagnostics_have_the_distance_at_eleven_steps_from_the_first_to_the_last() -> None:
     method, policy = build_method("aegis", {"samples": 50}), Policy(CONFIG)
     method.prepare(policy, Prior({"questions": toy_questions(3)}))
     assert method.diagnostics() == {}

@@ -33,7 +33,7 @@ def _stage(seed: int = 0) -> Stage:
 
 
 def _moments(batch: Batch) -> list[tuple[float, ...]]:
-    """Return what a demonstration showed, sample by sample: state, words and actions."""
+    """Return the samples of a demonstration: state, words and actions."""
     shown = [batch.state, batch.words, batch.action.flatten(1), batch.valid]
     return [tuple(row) for row in torch.cat([part.float() for part in shown], dim=1).tolist()]
 
@@ -54,7 +54,7 @@ def test_both_skills_are_kept() -> None:
     assert _ways(method.buffer) == {(-1.0, 0.0), (0.0, 1.0)}
 
 
-def test_what_is_kept_counts_in_bytes() -> None:
+def test_the_buffer_counts_in_bytes() -> None:
     method, _ = _prepared(share=0.1)
     kept = [value.nbytes for value in method.state().values()]
     # for each moment 4 numbers of the state, 8 actions of 2, their flags, noise of 8 by 2, a draw; 12 words
@@ -83,7 +83,7 @@ def test_the_share_of_replay_is_taken_out_of_the_batch(replay: float, count: int
     assert found == [False] * (16 - count) + [True] * count
 
 
-def test_flow_time_and_noise_of_what_is_replayed_are_drawn_anew() -> None:
+def test_flow_time_and_noise_of_replayed_samples_are_drawn_anew() -> None:
     method, prior = _prepared(share=0.02)
     first, second = (method.batch(toy_source("right"), prior) for _ in range(2))
     draws = torch.cat([first.draw[8:], second.draw[8:], method.buffer.draw])

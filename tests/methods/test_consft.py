@@ -115,7 +115,7 @@ def test_a_perfect_sample_weighs_1_and_a_hopeless_one_the_floor() -> None:
 
 def test_an_infinite_loss_stops_the_run_although_its_weight_is_the_floor() -> None:
     policy, batch = Policy(SMALL), toy_source("right").sample(2)
-    # at flow time 1 the head reads noise alone: its velocity is finite, the action to be hit is not
+    # at flow time 1 the head reads noise alone: its velocity is finite, its target action is not
     batch = dataclasses.replace(
         batch, action=torch.full_like(batch.action, 1e25), draw=torch.ones(2), valid=torch.ones(2, 8)
     )
@@ -154,7 +154,7 @@ def test_no_gradient_flows_through_the_weights() -> None:
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_one_sample_disrupts_what_was_known_by_the_square_of_its_weight(seed: int) -> None:
+def test_one_sample_disrupts_old_knowledge_by_the_square_of_its_weight(seed: int) -> None:
     """The paper's claim (Eq. 7): g'Fg of the weighted gradient is omega^2 times g'Fg of the plain one."""
     policy, batch = Policy(SMALL, seed=seed), toy_source("right", seed=seed).sample(1)
     method = _started("consft", kappa=1.0, tau_start=1.0)
@@ -182,7 +182,7 @@ def test_the_histogram_counts_each_sample_of_each_step_in_its_part_of_the_stage(
     assert not np.any(method.diagnostics()["omega_counts"])  # a new stage counts anew
 
 
-def test_the_histogram_is_that_of_the_weights() -> None:
+def test_the_histogram_counts_the_weights() -> None:
     policy, batch = Policy(SMALL), toy_source("right", seed=1).sample(64)
     method = _started("consft", kappa=2.0, tau_start=1.0)
     method.loss(policy, batch, Progress(7, 10))
@@ -222,7 +222,7 @@ def test_a_constant_weight_is_the_mean_weight_of_consft_for_every_sample() -> No
         assert even.tolist() == pytest.approx([float(uneven.mean())] * 16, rel=1e-5)
 
 
-def test_the_gradient_of_a_constant_weight_is_a_multiple_of_that_of_sft() -> None:
+def test_the_gradient_of_a_constant_weight_is_a_multiple_of_sfts() -> None:
     policy, batch = Policy(SMALL), toy_source("right", seed=2).sample(16)
     found = _set_gradient(_started("constant_weight", **UNEVEN), policy, batch, Progress(0, 100))
     losses = policy.action_loss(batch)
@@ -230,7 +230,7 @@ def test_the_gradient_of_a_constant_weight_is_a_multiple_of_that_of_sft() -> Non
     torch.testing.assert_close(found, float(omega) * _gradient(policy, losses.mean()), rtol=1e-3, atol=1e-6)
 
 
-def test_shuffled_weights_are_those_of_consft_in_another_order() -> None:
+def test_shuffled_weights_are_consfts_in_another_order() -> None:
     losses = Policy(SMALL).action_loss(toy_source("right", seed=2).sample(64))
     consft: Any = build_method("consft", UNEVEN)
     shuffled: Any = build_method("shuffled_weights", UNEVEN)

@@ -69,7 +69,7 @@ def _check_close(found: dict[str, Tensor], expected: dict[str, Tensor]) -> None:
 
 
 def _distilled(policy: Policy, teacher: Policy, batch: Batch) -> float:
-    """Return the mean over samples of the squared difference of the velocities, over what counts of each."""
+    """Return the mean over samples of the squared difference of the velocities at valid steps."""
     with torch.no_grad():
         away = (policy.predict(batch) - teacher.predict(batch)).double().numpy() ** 2
     counts = batch.valid.numpy() > 0
@@ -109,7 +109,7 @@ def test_the_teacher_of_lwf_does_not_learn() -> None:
     assert all(weight.equal(before[name]) for name, weight in method.teacher.named_parameters())
 
 
-def test_the_gradient_of_lwf_is_that_of_both_terms() -> None:
+def test_the_gradient_of_lwf_sums_both_terms() -> None:
     method, policy, batch = (
         build_method("lwf", {"strength": 0.7}),
         Policy(SMALL),
@@ -131,9 +131,9 @@ def _vector(gradients: dict[str, Tensor]) -> NDArray[np.float64]:
     return np.concatenate([value.double().numpy().ravel() for value in gradients.values()])
 
 
-def test_a_gem_projects_the_gradient_off_what_raises_the_prior_loss() -> None:
+def test_a_gem_projects_the_gradient_off_directions_that_raise_the_prior_loss() -> None:
     policy, method = Policy(SMALL), build_method("a_gem", {})
-    # at flow time 1 the head reads the noise alone; what it predicts there is too low for one, too high for
+    # at flow time 1 the head reads the noise alone; its prediction there is too low for one, too high for
     # the other
     batch = dataclasses.replace(toy_source("right").sample(16), draw=torch.ones(16))
     with torch.no_grad():
@@ -257,7 +257,7 @@ def test_low_rate_sft_keeps_the_form_of_the_schedule() -> None:
         assert method.learning_rate(scheduled, Progress(step, 100)) == pytest.approx(0.2 * scheduled)
 
 
-# ---- what the backbone learns from -------------------------------------------------------------------------
+# ---- sources of the backbone's gradient --------------------------------------------------------------------
 
 
 def test_stop_gradient_keeps_the_backbone_and_its_answers_to_the_last_bit() -> None:
@@ -297,7 +297,7 @@ def test_knowledge_insulation_trains_the_backbone_on_questions_and_the_head_on_a
         name: acting[name] if name.startswith("head.") else value for name, value in answering.items()
     }
     _check_close(found, expected)
-    assert acting["backbone.readout"].any()  # what insulation keeps out
+    assert acting["backbone.readout"].any()  # insulation stops this gradient
     loss = method.loss(policy, (batch, questions), NOW).item()
     assert loss == pytest.approx(
         0.5 * policy.action_loss(batch).mean().item() + policy.answer_loss(questions).mean().item(), rel=1e-5

@@ -1,4 +1,4 @@
-"""EWC and L2-SP: what pulls weights back, where to, and how strongly."""
+"""EWC and L2-SP: the pull on the weights, its anchor and its strength."""
 
 from typing import Any
 
@@ -98,7 +98,7 @@ def test_the_pull_is_the_gradient_of_the_penalty(spec: str, changes: dict[str, A
     pull = torch.autograd.grad(changes["strength"] / 2 * penalty, weights)
     for value, before, extra in zip(found, plain, pull, strict=True):
         if before is None:
-            assert value is None  # what answers questions is not trained: nothing moves it
+            assert value is None  # the part that answers questions is not trained: nothing moves it
         else:
             assert value is not None
             torch.testing.assert_close(value, before + extra, rtol=1e-4, atol=1e-6)

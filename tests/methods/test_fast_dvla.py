@@ -38,7 +38,7 @@ def _prepared(policy: Policy, **changes: Any) -> Any:
 
 
 def _regulariser_gradient(method: Any, policy: Policy) -> dict[str, Tensor]:
-    """Return what the method adds to the gradient of a loss that is flat."""
+    """Return the term that the method adds to the gradient of a flat loss."""
     policy.zero_grad()
     flat = torch.stack([(0.0 * weight).sum() for weight in policy.parameters()]).sum()
     method.gradients(policy, flat)

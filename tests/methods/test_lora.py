@@ -1,4 +1,4 @@
-"""LoRA: the policy under its adapters, and what the adapters add up to."""
+"""LoRA: the policy under its adapters, and the sum of the adapters."""
 
 import math
 from pathlib import Path
@@ -102,7 +102,7 @@ def test_merged_adapters_act_as_they_did(variant: str) -> None:
 
 
 @VARIANTS
-def test_what_an_adapter_adds_is_that_of_the_papers(variant: str) -> None:
+def test_an_adapter_adds_the_papers_matrix(variant: str) -> None:
     """W + s B A with s = alpha / rank, or alpha / sqrt(rank); DoRA gives each row of it a learned norm."""
     _, policy = _adapted(variant, alpha=6.0)
     weights = {name: weight.double().numpy() for name, weight in _weights(policy).items()}
@@ -118,7 +118,7 @@ def test_what_an_adapter_adds_is_that_of_the_papers(variant: str) -> None:
 
 
 def _map(policy: Policy) -> NDArray[np.float64]:
-    """Return the matrix that a linear map with its adapter is, from what it does to unit vectors."""
+    """Return the matrix of a linear map with its adapter, from the images of unit vectors."""
     module: Any = policy.get_submodule(MAP)
     with torch.no_grad():
         units = module(torch.eye(32)[None])[0] - module(torch.zeros(1, 1, 32))[0]

@@ -1,4 +1,4 @@
-"""What each method is for, shown on the toy."""
+"""The purpose of each method, shown on the toy."""
 
 import dataclasses
 import re
@@ -114,7 +114,7 @@ def short_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., 
         ("weight_interpolation", 0, 2),
     ],
 )
-def test_a_run_says_what_it_uses_and_costs_and_has_every_metric(
+def test_a_run_records_its_uses_and_costs_and_has_every_metric(
     name: str, preparing: int, adapting: int, short_run: Callable[..., Record]
 ) -> None:
     record = short_run(name, **FEWER.get(name, {}))

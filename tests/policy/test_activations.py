@@ -1,4 +1,4 @@
-"""Where hidden states lie, and the distance between two such places."""
+"""Positions of hidden states, and the distance between two of them."""
 
 import numpy as np
 import pytest
@@ -40,7 +40,7 @@ def test_a_distance_is_symmetric_and_zero_only_to_the_same_place() -> None:
     assert first.distance(first).tolist() == [0.0] * 3
 
 
-def test_mean_and_deviation_are_those_of_all_tokens_that_are_read() -> None:
+def test_mean_and_deviation_cover_all_tokens_that_are_read() -> None:
     policy, words = Policy(CONFIG, seed=1), encode(TEXTS)
     state = torch.randn(len(TEXTS), 4, generator=torch.Generator().manual_seed(0))
     with torch.no_grad():
@@ -58,7 +58,7 @@ def test_mean_and_deviation_are_those_of_all_tokens_that_are_read() -> None:
         np.testing.assert_allclose(found.deviation[layer].numpy(), deviation, rtol=1e-4)
 
 
-def test_what_stands_in_the_padding_does_not_count() -> None:
+def test_padding_tokens_do_not_count() -> None:
     policy, words = Policy(CONFIG), encode(TEXTS)
     mask = policy.backbone.mask(words)
     hidden = [torch.randn(3, mask.shape[-1], 32, generator=torch.Generator().manual_seed(0))]

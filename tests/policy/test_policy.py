@@ -70,7 +70,7 @@ def test_the_flow_loss_is_the_squared_error_of_the_velocity_at_the_drawn_time() 
 
 
 def test_the_loss_is_the_mean_over_the_steps_that_count() -> None:
-    """What does not count is still read by the other steps, as in a rollout; its own error is left out."""
+    """The other steps still read a step that does not count, as in a rollout; only its error is left out."""
     policy, batch = Policy(CONFIG), _batch(3)
     parts = []
     for step in range(CONFIG.chunk):
@@ -94,7 +94,7 @@ def test_detached_hidden_states_stop_the_gradient_at_the_backbone() -> None:
     assert all(parameter.grad is not None for parameter in policy.head.parameters())
 
 
-def test_padding_words_do_not_change_what_the_policy_does() -> None:
+def test_padding_words_do_not_change_the_actions_of_the_policy() -> None:
     policy, batch = Policy(CONFIG), _batch(16)
     changed = policy.backbone.words.weight.data.clone()
     before = policy.act(batch.state, batch.words, batch.noise)
@@ -109,7 +109,7 @@ def test_normalisation_follows_the_data_it_is_given() -> None:
     policy.normalise_like(state, torch.randn(100, 3))
     np.testing.assert_allclose(policy.state_mean, state.numpy().mean(axis=0), rtol=1e-5)
     np.testing.assert_allclose(policy.state_std[:4], state.numpy().std(axis=0)[:4], rtol=1e-5)
-    assert policy.state_std[4] == pytest.approx(0.01)  # what does not vary is not blown up
+    assert policy.state_std[4] == pytest.approx(0.01)  # constant channels are not blown up
 
 
 def test_a_policy_survives_saving(tmp_path: Path) -> None:
@@ -125,7 +125,7 @@ def _cut(folder: Path) -> None:
 
 
 def _set(**sizes: Any) -> Callable[[Path], None]:
-    """Return what writes other sizes beside the tensors."""
+    """Return a function that writes other sizes into a checkpoint and keeps its tensors."""
 
     def damage(folder: Path) -> None:
         config = json.loads((folder / "policy.json").read_text())
@@ -135,7 +135,7 @@ def _set(**sizes: Any) -> Callable[[Path], None]:
 
 
 def _edit(change: Callable[[dict[str, Tensor]], Any]) -> Callable[[Path], None]:
-    """Return what writes other tensors."""
+    """Return a function that writes other tensors into a checkpoint."""
 
     def damage(folder: Path) -> None:
         tensors = load((folder / "policy.safetensors").read_bytes())

@@ -60,7 +60,7 @@ def test_a_historic_record_can_be_written_in_the_present_schema(name: str, tmp_p
     assert read_record(tmp_path / "record.json") == record
 
 
-def test_words_of_schema_2_are_those_of_today() -> None:
+def test_words_of_schema_2_are_translated() -> None:
     tuning = read_record(HISTORIC / "schema-2" / "Fetch-v0-weight_interpolation-tuning.json")
     assert (tuning.run.split, set(tuning.episodes["split"])) == ("validation", {"validation"})
     budget = tuning.scenario.budget
@@ -70,14 +70,14 @@ def test_words_of_schema_2_are_those_of_today() -> None:
     assert not {"selection_episodes", "report_episodes", "report_questions", "perturbation"} & set(budget)
 
 
-def test_what_schema_2_left_out_has_its_usual_value() -> None:
+def test_fields_that_schema_2_lacks_have_their_usual_values() -> None:
     online = read_record(HISTORIC / "schema-2" / "DMControl-v0-sac-online.json")
     assert (online.run.order, online.run.perturb) == (0, False)
     assert online.costs == Costs(parameters=428296, environment_steps=30000)
     assert read_record(HISTORIC / "schema-2" / "MetaWorld-v0-sft-order-1.json").run.order == 1
 
 
-def test_what_follows_from_the_budget_of_schema_1_is_filled_in() -> None:
+def test_fields_that_follow_from_the_budget_of_schema_1_are_filled_in() -> None:
     record = read_record(HISTORIC / "schema-1" / "Fetch-v0-sft-seed-0.json")
     assert record.run.split == "test"
     assert record.scenario.evaluation_steps == [75, 150, 225, 300]
@@ -124,7 +124,7 @@ def put(values: dict[str, Any], place: str, value: Any) -> None:
         (1, "run", 5, "run must be an object"),
     ],
 )
-def test_a_record_that_is_not_of_its_old_schema_is_refused_by_what_is_wrong_with_it(
+def test_a_record_that_breaks_its_old_schema_is_refused_with_the_fault(
     schema: int, place: str, value: Any, words: str, tmp_path: Path
 ) -> None:
     values = json.loads(OLD[schema].read_text(encoding="utf-8"))

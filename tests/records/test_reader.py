@@ -1,4 +1,4 @@
-"""The reader of records: what is no record is refused by what is wrong with it."""
+"""The reader of records: a file that is no record is refused with its fault."""
 
 import json
 import re
@@ -58,7 +58,7 @@ def test_hostile_bytes_are_refused(content: bytes, tmp_path: Path) -> None:
         read_record(tmp_path / "record.json")
 
 
-def test_what_is_no_file_is_refused(tmp_path: Path) -> None:
+def test_a_path_that_is_no_file_is_refused(tmp_path: Path) -> None:
     (tmp_path / "folder.json").mkdir()
     for name in ("folder.json", "absent.json"):
         with pytest.raises(RecordError, match="cannot be read"):

@@ -1,4 +1,4 @@
-"""The writer of records: whatever it writes can be read, and equals what was written."""
+"""The writer of records: everything that it writes can be read, and comes back equal."""
 
 import dataclasses
 import os
@@ -34,7 +34,7 @@ def test_a_record_that_was_written_is_read_as_it_was(record: Record, tmp_path: P
     assert read_record(path) == record
 
 
-def test_a_failed_run_says_where(record: Record, tmp_path: Path) -> None:
+def test_a_failed_run_names_the_place(record: Record, tmp_path: Path) -> None:
     error = {"where": "loss of stage 1", "type": "ValueError", "message": "no", "traceback": "..."}
     failed = dataclasses.replace(record, status="failed", error=error)
     write_record(failed, tmp_path / "record.json")
@@ -75,9 +75,7 @@ def test_a_record_that_cannot_be_written_leaves_the_old_one_and_no_partial(
     assert os.listdir(tmp_path) == ["record.json"]
 
 
-def test_what_a_method_reports_with_tuples_and_numbers_as_names_can_be_read(
-    record: Record, tmp_path: Path
-) -> None:
+def test_diagnostics_with_tuples_and_numbers_as_names_can_be_read(record: Record, tmp_path: Path) -> None:
     record.diagnostics = {"1": {2: (1.0, 2.0), 10: "x"}}
     write_record(record, tmp_path / "record.json")
     assert read_record(tmp_path / "record.json").diagnostics == {"1": {"2": [1.0, 2.0], "10": "x"}}

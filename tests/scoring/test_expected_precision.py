@@ -18,7 +18,7 @@ from clbench.testing import TOY
     ("degrees", "value"),
     [(1, 12.706), (2, 4.303), (3, 3.182), (4, 2.776), (9, 2.262), (50, 2.009), (MANY, 1.960)],
 )
-def test_students_quantile_is_that_of_printed_tables(degrees: int, value: float) -> None:
+def test_students_quantile_agrees_with_printed_tables(degrees: int, value: float) -> None:
     assert student_quantile(degrees) == pytest.approx(value, abs=0.0006)
 
 
@@ -34,7 +34,7 @@ def test_students_quantile_is_that_of_printed_tables(degrees: int, value: float)
         (15, MANY, 4.80),
     ],
 )
-def test_the_quantile_of_the_studentised_range_is_that_of_printed_tables(
+def test_the_quantile_of_the_studentised_range_agrees_with_printed_tables(
     count: int, degrees: int, value: float
 ) -> None:
     assert studentised_range_quantile(count, degrees) == pytest.approx(value, abs=0.006)
@@ -59,7 +59,7 @@ def test_the_studentised_range_exceeds_its_quantile_in_a_twentieth_of_simulation
     assert share == pytest.approx(0.05, abs=0.0015)  # three standard errors
 
 
-def test_the_width_to_expect_with_one_seed_is_that_of_a_binomial() -> None:
+def test_the_width_to_expect_with_one_seed_is_binomial() -> None:
     expected = 1.96 * np.sqrt(0.25 / 120)
     assert half_width(1, 20, 6) == pytest.approx(expected, rel=0.01)
     assert half_width(1, 20, 6, seed_deviation=0.3) == half_width(1, 20, 6)

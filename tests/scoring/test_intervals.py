@@ -1,4 +1,4 @@
-"""Intervals against simulations, against SciPy, against closed forms and against what must be exact."""
+"""Intervals against simulations, against SciPy, against closed forms and against exact cases."""
 
 from typing import Any
 
@@ -44,7 +44,7 @@ def scores(final: Any, correct: int = 50) -> Scores:
 
 
 def whole_run(shape: Layout, success: Any, **arrays: Any) -> Scores:
-    """Return a run with the outcomes `success` at the ends; of `arrays` those given, the others missing."""
+    """Return a run with the outcomes `success` at the ends and the given `arrays`; the others are missing."""
     targets, points = len(shape.target), len(shape.steps)
     counts = np.full((targets + 1, len(shape.kinds)), 100.0)
     on_the_way = np.full((targets, points - 1, len(shape.tasks), len(shape.curve_episodes)), np.nan)
@@ -131,7 +131,7 @@ def test_rows_have_generators_of_their_own() -> None:
     assert len(draws) == len(names)
 
 
-def test_with_one_seed_and_task_the_interval_is_that_of_scipy() -> None:
+def test_with_one_seed_and_task_the_interval_is_scipys() -> None:
     outcomes = np.random.default_rng(0).random(40) < 0.7
     got = estimate(["retention"], {0: scores([outcomes])}, np.random.default_rng(1), replicates=20_000)
     expected = stats.bootstrap(
@@ -187,7 +187,7 @@ def rate_of_seeds(rates: Any, tasks: int, episodes: int, generator: np.random.Ge
 
 
 @pytest.mark.parametrize(("seeds", "spread"), [(1, 0.0), (3, 0.05), (5, 0.1)])
-def test_intervals_hold_the_truth_about_as_often_as_they_say(seeds: int, spread: float) -> None:
+def test_intervals_hold_the_truth_about_as_often_as_they_should(seeds: int, spread: float) -> None:
     generator = np.random.default_rng(0)
     held = 0
     for _ in range(300):
@@ -199,7 +199,7 @@ def test_intervals_hold_the_truth_about_as_often_as_they_say(seeds: int, spread:
     assert 0.92 <= held / 300 <= 0.98  # 0.95 within two and a half standard errors
 
 
-def test_with_several_seeds_the_interval_of_an_unbounded_quantity_is_that_of_students_t() -> None:
+def test_with_several_seeds_the_interval_of_an_unbounded_quantity_is_students_t() -> None:
     values = np.array([0.3, 1.7, 0.9, 4.0])
     without_one = (values.sum() - values) / 3
     expected = stats.t.interval(0.95, 3, loc=values.mean(), scale=stats.sem(values))
@@ -220,7 +220,7 @@ def test_the_interval_of_a_rate_is_students_on_the_scale_of_the_arcsine_of_the_r
     assert got.high == pytest.approx(np.sin(centre + reach) ** 2, rel=1e-3)
 
 
-def test_the_interval_of_pooled_curves_is_that_of_the_jackknife() -> None:
+def test_the_interval_of_pooled_curves_is_the_jackknifes() -> None:
     generator, shape = np.random.default_rng(3), layout(1, 10, targets=2, points=3)
     runs, scratch = ({seed: random_run(generator, shape) for seed in range(4)} for _ in range(2))
 
@@ -260,8 +260,8 @@ def test_seeds_that_agree_exactly_have_an_interval_of_episodes() -> None:
     assert width(alone) == pytest.approx(2 * width(got), rel=0.15)
 
 
-def test_what_is_known_exactly_has_no_width() -> None:
-    # A frozen policy meets the same episodes at all stages: whatever it can do, it forgets nothing.
+def test_an_exactly_known_quantity_has_no_width() -> None:
+    # A frozen policy meets the same episodes at all stages: it forgets none of its skills.
     generator, shape = np.random.default_rng(0), layout(3, 10, targets=2)
     frozen = {}
     for seed in range(3):
@@ -287,7 +287,7 @@ def test_a_quantity_without_value_for_some_seeds_has_no_interval() -> None:
 
 
 @pytest.mark.parametrize(("seeds", "deviation"), [(3, 0.05), (5, 0.0), (5, 0.1)])
-def test_the_width_to_expect_is_that_of_simulated_rows(seeds: int, deviation: float) -> None:
+def test_the_width_to_expect_agrees_with_simulated_rows(seeds: int, deviation: float) -> None:
     generator = np.random.default_rng(0)
     rates = 0.5 + deviation * generator.standard_normal((100, seeds))
     widths = [
@@ -333,7 +333,7 @@ def test_pairing_makes_the_interval_of_a_difference_narrower(seeds: int) -> None
     assert width(difference) < 0.7 * np.hypot(width(alone[0]), width(alone[1]))
 
 
-def test_with_one_seed_and_task_the_paired_interval_is_that_of_scipy() -> None:
+def test_with_one_seed_and_task_the_paired_interval_is_scipys() -> None:
     generator = np.random.default_rng(0)
     luck = generator.random(40)
     ours, theirs = luck < 0.8, (luck + 0.3 * generator.random(40)) < 0.6

@@ -80,12 +80,12 @@ PAGE = Path(__file__).parents[2] / "docs" / "reference" / "metrics.md"
 
 
 @pytest.mark.skipif(not PAGE.exists(), reason="pages are not part of an installed package")
-def test_the_page_of_the_metrics_is_what_the_registry_makes() -> None:
+def test_the_page_of_the_metrics_is_made_from_the_registry() -> None:
     assert PAGE.read_text(encoding="utf-8") == metric_pages.page()
 
 
 @pytest.mark.parametrize("name", METRICS)
-def test_all_about_a_metric_says_its_formula_source_direction_and_what_none_means(name: str) -> None:
+def test_the_description_of_a_metric_has_its_formula_source_direction_and_missing_cases(name: str) -> None:
     metric, text = METRICS[name], metric_pages.text(METRICS[name])
     for part in (metric.formula, metric.source, metric_pages.direction(metric), metric.missing, metric.units):
         assert part in text

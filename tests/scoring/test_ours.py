@@ -52,7 +52,7 @@ def test_forward_transfer_has_the_value_worked_out_by_hand(scores: Callable[...,
     steps = (200, 400)
     run = scores(MATRIX, curves=[[0.7], [0.6]], steps=steps)
     scratch = scores([[0.0] * 5, [0, 0, 0.6, 0, 0], [0, 0, 0, 0.4, 0]], curves=[[0.2], [0.0]], steps=steps)
-    # The curves start with what the stage before left: 0.1 for the first target, 0.2 for the second.
+    # The curves start where the stage before ended: 0.1 for the first target, 0.2 for the second.
     areas = (0.1 / 4 + 0.7 / 2 + 0.9 / 4, 0.2 / 4 + 0.6 / 2 + 0.8 / 4)
     from_scratch = (0.2 / 2 + 0.6 / 4, 0.4 / 4)
     expected = np.mean([(a - b) / (1 - b) for a, b in zip(areas, from_scratch, strict=True)])
@@ -64,7 +64,7 @@ def test_questions_of_all_kinds_count_together_at_the_end_alone(scores: Callable
     assert measure("question_retention", scores(MATRIX, answers=answers)) == pytest.approx(24 / 40)
 
 
-# Two stages with three points each: what plain fine-tuning and a gentler method do on the way.
+# Two stages with three points each, of plain fine-tuning and of a gentler method.
 MATCHED_STEPS = (100, 200, 400)
 PLAIN = {"validation": [[0.4, 0.9, 1.0], [0.0, 0.7, 0.8]], "retained_curves": [[[0.9, 0.7], [0.5, 0.6]]] * 2}
 GENTLE = {
@@ -100,7 +100,7 @@ def test_a_method_that_never_learns_a_target_as_well_has_no_matched_point(
     assert measure("retention_at_matched_adaptation", run, {"sft": sft}) is None
 
 
-def test_the_matched_point_is_chosen_on_validation_episodes_whatever_the_report_ones_say(
+def test_the_matched_point_is_chosen_on_validation_episodes_and_not_on_test_episodes(
     scores: Callable[..., Scores],
 ) -> None:
     sft = scores(MATRIX, steps=MATCHED_STEPS, curves=np.ones((2, 2)), **PLAIN)
@@ -132,7 +132,7 @@ def test_a_rate_that_just_reaches_the_goal_is_matched_whatever_its_last_bit(
     ("method", "point", "points"),
     [("run", 0, [np.nan, 1]), ("run", 2, [np.nan, 1]), ("sft", 2, [np.nan, 1]), ("sft", 0, [2, 1])],
 )
-def test_a_missing_selection_rate_leaves_no_point_that_could_be_another(
+def test_a_missing_validation_rate_leaves_no_point_that_could_be_another(
     method: str, point: int, points: list[float], scores: Callable[..., Scores]
 ) -> None:
     selection = {"sft": np.array(PLAIN["validation"]), "run": np.array(GENTLE["validation"])}
@@ -161,7 +161,7 @@ def test_without_plain_fine_tuning_there_is_no_matched_retention(scores: Callabl
 
 
 @pytest.mark.parametrize(("name", "table"), [("update_sparsity", "sparsity"), ("activation_drift", "drift")])
-def test_what_has_become_of_the_policy_counts_after_the_last_target(
+def test_changes_of_the_policy_count_after_the_last_target(
     name: str, table: str, scores: Callable[..., Scores]
 ) -> None:
     values = np.array([[0.9, 0.8, 0.7, 0.6], [0.5, 0.4, 0.3, 0.2]])
@@ -270,7 +270,7 @@ def test_a_record_of_the_pretrained_policy_alone_has_no_value_that_needs_a_targe
         (2, 4, {"zero_shot"}),
     ],
 )
-def test_what_needs_a_missing_cell_is_none_and_the_rest_is_not(
+def test_metrics_that_need_a_missing_cell_are_none_and_the_others_are_not(
     stage: int, task: int, missing: set[str], scores: Callable[..., Scores]
 ) -> None:
     matrix = np.array(MATRIX)

@@ -174,7 +174,7 @@ LATE = [[0.2, 0, 0], [0.9, 0.2, 0], [0.6, 0.2, 0.2]]
         # from the best success, or from the first
         (LOST, LATE, "forgetting_avalanche", "forgetting_chaudhry"),
         (LOST, LATE, "forgetting_continual_world", "forgetting_mammoth"),
-        # what is clipped, or what is not
+        # the clipped difference, or the plain one
         (LOST, LATE, "forgetting_avalanche", "forgetting_mammoth"),
     ],
 )
@@ -200,7 +200,7 @@ def test_the_highest_of_chaudhry_counts_stages_before_the_target_and_mammoths_do
     assert measure("forgetting_mammoth", run) == pytest.approx(0)
 
 
-def test_with_one_target_what_compares_later_stages_is_none(scores: Callable[..., Scores]) -> None:
+def test_with_one_target_metrics_that_compare_later_stages_are_none(scores: Callable[..., Scores]) -> None:
     run = scores([[1.0, 0.0, 0.0], [0.5, 1.0, 0.0]])
     names = [name for name, metric in METRICS.items() if "fewer than two targets" in metric.missing]
     assert len(names) == 16

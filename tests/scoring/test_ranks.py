@@ -100,7 +100,7 @@ def test_less_forgetting_is_better() -> None:
     assert tie_groups("forgetting", rows) == {"keeps": 1, "forgets": 2}
 
 
-def test_with_complete_boards_rows_are_told_apart_as_by_tukeys_test() -> None:
+def test_with_complete_boards_ranks_agree_with_tukeys_test() -> None:
     # Rows vary enough for the pooled error to be the largest, so that SciPy's test must agree.
     generator = np.random.default_rng(0)
     agreed = 0
@@ -146,14 +146,14 @@ def test_a_row_with_one_seed_is_compared_by_that_seed() -> None:
     assert tie_groups("final_average", {**rows, "single": {1: equal_run(0)}})["single"] == 4
 
 
-def test_rows_without_a_common_seed_are_compared_by_what_runs_vary_by() -> None:
+def test_rows_without_a_common_seed_are_compared_by_the_variation_of_runs() -> None:
     near: dict[str, Runs] = {"one": row(8, 9, 7), "two": {seed + 5: equal_run(7) for seed in range(3)}}
     far: dict[str, Runs] = {**near, "two": {seed + 5: equal_run(1) for seed in range(3)}}
     assert tie_groups("final_average", near) == {"one": 1, "two": 1}
     assert tie_groups("final_average", far) == {"one": 1, "two": 2}
 
 
-def test_where_no_row_has_a_second_seed_only_what_is_far_apart_is_told_apart() -> None:
+def test_where_no_row_has_a_second_seed_only_distant_rows_have_different_ranks() -> None:
     # The studentised range of three, their deviation known, is 3.31: at least 3.31 * 0.15 = 0.5 is needed.
     assert pytest.approx(0.15) == UNKNOWN_DEVIATION
     near, far = ({"one": row(9), "two": row(9), "three": row(last)} for last in (4, 1))
@@ -170,7 +170,7 @@ def test_rows_without_value_have_no_rank() -> None:
     assert tie_groups("final_average", {}) == {}
 
 
-def test_a_metric_that_says_nothing_of_better_ranks_nothing() -> None:
+def test_a_metric_without_a_direction_ranks_nothing() -> None:
     with pytest.raises(ValueError, match="update_sparsity says nothing of better or worse"):
         tie_groups("update_sparsity", {"one": row(5, 6)})
     with pytest.raises(LookupError, match="final_average"):
@@ -187,7 +187,7 @@ def of_rates(*rates: float) -> Runs:
     return {seed: run(np.tile(np.arange(20) < round(20 * rate), (2, 1))) for seed, rate in enumerate(rates)}
 
 
-def test_the_deviation_of_differences_is_what_is_left_when_rows_and_seeds_have_their_means() -> None:
+def test_the_deviation_of_differences_is_the_residual_after_row_and_seed_means() -> None:
     rows = [of_rates(0.5, 0.7, 0.6), of_rates(0.2, 0.5, 0.2), of_rates(0.9, 0.9, 1.0)]
     values = np.array([[0.5, 0.7, 0.6], [0.2, 0.5, 0.2], [0.9, 0.9, 1.0]])
     residuals = values - values.mean(axis=0) - values.mean(axis=1, keepdims=True) + values.mean()
@@ -213,7 +213,7 @@ def test_boards_of_equal_methods_are_hardly_ever_split(methods: int, seeds: int,
     assert sum(max(tie_groups("final_average", rows).values()) > 1 for rows in boards) <= 5  # 2 expected
 
 
-def test_methods_that_differ_clearly_are_told_apart() -> None:
+def test_methods_that_differ_clearly_have_different_ranks() -> None:
     generator = np.random.default_rng(0)
     right = []
     for _ in range(10):
@@ -264,7 +264,7 @@ def test_the_page_has_the_figures_of_the_simulations(coverage: ModuleType, resul
     assert f"{retention['greatest']:.3f}" in page
 
 
-def test_the_examples_of_the_page_give_what_it_says() -> None:
+def test_the_examples_of_the_page_give_its_results() -> None:
     page = (ROOT / "docs" / "guide" / "statistics.md").read_text(encoding="utf-8")
     examples = re.findall(r"^((?:half_width|episodes_needed)\(.*\))  # (None|[\d.]+)", page, re.MULTILINE)
     functions: dict[str, Callable[..., float | None]]
@@ -279,7 +279,7 @@ def test_the_examples_of_the_page_give_what_it_says() -> None:
         assert (f"{got:.2f}" if isinstance(got, float) else str(got)) == result
 
 
-def test_the_command_line_says_before_a_run_how_wide_the_intervals_will_be(
+def test_the_command_line_shows_the_width_to_expect_of_intervals_before_a_run(
     tmp_path: Path,
     make_record: Callable[..., Record],
     capsys: pytest.CaptureFixture[str],

@@ -1,4 +1,4 @@
-"""Scores: what a record says, and nothing of what it does not say."""
+"""Scores: the values in a record, and no others."""
 
 from collections.abc import Callable
 from typing import Any
@@ -76,7 +76,7 @@ def test_the_curves_of_rates_end_with_the_end_of_the_stage(scores: Callable[...,
     np.testing.assert_allclose(rates.learned, rates.learning_curves[:, -1])
 
 
-def test_what_is_not_in_the_record_is_missing_and_not_guessed(scores: Callable[..., Scores]) -> None:
+def test_values_that_the_record_lacks_are_missing_and_not_guessed(scores: Callable[..., Scores]) -> None:
     run = scores(MATRIX)
     for name in ("validation", "answer_curves", "update_sparsity", "activation_drift"):
         assert getattr(run, name).shape == (2, 4)
@@ -154,7 +154,7 @@ def test_perturbed_episodes_are_scores_of_their_own_and_change_no_other(
     assert np.isnan(both.mean_over_runs().perturbed).all()  # a mean over some seeds alone would be another
 
 
-def test_perturbed_episodes_are_drawn_with_those_of_their_numbers(scores: Callable[..., Scores]) -> None:
+def test_perturbed_episodes_are_drawn_with_episodes_of_the_same_number(scores: Callable[..., Scores]) -> None:
     generator = np.random.default_rng(0)
     outcomes = generator.integers(2, size=(3, 5, 6)).astype(float)
     run = scores(outcomes, perturbed=1 - outcomes[:, :2])
@@ -189,7 +189,7 @@ def test_perturbed_episodes_other_than_the_test_episodes_are_refused(
         Scores.from_record(record)
 
 
-def test_a_run_that_says_perturb_and_has_no_such_episode_is_refused(make_record: MakeRecord) -> None:
+def test_a_perturb_run_without_perturbed_episodes_is_refused(make_record: MakeRecord) -> None:
     with pytest.raises(RecordError, match="0 are perturbed, not 120"):
         Scores.from_record(make_record(MATRIX, perturb=True))
 
@@ -223,7 +223,7 @@ def test_a_tuning_run_is_scored_on_its_validation_episodes(scores: Callable[...,
     np.testing.assert_allclose(run.validation, run.rates().learning_curves)
 
 
-def test_a_tuning_run_with_a_report_episode_is_refused(make_record: MakeRecord) -> None:
+def test_a_tuning_run_with_a_test_episode_is_refused(make_record: MakeRecord) -> None:
     record = make_record(MATRIX, episodes=10, split="validation")
     record.episodes["split"][0] = "test"
     with pytest.raises(RecordError, match="tuning run"):
@@ -264,7 +264,7 @@ def test_the_order_of_rows_does_not_matter(make_record: MakeRecord) -> None:
         ("success", [], "neither true nor false"),
     ],
 )
-def test_an_episode_that_cannot_be_is_refused(
+def test_an_impossible_episode_is_refused(
     column: str, value: Any, words: str, make_record: MakeRecord
 ) -> None:
     record = make_record(MATRIX)
@@ -298,7 +298,7 @@ def test_an_episode_at_a_step_between_the_evaluation_points_is_refused(
         (2, 400, "left", 10**40, 1),
     ],
 )
-def test_an_answer_count_that_cannot_be_is_refused(row: tuple[Any, ...], make_record: MakeRecord) -> None:
+def test_an_impossible_answer_count_is_refused(row: tuple[Any, ...], make_record: MakeRecord) -> None:
     record = make_record(MATRIX, answers={(0, "left"): (10, 9)})
     append(record.answers, *row)
     with pytest.raises(RecordError, match="answers"):
@@ -322,7 +322,7 @@ def test_an_answer_count_that_cannot_be_is_refused(row: tuple[Any, ...], make_re
         (2, 400, 0.5, [1]),
     ],
 )
-def test_a_row_of_the_policy_table_that_cannot_be_is_refused(
+def test_an_impossible_row_of_the_policy_table_is_refused(
     row: tuple[Any, ...], make_record: MakeRecord
 ) -> None:
     record = make_record(MATRIX, sparsity=[[0.5] * 4, [np.nan] * 4])
@@ -351,12 +351,12 @@ def test_a_scenario_without_clear_evaluation_steps_is_refused(steps: Any, make_r
 
 def test_a_run_of_an_unknown_split_is_refused(make_record: MakeRecord) -> None:
     record = make_record(MATRIX)
-    record.run.split = "all"
+    record.run.split = "all"  # type: ignore[assignment] # the fault
     with pytest.raises(RecordError, match="split must be test or validation"):
         Scores.from_record(record)
 
 
-def test_a_record_without_report_episodes_is_refused(make_record: MakeRecord) -> None:
+def test_a_record_without_test_episodes_is_refused(make_record: MakeRecord) -> None:
     record = make_record(MATRIX)
     record.episodes["split"] = ["validation"] * len(record.episodes["split"])
     with pytest.raises(RecordError, match="no test episode"):

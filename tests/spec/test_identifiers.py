@@ -1,4 +1,4 @@
-"""Names that strangers choose: what they may be, and what they must not be taken for."""
+"""Names that strangers choose: the allowed ones, and the ones that could be confused."""
 
 import itertools
 

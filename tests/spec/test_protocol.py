@@ -15,8 +15,6 @@ PROTOCOL = Protocol(
 )
 
 
-
-
 def test_a_stage_ends_at_its_last_step_and_stage_0_has_none() -> None:
     assert PROTOCOL.points(0) == (Point(0, 0),)
     assert PROTOCOL.points(2) == (Point(2, 10), Point(2, 20))
@@ -47,7 +45,7 @@ def test_a_tuning_run_has_validation_episodes_alone() -> None:
     assert len(tuning.episodes(Point(1, 10))) == 3 * 2
 
 
-def test_perturbed_episodes_are_those_of_the_test_on_the_skills_at_the_ends() -> None:
+def test_perturbed_episodes_repeat_the_test_episodes_on_the_skills_at_the_ends() -> None:
     perturbed = dataclasses.replace(PROTOCOL, perturb=True)
     extra = set(perturbed.episodes(Point(1, 20))) - set(PROTOCOL.episodes(Point(1, 20)))
     assert extra == {EpisodeKey(task, "perturbed", number) for task in "ab" for number in range(3)}

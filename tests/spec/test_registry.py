@@ -1,4 +1,4 @@
-"""A scenario of a stranger: what registers it, and what is said of one that cannot be."""
+"""A stranger's scenario: its registration, and the errors of wrong ones."""
 
 import dataclasses
 import sys
@@ -66,7 +66,7 @@ def test_nothing_is_imported_before_it_is_used() -> None:
         ("me/Mine-v0", ":MINE", "must be the place of a scenario"),
     ],
 )
-def test_what_cannot_be_registered_is_refused_by_name(name: str, entry_point: str, message: str) -> None:
+def test_a_wrong_registration_is_refused_by_name(name: str, entry_point: str, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         register(name, entry_point)
 
@@ -109,7 +109,7 @@ def test_a_word_outside_the_vocabulary_is_named_with_the_nearest(module: types.M
         ({"name": "../right"}, ValueError, "cannot be the name of a task"),
     ],
 )
-def test_a_task_that_cannot_be_is_refused_where_it_is_built(
+def test_an_impossible_task_is_refused_where_it_is_built(
     changes: dict[str, Any], error: type[Exception], message: str
 ) -> None:
     with pytest.raises(error, match=message):
@@ -121,7 +121,7 @@ def test_two_tasks_of_one_name_are_refused_where_the_scenario_is_built() -> None
         Scenario("me/Mine-v0", "", TOY.retained, TOY.target, TOY.retained[:1], TOY.questions)
 
 
-def test_tasks_that_are_seen_differently_are_refused_where_the_scenario_is_built() -> None:
+def test_tasks_with_different_observations_are_refused_where_the_scenario_is_built() -> None:
     seen = tuple(dataclasses.replace(task, camera="mine:Camera") for task in TOY.target)
     with pytest.raises(ValueError, match=r"the same camera, not \['mine:Camera', 'none'\]"):
         Scenario("me/Mine-v0", "", TOY.retained, seen, (), TOY.questions)

@@ -71,14 +71,14 @@ def unusable() -> Iterator[str]:
         yield name
 
 
-def test_a_scenario_without_its_simulator_is_data_and_says_what_to_install(unusable: str) -> None:
+def test_a_scenario_without_its_simulator_is_data_and_names_the_package_to_install(unusable: str) -> None:
     assert registered_scenario(unusable).target[0].packages == ("no-simulator",)
     for use in (load_scenario, gymnasium.make):
         with pytest.raises(LookupError, match=f"{unusable} needs the package no-simulator: pip install no-"):
             use(unusable)
 
 
-def test_what_an_extra_brings_is_installed_as_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_package_of_an_extra_is_installed_as_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     def version(package: str) -> str:
         raise importlib.metadata.PackageNotFoundError(package)
 
@@ -122,13 +122,13 @@ def test_all_orders_are_different_permutations_and_the_first_is_the_published_on
 
 
 @pytest.mark.parametrize("order", [-1, 24])
-def test_an_order_that_is_none_is_refused_with_what_there_is(order: int) -> None:
+def test_an_unknown_order_is_refused_with_the_known_ones(order: int) -> None:
     with pytest.raises(ValueError, match=rf"clbench/Fetch-v0: 4 targets have orders 0 to 23, not {order}"):
         load_scenario(FETCH).in_order(order)
 
 
 def test_an_order_never_changes() -> None:
-    # records of these orders may lie about: whoever changes this line makes them lie
+    # published records may have these orders: a change of this line makes them false
     assert [target_order(4, order) for order in range(1, 4)] == [(3, 2, 1, 0), (3, 1, 0, 2), (0, 3, 1, 2)]
 
 

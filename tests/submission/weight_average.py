@@ -39,7 +39,7 @@ class WeightAverage(Method):
         return policy.parameters()
 
     def loss(self, policy: Policy, batch: Batch, progress: Progress) -> Tensor:
-        """Return the action loss; what the last step made of the weights enters the average."""
+        """Return the action loss; the weights after the last step enter the average."""
         self._enter(policy)
         return super().loss(policy, batch, progress)
 

@@ -1,4 +1,4 @@
-"""The choice of what draws: EGL, then OSMesa, but first whatever the user has set."""
+"""The choice of the rendering back end: the user's setting, then EGL, then OSMesa."""
 
 import os
 
@@ -48,7 +48,7 @@ def test_where_nothing_draws_the_debian_packages_are_named(monkeypatch: pytest.M
     assert os.environ["MUJOCO_GL"] == ""
 
 
-def test_who_has_chosen_is_obeyed(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_choice_of_the_user_is_obeyed(monkeypatch: pytest.MonkeyPatch) -> None:
     tried = _only(monkeypatch, "egl", "osmesa", "glfw")
     monkeypatch.setenv("MUJOCO_GL", "glfw")
     assert choose_back_end([WORLD]) == "glfw"

@@ -16,7 +16,7 @@ LEFT, UP = TOY.task("left"), TOY.task("up")
 
 
 class OwnVectorWorld(PlainVectorWorld):
-    """A suite's own vector world: it remembers what it was made with."""
+    """A suite's own vector world: it remembers the arguments that made it."""
 
     perturbable = True
 
@@ -32,7 +32,7 @@ class OtherToyWorld(ToyWorld):
 
 
 class SteadyWorld(ToyWorld):
-    """The toy world of somebody who never heard of perturbations."""
+    """The toy world of a suite without perturbations."""
 
     perturbable = False
 
@@ -103,7 +103,7 @@ def episode(lanes: Lanes, lane: int, seed: int, task: Task, perturbed: bool) -> 
     return np.concatenate(states).tobytes()
 
 
-def test_perturbed_episodes_run_beside_plain_ones_which_they_do_not_change(other_task: Task) -> None:
+def test_perturbed_episodes_run_together_with_plain_ones_and_do_not_change_them(other_task: Task) -> None:
     for task in (LEFT, other_task):
         plain = episode(Lanes(1), 0, 3, task, perturbed=False)
         changed = episode(Lanes(1), 0, 3, task, perturbed=True)
@@ -127,7 +127,7 @@ def test_perturbed_episodes_run_beside_plain_ones_which_they_do_not_change(other
         ),
     ],
 )
-def test_a_task_whose_world_cannot_be_perturbed_is_named_with_the_way_out(
+def test_an_error_names_the_task_whose_world_cannot_be_perturbed_and_the_way_out(
     world: str, own: object, message: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     steady = type(world, (SteadyWorld,), {} if own is None else {"vector_world": own})

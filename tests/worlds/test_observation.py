@@ -1,4 +1,4 @@
-"""What a policy is shown of a world: its states, or what a camera leaves of them."""
+"""The observations of a policy: states, or a camera's pictures and numbers."""
 
 import dataclasses
 import os
@@ -63,14 +63,14 @@ def test_a_camera_that_lacks_something_is_refused_by_name() -> None:
 
 @pytest.fixture
 def camera_of(write_module: Callable[[str, str], None]) -> Callable[[str], str]:
-    """Return a function that writes a camera, the toy's but for some lines, and returns its entry point."""
+    """Return a function that writes the toy's camera with other lines, and returns its entry point."""
 
     def write(lines: str) -> str:
         head = (
             "import numpy as np\nfrom clbench.testing.toy_camera import ToyCamera\nclass Other(ToyCamera):\n"
         )
         write_module("other_camera", head + lines)
-        sys.modules.pop("other_camera", None)  # that of another test
+        sys.modules.pop("other_camera", None)  # another test's module
         return "other_camera:Other"
 
     return write
@@ -117,7 +117,7 @@ def test_where_the_source_of_the_camera_changes_the_policy_is_pretrained_anew(
     assert inputs(0) != inputs(1)
 
 
-def test_processes_draw_what_the_camera_draws_in_the_order_of_the_states() -> None:
+def test_processes_draw_the_cameras_pictures_in_the_order_of_the_states() -> None:
     states = _states(2 * TOGETHER + 3)
     views = np.zeros((len(states), VIEW_SIZE), np.float32)
     views[::2] = np.random.default_rng(1).uniform(-1.0, 1.0, views[::2].shape)
@@ -177,7 +177,7 @@ def test_a_process_that_dies_is_named_with_its_last_words(
     observer.close()
 
 
-def test_where_nothing_draws_it_is_said_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_where_nothing_draws_the_error_names_the_packages_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("MUJOCO_GL", raising=False)
     monkeypatch.setattr("clbench.worlds.gl_backend.rendering_fault", lambda *_: "no driver")
     with pytest.raises(RenderingError, match=r"\(no driver\).*apt-get install"):
@@ -199,7 +199,7 @@ def test_an_agent_of_the_scenario_sees_the_picture_and_no_more() -> None:
     env.close()
 
 
-def test_a_policy_learns_what_only_the_picture_shows() -> None:
+def test_a_policy_learns_facts_that_only_the_picture_shows() -> None:
     policy = Policy(policy_config(SEEN_TOY), seed=0)
     assert (policy.config.state_size, policy.config.image_size) == (1, 16)
     asked = load_questions(SEEN_TOY)[0].sample(32, torch.Generator().manual_seed(0))

@@ -1,4 +1,4 @@
-"""Perturbations: what is drawn, and what a heavier thing is in MuJoCo."""
+"""Perturbations: their draws, and heavier things in MuJoCo."""
 
 import mujoco
 import numpy as np
@@ -31,7 +31,7 @@ DERIVED = ("body_subtreemass", "body_invweight0", "dof_M0", "dof_invweight0", "a
 
 
 def test_a_perturbation_follows_from_the_seed_alone_and_never_changes() -> None:
-    # records of these episodes may lie about: whoever changes this line makes them lie
+    # published records may have these episodes: a change of this line makes them false
     drawn = draw_perturbation(7)
     assert drawn == draw_perturbation(7) != draw_perturbation(8)
     start = (0.2693702600102559, 0.4668422362346363, -0.3841252256565115)
@@ -50,7 +50,7 @@ def test_all_masses_and_all_sides_are_drawn() -> None:
     np.testing.assert_allclose(np.abs(shares_drawn).mean(axis=0), 0.5, atol=0.1)
 
 
-def test_a_heavier_thing_is_as_much_harder_to_turn_and_to_push_and_the_rest_is_as_it_was() -> None:
+def test_a_heavier_thing_is_as_much_harder_to_turn_and_to_push_and_nothing_else_changes() -> None:
     model = mujoco.MjModel.from_xml_string(XML)
     before = {
         name: getattr(model, name).copy() for name in ("body_mass", "body_inertia", *DERIVED, "eq_data")
@@ -75,7 +75,7 @@ def test_a_heavier_thing_is_as_much_harder_to_turn_and_to_push_and_the_rest_is_a
     assert speeds[1] == pytest.approx(speeds[0] / 2)
 
 
-def test_what_mujoco_derives_from_masses_is_what_it_derives_from_a_heavier_description() -> None:
+def test_values_that_mujoco_derives_from_masses_equal_those_from_a_heavier_description() -> None:
     model = mujoco.MjModel.from_xml_string(XML)
     lighter_lid = XML.replace('mass="1"', 'mass="0.5"')
     described = mujoco.MjModel.from_xml_string(lighter_lid.replace('mass="2"', 'mass="1"'))

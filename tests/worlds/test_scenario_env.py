@@ -20,7 +20,7 @@ def _toy(**options: Any) -> ScenarioEnv:
     return ScenarioEnv("clbench.testing:TOY", **options)
 
 
-def test_the_walk_goes_from_the_skills_to_each_target_and_stays_at_the_last() -> None:
+def test_the_schedule_goes_from_the_skills_to_each_target_and_stays_at_the_last() -> None:
     env = _toy(episodes_per_stage=3)
     schedule = []
     for _ in range(12):
@@ -43,7 +43,7 @@ def test_the_targets_come_in_the_order_that_is_asked_for(vector: bool) -> None:
         _toy(order=2)
 
 
-def test_a_seed_begins_the_walk_anew_and_repeats_it_bit_for_bit() -> None:
+def test_a_seed_begins_the_schedule_anew_and_repeats_it_bit_for_bit() -> None:
     env = _toy(episodes_per_stage=2)
 
     def schedule() -> list[tuple[str, str, bytes]]:

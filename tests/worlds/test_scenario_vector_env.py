@@ -1,4 +1,4 @@
-"""The vector environments of scenarios, against Gymnasium's own of the plain ones."""
+"""The vector environments of scenarios, against Gymnasium's own vector of plain environments."""
 
 from typing import Any
 
@@ -30,8 +30,8 @@ def _same(first: Any, second: Any) -> None:
         assert first == second
 
 
-def _walk_together(scenario: str, steps: int, towards: float, **options: Any) -> int:
-    """Step ours beside Gymnasium's, and return how many episodes ended."""
+def _run_together(scenario: str, steps: int, towards: float, **options: Any) -> int:
+    """Step ours and Gymnasium's in turn, and return how many episodes ended."""
     ours: VectorEnv[Any, Any, Any] = gymnasium.make_vec(scenario, num_envs=3, threads=2, **options)
     plain = gymnasium.make_vec(scenario, num_envs=3, vectorization_mode="sync", **options)
     assert isinstance(ours, ScenarioVectorEnv)
@@ -53,12 +53,12 @@ def _walk_together(scenario: str, steps: int, towards: float, **options: Any) ->
 
 
 @pytest.mark.parametrize("instruction", ["text", "tokens"])
-def test_it_does_what_gymnasiums_own_does_over_the_whole_walk(instruction: str) -> None:
-    assert _walk_together(TOY, 120, 0.5, instruction=instruction, episodes_per_stage=2) > 20
+def test_it_equals_gymnasiums_own_over_the_whole_schedule(instruction: str) -> None:
+    assert _run_together(TOY, 120, 0.5, instruction=instruction, episodes_per_stage=2) > 20
 
 
 def test_it_does_so_with_the_suites_own_vector_world() -> None:
-    assert _walk_together(FETCH, 130, 0.0, instruction="tokens", episodes_per_stage=2) >= 6
+    assert _run_together(FETCH, 130, 0.0, instruction="tokens", episodes_per_stage=2) >= 6
 
 
 def _toy(**options: Any) -> ScenarioVectorEnv:
@@ -89,7 +89,7 @@ def test_wrong_calls_are_refused_by_name() -> None:
         _toy(episodes_per_stage=0)
 
 
-def test_what_was_returned_does_not_change_later() -> None:
+def test_returned_arrays_do_not_change_later() -> None:
     env = _toy(instruction="tokens")
     observation, _ = env.reset(seed=0)
     state, tokens = observation["state"].copy(), observation["instruction"].copy()

@@ -79,7 +79,7 @@ def _forward(parts: list[Array], inputs: Array) -> _Pass:
 
 
 def _backward(parts: list[Array], run: _Pass, slope: Array, gradients: list[Array] | None) -> Array:
-    """Return the gradient of the inputs (networks, B, in) from that of the outputs (networks, B, out).
+    """Return the gradient of the inputs (networks, B, in), given the outputs' gradient (networks, B, out).
 
     If `gradients` is given, the gradients of the parameters are written there.
     """

@@ -165,7 +165,7 @@ def train(
     """Train an expert, write its weights and its JSON to `folder`, and return the content of the JSON.
 
     An interrupted training continues from its checkpoint in the cache. If a symmetry derives the expert from
-    that of another task, the other expert is trained, and the derived one is measured on its own task.
+    another task's expert, that one is trained, and the derived one is measured on its own task.
 
     Args:
         settings: Inputs that determine the weights.

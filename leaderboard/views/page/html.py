@@ -112,7 +112,7 @@ def _templates() -> Environment:
 
 
 def _shade_of_rank(rank: int, count: int) -> int:
-    """Return the shade of a rank: that of success 1 for the first of `count`, of success 0 for the last."""
+    """Return the shade of a rank, from success 1's for the first of `count` to success 0's for the last."""
     return SHADES - (rank - 1) * SHADES // max(count - 1, 1)
 
 

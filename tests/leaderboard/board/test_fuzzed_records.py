@@ -1,4 +1,4 @@
-"""Damaged records by the thousand: each is refused by name, or its numbers are those of plain counting."""
+"""Damaged records by the thousand: each is refused by name, or its numbers equal plain counts."""
 
 import importlib
 import json
@@ -25,7 +25,7 @@ PLACES = {
     "clbench/Toy-v0": "Toy-v0/theirs--mine/seed-0.json",
     "theirs/Own-v0": "theirs--Own-v0/theirs--mine/seed-0.json",
 }
-"""Scenario of the damaged record, shared with the honest ones or its own, and where it lies."""
+"""Scenario of the damaged record, shared with the honest ones or its own, and its place."""
 
 JUNK: tuple[Any, ...] = (None, True, False, -1, 0, 1, 2, 0.5, -0.0, 1e18, 10**300, 2**63)
 JUNK += ("", "x", "skill_0", "test", "validation", "\ud800", "\x1b[31m", [], [1], {}, {"x": []})

@@ -1,4 +1,4 @@
-"""What strangers hand in: what is no honest record is refused by its fault, and moves nothing else."""
+"""Submissions of strangers: a dishonest record is refused with its fault, and changes nothing else."""
 
 import importlib
 import json
@@ -149,7 +149,7 @@ FIELDS = [
     ("diagnostics.number", 2**64, "diagnostics: a whole number of 65 bits"),
     ("fingerprint", None, "fingerprint must be an object"),
     ("fingerprint.rollouts", {"toy:world": "4567"}, "the rollouts of toy:world differ"),
-    ("scenario.budget.learning_rate", 1.0, "its scenario is not that of most records: budget"),
+    ("scenario.budget.learning_rate", 1.0, "its scenario does not match most records: budget"),
 ]
 
 ROWS = [
@@ -176,7 +176,7 @@ ROWS = [
 
 
 @pytest.mark.parametrize(("field", "value", "reason"), [*NAMES, *FIELDS, *ROWS])
-def test_a_record_that_cannot_be_is_refused_by_what_is_wrong_with_it(
+def test_an_impossible_record_is_refused_with_its_fault(
     field: str, value: Any, reason: str, board: Path
 ) -> None:
     def damage() -> None:
@@ -255,7 +255,7 @@ FILES = [
 
 
 @pytest.mark.parametrize(("damage", "reason"), FILES)
-def test_a_file_that_is_no_record_is_refused_by_what_is_wrong_with_it(
+def test_a_file_that_is_no_record_is_refused_with_its_fault(
     damage: Callable[[Path], Any], reason: str, board: Path
 ) -> None:
     check_refused(board, lambda: damage(board / MINE), MINE, reason)
@@ -267,7 +267,7 @@ CLAIMS = [
         9,
         "Toy-v0/theirs--mine/seed-9.json",
         {},
-        "it is the record of Toy-v0/sft/seed-9.json, and must lie",
+        "it is the record of Toy-v0/sft/seed-9.json, and must be",
     ),
     (
         "theirs/mine",
@@ -281,11 +281,11 @@ CLAIMS = [
         9,
         "Toy-v0/sft/seed-9.json",
         {"uses.questions": "throughout"},
-        "uses are not those of sft: questions",
+        "uses do not match sft: questions",
     ),
-    ("sft", 9, "Toy-v0/sft/seed-9.json", {"uses.reference": True}, "uses are not those of sft: reference"),
-    ("sft", 9, "Toy-v0/sft/seed-9.json", {"settings.boost": 2}, "settings are not those of sft: boost"),
-    ("lora", 9, "Toy-v0/lora/seed-9.json", {"settings.rank": 2}, "settings are not those of lora: rank"),
+    ("sft", 9, "Toy-v0/sft/seed-9.json", {"uses.reference": True}, "uses do not match sft: reference"),
+    ("sft", 9, "Toy-v0/sft/seed-9.json", {"settings.boost": 2}, "settings do not match sft: boost"),
+    ("lora", 9, "Toy-v0/lora/seed-9.json", {"settings.rank": 2}, "settings do not match lora: rank"),
 ]
 
 
@@ -395,8 +395,8 @@ def test_a_linked_folder_is_listed_and_not_followed(board: Path, tmp_path: Path)
 
 
 @pytest.mark.parametrize("count", [1, 5])
-def test_records_of_strangers_do_not_outvote_those_of_built_in_methods(count: int, board: Path) -> None:
-    """The simulator of the built-in methods' records is the board's, whatever others bring."""
+def test_records_of_strangers_do_not_outvote_built_in_methods(count: int, board: Path) -> None:
+    """The simulator of the built-in methods' records is the board's, also against others' records."""
     values = json.loads((board / MINE).read_text(encoding="utf-8"))
     values["fingerprint"]["rollouts"] = {"toy:world": "4567"}
     for number in range(count):

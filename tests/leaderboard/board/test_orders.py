@@ -1,4 +1,4 @@
-"""Orders of the targets: runs in others stand beside the row, and tell how much depends on the order."""
+"""Orders of the targets: runs in other orders appear with the row, and show how much depends on the order."""
 
 import importlib
 import json
@@ -112,7 +112,7 @@ def test_the_page_and_the_csv_show_every_order_and_the_range(add: Callable[..., 
     assert dict(zip(head.split(","), line.split(","), strict=True))["order_sensitivity"] == "0.2000"
 
 
-def test_a_method_that_was_run_in_other_orders_alone_has_no_row_and_it_is_said_why(
+def test_a_method_that_ran_in_other_orders_alone_has_no_row_and_the_reason_is_shown(
     add: Callable[..., Path], records: Path
 ) -> None:
     add(0.5)
@@ -135,8 +135,8 @@ def edit(path: Path, part: str, **values: Any) -> None:
         ("run", {"order": 2}, "it is the record of Toy-v0/sft/seed-0-order-2.json"),
         ("run", {"order": 6}, "3 targets have orders 0 to 5, not 6"),
         ("run", {"order": 10**12}, "3 targets have orders 0 to 5"),
-        ("scenario", {"target": TARGETS}, "its scenario is not that of most records: target differ."),
-        ("scenario", {"budget": BUDGET}, "its scenario is not that of most records: budget"),
+        ("scenario", {"target": TARGETS}, "its scenario does not match most records: target differ."),
+        ("scenario", {"budget": BUDGET}, "its scenario does not match most records: budget"),
     ],
 )
 def test_a_record_that_is_not_of_its_order_is_not_counted(

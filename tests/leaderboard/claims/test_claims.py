@@ -49,10 +49,10 @@ class Bench:
         """Add the records of a method, or of changed settings of one.
 
         Args:
-            label: As "lora" or "lora+rank=4".
-            seeds: How many.
+            label: Name with changed settings, such as "lora" or "lora+rank=4".
+            seeds: Number of seeds.
             kept: Success on the two skills at the end; it is 1 before.
-            at_points: The same at the points before a stage's end, that of the end if None.
+            at_points: The same at the points before a stage's end, by default as at the end.
             learned: Success on a target right after it was learned.
             earlier: Success on the first target at the end.
             curve: Success on a target on the way.
@@ -60,7 +60,7 @@ class Bench:
             right: Questions of 500 answered rightly at the start and at the end.
             sparsity: Update sparsity at all points, a number or one for each seed.
             drift: Activation drift, likewise.
-            costs: What differs in `Record.costs`.
+            costs: Fields of `Record.costs` that differ.
             diagnostics: `Record.diagnostics`.
             edit: Changes each record before it is written.
         """
@@ -130,7 +130,7 @@ def verdicts(page: str) -> dict[str, str]:
 
 
 def section(page: str, identifier: str) -> str:
-    """Return what the page says of a claim, without the backslashes of Markdown."""
+    """Return the page's text on a claim, without the backslashes of Markdown."""
     found = re.search(rf"^### {identifier}\n(.*?)(?=^#|\Z)", page, re.MULTILINE | re.DOTALL)
     assert found
     return found[1].replace("\\", "")
@@ -291,8 +291,8 @@ def test_every_claim_has_its_paper_rule_and_the_papers_figure(bench: Bench) -> N
 
 
 def test_the_bound_of_a_step_names_a_test_that_exists(bench: Bench) -> None:
-    told = section(bench.page(), "C5")
-    names = re.findall(r"`(test_\w+)` of `(tests/[\w/]+\.py)`", told)
+    entry = section(bench.page(), "C5")
+    names = re.findall(r"`(test_\w+)` of `(tests/[\w/]+\.py)`", entry)
     assert names
     for test, path in names:
         assert f"def {test}(" in (Path(__file__).parents[3] / path).read_text(encoding="utf-8")
@@ -311,16 +311,16 @@ def test_a_control_that_does_as_well_explains_the_gain(bench: Bench) -> None:
         bench.add(method, kept=0.9)
     for method in ("low_rate_sft", "finch"):
         bench.add(method)
-    told = section(bench.page(), "C2")
-    assert "constant_weight does as well as consft: the gain does not come from weighting samples." in told
-    assert "low_rate_sft does not reach consft, so it does not explain the result." in told
+    entry = section(bench.page(), "C2")
+    assert "constant_weight does as well as consft: the gain does not come from weighting samples." in entry
+    assert "low_rate_sft does not reach consft, so it does not explain the result." in entry
 
 
 def test_without_a_gain_no_control_explains_it(bench: Bench) -> None:
     for method in ("sft", "consft", "consft_calibrated", "constant_weight"):
         bench.add(method)
-    told = section(bench.page(), "C2")
-    assert "consft has no certain gain over sft that constant_weight could explain." in told
+    entry = section(bench.page(), "C2")
+    assert "consft has no certain gain over sft that constant_weight could explain." in entry
 
 
 def test_methods_are_matched_over_the_stages_in_which_both_learn_as_well_as_sft(bench: Bench) -> None:
@@ -353,9 +353,9 @@ def test_one_seed_is_shown_and_decides_nothing(bench: Bench) -> None:
 
 def test_the_curve_of_the_answers_is_shown_over_the_steps(bench: Bench) -> None:
     bench.add("sft")
-    told = section(bench.page(), "A1")
+    entry = section(bench.page(), "A1")
     for step in (50, 100):
-        assert f"question accuracy, pretrained - sft after {step} steps of the first target" in told
+        assert f"question accuracy, pretrained - sft after {step} steps of the first target" in entry
 
 
 def test_a_control_that_was_not_evaluated_like_the_board_is_left_out_with_its_reason(bench: Bench) -> None:

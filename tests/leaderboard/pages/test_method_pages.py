@@ -150,7 +150,7 @@ def test_a_subclass_takes_the_docstring_and_has_its_own_defaults(bench: Bench) -
     assert "`kappa`" in part(pages["consft_calibrated"], "Hyper-parameters")
 
 
-def test_what_is_stored_comes_from_the_declaration_and_the_records(bench: Bench) -> None:
+def test_the_stored_data_come_from_the_declaration_and_the_records(bench: Bench) -> None:
     for seed in range(2):
         bench.add("ewc", seed=seed, costs={"bytes_kept": 8000, "parameters_added": 12})
     stored = part(bench.pages()["ewc"], "Stored")
@@ -187,9 +187,9 @@ def test_the_claims_on_a_method_are_linked_with_their_verdicts(bench: Bench) -> 
     )
     for identifier in ("C2", "C5", "C8"):
         assert f"[{identifier}](../claims.md#{identifier.lower()})" in part(pages["consft"], "Results here")
-    told = part(pages["low_rate_sft"], "Results here")
-    assert "[C2]" in told
-    assert "(Comparison only.)" in next(line for line in told.splitlines() if "[C2]" in line)
+    section = part(pages["low_rate_sft"], "Results here")
+    assert "[C2]" in section
+    assert "(Comparison only.)" in next(line for line in section.splitlines() if "[C2]" in line)
     assert "### Claims" not in pages["lwf"]
 
 
@@ -197,10 +197,10 @@ def test_scalar_diagnostics_are_averaged_over_stages_and_seeds(bench: Bench) -> 
     for seed, shed in enumerate((0.019, 0.02, 0.021)):
         stages = {str(stage): {"energy_shed_mean": shed, "anchor_distance": [1.0]} for stage in (1, 2)}
         bench.add("aegis", seed=seed, diagnostics={"0": "none", **stages})
-    told = part(bench.pages()["aegis"], "Diagnostics")
-    assert told.startswith("How much was projected out")
-    assert "| energy_shed_mean | 0.02 [0.01752, 0.02248] |" in told
-    assert "| anchor_distance" not in told
+    section = part(bench.pages()["aegis"], "Diagnostics")
+    assert section.startswith("How much was projected out")
+    assert "| energy_shed_mean | 0.02 [0.01752, 0.02248] |" in section
+    assert "| anchor_distance" not in section
 
 
 def test_settings_that_were_tried_are_compared_on_validation_episodes(bench: Bench) -> None:

@@ -1,4 +1,4 @@
-"""Cards of scenarios: from the code, the records and kept measurements; they name what is missing."""
+"""Cards of scenarios: from the code, the records and kept measurements; they name missing parts."""
 
 import dataclasses
 import json
@@ -75,7 +75,7 @@ class Bench:
 @pytest.fixture
 def bench(tmp_path: Path, make_record: Callable[..., Record], monkeypatch: pytest.MonkeyPatch) -> Bench:
     """Return a bench with a renderer; MuJoCo's own is tested elsewhere, as it takes seconds."""
-    monkeypatch.setenv("MUJOCO_GL", "egl")  # what is chosen goes with the test
+    monkeypatch.setenv("MUJOCO_GL", "egl")  # the choice ends with the test
     monkeypatch.setattr("clbench.worlds.gl_backend.rendering_fault", lambda *_: None)
     return Bench(tmp_path, make_record)
 
@@ -107,7 +107,7 @@ def test_every_task_has_its_group_picture_instructions_and_measured_expert(bench
     assert sum(path.stat().st_size for path in (bench.output / "Toy-v0").iterdir()) < 500_000
 
 
-def test_budget_and_questions_are_those_of_the_code(bench: Bench) -> None:
+def test_budget_and_questions_come_from_the_code(bench: Bench) -> None:
     card = bench.card()
     budget = part(card, "Budget")
     assert "| `pretraining_learning_rate` | Peak learning rate of pretraining. | 0.002 |" in budget
@@ -163,10 +163,10 @@ def test_missing_records_are_named_with_the_command_that_makes_them(bench: Bench
     bench.add("sft", FORGETS)
     bench.add("frozen", STAYS)
     card = bench.card()
-    told = (
+    passage = (
         "Missing: records of joint, from_scratch. `clbench run clbench/Toy-v0 joint from_scratch` makes them."
     )
-    assert told in card
+    assert passage in card
     assert bars(card)["best final average minus that of joint"] == ["at most 0.07", "-", "-"]
 
 
@@ -180,7 +180,7 @@ def test_without_any_record_the_card_says_so_and_invents_nothing(bench: Bench) -
     assert part(card, "Order of the targets").startswith("The records have the published order only.")
 
 
-def test_what_is_resolved_is_half_of_the_interval_of_a_difference_at_the_measured_spread(
+def test_the_resolution_is_half_of_the_interval_of_a_difference_at_the_measured_spread(
     bench: Bench,
 ) -> None:
     for method, kept in (("sft", (0.2, 0.4, 0.3)), ("lwf", (0.5, 0.5, 0.6))):
@@ -201,8 +201,8 @@ def test_what_is_resolved_is_half_of_the_interval_of_a_difference_at_the_measure
 def test_other_orders_are_shown_with_the_published_one(bench: Bench) -> None:
     bench.add("sft", FORGETS)
     bench.add("sft", KEEPS, [0, 1], order=1)
-    told = part(bench.card(), "Order of the targets")
-    assert "| sft | 0: 0.25, 1: 1.00 | 0, 1 | - |" in told  # two targets have two orders: no range
+    passage = part(bench.card(), "Order of the targets")
+    assert "| sft | 0: 0.25, 1: 1.00 | 0, 1 | - |" in passage  # two targets have two orders: no range
 
 
 def test_where_nothing_draws_the_card_says_so_and_keeps_the_pictures_that_are_there(

@@ -68,7 +68,7 @@ def test_a_sound_class_gets_a_row_a_rank_and_its_ties(
     record = read_record(path)
     assert record.status == "success"
     assert "submitted:Mine" in Path("board/site/LEADERBOARD.md").read_text(encoding="utf-8")
-    # the same run under another name: nobody can tell the two rows apart
+    # the same run under another name: the two rows cannot be told apart
     record.run.method = "another:Twin"
     write_record(record, record_path(Path("board/records"), "clbench/Toy-v0", "another:Twin", 0))
     before = path.read_bytes()

@@ -79,9 +79,9 @@ def test_an_honest_record_earns_every_tier_and_is_not_touched(tier: str, mine: P
     assert failures(checks) == ""
     assert tiers.tier_of(mine) == tier
     assert mine.read_bytes() == before
-    told = json.loads(tiers.verification_path(mine).read_text(encoding="utf-8"))
-    assert told["verifier"]["versions"]["torch"]
-    assert [check["name"] for check in told["checks"]] == [check.name for check in checks]
+    stored = json.loads(tiers.verification_path(mine).read_text(encoding="utf-8"))
+    assert stored["verifier"]["versions"]["torch"]
+    assert [check["name"] for check in stored["checks"]] == [check.name for check in checks]
 
 
 def test_a_run_in_another_order_of_the_targets_is_verified_in_that_order(tmp_path: Path) -> None:
@@ -94,7 +94,7 @@ def test_a_run_in_another_order_of_the_targets_is_verified_in_that_order(tmp_pat
     assert "scenario.target differ from the installed code" in failures(verify(path, "recomputed"))
 
 
-def test_perturbed_episodes_are_replayed_like_those_of_the_report(tmp_path: Path) -> None:
+def test_perturbed_episodes_are_replayed_like_test_episodes(tmp_path: Path) -> None:
     spec = RunSpec(TOY, "frozen", 0, perturb=True)
     execute(spec, tmp_path / "records")
     path = spec.path(tmp_path / "records")
@@ -181,15 +181,15 @@ FORGERIES = [
     ),
     (
         "recomputed",
-        "record: run: uses are not those of ",
+        "record: run: uses do not match ",
         lambda values: values["run"]["uses"].update(demonstrations="throughout"),
     ),
     (
         "recomputed",
-        "record: run: settings are not those of ",
+        "record: run: settings do not match ",
         lambda values: values["run"]["settings"].update(strength=1.0),
     ),
-    ("recomputed", "and must lie there", lambda values: values["run"].update(seed=7)),
+    ("recomputed", "and must be there", lambda values: values["run"].update(seed=7)),
     ("recomputed", "record: ", lambda values: values["episodes"]["success"].pop()),
     ("replayed", "episodes: 1 of ", lambda values: flip(values, 0, 60)),
     ("replayed", "answers: different counts", more_right_answers),
@@ -197,7 +197,7 @@ FORGERIES = [
 
 
 @pytest.mark.parametrize(("tier", "reason", "change"), FORGERIES)
-def test_a_forged_record_is_denied_the_tier_and_what_is_wrong_is_named(
+def test_a_forged_record_is_denied_the_tier_and_its_fault_is_named(
     tier: str, reason: str, change: Edit, mine: Path, honest: Path
 ) -> None:
     edit(mine, change)
@@ -207,7 +207,7 @@ def test_a_forged_record_is_denied_the_tier_and_what_is_wrong_is_named(
     assert tiers.tier_of(mine) == below
 
 
-def test_what_only_the_whole_run_can_tell_is_found_by_doing_it_again(mine: Path, honest: Path) -> None:
+def test_a_fault_that_only_the_whole_run_shows_is_found_by_doing_it_again(mine: Path, honest: Path) -> None:
     edit(mine, lambda values: flip(values, 0, 30))  # on the way: no policy of that moment is kept
     edit(mine, lambda values: values["costs"].update(bytes_kept=1))
     edit(mine, lambda values: values["diagnostics"].update({"1": {"energy": 0.5}}))
@@ -254,7 +254,7 @@ def test_a_failed_check_takes_an_earlier_tier_back(mine: Path, honest: Path) -> 
     assert not tiers.verification_path(mine).exists()
 
 
-def test_what_a_record_names_is_not_imported_unless_the_verifier_says_so(
+def test_a_module_that_a_record_names_is_not_imported_unless_the_verifier_allows_it(
     mine: Path, honest: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     trace = f"import pathlib\npathlib.Path({str(tmp_path / 'ran')!r}).touch()\n"
@@ -274,9 +274,7 @@ def test_what_a_record_names_is_not_imported_unless_the_verifier_says_so(
     assert (tmp_path / "ran").exists()
 
 
-def test_the_command_says_what_was_looked_at(
-    mine: Path, honest: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_command_lists_its_checks(mine: Path, honest: Path, capsys: pytest.CaptureFixture[str]) -> None:
     command = importlib.import_module("clbench.leaderboard.cli").verify
     records = next(folder for folder in mine.parents if folder.name == "records")
     command(mine, tier="recomputed", scenario=TOY, records=records, workers=1)

@@ -26,7 +26,7 @@ def test_a_method_that_does_not_learn_as_well_as_plain_fine_tuning_has_no_matche
     assert "**matched retention** (higher is better; from 0 to 1; version 0)" in page
 
 
-def test_the_markdown_has_values_with_intervals_and_says_what_they_are(
+def test_the_markdown_has_values_with_intervals_and_explains_them(
     shown: Callable[[], tuple[str, str]],
 ) -> None:
     _, page = shown()
@@ -63,7 +63,7 @@ def test_perturbed_retention_follows_retention_where_a_row_has_it(
     assert after.set_index("method").perturbed_retention["sft"] == pytest.approx(0.3)
 
 
-def test_what_is_missing_is_a_dash_in_markdown_and_empty_in_csv(
+def test_a_missing_value_is_a_dash_in_markdown_and_empty_in_csv(
     four_methods: Path, shown: Callable[[], tuple[str, str]]
 ) -> None:
     _, page = shown()

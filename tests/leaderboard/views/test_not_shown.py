@@ -112,8 +112,8 @@ def lose_validation_episode(record: Record) -> None:
         (set_in("policy", "step", []), "the columns of policy have different lengths"),
         (set_in("run", "split", "validation"), "it is a tuning run: its episodes may be chosen on."),
         (set_in("run", "split", "all"), "split must be test or validation"),
-        (set_in("run", "settings", {"strength": 2}), "settings are not those of most seeds: strength"),
-        (set_in("run", "device", "cuda"), "settings are not those of most seeds: device"),
+        (set_in("run", "settings", {"strength": 2}), "settings do not match most seeds: strength"),
+        (set_in("run", "device", "cuda"), "settings do not match most seeds: device"),
     ],
 )
 def test_a_record_that_cannot_be_a_row_is_listed_with_its_reason_and_hides_no_other(
@@ -157,7 +157,7 @@ def test_a_file_name_with_control_characters_is_shown_without_them(
         assert "\n## y" not in text
 
 
-def test_a_record_that_lies_elsewhere_is_refused_though_its_run_has_no_other(
+def test_a_record_in_another_place_is_refused_though_its_run_has_no_other(
     four_methods: Path, add_full: Callable[..., Path], shown: Callable[[], tuple[str, str]]
 ) -> None:
     before = load(four_methods)
@@ -165,8 +165,8 @@ def test_a_record_that_lies_elsewhere_is_refused_though_its_run_has_no_other(
     add_full("sft", 2, np.ones((3, 5)), place="a/more.json")
     pandas.testing.assert_frame_equal(load(four_methods), before)
     for text in shown():
-        assert "a/copy.json: it is the record of Toy-v0/sft/seed-1.json, and must lie there." in flat(text)
-        assert "a/more.json: it is the record of Toy-v0/sft/seed-2.json, and must lie there." in flat(text)
+        assert "a/copy.json: it is the record of Toy-v0/sft/seed-1.json, and must be there." in flat(text)
+        assert "a/more.json: it is the record of Toy-v0/sft/seed-2.json, and must be there." in flat(text)
 
 
 def test_any_damage_to_a_record_ends_in_a_row_or_a_reason(

@@ -113,7 +113,7 @@ def test_the_same_records_give_the_same_bytes_in_another_place_time_zone_and_loc
     assert [(elsewhere / "leaderboard" / "site" / name).read_bytes() for name in names] == here
 
 
-def test_what_strangers_wrote_is_text(add: Callable[..., Path], records: Path) -> None:
+def test_texts_of_strangers_stay_text(add: Callable[..., Path], records: Path) -> None:
     def edit(record: Record) -> None:
         record.run.settings = {HOSTILE: HOSTILE}
         record.diagnostics = {"1": {HOSTILE: HOSTILE, "x": [1.0, 2.0]}, HOSTILE: {"y": [HOSTILE]}}
@@ -136,7 +136,7 @@ def test_what_strangers_wrote_is_text(add: Callable[..., Path], records: Path) -
     assert "<img src=x onerror=alert(2)>.json" in shown
 
 
-def test_a_command_can_be_pasted_whatever_its_record_says(add: Callable[..., Path], records: Path) -> None:
+def test_a_command_can_be_pasted_with_any_record(add: Callable[..., Path], records: Path) -> None:
     def edit(record: Record) -> None:
         record.run.device = "cpu; touch /tmp/gone"
         record.fingerprint["commit"] = {"id": "; touch /tmp/gone", "dirty": True}
@@ -185,7 +185,7 @@ def test_files_that_make_no_row_are_listed_with_their_reason(records: Path) -> N
 
 
 def test_definitions_that_rank_in_opposite_orders_are_named(add: Callable[..., Path], records: Path) -> None:
-    # one forgets the skills alone, one the targets alone: they are told apart by who counts what
+    # one forgets the skills alone, one the targets alone: the metrics distinguish them
     for seed in range(2):
         add("skills", seed, [[1, 1, 0, 0, 0], [0, 0, 1, 0, 0], [0, 0, 1, 1, 0]], scenario="clbench/Two-v0")
         add("targets", seed, [[1, 1, 0, 0, 0], [1, 1, 1, 0, 0], [1, 1, 0, 1, 0]], scenario="clbench/Two-v0")
@@ -241,8 +241,8 @@ def test_15_methods_with_5_seeds_on_4_scenarios_are_less_than_3_megabytes(
             method="method",
             seed=seed,
         )
-        told = {"distance": generator.random(11).tolist(), **{f"share_{n}": n / 7 for n in range(3)}}
-        record.diagnostics = {str(stage): told for stage in range(1, 5)}
+        diagnosed = {"distance": generator.random(11).tolist(), **{f"share_{n}": n / 7 for n in range(3)}}
+        record.diagnostics = {str(stage): diagnosed for stage in range(1, 5)}
         record.fingerprint["versions"] = {f"package-{number}": "1.22.333" for number in range(9)}
         write_record(record, record_path(tmp_path, "clbench/Toy-v0", "method", seed))
     table = read_table(tmp_path)

@@ -131,7 +131,7 @@ def test_a_click_on_a_head_sorts_and_a_second_one_the_other_way(open_page: Calla
     expect(head(page, "final average")).to_have_attribute("aria-sort", "none")
     button.press("Enter")
     assert names(page)[0] == "x_with_a_name_that_is_longer_than_a_phone"
-    # lower is better first, and what is missing last either way
+    # lower is better first, and missing values last either way
     head(page, "forgetting").get_by_role("button").click()
     expect(head(page, "forgetting")).to_have_attribute("aria-sort", "ascending")
 
@@ -262,7 +262,7 @@ def test_axe_finds_nothing_serious(place: str, color_scheme: str, open_page: Cal
     assert not serious
 
 
-def test_what_strangers_wrote_is_shown_as_they_wrote_it(open_page: Callable[..., Page]) -> None:
+def test_texts_of_strangers_are_shown_unchanged(open_page: Callable[..., Page]) -> None:
     page = open_page("clbench/Toy-v0/sft")
     expect(row(page)).to_contain_text(HOSTILE)
     assert page.locator("img").count() == 0
