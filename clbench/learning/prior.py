@@ -25,7 +25,7 @@ class Uses:
     questions: Access = "never"
     """Access to the training questions."""
     reference: bool = False
-    """Whether the method does not compete but is a guide: an upper or lower bound, or a transfer baseline."""
+    """Whether the method is a reference, which does not compete: a bound or a transfer baseline."""
 
 
 class UndeclaredAccessError(ClbenchError, RuntimeError):

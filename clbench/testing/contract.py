@@ -338,7 +338,7 @@ def learning(subject: Subject) -> None:
         raise _breach(
             learning,
             f"a mean return of {before + LEAST_GAIN:.1f} or more on the toy's first target after "
-            f"{LEARNING_STEPS} steps; only a guide, `uses = Uses(reference=True)`, may learn nothing",
+            f"{LEARNING_STEPS} steps; only a reference, `uses = Uses(reference=True)`, may learn nothing",
             f"{after:.1f}, with {before:.1f} before",
             "start_task(), loss(), gradients() and learning_rate()",
         )

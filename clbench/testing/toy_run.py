@@ -203,7 +203,7 @@ class ToyRun:
         members = [group["params"] if isinstance(group, dict) else [group] for group in groups]
         self._trained = list(itertools.chain.from_iterable(members))
         if not self._trained and not self.uses.reference:
-            expected = "parameters to train; only a guide, `uses = Uses(reference=True)`, may train none"
+            expected = "parameters to train; only a reference, `uses = Uses(reference=True)`, may train none"
             raise _unsound("start_task", expected, "none")
         for one in self._trained:
             if not isinstance(one, nn.Parameter):

@@ -25,7 +25,7 @@ from .tiers import tier_of
 DIVISIONS = ("prior-data-free", "prior questions", "prior demonstrations", "online", "reference")
 """Divisions in the order of the table: the first three by the prior data that a method may use; "online" for
 agents that learned by trial instead of from demonstrations, with which no method is compared; "reference" for
-guides that do not compete."""
+references, which do not compete."""
 
 METHODS = DIVISIONS[:3]
 """Divisions of methods, which start from the same policy and learn from the same demonstrations."""

@@ -244,7 +244,7 @@ FAULTS: list[tuple[Any, str, str, str]] = [
     (Misspelt, "declaration", "did you mean gradients()?", "gradient() is never called"),
     (Forgetful, "declaration", "loss(self, policy, batch, progress)", "loss(self, policy, batch)"),
     (Counts, "sound hooks", "the number of optimiser steps that it took, or None", "0.5"),
-    (Idle, "sound hooks", "only a guide, `uses = Uses(reference=True)`, may train none", "none"),
+    (Idle, "sound hooks", "only a reference, `uses = Uses(reference=True)`, may train none", "none"),
     (Nameless, "sound hooks", "an iterable of the policy's parameters", "a str among them"),
     (Freezes, "sound hooks", "parameters that require a gradient", "one that does not"),
     (Greedy, "sound hooks", "at most target.batch_size = 16 samples of the target in a step", "32 samples"),

@@ -307,7 +307,7 @@ FAULTS: list[tuple[Any, str, str, str]] = [
     (Writes, "global state", "only in clbench's cache", "losses.txt is written"),
     (Patches, "global state", "as it was", "the class clbench.Policy differs in predict"),
     (Standstill, "learning", "a mean return of -", "before"),
-    (Backwards, "learning", "only a guide, `uses = Uses(reference=True)`, may learn nothing", "before"),
+    (Backwards, "learning", "only a reference, `uses = Uses(reference=True)`, may learn nothing", "before"),
 ]
 
 
