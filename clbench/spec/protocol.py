@@ -20,7 +20,7 @@ perturbed episode is the test episode of the same number in a perturbed world
 
 SPLITS: tuple[Split, ...] = ("validation", "test", "perturbed")
 
-ScoredSplit = Literal["validation", "test"]
+ScoredSplit = Literal["test", "validation"]
 """Split whose episodes are scored: "validation" in a tuning run, "test" otherwise."""
 
 

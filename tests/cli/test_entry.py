@@ -73,7 +73,9 @@ def _exit_code(process: subprocess.Popen[str]) -> tuple[int, str, str]:
     return (128 - code if code < 0 else code), out, err
 
 
-@pytest.mark.parametrize("number", range(10))
+@pytest.mark.parametrize(
+    "number", [pytest.param(number, marks=[pytest.mark.slow] if number > 3 else []) for number in range(10)]
+)
 def test_ctrl_c_at_any_moment_ends_the_command(number: int) -> None:
     process = _start(STARTED + RUN, "list")
     _wait_for(process, "handled")
