@@ -7,6 +7,7 @@ key.
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import importlib.util
 import sys
@@ -22,6 +23,7 @@ RUN_SOURCES = (*TRAINING_SOURCES, "clbench.records", "clbench.evaluation", "clbe
 """Code that a run depends on, besides the suites of its tasks and the package of its method."""
 
 
+@functools.cache  # it takes 10 ms, and a run asks 20 times; the code of a process does not change
 def source_hash(*modules: str) -> str:
     """Return the hash of the source of `modules`; a package counts with all files below it.
 

@@ -48,6 +48,8 @@ _NAME = re.compile(r"(?:.*-)?[0-9a-f]{16}(?:\.\w+)?")
 _LEFTOVER = re.compile(r"\..+\.[0-9a-f]{32}\.(?:partial|old)")
 _CODE = ("source", "versions", "torch")
 _DAY = 24 * 60 * 60
+_LEFTOVER_DAYS = 7
+"""Days after which an unfinished entry counts as left behind: a process may fill it at its very end."""
 
 
 def cache(
@@ -59,9 +61,10 @@ def cache(
     """Show what the cache and the Minari datasets of clbench hold, and which entries are stale.
 
     An entry is stale if it has not been used for --older-than days, if newer code has made its replacement
-    since its last use, or if a killed process left it behind more than a day ago. The cache holds no records,
-    and everything in it can be made again. Where the file system does not note when a file is read, an entry
-    counts as used when it was made.
+    since its last use, or if a killed process left it behind more than a week ago. The cache holds no
+    records, and everything in it can be made again. Files that clbench did not make are neither shown nor
+    deleted. Where the file system does not note when a file is read, an entry counts as used when it was
+    made.
 
     Args:
         prune: List the stale entries, and delete them.
@@ -83,9 +86,15 @@ def cache(
     count = f"{len(stale)} stale {'entry' if len(stale) == 1 else 'entries'}"
     size = _size(sum(entry.size for entry in stale))
     if prune and not dry_run:
-        with checked_input():
-            for entry in stale:
+        faults = []
+        for entry in stale:
+            try:
                 entry.delete()
+            except InputError as error:
+                faults.append(str(error))
+        with checked_input():
+            if faults:
+                raise InputError(f"{len(faults)} of {count} could not be deleted. {' '.join(faults)}")
         console.print(f"Deleted {count}, {size}.", soft_wrap=True)
     elif stale:
         console.print(f"`clbench cache --prune` deletes {count}, {size}.", soft_wrap=True)
@@ -138,9 +147,8 @@ class Entry:
     def origin(self) -> tuple[str, str] | None:
         """Hashes of its inputs and of the code that made it; None if no manifest shows these."""
         manifests = sorted(path for path in self._stats if path.name == _MANIFEST)
-        try:
-            made_from = json.loads(manifests[0].read_text(encoding="utf-8"))["made_from"]
-        except (IndexError, OSError, ValueError, KeyError, TypeError):
+        made_from = _made_from(manifests[0]) if manifests else None
+        if made_from is None:
             return None
         code: list[Any] = []
         purpose = _without_code(made_from, code)
@@ -166,16 +174,57 @@ class Entry:
 
 
 def entries() -> Iterator[Entry]:
-    """Yield everything in the cache, and all Minari datasets that clbench collected. Links are left alone."""
-    for folder in sorted(path for path in cache_folder().glob("*") if path.is_dir()):
+    """Yield what clbench made in the cache, and the Minari datasets that it collected.
+
+    The folders may hold other people's files too. An entry has a name and a place that clbench gives, and the
+    files that it writes there; links are never followed.
+    """
+    for kind in KINDS:
+        folder = cache_folder() / kind
+        if kind == DEMONSTRATIONS or not _is_folder(folder):
+            continue
         for path in sorted(folder.iterdir()):
-            if _NAME.fullmatch(path.name) and not path.is_symlink():
-                yield Entry(folder.name, path)
-        yield from _leftovers(folder.name, folder)
-    root = minari_folder()
-    manifests = sorted(path for path in _walk(root) if path.name == _MANIFEST)
-    yield from (Entry(DEMONSTRATIONS, path.parent) for path in manifests)
-    yield from _leftovers(DEMONSTRATIONS, root)
+            if _NAME.fullmatch(path.name) and _is_made_here(kind, path):
+                yield Entry(kind, path)
+        yield from _leftovers(kind, folder)
+    datasets = minari_folder() / "clbench"  # the ids of its datasets begin with this name
+    if _is_folder(datasets):
+        manifests = sorted(path for path in _walk(datasets) if path.name == _MANIFEST)
+        yield from (Entry(DEMONSTRATIONS, path.parent) for path in manifests if _is_dataset(path.parent))
+        yield from _leftovers(DEMONSTRATIONS, datasets)
+
+
+def _is_folder(path: Path) -> bool:
+    return path.is_dir() and not path.is_symlink()
+
+
+def _is_made_here(kind: str, path: Path) -> bool:
+    """Return whether a path below the folder of a kind holds what clbench writes there."""
+    if kind == "experts":
+        return path.is_file() and not path.is_symlink() and path.suffix == ".safetensors"
+    if not _is_folder(path):
+        return False
+    if kind == "ray":  # records on their way; a worker that was killed leaves them
+        files = [one for one in _walk(path) if not _is_folder(one)]
+        return bool(files) and all(one.suffix == ".json" for one in files)
+    inside = (one for one in path.iterdir() if _is_folder(one))
+    return any(_made_from(one / _MANIFEST) is not None for one in (path, *inside))
+
+
+def _is_dataset(folder: Path) -> bool:
+    """Return whether a folder is a dataset that clbench collected, and nothing else is in it."""
+    parts = {path.name for path in folder.iterdir()}
+    nested = any(path.name == _MANIFEST and path.parent != folder for path in _walk(folder))
+    return parts == {_MANIFEST, "data"} and not nested and _made_from(folder / _MANIFEST) is not None
+
+
+def _made_from(manifest: Path) -> Any:
+    """Return the inputs in a manifest of `clbench.base.cache`, None if it is no such manifest."""
+    try:
+        values = json.loads(manifest.read_text(encoding="utf-8"))
+        return values["made_from"] if {"inputs", "files", "made_from"} <= set(values) else None
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
 
 
 def _walk(folder: Path) -> Iterator[Path]:
@@ -219,7 +268,7 @@ def find_stale(found: Iterable[Entry], days: int, now: float) -> dict[Entry, str
     for entry in found:
         newer = newest.get(entry.origin[0]) if entry.origin is not None else None
         if entry.is_leftover:
-            if now - entry.made > _DAY:
+            if now - entry.made > _LEFTOVER_DAYS * _DAY:
                 stale[entry] = "left behind by a killed process"
         elif now - entry.used > days * _DAY:
             stale[entry] = f"not used for {_days(now - entry.used)}"

@@ -97,15 +97,16 @@ def test_an_entry_of_older_code_is_stale_unless_it_was_used_since(
 
 
 @pytest.mark.usefixtures("empty_caches")
-def test_leftovers_of_killed_processes_are_deleted_after_a_day(capsys: pytest.CaptureFixture[str]) -> None:
+def test_leftovers_of_killed_processes_are_deleted_after_a_week(capsys: pytest.CaptureFixture[str]) -> None:
     root, whole = cache_folder() / "stages" / hash_of("run"), "f" * 32
     _write(root / "stage-0" / "data")
     old, fresh = root / f".stage-1.{whole}.partial", root / f".stage-2.{whole}.partial"
     dataset = minari_folder() / "clbench" / "toy" / f".left-v0.{whole}.old"
     for folder in (old, fresh, dataset):
         _write(folder / "data")
-    _age(old, 2)
-    _age(dataset, 2)
+    _age(old, 8)
+    _age(fresh, 2)
+    _age(dataset, 8)
     out = _cache(capsys, "--prune")
     assert f"{old}: left behind by a killed process" in out
     assert "Deleted 2 stale entries" in out
@@ -139,3 +140,59 @@ def test_datasets_that_clbench_collected_are_entries() -> None:
 @pytest.mark.usefixtures("empty_caches")
 def test_an_empty_cache_is_shown_too(capsys: pytest.CaptureFixture[str]) -> None:
     assert "Deleted 0 stale entries, 0.0 MB." in _cache(capsys, "--prune")
+
+
+@pytest.mark.usefixtures("empty_caches")
+def test_files_that_clbench_did_not_make_are_left_alone(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    name = "0123456789abcdef"
+    foreign = [
+        _write(cache_folder() / "photos" / f"holiday-{name}.jpg"),
+        _write(cache_folder() / "projects" / name / "thesis.txt"),
+        _write(cache_folder() / "runs" / name / "thesis.txt"),
+        _write(cache_folder() / "ray" / name / "thesis.txt"),
+        _write(cache_folder() / "experts" / name / "thesis.txt"),
+        _write(cache_folder() / "frames" / f"holiday-{name}.jpg"),
+        _write(minari_folder() / "precious" / "data" / "x.h5"),
+        _write(minari_folder() / "clbench" / "mine" / "push-v0" / "data" / "x.h5"),
+    ]
+    manifest = next(_make("scenes").glob("clbench.json")).read_bytes()
+    for folder in (minari_folder(), minari_folder() / "clbench", minari_folder() / "clbench" / "mine"):
+        foreign.append(folder / "clbench.json")
+        folder.joinpath("clbench.json").write_bytes(manifest)
+    for path in foreign:
+        _age(path.parent, 400)
+    assert [entry.kind for entry in entries()] == ["scenes"]
+    _cache(capsys, "--prune", "--older-than", "0")
+    assert all(path.is_file() for path in foreign)
+
+
+@pytest.mark.usefixtures("empty_caches")
+def test_a_linked_folder_is_not_followed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    target = _make("runs", 400).parent
+    moved = target.rename(tmp_path / "elsewhere")
+    target.symlink_to(moved)
+    assert list(entries()) == []
+    _cache(capsys, "--prune")
+    assert len(list(moved.iterdir())) == 1
+
+
+@pytest.mark.usefixtures("empty_caches")
+def test_an_entry_that_cannot_be_deleted_does_not_stop_the_others(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first, second = sorted((_make("runs", 40), _make("runs", 50)))
+    rename = Path.rename
+
+    def refuse(path: Path, target: Path) -> Path:
+        if path == first:
+            raise PermissionError(13, "Permission denied")
+        return rename(path, target)
+
+    monkeypatch.setattr(Path, "rename", refuse)
+    with pytest.raises(SystemExit) as ended:
+        app(["cache", "--prune"], result_action="return_value")
+    assert ended.value.code == 2
+    assert f"1 of 2 stale entries could not be deleted. {first}" in capsys.readouterr().err
+    assert (first.is_dir(), second.is_dir()) == (True, False)
