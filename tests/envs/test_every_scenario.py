@@ -36,6 +36,9 @@ every_scenario = pytest.mark.parametrize(
     "scenario", [registered_scenario(name) for name in BUILT_IN], ids=BUILT_IN
 )
 
+QUICK = ("clbench/Fetch-v0", "clbench/MetaWorld-v0")
+"""Scenarios that a test in a process of its own tries by default."""
+
 Rows = NDArray[np.float64]
 
 
@@ -100,7 +103,13 @@ def test_the_data_of_all_scenarios_load_no_simulator() -> None:
     )
 
 
-@every_scenario
+@pytest.mark.parametrize(
+    "scenario",
+    [
+        pytest.param(registered_scenario(name), id=name, marks=[] if name in QUICK else [pytest.mark.slow])
+        for name in BUILT_IN
+    ],
+)
 def test_an_outsiders_script_makes_it_without_an_import_and_without_pytorch(scenario: Scenario) -> None:
     make_environment(scenario).close()
     run(
