@@ -23,7 +23,6 @@ RUN_SOURCES = (*TRAINING_SOURCES, "clbench.records", "clbench.evaluation", "clbe
 """Code that a run depends on, besides the suites of its tasks and the package of its method."""
 
 
-@functools.cache  # it takes 10 ms, and a run asks 20 times; the code of a process does not change
 def source_hash(*modules: str) -> str:
     """Return the hash of the source of `modules`; a package counts with all files below it.
 
@@ -42,8 +41,15 @@ def source_hash(*modules: str) -> str:
             continue
         for path in sorted(origin.parent.rglob("*")) if origin.name == "__init__.py" else [origin]:
             if path.is_file() and path.suffix != ".pyc":
-                digest.update(path.read_bytes())
+                status = path.stat()
+                digest.update(_file_hash(path, status.st_mtime_ns, status.st_size))
     return digest.hexdigest()[:16]
+
+
+@functools.lru_cache(maxsize=4096)  # a run asks 20 times, 10 ms each
+def _file_hash(path: Path, changed: int, size: int) -> bytes:
+    """Return the hash of a file that was last changed at a time and has a size."""
+    return hashlib.sha256(path.read_bytes()).digest()
 
 
 def _origin(module: str) -> Path | None:
