@@ -1,15 +1,12 @@
-"""Coverage of the intervals and false splits of the ranks, simulated in minutes.
+"""Coverage of the intervals, and false splits and power of the groups, simulated in minutes.
 
 Run `python benchmarks/coverage.py`.
 
-The model mimics a row of the benchmark. A run's success rate on a task is, on the scale of the logit,
-
-    the method's level + the task's effect + the seed's, shared by all methods + the run's own
-
-The last two are normal, and the same for all tasks of a run. Their standard deviation is stated for a rate of
-one half; it is 4 times as large on the scale of the logit. An episode succeeds if its luck is below the rate.
-Half of the variance of luck belongs to the initial state, which all methods share. Draws are seeded, so that
-the result is the same each time.
+The model mimics a row of the benchmark. The success rates of a method's runs have a beta distribution. Its
+standard deviation is stated for a mean rate of one half; at a rate p it is 2 sqrt(p (1 - p)) times as large.
+On the normal scale, half of the variance between runs belongs to the seed, which all methods share, and half
+to the run alone. An episode succeeds if its luck is below the rate. Half of the variance of luck belongs to
+the initial state, which all methods share. Draws are seeded, so that the result is the same each time.
 """
 
 from __future__ import annotations
@@ -18,48 +15,48 @@ import argparse
 import itertools
 import json
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from statistics import NormalDist
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from rich.progress import track
+from scipy import special
 
 from clbench.records.paths import RECORDS
 from clbench.records.reader import read_record
+from clbench.scoring.groups import told_apart
 from clbench.scoring.intervals import Estimate, interval
 from clbench.scoring.layout import Array
 from clbench.scoring.metrics import load_metric
-from clbench.scoring.ranks import ranks
 from clbench.scoring.scores import Scores, rates_of
 
 RESULTS = Path(__file__).parent / "results" / "coverage.json"
-EPISODES = 20
+EPISODES = 200
+"""Episodes of a run, of all tasks together."""
 ROOT = math.sqrt(0.5)
 """Weight of each half of a variance."""
-SKILLS, TRAINED = 6, 9
-"""Tasks in retention, and in the final average of a board."""
+OTHERS = {0.01: 0.03, 0.03: 0.1, 0.1: 0.5, 0.5: 0.5, 0.9: 0.5, 0.97: 0.03, 0.99: 0.01}
+"""Mean rates, each with another one for the difference of two methods."""
 Outcomes = NDArray[np.bool_]
-"""Success of episodes, (methods, seeds, tasks, episodes)."""
+"""Success of episodes, (methods, seeds, episodes)."""
 
 
 def main() -> None:
     """Simulate, print the tables of docs/guide/statistics.md and write results/coverage.json."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("--simulations", type=int, default=1500, help="rows for each interval")
+    parser.add_argument("--simulations", type=int, default=4000, help="rows for each interval")
     parser.add_argument("--boards", type=int, default=1000, help="boards for each kind of board")
     arguments = parser.parse_args()
     generator = np.random.default_rng(0)
-    of_records = seed_deviations(RECORDS / "Fetch-v0")
     results = {
         "simulations": arguments.simulations,
         "boards": arguments.boards,
         "intervals": list(interval_coverage(generator, arguments.simulations)),
         "false_splits": list(false_splits(generator, arguments.boards)),
         "power": list(power(generator, arguments.boards)),
-        "records": of_records,
+        "records": seed_deviations(RECORDS / "Fetch-v0"),
     }
     RESULTS.parent.mkdir(exist_ok=True)
     RESULTS.write_text(_json(results), encoding="utf-8", newline="\n")
@@ -77,48 +74,26 @@ def _json(results: dict[str, Any]) -> str:
 
 # ---- model -------------------------------------------------------------------------------------------------
 
-_PLACES = np.linspace(-6, 6, 12001)
-_BELOW = np.array([NormalDist().cdf(place) for place in _PLACES])
 
-
-def outcomes(
-    generator: np.random.Generator, levels: Array, deviations: Array, shared: float, shape: tuple[int, int]
-) -> Outcomes:
+def outcomes(generator: np.random.Generator, rates: Array, deviations: Array, seeds: int) -> Outcomes:
     """Return the outcomes of methods.
 
     Args:
         generator: Source of the draws.
-        levels: The methods' levels, (methods,).
-        deviations: Standard deviations of their runs' own effects, (methods,).
-        shared: Standard deviation of the effects that all methods share.
-        shape: Number of seeds and of tasks.
+        rates: The methods' mean rates, (methods,).
+        deviations: Standard deviations of their runs' rates, as if the mean rate were one half, (methods,).
+        seeds: Number of seeds.
     """
-    methods, seeds = len(levels), shape[0]
-    effects = levels[:, None] + 4 * deviations[:, None] * generator.standard_normal((methods, seeds))
-    effects += 4 * shared * generator.standard_normal(seeds)
-    luck = generator.standard_normal((methods, *shape, EPISODES))
-    luck = ROOT * (luck + generator.standard_normal((*shape, EPISODES)))
-    rates = _rate(effects[..., None] + _of_tasks(shape[1]))
-    return np.asarray(luck < np.interp(rates, _BELOW, _PLACES)[..., None])
-
-
-def level_of(rate: float, deviation: float, tasks: int) -> float:
-    """Return the level that gives a mean rate of `rate` over seeds and tasks."""
-    nodes, weights = np.polynomial.hermite_e.hermegauss(61)
-    low, high = -15.0, 15.0
-    for _ in range(60):
-        middle = (low + high) / 2
-        means = _rate(middle + 4 * deviation * nodes[:, None] + _of_tasks(tasks)).mean(axis=1)
-        low, high = (middle, high) if weights @ means < rate * weights.sum() else (low, middle)
-    return low
-
-
-def _of_tasks(tasks: int) -> Array:
-    return np.linspace(-0.5, 0.5, tasks)
-
-
-def _rate(logit: Array) -> Array:
-    return np.asarray(1 / (1 + np.exp(-logit)))
+    shape = (len(rates), seeds)
+    places = ROOT * (generator.standard_normal(shape) + generator.standard_normal(seeds))
+    rates, deviations = np.broadcast_to(rates[:, None], shape), np.broadcast_to(deviations[:, None], shape)
+    of_runs, vary = rates.copy(), deviations > 0
+    # A beta distribution of mean p has the variance p (1 - p) / (size + 1).
+    mean, size = rates[vary], 0.25 / deviations[vary] ** 2 - 1
+    of_runs[vary] = special.betaincinv(mean * size, (1 - mean) * size, special.ndtr(places[vary]))
+    luck = generator.standard_normal((*shape, EPISODES), dtype=np.float32)
+    luck += generator.standard_normal((seeds, EPISODES), dtype=np.float32)
+    return np.asarray(ROOT * luck < special.ndtri(of_runs)[..., None])
 
 
 # ---- intervals ---------------------------------------------------------------------------------------------
@@ -129,26 +104,18 @@ def interval_coverage(generator: np.random.Generator, simulations: int) -> Itera
 
     With one seed the truth is the rate of this run, so that seeds do not differ.
     """
-    deviations = {1: (0.0,)}
-    cells = [
-        (seeds, deviation, rate)
-        for seeds in (1, 2, 3, 5, 10)
-        for deviation in deviations.get(seeds, (0.0, 0.05, 0.1, 0.15))
-        for rate in (0.1, 0.5, 0.9, 0.98)
-    ]
+    several = itertools.product((2, 3, 4, 5, 8), (0.0, 0.05, 0.1), OTHERS)
+    cells = [*itertools.product((1,), (0.0,), OTHERS), *several]
     for seeds, deviation, rate in track(cells, "intervals"):
-        other = rate - 0.2 if rate > 0.5 else rate + 0.2
-        levels = np.array([level_of(one, deviation, SKILLS) for one in (rate, other)])
+        other = OTHERS[rate]
         # Seeds are independent: the seeds of all simulations are drawn at once.
-        shape = (simulations * seeds, SKILLS)
-        success = outcomes(generator, levels, np.full(2, ROOT * deviation), ROOT * deviation, shape)
-        for name, weights, truth, span in (
-            ("rate", np.array([1.0, 0.0]), rate, (0, 1)),
-            ("difference", np.array([1.0, -1.0]), rate - other, (-1, 1)),
+        both = outcomes(generator, np.array([rate, other]), np.full(2, deviation), simulations * seeds)
+        first, second = both.astype(np.int8).reshape(2, simulations, seeds, EPISODES)
+        for name, success, truth, span in (
+            ("rate", first, rate, (0.0, 1.0)),
+            ("difference", first - second, rate - other, (-1.0, 1.0)),
         ):
-            found = [
-                _interval(generator, one, weights, span) for one in np.split(success, simulations, axis=1)
-            ]
+            found = [_interval(generator, one, span) for one in success]
             ends = np.array([[one.low, one.high] for one in found], dtype=float)
             yield {
                 "quantity": name,
@@ -161,43 +128,47 @@ def interval_coverage(generator: np.random.Generator, simulations: int) -> Itera
 
 
 def _interval(
-    generator: np.random.Generator, success: Outcomes, weights: Array, span: tuple[float, float]
+    generator: np.random.Generator, success: NDArray[np.int8], span: tuple[float, float]
 ) -> Estimate:
-    """Return the interval of a weighted sum of the methods' mean success."""
-    of_episodes = np.tensordot(weights, success, 1)
-    of_runs = of_episodes.mean(axis=(1, 2))
+    """Return the interval of the mean of outcomes, or of differences of outcomes, (seeds, episodes)."""
+    of_runs = success.mean(axis=1)
     total, seeds = of_runs.sum(), len(of_runs)
 
     def other_episodes() -> Array:
-        drawn = generator.integers(EPISODES, size=(500, of_episodes.size // EPISODES, EPISODES))
-        drawn += np.arange(drawn.shape[1])[:, None] * EPISODES
-        return np.asarray(of_episodes.ravel()[drawn.reshape(len(drawn), -1)].mean(axis=1))
+        # Draws with replacement from each run's outcomes -1, 0 and 1.
+        kinds = np.array([-1, 0, 1])
+        shares = (success[..., None] == kinds).mean(axis=1)
+        drawn = generator.multinomial(EPISODES, shares, (500, seeds)) @ kinds
+        return np.asarray(drawn.mean(axis=1) / EPISODES)
 
     without_one = (total - of_runs) / (seeds - 1) if seeds > 1 else np.zeros(0)
     return interval(float(total / seeds), without_one, other_episodes, span)
 
 
-# ---- tie groups --------------------------------------------------------------------------------------------
+# ---- groups ------------------------------------------------------------------------------------------------
 
 
 def false_splits(generator: np.random.Generator, boards: int) -> Iterator[dict[str, Any]]:
     """Yield the share of boards of equal methods that have more than one group.
 
-    Besides plain boards there are harder ones: runs of every second method vary and other runs do not; a
-    third of the rows has only the first seed; all rows have only the first seed.
+    Besides plain boards there are harder ones: runs of every second method vary and other runs do not; one
+    method varies three times as much as the others; a third of the rows has only the first seed; all rows
+    have only the first seed.
     """
-    asked = itertools.product(("equal",), (5, 10, 15), (3, 5), (0.0, 0.05, 0.15))
-    harder = itertools.product(("unequal", "ragged"), (10,), (3, 5), (0.05, 0.15))
-    single = itertools.product(("single",), (5, 10, 15), (1,), (0.0, 0.05, 0.15))
-    for kind, methods, seeds, deviation in track([*asked, *harder, *single], "false splits"):
-        own = np.full(methods, deviation)
+    asked = itertools.product(("equal",), (5, 10, 15), (3, 5, 8), (0.0, 0.05, 0.15))
+    harder = itertools.product(("unequal", "ragged"), (10,), (3, 5, 8), (0.05, 0.15))
+    loud = itertools.product(("loud",), (10,), (3, 5, 8), (0.05,))
+    single = itertools.product(("single",), (10,), (1,), (0.0, 0.05, 0.15))
+    for kind, methods, seeds, deviation in track([*asked, *harder, *loud, *single], "false splits"):
+        deviations = np.full(methods, deviation)
         if kind == "unequal":
-            own[::2] = 0.0
+            deviations[::2] = 0.0
+        if kind == "loud":
+            deviations[0] *= 3
         split = 0
         for _ in range(boards):
-            success = outcomes(generator, np.zeros(methods), own, deviation, (seeds, TRAINED))
-            found = board_ranks(success, single=methods // 3 if kind == "ragged" else 0)
-            split += bool(found.max() > 1)
+            success = outcomes(generator, np.full(methods, 0.5), deviations, seeds)
+            split += bool(board_apart(success, single=methods // 3 if kind == "ragged" else 0).any())
         yield {
             "kind": kind,
             "methods": methods,
@@ -208,20 +179,17 @@ def false_splits(generator: np.random.Generator, boards: int) -> Iterator[dict[s
 
 
 def power(generator: np.random.Generator, boards: int) -> Iterator[dict[str, Any]]:
-    """Yield the share of the pairs of a better and a worse method that have ranks in the right order.
+    """Yield the share of the pairs of a better and a worse method that are told apart.
 
     Five of ten methods are better by a difference, all around a rate of one half.
     """
-    cells = list(itertools.product((0.15, 0.2, 0.3), (3, 5), (0.0, 0.05, 0.1)))
+    cells = list(itertools.product((0.1, 0.2, 0.3), (3, 5, 8), (0.0, 0.05, 0.1)))
     for difference, seeds, deviation in track(cells, "power"):
-        rates = [0.5 + difference / 2, 0.5 - difference / 2]
-        total = math.hypot(deviation, deviation)
-        levels = np.repeat([level_of(rate, total, TRAINED) for rate in rates], 5)
+        rates = np.repeat([0.5 + difference / 2, 0.5 - difference / 2], 5)
         right = 0.0
         for _ in range(boards // 4):
-            success = outcomes(generator, levels, np.full(10, deviation), deviation, (seeds, TRAINED))
-            found = board_ranks(success)
-            right += float((found[:5, None] < found[None, 5:]).mean())
+            success = outcomes(generator, rates, np.full(10, deviation), seeds)
+            right += float(board_apart(success)[:5, 5:].mean())
         yield {
             "difference": difference,
             "seeds": seeds,
@@ -230,15 +198,14 @@ def power(generator: np.random.Generator, boards: int) -> Iterator[dict[str, Any
         }
 
 
-def board_ranks(success: Outcomes, single: int = 0) -> NDArray[np.int64]:
-    """Return the ranks of methods by mean success, (methods,); the first `single` have only one seed."""
-    values = success.mean(axis=(2, 3))
+def board_apart(success: Outcomes, single: int = 0) -> NDArray[np.bool_]:
+    """Return which methods are told apart by mean success; the first `single` have only one seed."""
+    values = success.mean(axis=2)
     values[:single, 1:] = np.nan
-    without_episode = (success.sum(axis=3, keepdims=True) - success).mean(axis=2) / (EPISODES - 1)
+    without_episode = (success.sum(axis=2, keepdims=True) - success) / (EPISODES - 1)
     order = np.argsort(-np.nanmean(values, axis=1), kind="stable")
-    found = np.empty(len(values), dtype=np.int64)
-    found[order] = ranks(values[order], without_episode[order])
-    return found
+    place = np.argsort(order)
+    return told_apart(values[order], without_episode[order])[np.ix_(place, place)]
 
 
 # ---- committed records -------------------------------------------------------------------------------------
@@ -280,55 +247,62 @@ def _excess(metric: str, runs: list[Scores]) -> float:
 
 Row = dict[str, Any]
 """A row of the results."""
+QUANTITIES = ("rate", "difference")
+"""Of the intervals."""
 Lines = dict[str, Row]
 """Lines or columns of a table, with the values that a row of the results must have to belong there."""
 
 
 def tables(results: Row) -> list[str]:
-    """Return the tables of docs/guide/statistics.md: coverage, widths, false splits twice, power."""
-    seeds = {_seeds(count): {"seeds": count} for count in (1, 2, 3, 5, 10)}
-    deviations = {f"deviation {size:.2f}": {"deviation": size} for size in (0.0, 0.05, 0.1, 0.15)}
+    """Return the tables of docs/guide/statistics.md: coverage twice, widths, false splits twice, power."""
     equal: Lines = {f"{count} methods": {"kind": "equal", "methods": count} for count in (5, 10, 15)}
     harder: Lines = {
         "runs of every second method differ, others do not": {"kind": "unequal"},
+        "one method varies three times as much as the others": {"kind": "loud"},
         "a third of the rows have one seed": {"kind": "ragged"},
-        "all rows have one seed": {"kind": "single", "methods": 10},
+        "all rows have one seed": {"kind": "single"},
     }
-    differences = {f"difference {size:.2f}": {"difference": size} for size in (0.15, 0.2, 0.3)}
-    middle = [row for row in results["intervals"] if row["quantity"] == "rate" and row["rate"] == 0.5]
+    differences = {f"difference {size:.1f}": {"difference": size} for size in (0.1, 0.2, 0.3)}
+    rates, minus = ([row for row in results["intervals"] if row["quantity"] == name] for name in QUANTITIES)
+    middle = [row for row in rates if row["rate"] == 0.5]
     splits, pairs = results["false_splits"], results["power"]
+    of_rates: Lines = {f"{rate:g}": {"rate": rate} for rate in OTHERS}
+    of_pairs: Lines = {f"{rate:g} - {other:g}": {"rate": rate} for rate, other in OTHERS.items()}
     return [
-        _table("%", results["intervals"], seeds, deviations, _coverages),
-        _table("width", middle, seeds, deviations, lambda found: f"{found[0]['width']:.2f}"),
-        _table("%", splits, equal, _kinds(splits, "equal"), lambda found: _per_cent(found[0]["split"])),
-        _table(
-            "%",
-            splits,
-            harder,
-            _kinds(splits, "unequal", "single"),
-            lambda found: _per_cent(found[0]["split"]),
-        ),
-        _table("%", pairs, differences, _kinds(pairs), lambda found: f"{100 * found[0]['power']:.0f}"),
+        _table("%", rates, _kinds(rates), of_rates, _coverage),
+        _table("%", minus, _kinds(minus), of_pairs, _coverage),
+        _table("width", middle, _seeds(rates), _deviations(rates), lambda row: f"{row['width']:.2f}"),
+        _table("%", splits, equal, _kinds(splits, "equal"), _split),
+        _table("%", splits, harder, _kinds(splits, "unequal", "single"), _split),
+        _table("%", pairs, differences, _kinds(pairs), lambda row: f"{100 * row['power']:.0f}"),
     ]
 
 
-def _seeds(count: int) -> str:
-    return f"{count} seeds" if count > 1 else "1 seed"
+def _coverage(row: Row) -> str:
+    return f"{100 * row['coverage']:.1f}"
 
 
-def _per_cent(share: float) -> str:
-    return f"{100 * share:.1f}"
+def _split(row: Row) -> str:
+    return f"{100 * row['split']:.1f}"
 
 
-def _coverages(found: list[Row]) -> str:
-    shares = [row["coverage"] for row in found]
-    return f"{_per_cent(min(shares))} to {_per_cent(max(shares))}"
+def _plural(seeds: int) -> str:
+    return f"{seeds} seeds" if seeds > 1 else "1 seed"
+
+
+def _seeds(rows: Iterable[Row]) -> Lines:
+    return {_plural(count): {"seeds": count} for count in sorted({row["seeds"] for row in rows})}
+
+
+def _deviations(rows: Iterable[Row]) -> Lines:
+    sizes = sorted({row["deviation"] for row in rows})
+    return {f"deviation {size:.2f}": {"deviation": size} for size in sizes}
 
 
 def _kinds(rows: list[Row], *kinds: str) -> Lines:
     """Return a column for each pair of a number of seeds and a deviation in the rows of these kinds."""
     pairs = {(row["seeds"], row["deviation"]) for row in rows if row.get("kind") in (kinds or (None,))}
-    return {f"{_seeds(a)}, {b:.2f}": {"seeds": a, "deviation": b} for a, b in sorted(pairs)}
+    return {f"{_plural(a)}, {b:.2f}": {"seeds": a, "deviation": b} for a, b in sorted(pairs)}
 
 
 def _table(
@@ -336,16 +310,16 @@ def _table(
     rows: list[Row],
     lines: Lines,
     columns: Lines,
-    cell: Callable[[list[Row]], str],
+    cell: Callable[[Row], str],
 ) -> str:
-    """Return a Markdown table; a cell shows the rows that have the values of its line and column."""
+    """Return a Markdown table; a cell shows the row that has the values of its line and column."""
     text = [f"| {' | '.join([corner, *columns])} |", f"| --- |{' --: |' * len(columns)}"]
     for name, line in lines.items():
         cells = []
         for column in columns.values():
             wanted = {**line, **column}.items()
             found = [row for row in rows if wanted <= row.items()]
-            cells.append(cell(found) if found else "-")
+            cells.append(cell(found[0]) if found else "-")
         text.append(f"| {' | '.join([name, *cells])} |")
     return "\n".join(text)
 

@@ -12,7 +12,6 @@ from result_files import read_results
 from clbench.base.entry_points import resolve
 
 DOCS = Path(__file__).parents[1] / "docs" / "reference"
-table_lines = resolve("clbench.leaderboard.views.markdown:table_lines")
 VEGA_LITE = resolve("clbench.leaderboard.views.page.html:VEGA_LITE")
 
 INTRODUCTION = """\
@@ -71,7 +70,9 @@ def _ratio(ratio: dict[str, float]) -> str:
 
 
 def _table(head: list[str], rows: list[list[str]]) -> Iterator[str]:
-    yield from table_lines(head, rows, numbers=len(head) - 1)
+    """Yield a table of Markdown; all columns but the first are numbers."""
+    under = ["---", *["--:"] * (len(head) - 1)]
+    yield from (f"| {' | '.join(cells)} |" for cells in (head, under, *rows))
     yield ""
 
 

@@ -31,7 +31,7 @@ from clbench.learning.method import Stage
 from clbench.learning.optimise import BETAS, GRADIENT_NORM, deterministic
 from clbench.learning.pretraining import pretrained_policy
 from clbench.learning.prior import Prior, Source
-from clbench.learning.registry import build_method, method_names
+from clbench.learning.registry import load_method, method_names, new_method
 from clbench.policy.policy import Policy
 from clbench.spec.registry import load_scenario
 from clbench.spec.scenario import Scenario
@@ -52,7 +52,7 @@ class Bench:
 
     def __init__(self, name: str, scenario: Scenario, policy: Policy, data: Mapping[str, Any]) -> None:
         self.scenario, self.policy, self.data = scenario, deepcopy(policy), data
-        self.method = build_method(name, {})
+        self.method = new_method(name, load_method(name), {})
         with seeded("benchmark", name):
             self.method.prepare(self.policy, self._prior("prepare"))
 

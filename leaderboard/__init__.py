@@ -14,8 +14,8 @@ __all__ = ["load"]
 def load(records: Path | str = Path("leaderboard/records")) -> pandas.DataFrame:
     """Return the leaderboard as a table with one row per scenario and method, in the order of the board.
 
-    Columns: `scenario`, `method`, `division`, `rank` (within the division; statistically indistinguishable
-    rows share one), `tier`, `seeds` (their number); for every metric its value and the ends of its 95 %
+    Columns: `scenario`, `method`, `division`, `groups` (letters; two rows of a division share one if they
+    are not told apart), `tier`, `seeds` (their number); for every metric its value and the ends of its 95 %
     confidence interval, for example `retention`, `retention_low`, `retention_high`; then `relative_cost`
     (training time relative to sft), `steps`, `bytes_kept`, `parameters`, `parameters_added` and
     `environment_steps` (of agents that learned online), each a mean over seeds; and `order_sensitivity`
@@ -34,5 +34,5 @@ def load(records: Path | str = Path("leaderboard/records")) -> pandas.DataFrame:
 
     rows = [values_of(row) for row in read_table(Path(records)).rows]
     frame = pandas.DataFrame(rows, columns=column_names(), dtype=object)
-    kinds = {"scenario": "str", "method": "str", "division": "str", "tier": "str", "seeds": "int64"}
+    kinds = {"seeds": "int64", **dict.fromkeys(("scenario", "method", "division", "groups", "tier"), "str")}
     return frame.astype({name: kinds.get(name, "float64") for name in column_names()})

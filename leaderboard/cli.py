@@ -60,7 +60,7 @@ def submit(
     workers: Annotated[int | None, whole_number(1)] = None,
     records: Path = RECORDS,
 ) -> None:
-    """Check METHOD, run it, and print its row and rank, or the reason why it has no row.
+    """Check METHOD, run it, and print its row and place, or the reason why it has no row.
 
     The check takes seconds on a toy scenario and reports what to fix. Each run has its own process, which is
     stopped if it exceeds the scenario's limits on time, memory and written bytes. Runs with a record are

@@ -42,6 +42,7 @@ class WeightedSFT(Method, ABC):
     """Length T of the schedule, as a share of the stage's steps."""
 
     metadata = Metadata(link="https://arxiv.org/abs/2605.08879")
+    tunes = ("tau_start", (0.03, 0.3))
 
     def __post_init__(self) -> None:
         for name in ("tau_start", "tau_end", "kappa", "decay", "curvature", "schedule"):

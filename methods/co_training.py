@@ -29,6 +29,7 @@ class CoTraining(Method):
 
     uses = Uses(questions="throughout")
     metadata = Metadata(link="https://arxiv.org/abs/2604.16067")
+    tunes = ("auxiliary", (0.3, 3.0))
 
     def __post_init__(self) -> None:
         in_range("auxiliary", self.auxiliary, 0.0)

@@ -47,6 +47,8 @@ class ConSFTCalibrated(WeightedSFT):
     schedule: float = 1.0
     """Chosen on the same episodes."""
 
+    tunes = ("tau_start", (0.3, 3.0))
+
     def weights(self, losses: Tensor, progress: Progress) -> Tensor:
         """Return the policy's confidence in each sample (B,)."""
         return self.confidence(losses, progress)

@@ -37,6 +37,7 @@ class EWC(Method):
 
     uses = Uses(demonstrations="prepare")
     metadata = Metadata(link="https://arxiv.org/abs/1612.00796")
+    tunes = ("strength", (1e3, 1e5))
 
     def __post_init__(self) -> None:
         in_range("strength", self.strength, 0.0)

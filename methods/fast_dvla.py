@@ -66,6 +66,7 @@ class FastDVLA(Method):
 
     uses = Uses(demonstrations="prepare", questions="prepare")
     metadata = Metadata(link="https://arxiv.org/abs/2603.25661")
+    tunes = ("orthogonal", (1e-2, 1.0))
 
     def __post_init__(self) -> None:
         for name in ("alpha", "orthogonal", "auxiliary"):

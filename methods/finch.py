@@ -34,6 +34,7 @@ class Finch(Method):
     """Momentum of the exponential moving average of the loss (the paper's value)."""
 
     metadata = Metadata(link="https://arxiv.org/abs/2605.20005")
+    tunes = ("kappa", (0.1, 1.0))
 
     def __post_init__(self) -> None:
         in_range("kappa", self.kappa, 1e-9)

@@ -20,6 +20,7 @@ class FromScratch(Method):
     """Start every target from random weights."""
 
     uses = Uses(reference=True)
+    tunes = ("step_factor", (2.2, 5.0))  # new weights need larger steps; pretraining's are 5 times as large
 
     def start_task(self, policy: Policy, stage: Stage) -> Iterable[nn.Parameter]:
         """Return all parameters, set to new random weights."""

@@ -30,6 +30,7 @@ class KnowledgeInsulation(Method):
 
     uses = Uses(questions="throughout")
     metadata = Metadata(link="https://arxiv.org/abs/2505.23705")
+    tunes = ("alpha", (0.3, 3.0))
 
     def __post_init__(self) -> None:
         in_range("alpha", self.alpha, 0.0)

@@ -27,6 +27,7 @@ class L2SP(Method):
     """Factor of the penalty."""
 
     metadata = Metadata(link="https://arxiv.org/abs/1802.01483")
+    tunes = ("strength", (0.1, 1.0))
 
     def __post_init__(self) -> None:
         in_range("strength", self.strength, 0.0)

@@ -37,6 +37,7 @@ class LoRA(Method):
     """Factor of the step size."""
 
     metadata = Metadata(link="https://arxiv.org/abs/2106.09685")
+    tunes = ("rank", (4, 64))
 
     def __post_init__(self) -> None:
         in_range("rank", self.rank, 1)

@@ -32,6 +32,7 @@ class LwF(Method):
     """Factor of the distillation loss."""
 
     metadata = Metadata(link="https://arxiv.org/abs/1606.09282")
+    tunes = ("strength", (0.01, 1.0))
 
     def __post_init__(self) -> None:
         in_range("strength", self.strength, 0.0)

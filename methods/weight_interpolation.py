@@ -32,6 +32,7 @@ class WeightInterpolation(Method):
 
     whole_stages = True
     metadata = Metadata(link="https://arxiv.org/abs/2109.01903")
+    tunes = ("coefficient", (0.7, 0.9))
 
     def __post_init__(self) -> None:
         in_range("coefficient", self.coefficient, 0.0, 1.0)

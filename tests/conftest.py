@@ -20,13 +20,23 @@ from clbench.learning.optimise import deterministic
 from clbench.learning.prior import Uses
 from clbench.learning.registry import load_method
 from clbench.records.paths import record_path
-from clbench.records.record import AnswerRow, Costs, EpisodeRow, PolicyRow, Record, RunInfo, ScenarioInfo
+from clbench.records.record import (
+    AnswerRow,
+    CheckRow,
+    Costs,
+    EpisodeRow,
+    PolicyRow,
+    Record,
+    RunInfo,
+    ScenarioInfo,
+)
 from clbench.records.writer import record_text
 from clbench.runs.length import run_length
 from clbench.runs.run import execute
 from clbench.runs.spec import RunSpec
 from clbench.scoring.scores import Scores
 from clbench.spec.identifiers import built_in_methods
+from clbench.spec.protocol import check_steps
 
 collect_ignore = ["submission"]
 """A package of its own, which test_submission.py installs and tests."""
@@ -190,6 +200,7 @@ def _make_record(
     episodes: int = 20,
     curve_episodes: int | None = None,
     validation_episodes: int = 10,
+    ends: tuple[int, ...] | None = None,
     **run: Any,
 ) -> Record:
     """Return a record. Where a value is NaN there is no row, or None in it.
@@ -208,6 +219,7 @@ def _make_record(
         episodes: Episodes per task, where rates are given.
         curve_episodes: Episodes per task on the way, where rates are given; as many as at the end if None.
         validation_episodes: Validation episodes, where rates are given.
+        ends: Steps of each stage if stages have a criterion, of .9; it is met at steps before the last one.
         run: Fields of `Record.run`, for example method="ewc"; split="validation" holds for all episodes.
             A built-in method uses what it declares.
     """
@@ -222,8 +234,9 @@ def _make_record(
     names_of_run = {"scenario": "clbench/Toy-v0", "method": method, "seed": 0, "device": "cpu"}
     run = {**names_of_run, "split": "test", "settings": {}, "changes": {}, "uses": uses, **run}
     split, on_the_way = run["split"], curve_episodes or outcomes.shape[2]
+    at_end = (0, *(ends or stages * steps[-1:]))
     rows: list[tuple[Any, ...]] = [
-        (stage, steps[-1] if stage else 0, names[task], split, episode, int(value), value, 50)
+        (stage, at_end[stage], names[task], split, episode, int(value), value, 50)
         for (stage, task, episode), value in np.ndenumerate(outcomes)
         if not np.isnan(value)
     ]
@@ -240,7 +253,7 @@ def _make_record(
         for (target, point, task, episode), value in _each(retained_curves, 3, on_the_way)
     ]
     rows += [
-        (stage, steps[-1] if stage else 0, names[task], "perturbed", episode, int(value), value, 50)
+        (stage, at_end[stage], names[task], "perturbed", episode, int(value), value, 50)
         for (stage, task, episode), value in _each(perturbed, 2, outcomes.shape[2])
     ]
     run |= {} if perturbed is None else {"perturb": True}
@@ -249,6 +262,7 @@ def _make_record(
         "test_episodes": outcomes.shape[2],
         "curve_episodes": on_the_way,
         "validation_episodes": validation_episodes,
+        "criterion": 0.9 if ends else None,
     }
     given = answers or {}
     record = Record(
@@ -268,7 +282,12 @@ def _make_record(
     for row in rows:
         record.add_episode(EpisodeRow(*row))
     for (stage, kind), value in given.items():
-        record.add_answers(AnswerRow(stage, steps[-1] if stage else 0, kind, *value))
+        record.add_answers(AnswerRow(stage, at_end[stage], kind, *value))
+    for stage, end in enumerate(ends or (), 1):
+        for step in check_steps(steps[-1]):
+            if step <= end:
+                met = step == end < steps[-1]
+                record.add_check(CheckRow(stage, step, validation_episodes if met else 2, 9 if met else 0))
     for values in _policy_rows(sparsity, drift, (stages, len(steps)), steps):
         record.add_policy(PolicyRow(*values))
     return record

@@ -74,7 +74,7 @@ def test_three_commands_lead_from_nothing_to_a_row_on_the_board(tmp_path: Path) 
     printed = subprocess.run(
         [*command, *words], cwd=tmp_path, check=True, capture_output=True, text=True
     ).stdout
-    assert "Rank 1 of 1 in the division prior-data-free." in printed
+    assert "Division prior-data-free: place 1 of 1." in printed
     assert (tmp_path / "try/records/FetchToy-v0/gentle_tuning.GentleTuning/seed-0.json").is_file()
     assert "gentle" in (tmp_path / "try/site/LEADERBOARD.md").read_text(encoding="utf-8")
 

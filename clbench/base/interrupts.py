@@ -18,7 +18,9 @@ _AGAIN_SECONDS = 0.01
 
 
 def install() -> None:
-    """Remember each Ctrl-C, and raise it again if a destructor or a callback dropped it."""
+    """Remember each Ctrl-C from now on, and raise it again if a destructor or a callback dropped it."""
+    global _interrupted
+    _interrupted = False  # an earlier command in this process may have been stopped
     signal.signal(signal.SIGINT, _handle)
     sys.unraisablehook = _raise_again
 

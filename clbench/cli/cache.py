@@ -19,10 +19,12 @@ from typing import Annotated, Any
 from cyclopts import Parameter
 from rich.console import Console
 from rich.table import Table
+from safetensors import SafetensorError, safe_open
 
 from clbench.base.cache import cache_folder, hash_of
 from clbench.base.errors import InputError
 from clbench.cli.arguments import checked_input, whole_number
+from clbench.records.reader import RecordError, read_record
 
 DEMONSTRATIONS = "demonstrations"
 """Kind of the Minari datasets that clbench collected."""
@@ -45,7 +47,9 @@ KINDS = {
 _MANIFEST = "clbench.json"
 _NAME = re.compile(r"(?:.*-)?[0-9a-f]{16}(?:\.\w+)?")
 """Names of entries: they end with a hash. Nothing else is shown or deleted."""
-_LEFTOVER = re.compile(r"\..+\.[0-9a-f]{32}\.(?:partial|old)")
+_LEFTOVER = re.compile(r"\.(.+)\.[0-9a-f]{32}\.(?:partial|old)")
+_READ_HERE = ("ray", "experts")
+"""Kinds without manifests: this command itself reads their files. A run or a training writes them again."""
 _CODE = ("source", "versions", "torch")
 _DAY = 24 * 60 * 60
 _LEFTOVER_DAYS = 7
@@ -62,9 +66,9 @@ def cache(
 
     An entry is stale if it has not been used for --older-than days, if newer code has made its replacement
     since its last use, or if a killed process left it behind more than a week ago. The cache holds no
-    records, and everything in it can be made again. Files that clbench did not make are neither shown nor
-    deleted. Where the file system does not note when a file is read, an entry counts as used when it was
-    made.
+    records, and everything in it can be made again. Files that clbench did not make are never deleted: an
+    entry that holds one is named, and left as it is. Where the file system does not note when a file is read,
+    an entry counts as used when it was made.
 
     Args:
         prune: List the stale entries, and delete them.
@@ -79,6 +83,11 @@ def cache(
     lines = [
         f"Cache: {cache_folder()} (CLBENCH_CACHE moves it)",
         f"Demonstrations: {minari_folder()} (MINARI_DATASETS_PATH moves it)",
+    ]
+    lines += [
+        f"{entry.path} is left: clbench did not make {_some(entry.foreign)} in it."
+        for entry in found
+        if entry.foreign
     ]
     if prune or dry_run:
         lines += [f"{_size(entry.size):>9}  {entry.path}: {reason}" for entry, reason in stale.items()]
@@ -130,6 +139,8 @@ class Entry:
     @property
     def used(self) -> float:
         """Time of the last change, or of the last reading as far as the file system notes it."""
+        if self.kind in _READ_HERE:
+            return self.made
         # this command itself reads manifests and lists folders
         read = (
             stat.st_atime
@@ -137,6 +148,19 @@ class Entry:
             if path.name != _MANIFEST and not S_ISDIR(stat.st_mode)
         )
         return max((self.made, *read))
+
+    @cached_property
+    def foreign(self) -> list[str]:
+        """Paths of the files in it that clbench did not write; a leftover has no list to tell them by."""
+        if self.is_leftover or not self.path.is_dir():
+            return []
+        files = {path for path, stat in self._stats.items() if not S_ISDIR(stat.st_mode)}
+        if self.kind == "ray":
+            ours = {path for path in files if _is_record(path)}
+        else:
+            ours = set[Path]().union(*(_listed(path) for path in files if path.name == _MANIFEST))
+        left = (path for path in files - ours if os.path.lexists(path))  # a run may just remove its own
+        return sorted(path.relative_to(self.path).as_posix() for path in left)
 
     @property
     def is_leftover(self) -> bool:
@@ -147,11 +171,11 @@ class Entry:
     def origin(self) -> tuple[str, str] | None:
         """Hashes of its inputs and of the code that made it; None if no manifest shows these."""
         manifests = sorted(path for path in self._stats if path.name == _MANIFEST)
-        made_from = _made_from(manifests[0]) if manifests else None
-        if made_from is None:
+        manifest = _read_manifest(manifests[0]) if manifests else None
+        if manifest is None:
             return None
         code: list[Any] = []
-        purpose = _without_code(made_from, code)
+        purpose = _without_code(manifest["made_from"], code)
         return hash_of([self.kind, purpose]), hash_of(code)
 
     def delete(self) -> None:
@@ -201,30 +225,54 @@ def _is_folder(path: Path) -> bool:
 def _is_made_here(kind: str, path: Path) -> bool:
     """Return whether a path below the folder of a kind holds what clbench writes there."""
     if kind == "experts":
-        return path.is_file() and not path.is_symlink() and path.suffix == ".safetensors"
+        return not path.is_symlink() and _is_training(path)
     if not _is_folder(path):
         return False
     if kind == "ray":  # records on their way; a worker that was killed leaves them
-        files = [one for one in _walk(path) if not _is_folder(one)]
-        return bool(files) and all(one.suffix == ".json" for one in files)
+        return any(map(_is_record, _walk(path)))
     inside = (one for one in path.iterdir() if _is_folder(one))
-    return any(_made_from(one / _MANIFEST) is not None for one in (path, *inside))
+    return any(_read_manifest(one / _MANIFEST) is not None for one in (path, *inside))
 
 
 def _is_dataset(folder: Path) -> bool:
     """Return whether a folder is a dataset that clbench collected, and nothing else is in it."""
     parts = {path.name for path in folder.iterdir()}
     nested = any(path.name == _MANIFEST and path.parent != folder for path in _walk(folder))
-    return parts == {_MANIFEST, "data"} and not nested and _made_from(folder / _MANIFEST) is not None
+    return parts == {_MANIFEST, "data"} and not nested and _read_manifest(folder / _MANIFEST) is not None
 
 
-def _made_from(manifest: Path) -> Any:
-    """Return the inputs in a manifest of `clbench.base.cache`, None if it is no such manifest."""
+def _is_training(path: Path) -> bool:
+    """Return whether a file is the checkpoint of an expert's training."""
     try:
-        values = json.loads(manifest.read_text(encoding="utf-8"))
-        return values["made_from"] if {"inputs", "files", "made_from"} <= set(values) else None
-    except (OSError, ValueError, KeyError, TypeError):
+        with safe_open(path, "np") as file:
+            return "training" in (file.metadata() or {})
+    except (OSError, SafetensorError):
+        return False
+
+
+def _is_record(path: Path) -> bool:
+    """Return whether a file is a record, which no one has changed."""
+    try:
+        read_record(path)
+    except (OSError, RecordError):
+        return False
+    return True
+
+
+def _read_manifest(path: Path) -> dict[str, Any] | None:
+    """Return a manifest of `clbench.base.cache`, None if the file is no such manifest."""
+    try:
+        values = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
         return None
+    whole = isinstance(values, dict) and {"inputs", "files", "made_from"} <= set(values)
+    return values if whole and isinstance(values["files"], dict) else None
+
+
+def _listed(manifest: Path) -> set[Path]:
+    """Return the files that a manifest lists, and itself."""
+    values = _read_manifest(manifest)
+    return set() if values is None else {manifest, *(manifest.parent / name for name in values["files"])}
 
 
 def _walk(folder: Path) -> Iterator[Path]:
@@ -235,9 +283,15 @@ def _walk(folder: Path) -> Iterator[Path]:
 
 
 def _leftovers(kind: str, folder: Path) -> Iterator[Entry]:
+    """Yield the folders with names of leftovers, in entries and of entries."""
     for place, folders, _ in os.walk(folder):
-        found = [Path(place, name) for name in sorted(folders) if _LEFTOVER.fullmatch(name)]
-        yield from (Entry(kind, path) for path in found if not path.is_symlink())
+        above = Path(place).relative_to(folder).parts
+        for name in sorted(folders):
+            leftover = _LEFTOVER.fullmatch(name)
+            if leftover is None or Path(place, name).is_symlink():
+                continue
+            if kind == DEMONSTRATIONS or _NAME.fullmatch([*above, leftover[1]][0]):
+                yield Entry(kind, Path(place, name))
 
 
 def _without_code(value: Any, code: list[Any]) -> Any:
@@ -251,14 +305,14 @@ def _without_code(value: Any, code: list[Any]) -> Any:
 
 
 def find_stale(found: Iterable[Entry], days: int, now: float) -> dict[Entry, str]:
-    """Return the stale entries, each with the reason.
+    """Return the stale entries, each with the reason. An entry with foreign files is never stale.
 
     Args:
         found: Entries.
         days: Days without use after which an entry is stale.
         now: Present time, in seconds since the epoch.
     """
-    found = list(found)
+    found = [entry for entry in found if not entry.foreign]
     newest: dict[str, Entry] = {}
     for entry in found:
         if entry.origin is not None and not entry.is_leftover:
@@ -301,6 +355,11 @@ def _table(found: Sequence[Entry], stale: Mapping[Entry, str], now: float) -> Ta
             f"{len(unused)} ({_size(sum(unused))})" if unused else "-",
         )
     return table
+
+
+def _some(names: Sequence[str]) -> str:
+    more = len(names) - 1
+    return names[0] + (f" and {more} more {'file' if more == 1 else 'files'}" if more else "")
 
 
 def _size(count: int) -> str:

@@ -4,91 +4,161 @@ from __future__ import annotations
 
 import itertools
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
+from cyclopts import Parameter
 from rich.console import Console
 from rich.table import Table
 
+from clbench.base.errors import InputError
 from clbench.cli.arguments import add_cwd_to_path, checked_input, whole_number
 from clbench.cli.runs import run_missing
 from clbench.records.paths import TUNING
+from clbench.spec.references import BASELINE
 
 if TYPE_CHECKING:
     from clbench.runs.spec import ResolvedRun
+    from clbench.runs.tuning import Settings, Tried, Tuned
 
-METRICS = ("adaptation", "retention", "retention_at_matched_adaptation", "question_retention")
-"""Metrics in the table."""
+FIRST_SEED = 100
+"""First seed of tuning: no board has it or a later one."""
 
 
 def tune(
     scenario: str,
-    method: str,
     /,
-    *,
-    values: dict[str, str],
-    seed: Annotated[int, whole_number(0)] = 100,
+    *methods: str,
+    every: Annotated[bool, Parameter(name="--all", negative="")] = False,
+    seeds: Annotated[int, whole_number(1)] = 2,
+    first_seed: Annotated[int, whole_number(0)] = FIRST_SEED,
+    values: dict[str, str] | None = None,
     targets: Annotated[int | None, whole_number(1)] = None,
     workers: Annotated[int | None, whole_number(1)] = None,
     records: Path = TUNING,
+    write: Path | None = None,
 ) -> None:
-    """Compare settings of METHOD on SCENARIO without test episodes.
+    """Choose the settings of METHODS for SCENARIO on validation episodes, with equal effort for each method.
 
-    The command runs every combination of the values, and plain fine-tuning for comparison, on validation
-    episodes and with a seed that no board reports. It skips runs that have a record, so the same command
-    shows the table again.
+    Each method runs with four step sizes, then with two values of its own strength at the best of them, or
+    with two more step sizes. All targets are learned, with seeds that no board has, and no test episode is
+    played. The setting with the best final average wins, among those that learn .8 of the targets' success.
+    Runs with a record are skipped: the same command continues a stopped one and shows the choice again.
+
+    With --values the methods run with every combination of these values instead, besides plain fine-tuning,
+    and nothing is chosen.
 
     Args:
-        scenario: Gymnasium id of the scenario.
-        method: Name of an installed method, or module:Class.
+        scenario: Gymnasium id of the scenario; module:id imports the module first.
+        methods: Names of installed methods, or module:Class.
+        every: Tune all installed methods but the references that have nothing to tune.
+        seeds: Number of tuning seeds.
+        first_seed: The first of them; the boards report seeds from 0.
         values: Hyper-parameters and the values to try, as --values.tau_start 0.3,1,3
-        seed: Seed of pretraining and of every draw; the boards report seeds from 0.
-        targets: Number of targets to learn, from the first; all if not given. Fewer targets take less time.
+        targets: Number of targets to learn, from the first, with --values; all if not given.
         workers: Number of runs at once, each a process with one thread; all cores if not given.
         records: Folder of the records.
+        write: File that receives the chosen settings; those of other methods in it stay. For built-in methods
+            `clbench run` reads methods/tuned/.
     """
-    from clbench.jobs.processes import Processes
-    from clbench.runs.spec import RunSpec
-    from clbench.spec.references import BASELINE
+    from clbench.learning.registry import load_method, method_names
+    from clbench.runs.tuning import Tuned, best_of, refinements, rungs, write_tuned
+
+    numbers = range(first_seed, first_seed + seeds)
+
+    def run(wanted: Mapping[str, Sequence[Settings]]) -> dict[str, list[Tried]]:
+        return _run(wanted, scenario, numbers, targets, workers, records)
 
     add_cwd_to_path()
     with checked_input():
-        lists = [[(name, value) for value in text.split(",")] for name, text in values.items()]
-        settings = [
-            (BASELINE, {}),
-            *((method, dict(combination)) for combination in itertools.product(*lists)),
-        ]
-        runs = [
-            RunSpec(scenario, name, seed, changes, split="validation", targets=targets).resolve()
-            for name, changes in settings
-        ]
-    successful = run_missing(runs, records, lambda: Processes(workers))
-    Console().print(_table(runs, records))
-    if not successful:
+        names = list(dict.fromkeys([*methods, *(method_names() if every else ())]))
+        if not names:
+            raise InputError("Name at least one method, or --all; `clbench list` shows them.")
+        classes = {name: load_method(name) for name in names}
+    if values:
+        combinations = _combinations(values)
+        found = run({BASELINE: [{}], **dict.fromkeys(names, combinations)})
+        Console().print(_table(scenario, {name: Tuned({}, tuple(one)) for name, one in found.items()}, seeds))
+        return
+    first = run({name: rungs(cls) for name, cls in classes.items()})
+    second = run({name: refinements(cls, best_of(first[name]).settings) for name, cls in classes.items()})
+    chosen: dict[str, Tuned] = {}
+    for name in names:
+        tried = (*first[name], *second[name])
+        chosen[name] = Tuned(best_of(tried).settings, tried)
+    Console().print(_table(scenario, chosen, seeds))
+    if write is not None:
+        write_tuned(write, scenario.rpartition(":")[2], numbers, chosen)
+
+
+def _combinations(values: Mapping[str, str]) -> list[dict[str, str]]:
+    """Return every combination of the values that are separated by commas."""
+    lists = [[(name, value) for value in text.split(",")] for name, text in values.items()]
+    return [dict(combination) for combination in itertools.product(*lists)]
+
+
+def _run(
+    wanted: Mapping[str, Sequence[Settings]],
+    scenario: str,
+    seeds: Sequence[int],
+    targets: int | None,
+    workers: int | None,
+    records: Path,
+) -> dict[str, list[Tried]]:
+    """Do the runs of all settings that have no record, and return the scores of each setting."""
+    from clbench.jobs.processes import Processes
+    from clbench.runs.spec import RunSpec
+
+    with checked_input():
+        runs = {
+            name: [
+                [
+                    RunSpec(scenario, name, seed, dict(one), split="validation", targets=targets).resolve()
+                    for seed in seeds
+                ]
+                for one in settings
+            ]
+            for name, settings in wanted.items()
+        }
+    every = [one for groups in runs.values() for group in groups for one in group]
+    if not run_missing(every, records, lambda: Processes(workers)):
         sys.exit(1)
+    return {name: [_tried(group, records) for group in groups] for name, groups in runs.items()}
 
 
-def _table(runs: Sequence[ResolvedRun], records: Path) -> Table:
-    """Return the metrics of the runs that have a record; the first run is the baseline."""
+def _tried(runs: Sequence[ResolvedRun], records: Path) -> Tried:
+    """Return the scores of one setting, averaged over its runs."""
     from clbench.records.reader import read_record
-    from clbench.runs.spec import has_record
+    from clbench.runs.tuning import Tried
     from clbench.scoring.metrics import measure
     from clbench.scoring.scores import Scores
-    from clbench.spec.references import BASELINE
 
-    baseline = runs[0]
-    table = Table(title=f"{baseline.spec.scenario}, seed {baseline.spec.seed}, validation episodes")
-    table.add_column("settings", no_wrap=True)
-    for name in METRICS:
-        table.add_column(name.replace("_", " "), justify="right")
-    scores = {
-        run.label: Scores.from_record(read_record(run.path(records)))
-        for run in runs
-        if has_record(run, records)
-    }
-    reference = scores.get(baseline.label)
-    for label, one in scores.items():
-        row = [measure(name, one, {BASELINE: reference} if reference else {}) for name in METRICS]
-        table.add_row(label, *("-" if value is None else f"{value:.2f}" for value in row))
+    scores = [Scores.from_record(read_record(run.path(records))) for run in runs]
+
+    def mean(metric: str) -> float:
+        values = [measure(metric, one) for one in scores]
+        known = [value for value in values if value is not None]
+        return round(sum(known) / len(values), 4) if len(known) == len(values) else 0.0
+
+    return Tried(dict(runs[0].changes), mean("final_average"), mean("adaptation"))
+
+
+def _table(scenario: str, chosen: Mapping[str, Tuned], seeds: int) -> Table:
+    """Return all settings with their scores, the chosen ones in bold."""
+    table = Table(title=f"{scenario}, {seeds} tuning seeds, validation episodes")
+    for title in ("method", "settings"):
+        table.add_column(title, overflow="fold")
+    for title in ("learned", "final average"):
+        table.add_column(title, justify="right")
+    for name, one in chosen.items():
+        table.add_section()
+        for tried in one.tried:
+            style = "bold" if tried.settings == one.settings else ""
+            values = f"{tried.learned:.2f}", f"{tried.final_average:.3f}"
+            table.add_row(name, _words(tried.settings), *values, style=style)
     return table
+
+
+def _words(settings: Mapping[str, Any]) -> str:
+    return " ".join(f"{name}={value}" for name, value in settings.items()) or "defaults"

@@ -1,8 +1,8 @@
 """Rollouts: many evaluation episodes in lock-step.
 
 The outcome of an episode depends only on the policy, the task, the number of the episode and the seed of the
-run. Every forward pass has the same shape: `LANES` rows, with padding in unused rows, because a matrix
-product may round differently for another number of rows.
+run. Every forward pass of an evaluator has the same number of rows, with padding in unused ones, because a
+matrix product may round differently for another number of rows.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ Watch = Callable[[Trial, NDArray[np.float32]], None]
 """Called with a trial and each action (A,) taken in it."""
 
 LANES = 40
-"""Number of episodes that step together, and of rows in every forward pass."""
+"""Number of episodes that step together where all are played."""
 
 
 @dataclass(frozen=True)
@@ -86,12 +86,14 @@ class Evaluator:
         scenario: Scenario of the tasks.
         seed: Seed of the run: it chooses the initial states, the same for all methods.
         threads: Number of threads that may step the worlds; no outcome depends on it.
+        lanes: Number of episodes that step together, and of rows in every forward pass.
     """
 
-    def __init__(self, scenario: Scenario, seed: int, threads: int = 1) -> None:
+    def __init__(self, scenario: Scenario, seed: int, threads: int = 1, lanes: int = LANES) -> None:
         self.scenario = scenario
         self.seed = seed
-        self._lanes = Lanes(LANES, threads)
+        self._count = lanes
+        self._lanes = Lanes(lanes, threads)
 
     def close(self) -> None:
         """Close all worlds."""
@@ -121,6 +123,7 @@ class Evaluator:
         trials: Sequence[Trial],
         progress: ProgressCallback = no_progress,
         watch: Watch = lambda _, __: None,
+        enough: Callable[[Episode], bool] = lambda _: False,
     ) -> list[Episode]:
         """Return the outcome of each of `trials`, in their order; no trial may occur twice.
 
@@ -130,13 +133,15 @@ class Evaluator:
             progress: Called with the number of episodes that have ended since its last call.
             watch: Called with every action. With these actions the plain world, reset with the seed of
                 `start_of`, repeats the episode unless it is perturbed.
+            enough: Called with each outcome; once it returns True, only the episodes that have ended count.
         """
         check_episodes((task.name, split) for task, split, _ in trials)
         queue = list(reversed(trials))
         ended: dict[tuple[str, Split, int], Episode] = {}
         live: list[_Lane] = []
-        idle = list(range(LANES))
-        while queue or live:
+        idle = list(range(self._count))
+        certain = False
+        while (queue or live) and not certain:
             starting = [(idle.pop(), queue.pop()) for _ in range(min(len(idle), len(queue)))]
             live += self._start(policy, starting)
             self._execute(live, self._act(policy, live), watch)
@@ -146,7 +151,11 @@ class Evaluator:
                 live.remove(lane)
                 idle.append(lane.number)
                 progress(1)
-        return [ended[task.name, split, number] for task, split, number in trials]
+                certain = enough(episode)
+                if certain:
+                    break
+        keys = [(task.name, split, number) for task, split, number in trials]
+        return [ended[key] for key in keys if key in ended]
 
     def _start(self, policy: Policy, starting: Sequence[tuple[int, Trial]]) -> list[_Lane]:
         """Begin each trial in the lane that is paired with it."""
@@ -172,10 +181,11 @@ class Evaluator:
     def _act(self, policy: Policy, live: Sequence[_Lane]) -> NDArray[np.float32]:
         """Return the actions to execute, (len(live), executed, A)."""
         config = policy.config
-        state = torch.zeros(LANES, config.state_size)
-        words = torch.ones(LANES, len(live[0].words), dtype=torch.int64)
-        noise = torch.zeros(LANES, config.chunk, config.action_size)
-        image = torch.zeros(LANES, config.image_size, config.image_size, 3, dtype=torch.uint8)
+        rows = self._count
+        state = torch.zeros(rows, config.state_size)
+        words = torch.ones(rows, len(live[0].words), dtype=torch.int64)
+        noise = torch.zeros(rows, config.chunk, config.action_size)
+        image = torch.zeros(rows, config.image_size, config.image_size, 3, dtype=torch.uint8)
         for row, lane in enumerate(live):
             words[row] = lane.words
             noise[row] = lane.noise[lane.length // config.executed]
@@ -213,6 +223,7 @@ def start_of(trial: Trial, seed: int) -> tuple[int, str]:
     A perturbed episode has the same start as the test episode of its number.
     """
     task, split, number = trial
-    instruction = task.instructions[number % len(task.instructions)]
+    wordings = task.wordings(split)
+    instruction = wordings[number % len(wordings)]
     label = SPLIT_LABELS["test" if split == "perturbed" else split]
     return derive_seed("episode", seed, task.name, label, number), instruction

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from clbench.learning.method import Method, Progress, Stage
-from clbench.learning.optimise import MethodError, optimise
+from clbench.learning.optimise import MethodError, optimise, warm_up
 from clbench.policy.policy import Policy
 from clbench.spec.budget import Budget
 
@@ -31,21 +32,26 @@ def adapt(
     method: Method,
     stage: Stage,
     budget: Budget,
-    after: Callable[[Step], None] = lambda _: None,
+    after: Callable[[Step], bool | None] = lambda _: None,
 ) -> int:
     """Let `method` fine-tune the policy on one target, in place, and return the optimiser steps done.
+
+    Without a criterion every stage has the same steps, and the step size falls along a cosine. With one, the
+    stage ends when `after` returns True. The step size is then constant after its warm-up, and `after` is
+    also called before the first step: a policy that has learned the target already takes none.
 
     Args:
         policy: Policy to train.
         method: Method that trains it.
         stage: Stage of the target, with the data that the method may use.
-        budget: Budget that gives the step size.
-        after: Called after each step.
+        budget: Budget that gives the step size and the criterion.
+        after: Called after each step; the stage ends if it returns True.
 
     Raises:
         MethodError: Optimisation fails, or leaves a parameter that is not finite.
     """
-    parameters = method.start_task(policy, stage)
+    parameters: list[Any] = list(method.start_task(policy, stage))
+    to_criterion = budget.criterion is not None
     loss: Tensor | None = None
     learning_rate: float | None = None
 
@@ -57,17 +63,19 @@ def adapt(
 
     def rate(scheduled: float, step: int) -> float:
         nonlocal learning_rate
-        learning_rate = method.learning_rate(scheduled, Progress(step, stage.steps))
+        learning_rate = method.learning_rate(method.step_factor * scheduled, Progress(step, stage.steps))
         return learning_rate
 
+    learned = to_criterion and after(Step(0, None, None))
     steps = optimise(
         parameters,
         budget.learning_rate,
-        stage.steps,
+        0 if learned or (to_criterion and not parameters) else stage.steps,
         loss_at,
         lambda loss: method.gradients(policy, loss),
         lambda done: after(Step(done, loss, learning_rate)),
         rate,
+        warm_up if to_criterion else None,
     )
     method.end_task(policy, stage)
     for name, parameter in policy.named_parameters():

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 from torch import Tensor, nn
 
@@ -84,6 +84,7 @@ class Progress:
     """Number of optimiser steps in the whole stage."""
 
 
+@dataclass(kw_only=True, eq=False)
 class Method:
     """A rule for fine-tuning: a dataclass whose fields are its hyper-parameters.
 
@@ -92,9 +93,15 @@ class Method:
     data that the method needs.
     """
 
-    uses: Uses = Uses()
-    metadata: Metadata = Metadata()
-    whole_stages: bool = False
+    step_factor: float = 1.0
+    """Factor of the scenario's learning rate: every method has the same ladder of these."""
+
+    uses: ClassVar[Uses] = Uses()
+    metadata: ClassVar[Metadata] = Metadata()
+    tunes: ClassVar[tuple[str, tuple[Any, Any]] | None] = None
+    """Hyper-parameter that sets how strongly the method protects what is known, and two values that tuning
+    tries besides the default. None: tuning tries further step sizes instead."""
+    whole_stages: ClassVar[bool] = False
     """Whether the policy is ready only at the end of a stage, for example because `end_task` merges it. Such
     a policy is not evaluated within a stage."""
 

@@ -23,6 +23,21 @@ class MethodError(ClbenchError, RuntimeError):
     """A method did something after which the loop cannot continue."""
 
 
+WARM_UP = 15
+"""Steps of linear warm-up before a constant step size."""
+
+Schedule = Callable[[int], float]
+"""Maps the number of steps done to the step size, as a share of its peak."""
+
+
+def warm_up(step: int) -> float:
+    """Return the step size at `step` as a share of its peak: linear over `WARM_UP` steps, then constant.
+
+    A stage that ends early has then taken the same steps as one that goes on.
+    """
+    return min(1.0, (step + 1) / WARM_UP)
+
+
 def learning_rate_factor(step: int, steps: int) -> float:
     """Return the step size at `step` as a share of its peak: 5 % linear warm-up, then a cosine to a tenth."""
     warm_up = max(1, round(0.05 * steps))
@@ -51,19 +66,21 @@ def optimise(
     steps: int,
     loss_at: Callable[[int], Tensor],
     gradients: Callable[[Tensor], None] = Tensor.backward,
-    after: Callable[[int], None] = lambda _: None,
+    after: Callable[[int], bool | None] = lambda _: None,
     rate: Callable[[float, int], float] = lambda scheduled, _: scheduled,
+    schedule: Schedule | None = None,
 ) -> int:
     """Minimise a loss with AdamW and return the number of steps done, 0 if there are no parameters.
 
     Args:
         parameters: Parameters to train, or optimiser groups of them.
         learning_rate: Peak step size, for groups without their own.
-        steps: Number of steps.
+        steps: Number of steps, at most.
         loss_at: Returns the scalar loss of a step.
         gradients: Sets the gradients from the loss.
-        after: Called after each step with the number of steps done.
+        after: Called after each step with the number of steps done. Training ends if it returns True.
         rate: Maps the scheduled step size of a group, and the number of steps done, to its actual step size.
+        schedule: Schedule of the step size; `learning_rate_factor` if None.
 
     Raises:
         MethodError: The loss is not a finite scalar with a gradient, a gradient is not finite, or a step size
@@ -72,8 +89,10 @@ def optimise(
     groups: list[Any] = list(parameters)
     if not groups:
         for step in range(steps):
-            after(step + 1)
+            if after(step + 1):
+                break
         return 0
+    factor = schedule or (lambda step: learning_rate_factor(step, steps))
     optimiser = torch.optim.AdamW(groups, lr=learning_rate, betas=BETAS, weight_decay=1e-10, fused=True)
     peaks = [group["lr"] for group in optimiser.param_groups]
     trained = [parameter for group in optimiser.param_groups for parameter in group["params"]]
@@ -84,9 +103,10 @@ def optimise(
         gradients(loss)
         _clip(trained, step)
         for group, peak in zip(optimiser.param_groups, peaks, strict=True):
-            group["lr"] = _checked_rate(rate(peak * learning_rate_factor(step, steps), step), step)
+            group["lr"] = _checked_rate(rate(peak * factor(step), step), step)
         optimiser.step()
-        after(step + 1)
+        if after(step + 1):
+            return step + 1
     return steps
 
 

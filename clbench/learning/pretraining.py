@@ -32,6 +32,7 @@ SHIPPED = Path(__file__).parents[1] / "pretrained"
 
 AFTER_PRETRAINING = (
     "adaptation_steps",
+    "criterion",
     "learning_rate",
     "evaluation_points",
     "validation_episodes",

@@ -6,6 +6,7 @@ import contextlib
 import dataclasses
 import difflib
 import importlib
+import math
 from collections.abc import Callable, Mapping
 from types import NoneType, UnionType
 from typing import Any, Union, get_args, get_origin, get_type_hints
@@ -41,7 +42,7 @@ def load_method(spec: str) -> type[Method]:
         )
     if not (isinstance(cls, type) and issubclass(cls, Method)):
         raise WrongTypeError(f"{spec!r} is not a subclass of clbench.Method.")
-    if not dataclasses.is_dataclass(cls):
+    if "__dataclass_fields__" not in vars(cls):  # it inherits those of Method
         raise WrongTypeError(f"{spec!r} is not a dataclass: decorate it with @dataclasses.dataclass.")
     return cls
 
@@ -79,21 +80,6 @@ def _import_method(spec: str) -> Any:
     return getattr(module, attribute)
 
 
-def build_method(spec: str, changes: Mapping[str, Any]) -> Method:
-    """Return the method that `spec` names, with `changes` to its hyper-parameters.
-
-    Args:
-        spec: Name of the method, as for `load_method`.
-        changes: Values by name of the hyper-parameter, as for `read_changes`.
-
-    Raises:
-        UnknownNameError: The method has no such hyper-parameter; the message names the nearest one.
-        InputError: A value cannot be read as the type of its field, or the method refuses it.
-    """
-    cls = load_method(spec)
-    return new_method(spec, cls, read_changes(spec, cls, changes))
-
-
 def read_changes(spec: str, cls: type[Method], changes: Mapping[str, Any]) -> dict[str, Any]:
     """Return changed hyper-parameters as the method holds them.
 
@@ -108,7 +94,7 @@ def read_changes(spec: str, cls: type[Method], changes: Mapping[str, Any]) -> di
         InputError: A value cannot be read as the type of its field, or the method refuses it.
     """
     hints = get_type_hints(cls)
-    fields = [field.name for field in dataclasses.fields(cls)]  # type: ignore[arg-type]
+    fields = [field.name for field in dataclasses.fields(cls)]
     values = {}
     for name, value in changes.items():
         if name not in fields:
@@ -134,9 +120,12 @@ def new_method(spec: str, cls: type[Method], values: Mapping[str, Any]) -> Metho
         InputError: The method refuses a value.
     """
     try:
-        return cls(**values)
+        method = cls(**values)
     except Exception as error:
         raise InputError(f"{spec} refuses its hyper-parameters: {error}") from error
+    if not (isinstance(method.step_factor, int | float) and 0 < method.step_factor < math.inf):
+        raise InputError(f"{spec}: step_factor must be a number above 0, not {method.step_factor!r}.")
+    return method
 
 
 def _read(name: str, text: str, hint: Any) -> Any:

@@ -92,12 +92,12 @@ class Trainer:
         check_policy(self.policy, self.pretrained)
         return steps
 
-    def learn(self, number: int, after: Callable[[Step], None]) -> int:
+    def learn(self, number: int, after: Callable[[Step], bool | None]) -> int:
         """Adapt to a target, and return the number of optimiser steps done.
 
         Args:
             number: Number of the target, from 1.
-            after: Called after each step.
+            after: Called after each step, as by `adapt`; the stage ends if it returns True.
         """
         budget, task = self.scenario.budget, self.scenario.target[number - 1]
         self.where = f"stage {number} ({task.name})"
@@ -106,9 +106,9 @@ class Trainer:
         method_seed = derive_seed("method", self.seed, number)
         stage = Stage(number, task, method_seed, budget.adaptation_steps, target, prior)
 
-        def report(step: Step) -> None:
+        def report(step: Step) -> bool | None:
             with outside():
-                after(step)
+                return after(step)
 
         with seeded("method", self.seed, number), hooks(self._known(number)):
             steps = adapt(self.policy, self.method, stage, budget, report)

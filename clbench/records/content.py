@@ -25,8 +25,3 @@ def content_hash(values: Mapping[str, Any]) -> str:
     content = {name: value for name, value in values.items() if name != "content"}
     text = json.dumps(content, sort_keys=True, separators=(",", ":"), ensure_ascii=True)
     return hashlib.sha256(text.encode("ascii")).hexdigest()
-
-
-def sealed(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a record's JSON with the hash of its content as `content`."""
-    return {**values, "content": content_hash(values)}

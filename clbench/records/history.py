@@ -1,7 +1,8 @@
 """Records of older schemas, converted to the present one while they are read. Their files stay as they are.
 
 Schema 2 wrote "report" for the split "test" and "selection" for "validation", named four fields of the budget
-after these words, and left out `order`, `perturb` and costs where they had their usual values.
+after these words, and left out `order`, `perturb` and costs where they had their usual values. Its stages had
+no criterion.
 
 Schema 1 knew no tuning runs, evaluated only the target before the end of a stage, on all test episodes and at
 equal distances, asked questions only at the ends of stages, and did not measure changes of the policy. All of
@@ -15,7 +16,7 @@ from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 from clbench.base.errors import InputError
-from clbench.records.record import POLICY_COLUMNS
+from clbench.records.record import CHECK_COLUMNS, POLICY_COLUMNS
 
 SPLITS = {"report": "test", "selection": "validation"}
 """Splits of schemas 1 and 2, with their present names."""
@@ -105,16 +106,26 @@ def _from_2(values: _Values) -> _Values:
     if run is not None:
         _check_usual(run)
         run = {**run, "order": run.get("order", 0), "perturb": run.get("perturb", False)}
+        uses, settings = _part(run, "uses"), _part(run, "settings")
+        if settings is not None and not (uses or {}).get("online"):
+            _refuse_later("settings", settings, ("step_factor",), 2)
+            run["settings"] = {"step_factor": 1.0, **settings}
         if "split" in run:
             run["split"] = _split(run["split"], "run: split")
     if scenario is not None and (budget := _part(scenario, "budget")) is not None:
-        _refuse_later("budget", budget, BUDGET.values(), 2)
-        scenario["budget"] = {BUDGET.get(name, name): value for name, value in budget.items()}
+        _refuse_later("budget", budget, (*BUDGET.values(), "criterion"), 2)
+        renamed = {BUDGET.get(name, name): value for name, value in budget.items()}
+        scenario["budget"] = {**renamed, "criterion": None}
+    if scenario is not None:
+        _refuse_later("scenario", scenario, ("balanced",), 2)
+        scenario["balanced"] = False
     if episodes is not None and isinstance(episodes.get("split"), list):
         episodes["split"] = [_split(split, "episodes: split") for split in episodes["split"]]
     if costs is not None:
         costs = {**dict.fromkeys(COSTS), **costs}
-    return _with(values, {"run": run, "scenario": scenario, "episodes": episodes, "costs": costs})
+    _refuse_later("a record", values, ("checks",), 2)
+    changed = {"run": run, "scenario": scenario, "episodes": episodes, "costs": costs}
+    return {**_with(values, changed), "checks": {name: [] for name in CHECK_COLUMNS}}
 
 
 _STEPS: tuple[Callable[[_Values], _Values], ...] = (_from_1, _from_2)

@@ -11,7 +11,15 @@ from clbench.base.strict_json import StrictJSONError, read_json
 from clbench.records.content import content_hash
 from clbench.records.fields import load_fields
 from clbench.records.history import to_present
-from clbench.records.record import ANSWER_COLUMNS, EPISODE_COLUMNS, POLICY_COLUMNS, SCHEMA, Costs, Record
+from clbench.records.record import (
+    ANSWER_COLUMNS,
+    CHECK_COLUMNS,
+    EPISODE_COLUMNS,
+    POLICY_COLUMNS,
+    SCHEMA,
+    Costs,
+    Record,
+)
 from clbench.spec.identifiers import check_plain
 
 MOST_ROWS = 200_000
@@ -59,6 +67,7 @@ def _record(values: Any) -> Record:
     _check_columns("episodes", record.episodes, EPISODE_COLUMNS)
     _check_columns("answers", record.answers, ANSWER_COLUMNS)
     _check_columns("policy", record.policy, POLICY_COLUMNS)
+    _check_columns("checks", record.checks, CHECK_COLUMNS)
     scenario = record.scenario
     _check_names("task", (*scenario.retained, *scenario.target, *scenario.held_out))
     _check_names("kind of question", set(record.answers["kind"]))

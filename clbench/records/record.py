@@ -32,6 +32,11 @@ averaged over layers. Each may be None.
 """
 
 
+CHECK_COLUMNS = ("stage", "step", "episodes", "successes")
+"""One row for each check of a stage's criterion. A check plays the target's validation episodes until its
+outcome is certain: `episodes` have ended by then."""
+
+
 class EpisodeRow(NamedTuple):
     """A row of `Record.episodes`: one evaluation episode at one point."""
 
@@ -68,6 +73,15 @@ class PolicyRow(NamedTuple):
     step: int
     update_sparsity: float | None
     activation_drift: float | None
+
+
+class CheckRow(NamedTuple):
+    """A row of `Record.checks`: a check whether the target is learned."""
+
+    stage: int
+    step: int
+    episodes: int
+    successes: int
 
 
 @dataclass
@@ -113,9 +127,11 @@ class ScenarioInfo:
     """Steps of a stage after which the policy was evaluated; the last one is the end of the stage."""
     budget: dict[str, Any]
     """Fields of `clbench.Budget` by name."""
+    balanced: bool = False
+    """Whether each seed has its own order of the targets: see `clbench.spec.scenario.balanced_order`."""
 
-    def protocol(self, run: RunInfo) -> Protocol:
-        """Return the evaluation protocol of a run on this scenario."""
+    def protocol(self, run: RunInfo, ends: tuple[int, ...] | None = None) -> Protocol:
+        """Return the evaluation protocol of a run on this scenario, whose stages had the steps `ends`."""
         return Protocol(
             tuple(self.retained),
             tuple(self.target),
@@ -126,6 +142,8 @@ class ScenarioInfo:
             self.budget["curve_episodes"],
             run.split,
             run.perturb,
+            self.budget.get("criterion"),
+            ends,
         )
 
 
@@ -163,6 +181,8 @@ class Record:
     """Answers to test questions (in a tuning run: to training questions), see `ANSWER_COLUMNS`."""
     policy: dict[str, list[Any]] = field(default_factory=lambda: {name: [] for name in POLICY_COLUMNS})
     """Changes of the policy, see `POLICY_COLUMNS`."""
+    checks: dict[str, list[Any]] = field(default_factory=lambda: {name: [] for name in CHECK_COLUMNS})
+    """Checks of the criterion, see `CHECK_COLUMNS`."""
     costs: Costs = field(default_factory=Costs)
     """What the run cost."""
     diagnostics: dict[str, Any] = field(default_factory=dict)
@@ -186,6 +206,14 @@ class Record:
     def add_answers(self, row: AnswerRow) -> None:
         """Append a row to `answers`."""
         _append(self.answers, row)
+
+    def check_rows(self) -> list[CheckRow]:
+        """Return the rows of `checks`."""
+        return [CheckRow(*values) for values in zip(*self.checks.values(), strict=True)]
+
+    def add_check(self, row: CheckRow) -> None:
+        """Append a row to `checks`."""
+        _append(self.checks, row)
 
     def add_policy(self, row: PolicyRow) -> None:
         """Append a row to `policy`."""

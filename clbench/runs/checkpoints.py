@@ -10,15 +10,19 @@ import dataclasses
 import functools
 import logging
 import shutil
+from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from clbench.base.cache import cache_folder, cached, hash_of, is_cached
 from clbench.base.progress import ProgressCallback, no_progress
+from clbench.evaluation.checks import Checker
+from clbench.learning.adaptation import Step
 from clbench.learning.optimise import MethodError
 from clbench.learning.registry import method_packages
 from clbench.learning.trainer import STAGE_FILES, Trainer, load_stage, repeatable, sources
 from clbench.policy.policy import Policy
+from clbench.spec.protocol import Point
 
 if TYPE_CHECKING:
     from clbench.runs.spec import ResolvedRun
@@ -97,10 +101,17 @@ def make_stages(run: ResolvedRun, progress: ProgressCallback = no_progress) -> P
 
     def make(number: int, folder: Path) -> None:
         trainer = new_trainer()
+
+        def after(step: Step) -> bool:
+            progress(min(step.done, 1))
+            point = Point(number, step.done)
+            return checker.is_due(point) and checker.is_learned(checker.check(trainer.policy, point))
+
         try:
             if number:
                 trainer.load(root / f"stage-{number - 1}", number - 1)
-                trainer.learn(number, lambda _: progress(1))
+                steps = trainer.learn(number, after)
+                progress(scenario.budget.adaptation_steps - steps if scenario.budget.criterion else 0)
             else:
                 trainer.prepare()
             trainer.save(folder, number)
@@ -108,7 +119,8 @@ def make_stages(run: ResolvedRun, progress: ProgressCallback = no_progress) -> P
             message = f"{run.label} failed in {trainer.where}: {type(error).__name__}: {error}"
             raise MethodError(message) from error
 
-    with repeatable(run.spec.device):
+    checker = Checker(scenario, run.protocol, run.spec.seed)
+    with closing(checker), repeatable(run.spec.device):
         for number in range(len(scenario.target) + 1):
             folder, identity = root / f"stage-{number}", _identity(run, number)
             if is_cached(folder, identity):

@@ -10,6 +10,7 @@ import functools
 import os
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
+from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -93,24 +94,23 @@ def shoot(
     Raises:
         RuntimeError: A world does not repeat an episode.
     """
-    evaluator = Evaluator(scenario, seed)
     worlds: dict[str, World] = {}
     takes: list[list[Take]] = [[] for _ in trials]
-    for policy in policies:
-        with deterministic():
-            episodes, actions = _act(evaluator, policy, trials)
-        for column, trial, episode in zip(takes, trials, episodes, strict=True):
-            entry_point = trial[0].world
-            if entry_point not in worlds:
-                worlds[entry_point] = resolve(entry_point)(render_mode="rgb_array")
-            pictures, success = _repeat(worlds[entry_point], trial, seed, actions[trial], width)
-            if success != episode.success:
-                raise RuntimeError(f"{entry_point} does not repeat an episode of {trial[0].name!r}.")
-            column.append(Take(pictures, episode))
-            progress(1)
-    evaluator.close()
-    for world in worlds.values():
-        world.close()
+    with ExitStack() as opened:
+        evaluator = opened.enter_context(closing(Evaluator(scenario, seed)))
+        for policy in policies:
+            with deterministic():
+                episodes, actions = _act(evaluator, policy, trials)
+            for column, trial, episode in zip(takes, trials, episodes, strict=True):
+                entry_point = trial[0].world
+                if entry_point not in worlds:
+                    world = resolve(entry_point)(render_mode="rgb_array")
+                    worlds[entry_point] = opened.enter_context(closing(world))
+                pictures, success = _repeat(worlds[entry_point], trial, seed, actions[trial], width)
+                if success != episode.success:
+                    raise RuntimeError(f"{entry_point} does not repeat an episode of {trial[0].name!r}.")
+                column.append(Take(pictures, episode))
+                progress(1)
     return takes
 
 
@@ -311,10 +311,8 @@ def film_run(
 
 def steps_per_second(task: Task) -> int:
     """Return the steps per second of a task's world, at most `FASTEST`; 25 if the world has no rate."""
-    world = resolve(task.world)()
-    rate = world.metadata.get("render_fps", 25)
-    world.close()
-    return min(int(rate), FASTEST)
+    with closing(resolve(task.world)()) as world:
+        return min(int(world.metadata.get("render_fps", 25)), FASTEST)
 
 
 @functools.cache

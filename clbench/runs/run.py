@@ -17,6 +17,7 @@ from clbench.base.cache import cache_folder, cached, hash_of, is_cached
 from clbench.base.errors import WrongTypeError
 from clbench.base.progress import ProgressCallback, no_progress
 from clbench.data.training_data import TrainingData
+from clbench.evaluation.checks import Checker
 from clbench.evaluation.examiner import Examiner
 from clbench.learning.adaptation import Step
 from clbench.learning.pretraining import pretrained_policy
@@ -103,6 +104,7 @@ class _Run:
     run: ResolvedRun
     trainer: Trainer
     examiner: Examiner
+    checker: Checker
     record: Record
     log: Log
     progress: ProgressCallback
@@ -131,11 +133,12 @@ class _Run:
         data = TrainingData.open(scenario, pretrained.config)
         trainer = Trainer(scenario, data, pretrained, run.new_method, spec.seed)
         examiner = Examiner(scenario, run.protocol, data, pretrained, spec.seed, progress)
+        checker = Checker(scenario, run.protocol, spec.seed)
         record = _new_record(run, trainer, folder)
         # two commands may do the same run for different folders at once
         key = {**_inputs(run, 0), "records": str(records.resolve())}
         checkpoints = cache_folder() / "runs" / hash_of(key)
-        return cls(run, trainer, examiner, record, Log(), progress, checkpoints, kept, tensorboard)
+        return cls(run, trainer, examiner, checker, record, Log(), progress, checkpoints, kept, tensorboard)
 
     def go(self) -> Record:
         """Go through all stages without a checkpoint, and return the record."""
@@ -152,6 +155,7 @@ class _Run:
             }
         finally:
             self.examiner.close()
+            self.checker.close()
             self.log.close()
         self._count_seconds()
         return self.record
@@ -192,9 +196,10 @@ class _Run:
 
     def _stage(self, number: int) -> None:
         """Adapt to target `number`, and evaluate the policy at each point of the stage."""
-        *on_the_way, end = self.run.protocol.points(number)
+        protocol = self.run.protocol
+        *on_the_way, _ = protocol.points(number)
         points = set() if self.trainer.method.whole_stages else set(on_the_way)
-        begin, evaluating = time.perf_counter(), 0.0
+        begin, evaluating, checking = time.perf_counter(), 0.0, 0.0
 
         def evaluate(point: Point) -> None:
             nonlocal evaluating
@@ -203,20 +208,31 @@ class _Run:
             self.log.report(self.record, point)
             evaluating += time.perf_counter() - paused
 
-        def after(step: Step) -> None:
-            self.progress(1)
-            self.log.step(number, step)
-            if (point := Point(number, step.done)) in points:
+        def is_learned(point: Point) -> bool:
+            nonlocal checking
+            paused = time.perf_counter()
+            row = self.checker.check(self.trainer.policy, point)
+            self.record.add_check(row)
+            checking += time.perf_counter() - paused
+            return self.checker.is_learned(row)
+
+        def after(step: Step) -> bool:
+            point = Point(number, step.done)
+            if step.done:
+                self.progress(1)
+                self.log.step(number, step)
+            if point in points:
                 evaluate(point)
+            return self.checker.is_due(point) and is_learned(point)
 
         steps = self.trainer.learn(number, after)
-        evaluate(end)
+        self.progress(protocol.steps[-1] - steps if protocol.criterion else 0)
+        evaluate(Point(number, steps) if protocol.criterion else protocol.end(number))
         self._diagnose(number)
-        training = time.perf_counter() - begin - evaluating
+        training = time.perf_counter() - begin - evaluating - checking
         self._count_steps(steps)
-        self.record.timing["stages"].append(
-            {"training": round(training, 2), "evaluation": round(evaluating, 2)}
-        )
+        seconds = {"training": training, "checks": checking, "evaluation": evaluating}
+        self.record.timing["stages"].append({name: round(value, 2) for name, value in seconds.items()})
 
     def _diagnose(self, number: int) -> None:
         """Keep the method's report on stage `number`."""

@@ -14,6 +14,7 @@ from clbench.base.errors import InputError
 from clbench.records.paths import label_of, record_path
 from clbench.records.reader import RecordError, read_record
 from clbench.records.record import RunInfo, ScenarioInfo
+from clbench.runs.tuning import tuned_settings
 from clbench.spec.protocol import Protocol, ScoredSplit
 from clbench.spec.registry import load_scenario
 from clbench.spec.scenario import Scenario
@@ -37,7 +38,8 @@ class RunSpec:
     seed: int
     """Seed of every draw of the run."""
     changes: Mapping[str, Any] = field(default_factory=dict)
-    """Hyper-parameters that differ from the method's defaults, by name."""
+    """Hyper-parameters that differ from those tuned for the scenario or, without tuning, from the method's
+    defaults, by name."""
     device: str = "cpu"
     """Device on which the policy is computed."""
     split: ScoredSplit = "test"
@@ -79,7 +81,7 @@ class RunSpec:
             InputError: There is no such order, or nothing can be perturbed.
         """
         published = load_scenario(self.scenario)
-        scenario = published.in_order(self.order)
+        scenario = published.in_order(self.order).for_seed(self.seed)
         if self.perturb and not scenario.retained:
             raise InputError(f"{scenario.id} retains no skills that could be perturbed: leave out --perturb.")
         if self.perturb:
@@ -106,10 +108,11 @@ class ResolvedRun:
     """Changed hyper-parameters as the method holds them: the text "0.5" may have become a number."""
 
     def new_method(self) -> Method:
-        """Return a new object of the method."""
+        """Return a new object of the method, with the settings tuned for the scenario but for `changes`."""
         from clbench.learning.registry import new_method
 
-        return new_method(self.spec.method, self.method, self.changes)
+        tuned = tuned_settings(self.scenario.id, self.spec.method)
+        return new_method(self.spec.method, self.method, {**tuned, **self.changes})
 
     @cached_property
     def protocol(self) -> Protocol:
@@ -120,7 +123,7 @@ class ResolvedRun:
     def info(self) -> RunInfo:
         """`Record.run`. Two runs with equal `info` and `scenario_info` are the same run."""
         spec, method = self.spec, self.new_method()
-        values = dataclasses.asdict(method)  # type: ignore[call-overload]
+        values = dataclasses.asdict(method)
         settings = {name: _plain(value) for name, value in values.items()}
         return RunInfo(
             scenario=self.scenario.id,
@@ -155,7 +158,7 @@ def describe_scenario(scenario: Scenario) -> ScenarioInfo:
     groups = (scenario.retained, scenario.target, scenario.held_out)
     retained, target, held_out = ([task.name for task in group] for group in groups)
     steps, budget = list(scenario.budget.evaluation_steps), dataclasses.asdict(scenario.budget)
-    return ScenarioInfo(scenario.id, retained, target, held_out, steps, budget)
+    return ScenarioInfo(scenario.id, retained, target, held_out, steps, budget, scenario.balanced)
 
 
 def _plain(value: Any) -> Any:

@@ -1,1 +1,1 @@
-"""Scoring: from records to metrics, intervals and ranks. It needs neither PyTorch nor a simulator."""
+"""Scoring: from records to metrics, intervals and groups. It needs neither PyTorch nor a simulator."""

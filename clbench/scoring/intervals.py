@@ -5,10 +5,8 @@ seed is one whole run, from the pretrained policy to the last stage: its tasks s
 several seeds vary for both reasons. Therefore:
 
 1. With two or more seeds the interval is Student's over the seeds. Its standard error comes from the
-   jackknife, which leaves out one whole seed at a time. Its degrees of freedom are the seeds less one. A
-   quantity with a least and a greatest value is transformed by the arcsine of its root, as is usual for
-   rates. The interval then stays inside the range, and is longer towards the middle of it, where the truth
-   more often is.
+   jackknife, which leaves out one whole seed at a time. Its degrees of freedom are the seeds less one. For a
+   quantity with a least and a greatest value it is Wilson's score interval: see `interval_of_seeds`.
 2. With one seed, or where the seeds agree exactly, the variation between seeds is unknown, and the interval
    covers episodes alone. It holds the percentiles of replicates in which every run keeps its policy and meets
    episodes drawn with replacement, for each task. All stages and evaluation points of a run get the same
@@ -16,8 +14,9 @@ several seeds vary for both reasons. Therefore:
    run before the end of a stage. There the rate is the mean over the drawn ones among them. Right answers are
    drawn from a binomial for each stage and kind of question, since records hold counts only.
 
-Tasks are fixed: a scenario consists of them. Choices on a run's validation episodes are fixed too, for
-example the points of `retention_at_matched_adaptation`: the interval does not cover the luck of the choice.
+Tasks are fixed: a scenario consists of them. All seeds share demonstrations, scenes and questions: intervals
+do not cover other ones. Choices on a run's validation episodes are fixed too: the interval does not cover the
+luck of the choice.
 `docs/guide/statistics.md` reports the coverage of these 95 % intervals and their limits.
 """
 
@@ -28,7 +27,6 @@ import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
-from typing import NamedTuple
 
 import numpy as np
 
@@ -42,6 +40,10 @@ from clbench.spec.scenario import Scenario
 
 Runs = Mapping[int, Scores]
 """Runs of one method on one scenario, by seed."""
+
+Span = tuple[float, float]
+"""The least and the greatest value that a quantity can have; they may be infinite."""
+UNBOUNDED: Span = (-math.inf, math.inf)
 
 REPLICATES = 2000
 """Draws behind an interval of episodes."""
@@ -65,25 +67,6 @@ class Estimate:
     """Lower end of the interval."""
     high: float | None
     """Upper end of the interval."""
-
-
-class Span(NamedTuple):
-    """The least and the greatest value that a quantity can have."""
-
-    low: float = -math.inf
-    high: float = math.inf
-
-    def angles(self, values: Array) -> Array:
-        """Return the arcsine of the root of positions in a finite span; in an infinite one, `values`."""
-        if not math.isfinite(self.high - self.low):
-            return values
-        return np.asarray(np.arcsin(np.sqrt(np.clip((values - self.low) / (self.high - self.low), 0, 1))))
-
-    def values(self, angles: Array) -> Array:
-        """Return the values in the span with these angles, or the nearest ones."""
-        if not math.isfinite(self.high - self.low):
-            return np.clip(angles, self.low, self.high)
-        return np.asarray(self.low + (self.high - self.low) * np.sin(np.clip(angles, 0, math.pi / 2)) ** 2)
 
 
 def row_generator(scenario: str, method: str) -> np.random.Generator:
@@ -128,9 +111,7 @@ def estimate(
     def over_runs(metric: Metric) -> _Quantity:
         return lambda rates: metric.over_runs(rates[0])
 
-    return {
-        one.name: samples[one.references].estimate(over_runs(one), Span(one.low, one.high)) for one in wanted
-    }
+    return {one.name: samples[one.references].estimate(over_runs(one), (one.low, one.high)) for one in wanted}
 
 
 def paired_difference(
@@ -168,7 +149,7 @@ def paired_difference(
     samples = _Samples(methods, needed_references([wanted], seeds, references), generator, replicates)
     reach = wanted.high - wanted.low
     return samples.estimate(
-        lambda rates: wanted.over_runs(rates[0]) - wanted.over_runs(rates[1]), Span(-reach, reach)
+        lambda rates: wanted.over_runs(rates[0]) - wanted.over_runs(rates[1]), (-reach, reach)
     )
 
 
@@ -177,7 +158,7 @@ def bootstrap(
     runs: Mapping[str, Sequence[Scores]],
     generator: np.random.Generator,
     *,
-    span: tuple[float, float] = (-math.inf, math.inf),
+    span: Span = UNBOUNDED,
     replicates: int = REPLICATES,
 ) -> Estimate:
     """Return any quantity of the success rates of several methods, with its interval.
@@ -193,14 +174,14 @@ def bootstrap(
         InputError: The runs are of different tasks, episodes, evaluation points or questions.
     """
     samples = _Samples(list(runs.values()), {}, generator, replicates)
-    return samples.estimate(lambda rates: quantity(dict(zip(runs, rates, strict=True))), Span(*span))
+    return samples.estimate(lambda rates: quantity(dict(zip(runs, rates, strict=True))), span)
 
 
 def interval(
     value: float,
     without_one: Array,
     other_episodes: Callable[[], Array] | None = None,
-    span: tuple[float, float] = (-math.inf, math.inf),
+    span: Span = UNBOUNDED,
 ) -> Estimate:
     """Return a value with its interval.
 
@@ -218,15 +199,43 @@ def interval(
         return Estimate(value, None, None)
     # Equal values may differ in the last bits.
     if np.abs(without_one - value).max(initial=0.0) > 1e-12 * max(1.0, abs(value)):
-        scale, degrees = Span(*span), len(without_one) - 1
-        reach = student_quantile(degrees) * math.sqrt(degrees) * scale.angles(without_one).std()
-        low, high = scale.values(scale.angles(np.array(value)) + np.array([-reach, reach]))
+        degrees = len(without_one) - 1
+        low, high = interval_of_seeds(value, math.sqrt(degrees) * float(without_one.std()), degrees, span)
     else:
         replicates = other_episodes() if other_episodes else np.array([math.nan])
         if not np.isfinite(replicates).all():
             return Estimate(value, None, None)
         low, high = np.percentile(replicates, [50 - LEVEL / 2, 50 + LEVEL / 2])
     return Estimate(value, min(float(low), value), max(float(high), value))
+
+
+def interval_of_seeds(value: float, error: float, degrees: int, span: Span = UNBOUNDED) -> Span:
+    """Return the ends of the interval of a value, given its standard error over seeds.
+
+    Without two bounds it is Student's: the value plus and minus quantile times error. Near a bound Student's
+    interval passes the bound, and it is too short on the other side: if most seeds agree at the bound, their
+    error is small by chance. Between two bounds it is therefore Wilson's score interval, 1927,
+    doi 10.1080/01621459.1927.10502953. It holds each x with |value - x| <= quantile * e(x). The error e(x) is
+    `error` at the value, and its square is proportional to (x - low) (high - x), as for rates. The ends stay
+    inside the span without clipping. Wilson's interval with an error between clusters, here seeds, is
+    recommended by Franco et al. 2019, doi 10.1093/jssam/smy019, after simulations.
+
+    Args:
+        value: The value, within the span.
+        error: Its standard error, above 0.
+        degrees: Degrees of freedom of the standard error.
+        span: Least and greatest possible value.
+    """
+    low, high = span
+    reach = student_quantile(degrees) * error
+    if not math.isfinite(high - low):
+        return max(value - reach, low), min(value + reach, high)
+    place, reach = min(max((value - low) / (high - low), 0.0), 1.0), reach / (high - low)
+    spread = place * (1 - place)
+    # The ends are the roots x of spread (x - place)^2 = reach^2 x (1 - x).
+    middle, half = 2 * spread * place + reach**2, reach * math.hypot(reach, 2 * spread)
+    below, above = ((middle + side) / (2 * (spread + reach**2)) for side in (-half, half))
+    return low + (high - low) * below, low + (high - low) * above
 
 
 def needed_references(
@@ -366,7 +375,8 @@ def half_width(seeds: int, episodes: int, tasks: int, *, seed_deviation: float =
     """
     of_seeds = seed_deviation**2 if seeds > 1 else 0.0
     error = math.sqrt((of_seeds + 0.25 / (episodes * tasks)) / seeds)
-    return math.sin(2 * min(_quantile(seeds) * error, math.pi / 4)) / 2
+    reach = _quantile(seeds) * error
+    return reach / math.sqrt(1 + 4 * reach**2)  # `interval_of_seeds` at one half
 
 
 def episodes_needed(
@@ -383,8 +393,10 @@ def episodes_needed(
     Returns:
         None if no number of episodes is enough: more seeds are needed.
     """
+    if wished >= 0.5:
+        return 1  # half of any interval
     of_seeds = seed_deviation**2 if seeds > 1 else 0.0
-    error = math.asin(min(2 * wished, 1.0)) / 2 / _quantile(seeds)
+    error = wished / math.sqrt(1 - 4 * wished**2) / _quantile(seeds)
     of_episodes = seeds * error**2 - of_seeds
     # A number of episodes that gives the half-width exactly needs no further one.
     return math.ceil(0.25 / (tasks * of_episodes) - 1e-6) if of_episodes > 0 else None

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,8 +18,9 @@ class Layout:
 
     retained: tuple[str, ...]
     """Names of the skills that are pretrained and never trained again."""
-    target: tuple[str, ...]
-    """Names of the tasks that are learned, in order."""
+    target: tuple[str, ...] = field(compare=False)
+    """Names of the tasks that are learned, in order. Runs with other orders of the same tasks combine: the
+    axis means "learned first", "learned second" and so on."""
     held_out: tuple[str, ...]
     """Names of the tasks that are never trained."""
     episodes: tuple[int, ...]
@@ -33,6 +34,11 @@ class Layout:
     end."""
     kinds: tuple[str, ...]
     """Kinds of questions, sorted."""
+    targets: frozenset[str] = field(init=False)
+    """Names of the tasks that are learned."""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "targets", frozenset(self.target))
 
     @property
     def tasks(self) -> tuple[str, ...]:

@@ -51,6 +51,142 @@ def retention(rates: Rates) -> Array:
 
 
 @metric(
+    formula="mean of R[K][k] over all targets k but the last",
+    source="clbench",
+    missing="There are fewer than two targets, or a success on an earlier one is missing.",
+)
+def kept_targets(rates: Rates) -> Array:
+    """Success on the earlier targets after the last one."""
+    return average(rates.target[..., -1, :-1])
+
+
+@metric(
+    formula="mean of R[K][s] over the retained skills and all targets but the last",
+    source="clbench",
+    missing="A success after the last target on a retained skill or an earlier target is missing.",
+)
+def kept(rates: Rates) -> Array:
+    """Success after the last target on everything that was known before it."""
+    return average(np.concatenate([rates.retained[..., -1, :], rates.target[..., -1, :-1]], axis=-1))
+
+
+@metric(
+    formula="mean over the stages l from 1 of the mean of R[l][s] over the retained skills s",
+    source="clbench",
+    missing="A success on a retained skill at the end of a stage is missing.",
+)
+def kept_skills_over_stages(rates: Rates) -> Array:
+    """Success on the retained skills at the ends of all stages."""
+    return average(average(rates.retained[..., 1:, :]))
+
+
+@metric(
+    formula="mean over the stages l from 2 of the mean of R[l][k] over the targets k before l",
+    source="clbench",
+    missing="There are fewer than two targets, or a success on an earlier one is missing.",
+)
+def kept_targets_over_stages(rates: Rates) -> Array:
+    """Success on the earlier targets at the ends of all later stages."""
+    count = len(rates.layout.target)
+    before = np.tri(count, k=-1)[1:]
+    shares = before / np.maximum(before.sum(axis=-1, keepdims=True), 1)
+    # a target that was not learned yet may be missing without harm
+    known = np.where(shares > 0, rates.target[..., 2:, :], 0.0)
+    return average((known * shares).sum(axis=-1))
+
+
+@metric(
+    formula="mean over the stages l from 1 of the mean of R[l][s] over the retained skills and the targets "
+    "before l",
+    source="clbench",
+    missing="A success on something known before a stage is missing at its end.",
+)
+def kept_over_stages(rates: Rates) -> Array:
+    """Success at the ends of all stages on everything that was known before the stage."""
+    after, _, count = _known(rates)
+    return average(after / count)
+
+
+@metric(
+    formula="mean over the stages l from 1 of the sum of R[l][s] divided by the sum of R[l-1][s], both over "
+    "the retained skills and the targets before l",
+    source="clbench",
+    high=math.inf,
+    units="share of what was known",
+    missing="A success on something known before a stage is missing, or nothing was known.",
+)
+def kept_share(rates: Rates) -> Array:
+    """Share of what was known before a stage that is left at its end, averaged over the stages."""
+    after, before, _ = _known(rates)
+    return average(after / np.where(before > 0, before, np.nan))
+
+
+def _known(rates: Rates) -> tuple[Array, Array, Array]:
+    """Return the sums of success on what was known before each stage, at its end and before it.
+
+    Returns:
+        The sums at the end of each stage and before it, both (..., targets), and the number of tasks,
+        (targets,), at least 1.
+    """
+    count = len(rates.layout.target)
+    learned = np.tri(count, k=-1)
+    after = rates.retained[..., 1:, :].sum(axis=-1) + _where(learned, rates.target[..., 1:, :])
+    before = rates.retained[..., :-1, :].sum(axis=-1) + _where(learned, rates.target[..., :-1, :])
+    return after, before, np.maximum(len(rates.layout.retained) + np.arange(count), 1)
+
+
+def _where(chosen: Array, values: Array) -> Array:
+    """Return the sum along the last axis of the values that are chosen (1 or 0)."""
+    return np.asarray(np.where(chosen > 0, values, 0.0).sum(axis=-1))
+
+
+@metric(
+    formula="final_average less the final_average of sft with the same seed",
+    source="clbench",
+    low=-1.0,
+    units="difference of success rates",
+    references=(BASELINE,),
+    missing=f"There is no {BASELINE} of the same seeds, or a final average is missing.",
+)
+def gain(rates: Rates) -> Array:
+    """Final average beyond that of plain fine-tuning, seed by seed."""
+    return final_average(rates) - final_average(rates.references[BASELINE])
+
+
+@metric(
+    formula="mean over the targets of the optimiser steps until the criterion was met; a stage that never "
+    "met it counts with all its steps",
+    source="clbench",
+    high=math.inf,
+    higher_is_better=False,
+    units="optimiser steps",
+    missing="The scenario has no criterion.",
+)
+def steps_to_criterion(rates: Rates) -> Array:
+    """Optimiser steps until a target was learned."""
+    return average(rates.steps)
+
+
+@metric(
+    formula="geometric mean over the targets of the steps that from_scratch takes to the criterion divided "
+    "by the steps that the method takes, at least 1",
+    source="clbench; the speed of forward transfer, arXiv 2105.10919, without a ceiling",
+    high=math.inf,
+    units="times as fast",
+    references=(FROM_SCRATCH,),
+    missing=f"The scenario has no criterion, or there is no {FROM_SCRATCH} of the same seeds.",
+)
+def speed(rates: Rates) -> Array:
+    """How many times as fast as from scratch targets are learned.
+
+    A stage that never meets its criterion counts with all its steps: where that is from_scratch, the value is
+    too low.
+    """
+    ratios = np.maximum(rates.references[FROM_SCRATCH].steps, 1.0) / np.maximum(rates.steps, 1.0)
+    return np.exp(average(np.log(ratios)))
+
+
+@metric(
     formula="mean over the retained skills s of the success on s after the last target in perturbed episodes",
     source="clbench",
     missing="The run has no perturbed episodes; `clbench run --perturb` adds them.",

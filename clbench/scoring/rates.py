@@ -30,6 +30,10 @@ class Measured:
     """Share of the parameters that have hardly changed since pretraining, (..., targets, points)."""
     activation_drift: Array
     """Distance of the hidden states from the pretrained policy's, (..., targets, points)."""
+    steps: Array
+    """Optimiser steps of each stage, (..., targets); NaN without a criterion."""
+    met: Array
+    """Whether each stage met its criterion, 0 or 1, (..., targets); NaN without a criterion."""
 
 
 def _arrays(cls: type[Measured]) -> tuple[str, ...]:

@@ -9,9 +9,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from clbench.records.reader import RecordError
-from clbench.records.record import EPISODE_COLUMNS, Record
+from clbench.records.record import EPISODE_COLUMNS, CheckRow, Record
 from clbench.scoring.layout import Array
-from clbench.spec.protocol import SPLITS, Point, Protocol
+from clbench.spec.protocol import SPLITS, Point, Protocol, check_steps
 
 MOST = 10**9
 """More steps, episodes or questions than any run has: a number beyond it is damage."""
@@ -63,7 +63,56 @@ def read_protocol(record: Record) -> Protocol:
             raise RecordError(f"scenario: {name} of its budget must be a whole number, not {count!r}.")
     # few rows may ask for more memory than there is
     check_cells("stages x points x tasks", len(scenario.target) + 1, len(scenario.evaluation_steps), tasks)
-    return scenario.protocol(record.run)
+    criterion = scenario.budget.get("criterion")
+    if criterion is None:
+        if any(record.checks.values()):
+            raise RecordError("checks: its budget has no criterion that could have been checked.")
+        return scenario.protocol(record.run)
+    if not _is_number(criterion, 1) or len(scenario.evaluation_steps) != 1:
+        raise RecordError("scenario: a criterion must be a success rate, with one evaluation step.")
+    if record.run.uses.get("online"):  # an agent's stages are budgets of interaction, and end with them
+        ends = tuple(scenario.evaluation_steps * len(scenario.target))
+    else:
+        ends = _read_ends(record)
+    return scenario.protocol(record.run, ends)
+
+
+def _read_ends(record: Record) -> tuple[int, ...]:
+    """Return the steps of each stage, from its checks.
+
+    Raises:
+        RecordError: A check is impossible, or a stage does not end with its criterion or its last step.
+    """
+    protocol = record.scenario.protocol(record.run)
+    by_stage: dict[int, list[CheckRow]] = {stage: [] for stage in protocol.stages[1:]}
+    for number, row in enumerate(record.check_rows()):
+        where = f"checks: row {number}"
+        if any(type(value) is not int for value in row) or row.stage not in by_stage:
+            raise RecordError(f"{where} must hold whole numbers, and a stage of the run.")
+        if not 0 <= row.successes <= row.episodes <= protocol.validation_episodes:
+            raise RecordError(f"{where} has impossible counts of episodes.")
+        by_stage[row.stage].append(row)
+    planned = check_steps(protocol.steps[-1])
+    for stage, rows in by_stage.items():
+        where = f"checks: those of stage {stage}"
+        if tuple(row.step for row in rows) != planned[: len(rows)] or not rows:
+            raise RecordError(f"{where} are not at the steps that the protocol demands.")
+        learned = [protocol.is_learned(row.successes) for row in rows]
+        if any(learned[:-1]):
+            raise RecordError(f"{where} go on after the criterion was met.")
+        # a method that trains nothing is checked once
+        if not learned[-1] and rows[-1].step not in (0, planned[-1]):
+            raise RecordError(f"{where} end before the criterion was met.")
+    return tuple(rows[-1].step for rows in by_stage.values())
+
+
+def read_checks(record: Record, protocol: Protocol) -> tuple[Array, Array]:
+    """Return the steps of each stage, and whether it met the criterion, both (targets,); NaN without one."""
+    ends = dict.fromkeys(protocol.stages[1:], (math.nan, math.nan))
+    for row in record.check_rows():
+        ends[row.stage] = float(row.step), float(protocol.is_learned(row.successes))
+    steps, learned = np.array(list(ends.values())).reshape(-1, 2).T
+    return steps, learned
 
 
 def _check_steps(steps: Any) -> None:
@@ -86,8 +135,8 @@ def check_cells(what: str, *sizes: int) -> None:
 
 
 def place(protocol: Protocol, point: Point) -> int:
-    """Return the index of a point among the evaluation steps; stage 0, which has one point, is at its end."""
-    return protocol.steps.index(point.step) if point.stage else -1
+    """Return the index of a point among the evaluation steps; one that ends a stage may have index -1."""
+    return protocol.steps.index(point.step) if point.stage and protocol.ends is None else -1
 
 
 class _Points:

@@ -17,6 +17,7 @@ from clbench.scoring.reading import (
     numbers,
     place,
     read_answers,
+    read_checks,
     read_episodes,
     read_perturbed,
     read_policy,
@@ -71,6 +72,7 @@ class Scores(Measured):
         perturbed = _perturbed(read_perturbed(protocol, rows, episodes), layout)
         in_curves = [episodes.index(number) for number in layout.curve_episodes]
         sparsity, drift = read_policy(record, protocol)
+        steps, met = read_checks(record, protocol)
         return cls(
             layout=layout,
             success=success[:, -1],
@@ -82,6 +84,8 @@ class Scores(Measured):
             answer_curves=_shares(*counts[:, 1:]),
             update_sparsity=sparsity,
             activation_drift=drift,
+            steps=steps,
+            met=met,
         )
 
     def rates(self, counts: Array | None = None) -> Rates:

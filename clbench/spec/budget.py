@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from clbench.base.errors import InputError
-from clbench.spec.protocol import Split
+from clbench.spec.protocol import Split, check_steps
 
 
 @dataclass(frozen=True)
@@ -26,9 +26,11 @@ class Budget:
     pretraining_learning_rate: float = 1.5e-3
     """Peak learning rate of pretraining."""
     adaptation_steps: int = 300
-    """Optimiser steps on each target task."""
+    """Optimiser steps on each target task; with a criterion the most."""
+    criterion: float | None = None
+    """Success rate on the target's validation episodes that ends a stage. None: stages are equally long."""
     learning_rate: float = 3e-4
-    """Peak learning rate of adaptation."""
+    """Peak learning rate of adaptation, which each method multiplies by its `step_factor`."""
     batch_size: int = 64
     """Samples per optimiser step."""
     policy_width: int = 96
@@ -36,7 +38,7 @@ class Budget:
     policy_layers: int = 3
     """Layers of the policy's backbone, and as many of its action head."""
     evaluation_points: int = 4
-    """Evaluation points of each stage, its end included."""
+    """Evaluation points of each stage, its end included. A stage with a criterion has its end alone."""
     validation_episodes: int = 10
     """Validation episodes per task, which choices may look at."""
     test_episodes: int = 20
@@ -50,6 +52,8 @@ class Budget:
                 f"curve_episodes are the first of the {self.test_episodes} test episodes: "
                 f"{self.curve_episodes} are too many."
             )
+        if self.criterion is not None and not 0 < self.criterion <= 1:
+            raise InputError(f"criterion must be a success rate above 0, at most 1, not {self.criterion}.")
 
     def episodes(self, split: Split) -> int:
         """Return the number of episodes per task in `split`."""
@@ -61,5 +65,11 @@ class Budget:
 
         Each point comes at half the steps of the next: a policy learns and forgets most at the beginning.
         """
-        points = (self.adaptation_steps >> halvings for halvings in range(self.evaluation_points))
+        halvings = range(self.evaluation_points if self.criterion is None else 1)
+        points = (self.adaptation_steps >> halving for halving in halvings)
         return tuple(sorted({point for point in points if point}))
+
+    @property
+    def check_steps(self) -> tuple[int, ...]:
+        """Steps of a stage at which the criterion is checked, rising; none without a criterion."""
+        return () if self.criterion is None else check_steps(self.adaptation_steps)

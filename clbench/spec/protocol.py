@@ -6,6 +6,7 @@ and a verifier draws some of them again.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal, NamedTuple
@@ -45,6 +46,22 @@ class EpisodeKey(NamedTuple):
     number: int
 
 
+def check_steps(last: int) -> tuple[int, ...]:
+    """Return the steps of a stage at which its criterion is checked, rising.
+
+    The first check comes before any step, the last one after all. In between, checks are 2 steps apart up to
+    step 20, since targets are learned in 10 to 30 steps at the published step size. Later ones are 12 %
+    apart, so that a stage is at most an eighth longer than it had to be.
+
+    Args:
+        last: Most steps of a stage.
+    """
+    steps = [0]
+    while steps[-1] < last:
+        steps.append(steps[-1] + max(2, round(0.12 * steps[-1])))
+    return (*steps[:-1], last)
+
+
 @dataclass(frozen=True)
 class Protocol:
     """The evaluation of one run: its points, and the episodes at each of them."""
@@ -67,6 +84,10 @@ class Protocol:
     """The split that is scored: "test", or "validation" in a tuning run."""
     perturb: bool = False
     """Whether the retained skills also meet perturbed episodes at the end of each stage."""
+    criterion: float | None = None
+    """Success rate on the target's validation episodes that ends a stage before its last step."""
+    ends: tuple[int, ...] | None = None
+    """Steps of each stage of a finished run; None if all stages are equally long, or before the run."""
 
     @classmethod
     def of(cls, scenario: Scenario, split: ScoredSplit = "test", perturb: bool = False) -> Protocol:
@@ -92,6 +113,7 @@ class Protocol:
             budget.curve_episodes,
             split,
             perturb,
+            budget.criterion,
         )
 
     @property
@@ -105,35 +127,52 @@ class Protocol:
         return range(len(self.target) + 1)
 
     def end(self, stage: int) -> Point:
-        """Return the end of a stage; stage 0 has no steps and ends at step 0."""
-        return Point(stage, self.steps[-1] if stage else 0)
+        """Return the end of a stage, the latest possible one before a run with a criterion.
+
+        Stage 0 has no steps and ends at step 0.
+        """
+        if not stage:
+            return Point(0, 0)
+        return Point(stage, self.steps[-1] if self.ends is None else self.ends[stage - 1])
 
     def is_end(self, point: Point) -> bool:
-        """Return whether a stage ends at `point`."""
-        return point == self.end(point.stage)
+        """Return whether a stage ends at `point`, which the run evaluates."""
+        any_step = self.criterion is not None and self.ends is None
+        return any_step or point == self.end(point.stage)
 
     def points(self, stage: int) -> tuple[Point, ...]:
         """Return the evaluation points of a stage; the last one is its end."""
-        return tuple(Point(stage, step) for step in self.steps) if stage else (self.end(0),)
+        on_the_way = self.steps[:-1] if stage else ()
+        return (*(Point(stage, step) for step in on_the_way), self.end(stage))
 
     def episodes(self, point: Point) -> list[EpisodeKey]:
         """Return the episodes to play at `point`, in their order.
 
         At the end of a stage these are all scored episodes of all tasks, and the perturbed ones of the
         retained skills. Before the end they are the first scored episodes of what the stage can change: the
-        retained skills and its target. At every point the target has all its validation episodes, so that
-        choices need not look at test episodes.
+        retained skills and its target. Without a criterion the target has all its validation episodes at
+        every point, so that choices need not look at test episodes.
         """
         target = self.target[point.stage - 1 : point.stage] if point.stage else ()
         at_end = self.is_end(point)
         keys = self._each(
             self.tasks if at_end else self.retained + target, self.split, self.scored_episodes(at_end)
         )
-        if self.split == "test":
+        if self.split == "test" and self.criterion is None:
             keys += self._each(target, "validation", self.validation_episodes)
         if self.perturb and at_end:
             keys += self._each(self.retained, "perturbed", self.test_episodes)
         return keys
+
+    def is_learned(self, successes: int) -> bool:
+        """Return whether so many successes in the validation episodes of a target meet the criterion."""
+        return self.criterion is not None and successes >= self.goal
+
+    @property
+    def goal(self) -> int:
+        """Successes in the validation episodes of a target that meet the criterion."""
+        assert self.criterion is not None
+        return math.ceil(self.criterion * self.validation_episodes - 1e-9)
 
     def scored_episodes(self, at_end: bool) -> int:
         """Return the number of scored episodes of a task, at the end of a stage or before it."""

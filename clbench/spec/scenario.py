@@ -33,13 +33,16 @@ class Scenario:
     retained: tuple[Task, ...]
     """Skills that the policy is pretrained on and that no stage trains again; there may be none."""
     target: tuple[Task, ...]
-    """Tasks to learn, in this order."""
+    """Tasks to learn, in their published order."""
     held_out: tuple[Task, ...]
     """Tasks that are never trained."""
     questions: str
     """Entry point of a tuple of `QuestionKind`, the questions about a state."""
     scenes: tuple[Task, ...] = ()
     """Tasks whose expert episodes give the states for the questions; empty for the retained tasks."""
+    balanced: bool = False
+    """Whether each seed learns the targets in its own order, see `balanced_order`, so that every target is
+    learned in every position. If not, all seeds have the published order."""
     budget: Budget = field(default_factory=Budget)
     """Data, steps and evaluation episodes that every method gets."""
     limits: Limits = field(default_factory=Limits)
@@ -80,11 +83,22 @@ class Scenario:
         Raises:
             ValueError: There is no such order.
         """
+        if order and self.balanced:
+            raise InputError(
+                f"{self.id}: each seed has its own order of the targets: leave out order {order}."
+            )
         try:
             places = target_order(len(self.target), order)
         except ValueError as error:
             raise InputError(f"{self.id}: {error}") from error
         return replace(self, target=tuple(self.target[place] for place in places)) if order else self
+
+    def for_seed(self, seed: int) -> Scenario:
+        """Return the scenario with its targets in the order in which runs of `seed` learn them."""
+        if not self.balanced:
+            return self
+        places = balanced_order(len(self.target), seed)
+        return replace(self, target=tuple(self.target[place] for place in places))
 
     def group(self, task: str) -> Group:
         """Return the part of the scenario that the task called `task` belongs to."""
@@ -106,6 +120,28 @@ class Scenario:
 
     def _unknown(self, name: str) -> LookupError:
         return unknown(f"task of {self.id}", name, (task.name for task in self.tasks))
+
+
+def balanced_order(count: int, seed: int) -> tuple[int, ...]:
+    """Return, for each stage, the published place, from 0, of the target that a seed learns in it.
+
+    Seeds 0 to `count` - 1 are the rows of a Latin square: together they learn every target once in every
+    stage. So are the next `count` seeds, and so on. If `count` is even, each square is also balanced for what
+    comes before: every target directly follows every other one once (Williams 1949, doi 10.1071/CH9490149).
+    Seed 0 has the published order.
+
+    Args:
+        count: Number of targets.
+        seed: Seed of the run.
+    """
+    square, row = divmod(seed, max(count, 1))
+    steps = [(place + 1) // 2 * (-1) ** (place + 1) % max(count, 1) for place in range(count)]
+    names = {step: place for place, step in enumerate(steps)}  # row 0 of the first square counts up
+    places = [names[(step + row) % count] for step in steps]
+    generator = random.Random(square)  # random() is the only draw that Python promises never to change
+    draws = [generator.random() for _ in range(count)] if square else list(range(count))
+    relabelled = sorted(range(count), key=draws.__getitem__)
+    return tuple(relabelled[place] for place in places)
 
 
 def target_order(count: int, order: int) -> tuple[int, ...]:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from clbench.base.errors import InputError, WrongTypeError
 from clbench.base.source import package_of
 from clbench.spec.identifiers import check_plain
+from clbench.spec.protocol import Split
 
 
 @dataclass(frozen=True)
@@ -19,7 +20,7 @@ class Task:
     suite: str
     """Family of worlds that it belongs to, such as "fetch"."""
     instructions: tuple[str, ...]
-    """Instruction in words: the canonical wording, then its paraphrases."""
+    """Instruction in words: the canonical wording, then its paraphrases, from which training draws."""
     horizon: int
     """Length in steps after which an episode ends without success."""
     world: str
@@ -39,20 +40,29 @@ class Task:
     packages: tuple[str, ...] = ()
     """Distributions whose version can change a trajectory, besides those common to all worlds: the simulator
     of the suite, such as ("gymnasium-robotics",)."""
+    test_instructions: tuple[str, ...] = ()
+    """Wordings of test episodes that training never shows; test episodes have those of training if empty."""
     seed_name: str | None = None
     """Spelling of the suite in seeds and data set ids, where it differs from `suite`: it may never change, or
     demonstrations and measurements would change with it."""
 
     def __post_init__(self) -> None:
         check_plain("task", self.name)
-        if isinstance(self.instructions, str):
-            raise WrongTypeError(
-                f"instructions of the task {self.name} must be a tuple of texts, not one text."
-            )
-        if not self.instructions or not all(words.strip() for words in self.instructions):
+        for field in ("instructions", "test_instructions"):
+            if isinstance(getattr(self, field), str):
+                raise WrongTypeError(
+                    f"{field} of the task {self.name} must be a tuple of texts, not one text."
+                )
+        if not self.instructions or not all(
+            words.strip() for words in self.instructions + self.test_instructions
+        ):
             raise InputError(f"The task {self.name} needs an instruction, and none of them may be empty.")
         if self.horizon < 1:
             raise InputError(f"horizon of the task {self.name} must be at least 1 step, not {self.horizon}.")
+
+    def wordings(self, split: Split) -> tuple[str, ...]:
+        """Return the wordings of the instruction in the episodes of a split, which take turns."""
+        return (split != "validation" and self.test_instructions) or self.instructions
 
     @property
     def seed_suite(self) -> str:

@@ -158,7 +158,7 @@ def declaration(subject: Subject) -> None:
 
 def _check_declared(cls: type[Method]) -> None:
     """Check the declarations of the class besides its hyper-parameters."""
-    fields = {field.name for field in dataclasses.fields(cls)}  # type: ignore[arg-type]
+    fields = {field.name for field in dataclasses.fields(cls)}
     for name, kind in _KINDS.items():
         value = getattr(cls, name)
         if not isinstance(value, kind):
@@ -203,7 +203,7 @@ def constructor(subject: Subject) -> None:
 
 def _check_fields(cls: type[Method]) -> None:
     """Check that the fields are hyper-parameters, and that an object has no other attributes."""
-    fields = dataclasses.fields(cls)  # type: ignore[arg-type]
+    fields = dataclasses.fields(cls)
     for field in fields:
         if not field.init:
             expected = "every field to be a hyper-parameter; the hooks set learned values"
@@ -233,7 +233,7 @@ def _check_stored(cls: type[Method]) -> None:
     """Check that objects keep their values: the defaults, and other values unless they are refused."""
     expected = "hyper-parameters to be kept unchanged, or refused with a ValueError"
     method = cls()
-    for field in dataclasses.fields(cls):  # type: ignore[arg-type]
+    for field in dataclasses.fields(cls):
         name = field.name
         default = getattr(method, name) if field.default is dataclasses.MISSING else field.default
         given = [default]

@@ -153,6 +153,14 @@ SCENARIO = Scenario(
 )
 """Eight skills to keep, four tasks to learn in order with their objects, and two held-out variants."""
 
+TO_CRITERION = dataclasses.replace(
+    SCENARIO,
+    id="clbench/MetaWorld-v1",
+    balanced=True,
+    budget=dataclasses.replace(SCENARIO.budget, criterion=0.9, adaptation_steps=1000, validation_episodes=20),
+)
+"""The same tasks with stages that end when the target is learned, in an order of its own for each seed."""
+
 _CW10 = (
     _task(
         "hammer",

@@ -21,8 +21,8 @@ class OverallRow:
     """Name or "module:Class"."""
     division: str
     """One of `DIVISIONS`."""
-    ranks: tuple[int | None, ...]
-    """Ranks in the scenarios, sorted by the scenario's id."""
+    groups: tuple[str | None, ...]
+    """Letters of its groups in the scenarios, sorted by the scenario's id."""
     estimates: Mapping[str, Estimate]
     """Mean over scenarios and interval of every metric."""
 
@@ -50,7 +50,7 @@ def _place(row: OverallRow) -> tuple[int, float, str]:
 def _overall_row(found: Mapping[str, Row]) -> OverallRow:
     rows = [row for _, row in sorted(found.items())]
     estimates = {name: mean_estimate([row.estimates[name] for row in rows]) for name in METRICS}
-    return OverallRow(rows[0].method, rows[0].division, tuple(row.rank for row in rows), estimates)
+    return OverallRow(rows[0].method, rows[0].division, tuple(row.groups for row in rows), estimates)
 
 
 def mean_estimate(parts: Sequence[Estimate]) -> Estimate:

@@ -12,9 +12,9 @@ from itertools import groupby
 from pathlib import Path
 
 from clbench.records.record import ScenarioInfo
+from clbench.scoring.groups import groups
 from clbench.scoring.intervals import Estimate, Runs, estimate, row_generator
 from clbench.scoring.metrics import METRICS
-from clbench.scoring.ranks import tie_groups
 from clbench.spec.references import BASELINE
 
 from .costs import COSTS, costs_of, read_step_times, step_time_of
@@ -23,7 +23,7 @@ from .runs import ALIKE, DIVISIONS, NotShown, Run, Sifted, no_row, read_run, rea
 from .tiers import TIERS
 
 RANKED_BY = "final_average"
-"""Metric that rows are sorted and ranked by."""
+"""Metric that rows are sorted and compared by."""
 
 
 @dataclass(frozen=True)
@@ -36,9 +36,9 @@ class Row:
     """Name or "module:Class"."""
     division: str
     """One of `DIVISIONS`."""
-    rank: int | None
-    """Rank inside its scenario and division, shared by rows that cannot be told apart. None for a reference,
-    which does not compete, and for a row without a final average."""
+    groups: str | None
+    """Letters of its groups. Two rows of a scenario and division share a letter if they are not told apart.
+    None for a reference, which does not compete, and for a row without a final average."""
     runs: tuple[Run, ...]
     """Its runs with the targets in the published order, by rising seed. All but `orders` is made from
     them."""
@@ -115,7 +115,7 @@ def _scenario_rows(runs: list[Run], times: Mapping[str, Estimate]) -> list[Row]:
         members = {method: runs for method, runs in by_method.items() if runs[0].division == division}
         estimates = {method: _estimates(method, by_method) for method in members}
         competing = {method: _scores(runs) for method, runs in members.items() if division != "reference"}
-        ranks = tie_groups(RANKED_BY, competing)
+        letters = groups(RANKED_BY, competing)
         order = sorted(members, key=lambda method: (_falling(estimates[method][RANKED_BY]), method))
         for method in order:
             costs = costs_of(members[method], by_method.get(BASELINE, []), times)
@@ -125,7 +125,7 @@ def _scenario_rows(runs: list[Run], times: Mapping[str, Estimate]) -> list[Row]:
                     scenario,
                     method,
                     division,
-                    ranks.get(method),
+                    letters.get(method),
                     tuple(members[method]),
                     min((run.tier for run in members[method]), key=TIERS.index),
                     estimates[method],
@@ -158,10 +158,28 @@ def _scores(runs: Iterable[Run]) -> Runs:
     return {run.seed: run.scores for run in runs}
 
 
-def rank_mates(row: Row, rows: Iterable[Row]) -> tuple[int, list[str]]:
-    """Return the number of `rows` in the division of `row`, and the methods that share its rank there."""
-    division = [other for other in rows if other.division == row.division]
-    return len(division), [other.method for other in division if other.rank == row.rank and other is not row]
+@dataclass(frozen=True)
+class Standing:
+    """A row among the rows of its division that have a final average."""
+
+    place: int
+    """One more than the number of rows with a higher final average; it ignores noise."""
+    count: int
+    """Number of rows."""
+    alike: tuple[str, ...]
+    """Methods of the other rows that are not told apart from it, by falling final average."""
+
+
+def standing_of(row: Row, rows: Iterable[Row]) -> Standing | None:
+    """Return the standing of `row` among all `rows` of its scenario; None if it is in no group."""
+    if row.groups is None:
+        return None
+    division = [other for other in rows if other.division == row.division and other.groups is not None]
+    value = _falling(row.estimates[RANKED_BY])
+    # Values are quotients of whole numbers: equal ones may differ in the last bit.
+    better = [other for other in division if _falling(other.estimates[RANKED_BY]) < value - 1e-9]
+    alike = [other for other in division if other is not row and set(other.groups or "") & set(row.groups)]
+    return Standing(1 + len(better), len(division), tuple(other.method for other in alike))
 
 
 def column_names() -> list[str]:
@@ -172,7 +190,7 @@ def column_names() -> list[str]:
         "scenario",
         "method",
         "division",
-        "rank",
+        "groups",
         "tier",
         "seeds",
         *metrics,
@@ -186,5 +204,5 @@ def values_of(row: Row) -> list[str | float | None]:
     """Return the values of `row` in the order of `column_names`."""
     estimates = (row.estimates[name] for name in METRICS)
     numbers = [number for one in estimates for number in (one.value, one.low, one.high)]
-    place = [row.scenario, row.method, row.division, row.rank, row.tier, len(row.seeds)]
+    place = [row.scenario, row.method, row.division, row.groups, row.tier, len(row.seeds)]
     return [*place, *numbers, *row.costs.values(), row.orders.sensitivity]

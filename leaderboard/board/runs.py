@@ -14,11 +14,12 @@ from typing import Any
 from clbench.records.paths import label_of, record_name
 from clbench.records.reader import RecordError, read_record
 from clbench.records.record import Record, RunInfo, ScenarioInfo
+from clbench.runs.tuning import tuned_settings
 from clbench.scoring.layout import Layout
 from clbench.scoring.scores import Scores
 from clbench.spec.identifiers import built_in_methods
 from clbench.spec.protocol import Split
-from clbench.spec.scenario import target_order
+from clbench.spec.scenario import balanced_order, target_order
 
 from .tiers import tier_of
 
@@ -143,7 +144,10 @@ def _published(record: Record) -> ScenarioInfo:
     """Return `Record.scenario` with the targets in their published order."""
     targets = record.scenario.target
     try:
-        places = target_order(len(targets), record.run.order)
+        if record.scenario.balanced:
+            places = balanced_order(len(targets), record.run.seed)
+        else:
+            places = target_order(len(targets), record.run.order)
     except ValueError as error:
         raise RecordError(f"run: {error}") from error
     target = [name for _, name in sorted(zip(places, targets, strict=True))]
@@ -168,7 +172,7 @@ def _check_settings(run: RunInfo) -> None:
         raise RecordError(f"run: changes and settings differ in {', '.join(lost)}.")
     if method not in built_in_methods():
         return
-    uses, defaults = _declared(method)
+    uses, defaults = _declared(run.scenario, method)
     if run.uses != uses:
         raise RecordError(f"run: uses do not match {method}: {', '.join(differences(run.uses, uses))}.")
     # a setting that is missing here was added later, with a default that changes nothing
@@ -182,10 +186,10 @@ def _check_settings(run: RunInfo) -> None:
 
 
 @cache
-def _declared(method: str) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return the prior data that a built-in method uses, and its hyper-parameters with their defaults."""
+def _declared(scenario: str, method: str) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Return the prior data that a built-in method uses, and its hyper-parameters, tuned for the scenario."""
     cls = built_in_methods()[method].load()
-    return dataclasses.asdict(cls.uses), dataclasses.asdict(cls())
+    return dataclasses.asdict(cls.uses), {**dataclasses.asdict(cls()), **tuned_settings(scenario, method)}
 
 
 def _check_kind(run: RunInfo, split: Split, changed: bool | None) -> None:
@@ -282,7 +286,7 @@ def same_settings(runs: list[Run]) -> Sifted:
     def parts(run: Run) -> list[dict[str, Any]]:
         info = run.record.run
         # a setting that an older record lacks was added later, with a default that changes nothing
-        defaults = _declared(info.method)[1] if info.method in built_in_methods() else {}
+        defaults = _declared(info.scenario, info.method)[1] if info.method in built_in_methods() else {}
         return [{**defaults, **info.settings}, info.uses, {"device": info.device}]
 
     def reason(run: Run, other: Run) -> str:

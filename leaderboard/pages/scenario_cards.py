@@ -16,9 +16,9 @@ from typing import Any
 import numpy as np
 
 from clbench.base.entry_points import resolve
+from clbench.scoring.groups import deviation_of_differences
 from clbench.scoring.intervals import Estimate, bootstrap, paired_difference, row_generator, student_quantile
 from clbench.scoring.layout import Array, average
-from clbench.scoring.ranks import deviation_of_differences
 from clbench.scoring.rates import Rates
 from clbench.spec.budget import Budget
 from clbench.spec.identifiers import folder_name
@@ -133,7 +133,7 @@ class Card:
             seed_counts=SEEDS,
             competing=len(competing),
             resolution=_resolution(competing),
-            ranks=_ranks(competing),
+            group_counts=_group_counts(competing),
             orders=[row for row in self.rows.values() if len(row.orders.orders) > 1],
             task_versions=self._task_versions(),
             recorded=[row.method for row in present],
@@ -214,13 +214,14 @@ def _resolution(competing: Sequence[Row]) -> dict[str, list[float]]:
     return found
 
 
-def _ranks(competing: Sequence[Row]) -> list[tuple[str, int, int]]:
-    """Return how many methods each division has, and how many ranks the board gives them."""
+def _group_counts(competing: Sequence[Row]) -> list[tuple[str, int, int]]:
+    """Return how many methods each division has, and how many groups they form on the board."""
     found = []
     for division in METHODS:
-        members = [row for row in competing if row.division == division and row.rank is not None]
+        members = [row for row in competing if row.division == division and row.groups]
         if len(members) > 1:
-            found.append((division, len(members), len({row.rank for row in members})))
+            letters = {letter for row in members for letter in row.groups or ""}
+            found.append((division, len(members), len(letters)))
     return found
 
 

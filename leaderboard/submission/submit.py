@@ -18,8 +18,8 @@ from clbench.runs.spec import ResolvedRun, has_record
 from clbench.scoring.metrics import METRICS
 from clbench.testing import ContractError, check_method
 
-from ..board.rows import Row, Table, rank_mates
-from ..views.format import FITTING, counted, format_interval, title_of
+from ..board.rows import Row, Table
+from ..views.format import FITTING, counted, format_interval, standing_text, title_of
 
 CHECK_STEPS = 100.0
 """Duration of the check in optimiser steps, for the time left that the progress bar shows."""
@@ -60,7 +60,7 @@ def check_job(method: str, progress: Callable[[float], None]) -> str:
 
 
 def placement(table: Table, scenario: str, method: str, records: Path) -> list[str]:
-    """Return lines with the rank of a method on the board, or with the reason why it has no row."""
+    """Return lines with the place of a method on the board, or with the reason why it has no row."""
     rows = [row for row in table.rows if row.scenario == scenario]
     mine = [row for row in rows if row.method == method]
     folder = record_path(Path(), scenario, label_of(method, {}), 0).parent.as_posix()
@@ -76,14 +76,7 @@ def placement(table: Table, scenario: str, method: str, records: Path) -> list[s
 
 def _row_lines(row: Row, rows: Sequence[Row]) -> list[str]:
     lines = [f"{row.method} on {row.scenario}, {counted(len(row.seeds), 'seed')}, {row.tier}"]
-    if row.rank is None:
-        lines.append(
-            "A reference method has no rank." if row.division == "reference" else "It has no final average."
-        )
-    else:
-        count, tied = rank_mates(row, rows)
-        shared = f", shared with {', '.join(tied)} (statistically indistinguishable)" if tied else ""
-        lines.append(f"Rank {row.rank} of {count} in the division {row.division}{shared}.")
+    lines.append(f"Division {row.division}: {standing_text(row, rows)}.")
     lines += [
         f"  {title_of(metric.name)}: {format_interval(row.estimates[metric.name])}" for metric in FITTING
     ]

@@ -11,7 +11,8 @@ import hashlib
 import json
 import tempfile
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, is_dataclass
+from contextlib import closing
+from dataclasses import asdict, dataclass, is_dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -23,6 +24,7 @@ from clbench.base.errors import ClbenchError
 from clbench.base.progress import ProgressCallback, no_progress
 from clbench.data.questions import load_questions, scored_questions
 from clbench.evaluation.answers import answer
+from clbench.evaluation.checks import Checker
 from clbench.evaluation.examiner import episode_row
 from clbench.evaluation.rollouts import Evaluator, Trial
 from clbench.jobs.job import Job, JobError
@@ -40,6 +42,7 @@ from clbench.runs.length import run_length
 from clbench.runs.run import execute, pretrained_hash
 from clbench.runs.spec import ResolvedRun, RunSpec
 from clbench.scoring.metrics import measure
+from clbench.scoring.reading import read_protocol
 from clbench.spec.protocol import Point, Protocol
 from clbench.spec.scenario import Scenario
 
@@ -50,7 +53,7 @@ from ..views.format import write_if_changed
 SHOWN = 3
 """Number of differences that a check reports in full."""
 
-PARTS = ("run", "scenario", "episodes", "answers", "policy", "costs", "diagnostics")
+PARTS = ("run", "scenario", "episodes", "answers", "policy", "checks", "costs", "diagnostics")
 """Parts that two records of one run share to the last bit."""
 
 
@@ -127,8 +130,9 @@ class _Subject:
 
     @property
     def protocol(self) -> Protocol:
-        """The evaluation protocol of the run."""
-        return Protocol.of(self.scenario, self.spec.split, self.spec.perturb)
+        """The evaluation protocol of the run, with the ends of its stages."""
+        planned = Protocol.of(self.scenario, self.spec.split, self.spec.perturb)
+        return replace(planned, ends=read_protocol(self.run.record).ends)
 
     @cached_property
     def here(self) -> dict[str, Any]:
@@ -267,7 +271,8 @@ def _replay(subject: _Subject, progress: ProgressCallback) -> list[Check]:
         episodes = _replay_episodes(subject, policies)
         answers = _replay_answers(subject, policies)
     origin = "kept by the run" if kept else "trained again"
-    return [Check("policies", origin, True), episodes, answers]
+    checks = _replay_checks(subject, policies) if subject.scenario.budget.criterion else []
+    return [Check("policies", origin, True), episodes, answers, *checks]
 
 
 def _replay_episodes(subject: _Subject, policies: Sequence[Policy]) -> Check:
@@ -278,14 +283,13 @@ def _replay_episodes(subject: _Subject, policies: Sequence[Policy]) -> Check:
     chosen = generator.permutation(len(at_ends))[: request.episodes]
     rows = [at_ends[index] for index in sorted(chosen)]
     again: list[EpisodeRow] = []
-    evaluator = Evaluator(scenario, subject.spec.seed)
-    for stage, policy in enumerate(policies):
-        trials: list[Trial] = [
-            (scenario.task(row.task), row.split, row.episode) for row in rows if row.stage == stage
-        ]
-        policy.eval()
-        again += [episode_row(protocol.end(stage), episode) for episode in evaluator.play(policy, trials)]
-    evaluator.close()
+    with closing(Evaluator(scenario, subject.spec.seed)) as evaluator:
+        for stage, policy in enumerate(policies):
+            trials: list[Trial] = [
+                (scenario.task(row.task), row.split, row.episode) for row in rows if row.stage == stage
+            ]
+            policy.eval()
+            again += [episode_row(protocol.end(stage), episode) for episode in evaluator.play(policy, trials)]
     wrong = [
         f"{theirs.task} {theirs.split} episode {theirs.episode} of stage {theirs.stage} has "
         f"{_outcome(theirs)}, not {_outcome(ours)}"
@@ -295,6 +299,22 @@ def _replay_episodes(subject: _Subject, policies: Sequence[Policy]) -> Check:
     if wrong:
         return Check("episodes", f"{len(wrong)} of {len(rows)} ended differently: {_some(wrong)}", False)
     return Check("episodes", f"{len(rows)} of {len(at_ends)} replayed, all ended as recorded", True)
+
+
+def _replay_checks(subject: _Subject, policies: Sequence[Policy]) -> list[Check]:
+    """Repeat the last check of each stage with the policy that the stage left."""
+    if subject.resolved.method.whole_stages:
+        return []  # the policy changed after the last check
+    last = {row.stage: row for row in subject.run.record.check_rows()}
+    with closing(Checker(subject.scenario, subject.protocol, subject.spec.seed)) as checker:
+        wrong = [
+            f"stage {stage}"
+            for stage, row in last.items()
+            if checker.check(policies[stage], subject.protocol.end(stage)) != row
+        ]
+    if wrong:
+        return [Check("ends of stages", f"another outcome of the last check: {_some(wrong)}", False)]
+    return [Check("ends of stages", f"the last checks of all {len(last)} stages repeat themselves", True)]
 
 
 def _outcome(row: EpisodeRow) -> str:

@@ -71,7 +71,7 @@ class Description:
     @property
     def defaults(self) -> dict[str, Any]:
         """Default hyper-parameters by name."""
-        return dataclasses.asdict(self.cls())  # type: ignore[call-overload, no-any-return]
+        return dataclasses.asdict(self.cls())
 
     def hook(self, name: str) -> list[str]:
         """Return the paragraphs on what a hook returns, none if the method does not override the hook."""
@@ -124,7 +124,7 @@ def _hyper_parameters(cls: type[Method]) -> list[HyperParameter]:
                 meanings.setdefault(name, []).append(meaning)
     return [
         HyperParameter(field.name, _default(field), " ".join(meanings.get(field.name, [])))
-        for field in dataclasses.fields(cls)  # type: ignore[arg-type]
+        for field in dataclasses.fields(cls)
     ]
 
 

@@ -6,7 +6,7 @@ The same rows give the same bytes: no date, no absolute path, fixed digits.
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TypeAlias
 
@@ -15,7 +15,8 @@ from clbench.scoring.metric import Metric
 from clbench.scoring.metrics import METRICS
 
 from ..board.overall import OverallRow
-from ..board.rows import Row
+from ..board.rows import Row, standing_of
+from ..board.runs import DIVISIONS
 
 SHOWN = tuple(
     METRICS[name]
@@ -71,6 +72,37 @@ def format_interval(estimate: Estimate, form: str = ".2f") -> str:
     """Return a value with its interval, if it has one: "0.14 [0.08, 0.22]"."""
     value, low, high = (number_text(one, form) for one in (estimate.value, estimate.low, estimate.high))
     return value if estimate.low is None else f"{value} [{low}, {high}]"
+
+
+def aligned(groups: str | None, rows: Iterable[Row]) -> str:
+    """Return the letters of a row, each in the column of its group: "a", "ab" and " b" below each other.
+
+    Args:
+        groups: Letters of the row.
+        rows: All rows of its scenario and division.
+    """
+    letters = sorted({letter for row in rows for letter in row.groups or ""})
+    return "".join(letter if letter in groups else " " for letter in letters) if groups else ""
+
+
+def standing_text(row: Row, rows: Iterable[Row], named: int | None = None) -> str:
+    """Return the place of a row in its division, and the methods that are not told apart from it.
+
+    Args:
+        row: The row.
+        rows: All rows of its scenario.
+        named: Number of methods that are named; further ones are only counted.
+    """
+    standing = standing_of(row, rows)
+    if standing is None:
+        return "a reference does not compete" if row.division == DIVISIONS[-1] else "no final average"
+    shown = list(standing.alike[:named])
+    if len(standing.alike) > len(shown):
+        shown.append(f"{len(standing.alike) - len(shown)} more")
+    text = f"place {standing.place} of {standing.count}"
+    if standing.alike:
+        return f"{text}; not told apart from {', '.join(shown)}"
+    return f"{text}; told apart from all others" if standing.count > 1 else text
 
 
 def counted(count: int, noun: str) -> str:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from functools import cache
 from itertools import groupby
 from pathlib import Path
@@ -126,12 +126,6 @@ def links(ids: Iterable[str]) -> Markdown:
 def code(text: str) -> Markdown:
     """Return `text`, of ours, as code."""
     return Markdown(f"`{text}`")
-
-
-def table_lines(head: Sequence[str], rows: Iterable[Sequence[str]], numbers: int = 0) -> list[str]:
-    """Return the lines of a table of Markdown whose last `numbers` columns are numbers."""
-    under = ["---"] * (len(head) - numbers) + ["--:"] * numbers
-    return [f"| {' | '.join(cells)} |" for cells in (head, under, *rows)]
 
 
 def _interval(estimate: Estimate, form: str = ".2f") -> Markdown:

@@ -15,11 +15,12 @@ from clbench.scoring.intervals import Estimate
 from ..board.overall import OverallRow, overall
 from ..board.rows import Row, Table
 from ..board.tiers import TIERS
-from .format import FITTING, MISSING, number_text, scaled, title_of
+from .format import FITTING, MISSING, aligned, number_text, scaled, title_of
 
 LEGEND = (
-    "Rows of a division that are statistically indistinguishable share a rank. "
-    "± is half the width of a 95 % confidence interval. "
+    "Rows of a division that share a letter are not told apart. "
+    "± is half the width of a 95 % confidence interval; it does not cover what all seeds share: "
+    "demonstrations, scenes and questions. "
     "Higher is better, except for {lower}. Cost: training time relative to sft. Tier: {tiers}.\n"
 )
 """Legend below the tables."""
@@ -30,10 +31,10 @@ def terminal(table: Table) -> RenderableType:
     # Text and not str: rich would obey markup in a stranger's words.
     parts: list[RenderableType] = []
     for scenario, rows in groupby(table.rows, key=lambda row: row.scenario):
-        parts.append(_scenario(scenario, list(rows)))
+        parts += [_scenario(scenario, list(rows)), Text()]
     over_scenarios = overall(table.rows)
     if over_scenarios:
-        parts.append(_all_scenarios(over_scenarios))
+        parts += [_all_scenarios(over_scenarios), Text()]
     if parts:
         lower = ", ".join(title_of(metric.name) for metric in FITTING if metric.higher_is_better is False)
         tiers = ", ".join(f"{number} {tier}" for number, tier in enumerate(TIERS))
@@ -46,17 +47,20 @@ def terminal(table: Table) -> RenderableType:
 
 def _scenario(scenario: str, rows: list[Row]) -> TextTable:
     """Return the table of one scenario, with a section for each division."""
-    table = TextTable(title=Text(scenario, style="bold"), box=SIMPLE_HEAD, padding=0, title_justify="left")
-    table.add_column("", justify="right", min_width=2)
-    table.add_column("method", overflow="fold", min_width=20)
+    table = TextTable(
+        title=Text(scenario, style="bold"), box=SIMPLE_HEAD, padding=0, title_justify="left", show_edge=False
+    )
+    table.add_column("", no_wrap=True)  # letters of the groups: the legend explains them
+    table.add_column("method", overflow="fold", min_width=16)
     for name in ("seeds", *(title_of(metric.name) for metric in FITTING), "cost", "bytes kept", "tier"):
         # One word a line: a header must not make its column wider than the numbers.
-        table.add_column(name.replace(" ", "\n"), justify="right")
+        table.add_column(name.replace(" ", "\n"), justify="right", no_wrap=True)
     for division, members in groupby(rows, key=lambda row: row.division):
         table.add_section()
         table.add_row("", Text(division, style="italic"))
-        for row in members:
-            cells = [number_text(row.rank, ".0f", ""), row.method, str(len(row.seeds))]
+        division_rows = list(members)
+        for row in division_rows:
+            cells = [aligned(row.groups, division_rows), row.method, str(len(row.seeds))]
             cells += [_compact(row.estimates[metric.name]) for metric in FITTING]
             kept = row.costs["bytes_kept"]
             size = MISSING if kept is None else "".join(scaled(kept))
@@ -68,17 +72,17 @@ def _scenario(scenario: str, rows: list[Row]) -> TextTable:
 def _all_scenarios(rows: Sequence[OverallRow]) -> TextTable:
     """Return the table over scenarios, with a section for each division."""
     title = Text("All scenarios", style="bold")
-    table = TextTable(title=title, box=SIMPLE_HEAD, padding=0, title_justify="left")
+    table = TextTable(title=title, show_edge=False, box=SIMPLE_HEAD, padding=0, title_justify="left")
     table.add_column("method", overflow="fold", min_width=20)
-    for name in ("ranks", *(title_of(metric.name) for metric in FITTING)):
+    for name in ("groups", *(title_of(metric.name) for metric in FITTING)):
         table.add_column(name.replace(" ", "\n"), justify="right")
     for division, members in groupby(rows, key=lambda row: row.division):
         table.add_section()
         table.add_row(Text(division, style="italic"))
         for row in members:
-            ranks = ",".join(number_text(rank, ".0f") for rank in row.ranks)
+            groups = ",".join(letters or MISSING for letters in row.groups)
             cells = [_compact(row.estimates[metric.name]) for metric in FITTING]
-            table.add_row(*map(Text, [row.method, ranks, *cells]))
+            table.add_row(*map(Text, [row.method, groups, *cells]))
     return table
 
 

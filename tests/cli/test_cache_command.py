@@ -2,13 +2,18 @@
 
 import os
 import time
+from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
+from safetensors.numpy import save_file
 
 from clbench.base.cache import cache_folder, cached, hash_of
 from clbench.cli.cache import entries, find_stale, minari_folder
 from clbench.cli.main import app
+from clbench.records.record import Record
+from clbench.records.writer import record_text
 
 DAY = 24 * 60 * 60
 
@@ -166,6 +171,66 @@ def test_files_that_clbench_did_not_make_are_left_alone(
     assert [entry.kind for entry in entries()] == ["scenes"]
     _cache(capsys, "--prune", "--older-than", "0")
     assert all(path.is_file() for path in foreign)
+
+
+@pytest.mark.usefixtures("empty_caches")
+def test_an_entry_with_a_foreign_file_is_named_and_left(capsys: pytest.CaptureFixture[str]) -> None:
+    stages = cache_folder() / "stages" / hash_of("run")
+    cached(stages / "stage-0", {"stage": 0}, lambda partial: _fill(partial / "data", 1))
+    dataset = minari_folder() / "clbench" / "toy" / "left-v0"
+    cached(dataset, {"task": "left"}, lambda partial: _fill(partial / "data" / "main_data.hdf5", 1))
+    thesis = _make("pretrained", 400) / "thesis.txt"
+    foreign = [thesis, stages / "notes" / "a.txt", stages / "b.txt", dataset / "data" / "mine.hdf5"]
+    for path in foreign:
+        _write(path)
+    for folder in (thesis.parent, stages, dataset):
+        _age(folder, 400)
+    old = _make("scenes", 400)
+    out = _cache(capsys, "--prune", "--older-than", "0")
+    assert f"{thesis.parent} is left: clbench did not make thesis.txt in it." in out
+    assert f"{stages} is left: clbench did not make b.txt and 1 more file in it." in out
+    assert f"{dataset} is left: clbench did not make data/mine.hdf5 in it." in out
+    assert "Deleted 1 stale entry" in out
+    assert not old.exists()
+    assert all(path.is_file() for path in (*foreign, stages / "stage-0" / "data"))
+
+
+@pytest.mark.usefixtures("empty_caches")
+def test_records_on_their_way_are_deleted_and_other_json_is_left(
+    make_record: Callable[..., Record], capsys: pytest.CaptureFixture[str]
+) -> None:
+    ours, mixed, foreign = (_write(cache_folder() / "ray" / hash_of(name) / "a.json") for name in "abc")
+    for path in (ours, mixed):
+        path.write_text(record_text(make_record([[1.0, 0.0, 0.0], [1.0, 1.0, 0.0]])), encoding="utf-8")
+    settings = _write(mixed.with_name("settings.json"))
+    for path in (ours, mixed, foreign):
+        _age(path.parent, 40)
+    out = _cache(capsys, "--prune")
+    assert f"{mixed.parent} is left: clbench did not make settings.json in it." in out
+    assert not ours.parent.exists()
+    assert all(path.is_file() for path in (mixed, settings, foreign))
+
+
+@pytest.mark.usefixtures("empty_caches")
+def test_checkpoints_of_expert_training_are_deleted_and_other_weights_are_left(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    folder = cache_folder() / "experts"
+    names = [f"{name}-0123456789abcdef.safetensors" for name in ("left-seed-0", "mine", "text")]
+    ours, weights, text = (_write(folder / name) for name in names)
+    save_file({"x": np.zeros(1)}, ours, {"training": "{}"})
+    save_file({"x": np.zeros(1)}, weights)
+    _age(folder, 40)
+    assert "Deleted 1 stale entry" in _cache(capsys, "--prune")
+    assert [path.is_file() for path in (ours, weights, text)] == [False, True, True]
+
+
+@pytest.mark.usefixtures("empty_caches")
+def test_a_folder_named_like_a_leftover_is_left_unless_an_entry_would_be_there() -> None:
+    name = f"draft.{'f' * 32}.partial"
+    for place in ("projects", "runs", "runs/projects"):
+        _write(cache_folder() / place / f".{name}" / "thesis.txt")
+    assert list(entries()) == []
 
 
 @pytest.mark.usefixtures("empty_caches")

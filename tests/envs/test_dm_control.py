@@ -119,9 +119,10 @@ def test_every_number_of_a_body_is_in_the_state_and_the_rest_is_masked() -> None
         body = RULES[task.name].body
         size = len(observed(dm_control_environment(task.name, 0).reset().observation))
         first = world().reset(seed=0, options={"task": task.name})[0]
-        assert first[state.MASK].tolist() == [1.0] * size + [0.0] * (state.OBSERVATION_SIZE - size)
-        assert not first[state.OBSERVATION][size:].any()
-        assert first[state.BODY].tolist() == [float(body == name) for name in state.BODIES]
+        padding = state.OBSERVATION_SIZE - size
+        assert first[8:16].tolist() == [1.0] * size + [0.0] * padding
+        assert not first[size:8].any()
+        assert first[16:].tolist() == [float(body == name) for name in state.BODIES]
 
 
 def test_a_motor_that_a_body_lacks_is_ignored() -> None:

@@ -68,8 +68,8 @@ def test_a_row_does_not_depend_on_the_other_rows(four_methods: Path, add_full: C
     add_full("sft", 0, scenario="clbench/Other-v0")
     after = load(four_methods)
     kept = after[(after.scenario == "clbench/Toy-v0") & (after.method != "another")]
-    kept = kept.reset_index(drop=True).drop(columns="rank")
-    pandas.testing.assert_frame_equal(kept, before.drop(columns="rank"))
+    kept = kept.reset_index(drop=True).drop(columns="groups")
+    pandas.testing.assert_frame_equal(kept, before.drop(columns="groups"))
 
 
 def test_the_relative_cost_counts_all_steps_with_the_time_of_one(

@@ -6,12 +6,12 @@ from pathlib import Path
 
 import pytest
 import torch
+from helpers import build_method
 
 from clbench.data.demonstrations import Demonstrations
 from clbench.learning.method import Metadata, Method
 from clbench.learning.prior import Prior, Source, UndeclaredAccessError
 from clbench.learning.registry import (
-    build_method,
     describe_method,
     load_method,
     method_names,
@@ -47,7 +47,7 @@ def test_an_installed_method_loads_and_is_built_from_its_defaults(name: str) -> 
     method = build_method(name, {})
     assert isinstance(method, Method)
     assert type(method).__doc__
-    assert all(field.default is not dataclasses.MISSING for field in dataclasses.fields(method))  # type: ignore[arg-type]
+    assert all(field.default is not dataclasses.MISSING for field in dataclasses.fields(method))
 
 
 def test_a_method_can_be_named_by_module_and_class(module: types.ModuleType) -> None:
@@ -75,7 +75,12 @@ def test_an_object_that_is_no_method_is_refused_by_name(
 @pytest.mark.usefixtures("module")
 def test_changes_from_the_command_line_take_the_types_of_the_fields() -> None:
     method = build_method("stranger:Acme", {"strength": "0.25", "rounds": "7", "gentle": "true"})
-    assert dataclasses.asdict(method) == {"strength": 0.25, "rounds": 7, "gentle": True}  # type: ignore[call-overload]
+    assert dataclasses.asdict(method) == {
+        "step_factor": 1.0,
+        "strength": 0.25,
+        "rounds": 7,
+        "gentle": True,
+    }
 
 
 @pytest.mark.parametrize(

@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from helpers import build_method
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from clbench.learning.adaptation import adapt
 from clbench.learning.method import Progress, Stage
 from clbench.learning.prior import Prior
-from clbench.learning.registry import build_method
 from clbench.policy.activations import Gaussian
 from clbench.policy.batch import Batch
 from clbench.policy.policy import Policy, PolicyConfig

@@ -4,11 +4,11 @@ from typing import Any
 
 import pytest
 import torch
+from helpers import build_method
 from torch import Tensor
 
 from clbench.learning.method import Stage
 from clbench.learning.prior import Prior
-from clbench.learning.registry import build_method
 from clbench.policy.batch import Batch
 from clbench.policy.policy import Policy
 from clbench.testing import TOY

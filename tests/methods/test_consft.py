@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from helpers import build_method
 from torch import Tensor
 
 from clbench.base.seeding import seeded
@@ -14,7 +15,6 @@ from clbench.learning.adaptation import adapt
 from clbench.learning.method import Progress, Stage
 from clbench.learning.optimise import MethodError, optimise
 from clbench.learning.prior import Prior
-from clbench.learning.registry import build_method
 from clbench.policy.batch import Batch
 from clbench.policy.policy import Policy
 from clbench.spec.budget import Budget
@@ -196,7 +196,7 @@ def test_the_histogram_counts_the_weights() -> None:
 
 def test_the_calibrated_variant_changes_only_what_the_authors_tune() -> None:
     published, calibrated = (
-        dataclasses.asdict(build_method(name, {}))  # type: ignore[call-overload]
+        dataclasses.asdict(build_method(name, {}))
         for name in ("consft", "consft_calibrated")
     )
     changed = {name for name in published if published[name] != calibrated[name]}

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from helpers import build_method
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -15,7 +16,6 @@ from clbench.learning.adaptation import adapt
 from clbench.learning.method import Method, Progress, Stage
 from clbench.learning.optimise import learning_rate_factor
 from clbench.learning.prior import Prior
-from clbench.learning.registry import build_method
 from clbench.policy.batch import Batch
 from clbench.policy.policy import Policy
 from clbench.spec.budget import Budget

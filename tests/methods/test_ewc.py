@@ -4,12 +4,12 @@ from typing import Any
 
 import pytest
 import torch
+from helpers import build_method
 from torch import Tensor
 
 from clbench.learning.adaptation import adapt
 from clbench.learning.method import Progress, Stage
 from clbench.learning.prior import Prior, Source
-from clbench.learning.registry import build_method
 from clbench.policy.batch import Batch
 from clbench.policy.policy import Policy
 from clbench.spec.budget import Budget

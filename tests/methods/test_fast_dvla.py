@@ -7,12 +7,13 @@ from typing import Any, NoReturn
 import numpy as np
 import pytest
 import torch
+from helpers import build_method
 from torch import Tensor
 
 from clbench.learning.method import Progress, Stage
 from clbench.learning.optimise import optimise
 from clbench.learning.prior import Prior
-from clbench.learning.registry import build_method, load_method
+from clbench.learning.registry import load_method
 from clbench.policy.policy import Policy
 from clbench.testing import TOY
 from clbench.testing.small import SMALL, toy_questions, toy_source

@@ -9,12 +9,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from helpers import build_method
 from torch import nn
 
 import clbench.testing
 from clbench.learning.method import Method, Stage
 from clbench.learning.prior import Access, Prior, Source, UndeclaredAccessError, Uses
-from clbench.learning.registry import build_method, load_method, method_names
+from clbench.learning.registry import load_method, method_names
 from clbench.policy.batch import Batch
 from clbench.policy.policy import Policy
 from clbench.records.record import Record
@@ -185,7 +186,7 @@ def test_prior_data_can_be_touched_in_the_hooks_that_are_declared_and_in_no_othe
 NUMBERS = [
     (name, field.name)
     for name in method_names()
-    for field in dataclasses.fields(load_method(name))  # type: ignore[arg-type]
+    for field in dataclasses.fields(load_method(name))
     if isinstance(field.default, int | float)
 ]
 

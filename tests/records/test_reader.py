@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from helpers import sealed
 
-from clbench.records.content import sealed
 from clbench.records.reader import RecordError, read_record
 from clbench.records.record import Record
 from clbench.records.writer import write_record
@@ -83,7 +83,7 @@ def test_a_path_that_is_no_file_is_refused(tmp_path: Path) -> None:
         ),
         (
             {"scenario": {"id": "x"}},
-            "scenario: retained, target, held_out, evaluation_steps, budget are missing",
+            "scenario: retained, target, held_out, evaluation_steps, budget, balanced are missing",
         ),
         ({"costs": {}}, "costs: optimiser_steps, parameters, preparation_steps, parameters_added, "),
         ({"status": "failed", "error": {"where": "loss"}}, "error must have the entries where, type, mess"),

@@ -12,9 +12,9 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
+from helpers import sealed
 
 from clbench.base.entry_points import resolve
-from clbench.records.content import sealed
 from clbench.records.reader import read_record
 from clbench.records.record import Costs
 from clbench.runs.agents import evaluate_agent, next_stage
@@ -359,7 +359,7 @@ def board(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_an_agent_has_its_own_division_and_takes_no_part_in_others(board: Path) -> None:
     table = importlib.import_module("clbench.leaderboard").load(board / "records").set_index("method")
     assert dict(table["division"]) == {"sft": "prior-data-free", "me/knows": "online"}
-    assert list(table["rank"]) == [1, 1]
+    assert list(table["groups"]) == ["a", "a"]
     row = table.loc["me/knows"]
     assert (row["retention"], row["environment_steps"], row["tier"]) == (0.5, 21, "self-reported")
     for missing in (
@@ -378,11 +378,11 @@ def test_the_page_marks_an_agent_and_shows_no_run_command_for_it(
 ) -> None:
     importlib.import_module("clbench.leaderboard.cli").show(records=board / "records")
     lines = [" ".join(line.split()) for line in capsys.readouterr().out.splitlines()]
-    assert lines[lines.index("online") + 1].startswith("1 me/knows 1 0.75")
+    assert lines[lines.index("online") + 1].startswith("a me/knows 1 0.75")
     page = (board / "site" / "index.html").read_text(encoding="utf-8")
     assert "# me/knows is a separate program: docs/guide/online.md" in page
     assert "clbench run clbench/Toy-v0 me/knows" not in page
-    assert "| 1 | me/knows | online |" in (board / "site" / "LEADERBOARD.md").read_text(encoding="utf-8")
+    assert "| a | me/knows | online |" in (board / "site" / "LEADERBOARD.md").read_text(encoding="utf-8")
 
 
 def test_the_record_of_an_agent_is_recomputed_and_cannot_be_replayed(board: Path) -> None:

@@ -7,7 +7,7 @@ import sys
 import types
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
@@ -172,13 +172,22 @@ def test_all_columns_of_a_row_begin_with_the_same_picture(recorded: tuple[Record
 
 
 class Unsteady(ToyWorld):
-    """A world that behaves differently when it is drawn."""
+    """A world that behaves differently when it is drawn; the class counts its open worlds."""
+
+    still_open: ClassVar[int] = 0
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(**options)
+        Unsteady.still_open += 1
+
+    def close(self) -> None:
+        Unsteady.still_open -= 1
 
     def step(self, action: Any) -> Any:
         return super().step(action if self.render_mode is None else 0 * action)
 
 
-def test_a_world_that_does_not_repeat_an_episode_is_refused(
+def test_a_world_that_does_not_repeat_an_episode_is_refused_and_all_worlds_are_closed(
     recorded: tuple[Record, Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     module = types.ModuleType("stranger")
@@ -188,6 +197,7 @@ def test_a_world_that_does_not_repeat_an_episode_is_refused(
     policies = stage_policies(SPEC.resolve(), recorded[1])[:1]
     with pytest.raises(RuntimeError, match="stranger:Unsteady does not repeat an episode of 'left'"):
         shoot(SCENARIO, 0, policies, [(task, "validation", 0)], 32)
+    assert Unsteady.still_open == 0
 
 
 def test_the_command_writes_the_requested_film(recorded: tuple[Record, Path], tmp_path: Path) -> None:

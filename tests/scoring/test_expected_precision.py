@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy import stats
 
 from clbench.scoring.intervals import (
     MANY,
@@ -60,8 +61,8 @@ def test_the_studentised_range_exceeds_its_quantile_in_a_twentieth_of_simulation
 
 
 def test_the_width_to_expect_with_one_seed_is_binomial() -> None:
-    expected = 1.96 * np.sqrt(0.25 / 120)
-    assert half_width(1, 20, 6) == pytest.approx(expected, rel=0.01)
+    expected = stats.binomtest(60, 120).proportion_ci(0.95, "wilson")
+    assert half_width(1, 20, 6) == pytest.approx((expected.high - expected.low) / 2, rel=1e-5)
     assert half_width(1, 20, 6, seed_deviation=0.3) == half_width(1, 20, 6)
 
 
@@ -72,6 +73,7 @@ def test_the_episodes_needed_are_the_fewest_that_are_enough() -> None:
         assert half_width(seeds, needed, tasks) <= wished + 1e-9
         assert needed == 1 or half_width(seeds, needed - 1, tasks) > wished
     assert episodes_needed(half_width(5, 20, 6), 5, 6) == 20
+    assert episodes_needed(0.5, 2, 6) == 1  # no interval of a rate is longer
 
 
 def test_no_number_of_episodes_makes_up_for_seeds_that_differ() -> None:

@@ -4,14 +4,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy import stats
+from scipy import optimize, stats
 
 from clbench.scoring.intervals import (
     Estimate,
     bootstrap,
     estimate,
     half_width,
-    interval,
     paired_difference,
     row_generator,
 )
@@ -56,6 +55,8 @@ def whole_run(shape: Layout, success: Any, **arrays: Any) -> Scores:
         "on_the_way": on_the_way,
         "asked": counts,
         "correct": counts / 2,
+        "steps": np.full(targets, np.nan),
+        "met": np.full(targets, np.nan),
         **missing,
         **arrays,
     }
@@ -79,6 +80,8 @@ def random_run(generator: np.random.Generator, shape: Layout) -> Scores:
         answer_curves=generator.random((targets, points)),
         update_sparsity=generator.random((targets, points)),
         activation_drift=generator.random((targets, points)),
+        steps=generator.integers(1, 100, targets).astype(float),
+        met=np.ones(targets),
     )
 
 
@@ -159,7 +162,7 @@ def test_seeds_are_drawn_as_whole_runs() -> None:
     # Two seeds, one good at everything and one at nothing. Drawn apart, six tasks would hide it.
     runs = {0: scores(np.ones((6, 20))), 1: scores(np.zeros((6, 20)))}
     got = estimate(["retention"], runs, np.random.default_rng(0))["retention"]
-    assert (got.value, got.low, got.high) == (0.5, 0.0, 1.0)
+    assert (got.value, got.low, got.high) == pytest.approx((0.5, 0.002, 0.998), abs=5e-4)
 
 
 def test_the_episodes_of_a_run_are_the_same_at_all_stages() -> None:
@@ -199,25 +202,18 @@ def test_intervals_hold_the_truth_about_as_often_as_they_should(seeds: int, spre
     assert 0.92 <= held / 300 <= 0.98  # 0.95 within two and a half standard errors
 
 
-def test_with_several_seeds_the_interval_of_an_unbounded_quantity_is_students_t() -> None:
-    values = np.array([0.3, 1.7, 0.9, 4.0])
-    without_one = (values.sum() - values) / 3
-    expected = stats.t.interval(0.95, 3, loc=values.mean(), scale=stats.sem(values))
-    got = interval(float(values.mean()), without_one)
-    assert (got.low, got.high) == pytest.approx(expected, rel=1e-4)
-
-
-def test_the_interval_of_a_rate_is_students_on_the_scale_of_the_arcsine_of_the_root() -> None:
-    # Retentions 0.4, 0.5 and 0.9: without one of them 0.7, 0.65 and 0.45.
+def test_the_interval_of_a_rate_ends_where_the_value_is_just_likely() -> None:
+    # Retentions 0.4, 0.5 and 0.9: the error at a rate is Student's, scaled by the root of rate (1 - rate).
     runs = {0: scores([[1] * 4 + [0] * 6]), 1: scores([[1] * 5 + [0] * 5]), 2: scores([[1] * 9 + [0]])}
-    angles = [np.arcsin(np.sqrt(rate)) for rate in (0.7, 0.65, 0.45)]
-    error = np.sqrt(2 / 3 * sum((angle - np.mean(angles)) ** 2 for angle in angles))
-    centre, reach = np.arcsin(np.sqrt(0.6)), stats.t.ppf(0.975, 2) * error
-    assert centre + reach < np.pi / 2
     got = estimate(["retention"], runs, np.random.default_rng(0))["retention"]
     assert got.value == pytest.approx(0.6)
-    assert got.low == pytest.approx(np.sin(max(centre - reach, 0)) ** 2, rel=1e-3)
-    assert got.high == pytest.approx(np.sin(centre + reach) ** 2, rel=1e-3)
+    reach = stats.t.ppf(0.975, 2) * stats.sem([0.4, 0.5, 0.9])
+
+    def excess(rate: float) -> float:
+        return float(abs(rate - 0.6) - reach * np.sqrt(rate * (1 - rate) / (0.6 * 0.4)))
+
+    assert got.low == pytest.approx(optimize.brentq(excess, 1e-9, 0.6), rel=1e-6)
+    assert got.high == pytest.approx(optimize.brentq(excess, 0.6, 1 - 1e-9), rel=1e-6)
 
 
 def test_the_interval_of_pooled_curves_is_the_jackknifes() -> None:
@@ -277,13 +273,6 @@ def test_if_all_outcomes_are_equal_the_interval_has_no_width() -> None:
     runs = {seed: scores(np.ones((6, 20))) for seed in range(3)}
     got = estimate(["retention"], runs, np.random.default_rng(0))["retention"]
     assert got == Estimate(1.0, 1.0, 1.0)
-
-
-def test_a_quantity_without_value_for_some_seeds_has_no_interval() -> None:
-    assert interval(1.0, np.array([1.0, np.nan])) == Estimate(1.0, None, None)
-    assert interval(np.nan, np.array([1.0, 2.0])) == NOTHING
-    assert interval(1.0, np.zeros(0)) == Estimate(1.0, None, None)
-    assert interval(1.0, np.zeros(0), lambda: np.array([1.0, np.nan])) == Estimate(1.0, None, None)
 
 
 @pytest.mark.parametrize(("seeds", "deviation"), [(3, 0.05), (5, 0.0), (5, 0.1)])

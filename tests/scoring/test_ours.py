@@ -26,7 +26,17 @@ BY_HAND = {
     "forgetting": ((1.0 - 0.5) + (0.9 - 0.4) + (0.9 - 0.3)) / 3,
     "backward_transfer": 0.3 - 0.9,
     "zero_shot": 0.1,
+    "kept_targets": 0.3,
+    "kept": (0.5 + 0.4 + 0.3) / 3,
+    "kept_skills_over_stages": ((0.6 + 0.9) / 2 + (0.5 + 0.4) / 2) / 2,
+    "kept_targets_over_stages": 0.3,
+    "kept_over_stages": ((0.6 + 0.9) / 2 + (0.5 + 0.4 + 0.3) / 3) / 2,
+    "kept_share": ((0.6 + 0.9) / (1.0 + 0.8) + (0.5 + 0.4 + 0.3) / (0.6 + 0.9 + 0.9)) / 2,
 }
+
+
+KEPT_SKILLS = ("kept_skills_over_stages", "kept_over_stages", "kept_share")
+"""Metrics of the skills at the ends of all stages."""
 
 
 @pytest.mark.parametrize("name", BY_HAND)
@@ -37,6 +47,7 @@ def test_a_metric_has_the_value_worked_out_by_hand(name: str, scores: Callable[.
 def test_every_metric_of_the_leaderboard_is_worked_out_by_hand() -> None:
     others = {"forward_transfer", "question_retention", "retention_at_matched_adaptation"}
     others |= {"perturbed_retention", "update_sparsity", "activation_drift"}
+    others |= {"gain", "steps_to_criterion", "speed"}
     found = {name for name, metric in METRICS.items() if metric.function.__module__ == MODULE}
     assert {*BY_HAND, *others} == found
 
@@ -46,6 +57,35 @@ def test_perturbed_retention_has_the_value_worked_out_by_hand(scores: Callable[.
     assert measure("perturbed_retention", run) == pytest.approx((0.4 + 0.2) / 2)
     assert measure("retention", run) == pytest.approx(BY_HAND["retention"])
     assert measure("perturbed_retention", scores(MATRIX)) is None
+
+
+def test_gain_is_the_final_average_beyond_that_of_plain_fine_tuning(scores: Callable[..., Scores]) -> None:
+    sft = scores([[1.0] * 5, [0.5] * 5, [0.2, 0.4, 0.0, 0.6, 1.0]])
+    expected = BY_HAND["final_average"] - (0.2 + 0.4 + 0.0 + 0.6) / 4
+    assert measure("gain", scores(MATRIX), {"sft": sft}) == pytest.approx(expected)
+    assert measure("gain", scores(MATRIX)) is None
+
+
+def test_steps_to_the_criterion_count_a_stage_that_never_met_it_with_all_its_steps(
+    scores: Callable[..., Scores],
+) -> None:
+    run, scratch = (scores(MATRIX, steps=(100,), ends=ends) for ends in ((8, 0), (100, 25)))
+    assert measure("steps_to_criterion", run) == (8 + 0) / 2
+    assert measure("steps_to_criterion", scratch) == (100 + 25) / 2
+    assert measure("speed", run, {"from_scratch": scratch}) == pytest.approx((100 / 8 * 25 / 1) ** 0.5)
+
+
+def test_without_a_criterion_there_are_no_steps_to_it(scores: Callable[..., Scores]) -> None:
+    run = scores(MATRIX)
+    assert measure("steps_to_criterion", run) is None
+    assert measure("speed", run, {"from_scratch": run}) is None
+
+
+def test_an_earlier_target_counts_as_kept_from_the_stage_after_its_own(scores: Callable[..., Scores]) -> None:
+    # three targets and no skill: rows are stages, and success before learning counts nowhere
+    run = scores([[0.9] * 3, [0.5, 0.9, 0.9], [0.4, 0.8, 0.9], [0.2, 0.6, 0.7]], groups=(0, 3, 0))
+    assert measure("kept_targets_over_stages", run) == pytest.approx((0.4 + (0.2 + 0.6) / 2) / 2)
+    assert measure("kept_share", run) is None  # nothing was known before the first stage
 
 
 def test_forward_transfer_has_the_value_worked_out_by_hand(scores: Callable[..., Scores]) -> None:
@@ -255,6 +295,7 @@ def test_a_record_of_the_pretrained_policy_alone_has_no_value_that_needs_a_targe
     values = {name: measure(name, run) for name in METRICS}
     assert {name for name, value in values.items() if value is not None} == {
         "final_average",
+        "kept",
         "retention",
         "zero_shot",
     }
@@ -263,9 +304,9 @@ def test_a_record_of_the_pretrained_policy_alone_has_no_value_that_needs_a_targe
 @pytest.mark.parametrize(
     ("stage", "task", "missing"),
     [
-        (2, 0, {"final_average", "retention", "forgetting"}),
-        (1, 2, {"adaptation", "forgetting", "backward_transfer"}),
-        (0, 0, {"forgetting"}),
+        (2, 0, {"final_average", "retention", "forgetting", "kept", *KEPT_SKILLS}),
+        (1, 2, {"adaptation", "forgetting", "backward_transfer", "kept_share"}),
+        (0, 0, {"forgetting", "kept_share"}),
         (0, 2, set()),
         (2, 4, {"zero_shot"}),
     ],

@@ -1,8 +1,10 @@
 """The contract: planted faults are found, each with its own message; sound methods pass."""
 
 import dataclasses
+import os
 import pickle
 import random
+import sys
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, ClassVar
@@ -10,6 +12,7 @@ from typing import Any, ClassVar
 import numpy as np
 import pytest
 import torch
+from faults_of_state import FAULTS_OF_STATE, Doubles, Draws, Exports, Moves, Patches, Seeded, Threads
 from torch import Tensor, nn
 
 from clbench.learning.method import Method, MethodState, Progress, Stage
@@ -20,7 +23,7 @@ from clbench.policy.policy import Policy
 from clbench.testing import Check, ContractError, check_method, method_checks
 from clbench.testing.toy_run import HOOKS, ToyRun
 
-# mypy: disable-error-code="arg-type, assignment, attr-defined, dict-item, override"
+# mypy: disable-error-code="arg-type, assignment, attr-defined, dict-item, misc, override"
 # A type checker finds many of these faults.
 
 CONTRACT = Path(__file__).parents[2] / "docs" / "guide" / "contract.md"
@@ -271,6 +274,7 @@ FAULTS: list[tuple[Any, str, str, str]] = [
     (Hoards, "declared data", "to draw from its arguments", "after the hooks that received it"),
     (Modest, "declared data", "prior questions to be drawn", "they are never drawn; leave them out"),
     (Early, "declared data", "prior demonstrations to be drawn", "in prepare() alone; declare 'prepare'"),
+    *FAULTS_OF_STATE,
 ]
 
 
@@ -289,6 +293,23 @@ def test_a_planted_fault_is_found_with_its_own_message(
 
 def test_no_two_faults_have_the_same_message() -> None:
     assert len({(expected, found) for _, _, expected, found in FAULTS}) == len(FAULTS)
+
+
+def test_changes_that_a_faulty_method_leaves_behind_are_undone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+
+    def process() -> list[Any]:
+        torch_settings = (torch.get_num_threads(), torch.get_default_dtype(), torch.is_grad_enabled())
+        generators = (random.getstate(), str(np.random.get_state()), torch.get_rng_state().tolist())  # noqa: NPY002
+        return [*torch_settings, *generators, dict(os.environ), Path.cwd(), list(sys.path), Policy.predict]
+
+    before = process()
+    for cls in (Seeded, Threads, Doubles, Exports, Moves, Patches, Draws):
+        with pytest.raises(ContractError):
+            check_method(cls)
+    assert process() == before
 
 
 def test_a_message_shows_the_expectation_the_finding_and_the_place() -> None:
@@ -313,7 +334,7 @@ def test_the_page_of_the_contract_has_a_heading_for_each_clause_in_order() -> No
     assert headings == [str(check).replace("_", " ").capitalize() for check in method_checks(Method)]
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass
 class Sound(Method):
     """Draws from every generator, keeps a state, and uses all data that it declares."""
 
@@ -323,7 +344,7 @@ class Sound(Method):
     uses = Uses(demonstrations="prepare", questions="throughout")
 
     def prepare(self, policy: Policy, prior: Prior) -> int:
-        object.__setattr__(self, "anchor", prior.demonstrations.sample(4).state.mean(dim=0))
+        self.anchor = prior.demonstrations.sample(4).state.mean(dim=0)
         return 1
 
     def batch(self, target: Source[Batch], prior: Prior) -> Any:
@@ -339,7 +360,7 @@ class Sound(Method):
         return {"anchor": self.anchor, "words": self.words}
 
     def load_state(self, policy: Policy, state: MethodState) -> None:
-        object.__setattr__(self, "anchor", state["anchor"])
+        self.anchor = state["anchor"]
 
 
 @dataclasses.dataclass

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 from gymnasium.utils.env_checker import check_env
+from helpers import build_method
 from numpy.typing import NDArray
 
 from clbench.base.cache import cache_folder
@@ -19,7 +20,7 @@ from clbench.data.questions import load_questions
 from clbench.evaluation.rollouts import Evaluator
 from clbench.learning.optimise import deterministic, optimise
 from clbench.learning.pretraining import policy_config, pretrained_policy, pretraining_inputs
-from clbench.learning.registry import build_method, method_names
+from clbench.learning.registry import method_names
 from clbench.learning.trainer import Trainer
 from clbench.policy.policy import Policy
 from clbench.spec.registry import load_scenario

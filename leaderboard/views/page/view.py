@@ -17,10 +17,20 @@ from clbench.scoring.metrics import METRICS
 from clbench.scoring.scores import rates_of
 from clbench.spec.identifiers import built_in_methods
 
-from ...board.rows import Row, Table, rank_mates
+from ...board.rows import Row, Table, standing_of
 from ...board.runs import DIVISIONS, METHODS, printable
 from ..descriptions import Description, describe
-from ..format import SHOWN, Rows, format_interval, number_text, scaled, shown, title_of
+from ..format import (
+    SHOWN,
+    Rows,
+    aligned,
+    format_interval,
+    number_text,
+    scaled,
+    shown,
+    standing_text,
+    title_of,
+)
 from ..markdown import arxiv_ids
 from .charts import finite, rounded
 from .curves import estimated, retained_curve, target_curves
@@ -31,7 +41,7 @@ MISSING = "\N{EN DASH}"
 """Text for a value that could not be computed."""
 
 NAMED = 3
-"""Number of methods with the same rank that are named; further ones are only counted."""
+"""Number of methods not told apart from a row that are named; further ones are only counted."""
 
 OTHERS = tuple(metric for metric in METRICS.values() if metric not in SHOWN)
 """Further metrics in the section of a row."""
@@ -114,10 +124,12 @@ class RowView:
     """A row and its section."""
 
     row: Row
-    rank: str
-    """Rank as text, with = if it is shared."""
-    place: str
-    """Rank in words."""
+    groups: str
+    """Letters of its groups, each in the column of its group."""
+    place: int | None
+    """Place in its division."""
+    standing: str
+    """Its place, and the methods that are not told apart from it, in words."""
     cells: tuple[Number, ...]
     """Cells of the table's `columns`, then the relative cost and the bytes kept."""
     metrics: tuple[MetricView, ...]
@@ -260,7 +272,9 @@ def _row(row: Row, rows: Sequence[Row]) -> RowView:
     seeds = _of_seeds(row, rows)
     return RowView(
         row,
-        *_rank(row, rows),
+        aligned(row.groups, [other for other in rows if other.division == row.division]) or MISSING,
+        standing.place if (standing := standing_of(row, rows)) else None,
+        standing_text(row, rows, NAMED),
         (*(number(row.estimates[metric.name], metric) for metric in columns(rows)), *_costs(row)),
         tuple(_metric(metric, row.estimates[metric.name], seeds[metric.name]) for metric in shown([row])),
         tuple(_stages(row)),
@@ -322,19 +336,6 @@ def _costs(row: Row) -> tuple[Number, Number]:
         text = f"{digits} {unit}B" if unit else digits
         size = Number(text, number_text(kept, ".0f"), f"{number_text(kept, ',.0f')} bytes")
     return cost, size
-
-
-def _rank(row: Row, rows: Sequence[Row]) -> tuple[str, str]:
-    """Return the rank of a row as text, and in words."""
-    if row.rank is None:
-        reference = row.division == DIVISIONS[-1]
-        return MISSING, "no rank: references do not compete" if reference else "no rank"
-    count, same = rank_mates(row, rows)
-    place = f"rank {row.rank} of {count}"
-    if not same:
-        return str(row.rank), place
-    shown = ", ".join(same[:NAMED]) + (f" and {len(same) - NAMED} more" if len(same) > NAMED else "")
-    return f"{row.rank}=", f"{place}, shared with {shown}"
 
 
 def _metric(metric: Metric, one: Estimate, seeds: Sequence[float | None]) -> MetricView:

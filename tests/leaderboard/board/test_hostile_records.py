@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from helpers import sealed
 
-from clbench.records.content import sealed
 from clbench.records.paths import record_path
 from clbench.records.record import Record
 from clbench.records.writer import write_record

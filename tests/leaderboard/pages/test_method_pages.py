@@ -116,7 +116,7 @@ def test_every_hyper_parameter_has_its_default_and_its_meaning(bench: Bench) -> 
     pages = bench.pages()
     for name in BUILT_IN:
         text = part(pages[name], "Hyper-parameters")
-        for field in load_method(name).__dataclass_fields__.values():  # type: ignore[attr-defined]
+        for field in load_method(name).__dataclass_fields__.values():
             assert re.search(rf"\| `{field.name}` \| `{re.escape(repr(field.default))}` \| \w", text)
         assert text == "None." or text.startswith("| name | default | meaning |")
 
@@ -144,7 +144,7 @@ def test_a_subclass_takes_the_docstring_and_has_its_own_defaults(bench: Bench) -
     pages = bench.pages()
     for heading in ("Rule", "Implementation details", "Paper"):
         assert part(pages["consft_calibrated"], heading) == part(pages["consft"], heading)
-    default = load_method("consft_calibrated").__dataclass_fields__["tau_start"].default  # type: ignore[attr-defined]
+    default = load_method("consft_calibrated").__dataclass_fields__["tau_start"].default
     row = f"| `tau_start` | `{default}` | Temperature at the start (Table 5). Chosen on validation episodes"
     assert row in part(pages["consft_calibrated"], "Hyper-parameters")
     assert "`kappa`" in part(pages["consft_calibrated"], "Hyper-parameters")

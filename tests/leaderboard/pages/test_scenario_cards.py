@@ -10,11 +10,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from helpers import sealed
 from PIL import Image
 from scipy import stats
 
 from clbench.base.entry_points import resolve
-from clbench.records.content import sealed
 from clbench.records.record import Record
 from clbench.records.writer import write_record
 from clbench.runs.spec import RunSpec

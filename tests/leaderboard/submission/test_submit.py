@@ -27,6 +27,7 @@ register(id=hurried.id, entry_point="clbench.worlds.scenario_env:ScenarioEnv", k
 class Mine(clbench.Method):
     '''Plain fine-tuning, under another name.'''
 
+@dataclasses.dataclass
 class Größe(Mine):
     '''Its name is not one of a row.'''
 
@@ -56,13 +57,13 @@ def submit(method: str, scenario: str = "clbench.testing:clbench/Toy-v0", **rest
     command(method, scenario=scenario, **{"seeds": 1, "workers": 1, "records": Path("board/records"), **rest})
 
 
-def test_a_sound_class_gets_a_row_a_rank_and_its_ties(
+def test_a_sound_class_gets_a_row_and_a_place(
     make_record: Callable[..., Record], capsys: pytest.CaptureFixture[str]
 ) -> None:
     submit("submitted:Mine")
     printed = capsys.readouterr()
     assert "the method keeps the contract" in printed.err
-    assert "Rank 1 of 1 in the division prior-data-free." in printed.out
+    assert "Division prior-data-free: place 1 of 1." in printed.out
     assert "Metrics that compare with sft need its records" in printed.out
     path = record_path(Path("board/records"), "clbench/Toy-v0", "submitted:Mine", 0)
     record = read_record(path)
@@ -75,8 +76,7 @@ def test_a_sound_class_gets_a_row_a_rank_and_its_ties(
     submit("submitted:Mine")
     printed = capsys.readouterr()
     assert "All runs already have a record." in printed.err
-    assert "Rank 1 of 2" in printed.out
-    assert "shared with another:Twin" in printed.out
+    assert "place 1 of 2; not told apart from another:Twin." in printed.out
     assert path.read_bytes() == before
 
 

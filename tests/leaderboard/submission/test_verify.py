@@ -8,8 +8,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from helpers import sealed
 
-from clbench.records.content import sealed
+from clbench.evaluation.rollouts import Evaluator
 from clbench.records.paths import record_path
 from clbench.records.reader import read_record
 from clbench.runs.run import execute
@@ -215,6 +216,25 @@ def test_a_fault_that_only_the_whole_run_shows_is_found_by_doing_it_again(mine: 
     parts = "episodes (success), costs (bytes_kept), diagnostics (1)"
     assert found == f"whole run: repeated, {parts} differ"
     assert tiers.tier_of(mine) == "replayed"
+
+
+def test_the_worlds_are_closed_if_a_replay_fails(
+    mine: Path, honest: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    closed = []
+
+    class Broken(Evaluator):
+        def play(self, *arguments: Any, **options: Any) -> Any:
+            raise RuntimeError("the simulator crashed")
+
+        def close(self) -> None:
+            closed.append(self)
+            super().close()
+
+    monkeypatch.setattr(verification, "Evaluator", Broken)
+    with pytest.raises(RuntimeError, match="the simulator crashed"):
+        verify(mine, "replayed", honest)
+    assert len(closed) == 1
 
 
 def test_the_episodes_of_another_seed_are_found(mine: Path, honest: Path) -> None:

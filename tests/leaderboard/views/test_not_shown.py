@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 import pandas
 import pytest
+from helpers import sealed
 
 from clbench.base.entry_points import resolve
-from clbench.records.content import sealed
 from clbench.records.paths import record_path
 from clbench.records.record import Record
 from clbench.records.writer import write_record

@@ -71,6 +71,16 @@ def test_the_page_is_valid_and_has_a_row_and_a_section_for_each_method(records: 
     assert "after target_1 0.50 0.40 0.30 0.80 0.10" in words(by_id(document, "clbench/Toy-v0/sft"))
 
 
+def test_rows_show_their_groups_and_what_intervals_do_not_cover(records: Path) -> None:
+    section = by_id(parsed(page(read_table(records))), "clbench/Toy-v0")
+    cells = [one for one in section.iter("td") if one.get("class") == "groups"]
+    assert [(one.text, one.get("data-order"), one.get("title")) for one in cells] == [
+        ("a", "1", "place 1 of 2; not told apart from sft"),
+        ("a", "2", "place 2 of 2; not told apart from better"),
+    ]
+    assert "do not cover what all seeds share: demonstrations, scenes and questions" in words(section)
+
+
 def test_perturbed_retention_has_a_column_only_where_a_row_has_it(
     add: Callable[..., Path], records: Path
 ) -> None:

@@ -220,7 +220,7 @@ def test_the_keys_lead_through_the_page_and_show_where_they_are(open_page: Calla
         assert ring == "solid"
         assert width == "2px"
         met.append(what)
-    order = ["text", "division", "tier", "grouped", "rank", "method", "final average", "other", "replay"]
+    order = ["text", "division", "tier", "grouped", "group", "method", "final average", "other", "replay"]
     assert [met.index(one) for one in order] == sorted(met.index(one) for one in order)
 
 

@@ -1,4 +1,4 @@
-"""Ranks: rows of the leaderboard in order; rows that cannot be told apart share one."""
+"""Groups of rows of the leaderboard that are not told apart, shown by letters."""
 
 from __future__ import annotations
 
@@ -6,9 +6,10 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import combinations
+from itertools import combinations, count
 
 import numpy as np
+from numpy.typing import NDArray
 
 from clbench.base.errors import InputError
 from clbench.scoring.intervals import MANY, Runs, needed_references, studentised_range_quantile
@@ -47,31 +48,34 @@ def deviation_of_differences(metric: str, rows: Iterable[Runs]) -> float | None:
     return math.sqrt(total / degrees) if degrees else None
 
 
-# ---- tie groups --------------------------------------------------------------------------------------------
+# ---- groups ------------------------------------------------------------------------------------------------
 
 
-def tie_groups(
+def groups(
     metric: str, rows: Mapping[str, Runs], *, references: Mapping[str, Runs] | None = None
-) -> dict[str, int]:
-    """Return the rank of each row by `metric`, the best first: rows that cannot be told apart share one.
+) -> dict[str, str]:
+    """Return the groups of each row, the best row first: two rows share a letter if they are not told apart.
 
-    From the best value down, a row joins the group of the row above unless it is told apart from the first
-    row of that group; then it begins the next one. A group's rank counts the rows above it, as in sport: 1,
-    1, 3. So each rank after the first stands for a tested statement: this row is worse than the first row of
-    the group above. It need not be worse than the last row of that group: two rows may both be like the one
-    between them, and unlike each other.
+    A row with the letters "ab" belongs to two groups. It is not told apart from the other members of either,
+    but some members of one are told apart from some of the other: similarity is not transitive. Ranks would
+    hide this. They would also depend on noise: of two rows of one value, the noisier one would be like the
+    best row and rank high, the other would not. Here both have the place of their value, and the noisier
+    has more letters.
 
     Rows are compared over their common seeds, which share pretrained policy and initial states. A difference
     tells them apart if it exceeds the largest of three standard errors, times Tukey's factor for so many
     rows:
 
-    1. from all rows together: the variation of runs around the means of their row and seed;
-    2. from the two rows alone: the variation of their difference between seeds, if there are several;
-    3. from the episodes: the jackknife over them, since seeds may agree by chance.
+    1. from all rows together: the variation of runs around the means of their row and seed. With few seeds
+       it is far more certain than the next, and a row whose runs agree by chance gains nothing;
+    2. from the two rows alone: the variation of their difference between seeds, if there are several. Rows
+       may vary more than others do;
+    3. from the episodes: the jackknife over them, since all rows may agree by chance.
 
-    So at most 5 % of the boards of equal methods are split; `docs/guide/statistics.md` has the figures. Rows
-    without a common seed are compared by the variation of runs around the mean of their row. Where no row has
-    a second seed, a deviation of `UNKNOWN_DEVIATION` is assumed: only distant rows are told apart.
+    So at most 5 % of the boards of equal methods have more than one group; `docs/guide/statistics.md` has the
+    figures. Rows without a common seed are compared by the variation of runs around the mean of their row.
+    Where no row has a second seed, a deviation of `UNKNOWN_DEVIATION` is assumed: only distant rows are told
+    apart.
 
     Args:
         metric: Name of a metric.
@@ -79,7 +83,7 @@ def tie_groups(
         references: Runs of reference methods by name and seed.
 
     Returns:
-        Ranks by row, the best row first. Rows without a value have none.
+        Letters by row, the best row first; it is in group a. Rows without a value have none.
 
     Raises:
         UnknownNameError: The metric is unknown.
@@ -88,7 +92,7 @@ def tie_groups(
     """
     wanted = load_metric(metric)
     if wanted.higher_is_better is None:
-        raise InputError(f"{metric} says nothing of better or worse: no row is ranked by it.")
+        raise InputError(f"{metric} says nothing of better or worse: no row is ordered by it.")
     sign = 1.0 if wanted.higher_is_better else -1.0
     seeds = sorted({seed for runs in rows.values() for seed in runs})
     if len({run.layout for runs in rows.values() for run in runs.values()}) > 1:
@@ -106,29 +110,58 @@ def tie_groups(
     entries.sort(key=lambda entry: entry[:2])
     if not entries:
         return {}
-    found = ranks(np.stack([entry[2] for entry in entries]), np.stack([entry[3] for entry in entries]))
-    return {entry[1]: rank for entry, rank in zip(entries, found, strict=True)}
+    apart = told_apart(np.stack([entry[2] for entry in entries]), np.stack([entry[3] for entry in entries]))
+    return {entry[1]: letters for entry, letters in zip(entries, letter_display(apart), strict=True)}
 
 
-def ranks(values: Array, without_episode: Array) -> list[int]:
-    """Return the ranks of several rows, the best first, by the rule of `tie_groups`.
+def told_apart(values: Array, without_episode: Array) -> NDArray[np.bool_]:
+    """Return which rows are told apart by the test of `groups`, (rows, rows), symmetric.
+
+    Rows whose order on their common seeds is not the order of their values are not told apart.
 
     Args:
-        values: Higher is better, NaN where a row lacks a seed, (rows, seeds).
+        values: Values of the runs, higher is better, the best row first, (rows, seeds). NaN where a row lacks
+            a seed.
         without_episode: The same if the first, the second, ... episode of all tasks is left out,
             (rows, seeds, episodes).
     """
-    board, found, first = _Board(values, without_episode), [1], 0
-    for row in range(1, len(values)):
-        if board.tells_apart(first, row):
-            first = row
-        found.append(first + 1)
-    return found
+    board = _Board(values, without_episode)
+    apart = np.zeros((len(values), len(values)), dtype=np.bool_)
+    for better, worse in combinations(range(len(values)), 2):
+        apart[better, worse] = apart[worse, better] = board.tells_apart(better, worse)
+    return apart
+
+
+def letter_display(apart: NDArray[np.bool_]) -> list[str]:
+    """Return letters for each row such that two rows share one if, and only if, they are not told apart.
+
+    The algorithm inserts and absorbs: all rows begin in one group. Each pair that is told apart splits the
+    groups that have both, and a group inside another one is dropped. Piepho 2004, doi 10.1198/1061860043515.
+
+    Args:
+        apart: Which rows are told apart, (rows, rows), symmetric.
+
+    Returns:
+        Letters by row, in alphabetic order. Groups are named in the order of their first rows.
+    """
+    found = [frozenset(range(len(apart)))]
+    for pair in combinations(range(len(apart)), 2):
+        if not apart[pair]:
+            continue
+        split = [group for group in found if group.issuperset(pair)]
+        found = [group for group in found if not group.issuperset(pair)]
+        for part in (group - {row} for group in split for row in pair):
+            if not any(part <= group for group in found):
+                found.append(part)
+    # a to z, and then other small letters: no board has so many groups.
+    alphabet = filter(str.islower, map(chr, count(ord("a"))))
+    named = list(zip(alphabet, sorted(found, key=sorted), strict=False))
+    return ["".join(letter for letter, group in named if row in group) for row in range(len(apart))]
 
 
 @dataclass(frozen=True, eq=False)
 class _Board:
-    """Rows to rank; the arrays are the arguments of `ranks`."""
+    """Rows to compare; the arrays are the arguments of `told_apart`."""
 
     values: Array
     without_episode: Array
@@ -137,13 +170,13 @@ class _Board:
         """Return whether one row is certainly better than another."""
         known = np.isfinite(self.values)
         common = known[better] & known[worse]
-        count = np.count_nonzero(common)
-        if count:
+        number = np.count_nonzero(common)
+        if number:
             differences = (self.values[better] - self.values[worse])[common]
             of_all, degrees = self.paired
-            own = differences.var(ddof=1) / count if count > 1 else 0.0
+            own = differences.var(ddof=1) / number if number > 1 else 0.0
             episodes = (self.without_episode[better] - self.without_episode[worse])[common]
-            variance = max(2 * of_all / count, own, _jackknife(episodes).sum() / count**2)
+            variance = max(2 * of_all / number, own, _jackknife(episodes).sum() / number**2)
             difference = differences.mean()
         else:
             of_all, degrees = self.unpaired

@@ -1,4 +1,4 @@
-"""The contract of a method: its constructor, and what must be the same after each hook."""
+"""Methods with faults of the constructor and of state: `tests/testing/test_contract.py` must find each."""
 
 import dataclasses
 import os
@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
-import pytest
 import torch
 from torch import Tensor, nn
 
@@ -19,7 +18,6 @@ from clbench.learning.method import Method, MethodState, Progress, Stage
 from clbench.learning.prior import Prior, Source
 from clbench.policy.batch import Batch
 from clbench.policy.policy import Policy
-from clbench.testing import ContractError, check_method
 
 
 @dataclasses.dataclass
@@ -273,7 +271,7 @@ class Backwards(Method):
         return -policy.action_loss(batch).mean()
 
 
-FAULTS: list[tuple[Any, str, str, str]] = [
+FAULTS_OF_STATE: list[tuple[Any, str, str, str]] = [
     (Demanding, "constructor", "a default for every hyper-parameter", "rate has none"),
     (Prepared, "constructor", "only hyper-parameters to be stored", "it sets buffer"),
     (Rounding, "constructor", "to be kept unchanged", "rate=0.5 becomes 0"),
@@ -309,37 +307,3 @@ FAULTS: list[tuple[Any, str, str, str]] = [
     (Standstill, "learning", "a mean return of -", "before"),
     (Backwards, "learning", "only a reference, `uses = Uses(reference=True)`, may learn nothing", "before"),
 ]
-
-
-@pytest.mark.parametrize(("cls", "clause", "expected", "found"), FAULTS)
-def test_a_planted_fault_is_found_with_its_own_message(
-    cls: Any, clause: str, expected: str, found: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    with pytest.raises(ContractError) as caught:
-        check_method(cls)
-    error = caught.value
-    assert error.clause == clause
-    assert expected in f"expected: {error.expected}"
-    assert found in f"found:    {error.found}"
-
-
-def test_no_two_faults_have_the_same_message() -> None:
-    assert len({(expected, found) for _, _, expected, found in FAULTS}) == len(FAULTS)
-
-
-def test_changes_that_a_faulty_method_leaves_behind_are_undone(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-
-    def process() -> list[Any]:
-        torch_settings = (torch.get_num_threads(), torch.get_default_dtype(), torch.is_grad_enabled())
-        generators = (random.getstate(), str(np.random.get_state()), torch.get_rng_state().tolist())  # noqa: NPY002
-        return [*torch_settings, *generators, dict(os.environ), Path.cwd(), list(sys.path), Policy.predict]
-
-    before = process()
-    for cls in (Seeded, Threads, Doubles, Exports, Moves, Patches, Draws):
-        with pytest.raises(ContractError):
-            check_method(cls)
-    assert process() == before

@@ -1,0 +1,56 @@
+"""Checks of a stage's criterion: whether the policy has learned the target."""
+
+from __future__ import annotations
+
+from clbench.evaluation.rollouts import Episode, Evaluator
+from clbench.policy.policy import Policy
+from clbench.records.record import CheckRow
+from clbench.spec.protocol import Point, Protocol
+from clbench.spec.scenario import Scenario
+
+
+class Checker:
+    """Checks during the stages of a run whether their targets are learned, on validation episodes.
+
+    Args:
+        scenario: Scenario with the targets that are learned.
+        protocol: Evaluation protocol of the run, with a criterion or without.
+        seed: Seed of the run: it chooses the initial states, the same at every check and for all methods.
+    """
+
+    def __init__(self, scenario: Scenario, protocol: Protocol, seed: int) -> None:
+        self._scenario, self._protocol = scenario, protocol
+        self._steps = frozenset(scenario.budget.check_steps)
+        # most checks fail, and a failed one ends with this many failures: 3 with a goal of 18 out of 20
+        failures = 1 if protocol.criterion is None else protocol.validation_episodes - protocol.goal + 1
+        self._evaluator = Evaluator(scenario, seed, lanes=failures)
+
+    def close(self) -> None:
+        """Close all worlds."""
+        self._evaluator.close()
+
+    def is_due(self, point: Point) -> bool:
+        """Return whether the criterion is checked at `point`."""
+        return point.step in self._steps
+
+    def check(self, policy: Policy, point: Point) -> CheckRow:
+        """Play the target's validation episodes until it is certain whether `policy` meets the criterion."""
+        protocol, task = self._protocol, self._scenario.target[point.stage - 1]
+        count, goal = protocol.validation_episodes, protocol.goal
+        successes = failures = 0
+
+        def certain(episode: Episode) -> bool:
+            nonlocal successes, failures
+            successes, failures = successes + episode.success, failures + (not episode.success)
+            return successes >= goal or failures > count - goal
+
+        policy.eval()
+        episodes = self._evaluator.play(
+            policy, [(task, "validation", number) for number in range(count)], enough=certain
+        )
+        policy.train()
+        return CheckRow(*point, len(episodes), successes)
+
+    def is_learned(self, row: CheckRow) -> bool:
+        """Return whether a check met the criterion."""
+        return self._protocol.is_learned(row.successes)

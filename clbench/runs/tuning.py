@@ -1,0 +1,121 @@
+"""Tuning: the settings that every method tries on a scenario, the choice among them, and its file.
+
+All methods try the same number of settings, on the same seeds, all targets and validation episodes alone:
+
+1. `LADDER`: four factors of the step size, with the method's own strength at its default.
+2. At the best of them two more settings: two other values of the own strength that the method declares in
+   `Method.tunes`, or, if it declares none, two step sizes between the rungs.
+
+Among the settings that learn at least `LEARNED` of the targets' success the one with the best final average
+wins.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from functools import cache
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from clbench.base.strict_json import read_json
+from clbench.spec.identifiers import folder_name
+
+if TYPE_CHECKING:
+    from clbench.learning.method import Method
+
+LADDER = (1.0, 0.3, 0.1, 0.03)
+"""Factors of the step size, for every method."""
+
+BETWEEN = (0.55, 1.8)
+"""Factors of the best rung, for methods without a strength of their own: half a rung down and up."""
+
+LEARNED = 0.8
+"""Least mean success on the targets right after learning them, for a setting that may be chosen."""
+
+Settings = Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Tried:
+    """One setting of a method, with its scores on validation episodes, averaged over the tuning seeds."""
+
+    settings: dict[str, Any]
+    """Hyper-parameters that tuning sets, by name."""
+    final_average: float
+    """Success after the last target on everything that was ever trained."""
+    learned: float
+    """Success on each target right after it was learned."""
+
+
+@dataclass(frozen=True)
+class Tuned:
+    """The settings of a method that tuning chose for a scenario."""
+
+    settings: dict[str, Any]
+    """Hyper-parameters that tuning chose, by name."""
+    tried: tuple[Tried, ...]
+    """All settings that it tried, in their order."""
+
+
+def rungs(method: type[Method]) -> list[dict[str, Any]]:
+    """Return the settings that a method tries first: the ladder of step sizes."""
+    own = {} if method.tunes is None else {method.tunes[0]: getattr(method(), method.tunes[0])}
+    return [{**own, "step_factor": factor} for factor in LADDER]
+
+
+def refinements(method: type[Method], best: Settings) -> list[dict[str, Any]]:
+    """Return the settings that a method tries next, around the best of its first ones."""
+    if method.tunes is None:
+        return [{"step_factor": round(share * best["step_factor"], 4)} for share in BETWEEN]
+    name, values = method.tunes
+    return [{**best, name: value} for value in values]
+
+
+def best_of(tried: Sequence[Tried]) -> Tried:
+    """Return the setting with the best final average among those that learn enough.
+
+    If none learns enough, it is the one that learns most. The first one wins a tie.
+    """
+    learners = [one for one in tried if one.learned >= LEARNED]
+    if not learners:
+        return max(tried, key=lambda one: one.learned)
+    return max(learners, key=lambda one: one.final_average)
+
+
+def tuned_file(scenario: str) -> Path:
+    """Return the path of the file with the settings for the scenario with this id, which need not exist."""
+    methods = find_spec("clbench.methods")
+    assert methods is not None
+    assert methods.origin is not None
+    return Path(methods.origin).parent / "tuned" / f"{folder_name(scenario)}.json"
+
+
+def write_tuned(path: Path, scenario: str, seeds: Sequence[int], methods: Mapping[str, Tuned]) -> None:
+    """Write the settings of `methods` to `path`, and keep those of others that it has already."""
+    known = {name: asdict(one) for name, one in methods.items()}
+    if path.is_file():
+        known = {**read_json(path)["methods"], **known}
+    content = {"scenario": scenario, "seeds": list(seeds), "methods": dict(sorted(known.items()))}
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+
+
+@cache
+def tuned(scenario: str) -> Mapping[str, Tuned]:
+    """Return what tuning chose on the scenario with this id, by method; nothing if it was never tuned."""
+    path = tuned_file(scenario)
+    if not path.is_file():
+        return {}
+    return {
+        name: Tuned(found["settings"], tuple(Tried(**one) for one in found["tried"]))
+        for name, found in read_json(path)["methods"].items()
+    }
+
+
+def tuned_settings(scenario: str, method: str) -> dict[str, Any]:
+    """Return the settings that tuning chose for a method; none if it was not tuned on the scenario."""
+    found = tuned(scenario).get(method)
+    return dict(found.settings) if found else {}

@@ -1,0 +1,168 @@
+"""Runs whose stages end when the target is learned."""
+
+import importlib
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from clbench.evaluation.rollouts import Evaluator
+from clbench.records.record import Record
+from clbench.records.writer import write_record
+from clbench.runs.checkpoints import stage_policies
+from clbench.runs.run import execute
+from clbench.runs.spec import RunSpec
+from clbench.scoring.metrics import measure
+from clbench.scoring.scores import Scores
+from clbench.spec.protocol import Point, check_steps
+from clbench.spec.registry import load_scenario, register
+from clbench.testing.toy import TOY
+
+verification = importlib.import_module("clbench.leaderboard.submission.verify")
+tiers = importlib.import_module("clbench.leaderboard.board.tiers")
+
+EAGER = replace(
+    TOY,
+    id="me/Eager-v0",
+    balanced=True,
+    budget=replace(TOY.budget, criterion=0.75, adaptation_steps=200, validation_episodes=4),
+)
+"""The toy with a criterion of three successes in four episodes, and an order of the targets for each seed."""
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _registered() -> None:
+    register(EAGER.id, f"{__name__}:EAGER")
+
+
+@pytest.fixture(scope="module")
+def record(tmp_path_factory: pytest.TempPathFactory) -> Record:
+    """A run of plain fine-tuning."""
+    return execute(RunSpec(EAGER.id, "sft", seed=0), tmp_path_factory.mktemp("records"))
+
+
+def test_a_stage_ends_at_the_first_check_that_meets_the_criterion(record: Record) -> None:
+    assert record.status == "success", record.error
+    planned = check_steps(200)
+    for stage in (1, 2):
+        rows = [row for row in record.check_rows() if row.stage == stage]
+        assert tuple(row.step for row in rows) == planned[: len(rows)]
+        assert [row.successes >= 3 for row in rows] == [False] * (len(rows) - 1) + [True]
+        assert 0 < rows[-1].step < 200
+    steps = [row.step for row in record.check_rows() if row.successes >= 3]
+    assert record.costs.optimiser_steps == sum(steps)
+
+
+def test_every_task_is_evaluated_at_the_end_of_each_stage_and_nowhere_else(record: Record) -> None:
+    ends = {row.stage: row.step for row in record.check_rows()}
+    episodes = dict.fromkeys(("left", "up", "right", "down", "up_left"), EAGER.budget.test_episodes)
+    for stage, step in {0: 0, **ends}.items():
+        played = [row.task for row in record.episode_rows() if row.point == Point(stage, step)]
+        assert {task: played.count(task) for task in played} == episodes
+    assert len(record.episode_rows()) == 3 * sum(episodes.values())
+    assert {row.split for row in record.episode_rows()} == {"test"}
+
+
+def test_checks_play_validation_episodes_until_their_outcome_is_certain(
+    record: Record, tmp_path: Path
+) -> None:
+    run = RunSpec(EAGER.id, "sft", seed=0).resolve()
+    policies = stage_policies(run)  # made again, with checks of their own
+    evaluator = Evaluator(run.scenario, seed=0)
+    for stage in (1, 2):
+        last = [row for row in record.check_rows() if row.stage == stage][-1]
+        outcomes = evaluator.evaluate(policies[stage], [run.scenario.target[stage - 1]])
+        assert 3 <= last.successes <= last.episodes <= len(outcomes)
+        assert sum(one.success for one in outcomes) >= 3
+    evaluator.close()
+
+
+def test_an_interrupted_run_continues_to_the_same_record(
+    record: Record, execute_and_kill: Callable[..., None], tmp_path: Path
+) -> None:
+    spec = RunSpec(EAGER.id, "sft", seed=0)
+    execute_and_kill(spec, tmp_path, 0.6)
+    again = execute(spec, tmp_path)
+    for part in ("episodes", "answers", "policy", "checks", "costs", "run", "scenario"):
+        assert getattr(again, part) == getattr(record, part)
+
+
+def test_a_method_that_trains_nothing_is_checked_once(tmp_path: Path) -> None:
+    record = execute(RunSpec(EAGER.id, "frozen", seed=0), tmp_path)
+    assert [(row.stage, row.step) for row in record.check_rows()] == [(1, 0), (2, 0)]
+    assert measure("steps_to_criterion", Scores.from_record(record)) == 0
+
+
+def test_a_stage_that_never_meets_the_criterion_takes_all_its_steps(tmp_path: Path) -> None:
+    spec = RunSpec(EAGER.id, "sft", seed=0, changes={"step_factor": 1e-6})
+    record = execute(spec, tmp_path)
+    assert [row.step for row in record.check_rows()] == 2 * list(check_steps(200))
+    scores = Scores.from_record(record)
+    assert measure("steps_to_criterion", scores) == 200
+    assert scores.met.tolist() == [0, 0]
+
+
+def test_each_seed_learns_the_targets_in_its_own_order(tmp_path: Path) -> None:
+    orders = [RunSpec(EAGER.id, "sft", seed=seed).resolve().scenario.target for seed in range(4)]
+    names = [[task.name for task in order] for order in orders]
+    assert names[:2] == [["right", "down"], ["down", "right"]]
+    assert sorted(names[2:]) == sorted(names[:2])
+    with pytest.raises(ValueError, match="each seed has its own order"):
+        RunSpec(EAGER.id, "sft", seed=0, order=1).resolve()
+
+
+@pytest.mark.parametrize(
+    ("edit", "words"),
+    [
+        (lambda checks: checks["step"].__setitem__(1, 3), "are not at the steps"),
+        (lambda checks: [column.pop() for column in checks.values()], "end before the criterion was met"),
+        (lambda checks: checks["successes"].__setitem__(0, checks["episodes"][0]), "impossible|go on after"),
+        (lambda checks: checks["successes"].__setitem__(0, 5), "impossible counts"),
+        (lambda checks: checks["stage"].__setitem__(0, 3), "a stage of the run"),
+        (lambda checks: [column.clear() for column in checks.values()], "are not at the steps"),
+    ],
+)
+def test_checks_that_contradict_the_protocol_are_refused(
+    edit: Callable[[dict[str, list[Any]]], Any], words: str, record: Record
+) -> None:
+    checks = {name: list(column) for name, column in record.checks.items()}
+    if "go on" in words:
+        checks["episodes"][0] = checks["successes"][0] = 4
+    else:
+        edit(checks)
+    with pytest.raises(ValueError, match=words):
+        Scores.from_record(replace(record, checks=checks))
+
+
+def test_the_scenario_says_which_order_a_seed_has(record: Record) -> None:
+    assert record.scenario.balanced
+    assert record.scenario.target == ["right", "down"]
+    assert load_scenario(EAGER.id).for_seed(1).target[0].name == "down"
+
+
+def test_a_record_with_a_criterion_reaches_every_tier(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    records = tmp_path / "records"
+    spec = RunSpec(EAGER.id, "sft", seed=0)
+    execute(spec, records)
+    for tier in ("replayed", "retrained"):
+        request = verification.Request(tier, 20, 7, None, None, None)
+        checks = verification.verify(spec.path(records), records, request)
+        assert all(check.passed for check in checks), checks
+    assert "ends of stages" in [check.name for check in checks]
+    assert tiers.tier_of(spec.path(records)) == "retrained"
+
+
+def test_a_record_whose_last_check_does_not_repeat_itself_stays_recomputed(
+    record: Record, tmp_path: Path
+) -> None:
+    spec = RunSpec(EAGER.id, "sft", seed=0)
+    checks = {name: list(column) for name, column in record.checks.items()}
+    checks["episodes"][-1] = 7 - checks["episodes"][-1]  # 3 episodes instead of 4, or the reverse
+    write_record(replace(record, checks=checks), spec.path(tmp_path))
+    request = verification.Request("replayed", 20, 7, None, None, None)
+    found = verification.verify(spec.path(tmp_path), tmp_path, request)
+    assert [check.name for check in found if not check.passed] == ["ends of stages"]
