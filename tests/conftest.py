@@ -27,6 +27,7 @@ from clbench.records.record import (
     EpisodeRow,
     PolicyRow,
     Record,
+    Relearning,
     RunInfo,
     ScenarioInfo,
 )
@@ -194,6 +195,8 @@ def _make_record(
     perturbed: Any = None,
     sparsity: Any = None,
     drift: Any = None,
+    shift: Any = None,
+    relearning: Relearning | None = None,
     steps: tuple[int, ...] = (100, 200, 300, 400),
     answers: Mapping[tuple[int, str], tuple[int, int]] | None = None,
     groups: tuple[int, int, int] | None = None,
@@ -211,8 +214,11 @@ def _make_record(
         retained_curves: The same for the retained skills, (targets, points before the end, retained).
         validation: The same for the targets on validation episodes, (targets, points).
         perturbed: The same for the retained skills in perturbed episodes at the ends, (stages + 1, retained).
-        sparsity: Update sparsity, (targets, points). No policy was looked at if it and `drift` are None.
+        sparsity: Update sparsity, (targets, points). No policy was looked at if this and the next two are
+            None.
         drift: Activation drift, (targets, points).
+        shift: Shift of the policy in each stage, (targets,).
+        relearning: Relearning after the last stage.
         steps: Steps of the evaluation points; the last one ends a stage.
         answers: Questions asked and answered rightly by stage and kind, at the end of the stage.
         groups: Numbers of retained tasks, targets and held-out tasks; by default one is held out.
@@ -278,6 +284,7 @@ def _make_record(
         ),
         costs=Costs(optimiser_steps=stages * steps[-1], parameters=1000, parameters_added=0, bytes_kept=0),
         fingerprint={"rollouts": {"toy:world": "0123"}},
+        relearning=relearning,
     )
     for row in rows:
         record.add_episode(EpisodeRow(*row))
@@ -288,7 +295,7 @@ def _make_record(
             if step <= end:
                 met = step == end < steps[-1]
                 record.add_check(CheckRow(stage, step, validation_episodes if met else 2, 9 if met else 0))
-    for values in _policy_rows(sparsity, drift, (stages, len(steps)), steps):
+    for values in _policy_rows(sparsity, drift, shift, (stages, len(steps)), steps, at_end):
         record.add_policy(PolicyRow(*values))
     return record
 
@@ -315,16 +322,23 @@ def _each(values: Any, axes: int, episodes: int) -> list[tuple[tuple[int, ...], 
 
 
 def _policy_rows(
-    sparsity: Any, drift: Any, shape: tuple[int, int], steps: tuple[int, ...]
+    sparsity: Any,
+    drift: Any,
+    shift: Any,
+    shape: tuple[int, int],
+    steps: tuple[int, ...],
+    at_end: tuple[int, ...],
 ) -> list[tuple[Any, ...]]:
     """Return the rows of the policy table, including the pretrained policy's; none without values."""
-    if sparsity is None and drift is None:
+    if sparsity is None and drift is None and shift is None:
         return []
-    tables = [
-        np.full(shape, np.nan if values is None else values, dtype=float) for values in (sparsity, drift)
-    ]
-    rows: list[tuple[Any, ...]] = [(0, 0, 1.0, 0.0)]
+    tables = np.full((3, *shape), np.nan)
+    for table, values in zip(tables, (sparsity, drift), strict=False):
+        table[:] = np.nan if values is None else values
+    tables[2, :, -1] = np.nan if shift is None else shift
+    rows: list[tuple[Any, ...]] = [(0, 0, 1.0, 0.0, None)]
     for target, point in np.ndindex(shape):
-        both = (float(table[target, point]) for table in tables)
-        rows.append((target + 1, steps[point], *(None if np.isnan(value) else value for value in both)))
+        step = at_end[target + 1] if point == shape[1] - 1 else steps[point]
+        values = (None if np.isnan(value) else float(value) for value in tables[:, target, point])
+        rows.append((target + 1, step, *values))
     return rows

@@ -1,4 +1,4 @@
-"""Checks of a stage's criterion: whether the policy has learned the target."""
+"""Checks of a stage's criterion: whether the policy has learned a task."""
 
 from __future__ import annotations
 
@@ -7,10 +7,11 @@ from clbench.policy.policy import Policy
 from clbench.records.record import CheckRow
 from clbench.spec.protocol import Point, Protocol
 from clbench.spec.scenario import Scenario
+from clbench.spec.task import Task
 
 
 class Checker:
-    """Checks during the stages of a run whether their targets are learned, on validation episodes.
+    """Checks during the stages of a run whether their tasks are learned, on validation episodes.
 
     Args:
         scenario: Scenario with the targets that are learned.
@@ -19,7 +20,7 @@ class Checker:
     """
 
     def __init__(self, scenario: Scenario, protocol: Protocol, seed: int) -> None:
-        self._scenario, self._protocol = scenario, protocol
+        self._protocol = protocol
         self._steps = frozenset(scenario.budget.check_steps)
         # most checks fail, and a failed one ends with this many failures: 3 with a goal of 18 out of 20
         failures = 1 if protocol.criterion is None else protocol.validation_episodes - protocol.goal + 1
@@ -33,10 +34,9 @@ class Checker:
         """Return whether the criterion is checked at `point`."""
         return point.step in self._steps
 
-    def check(self, policy: Policy, point: Point) -> CheckRow:
-        """Play the target's validation episodes until it is certain whether `policy` meets the criterion."""
-        protocol, task = self._protocol, self._scenario.target[point.stage - 1]
-        count, goal = protocol.validation_episodes, protocol.goal
+    def check(self, policy: Policy, task: Task, point: Point) -> CheckRow:
+        """Play a task's validation episodes until it is certain whether `policy` meets the criterion."""
+        count, goal = self._protocol.validation_episodes, self._protocol.goal
         successes = failures = 0
 
         def certain(episode: Episode) -> bool:

@@ -2,22 +2,29 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from functools import cached_property
 
 import torch
+from torch import Tensor
 
 from clbench.base.progress import ProgressCallback, no_progress
+from clbench.base.seeding import torch_generator
 from clbench.data.questions import scored_questions
 from clbench.data.training_data import TrainingData
 from clbench.evaluation.answers import answer
-from clbench.evaluation.probes import activations, update_sparsity
+from clbench.evaluation.probes import activations, shift, update_sparsity, velocities
 from clbench.evaluation.rollouts import Episode, Evaluator, Trial
 from clbench.policy.activations import Gaussian
-from clbench.policy.batch import QuestionBatch
+from clbench.policy.batch import Batch, QuestionBatch
 from clbench.policy.policy import Policy
 from clbench.records.record import AnswerRow, EpisodeRow, PolicyRow, Record
 from clbench.spec.protocol import EPISODE_WEIGHT, Point, Protocol
 from clbench.spec.scenario import Scenario
+
+SHIFT_SAMPLES = 256
+"""Samples of a target's demonstrations on which the shift of a policy is measured."""
 
 
 class Examiner:
@@ -26,7 +33,7 @@ class Examiner:
     Args:
         scenario: Scenario with the targets that are learned.
         protocol: Evaluation protocol of the run.
-        data: Questions of the scenario.
+        data: Demonstrations and questions of the scenario.
         pretrained: The pretrained policy, with which later policies are compared.
         seed: Seed of the run: it chooses the initial states.
         progress: Called with the length of the work done since its last call, in optimiser steps.
@@ -42,7 +49,7 @@ class Examiner:
         progress: ProgressCallback = no_progress,
     ) -> None:
         self._scenario, self._protocol, self._data = scenario, protocol, data
-        self._pretrained, self._progress = pretrained, progress
+        self._pretrained, self._seed, self._progress = pretrained, seed, progress
         self._evaluator = Evaluator(scenario, seed)
 
     @cached_property
@@ -57,23 +64,63 @@ class Examiner:
         """Hidden states of the pretrained policy on the scored questions."""
         return self._activations(self._pretrained)
 
-    def examine(self, policy: Policy, point: Point, record: Record) -> None:
-        """Evaluate `policy` at `point`, and append the rows to the tables of `record`."""
-        trials: list[Trial] = [
-            (self._scenario.task(key.task), key.split, key.number) for key in self._protocol.episodes(point)
-        ]
-        policy.eval()
-        episodes = self._evaluator.play(policy, trials, lambda count: self._progress(EPISODE_WEIGHT * count))
-        policy.train()
+    def examine(
+        self, policy: Policy, point: Point, record: Record, velocities_before: Tensor | None = None
+    ) -> None:
+        """Evaluate `policy` at `point`, and append the rows to the tables of `record`.
+
+        Args:
+            policy: Policy to evaluate.
+            point: Point of the run.
+            record: Record of the run.
+            velocities_before: `velocities` before the stage, at the end of which the shift is measured; None
+                elsewhere.
+        """
+        keys = self._protocol.episodes(point)
+        episodes = self._play(policy, [(self._scenario.task(key.task), *key[1:]) for key in keys])
         for episode in episodes:
             record.add_episode(episode_row(point, episode))
         for kind, asked, correct in answer(policy, self._data.questions.kinds, *self._asked):
             record.add_answers(AnswerRow(*point, kind, asked, correct))
         drift = float(self._activations(policy).distance(self._anchor).mean())
-        record.add_policy(PolicyRow(*point, update_sparsity(policy, self._pretrained), drift))
+        moved = None if velocities_before is None else self._shift(policy, point.stage, velocities_before)
+        record.add_policy(PolicyRow(*point, update_sparsity(policy, self._pretrained), drift, moved))
+
+    def velocities(self, policy: Policy, stage: int) -> Tensor:
+        """Return the velocities (B, H, A) that `policy` predicts on a fixed batch of a stage's target."""
+        return velocities(policy, self._batch(stage))
+
+    def successes(self, policy: Policy) -> dict[str, int]:
+        """Return the successes of `policy` in the validation episodes of each retained skill, in order."""
+        skills, numbers = self._scenario.retained, range(self._protocol.validation_episodes)
+        trials: list[Trial] = [(skill, "validation", number) for skill in skills for number in numbers]
+        found = dict.fromkeys((skill.name for skill in skills), 0)
+        for episode in self._play(policy, trials):
+            found[episode.task] += episode.success
+        return found
+
+    def _play(self, policy: Policy, trials: Sequence[Trial]) -> list[Episode]:
+        policy.eval()
+        episodes = self._evaluator.play(policy, trials, lambda count: self._progress(EPISODE_WEIGHT * count))
+        policy.train()
+        return episodes
 
     def _activations(self, policy: Policy) -> Gaussian:
-        return activations(policy, self._asked[1].to(self._pretrained.state_mean.device))
+        return activations(policy, self._asked[1].to(self._device))
+
+    def _shift(self, policy: Policy, stage: int, before: Tensor) -> float | None:
+        """Return the shift since `before`, None for a diverged policy, whose velocities are not finite."""
+        moved = shift(before, self.velocities(policy, stage), self._batch(stage).valid)
+        return moved if math.isfinite(moved) else None
+
+    def _batch(self, stage: int) -> Batch:
+        """Return the batch of a stage's target on which the shift is measured: the same at each call."""
+        data = self._data.demonstrations(self._scenario.target[stage - 1])
+        return data.sample(SHIFT_SAMPLES, torch_generator("shift", self._seed, stage)).to(self._device)
+
+    @property
+    def _device(self) -> torch.device:
+        return self._pretrained.state_mean.device
 
     def close(self) -> None:
         """Close all worlds."""

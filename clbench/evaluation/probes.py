@@ -1,11 +1,13 @@
-"""Probes: measure how far a policy has moved from the pretrained policy."""
+"""Probes: measure how far a policy has moved, from the pretrained policy or in one stage."""
 
 from __future__ import annotations
 
 import torch
+from torch import Tensor
 
 from clbench.policy.activations import Gaussian
-from clbench.policy.batch import QuestionBatch
+from clbench.policy.batch import Batch, QuestionBatch
+from clbench.policy.flow import mean_over_valid
 from clbench.policy.policy import Policy
 
 SPARSITY_THRESHOLD = 1e-3
@@ -33,3 +35,20 @@ def update_sparsity(policy: Policy, pretrained: Policy) -> float | None:
         for name, value in before.items()
     ]
     return sum(int(part.sum()) for part in unchanged) / sum(part.numel() for part in unchanged)
+
+
+@torch.no_grad()
+def velocities(policy: Policy, batch: Batch) -> Tensor:
+    """Return the velocities (B, H, A) that `policy` predicts on `batch`, given on the policy's device."""
+    policy.eval()
+    predicted = policy.predict(batch)
+    policy.train()
+    return predicted
+
+
+def shift(before: Tensor, after: Tensor, valid: Tensor) -> float:
+    """Return the mean squared change from velocities `before` to `after`, both (B, H, A).
+
+    It averages as the loss does: over the action dimensions and the valid steps (B, H), then over samples.
+    """
+    return float(mean_over_valid((after - before).square(), valid).mean())

@@ -143,7 +143,7 @@ class Plan:
         steps = scenario.budget.pretraining_steps + vision_steps(scenario)
         needs = (
             self._question_job(name, scenario),
-            *self.add_demonstrations(name, scenario, scenario.retained),
+            *self.add_demonstrations(name, scenario, scenario.pretrained),
         )
         title = _title(name, f"pretraining seed {seed}")
         return Job(title, work.pretrain, {"scenario": name, "seed": seed}, steps, needs)

@@ -45,12 +45,12 @@ AFTER_PRETRAINING = (
 
 def pretraining_inputs(scenario: Scenario, seed: int) -> dict[str, Any]:
     """Return everything that a pretrained policy depends on."""
-    tasks = scenario.retained + scenario.scenes
+    tasks = scenario.pretrained + scenario.scenes
     suites = {*packages_of(tasks, "world", "expert", "camera"), package_of(scenario.questions)}
     budget = dataclasses.asdict(scenario.budget)
     installed = {**simulator_versions(tasks), **versions(("torch", "tokenizers"))}
     return {
-        "retained": [dataclasses.asdict(task) for task in scenario.retained],
+        "retained": [dataclasses.asdict(task) for task in scenario.pretrained],
         "scenes": [dataclasses.asdict(task) for task in scenario.scenes],
         "budget": {name: value for name, value in budget.items() if name not in AFTER_PRETRAINING},
         "seed": seed,
@@ -87,9 +87,9 @@ def _folder(scenario: Scenario, seed: int, inputs: Mapping[str, Any]) -> Path:
 def pretrained_policy(
     scenario: Scenario, seed: int, progress: ProgressCallback = no_progress
 ) -> tuple[Policy, Path]:
-    """Return the policy pretrained on the retained tasks and the questions, and its folder.
+    """Return the policy pretrained on the retained tasks, the background and the questions, and its folder.
 
-    A scenario without retained tasks pretrains on the questions alone: the states of the questions set the
+    A scenario without such tasks pretrains on the questions alone: the states of the questions set the
     normalisation of states, actions are not normalised, and the action head keeps its initial weights.
 
     The policy is trained on first use, and all methods share it.
@@ -134,7 +134,7 @@ def _pretrain(scenario: Scenario, seed: int, progress: ProgressCallback) -> Poli
     config, budget = policy_config(scenario), scenario.budget
     questions, _ = load_questions(scenario)
     policy = Policy(config, seed=derive_seed("weights", seed))
-    parts = [load_demonstrations(task, scenario, config) for task in scenario.retained]
+    parts = [load_demonstrations(task, scenario, config) for task in scenario.pretrained]
     demonstrations = Demonstrations.cat(parts) if parts else None
     if demonstrations is not None:
         policy.normalise_like(demonstrations.state, demonstrations.action[:, 0])

@@ -73,10 +73,15 @@ def _load(hint: Any, value: Any, where: str) -> Any:
 
 def _load_union(members: tuple[Any, ...], value: Any, where: str) -> Any:
     for member in members:
-        if _fits(value, get_origin(member) or member):
+        if _fits(value, _kind(member)):
             return _load(member, value, where)
-    words = " or ".join(_WORDS[get_origin(member) or member] for member in members)
+    words = " or ".join(_WORDS[_kind(member)] for member in members)
     raise InputError(f"{where} must be {words}, not {json.dumps(value)[:60]}.")
+
+
+def _kind(hint: Any) -> Any:
+    """Return the type of the JSON that stands for `hint`, a dictionary for a dataclass."""
+    return dict if dataclasses.is_dataclass(hint) else get_origin(hint) or hint
 
 
 def _check_type(value: Any, kind: Any, where: str) -> None:

@@ -2,7 +2,7 @@
 
 Schema 2 wrote "report" for the split "test" and "selection" for "validation", named four fields of the budget
 after these words, and left out `order`, `perturb` and costs where they had their usual values. Its stages had
-no criterion.
+no criterion, the shift of the policy was not measured, and nothing was relearned.
 
 Schema 1 knew no tuning runs, evaluated only the target before the end of a stage, on all test episodes and at
 equal distances, asked questions only at the ends of stages, and did not measure changes of the policy. All of
@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 from clbench.base.errors import InputError
-from clbench.records.record import CHECK_COLUMNS, POLICY_COLUMNS
+from clbench.records.record import CHECK_COLUMNS
 
 SPLITS = {"report": "test", "selection": "validation"}
 """Splits of schemas 1 and 2, with their present names."""
@@ -38,6 +38,9 @@ COSTS = (
     "environment_steps",
 )
 """All costs. Schemas 1 and 2 left out those that were not known."""
+
+POLICY = ("stage", "step", "update_sparsity", "activation_drift")
+"""Columns of the table of changes of the policy in schema 2."""
 
 _Values = dict[str, Any]
 
@@ -85,7 +88,7 @@ def _from_1(values: _Values) -> _Values:
     if diagnostics and scenario is not None and isinstance(scenario.get("target"), list):
         diagnostics = {str(len(scenario["target"])): diagnostics}  # reported once, at the end
     changed = {"run": run, "scenario": scenario, "answers": answers, "diagnostics": diagnostics}
-    return {**_with(values, changed), "policy": {name: [] for name in POLICY_COLUMNS}}
+    return {**_with(values, changed), "policy": {name: [] for name in POLICY}}
 
 
 def _equal_steps(last: Any, points: Any) -> list[int]:
@@ -100,8 +103,8 @@ def _equal_steps(last: Any, points: Any) -> list[int]:
 
 def _from_2(values: _Values) -> _Values:
     """Convert schema 2 to schema 3."""
-    run, scenario, episodes, costs = (
-        _part(values, name) for name in ("run", "scenario", "episodes", "costs")
+    run, scenario, episodes, policy, costs = (
+        _part(values, name) for name in ("run", "scenario", "episodes", "policy", "costs")
     )
     if run is not None:
         _check_usual(run)
@@ -123,9 +126,13 @@ def _from_2(values: _Values) -> _Values:
         episodes["split"] = [_split(split, "episodes: split") for split in episodes["split"]]
     if costs is not None:
         costs = {**dict.fromkeys(COSTS), **costs}
-    _refuse_later("a record", values, ("checks",), 2)
-    changed = {"run": run, "scenario": scenario, "episodes": episodes, "costs": costs}
-    return {**_with(values, changed), "checks": {name: [] for name in CHECK_COLUMNS}}
+    if policy is not None and isinstance(policy.get("stage"), list):
+        _refuse_later("policy", policy, ("shift",), 2)
+        policy["shift"] = [None] * len(policy["stage"])
+    _refuse_later("a record", values, ("checks", "relearning"), 2)
+    changed = {"run": run, "scenario": scenario, "episodes": episodes, "policy": policy, "costs": costs}
+    checks: _Values = {name: [] for name in CHECK_COLUMNS}
+    return {**_with(values, changed), "checks": checks, "relearning": None}
 
 
 _STEPS: tuple[Callable[[_Values], _Values], ...] = (_from_1, _from_2)

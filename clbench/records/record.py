@@ -23,12 +23,14 @@ point has."""
 ANSWER_COLUMNS = ("stage", "step", "kind", "asked", "correct")
 """One row for each evaluation point and kind of question; an agent that learned online is asked 0."""
 
-POLICY_COLUMNS = ("stage", "step", "update_sparsity", "activation_drift")
-"""One row for each evaluation point: how far the policy is from the pretrained one.
+POLICY_COLUMNS = ("stage", "step", "update_sparsity", "activation_drift", "shift")
+"""One row for each evaluation point: how far the policy has moved.
 
-`update_sparsity` is the share of its parameters whose relative change is below 1e-3. `activation_drift` is
-the squared 2-Wasserstein distance between its and the pretrained policy's hidden states on the questions,
-averaged over layers. Each may be None.
+`update_sparsity` is the share of its parameters whose relative change from pretraining is below 1e-3.
+`activation_drift` is the squared 2-Wasserstein distance between its and the pretrained policy's hidden states
+on the questions, averaged over layers. `shift` is the mean squared change of the predicted velocity on 256
+samples of the stage's target since the beginning of the stage, in normalised actions; only the ends of stages
+have one. Each may be None.
 """
 
 
@@ -67,12 +69,13 @@ class AnswerRow(NamedTuple):
 
 
 class PolicyRow(NamedTuple):
-    """A row of `Record.policy`: how far the policy is from the pretrained one at one point."""
+    """A row of `Record.policy`: how far the policy has moved at one point."""
 
     stage: int
     step: int
     update_sparsity: float | None
     activation_drift: float | None
+    shift: float | None
 
 
 class CheckRow(NamedTuple):
@@ -82,6 +85,20 @@ class CheckRow(NamedTuple):
     step: int
     episodes: int
     successes: int
+
+
+@dataclass
+class Relearning:
+    """How plain fine-tuning regained the retained skill most lost, after the last stage."""
+
+    skill: str
+    """Name of the skill: the one with the fewest successes, the first on a tie."""
+    successes: int
+    """Successes of the final policy in the skill's validation episodes."""
+    steps: int
+    """Optimiser steps until the criterion was met; without success the most of a stage."""
+    met: bool
+    """Whether the criterion was met."""
 
 
 @dataclass
@@ -183,6 +200,9 @@ class Record:
     """Changes of the policy, see `POLICY_COLUMNS`."""
     checks: dict[str, list[Any]] = field(default_factory=lambda: {name: [] for name in CHECK_COLUMNS})
     """Checks of the criterion, see `CHECK_COLUMNS`."""
+    relearning: Relearning | None = None
+    """Relearning of the skill most lost. None if it was not measured: without a criterion or a retained
+    skill, in a tuning run, or where plain fine-tuning failed."""
     costs: Costs = field(default_factory=Costs)
     """What the run cost."""
     diagnostics: dict[str, Any] = field(default_factory=dict)

@@ -104,8 +104,8 @@ def make_stages(run: ResolvedRun, progress: ProgressCallback = no_progress) -> P
 
         def after(step: Step) -> bool:
             progress(min(step.done, 1))
-            point = Point(number, step.done)
-            return checker.is_due(point) and checker.is_learned(checker.check(trainer.policy, point))
+            point, task = Point(number, step.done), scenario.target[number - 1]
+            return checker.is_due(point) and checker.is_learned(checker.check(trainer.policy, task, point))
 
         try:
             if number:

@@ -14,7 +14,8 @@ def run_length(scenario: Scenario, protocol: Protocol) -> float:
         protocol: Evaluation protocol of the run.
     """
     points = (point for stage in protocol.stages for point in protocol.points(stage))
-    return training_length(scenario) + sum(point_length(protocol, point) for point in points)
+    evaluation = sum(point_length(protocol, point) for point in points)
+    return training_length(scenario) + evaluation + relearning_length(protocol)
 
 
 def training_length(scenario: Scenario) -> float:
@@ -25,3 +26,20 @@ def training_length(scenario: Scenario) -> float:
 def point_length(protocol: Protocol, point: Point) -> float:
     """Return the length of the evaluation at one point."""
     return EPISODE_WEIGHT * len(protocol.episodes(point))
+
+
+def relearns(protocol: Protocol) -> bool:
+    """Return whether a run ends with relearning, see `clbench.runs.relearning`.
+
+    Tuning runs do without: nothing is chosen by it.
+    """
+    if protocol.criterion is None or protocol.split != "test":
+        return False
+    return bool(protocol.retained and protocol.target)
+
+
+def relearning_length(protocol: Protocol) -> float:
+    """Return the length of relearning, 0 if the run does without."""
+    if not relearns(protocol):
+        return 0.0
+    return protocol.steps[-1] + EPISODE_WEIGHT * len(protocol.retained) * protocol.validation_episodes

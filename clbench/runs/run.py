@@ -28,7 +28,8 @@ from clbench.records.record import Costs, Record
 from clbench.records.writer import check_diagnostics, write_record
 from clbench.runs.checkpoints import drop_stages, has_stages, keep_stage
 from clbench.runs.fingerprint import fingerprint
-from clbench.runs.length import run_length
+from clbench.runs.length import relearning_length, relearns, run_length
+from clbench.runs.relearning import relearn
 from clbench.runs.spec import ResolvedRun, RunSpec
 from clbench.runs.start import evaluate_start
 from clbench.runs.tensorboard import Log, require_tensorboard
@@ -182,6 +183,8 @@ class _Run:
             self._save(number)
         self._load(len(scenario.target))
         self._count_costs()
+        if relearns(self.run.protocol):
+            self._relearn()
 
     def _prepare(self) -> None:
         """Let the method prepare, and evaluate the policy before any target."""
@@ -199,19 +202,20 @@ class _Run:
         protocol = self.run.protocol
         *on_the_way, _ = protocol.points(number)
         points = set() if self.trainer.method.whole_stages else set(on_the_way)
+        velocities = self.examiner.velocities(self.trainer.policy, number)
         begin, evaluating, checking = time.perf_counter(), 0.0, 0.0
 
-        def evaluate(point: Point) -> None:
+        def evaluate(point: Point, before: torch.Tensor | None = None) -> None:
             nonlocal evaluating
             paused = time.perf_counter()
-            self.examiner.examine(self.trainer.policy, point, self.record)
+            self.examiner.examine(self.trainer.policy, point, self.record, before)
             self.log.report(self.record, point)
             evaluating += time.perf_counter() - paused
 
         def is_learned(point: Point) -> bool:
             nonlocal checking
             paused = time.perf_counter()
-            row = self.checker.check(self.trainer.policy, point)
+            row = self.checker.check(self.trainer.policy, self.run.scenario.target[number - 1], point)
             self.record.add_check(row)
             checking += time.perf_counter() - paused
             return self.checker.is_learned(row)
@@ -227,12 +231,19 @@ class _Run:
 
         steps = self.trainer.learn(number, after)
         self.progress(protocol.steps[-1] - steps if protocol.criterion else 0)
-        evaluate(Point(number, steps) if protocol.criterion else protocol.end(number))
+        evaluate(Point(number, steps) if protocol.criterion else protocol.end(number), velocities)
         self._diagnose(number)
         training = time.perf_counter() - begin - evaluating - checking
         self._count_steps(steps)
         seconds = {"training": training, "checks": checking, "evaluation": evaluating}
         self.record.timing["stages"].append({name: round(value, 2) for name, value in seconds.items()})
+
+    def _relearn(self) -> None:
+        """Relearn the skill most lost; the policy, the method and the costs of the run stay as they are."""
+        begin = time.perf_counter()
+        self.trainer.where = "relearning"
+        self.record.relearning = relearn(self.trainer, self.examiner, self.checker, self.progress)
+        self.record.timing["relearning"] = round(time.perf_counter() - begin, 2)
 
     def _diagnose(self, number: int) -> None:
         """Keep the method's report on stage `number`."""
@@ -299,7 +310,8 @@ class _Run:
             self.record = read_record(folder / "record.json")
             self.seconds_before = self.record.timing["seconds"]
             self.record.timing.update({"started": started, "resumed_after": number})
-            self.progress(number * run_length(self.run.scenario, self.run.protocol) / targets)
+            length = run_length(self.run.scenario, self.run.protocol) - relearning_length(self.run.protocol)
+            self.progress(number * length / targets)
             return number
         return None
 

@@ -30,7 +30,8 @@ class Log:
     `training/` has the loss and the step size every `LOG_STEPS` steps. At every evaluation point,
     `success_test/`, `success_validation/` and `success_perturbed/` have the success rate of each task,
     `question_accuracy/` has the accuracy of each kind of question and of all questions, and `policy/` has the
-    distance from the pretrained policy. `diagnostics/` has the numbers among the method's diagnostics.
+    distance from the pretrained policy, at the end of a stage also the shift in it. `diagnostics/` has the
+    numbers among the method's diagnostics.
 
     Args:
         folder: Folder of the event files; None logs nothing.
@@ -100,6 +101,7 @@ def _report(record: Record, point: Point) -> Iterator[tuple[str, float | None]]:
     for row in _rows(record.policy, point):
         yield "policy/update_sparsity", row["update_sparsity"]
         yield "policy/activation_drift", row["activation_drift"]
+        yield "policy/shift", row["shift"]
 
 
 def _rows(columns: Mapping[str, list[Any]], point: Point) -> Iterator[dict[str, Any]]:

@@ -374,6 +374,38 @@ def activation_drift(rates: Rates) -> Array:
     return _at_the_end(rates.activation_drift)
 
 
+@metric(
+    formula="mean over the stages k of the mean of (v[k] - v[k-1])^2 over the valid actions of 256 samples "
+    "of target k's demonstrations; v[k] is the velocity, in normalised actions, that the policy predicts at "
+    "the end of stage k",
+    source="the flow policy's analogue of the KL divergence on the new task, which predicts forgetting in "
+    "RL's Razor, arXiv 2509.04259",
+    high=math.inf,
+    higher_is_better=None,
+    units="squared velocity",
+    missing="It was not measured at the end of a stage.",
+)
+def shift(rates: Rates) -> Array:
+    """Change of the predicted actions on each new target's data while the target is learned."""
+    return average(rates.shift)
+
+
+@metric(
+    formula="optimiser steps of plain fine-tuning on the skill's demonstrations until the criterion is met, "
+    "from a copy of the policy at the end of stage K; the skill is the one with the fewest successes in its "
+    "validation episodes then; if it never meets the criterion, all steps of a stage",
+    source="clbench; savings in relearning, Ebbinghaus 1885",
+    high=math.inf,
+    higher_is_better=False,
+    units="optimiser steps",
+    missing="The scenario has no criterion or retains no skill, it is a tuning run, or plain fine-tuning of "
+    "the final policy failed.",
+)
+def relearning_steps(rates: Rates) -> Array:
+    """Optimiser steps to regain the retained skill most lost, after the last target."""
+    return rates.relearning_steps
+
+
 def _at_the_end(values: Array) -> Array:
     """Return the last of values (..., targets, points), NaN without targets."""
     return values[..., -1, -1] if values.shape[-2] else np.full(values.shape[:-2], np.nan)

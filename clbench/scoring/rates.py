@@ -30,10 +30,14 @@ class Measured:
     """Share of the parameters that have hardly changed since pretraining, (..., targets, points)."""
     activation_drift: Array
     """Distance of the hidden states from the pretrained policy's, (..., targets, points)."""
+    shift: Array
+    """Change of the policy on each stage's target in the stage, (..., targets)."""
     steps: Array
     """Optimiser steps of each stage, (..., targets); NaN without a criterion."""
     met: Array
     """Whether each stage met its criterion, 0 or 1, (..., targets); NaN without a criterion."""
+    relearning_steps: Array
+    """Optimiser steps to relearn the skill most lost, (...)."""
 
 
 def _arrays(cls: type[Measured]) -> tuple[str, ...]:

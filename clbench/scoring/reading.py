@@ -24,7 +24,10 @@ MOST_CELLS = 20_000
 Fetch-v0 has 240, a sequence of 40 targets among 50 tasks 8,200."""
 
 FARTHEST = 1e18
-"""A greater activation drift than any policy has whose hidden states are numbers of any use."""
+"""A greater activation drift or shift than any policy has whose outputs are numbers of any use."""
+
+_HIGHEST = {"update_sparsity": 1.0, "activation_drift": FARTHEST, "shift": FARTHEST}
+"""Greatest possible value of each change of the policy, in the order of the columns."""
 
 
 class Row(NamedTuple):
@@ -113,6 +116,29 @@ def read_checks(record: Record, protocol: Protocol) -> tuple[Array, Array]:
         ends[row.stage] = float(row.step), float(protocol.is_learned(row.successes))
     steps, learned = np.array(list(ends.values())).reshape(-1, 2).T
     return steps, learned
+
+
+def read_relearning(record: Record, protocol: Protocol) -> Array:
+    """Return the optimiser steps to relearn the skill most lost, (); NaN where it was not measured.
+
+    Raises:
+        RecordError: The skill, the successes or the steps are impossible.
+    """
+    found = record.relearning
+    if found is None:
+        return np.array(math.nan)
+    if protocol.criterion is None:
+        raise RecordError("relearning: its budget has no criterion that could have been met.")
+    if found.skill not in protocol.retained:
+        raise RecordError(f"relearning: {found.skill!r} is no retained skill.")
+    if not 0 <= found.successes <= protocol.validation_episodes:
+        raise RecordError("relearning: it has an impossible number of successes.")
+    planned = check_steps(protocol.steps[-1])
+    if found.steps not in planned:
+        raise RecordError("relearning: its steps are not those of a check.")
+    if not found.met and found.steps != planned[-1]:
+        raise RecordError("relearning: it ends before the criterion was met.")
+    return np.array(float(found.steps))
 
 
 def _check_steps(steps: Any) -> None:
@@ -259,26 +285,31 @@ def read_answers(record: Record, protocol: Protocol) -> tuple[tuple[str, ...], A
     return kinds, counts
 
 
-def read_policy(record: Record, protocol: Protocol) -> tuple[Array, Array]:
-    """Return the update sparsity and the activation drift at the points of each stage, (targets, points).
+def read_policy(record: Record, protocol: Protocol) -> tuple[Array, Array, Array]:
+    """Return the changes of the policy.
+
+    Returns:
+        The update sparsity and the activation drift at the points of each stage, both (targets, points), and
+        the shift in each stage, (targets,).
 
     Raises:
         RecordError: A value is impossible, or a point occurs twice.
     """
     rows, points = list(zip(*record.policy.values(), strict=True)), _Points(protocol)
-    values = np.full((2, len(protocol.stages), len(protocol.steps)), np.nan)
-    for number, (stage, step, *both) in enumerate(rows):
+    found = np.full((len(_HIGHEST), len(protocol.stages), len(protocol.steps)), np.nan)
+    for number, (stage, step, *values) in enumerate(rows):
         where = f"policy: row {number}"
         point = points.check(where, stage, step)
-        for value, name, high in zip(
-            both, ("update_sparsity", "activation_drift"), (1, FARTHEST), strict=True
-        ):
+        for value, (name, high) in zip(values, _HIGHEST.items(), strict=True):
             if value is not None and not _is_number(value, high):
                 raise RecordError(f"{where} has an impossible {name}.")
-        values[:, stage, place(protocol, point)] = [np.nan if value is None else value for value in both]
+        if values[-1] is not None and not (stage and protocol.is_end(point)):
+            raise RecordError(f"{where} has a shift, which only the end of a target's stage has.")
+        found[:, stage, place(protocol, point)] = [np.nan if value is None else value for value in values]
     if len({row[:2] for row in rows}) != len(rows):
         raise RecordError("policy: an evaluation point is there twice.")
-    return values[0, 1:], values[1, 1:]
+    sparsity, drift, shift = found[:, 1:]
+    return sparsity, drift, shift[:, -1]
 
 
 def _is_number(value: Any, high: float, low: float = 0) -> bool:

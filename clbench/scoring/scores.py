@@ -22,6 +22,7 @@ from clbench.scoring.reading import (
     read_perturbed,
     read_policy,
     read_protocol,
+    read_relearning,
 )
 from clbench.spec.protocol import Protocol
 
@@ -71,7 +72,7 @@ class Scores(Measured):
         success = _success(protocol, scored, layout)
         perturbed = _perturbed(read_perturbed(protocol, rows, episodes), layout)
         in_curves = [episodes.index(number) for number in layout.curve_episodes]
-        sparsity, drift = read_policy(record, protocol)
+        sparsity, drift, shift = read_policy(record, protocol)
         steps, met = read_checks(record, protocol)
         return cls(
             layout=layout,
@@ -84,8 +85,10 @@ class Scores(Measured):
             answer_curves=_shares(*counts[:, 1:]),
             update_sparsity=sparsity,
             activation_drift=drift,
+            shift=shift,
             steps=steps,
             met=met,
+            relearning_steps=read_relearning(record, protocol),
         )
 
     def rates(self, counts: Array | None = None) -> Rates:

@@ -97,5 +97,5 @@ def _scenario_at(entry_point: str) -> Scenario:
     if not isinstance(scenario, Scenario):
         raise UnknownNameError(f"{entry_point!r} is no Scenario but a {type(scenario).__name__}.")
     for task in scenario.tasks:
-        word_ids(task.instructions)
+        word_ids(task.instructions + task.test_instructions)
     return scenario

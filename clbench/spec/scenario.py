@@ -38,6 +38,9 @@ class Scenario:
     """Tasks that are never trained."""
     questions: str
     """Entry point of a tuple of `QuestionKind`, the questions about a state."""
+    background: tuple[Task, ...] = ()
+    """Tasks that the policy is pretrained on besides the skills, as a large model is on more than a benchmark
+    measures. No score counts them, and no method gets their demonstrations."""
     scenes: tuple[Task, ...] = ()
     """Tasks whose expert episodes give the states for the questions; empty for the retained tasks."""
     balanced: bool = False
@@ -49,11 +52,11 @@ class Scenario:
     """Limits of the process of a submitted run."""
 
     def __post_init__(self) -> None:
-        names = [task.name for task in self.tasks]
+        names = [task.name for task in self.tasks + self.background]
         for name in names:
             if names.count(name) > 1:
                 raise InputError(f"{self.id}: two tasks are called {name!r}.")
-        cameras = {task.camera or "none" for task in self.tasks + self.scenes}
+        cameras = {task.camera or "none" for task in self.tasks + self.background + self.scenes}
         if len(cameras) > 1:
             raise InputError(f"{self.id}: all tasks must have the same camera, not {sorted(cameras)}.")
 
@@ -61,6 +64,11 @@ class Scenario:
     def tasks(self) -> tuple[Task, ...]:
         """All tasks: retained, then target, then held out. Columns of every score table follow this order."""
         return self.retained + self.target + self.held_out
+
+    @property
+    def pretrained(self) -> tuple[Task, ...]:
+        """Tasks that the policy is pretrained on: the retained skills, then the background."""
+        return self.retained + self.background
 
     @property
     def scene_tasks(self) -> tuple[Task, ...]:
@@ -73,7 +81,8 @@ class Scenario:
         Raises:
             LookupError: A package is not installed; the message says how to get it.
         """
-        require_packages({package for task in self.tasks for package in task.packages}, self.id)
+        every = self.tasks + self.background
+        require_packages({package for task in every for package in task.packages}, self.id)
 
     def in_order(self, order: int) -> Scenario:
         """Return the scenario with its targets in an order of `target_order`; 0 is the published order.

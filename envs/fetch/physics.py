@@ -50,6 +50,13 @@ least `APART` away, it stays farther than the 5 cm that count as success."""
 SETTLE = 10
 """Steps until the displaced gripper is at rest, as many as FetchPickAndPlace-v4 takes for its own start."""
 
+BLOCK_CORNER, TARGET_CORNER = (1.12, 1.03), (1.12, 0.47)
+"""Corners of the table, in metres, where things lie that a task does not need: out of the gripper's way."""
+HELD = 0.0249
+"""Position of each finger in metres around the block, which is 0.05 wide."""
+GRASP = 3
+"""Steps until the fingers hold the block."""
+
 REACH = 0.05
 """Distance in metres along an axis by which an action of 1 moves the goal of the hand."""
 HAND_TURN = np.array([1.0, 0.0, 1.0, 0.0])
@@ -139,10 +146,15 @@ class FetchVectorWorld:
             perturbation = draw_perturbation(seed) if self._perturbed else None
             lane = self._lane_of(number, scene_with_mass(perturbation.mass) if perturbation else self._scene)
             generator, _ = np_random(seed)
-            block = self._place_block(generator)
             lane.rule = self._rules[task]
+            block = self._place_block(generator)
             lane.target[:] = self._place_target(block, lane.rule, generator)
-            self._reset_physics(lane, block)
+            layout = lane.rule.layout
+            if layout.target_aside:
+                lane.target[:] = (*TARGET_CORNER, self._scene.rest_height)
+            self._reset_physics(lane, np.array(BLOCK_CORNER) if layout.block_aside else block)
+            if layout.block_held:
+                self._hold(lane)
             if perturbation:
                 self._displace(lane, perturbation.start)
         begun = [self._lane(number) for number in lanes]
@@ -223,6 +235,17 @@ class FetchVectorWorld:
         data.qpos[scene.block_qpos : scene.block_qpos + 2] = block
         mujoco.mj_forward(scene.model, data)
         self._measure(lane)
+
+    def _hold(self, lane: _Lane) -> None:
+        """Put the block between the fingers, and close them on it."""
+        scene, data = lane.scene, lane.data
+        data.qpos[scene.block_qpos : scene.block_qpos + 3] = scene.gripper
+        data.qpos[scene.fingers_qpos] = HELD
+        mujoco.mj_forward(scene.model, data)
+        self._measure(lane)
+        for _ in range(GRASP):
+            self._act([lane], np.array([[0.0, 0.0, 0.0, -1.0]], np.float32))
+            self._advance(lane)
 
     def _displace(self, lane: _Lane, start: tuple[float, float, float]) -> None:
         """Move the gripper by a share `start` (3,) of `START` along each axis, until it is at rest."""

@@ -38,6 +38,18 @@ Distance: TypeAlias = Callable[[Numbers, Numbers], float]
 
 
 @dataclass(frozen=True)
+class Layout:
+    """Where things are at the start of an episode, if not in front of the gripper."""
+
+    block_aside: bool = False
+    """Whether the block lies in a corner of the table."""
+    target_aside: bool = False
+    """Whether the target is in another corner."""
+    block_held: bool = False
+    """Whether the gripper holds the block, at the height where it starts."""
+
+
+@dataclass(frozen=True)
 class Rule:
     """The definition of one task. The functions take a state and the state at the start."""
 
@@ -47,6 +59,8 @@ class Rule:
     """Returns the distance in metres that the gripper and the block still have to move."""
     target_on_table: bool = False
     """Whether the target is always on the table; otherwise it is in half of the episodes."""
+    layout: Layout = Layout()
+    """Where things are at the start."""
 
     def judge(self, state: Numbers, start: Numbers) -> tuple[float, bool]:
         """Return the reward and whether the task is done.

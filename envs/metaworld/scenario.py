@@ -156,10 +156,17 @@ SCENARIO = Scenario(
 TO_CRITERION = dataclasses.replace(
     SCENARIO,
     id="clbench/MetaWorld-v1",
+    description="Meta-World's arm learns to close and press objects, after six other skills.",
+    retained=SCENARIO.retained[:6],
+    background=SCENARIO.retained[6:],
     balanced=True,
     budget=dataclasses.replace(SCENARIO.budget, criterion=0.9, adaptation_steps=1000, validation_episodes=20),
 )
-"""The same tasks with stages that end when the target is learned, in an order of its own for each seed."""
+"""The same targets with stages that end when the target is learned, in an order of its own for each seed.
+
+It scores six of the eight skills. With all, a policy that never changes has a final average of .67, and tuned
+plain fine-tuning .66 and .71 on two seeds: there would be no room between them.
+"""
 
 _CW10 = (
     _task(

@@ -53,7 +53,17 @@ from ..views.format import write_if_changed
 SHOWN = 3
 """Number of differences that a check reports in full."""
 
-PARTS = ("run", "scenario", "episodes", "answers", "policy", "checks", "costs", "diagnostics")
+PARTS = (
+    "run",
+    "scenario",
+    "episodes",
+    "answers",
+    "policy",
+    "checks",
+    "relearning",
+    "costs",
+    "diagnostics",
+)
 """Parts that two records of one run share to the last bit."""
 
 
@@ -306,11 +316,12 @@ def _replay_checks(subject: _Subject, policies: Sequence[Policy]) -> list[Check]
     if subject.resolved.method.whole_stages:
         return []  # the policy changed after the last check
     last = {row.stage: row for row in subject.run.record.check_rows()}
+    targets = subject.scenario.target
     with closing(Checker(subject.scenario, subject.protocol, subject.spec.seed)) as checker:
         wrong = [
             f"stage {stage}"
             for stage, row in last.items()
-            if checker.check(policies[stage], subject.protocol.end(stage)) != row
+            if checker.check(policies[stage], targets[stage - 1], subject.protocol.end(stage)) != row
         ]
     if wrong:
         return [Check("ends of stages", f"another outcome of the last check: {_some(wrong)}", False)]

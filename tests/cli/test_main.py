@@ -233,11 +233,12 @@ def test_a_stranger_runs_a_class_from_the_working_directory_and_sees_it_on_the_b
 
 @pytest.mark.slow
 def test_tune_compares_settings_without_test_episodes(tmp_path: Path) -> None:
-    arguments = ("tune", TOY, "low_rate_sft", "--values.speed", "0.2,1", "--seed", "3")
+    arguments = ("tune", TOY, "low_rate_sft", "--values.speed", "0.2,1", "--first-seed", "3", "--seeds", "1")
     result = _clbench(*arguments, folder=tmp_path)
     assert result.returncode == 0, result.stderr
     rows = [line.split() for line in result.stdout.splitlines() if "low_rate_sft" in line or " sft" in line]
-    assert [row[1] for row in rows] == ["sft", "low_rate_sft+speed=0.2", "low_rate_sft+speed=1.0"]
+    settings = [row[:3:2] for row in rows]
+    assert settings == [["sft", "defaults"], ["low_rate_sft", "speed=0.2"], ["low_rate_sft", "speed=1.0"]]
     assert rows[0][3:] == rows[2][3:]  # at full speed it is plain fine-tuning
     paths = list((tmp_path / "leaderboard" / "tuning").rglob("seed-3.json"))
     assert len(paths) == 3

@@ -24,6 +24,7 @@ class Whole:
     kind: Literal["large", "small"]
     count: int | None
     part: Part
+    other: Part | None
     free: Any
     parts: list[Part]
 
@@ -32,15 +33,17 @@ GOOD: dict[str, Any] = {
     "kind": "large",
     "count": 3,
     "part": {"size": 1, "names": ["a"]},
+    "other": {"size": 2, "names": []},
     "free": [{}],
     "parts": [{"size": 0.5, "names": []}],
 }
 
 
 def test_nested_dataclasses_lists_and_unions_are_loaded() -> None:
-    expected = Whole("large", 3, Part(1, ["a"]), [{}], [Part(0.5, [])])
+    expected = Whole("large", 3, Part(1, ["a"]), Part(2, []), [{}], [Part(0.5, [])])
     assert load_fields(Whole, GOOD, "a whole") == expected
     assert load_fields(Whole, {**GOOD, "count": None}, "a whole").count is None
+    assert load_fields(Whole, {**GOOD, "other": None}, "a whole").other is None
 
 
 @pytest.mark.parametrize(
@@ -52,6 +55,8 @@ def test_nested_dataclasses_lists_and_unions_are_loaded() -> None:
         ({"count": 3.0}, "count must be a whole number or null, not 3.0."),
         ({"part": []}, r"part must be an object with named entries, not \[\]."),
         ({"part": {"size": 1}}, "part: names is missing."),
+        ({"other": []}, r"other must be an object with named entries or null, not \[\]."),
+        ({"other": {"size": 1}}, "other: names is missing."),
         ({"part": {}}, "part: size, names are missing."),
         ({"part": {"size": True, "names": []}}, "part: size must be a number, not true."),
         ({"part": {"size": 1, "names": "a"}}, 'part: names must be a list, not "a".'),

@@ -77,6 +77,12 @@ def test_fields_that_schema_2_lacks_have_their_usual_values() -> None:
     assert read_record(HISTORIC / "schema-2" / "MetaWorld-v0-sft-order-1.json").run.order == 1
 
 
+def test_quantities_that_schema_2_did_not_measure_are_missing() -> None:
+    tuning = read_record(HISTORIC / "schema-2" / "Fetch-v0-weight_interpolation-tuning.json")
+    assert tuning.policy["shift"] == [None] * len(tuning.policy["stage"]) != []
+    assert tuning.relearning is None
+
+
 def test_fields_that_follow_from_the_budget_of_schema_1_are_filled_in() -> None:
     record = read_record(HISTORIC / "schema-1" / "Fetch-v0-sft-seed-0.json")
     assert record.run.split == "test"
@@ -112,6 +118,8 @@ def put(values: dict[str, Any], place: str, value: Any) -> None:
         (2, "episodes.split", ["validation"], "episodes: split: schema 2 has no validation"),
         (2, "episodes.stage", [0], "the columns of episodes have different lengths"),
         (2, "costs.parametres", 1, "No field of costs is called 'parametres'"),
+        (2, "relearning", None, "a record: schema 2 has no relearning"),
+        (2, "policy.shift", [], "policy: schema 2 has no shift"),
         (2, "content", "0123", "a record of schema 2 has no content"),
         (2, "scenario", [], "scenario must be an object"),
         (2, "episodes", None, "episodes must be an object"),

@@ -10,8 +10,10 @@ import pytest
 from helpers import sealed
 
 from clbench.records.reader import RecordError, read_record
-from clbench.records.record import Record
+from clbench.records.record import Record, Relearning
 from clbench.records.writer import write_record
+
+RELEARNING: dict[str, Any] = {"skill": "left", "successes": 3, "steps": 14, "met": True}
 
 
 @pytest.fixture
@@ -86,6 +88,10 @@ def test_a_path_that_is_no_file_is_refused(tmp_path: Path) -> None:
             "scenario: retained, target, held_out, evaluation_steps, budget, balanced are missing",
         ),
         ({"costs": {}}, "costs: optimiser_steps, parameters, preparation_steps, parameters_added, "),
+        ({"relearning": "left"}, "relearning must be an object with named entries or null"),
+        ({"relearning": {**RELEARNING, "steps": 3.0}}, "relearning: steps must be a whole number, not 3.0"),
+        ({"relearning": {**RELEARNING, "met": 1}}, "relearning: met must be true or false, not 1"),
+        ({"relearning": {"skill": "left"}}, "relearning: successes, steps, met are missing"),
         ({"status": "failed", "error": {"where": "loss"}}, "error must have the entries where, type, mess"),
         (
             {"status": "failed", "error": dict.fromkeys(("where", "type", "message", "traceback"), 1)},
@@ -100,6 +106,13 @@ def test_a_field_that_does_not_fit_the_schema_is_refused_by_name(
     change(tmp_path / "record.json", **fields)
     with pytest.raises(RecordError, match=words):
         read_record(tmp_path / "record.json")
+
+
+def test_relearning_is_read_as_it_was_written(make_record: Callable[..., Record], tmp_path: Path) -> None:
+    found = Relearning(**RELEARNING)
+    record = make_record([[1.0, 0.0, 0.0], [0.5, 1.0, 0.0]], relearning=found)
+    write_record(record, tmp_path / "record.json")
+    assert read_record(tmp_path / "record.json").relearning == found
 
 
 @pytest.mark.parametrize(

@@ -79,13 +79,15 @@ def test_checks_play_validation_episodes_until_their_outcome_is_certain(
     evaluator.close()
 
 
+@pytest.mark.parametrize(("share", "stage"), [(0.6, 1), (0.8, 2)])
 def test_an_interrupted_run_continues_to_the_same_record(
-    record: Record, execute_and_kill: Callable[..., None], tmp_path: Path
+    share: float, stage: int, record: Record, execute_and_kill: Callable[..., None], tmp_path: Path
 ) -> None:
     spec = RunSpec(EAGER.id, "sft", seed=0)
-    execute_and_kill(spec, tmp_path, 0.6)
+    execute_and_kill(spec, tmp_path, share)
     again = execute(spec, tmp_path)
-    for part in ("episodes", "answers", "policy", "checks", "costs", "run", "scenario"):
+    assert again.timing["resumed_after"] == stage  # the second time it was relearning
+    for part in verification.PARTS:
         assert getattr(again, part) == getattr(record, part)
 
 

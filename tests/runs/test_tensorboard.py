@@ -71,6 +71,9 @@ def test_a_log_shows_the_contents_of_the_record(logged: tuple[Any, Path]) -> Non
     assert [value for _, value in points["policy/activation_drift"]] == pytest.approx(
         record.policy["activation_drift"]
     )
+    shifts = [value for value in record.policy["shift"] if value is not None]
+    assert [value for _, value in points["policy/shift"]] == pytest.approx(shifts)
+    assert len(shifts) == 2
     shed = {
         60 * int(stage): found["energy_shed_mean"] for stage, found in record.diagnostics.items() if found
     }

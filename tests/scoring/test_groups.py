@@ -63,6 +63,8 @@ def run(final: Any) -> Scores:
         activation_drift=missing,
         steps=missing[0],
         met=missing[0],
+        shift=missing[0],
+        relearning_steps=missing[0, 0],
     )
 
 

@@ -57,6 +57,8 @@ def whole_run(shape: Layout, success: Any, **arrays: Any) -> Scores:
         "correct": counts / 2,
         "steps": np.full(targets, np.nan),
         "met": np.full(targets, np.nan),
+        "shift": np.full(targets, np.nan),
+        "relearning_steps": np.array(np.nan),
         **missing,
         **arrays,
     }
@@ -82,6 +84,8 @@ def random_run(generator: np.random.Generator, shape: Layout) -> Scores:
         activation_drift=generator.random((targets, points)),
         steps=generator.integers(1, 100, targets).astype(float),
         met=np.ones(targets),
+        shift=generator.random(targets),
+        relearning_steps=np.array(float(generator.integers(1, 100))),
     )
 
 

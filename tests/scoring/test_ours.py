@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 from scipy.integrate import trapezoid
 
+from clbench.records.reader import RecordError
+from clbench.records.record import Relearning
 from clbench.scoring.metrics import METRICS, measure
 from clbench.scoring.ours import matched_points
 from clbench.scoring.scores import Scores, rates_of
@@ -47,7 +49,7 @@ def test_a_metric_has_the_value_worked_out_by_hand(name: str, scores: Callable[.
 def test_every_metric_of_the_leaderboard_is_worked_out_by_hand() -> None:
     others = {"forward_transfer", "question_retention", "retention_at_matched_adaptation"}
     others |= {"perturbed_retention", "update_sparsity", "activation_drift"}
-    others |= {"gain", "steps_to_criterion", "speed"}
+    others |= {"gain", "steps_to_criterion", "speed", "shift", "relearning_steps"}
     found = {name for name, metric in METRICS.items() if metric.function.__module__ == MODULE}
     assert {*BY_HAND, *others} == found
 
@@ -79,6 +81,39 @@ def test_without_a_criterion_there_are_no_steps_to_it(scores: Callable[..., Scor
     run = scores(MATRIX)
     assert measure("steps_to_criterion", run) is None
     assert measure("speed", run, {"from_scratch": run}) is None
+
+
+def test_the_shift_is_the_mean_over_the_stages(scores: Callable[..., Scores]) -> None:
+    assert measure("shift", scores(MATRIX, shift=[0.5, 1.5])) == (0.5 + 1.5) / 2
+    assert measure("shift", scores(MATRIX, steps=(100,), ends=(8, 12), shift=[2.0, 3.0])) == 2.5
+    assert measure("shift", scores(MATRIX, shift=[0.5, np.nan])) is None
+    assert measure("shift", scores(MATRIX)) is None
+
+
+def test_relearning_that_fails_counts_with_all_the_steps_of_a_stage(scores: Callable[..., Scores]) -> None:
+    regained, lost = Relearning("skill_0", 3, 14, True), Relearning("skill_1", 0, 100, False)
+    for relearning, steps in ((regained, 14), (lost, 100), (None, None)):
+        run = scores(MATRIX, steps=(100,), ends=(8, 12), relearning=relearning)
+        assert measure("relearning_steps", run) == steps
+
+
+@pytest.mark.parametrize(
+    ("relearning", "ends", "words"),
+    [
+        (Relearning("target_0", 3, 14, True), (8, 12), "'target_0' is no retained skill"),
+        (Relearning("skill_0", 11, 14, True), (8, 12), "an impossible number of successes"),
+        (Relearning("skill_0", -1, 14, True), (8, 12), "an impossible number of successes"),
+        (Relearning("skill_0", 3, 15, True), (8, 12), "are not those of a check"),
+        (Relearning("skill_0", 3, 200, False), (8, 12), "are not those of a check"),
+        (Relearning("skill_0", 3, 14, False), (8, 12), "it ends before the criterion was met"),
+        (Relearning("skill_0", 3, 14, True), None, "its budget has no criterion"),
+    ],
+)
+def test_relearning_that_contradicts_the_protocol_is_refused(
+    relearning: Relearning, ends: tuple[int, int] | None, words: str, scores: Callable[..., Scores]
+) -> None:
+    with pytest.raises(RecordError, match=words):
+        scores(MATRIX, steps=(100,), ends=ends, relearning=relearning)
 
 
 def test_an_earlier_target_counts_as_kept_from_the_stage_after_its_own(scores: Callable[..., Scores]) -> None:

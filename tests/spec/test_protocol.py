@@ -1,8 +1,12 @@
 """The evaluation protocol: its points and episodes, against a count by hand."""
 
 import dataclasses
+from itertools import pairwise
 
-from clbench.spec.protocol import EpisodeKey, Point, Protocol
+import pytest
+
+from clbench.spec.budget import Budget
+from clbench.spec.protocol import EpisodeKey, Point, Protocol, check_steps
 
 PROTOCOL = Protocol(
     retained=("a", "b"),
@@ -58,3 +62,49 @@ def test_no_episode_is_played_twice_at_a_point() -> None:
         for point in perturbed.points(stage):
             keys = perturbed.episodes(point)
             assert len(set(keys)) == len(keys)
+
+
+# ---- stages with a criterion -------------------------------------------------------------------------------
+
+TO_CRITERION = dataclasses.replace(PROTOCOL, steps=(100,), criterion=0.9, validation_episodes=20)
+
+
+def test_checks_are_close_at_first_and_about_an_eighth_apart_later() -> None:
+    steps = check_steps(1000)
+    assert steps[:12] == (0, 2, 4, 6, 8, 10, 12, 14, 16, 18, 20, 22)
+    assert steps[-1] == 1000
+    assert all(0 < later - step <= max(2, 0.12 * step + 0.5) for step, later in pairwise(steps))
+    assert check_steps(5) == (0, 2, 4, 5)
+
+
+def test_the_criterion_is_a_share_of_the_validation_episodes() -> None:
+    assert TO_CRITERION.goal == 18
+    assert [TO_CRITERION.is_learned(successes) for successes in (17, 18, 20)] == [False, True, True]
+    assert not PROTOCOL.is_learned(2)
+    assert dataclasses.replace(TO_CRITERION, criterion=0.7, validation_episodes=10).goal == 7
+
+
+def test_with_a_criterion_every_evaluated_point_of_a_stage_is_its_end() -> None:
+    assert TO_CRITERION.is_end(Point(2, 14))  # before the run every step may be the end
+    finished = dataclasses.replace(TO_CRITERION, ends=(14, 100))
+    assert finished.points(1) == (Point(1, 14),)
+    assert [finished.is_end(point) for point in (Point(1, 14), Point(1, 100), Point(2, 100))] == [
+        True,
+        False,
+        True,
+    ]
+    assert {key.split for key in finished.episodes(Point(1, 14))} == {"test"}
+    assert len(finished.episodes(Point(1, 14))) == 5 * 3
+
+
+@pytest.mark.parametrize("criterion", [0, -0.5, 1.1])
+def test_a_criterion_that_is_no_success_rate_is_refused(criterion: float) -> None:
+    with pytest.raises(ValueError, match="criterion must be a success rate"):
+        Budget(criterion=criterion)
+
+
+def test_a_budget_with_a_criterion_has_its_checks_and_one_evaluation_point() -> None:
+    budget = Budget(criterion=0.9, adaptation_steps=50)
+    assert budget.check_steps == check_steps(50)
+    assert budget.evaluation_steps == (50,)
+    assert Budget().check_steps == ()

@@ -1,0 +1,170 @@
+"""The scenario clbench/Fetch-v1: targets of graded conflict with the skills to keep."""
+
+from __future__ import annotations
+
+from clbench.spec.budget import Budget
+from clbench.spec.scenario import Scenario
+from clbench.spec.task import Task
+
+
+def _task(name: str, instructions: tuple[str, ...], test_instructions: tuple[str, ...]) -> Task:
+    return Task(
+        name=name,
+        suite="fetch_tidy",
+        instructions=instructions,
+        test_instructions=test_instructions,
+        horizon=40,
+        world="clbench.envs.fetch_tidy.world:TidyFetchWorld",
+        expert="clbench.envs.fetch.experts:expert",
+        packages=("gymnasium-robotics",),
+    )
+
+
+_REACH = _task(
+    "reach",
+    (
+        "move the gripper to the target",
+        "reach the target with the closed gripper",
+        "bring the closed gripper to the target",
+        "go to the target with closed fingers",
+        "touch the target with the fingers",
+        "approach the target until the gripper is there",
+    ),
+    ("guide the closed gripper to the target", "reach for the target"),
+)
+_HOVER = _task(
+    "hover",
+    (
+        "hold the open gripper above the block",
+        "hover over the block with open fingers",
+        "open the gripper and stay above the block",
+        "wait above the block with the gripper open",
+        "keep the open fingers over the block",
+        "stop above the block and open the fingers",
+    ),
+    ("stay over the block with open fingers", "hold the open fingers above the block"),
+)
+_PICK_AND_PLACE = _task(
+    "pick_and_place",
+    (
+        "pick up the block and carry it to the target",
+        "grasp the block and bring it to the target",
+        "take the block and hold it at the target",
+        "carry the block to the target in the gripper",
+        "pick the block and place it at the target",
+        "grip the block and move it to the target",
+    ),
+    ("take the block to the target in the gripper", "grasp the block and hold it at the target"),
+)
+_PUSH = _task(
+    "push",
+    (
+        "push the block to the target",
+        "slide the block over the table to the target",
+        "shove the block until it is at the target",
+        "push the block along the table onto the target",
+        "push the block until it is on the target",
+        "sweep the block over the table onto the target",
+    ),
+    ("shove the block to the target", "slide the block onto the target"),
+)
+_PUSH_LEFT = _task(
+    "push_left",
+    (
+        "push the block to the left",
+        "slide the block left",
+        "shove the block toward the left side of the table",
+        "move the block left with the closed gripper",
+        "push the block leftward",
+        "sweep the block to the left side",
+    ),
+    ("shove the block left", "slide the block to the left side"),
+)
+_PUSH_AWAY = _task(
+    "push_away",
+    (
+        "push the block away from the robot",
+        "slide the block away",
+        "shove the block farther from the robot",
+        "move the block away with the closed gripper",
+        "push the block forward",
+        "sweep the block away from the robot",
+    ),
+    ("shove the block away", "slide the block farther away from the robot"),
+)
+_PUSH_RIGHT = _task(
+    "push_right",
+    (
+        "push the block to the right",
+        "slide the block right",
+        "shove the block toward the right side of the table",
+        "move the block right with the closed gripper",
+        "push the block rightward",
+        "sweep the block to the right side",
+    ),
+    ("shove the block right", "slide the block to the right side"),
+)
+_HOVER_TARGET = _task(
+    "hover_target",
+    (
+        "hold the open gripper above the target",
+        "hover over the target with open fingers",
+        "open the gripper and stay above the target",
+        "wait above the target with the gripper open",
+        "keep the open fingers over the target",
+        "stop above the target and open the fingers",
+    ),
+    ("stay over the target with open fingers", "hold the open fingers above the target"),
+)
+_PRESS = _task(
+    "press",
+    (
+        "press on the block from above",
+        "touch the top of the block",
+        "press the closed gripper down on the block",
+        "put the closed fingers on top of the block",
+        "press the top of the block",
+        "touch the block from above with closed fingers",
+    ),
+    ("press down on the block", "put the fingers on top of the block"),
+)
+_PUT_DOWN = _task(
+    "put_down",
+    (
+        "put the block down",
+        "lower the block onto the table",
+        "set the block on the table and open the gripper",
+        "place the block on the table and release it",
+        "lay the block on the table",
+        "release the block on the table",
+    ),
+    ("put the block on the table", "lower the block and release it"),
+)
+_PUSH_LEFT_AWAY = _task(
+    "push_left_away",
+    (
+        "push the block to the left and away",
+        "slide the block left and away from the robot",
+        "shove the block away and to the left",
+        "move the block left and away with the closed gripper",
+    ),
+    ("sweep the block away and to the left",),
+)
+
+SCENARIO = Scenario(
+    id="clbench/Fetch-v1",
+    description="A robot arm learns to push right, hover, press and put down, and keeps four skills.",
+    retained=(_REACH, _HOVER, _PICK_AND_PLACE, _PUSH_LEFT),
+    target=(_PUSH_RIGHT, _HOVER_TARGET, _PRESS, _PUT_DOWN),
+    held_out=(_PUSH_LEFT_AWAY,),
+    questions="clbench.envs.fetch.questions:QUESTIONS",
+    background=(_PUSH, _PUSH_AWAY),
+    balanced=True,
+    budget=Budget(criterion=0.9, adaptation_steps=1000, validation_episodes=20),
+)
+"""Four skills to keep, four targets of graded conflict, and a held-out combination.
+
+`put_down` shares few states and words with the skills, `hover_target` shares words with `hover` and states
+with `reach`, `press` shares states but few words with `hover` and `push_left`, and `push_right` shares both
+with `push_left`.
+"""

@@ -1,0 +1,173 @@
+"""Measurements around the stages of a run: the shift of the policy in each, and relearning after the last."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from clbench.base.seeding import torch_generator
+from clbench.data.training_data import TrainingData
+from clbench.evaluation.rollouts import Evaluator
+from clbench.learning.method import Method
+from clbench.policy.batch import Batch
+from clbench.policy.policy import Policy
+from clbench.records.record import Record, Relearning
+from clbench.runs.checkpoints import stage_policies
+from clbench.runs.length import run_length
+from clbench.runs.run import execute
+from clbench.runs.spec import RunSpec
+from clbench.scoring.metrics import measure
+from clbench.scoring.scores import Scores
+from clbench.spec.protocol import check_steps
+from clbench.spec.registry import register
+from clbench.testing.toy import TOY
+
+EAGER = replace(
+    TOY,
+    id="me/Forgetful-v0",
+    budget=replace(TOY.budget, criterion=0.75, adaptation_steps=200, validation_episodes=4),
+)
+"""The toy with a criterion of three successes in four episodes."""
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _registered() -> None:
+    register(EAGER.id, f"{__name__}:EAGER")
+
+
+@pytest.fixture(scope="module")
+def record(tmp_path_factory: pytest.TempPathFactory) -> Record:
+    """A run of plain fine-tuning."""
+    return execute(RunSpec(EAGER.id, "sft", seed=0), tmp_path_factory.mktemp("records"))
+
+
+@pytest.fixture(scope="module")
+def policies(record: Record) -> list[Policy]:
+    """The policies of its stages, made again."""
+    return stage_policies(RunSpec(EAGER.id, "sft", seed=0).resolve())
+
+
+@pytest.fixture(scope="module")
+def data(policies: list[Policy]) -> TrainingData:
+    return TrainingData.open(EAGER, policies[0].config)
+
+
+def velocity(policy: Policy, batch: Batch) -> torch.Tensor:
+    with torch.no_grad():
+        return policy.predict(batch)
+
+
+@pytest.mark.usefixtures("one_thread")
+def test_the_shift_is_the_mean_squared_change_of_velocity_on_the_new_targets_data(
+    record: Record, policies: list[Policy], data: TrainingData
+) -> None:
+    assert record.policy["shift"][0] is None
+    for stage, task in enumerate(EAGER.target, 1):
+        batch = data.demonstrations(task).sample(256, torch_generator("shift", 0, stage))
+        change = velocity(policies[stage], batch) - velocity(policies[stage - 1], batch)
+        samples = [
+            sum(float(change[row, step].square().mean()) for step in valid.nonzero()) / int(valid.sum())
+            for row, valid in enumerate(batch.valid)
+        ]
+        assert record.policy["shift"][stage] == pytest.approx(sum(samples) / 256, rel=1e-4)
+    mean = sum(record.policy["shift"][1:]) / 2
+    assert measure("shift", Scores.from_record(record)) == pytest.approx(mean)
+
+
+@pytest.mark.usefixtures("one_thread")
+def test_relearning_repeats_itself_in_a_loop_written_out(
+    record: Record, policies: list[Policy], data: TrainingData
+) -> None:
+    policy, evaluator = policies[-1], Evaluator(EAGER, seed=0)
+    successes = {
+        task.name: sum(episode.success for episode in evaluator.evaluate(policy.eval(), [task]))
+        for task in EAGER.retained
+    }
+    lost = min(EAGER.retained, key=lambda task: successes[task.name])
+    demonstrations, generator = data.demonstrations(lost), torch_generator("relearning", 0)
+    optimiser = torch.optim.AdamW(policy.parameters(), betas=(0.9, 0.95), weight_decay=1e-10, fused=True)
+    steps = 0
+    while sum(episode.success for episode in evaluator.evaluate(policy.eval(), [lost])) < 3:
+        following = min(step for step in check_steps(200) if step > steps)
+        for step in range(steps, following):
+            optimiser.param_groups[0]["lr"] = 1e-3 * min(1.0, (step + 1) / 15)
+            loss = policy.train().action_loss(demonstrations.sample(16, generator)).mean()
+            optimiser.zero_grad()
+            loss.backward()  # type: ignore[no-untyped-call]
+            torch.nn.utils.clip_grad_norm_(policy.parameters(), 1.0)
+            optimiser.step()
+        steps = following
+    evaluator.close()
+    assert record.relearning == Relearning(lost.name, successes[lost.name], steps, True)
+    assert steps > 0
+    assert measure("relearning_steps", Scores.from_record(record)) == steps
+
+
+def test_a_skill_that_is_still_known_takes_no_steps_and_the_first_is_chosen_on_a_tie(tmp_path: Path) -> None:
+    record = execute(RunSpec(EAGER.id, "frozen", seed=0), tmp_path)
+    assert record.relearning == Relearning("left", 4, 0, True)
+    assert record.policy["shift"] == [None, 0.0, 0.0]
+
+
+def test_relearning_costs_the_run_nothing_but_seconds(record: Record, tmp_path: Path) -> None:
+    ends = {row.stage: row.step for row in record.check_rows()}
+    assert record.costs.optimiser_steps == sum(ends.values())
+    assert record.timing["relearning"] > 0
+    amounts: list[float] = []
+    spec = RunSpec(EAGER.id, "sft", seed=0)
+    execute(spec, tmp_path, amounts.append)
+    run = spec.resolve()
+    assert sum(amounts) == pytest.approx(run_length(run.scenario, run.protocol))
+
+
+def test_adapters_are_relearned_with_all_that_they_adapt(tmp_path: Path) -> None:
+    spec = RunSpec(EAGER.id, "lora", seed=0)
+    record = execute(spec, tmp_path, checkpoints=tmp_path / "kept")
+    assert record.relearning is not None
+    assert record.relearning.met
+    assert 0 < record.relearning.steps < 200
+    assert all(shift > 0 for shift in record.policy["shift"][1:])
+    # the run's own policy keeps the weights below its adapters
+    first, *_, last = stage_policies(spec.resolve(), tmp_path / "kept")
+    for (name, before), after in zip(first.named_parameters(), last.parameters(), strict=True):
+        assert ("lora_" in name) or torch.equal(before, after), name
+
+
+class Broken(Policy):
+    """A policy that cannot be fine-tuned: its loss is not finite."""
+
+    def action_loss(self, batch: Batch, hidden: list[torch.Tensor] | None = None) -> torch.Tensor:
+        return super().action_loss(batch, hidden) * float("nan")
+
+
+@dataclass
+class Breaking(Method):
+    """A method that learns targets and leaves such a policy."""
+
+    def loss(self, policy: Policy, batch: Batch, progress: object) -> torch.Tensor:
+        return Policy.action_loss(policy, batch).mean()
+
+    def load_state(self, policy: Policy, state: object) -> None:
+        policy.__class__ = Broken
+
+
+def test_a_policy_that_cannot_be_fine_tuned_is_not_relearned(
+    tmp_path: Path, stranger: Callable[[type[Method]], str]
+) -> None:
+    record = execute(RunSpec(EAGER.id, stranger(Breaking), seed=0), tmp_path)
+    assert (record.status, record.relearning) == ("success", None)
+    assert measure("relearning_steps", Scores.from_record(record)) is None
+
+
+def test_a_tuning_run_relearns_nothing(tmp_path: Path) -> None:
+    record = execute(RunSpec(EAGER.id, "sft", seed=0, split="validation"), tmp_path)
+    assert (record.status, record.relearning) == ("success", None)
+
+
+def test_a_scenario_of_equal_stages_has_a_shift_at_their_ends_and_no_relearning(tmp_path: Path) -> None:
+    record = execute(RunSpec("clbench.testing:clbench/Toy-v0", "sft", seed=0), tmp_path)
+    assert record.relearning is None
+    shifts = zip(record.policy["stage"], record.policy["step"], record.policy["shift"], strict=True)
+    assert [(stage, step) for stage, step, shift in shifts if shift is not None] == [(1, 60), (2, 60)]

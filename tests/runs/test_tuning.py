@@ -1,0 +1,89 @@
+"""Tuning: the same number of settings for every method, and a choice on validation episodes."""
+
+from pathlib import Path
+
+import pytest
+
+from clbench.learning.registry import load_method, new_method
+from clbench.runs import tuning
+from clbench.runs.spec import RunSpec
+from clbench.runs.tuning import Tried, Tuned, best_of, refinements, rungs, tuned, write_tuned
+from clbench.spec.identifiers import built_in_methods
+
+TOY = "clbench.testing:clbench/Toy-v0"
+
+
+def _tried(final_average: float, learned: float, factor: float = 1.0) -> Tried:
+    return Tried({"step_factor": factor}, final_average, learned)
+
+
+@pytest.mark.parametrize("name", built_in_methods())
+def test_every_method_tries_the_same_number_of_different_settings(name: str) -> None:
+    cls = load_method(name)
+    first = rungs(cls)
+    second = refinements(cls, first[2])
+    assert [one["step_factor"] for one in first] == [1.0, 0.3, 0.1, 0.03]
+    assert (len(first), len(second)) == (4, 2)
+    settings = [tuple(sorted(one.items())) for one in [*first, *second]]
+    assert len(set(settings)) == 6
+    for one in [*first, *second]:
+        new_method(name, cls, one)  # the method accepts them
+
+
+def test_a_method_without_its_own_strength_tries_step_sizes_between_the_rungs() -> None:
+    assert refinements(load_method("sft"), {"step_factor": 0.1}) == [
+        {"step_factor": 0.055},
+        {"step_factor": 0.18},
+    ]
+
+
+def test_a_method_with_its_own_strength_tries_two_values_of_it_at_the_best_rung() -> None:
+    cls = load_method("l2_sp")
+    assert rungs(cls)[1] == {"strength": 0.3, "step_factor": 0.3}
+    found = refinements(cls, {"strength": 0.3, "step_factor": 0.1})
+    assert found == [{"strength": 0.1, "step_factor": 0.1}, {"strength": 1.0, "step_factor": 0.1}]
+
+
+def test_the_best_final_average_wins_among_settings_that_learn_enough() -> None:
+    best, lazy = _tried(0.6, 0.85), _tried(0.7, 0.79)
+    assert best_of([_tried(0.5, 1.0), best, lazy]) is best
+
+
+def test_the_first_of_equal_settings_wins() -> None:
+    first, second = _tried(0.6, 0.9, 1.0), _tried(0.6, 0.9, 0.3)
+    assert best_of([first, second]) is first
+
+
+def test_if_no_setting_learns_enough_the_one_that_learns_most_wins() -> None:
+    most = _tried(0.2, 0.7)
+    assert best_of([_tried(0.6, 0.1), most]) is most
+
+
+def test_a_run_takes_the_tuned_settings_unless_it_changes_them(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "tuned" / "Toy-v0.json"
+    settings = {"strength": 2.0, "step_factor": 0.1}
+    write_tuned(path, "clbench/Toy-v0", [100, 101], {"l2_sp": Tuned(settings, (_tried(0.6, 0.9),))})
+    monkeypatch.setattr(tuning, "tuned_file", lambda _: path)
+    tuned.cache_clear()
+    plain, changed = (RunSpec(TOY, "l2_sp", 0, changes).resolve() for changes in ({}, {"strength": "5"}))
+    assert plain.info.settings == settings
+    assert (plain.info.changes, plain.label) == ({}, "l2_sp")
+    assert changed.info.settings == {"strength": 5.0, "step_factor": 0.1}
+    assert changed.label == "l2_sp+strength=5.0" or changed.label == "l2_sp+strength=5"
+    assert RunSpec(TOY, "ewc", 0).resolve().info.settings["step_factor"] == 1.0
+    tuned.cache_clear()
+
+
+def test_tuned_settings_of_other_methods_stay_in_the_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "Toy-v0.json"
+    one, other = (Tuned({"step_factor": factor}, (_tried(0.6, 0.9, factor),)) for factor in (0.1, 0.3))
+    write_tuned(path, "clbench/Toy-v0", [100], {"sft": one})
+    write_tuned(path, "clbench/Toy-v0", [100], {"lwf": other})
+    monkeypatch.setattr(tuning, "tuned_file", lambda _: path)
+    tuned.cache_clear()
+    assert tuned("clbench/Toy-v0") == {"lwf": other, "sft": one}
+    tuned.cache_clear()
