@@ -73,7 +73,7 @@ def made_record(
 ) -> Record:
     """Return the record of a run in which each stage keeps the share `keeps` of the skills."""
     access = "throughout" if method == "joint" else "never"
-    policy = generator.random((len(GROUPS["target"]) * len(STEPS), 2))
+    policy = generator.random((len(GROUPS["target"]) * len(STEPS), 3))
     points = list(product(range(1, len(GROUPS["target"]) + 1), STEPS))
     record = Record(
         status="success",
@@ -87,7 +87,14 @@ def made_record(
             changes={},
             uses={"demonstrations": access, "questions": access, "reference": method in REFERENCES[1:]},
         ),
-        scenario=ScenarioInfo(scenario, **GROUPS, evaluation_steps=list(STEPS), budget=dict(BUDGET)),
+        scenario=ScenarioInfo(
+            id=scenario,
+            retained=list(GROUPS["retained"]),
+            target=list(GROUPS["target"]),
+            held_out=list(GROUPS["held_out"]),
+            evaluation_steps=list(STEPS),
+            budget=dict(BUDGET),
+        ),
         costs=Costs(optimiser_steps=1200, parameters=673700, parameters_added=0, bytes_kept=2304),
         diagnostics={
             str(stage): {
@@ -109,7 +116,7 @@ def made_record(
     for (stage, step), kind in product([(0, 0), *points], range(KINDS)):
         correct = int(generator.binomial(ASKED, 0.95))
         record.add_answers(AnswerRow(stage, step, f"kind_{kind}", ASKED, correct))
-    record.add_policy(PolicyRow(0, 0, 1.0, 0.0))
+    record.add_policy(PolicyRow(0, 0, 1.0, 0.0, None))
     for point, row in zip(points, policy, strict=True):
         record.add_policy(PolicyRow(*point, *map(float, row)))
     return record

@@ -146,6 +146,7 @@ def _where(chosen: Array, values: Array) -> Array:
     low=-1.0,
     units="difference of success rates",
     references=(BASELINE,),
+    compares_itself=True,
     missing=f"There is no {BASELINE} of the same seeds, or a final average is missing.",
 )
 def gain(rates: Rates) -> Array:

@@ -122,7 +122,7 @@ class Scenario:
         Raises:
             LookupError: No task has this name; the nearest one is named.
         """
-        for task in self.tasks:
+        for task in self.tasks + self.background:
             if task.name == name:
                 return task
         raise self._unknown(name)

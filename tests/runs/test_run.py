@@ -289,7 +289,8 @@ def test_a_tuning_run_never_plays_a_test_episode(tmp_path: Path) -> None:
 
 def test_a_run_with_changes_records_them_and_has_its_own_file(tmp_path: Path) -> None:
     record = execute(RunSpec(TOY, "experience_replay", 0, {"replay": "0.25"}), tmp_path)
-    assert record.run.settings == record.run.changes == {"replay": 0.25}
+    assert record.run.changes == {"replay": 0.25}
+    assert record.run.settings == {"replay": 0.25, "step_factor": 1.0}
     assert [path.name for path in (tmp_path / "Toy-v0").iterdir()] == ["experience_replay+replay=0.25"]
 
 
