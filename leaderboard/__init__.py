@@ -18,8 +18,9 @@ def load(records: Path | str = Path("leaderboard/records")) -> pandas.DataFrame:
     are not told apart), `tier`, `seeds` (their number); for every metric its value and the ends of its 95 %
     confidence interval, for example `retention`, `retention_low`, `retention_high`; then `relative_cost`
     (training time relative to sft), `steps`, `bytes_kept`, `parameters`, `parameters_added` and
-    `environment_steps` (of agents that learned online), each a mean over seeds; and `order_sensitivity`
-    (range of the final average over three or more orders of the targets). Missing values are NaN.
+    `environment_steps` (of agents that learned online), each a mean over seeds; `order_sensitivity` (range
+    of the final average over three or more orders of the targets); and `settings_tried` (number of settings
+    that tuning tried). Missing values are NaN.
     `clbench leaderboard` lists the records that make no row, with the reason.
 
     Args:

@@ -28,7 +28,15 @@ def _put_down() -> Rule:
 
 _LAYOUTS = {
     Layout(block_aside=True): ("reach", "hover_target"),
-    Layout(target_aside=True): ("hover", "push_left", "push_away", "push_right", "press", "push_left_away"),
+    Layout(target_aside=True): (
+        "hover",
+        "push_left",
+        "push_away",
+        "push_right",
+        "press",
+        "lift",
+        "push_left_away",
+    ),
     Layout(target_aside=True, block_held=True): ("put_down",),
     Layout(): ("pick_and_place", "push"),
 }

@@ -116,6 +116,18 @@ _HOVER_TARGET = _task(
     ),
     ("stay over the target with open fingers", "hold the open fingers above the target"),
 )
+_LIFT = _task(
+    "lift",
+    (
+        "lift the block straight up",
+        "raise the block high above the table",
+        "grasp the block and lift it up",
+        "take the block and hold it high in the air",
+        "pick up the block and raise it",
+        "lift the block off the table",
+    ),
+    ("raise the block straight up", "hold the block high above the table"),
+)
 _PRESS = _task(
     "press",
     (
@@ -153,18 +165,17 @@ _PUSH_LEFT_AWAY = _task(
 
 SCENARIO = Scenario(
     id="clbench/Fetch-v1",
-    description="A robot arm learns to push right, hover, press and put down, and keeps four skills.",
+    description="A robot arm learns to push right, lift, press and put down, and keeps four skills.",
     retained=(_REACH, _HOVER, _PICK_AND_PLACE, _PUSH_LEFT),
-    target=(_PUSH_RIGHT, _HOVER_TARGET, _PRESS, _PUT_DOWN),
-    held_out=(_PUSH_LEFT_AWAY,),
+    target=(_PUSH_RIGHT, _LIFT, _PRESS, _PUT_DOWN),
+    held_out=(_PUSH_LEFT_AWAY, _HOVER_TARGET),
     questions="clbench.envs.fetch.questions:QUESTIONS",
     background=(_PUSH, _PUSH_AWAY),
     balanced=True,
     budget=Budget(criterion=0.9, adaptation_steps=1000, validation_episodes=20),
 )
-"""Four skills to keep, four targets of graded conflict, and a held-out combination.
+"""Four skills to keep, four targets of graded conflict, and two held-out combinations.
 
-`put_down` shares few states and words with the skills, `hover_target` shares words with `hover` and states
-with `reach`, `press` shares states but few words with `hover` and `push_left`, and `push_right` shares both
-with `push_left`.
+`put_down` shares few states and words with the skills. `lift` and `press` share states but few words with
+`hover` and `push_left`. `push_right` shares both with `push_left`.
 """

@@ -25,6 +25,8 @@ class OverallRow:
     """Letters of its groups in the scenarios, sorted by the scenario's id."""
     estimates: Mapping[str, Estimate]
     """Mean over scenarios and interval of every metric."""
+    to_criterion: bool
+    """Whether the stages of all scenarios end when the target is learned."""
 
 
 def overall(rows: Iterable[Row]) -> tuple[OverallRow, ...]:
@@ -50,7 +52,13 @@ def _place(row: OverallRow) -> tuple[int, float, str]:
 def _overall_row(found: Mapping[str, Row]) -> OverallRow:
     rows = [row for _, row in sorted(found.items())]
     estimates = {name: mean_estimate([row.estimates[name] for row in rows]) for name in METRICS}
-    return OverallRow(rows[0].method, rows[0].division, tuple(row.groups for row in rows), estimates)
+    return OverallRow(
+        rows[0].method,
+        rows[0].division,
+        tuple(row.groups for row in rows),
+        estimates,
+        all(row.to_criterion for row in rows),
+    )
 
 
 def mean_estimate(parts: Sequence[Estimate]) -> Estimate:

@@ -10,5 +10,8 @@ SCENARIO = "clbench/Fetch-v0"
 CONTROLS = Path("leaderboard/controls")
 """Folder of records with changed settings. Commands on pages name it."""
 
+LADDER = Path("leaderboard/ladder")
+"""Folder of records with the step sizes of the ladder, next to the folder of records."""
+
 STEP_TIME = Path("benchmarks/results/step_time.json")
 """Results of the speed benchmark."""

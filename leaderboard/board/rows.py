@@ -7,19 +7,24 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import groupby
 from pathlib import Path
 
+import numpy as np
+
 from clbench.records.record import ScenarioInfo
+from clbench.runs.tuning import tuned
 from clbench.scoring.groups import groups
 from clbench.scoring.intervals import Estimate, Runs, estimate, row_generator
-from clbench.scoring.metrics import METRICS
+from clbench.scoring.metrics import METRICS, measure
 from clbench.spec.references import BASELINE
 
+from .agreement import Agreement, agreement_of
 from .costs import COSTS, costs_of, read_step_times, step_time_of
+from .frontier import Curve, ladder_of, read_frontiers
 from .orders import Orders, orders_of
-from .runs import ALIKE, DIVISIONS, NotShown, Run, Sifted, no_row, read_run, read_runs
+from .runs import ALIKE, DIVISIONS, METHODS, NotShown, Run, Sifted, no_row, read_run, read_runs
 from .tiers import TIERS
 
 RANKED_BY = "final_average"
@@ -50,6 +55,13 @@ class Row:
     """Mean over seeds by column of the table."""
     orders: Orders
     """Its results with the targets in this and in other orders."""
+    tried: int | None = None
+    """Number of settings that tuning tried on the scenario; None for a method that was not tuned."""
+
+    @property
+    def to_criterion(self) -> bool:
+        """Whether its stages end when the target is learned."""
+        return self.runs[0].published.budget.get("criterion") is not None
 
     @property
     def seeds(self) -> tuple[int, ...]:
@@ -72,6 +84,8 @@ class Table:
     """Rows by scenario, division and falling final average."""
     not_shown: tuple[NotShown, ...]
     """Files that make no row, by path."""
+    frontiers: Mapping[str, tuple[Curve, ...]] = field(default_factory=dict)
+    """Methods at the step sizes of the ladder, by scenario; those with records only."""
 
 
 def read_table(records: Path) -> Table:
@@ -88,10 +102,12 @@ def read_table(records: Path) -> Table:
     rows: list[Row] = []
     for _, members in groupby(sorted(runs, key=lambda run: run.scenario), key=lambda run: run.scenario):
         rows += _scenario_rows(list(members), times)
+    frontiers, without = read_frontiers(ladder_of(records))
     return Table(
         scenarios={run.scenario: run.published for run in runs},
         rows=tuple(rows),
-        not_shown=tuple(sorted([*not_shown, *alone], key=lambda entry: entry.path)),
+        not_shown=tuple(sorted([*not_shown, *alone, *without], key=lambda entry: entry.path)),
+        frontiers=frontiers,
     )
 
 
@@ -131,9 +147,15 @@ def _scenario_rows(runs: list[Run], times: Mapping[str, Estimate]) -> list[Row]:
                     estimates[method],
                     costs,
                     orders_of(run for run in runs if run.method == method),
+                    _tried(scenario, method),
                 )
             )
     return rows
+
+
+def _tried(scenario: str, method: str) -> int | None:
+    found = tuned(scenario).get(method)
+    return len(found.tried) if found else None
 
 
 def _falling(one: Estimate) -> float:
@@ -182,6 +204,23 @@ def standing_of(row: Row, rows: Iterable[Row]) -> Standing | None:
     return Standing(1 + len(better), len(division), tuple(other.method for other in alike))
 
 
+def agreement(rows: Iterable[Row]) -> Agreement | None:
+    """Return how alike two halves of the seeds order the competing rows of a scenario; see `agreement_of`.
+
+    The seeds are the baseline's, and rows without one of them are left out. Only a scenario whose seeds have
+    orders of their own has an agreement.
+    """
+    competing = [row for row in rows if row.division in METHODS and row.runs[0].published.balanced]
+    seeds = next((row.seeds for row in competing if row.method == BASELINE), ())
+    values = [
+        [measure(RANKED_BY, row.scores[seed]) for seed in seeds]
+        for row in competing
+        if set(row.seeds).issuperset(seeds)
+    ]
+    known = [line for line in values if None not in line]
+    return agreement_of(np.array(known, dtype=float)) if seeds and known else None
+
+
 def column_names() -> list[str]:
     """Return the columns of the CSV file and of the data frame."""
     ends = ("", "_low", "_high")
@@ -197,6 +236,7 @@ def column_names() -> list[str]:
         "relative_cost",
         *COSTS,
         "order_sensitivity",
+        "settings_tried",
     ]
 
 
@@ -205,4 +245,4 @@ def values_of(row: Row) -> list[str | float | None]:
     estimates = (row.estimates[name] for name in METRICS)
     numbers = [number for one in estimates for number in (one.value, one.low, one.high)]
     place = [row.scenario, row.method, row.division, row.groups, row.tier, len(row.seeds)]
-    return [*place, *numbers, *row.costs.values(), row.orders.sensitivity]
+    return [*place, *numbers, *row.costs.values(), row.orders.sensitivity, row.tried]

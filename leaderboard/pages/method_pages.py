@@ -17,7 +17,7 @@ from ..board.runs import DIVISIONS, Run, is_number, printable, read_run, read_ru
 from ..claims.claim import Finding
 from ..claims.evidence import Evidence
 from ..claims.judges import CLAIMS
-from ..views.descriptions import Description, of_one_module
+from ..views.descriptions import COMMON, Description, common_hyper_parameters, of_one_module
 from ..views.format import shown
 from ..views.markdown import arxiv_ids, templates
 from .commands import run_command
@@ -95,7 +95,7 @@ def _contents(methods: Sequence[Description]) -> str:
     """Return the list of all methods by division."""
     divisions = {name: [one for one in methods if one.division == name] for name in DIVISIONS}
     present = {name: members for name, members in divisions.items() if members}
-    return _template("methods.md.jinja").render(divisions=present)
+    return _template("methods.md.jinja").render(divisions=present, common=common_hyper_parameters())
 
 
 def _page(method: Description, methods: Sequence[Description], sources: Sources) -> str:
@@ -195,7 +195,8 @@ def _order(run: Run) -> list[tuple[str, str, float, str]]:
 def _settings(run: Run, mates: Mapping[str, Description]) -> str:
     """Return the changed settings, and the methods of the module that have exactly these."""
     changes = ", ".join(f"{name} = {value}" for name, value in sorted(run.record.run.changes.items()))
-    same = [name for name, one in mates.items() if one.defaults == run.record.run.settings]
+    settings = {**COMMON, **run.record.run.settings}  # an older record lacks what was added later
+    same = [name for name, one in mates.items() if one.defaults == settings]
     return changes + (f" ({' and '.join(same)})" if same else "")
 
 

@@ -22,6 +22,7 @@ from clbench.scoring.layout import Array, average
 from clbench.scoring.rates import Rates
 from clbench.spec.budget import Budget
 from clbench.spec.identifiers import folder_name
+from clbench.spec.protocol import check_steps
 from clbench.spec.scenario import Scenario
 
 from ..board.rows import RANKED_BY, Row, Table
@@ -37,6 +38,9 @@ GROUPS = {
     "target": "Targets, learned in this order",
     "held_out": "Held-out tasks, never trained",
 }
+
+OWN_ORDERS = "Targets; each seed learns them in its own order"
+"""Title of the targets of a balanced scenario."""
 
 REFERENCES = ("sft", "joint", "frozen", "from_scratch")
 """Methods whose records a card needs."""
@@ -59,6 +63,11 @@ PRETRAINED_OF: Mapping[str, float] = {"clbench/DMControl-v0": 0.80, "clbench/Fet
 ADAPTATION, RETENTION, FORGETTING, JOINT, FROZEN = 0.85, 0.50, 0.40, 0.07, 0.30
 """The other bars: fine-tuning must learn, and must forget the skills (or the earlier targets, where there are
 no skills); one policy must be able to do all tasks; and a frozen policy must not do the targets."""
+
+SFT, AHEAD, REPLAY, BEFORE, CHECKS = (0.30, 0.85), 0.10, 0.90, 0.30, 8
+"""Bars of a scenario whose stages end when the target is learned: the range of the final average of sft; how
+far experience replay must be ahead of it, and how good it must be; the success on a target before its stage;
+and the checks until a target is learned, so that their distance does not decide the result."""
 
 NO_ESTIMATE = Estimate(None, None, None)
 
@@ -115,7 +124,7 @@ class Card:
         template = templates(Path(__file__).with_name("templates")).get_template("scenario.md.jinja")
         return template.render(
             scenario=self.scenario,
-            groups=GROUPS,
+            groups=GROUPS | ({"target": OWN_ORDERS} if self.scenario.balanced else {}),
             experts=self.experts,
             pictures={
                 task.name: picture_path(Path(folder_name(self.scenario.id)), task).as_posix()
@@ -147,20 +156,24 @@ class Card:
         if "sft" not in self.rows:
             return []
         row, quantities = self.rows["sft"], (_retained, _targets, _trained, _held_out, _answers)
-        return [("pretrained", [self._at_the_start(row, one) for one in quantities], len(row.seeds))]
+        return [("pretrained", [self._of_runs(row, one) for one in quantities], len(row.seeds))]
 
-    def _at_the_start(self, row: Row, quantity: Callable[[Rates], Array]) -> Estimate:
-        """Return a quantity (..., runs) of the pretrained policies with which the runs of a row begin."""
+    def _of_runs(
+        self, row: Row, quantity: Callable[[Rates], Array], span: tuple[float, float] = (0, 1)
+    ) -> Estimate:
+        """Return a quantity (..., runs) of the runs of a row, most of them of how the runs begin."""
         generator = row_generator(self.scenario.id, f"pretrained {quantity.__name__}")
         runs = {"one": list(row.scores.values())}
-        return bootstrap(lambda of: average(quantity(of["one"])), runs, generator, span=(0, 1))
+        return bootstrap(lambda of: average(quantity(of["one"])), runs, generator, span=span)
 
     def _bars(self) -> list[Bar]:
         """Return the bars; without retained skills, fine-tuning must forget the earlier targets instead."""
+        if self.scenario.budget.criterion is not None:
+            return self._bars_to_criterion()
         sft, id_ = self.rows.get("sft"), self.scenario.id
         bars = [Bar("adaptation of sft", ADAPTATION, self._metric("adaptation", "sft"), at_least=True)]
         if self.scenario.retained:
-            start = self._at_the_start(sft, _retained) if sft else NO_ESTIMATE
+            start = self._of_runs(sft, _retained) if sft else NO_ESTIMATE
             limit = PRETRAINED_OF.get(id_, PRETRAINED)
             bars.insert(0, Bar("pretrained policy on the retained skills", limit, start, at_least=True))
             bars.append(Bar("retention of sft", RETENTION, self._metric("retention", "sft")))
@@ -170,6 +183,31 @@ class Card:
         bars.append(self._joint())
         bars.append(Bar("adaptation of frozen", FROZEN, self._metric("adaptation", "frozen")))
         return bars
+
+    def _bars_to_criterion(self) -> list[Bar]:
+        """Return the bars where stages end when the target is learned: there must be room on both sides."""
+        sft = self.rows.get("sft")
+        average_of_sft = self._metric(RANKED_BY, "sft")
+        replay = self._metric(RANKED_BY, "experience_replay")
+        before = self._of_runs(sft, _before_its_stage) if sft else NO_ESTIMATE
+        checks = self._of_runs(sft, _checks, (0, math.inf)) if sft else NO_ESTIMATE
+        ahead, above = self._difference("experience_replay", "sft"), self._difference("sft", "frozen")
+        return [
+            Bar("final average of sft", SFT[0], average_of_sft, at_least=True),
+            Bar("final average of sft", SFT[1], average_of_sft),
+            Bar("final average of experience_replay", REPLAY, replay, at_least=True),
+            Bar("final average of experience_replay minus that of sft", AHEAD, ahead, at_least=True),
+            Bar("final average of sft minus that of frozen", 0.0, above, at_least=True),
+            Bar("success of sft on a target before its stage", BEFORE, before),
+            Bar("checks of sft until a target is learned", CHECKS, checks, at_least=True),
+        ]
+
+    def _difference(self, method: str, other: str) -> Estimate:
+        """Return the paired difference of the final averages of two methods."""
+        if method not in self.rows or other not in self.rows:
+            return NO_ESTIMATE
+        generator = row_generator(self.scenario.id, f"{method} - {other}")
+        return paired_difference(RANKED_BY, self.rows[method].scores, self.rows[other].scores, generator)
 
     def _metric(self, name: str, method: str) -> Estimate:
         return self.rows[method].estimates[name] if method in self.rows else NO_ESTIMATE
@@ -258,3 +296,15 @@ def _held_out(rates: Rates) -> Array:
 def _answers(rates: Rates) -> Array:
     asked, correct = rates.asked[..., 0, :].sum(axis=-1), rates.correct[..., 0, :].sum(axis=-1)
     return np.where(asked > 0, correct / np.maximum(asked, 1), np.nan)
+
+
+# ---- quantities of stages that end when the target is learned, (..., runs) --------------------------------
+
+
+def _before_its_stage(rates: Rates) -> Array:
+    return average(np.diagonal(rates.target[..., :-1, :], axis1=-2, axis2=-1))
+
+
+def _checks(rates: Rates) -> Array:
+    planned = check_steps(rates.layout.steps[-1])
+    return average(np.searchsorted(planned, rates.steps, side="right").astype(float))

@@ -19,7 +19,7 @@ from clbench.scoring.metrics import METRICS
 from clbench.testing import ContractError, check_method
 
 from ..board.rows import Row, Table
-from ..views.format import FITTING, counted, format_interval, standing_text, title_of
+from ..views.format import counted, fitting, fitting_names, format_interval, standing_text
 
 CHECK_STEPS = 100.0
 """Duration of the check in optimiser steps, for the time left that the progress bar shows."""
@@ -77,10 +77,11 @@ def placement(table: Table, scenario: str, method: str, records: Path) -> list[s
 def _row_lines(row: Row, rows: Sequence[Row]) -> list[str]:
     lines = [f"{row.method} on {row.scenario}, {counted(len(row.seeds), 'seed')}, {row.tier}"]
     lines.append(f"Division {row.division}: {standing_text(row, rows)}.")
+    columns = fitting(rows)
     lines += [
-        f"  {title_of(metric.name)}: {format_interval(row.estimates[metric.name])}" for metric in FITTING
+        f"  {one.title}: {format_interval(row.estimates[one.metric.name], one.form)}" for one in columns
     ]
-    needed = {name for metric in FITTING for name in METRICS[metric.name].references}
+    needed = {name for metric in fitting_names(rows) for name in METRICS[metric].references}
     absent = sorted(needed - {other.method for other in rows})
     if absent:
         command = f"clbench run {row.scenario} {' '.join(absent)}"

@@ -23,5 +23,5 @@ def csv_text(table: Table) -> str:
 
 
 def _field(column: str, value: str | float | None) -> str:
-    whole = column in ("seeds", *COSTS)
+    whole = column in ("seeds", "settings_tried", *COSTS)
     return value if isinstance(value, str) else number_text(value, ".0f" if whole else ".4f", "")

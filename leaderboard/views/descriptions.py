@@ -21,6 +21,10 @@ from ..board.runs import division_of
 _ITEM = re.compile(r"\d+\. +(.*)")
 
 
+COMMON: dict[str, Any] = {field.name: field.default for field in dataclasses.fields(Method)}
+"""Hyper-parameters of every method with their defaults: pages of methods list only other defaults of them."""
+
+
 @dataclass(frozen=True)
 class HyperParameter:
     """A field of a method's dataclass."""
@@ -56,7 +60,7 @@ class Description:
     text: Text
     """Parts of the docstring of its module."""
     hyper_parameters: tuple[HyperParameter, ...]
-    """Hyper-parameters in the order of the fields."""
+    """Hyper-parameters in the order of the fields, without those of every method."""
 
     @property
     def summary(self) -> str:
@@ -85,6 +89,12 @@ class Description:
 def built_in_methods() -> list[Description]:
     """Return the descriptions of the methods that come with clbench, by name."""
     return [describe(name, load_method(name)) for name in method_names() if "/" not in name]
+
+
+def common_hyper_parameters() -> list[HyperParameter]:
+    """Return the hyper-parameters that every method has."""
+    meanings = field_docstrings(Method)
+    return [HyperParameter(name, repr(default), meanings[name]) for name, default in COMMON.items()]
 
 
 def describe(name: str, cls: type[Method]) -> Description:
@@ -119,12 +129,13 @@ def paragraphs(lines: Iterable[str]) -> list[str]:
 def _hyper_parameters(cls: type[Method]) -> list[HyperParameter]:
     meanings: dict[str, list[str]] = {}
     for base in reversed(cls.__mro__):
-        if issubclass(base, Method) and base is not Method:
+        if issubclass(base, Method):
             for name, meaning in field_docstrings(base).items():
                 meanings.setdefault(name, []).append(meaning)
     return [
         HyperParameter(field.name, _default(field), " ".join(meanings.get(field.name, [])))
         for field in dataclasses.fields(cls)
+        if field.default != COMMON.get(field.name, dataclasses.MISSING)
     ]
 
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeAlias
 
@@ -15,33 +16,49 @@ from clbench.scoring.metric import Metric
 from clbench.scoring.metrics import METRICS
 
 from ..board.overall import OverallRow
-from ..board.rows import Row, standing_of
+from ..board.rows import Row, agreement, standing_of
 from ..board.runs import DIVISIONS
 
-SHOWN = tuple(
-    METRICS[name]
-    for name in (
-        "final_average",
-        "adaptation",
-        "retention",
-        "perturbed_retention",
-        "retention_at_matched_adaptation",
-        "forgetting",
-        "forward_transfer",
-        "question_retention",
-        "zero_shot",
-    )
+FIXED = (
+    "final_average",
+    "adaptation",
+    "retention",
+    "perturbed_retention",
+    "retention_at_matched_adaptation",
+    "forgetting",
+    "forward_transfer",
+    "question_retention",
+    "zero_shot",
 )
-"""Metrics in the Markdown tables; the CSV file has all."""
+"""Metrics in the tables of scenarios whose stages have a fixed number of steps; the CSV file has all."""
 
-RARE = ("perturbed_retention",)
-"""Metrics of `SHOWN` that need runs of a special kind: a table has them if one of its rows does."""
+TO_CRITERION = (
+    "final_average",
+    "gain",
+    "adaptation",
+    "retention",
+    "perturbed_retention",
+    "kept_targets",
+    "kept",
+    "kept_share",
+    "steps_to_criterion",
+    "speed",
+    "question_retention",
+    "relearning_steps",
+)
+"""Metrics in the tables of scenarios whose stages end when the target is learned."""
 
-FITTING = tuple(metric for metric in SHOWN if metric.name not in (*RARE, "forward_transfer", "zero_shot"))
-"""Metrics in the terminal: as many as fit into 108 columns."""
+FITTING = ("final_average", "gain", "adaptation", "retention", "kept")
+"""Metrics of `TO_CRITERION` in a terminal of 108 columns."""
+
+NOT_FITTING = ("perturbed_retention", "forward_transfer", "zero_shot")
+"""Metrics of `FIXED` that it has no room for."""
 
 SHORT_TITLES = {"retention_at_matched_adaptation": "matched retention"}
 """Titles of metrics whose names are too long for the head of a column."""
+
+TITLES_TO_CRITERION = {"adaptation": "learned", "retention": "kept skills"}
+"""Titles of metrics in the tables of `TO_CRITERION`, where they are beside `kept` and `kept_targets`."""
 
 MISSING = "-"
 """Text for a value that could not be computed."""
@@ -49,10 +66,60 @@ MISSING = "-"
 Rows: TypeAlias = Sequence[Row] | Sequence[OverallRow]
 
 
-def shown(rows: Rows) -> tuple[Metric, ...]:
-    """Return the metrics in a table of `rows`: `SHOWN`, but metrics of `RARE` only if a row has a value."""
-    found = {name for name in RARE if any(row.estimates[name].value is not None for row in rows)}
-    return tuple(metric for metric in SHOWN if metric.name not in RARE or metric.name in found)
+@dataclass(frozen=True)
+class Column:
+    """A metric in a table."""
+
+    metric: Metric
+    """The metric."""
+    title: str
+    """Head of the column."""
+
+    @property
+    def form(self) -> str:
+        """Format of its values."""
+        return ".0f" if self.metric.units == "optimiser steps" else ".2f"
+
+
+def shown(rows: Rows) -> tuple[Column, ...]:
+    """Return the columns of a table of `rows`: the metrics of its kind of scenario that a row has a value of.
+
+    A table over scenarios of both kinds has those of fixed stages.
+    """
+    to_criterion = _to_criterion(rows)
+    names = TO_CRITERION if to_criterion else FIXED
+    found = {name for name in METRICS if any(row.estimates[name].value is not None for row in rows)}
+    titles = TITLES_TO_CRITERION if to_criterion else {}
+    return tuple(Column(METRICS[name], titles.get(name) or title_of(name)) for name in names if name in found)
+
+
+def fitting(rows: Rows) -> tuple[Column, ...]:
+    """Return the columns of `rows` that fit into a terminal of 108 columns."""
+    names = fitting_names(rows)
+    return tuple(one for one in shown(rows) if one.metric.name in names)
+
+
+def fitting_names(rows: Rows) -> list[str]:
+    """Return the metrics of such columns, also those that no row has a value of."""
+    names = FITTING if _to_criterion(rows) else [name for name in FIXED if name not in NOT_FITTING]
+    return [name for name in names if name in METRICS]
+
+
+def _to_criterion(rows: Rows) -> bool:
+    return bool(rows) and all(row.to_criterion for row in rows)
+
+
+def agreement_text(rows: Iterable[Row]) -> str:
+    """Return a sentence on how alike two halves of the seeds order the methods; empty if it is not known."""
+    found = agreement(rows)
+    if found is None:
+        return ""
+    how = "order" if found.low > 0 else "do not surely order"
+    interval = format_interval(Estimate(found.tau, found.low, found.high))
+    return (
+        f"The two halves of the {found.seeds} seeds {how} the {found.rows} methods alike: "
+        f"Kendall's tau {interval}."
+    )
 
 
 def title_of(name: str) -> str:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from functools import cache
 from itertools import groupby
 from pathlib import Path
@@ -19,9 +19,9 @@ from clbench.scoring.intervals import Estimate
 from clbench.scoring.metric import Metric
 
 from ..board.overall import overall
-from ..board.rows import Table
+from ..board.rows import Row, Table
 from ..board.runs import printable
-from .format import MISSING, format_interval, number_text, shown, title_of
+from .format import MISSING, Column, agreement_text, format_interval, number_text, shown, title_of
 
 _ARXIV = re.compile(r"arXiv (\d{4}\.\d{5})")
 
@@ -42,9 +42,16 @@ def markdown(table: Table) -> str:
         averages=averages,
         by_scenario=by_scenario,
         shown=shown,
+        all_shown=_all_shown(by_scenario.values()),
+        agreement_text=agreement_text,
         direction=_direction,
         ends=_ends,
     )
+
+
+def _all_shown(tables: Iterable[Sequence[Row]]) -> list[Column]:
+    """Return the columns of all tables, each once."""
+    return list(dict.fromkeys(column for rows in tables for column in shown(rows)))
 
 
 def _direction(metric: Metric) -> str:

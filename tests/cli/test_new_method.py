@@ -59,7 +59,7 @@ def test_the_command_prints_the_next_steps(tmp_path: Path) -> None:
 def test_a_fresh_template_runs(fresh: str, tmp_path: Path) -> None:
     spec = RunSpec("clbench.testing:clbench/Toy-v0", f"{fresh}:FreshlyWritten", 0)
     record = execute(spec, tmp_path / "records")
-    assert (record.status, record.run.settings) == ("success", {"share": 0.9})
+    assert (record.status, record.run.settings) == ("success", {"step_factor": 1.0, "share": 0.9})
 
 
 def test_the_next_steps_name_another_folder(tmp_path: Path) -> None:

@@ -196,12 +196,12 @@ def test_the_histogram_counts_the_weights() -> None:
 
 def test_the_calibrated_variant_changes_only_what_the_authors_tune() -> None:
     published, calibrated = (
-        dataclasses.asdict(build_method(name, {}))
-        for name in ("consft", "consft_calibrated")
+        dataclasses.asdict(build_method(name, {})) for name in ("consft", "consft_calibrated")
     )
     changed = {name for name in published if published[name] != calibrated[name]}
     assert changed <= {"tau_start", "schedule"}
     assert published == {
+        "step_factor": 1.0,
         "tau_start": 0.003,
         "tau_end": 5.0,
         "kappa": 25.0,

@@ -85,7 +85,8 @@ def _config(font: str) -> Spec:
     }
 
 
-def _spec(layers: Sequence[Spec], font: str, **rest: Any) -> Spec:
+def specification(layers: Sequence[Spec], font: str, **rest: Any) -> Spec:
+    """Return a chart of layers, the lowest first."""
     return {
         "$schema": "https://vega.github.io/schema/vega-lite/v6.json",
         "config": _config(font),
@@ -94,10 +95,10 @@ def _spec(layers: Sequence[Spec], font: str, **rest: Any) -> Spec:
     }
 
 
-def _axis(name: str, title: str, **rest: Any) -> Spec:
+def axis(name: str, title: str, **rest: Any) -> Spec:
     """Return the encoding of a position on an axis, from 0 to 1 unless `rest` changes it."""
-    axis = {"values": [0, 0.25, 0.5, 0.75, 1], "format": ".2~f"}
-    return {"field": name, "type": "quantitative", "title": title, "axis": axis, **rest}
+    marks = {"values": [0, 0.25, 0.5, 0.75, 1], "format": ".2~f"}
+    return {"field": name, "type": "quantitative", "title": title, "axis": marks, **rest}
 
 
 def rounded(value: float | None) -> float | None:
@@ -166,7 +167,7 @@ def plane(
         for order, (x, y) in enumerate(front)
     ]
     x, y = (
-        _axis(name, title, scale={"domain": [LOW, HIGH]})
+        axis(name, title, scale={"domain": [LOW, HIGH]})
         for name, title in zip("xy", size.titles, strict=True)
     )
     found = {one["division"] for one in points}
@@ -188,16 +189,17 @@ def plane(
     }
     front = {"type": "line", "strokeWidth": 1.5, "strokeDash": [4, 3], "opacity": 0.8}
     layers = [
-        _layer(corners, front, x=x, y=y, color=hue, order={"field": "order"}),
-        _layer(points, {"type": "rule", "opacity": 0.4}, **across),
-        _layer(points, {"type": "rule", "opacity": 0.4}, **upright),
+        layer(corners, front, x=x, y=y, color=hue, order={"field": "order"}),
+        layer(points, {"type": "rule", "opacity": 0.4}, **across),
+        layer(points, {"type": "rule", "opacity": 0.4}, **upright),
         *_labels(points, {y for corners in fronts.values() for _, y in corners}, size),
-        _layer(points, mark, x=x, y=y, color=hue, shape=shape, tooltip=tooltip),
+        layer(points, mark, x=x, y=y, color=hue, shape=shape, tooltip=tooltip),
     ]
-    return _spec(layers, font, width=size.width, height=size.height)
+    return specification(layers, font, width=size.width, height=size.height)
 
 
-def _layer(values: Sequence[Mapping[str, Any]], mark: Spec, **encoding: Any) -> Spec:
+def layer(values: Sequence[Mapping[str, Any]], mark: Spec, **encoding: Any) -> Spec:
+    """Return a layer with its own data."""
     return {"data": {"values": list(values)}, "mark": mark, "encoding": encoding}
 
 
@@ -207,11 +209,11 @@ def _is_in_plane(row: Row) -> bool:
 
 def _point(row: Row, anchor: str) -> dict[str, Any]:
     point: dict[str, Any] = {"method": row.method, "division": row.division, "anchor": anchor}
-    for axis, name in (("x", "adaptation"), ("y", "retention")):
+    for side, name in (("x", "adaptation"), ("y", "retention")):
         one = row.estimates[name]
-        point[axis] = rounded(one.value)
-        point[f"{axis}_low"] = rounded(one.value if one.low is None else one.low)
-        point[f"{axis}_high"] = rounded(one.value if one.high is None else one.high)
+        point[side] = rounded(one.value)
+        point[f"{side}_low"] = rounded(one.value if one.low is None else one.low)
+        point[f"{side}_high"] = rounded(one.value if one.high is None else one.high)
         point[name] = format_interval(one)
     return point
 
@@ -256,7 +258,7 @@ def _labels(points: Sequence[Mapping[str, Any]], lines: Iterable[float], size: S
     # In pixels, since some labels are outside the plane.
     x, y = ({"field": name, "type": "quantitative", "scale": None, "axis": None} for name in "xy")
     rule = {"type": "rule", "color": colour("line")}
-    layers = [_layer(leaders, rule, x=x, y=y, x2={"value": size.width + 10}, y2={"field": "to"})]
+    layers = [layer(leaders, rule, x=x, y=y, x2={"value": size.width + 10}, y2={"field": "to"})]
     for align in ("left", "right"):
         texts = [
             {"method": one.name, "x": _pixel(one.x), "y": _pixel(one.y)}
@@ -265,7 +267,7 @@ def _labels(points: Sequence[Mapping[str, Any]], lines: Iterable[float], size: S
         ]
         mark = {"type": "text", "align": align, "baseline": "middle", "fontSize": 11, "limit": LONGEST}
         text = {"field": "method", "type": "nominal"}
-        layers.append(_layer(texts, mark | {"color": colour("ink")}, x=x, y=y, text=text))
+        layers.append(layer(texts, mark | {"color": colour("ink")}, x=x, y=y, text=text))
     return layers
 
 
@@ -295,13 +297,13 @@ def along_a_run(targets: Sequence[str], steps: int) -> Spec:
         for number, name in enumerate(targets)
     ]
     count = max(len(targets), 1)
-    x = _axis(
+    x = axis(
         "x",
         "optimiser steps, stage after stage",
         scale={"domain": [0, count * steps], "nice": False},
         axis={"values": [number * steps for number in range(count + 1)], "grid": False},
     )
-    y = _axis("y", "success", scale={"domain": [0, 1]})
+    y = axis("y", "success", scale={"domain": [0, 1]})
     hues = [colour(f"mark-{number}") for number in (0, 1, 4)]
     series = {"field": "series", "type": "nominal", "scale": {"domain": list(SERIES), "range": hues}}
     series |= {"legend": {"columns": {"expr": "width < 400 ? 1 : 3"}, "values": {"expr": "shown"}}}
@@ -314,13 +316,13 @@ def along_a_run(targets: Sequence[str], steps: int) -> Spec:
     area = lines | {"y": y | {"field": "low"}, "y2": {"field": "high"}}
     tooltip = [{"field": field} for field in ("series", "steps", "success")]
     layers = [
-        _layer(stages[1::2], {"type": "rect", "color": colour("raised")}, x=begin, x2={"field": "end"}),
-        _layer(stages, name, x=begin, y={"value": 0}, text={"field": "name", "type": "nominal"}),
+        layer(stages[1::2], {"type": "rect", "color": colour("raised")}, x=begin, x2={"field": "end"}),
+        layer(stages, name, x=begin, y={"value": 0}, text={"field": "name", "type": "nominal"}),
         _points({"type": "area", "opacity": 0.15}, **area),
         _points({"type": "line", "strokeWidth": 2}, **lines, strokeDash=dashes),
         _points({"type": "point", "filled": True, "size": 30, "opacity": 1}, **lines, tooltip=tooltip),
     ]
-    return _spec(layers, SYSTEM_FONT, width="container", height=230)
+    return specification(layers, SYSTEM_FONT, width="container", height=230)
 
 
 def _points(mark: Spec, **encoding: Any) -> Spec:

@@ -14,17 +14,22 @@ import vl_convert
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
+from clbench.spec.identifiers import folder_name
+
 from ...board.overall import overall
 from ...board.rows import Row, Table
 from ...board.tiers import TIERS
-from ..format import counted, title_of
+from ..format import counted, format_interval, number_text, title_of
 from .charts import FONT, NARROW, PALETTE, SERIES, SHAPES, WIDE, along_a_run, colour, in_theme, plane
-from .view import OTHERS, SHADES, ScenarioView, columns, grouped, number, scenarios
+from .frontier import NARROW as NARROW_FRONTIER
+from .frontier import WIDE as WIDE_FRONTIER
+from .frontier import frontier
+from .view import SHADES, ScenarioView, columns, grouped, number, scenarios
 
 FOLDER = Path(__file__).parent
 """Folder of the templates, the style and the script."""
 
-GROUPS = {"retained": "old skills to keep", "target": "new tasks, in order", "held out": "never trained"}
+GROUPS = {"retained": "old skills to keep", "target": "new tasks", "held out": "never trained"}
 """Titles of the groups of tasks."""
 
 TIER_RULES = (
@@ -77,15 +82,24 @@ def page(table: Table) -> str:
 
 
 def pictures(table: Table) -> dict[str, str]:
-    """Return the pictures by file name: the plane of the scenario with the most methods, light and dark."""
+    """Return the pictures by file name, each light and dark.
+
+    They are the plane of the scenario with the most methods, and the frontier of each scenario that has one.
+    """
     by_scenario: dict[str, list[Row]] = {}
     for row in table.rows:
         by_scenario.setdefault(row.scenario, []).append(row)
     rows = max(by_scenario.values(), key=len, default=[])
-    spec = plane(rows, WIDE, font=FONT)
-    spec["config"]["background"] = colour("paper")
-    svg = vl_convert.vegalite_to_svg(spec, vl_version=VEGA_LITE) + "\n"
-    return {"pareto.svg": in_theme(svg, dark=False), "pareto-dark.svg": in_theme(svg, dark=True)}
+    specs = {"pareto": plane(rows, WIDE, font=FONT)}
+    for scenario, curves in table.frontiers.items():
+        specs[f"frontier-{folder_name(scenario)}"] = frontier(curves, WIDE_FRONTIER, FONT)
+    found = {}
+    for name, spec in specs.items():
+        spec["config"]["background"] = colour("paper")
+        svg = vl_convert.vegalite_to_svg(spec, vl_version=VEGA_LITE) + "\n"
+        found[f"{name}.svg"] = in_theme(svg, dark=False)
+        found[f"{name}-dark.svg"] = in_theme(svg, dark=True)
+    return found
 
 
 @cache
@@ -105,6 +119,8 @@ def _templates() -> Environment:
         tier_rules=TIER_RULES,
         title_of=title_of,
         counted=counted,
+        format_interval=format_interval,
+        number_text=number_text,
         number_of=number,
         shade_of_rank=_shade_of_rank,
     )
@@ -166,14 +182,19 @@ def _data(views: Sequence[ScenarioView]) -> dict[str, Any]:
         "rows": {view.anchor: {**view.data, "scenario": one.id} for one in views for view in one.rows},
         "scenarios": {one.id: _scenario_data(one) for one in views},
         "series": SERIES,
-        "metrics": [[title_of(one.name), one.description, one.missing] for one in OTHERS],
     }
 
 
 def _scenario_data(one: ScenarioView) -> dict[str, Any]:
     rows = [view.row for view in one.rows]
     anchors = {view.row.method: view.anchor for view in one.rows}
+    frontiers = {}
+    if one.frontier:
+        frontiers["wide_frontier"] = frontier(one.frontier, WIDE_FRONTIER)
+        frontiers["narrow_frontier"] = frontier(one.frontier, NARROW_FRONTIER)
     return {
+        **frontiers,
+        "metrics": [[title_of(metric.name), metric.description, metric.missing] for metric in one.others],
         "sft": anchors.get("sft"),
         "steps": one.steps,
         "targets": one.tasks["target"],

@@ -125,6 +125,11 @@
     draw(element, narrow() ? one.narrow : one.wide);
   }
 
+  function drawFrontier(element) {
+    const one = data.scenarios[element.dataset.frontier];
+    draw(element, narrow() ? one.narrow_frontier : one.wide_frontier);
+  }
+
   const words = ([value, low, high]) =>
     value === null ? "–" : value.toFixed(2) + (low === null ? "" : ` [${low.toFixed(2)}, ${high.toFixed(2)}]`);
 
@@ -200,7 +205,7 @@
     metrics(row) {
       const seeds = Object.keys(row.seeds);
       const rows = row.metrics.map((numbers, index) => {
-        const [name, description, missing] = data.metrics[index];
+        const [name, description, missing] = data.scenarios[row.scenario].metrics[index];
         const [value, low, high, ...each] = numbers;
         const texts = [name, words([value, low, high]), ...each.map((one) => words([one, null, null]))];
         return { texts, title: value === null ? `Missing: ${missing}` : description };
@@ -217,11 +222,12 @@
   }, true);
 
   function drawInside(part) {
-    for (const element of part.querySelectorAll("[data-plane], [data-run]")) {
+    for (const element of part.querySelectorAll("[data-plane], [data-frontier], [data-run]")) {
       const hidden = element.closest("dialog:not([open])");
       if (hidden || element.dataset.drawn) continue;
       element.dataset.drawn = "yes";
-      (element.dataset.plane ? drawPlane : drawRun)(element);
+      const { plane, frontier } = element.dataset;
+      (plane ? drawPlane : frontier ? drawFrontier : drawRun)(element);
     }
   }
 

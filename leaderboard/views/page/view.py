@@ -17,12 +17,14 @@ from clbench.scoring.metrics import METRICS
 from clbench.scoring.scores import rates_of
 from clbench.spec.identifiers import built_in_methods
 
+from ...board.frontier import Curve
 from ...board.rows import Row, Table, standing_of
 from ...board.runs import DIVISIONS, METHODS, printable
 from ..descriptions import Description, describe
 from ..format import (
-    SHOWN,
+    Column,
     Rows,
+    agreement_text,
     aligned,
     format_interval,
     number_text,
@@ -42,9 +44,6 @@ MISSING = "\N{EN DASH}"
 
 NAMED = 3
 """Number of methods not told apart from a row that are named; further ones are only counted."""
-
-OTHERS = tuple(metric for metric in METRICS.values() if metric not in SHOWN)
-"""Further metrics in the section of a row."""
 
 SHADES = 20
 """Number of shades between success 0 and success 1."""
@@ -95,15 +94,11 @@ class MetricView:
     """A metric of one row."""
 
     metric: Metric
+    title: str
     number: Number
     interval: str
     seeds: tuple[str, ...]
     """Values by seed."""
-
-    @property
-    def title(self) -> str:
-        """Its name in words."""
-        return title_of(self.metric.name)
 
 
 @dataclass(frozen=True)
@@ -131,7 +126,8 @@ class RowView:
     standing: str
     """Its place, and the methods that are not told apart from it, in words."""
     cells: tuple[Number, ...]
-    """Cells of the table's `columns`, then the relative cost and the bytes kept."""
+    """Cells of the table's `columns`, then the settings tried if stages end when the target is learned, the
+    relative cost and the bytes kept."""
     metrics: tuple[MetricView, ...]
     """Metrics in the section of the row."""
     stages: tuple[Stage, ...]
@@ -209,9 +205,15 @@ class RowView:
         return same_or_each([(run.seed, flat(run.record.fingerprint)) for run in self.row.runs])
 
 
-def columns(rows: Rows) -> tuple[Metric, ...]:
-    """Return the metrics in a table of `rows`; the section of a row has all metrics."""
-    return tuple(metric for metric in shown(rows) if metric.name != "zero_shot")
+def columns(rows: Rows) -> tuple[Column, ...]:
+    """Return the columns of a table of `rows`; the section of a row has all metrics."""
+    return tuple(one for one in shown(rows) if one.metric.name != "zero_shot")
+
+
+def others(rows: Rows) -> list[Metric]:
+    """Return the metrics that a table of `rows` does not show; the section of a row lists them apart."""
+    there = {one.metric.name for one in shown(rows)}
+    return [metric for metric in METRICS.values() if metric.name not in there]
 
 
 @dataclass(frozen=True, eq=False)
@@ -219,12 +221,38 @@ class ScenarioView:
     """A scenario and its rows."""
 
     id: str
+    groups: Mapping[str, tuple[str, ...]]
+    """Names of the tasks by group, targets in their published order."""
     tasks: Mapping[str, tuple[str, ...]]
-    """Names of the tasks by group."""
+    """The same as heads of columns: targets by their place where each seed has its own order."""
+    balanced: bool
+    """Whether each seed has its own order of the targets."""
     steps: tuple[int, ...]
     """Evaluation points of a stage."""
     rows: tuple[RowView, ...]
     families: tuple[Family, ...]
+    frontier: tuple[Curve, ...]
+    """Methods along the ladder of step sizes."""
+
+    @property
+    def table(self) -> list[Row]:
+        """Its rows without their sections."""
+        return [view.row for view in self.rows]
+
+    @property
+    def to_criterion(self) -> bool:
+        """Whether its stages end when the target is learned."""
+        return self.rows[0].row.to_criterion
+
+    @property
+    def agreement(self) -> str:
+        """Sentence on how alike two halves of the seeds order the methods, empty if it is not known."""
+        return agreement_text(self.table)
+
+    @property
+    def others(self) -> list[Metric]:
+        """Metrics that its table does not show."""
+        return others(self.table)
 
     @property
     def divisions(self) -> list[Group[RowView]]:
@@ -232,9 +260,9 @@ class ScenarioView:
         return grouped(self.rows, [view.row.division for view in self.rows])
 
     @property
-    def columns(self) -> tuple[Metric, ...]:
-        """Metrics of its table."""
-        return columns([view.row for view in self.rows])
+    def columns(self) -> tuple[Column, ...]:
+        """Columns of its table."""
+        return columns(self.table)
 
     @property
     def runs(self) -> int:
@@ -252,20 +280,35 @@ def scenarios(table: Table) -> list[ScenarioView]:
     found = []
     for scenario, members in groupby(table.rows, key=lambda row: row.scenario):
         rows = list(members)
-        layout = rows[0].runs[0].scores.layout
-        tasks = {"retained": layout.retained, "target": layout.target, "held out": layout.held_out}
+        layout, published = rows[0].runs[0].scores.layout, rows[0].runs[0].published
+        groups = {"retained": layout.retained, "target": published.target, "held out": layout.held_out}
+        tasks = {**groups, "target": _places(rows[0])}
         views = [_row(row, rows) for row in rows]
         competing = [row for row in rows if row.division in METHODS]
         found.append(
             ScenarioView(
                 scenario,
-                {group: tuple(map(printable, names)) for group, names in tasks.items()},
+                _printable(groups),
+                _printable(tasks),
+                published.balanced,
                 layout.steps,
                 tuple(views),
                 tuple(families(competing)),
+                table.frontiers.get(scenario, ()),
             )
         )
     return found
+
+
+def _printable(groups: Mapping[str, Iterable[str]]) -> dict[str, tuple[str, ...]]:
+    return {group: tuple(map(printable, names)) for group, names in groups.items()}
+
+
+def _places(row: Row) -> tuple[str, ...]:
+    """Return the names of the targets by stage; by number where each seed has its own order."""
+    target = row.runs[0].scores.layout.target
+    numbered = tuple(f"target {number}" for number in range(1, len(target) + 1))
+    return numbered if row.runs[0].published.balanced else target
 
 
 def _row(row: Row, rows: Sequence[Row]) -> RowView:
@@ -275,10 +318,10 @@ def _row(row: Row, rows: Sequence[Row]) -> RowView:
         aligned(row.groups, [other for other in rows if other.division == row.division]) or MISSING,
         standing.place if (standing := standing_of(row, rows)) else None,
         standing_text(row, rows, NAMED),
-        (*(number(row.estimates[metric.name], metric) for metric in columns(rows)), *_costs(row)),
-        tuple(_metric(metric, row.estimates[metric.name], seeds[metric.name]) for metric in shown([row])),
+        (*(number(row.estimates[one.metric.name], one) for one in columns(rows)), *_tried(row), *_costs(row)),
+        tuple(_metric(one, row.estimates[one.metric.name], seeds[one.metric.name]) for one in shown(rows)),
         tuple(_stages(row)),
-        _drawn(row, seeds),
+        _drawn(row, seeds, others(rows)),
         _description(row.method) if row.method in built_in_methods() else None,
     )
 
@@ -288,8 +331,10 @@ def _description(method: str) -> Description:
     return describe(method, load_method(method))
 
 
-def _drawn(row: Row, seeds: Mapping[str, Sequence[float | None]]) -> dict[str, Any]:
-    """Return the curves, the success matrix of each seed, and the values of `OTHERS` by seed."""
+def _drawn(
+    row: Row, seeds: Mapping[str, Sequence[float | None]], metrics: Iterable[Metric]
+) -> dict[str, Any]:
+    """Return the curves, the success matrix of each seed, and the values of `metrics` by seed."""
     curves = estimated(
         {"retained": retained_curve, "target": target_curves},
         [run.scores for run in row.runs],
@@ -300,7 +345,7 @@ def _drawn(row: Row, seeds: Mapping[str, Sequence[float | None]]) -> dict[str, A
         **{name: [_triple(point) for point in points] for name, points in curves.items()},
         "seeds": {seed: [list(map(rounded, line)) for line in lines] for seed, lines in success.items()},
         "metrics": [
-            [*_triple(row.estimates[metric.name]), *map(rounded, seeds[metric.name])] for metric in OTHERS
+            [*_triple(row.estimates[metric.name]), *map(rounded, seeds[metric.name])] for metric in metrics
         ],
     }
 
@@ -312,16 +357,27 @@ def _triple(one: Estimate) -> list[float | None]:
 # ---- numbers -----------------------------------------------------------------------------------------------
 
 
-def number(one: Estimate, metric: Metric) -> Number:
+def number(one: Estimate, column: Column) -> Number:
     """Return the cell of a metric."""
+    metric, form = column.metric, column.form
     if one.value is None:
         return Number(MISSING, note=f"missing: {metric.missing}")
-    text, order = number_text(one.value, ".2f"), number_text(one.value, ".6f")
+    text, order = number_text(one.value, form), number_text(one.value, ".6f")
     if one.low is None or one.high is None:
         return Number(text, order, "without an interval")
     ends = [round(100 * min(max(round(end, 9), 0.0), 1.0)) for end in (one.low, one.value, one.high)]
-    note = f"95 % interval from {number_text(one.low, '.2f')} to {number_text(one.high, '.2f')}"
-    return Number(text, order, note, tuple(ends))
+    note = f"95 % interval from {number_text(one.low, form)} to {number_text(one.high, form)}"
+    has_bar = metric.high <= 1 and not metric.units.startswith("difference")
+    return Number(text, order, note, tuple(ends) if has_bar else ())
+
+
+def _tried(row: Row) -> tuple[Number, ...]:
+    """Return the number of settings that tuning tried, where the table has that column."""
+    if not row.to_criterion:
+        return ()
+    if row.tried is None:
+        return (Number(MISSING, note="the method was not tuned here"),)
+    return (Number(str(row.tried), str(row.tried)),)
 
 
 def _costs(row: Row) -> tuple[Number, Number]:
@@ -338,11 +394,10 @@ def _costs(row: Row) -> tuple[Number, Number]:
     return cost, size
 
 
-def _metric(metric: Metric, one: Estimate, seeds: Sequence[float | None]) -> MetricView:
-    words = "" if one.value is None else format_interval(one)
-    return MetricView(
-        metric, number(one, metric), words, tuple(number_text(value, ".2f", MISSING) for value in seeds)
-    )
+def _metric(column: Column, one: Estimate, seeds: Sequence[float | None]) -> MetricView:
+    words = "" if one.value is None else format_interval(one, column.form)
+    texts = tuple(number_text(value, column.form, MISSING) for value in seeds)
+    return MetricView(column.metric, column.title, number(one, column), words, texts)
 
 
 def _of_seeds(row: Row, rows: Sequence[Row]) -> dict[str, list[float | None]]:
@@ -361,14 +416,14 @@ def _of_seeds(row: Row, rows: Sequence[Row]) -> dict[str, list[float | None]]:
 
 def _stages(row: Row) -> list[Stage]:
     """Return the success matrix."""
-    layout = row.runs[0].scores.layout
+    layout, places = row.runs[0].scores.layout, _places(row)
     success = np.mean([run.scores.rates().success for run in row.runs], axis=0)
     stages = []
     for stage, line in enumerate(success):
         values = [finite(value) for value in line]
         stages.append(
             Stage(
-                printable(f"after {layout.target[stage - 1]}") if stage else "pretrained",
+                printable(f"after {places[stage - 1]}") if stage else "pretrained",
                 tuple(number_text(value, ".2f", MISSING) for value in values),
                 tuple(None if value is None else round(round(value, 9) * SHADES) for value in values),
                 len(layout.retained) + stage - 1 if stage else None,

@@ -285,3 +285,29 @@ def test_a_wrong_word_is_named(
     assert stopped.value.code == 2
     assert reason in " ".join(capsys.readouterr().err.split())
     assert not bench.output.exists()
+
+
+def test_a_scenario_with_a_criterion_has_bars_and_orders_of_its_own(
+    make_record: Callable[..., Record], tmp_path: Path
+) -> None:
+    budget = dataclasses.replace(TOY.budget, adaptation_steps=20, criterion=0.9)
+    scenario = dataclasses.replace(TOY, id="clbench/Even-v1", budget=budget, balanced=True)
+    for method, kept in (("sft", 0.5), ("experience_replay", 1.0), ("frozen", 0.2)):
+        for seed in range(3):
+            success = [[1, 1, 0.1, 0, 0], [kept, kept, 0.9, 0.3, 0], [kept, kept, kept, 0.9, 0]]
+            options = {"method": method, "seed": seed, "scenario": scenario.id}
+            record = make_record(success, steps=(20,), ends=(8, 20), **options)
+            write_record(record, tmp_path / "Even-v1" / method / f"seed-{seed}.json")
+    board = resolve("clbench.leaderboard.board.rows:read_table")(tmp_path)
+    experts = resolve("clbench.leaderboard.pages.scenario_tasks:Experts")(3, dict.fromkeys(NAMES, 3))
+    card = resolve("clbench.leaderboard.pages.scenario_cards:Card")(scenario, board, experts, frozenset())
+    found = bars(card.page().replace("\\", ""))
+    assert {words: (cells[0], cells[1].split()[0], cells[2]) for words, cells in found.items()} == {
+        "final average of sft": ("at most 0.85", "0.60", "holds"),  # the row before: at least 0.30
+        "final average of experience_replay": ("at least 0.90", "0.97", "holds"),
+        "final average of experience_replay minus that of sft": ("at least 0.10", "0.38", "holds"),
+        "final average of sft minus that of frozen": ("at least 0.00", "0.23", "holds"),
+        "success of sft on a target before its stage": ("at most 0.30", "0.20", "holds"),
+        "checks of sft until a target is learned": ("at least 8.00", "8.00", "holds"),
+    }
+    assert "Latin square" in part(card.page(), "Order of the targets")

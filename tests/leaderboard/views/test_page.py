@@ -84,8 +84,7 @@ def test_rows_show_their_groups_and_what_intervals_do_not_cover(records: Path) -
 def test_perturbed_retention_has_a_column_only_where_a_row_has_it(
     add: Callable[..., Path], records: Path
 ) -> None:
-    plain = page(read_table(records))
-    assert "perturbed retention" not in plain
+    assert "perturbed retention" not in words(by_id(parsed(page(read_table(records))), "clbench/Toy-v0"))
     for seed in range(2):
         add("sft", seed, perturbed=[[0.9, 0.8], [0.5, 0.7], [0.4, 0.2]])
     document = parsed(page(read_table(records)))
@@ -98,11 +97,15 @@ def test_perturbed_retention_has_a_column_only_where_a_row_has_it(
         by_id(document, "clbench/Toy-v0/sft")
     )
     better = words(by_id(document, "clbench/Toy-v0/better"))
-    assert "perturbed retention" not in better
-    assert "--perturb" not in better
+    assert "perturbed retention \N{EN DASH} The run has no perturbed episodes" in better
+    assert "--seeds 2 --perturb" not in better
 
 
-def test_a_missing_value_is_a_dash_that_says_why(records: Path) -> None:
+def test_a_missing_value_is_a_dash_that_says_why(add: Callable[..., Path], records: Path) -> None:
+    section = by_id(parsed(page(read_table(records))), "clbench/Toy-v0")
+    assert "forward transfer" not in [words(one) for one in section.iterfind(".//table/thead/tr/th")]
+    add("from_scratch", 0, uses={"demonstrations": "never", "questions": "never", "reference": True})
+    add("single", 0)
     text = words(by_id(parsed(page(read_table(records))), "clbench/Toy-v0"))
     assert ", missing: A point of a learning curve is missing, or there is no from_scratch" in text
 

@@ -1,0 +1,75 @@
+"""Agreement of two halves of the seeds on the order of the rows: Kendall's tau with an interval."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+REPLICATES = 2000
+"""Bootstrap draws of seeds."""
+
+LEAST_SEEDS, LEAST_ROWS = 4, 3
+"""Fewest seeds and rows: with one seed in a half there is nothing to draw, and two rows have two orders."""
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """Kendall's tau between the orders of rows by two halves of the seeds, with its 95 % interval."""
+
+    tau: float
+    low: float
+    high: float
+    seeds: int
+    """Number of seeds in both halves together."""
+    rows: int
+    """Number of rows."""
+
+
+def kendall_tau(one: Array, other: Array) -> Array:
+    """Return Kendall's tau-b between values (..., rows) and others of the same shape; NaN if all are equal.
+
+    Pairs that are in the same order count 1, pairs in opposite orders -1, ties 0. The sum is divided by the
+    geometric mean of the numbers of untied pairs: Kendall 1945, doi 10.2307/2332303.
+    """
+    first, second = np.triu_indices(one.shape[-1], 1)
+    signs, others = (_signs(values[..., first] - values[..., second]) for values in (one, other))
+    untied = np.sqrt(np.abs(signs).sum(axis=-1) * np.abs(others).sum(axis=-1))
+    return np.asarray((signs * others).sum(axis=-1) / np.where(untied > 0, untied, np.nan))
+
+
+def _signs(differences: Array) -> Array:
+    # Values are quotients of whole numbers: equal ones may differ in the last bit.
+    return np.where(np.abs(differences) < 1e-9, 0.0, np.sign(differences))
+
+
+def agreement_of(values: Array, replicates: int = REPLICATES) -> Agreement | None:
+    """Return the agreement of the first and the second half of the seeds on the order of the rows.
+
+    The interval holds the percentiles of `replicates` boards whose seeds are drawn with replacement, in each
+    half on its own; all rows share the draws, since seeds differ a lot.
+
+    Args:
+        values: Value of each row and seed, (rows, seeds).
+        replicates: Number of draws.
+
+    Returns:
+        None with too few rows or seeds, or if a half does not order the rows at all.
+    """
+    rows, seeds = values.shape
+    if rows < LEAST_ROWS or seeds < LEAST_SEEDS:
+        return None
+    halves = np.split(values, [seeds // 2], axis=1)
+    tau = float(kendall_tau(*(half.mean(axis=1) for half in halves)))
+    if not np.isfinite(tau):
+        return None
+    generator = np.random.default_rng(0)
+    drawn = [
+        half[:, generator.integers(half.shape[1], size=(replicates, half.shape[1]))].mean(axis=2).T
+        for half in halves
+    ]
+    low, high = np.nanpercentile(kendall_tau(*drawn), (2.5, 97.5))
+    return Agreement(tau, float(low), float(high), seeds, rows)

@@ -1,0 +1,113 @@
+"""The frontier: what methods learn and keep at each step size of the ladder."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from itertools import groupby
+from pathlib import Path
+
+from clbench.records.paths import label_of
+from clbench.scoring.intervals import Estimate, estimate, row_generator
+from clbench.spec.references import BASELINE
+
+from .places import LADDER
+from .runs import ALIKE, DIVISIONS, NotShown, Run, Sifted, is_number, no_row, read_run, read_runs
+
+FACTOR = "step_factor"
+"""Hyper-parameter that the ladder changes."""
+
+LEARNED, KEPT = "adaptation", "kept"
+"""Metrics of the two axes."""
+
+
+@dataclass(frozen=True)
+class Rung:
+    """One method at one step size."""
+
+    factor: float
+    """Factor of the step size."""
+    learned: Estimate
+    """Success on each target right after learning it."""
+    kept: Estimate
+    """Success at the end on everything that was known before the last target."""
+    seeds: tuple[int, ...]
+    """Seeds of its runs."""
+
+
+@dataclass(frozen=True)
+class Curve:
+    """One method along the ladder."""
+
+    method: str
+    """Name of the method; with its other changed settings if the ladder has several of it."""
+    division: str
+    """One of `DIVISIONS`."""
+    rungs: tuple[Rung, ...]
+    """By falling factor."""
+
+    @property
+    def is_baseline(self) -> bool:
+        """Whether it is plain fine-tuning, which the others must beat."""
+        return self.method == BASELINE
+
+
+def ladder_of(records: Path) -> Path:
+    """Return the folder of the ladder's records for a folder of records, from any working directory."""
+    return records.resolve().parent / LADDER.name
+
+
+def read_frontiers(folder: Path) -> tuple[dict[str, tuple[Curve, ...]], list[NotShown]]:
+    """Return the curves below `folder` by scenario, plain fine-tuning first, and the files that make none.
+
+    Their paths begin with the folder's name. A missing folder counts as empty.
+    """
+    runs, refused = read_runs(folder, partial(read_run, changed=True), (*ALIKE, _on_the_ladder))
+    runs.sort(key=lambda run: run.scenario)
+    found = {
+        scenario: _curves(list(members)) for scenario, members in groupby(runs, lambda run: run.scenario)
+    }
+    return found, [dataclasses.replace(one, path=f"{folder.name}/{one.path}") for one in refused]
+
+
+def _on_the_ladder(runs: list[Run]) -> Sifted:
+    """Keep the runs that changed the step size."""
+    changed = [is_number(run.record.run.changes.get(FACTOR)) for run in runs]
+    kept = [run for run, is_kept in zip(runs, changed, strict=True) if is_kept]
+    others = [run for run, is_kept in zip(runs, changed, strict=True) if not is_kept]
+    return kept, [no_row(run.path, f"its changes have no {FACTOR}, the ladder's setting.") for run in others]
+
+
+def _curves(runs: Sequence[Run]) -> tuple[Curve, ...]:
+    """Return the curves of the runs of one scenario."""
+    by_label: dict[str, dict[str, list[Run]]] = {}
+    for run in sorted(runs, key=lambda run: run.seed):
+        by_label.setdefault(run.record.run.method, {}).setdefault(_apart_from_the_factor(run), []).append(run)
+    curves = [
+        Curve(method if len(labels) == 1 else label, members[0].division, _rungs(members))
+        for method, labels in by_label.items()
+        for label, members in labels.items()
+    ]
+    return tuple(
+        sorted(curves, key=lambda one: (not one.is_baseline, DIVISIONS.index(one.division), one.method))
+    )
+
+
+def _apart_from_the_factor(run: Run) -> str:
+    changes = {name: value for name, value in run.record.run.changes.items() if name != FACTOR}
+    return label_of(run.record.run.method, changes)
+
+
+def _rungs(runs: Sequence[Run]) -> tuple[Rung, ...]:
+    by_factor: dict[float, list[Run]] = {}
+    for run in runs:
+        by_factor.setdefault(float(run.record.run.changes[FACTOR]), []).append(run)
+    return tuple(_rung(factor, members) for factor, members in sorted(by_factor.items(), reverse=True))
+
+
+def _rung(factor: float, runs: Sequence[Run]) -> Rung:
+    generator = row_generator(runs[0].scenario, runs[0].method)
+    found = estimate((LEARNED, KEPT), {run.seed: run.scores for run in runs}, generator)
+    return Rung(factor, found[LEARNED], found[KEPT], tuple(run.seed for run in runs))

@@ -1,0 +1,39 @@
+"""Agreement of two halves of the seeds, against SciPy's Kendall's tau."""
+
+import numpy as np
+import pytest
+from scipy.stats import kendalltau
+
+from clbench.base.entry_points import resolve
+
+agreement_of = resolve("clbench.leaderboard.board.agreement:agreement_of")
+kendall_tau = resolve("clbench.leaderboard.board.agreement:kendall_tau")
+
+
+@pytest.mark.parametrize("levels", [3, 1000])
+def test_tau_is_that_of_scipy_with_and_without_ties(levels: int) -> None:
+    values = np.random.default_rng(levels).integers(levels, size=(20, 2, 7)) / 7
+    expected = [kendalltau(one, other).statistic for one, other in values]
+    np.testing.assert_allclose(kendall_tau(values[:, 0], values[:, 1]), expected, atol=1e-12)
+
+
+def test_equal_values_that_differ_in_the_last_bit_are_ties() -> None:
+    assert kendall_tau(np.array([0.1 + 0.2, 0.3, 1.0]), np.array([0.3, 0.3, 1.0])) == pytest.approx(1.0)
+
+
+def test_rows_far_apart_agree_and_rows_of_noise_do_not() -> None:
+    generator = np.random.default_rng(0)
+    clear = np.arange(8)[:, None] / 8 + generator.normal(0, 0.01, (8, 8))
+    found = agreement_of(clear)
+    assert (found.tau, found.low, found.high, found.seeds, found.rows) == (1.0, 1.0, 1.0, 8, 8)
+    noise = agreement_of(generator.normal(0, 1, (8, 8)))
+    assert noise.low < 0 < noise.high
+
+
+@pytest.mark.parametrize("shape", [(2, 8), (8, 3)])
+def test_few_rows_or_seeds_have_no_agreement(shape: tuple[int, int]) -> None:
+    assert agreement_of(np.random.default_rng(0).random(shape)) is None
+
+
+def test_rows_of_one_value_have_no_agreement() -> None:
+    assert agreement_of(np.ones((4, 4))) is None

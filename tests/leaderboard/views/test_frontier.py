@@ -1,0 +1,141 @@
+"""Scenarios whose stages end when the target is learned: their columns, and the ladder of step sizes."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import html5lib
+import pytest
+
+from clbench.base.entry_points import resolve
+from clbench.records.paths import label_of, record_path
+from clbench.records.record import Record
+from clbench.records.writer import record_text
+from clbench.spec.scenario import balanced_order
+
+SCENARIO = "clbench/Even-v1"
+page = resolve("clbench.leaderboard.views.page:page")
+pictures = resolve("clbench.leaderboard.views.page:pictures")
+markdown = resolve("clbench.leaderboard.views.markdown:markdown")
+read_table = resolve("clbench.leaderboard.board.rows:read_table")
+show = resolve("clbench.leaderboard.cli:show")
+
+
+@pytest.fixture
+def board(make_record: Callable[..., Record], tmp_path: Path) -> Callable[..., Path]:
+    """Return a function that adds a record to a folder and returns the folder of records."""
+
+    def board(method: str, seed: int, kept: float, folder: str = "records", **changes: Any) -> Path:
+        success = [[1, 1, 0, 0, 0], [kept, kept, 0.9, 0, 0], [kept, kept, kept, 0.9, 0]]
+        options = {"steps": (20,), "ends": (8, 20), "settings": changes, "changes": changes}
+        record = make_record(success, method=method, seed=seed, scenario=SCENARIO, **options)
+        names = record.scenario.target
+        record.scenario.balanced = True
+        record.scenario.target = [names[place] for place in balanced_order(2, seed)]
+        swapped = dict(zip(names, record.scenario.target, strict=True))
+        record.episodes["task"] = [swapped.get(task, task) for task in record.episodes["task"]]
+        path = record_path(tmp_path / folder, SCENARIO, label_of(method, changes), seed)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(record_text(record), encoding="utf-8")
+        return tmp_path / "records"
+
+    return board
+
+
+@pytest.fixture
+def records(board: Callable[..., Path]) -> Path:
+    """Return a folder of records of three methods with four seeds, beside a ladder of two."""
+    for seed in range(4):
+        for method, kept in (("sft", 0.1), ("finch", 0.5), ("lora", 0.3)):
+            board(method, seed, kept)
+    for factor, kept in ((0.1, 0.4), (1.0, 0.2)):
+        for seed in range(2):
+            board("finch", seed, kept + 0.3, "ladder", step_factor=factor)
+            board("sft", seed, kept, "ladder", step_factor=factor)
+    return board("lora", 0, 0.3)
+
+
+def words(element: ElementTree.Element) -> str:
+    return " ".join(" ".join(element.itertext()).split())
+
+
+def section_of(records: Path) -> ElementTree.Element:
+    document = html5lib.HTMLParser(strict=True, namespaceHTMLElements=False).parse(page(read_table(records)))
+    found: ElementTree.Element
+    (found,) = (one for one in document.iter() if one.get("id") == SCENARIO)
+    return found
+
+
+def test_a_scenario_with_a_criterion_has_its_own_columns(records: Path) -> None:
+    head = next(line for line in markdown(read_table(records)).splitlines() if line.startswith("| group"))
+    columns = [cell.strip() for cell in head.strip("|").split("|")][5:]
+    assert columns[:6] == ["final average", "gain", "learned", "kept skills", "kept targets", "kept"]
+    assert columns[6:9] == ["kept share", "steps to criterion", "settings tried"]
+    heads = [words(one) for one in section_of(records).iterfind(".//table/thead/tr/th")]
+    assert "settings tried" in heads
+    assert "gain" in heads
+    assert "retention" not in heads
+
+
+def test_the_terminal_shows_gain_and_kept(records: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    show(records=records)
+    lines = capsys.readouterr().out.partition("Written")[0].splitlines()
+    assert max(map(len, lines)) <= 108
+    row = next(line.split() for line in lines if " finch " in line)
+    assert row[3].startswith("0.60±")  # skills and first target at .5, the last at .9
+    assert row[4].startswith("0.30±")  # sft: skills and first target at .1
+    assert row[-4:] == ["-", "-", "0", "0"]
+
+
+def test_settings_tried_are_counted(records: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    tuned = resolve("clbench.runs.tuning:Tuned")({}, (None,) * 6)
+    monkeypatch.setattr("clbench.leaderboard.board.rows.tuned", lambda _: {"finch": tuned})
+    text = markdown(read_table(records))
+    assert "| 6 | - |" in next(line for line in text.splitlines() if "| finch | prior" in line)
+    assert "| - | - |" in next(line for line in text.splitlines() if "| lora | prior" in line)
+
+
+def test_halves_of_the_seeds_that_order_the_methods_alike_are_named(records: Path) -> None:
+    sentence = "The two halves of the 4 seeds order the 3 methods alike: Kendall's tau 1.00 [1.00, 1.00]."
+    assert sentence in words(section_of(records))
+    assert sentence in markdown(read_table(records)).replace("\\", "")
+
+
+def test_targets_of_balanced_seeds_are_numbered_in_the_section_of_a_row(records: Path) -> None:
+    text = words(section_of(records))
+    assert "new tasks, each seed in its own order target_0, target_1" in text
+    assert "after target 2" in text
+
+
+def test_the_frontier_has_each_method_at_each_step_size(records: Path) -> None:
+    curves = read_table(records).frontiers[SCENARIO]
+    assert [curve.method for curve in curves] == ["sft", "finch"]
+    assert [(rung.factor, rung.kept.value, len(rung.seeds)) for rung in curves[1].rungs] == [
+        (1.0, pytest.approx(0.5), 2),
+        (0.1, pytest.approx(0.7), 2),
+    ]
+    assert "| finch | 0.1 | 0.90 [" in markdown(read_table(records))
+    section = section_of(records)
+    assert [one.get("data-frontier") for one in section.iter("figure") if one.get("data-frontier")]
+    assert "\N{MULTIPLICATION SIGN} 0.1 0.90 [" in words(section)
+    drawn = pictures(read_table(records))
+    assert {"frontier-Even-v1.svg", "frontier-Even-v1-dark.svg"} < set(drawn)
+    for picture in drawn.values():
+        assert "var(" not in picture
+
+
+def test_without_a_ladder_there_is_no_frontier(board: Callable[..., Path]) -> None:
+    table = read_table(board("sft", 0, 0.2))
+    assert not table.frontiers
+    assert "frontier" not in markdown(table)
+    assert set(pictures(table)) == {"pareto.svg", "pareto-dark.svg"}
+
+
+def test_a_ladder_record_without_a_step_size_is_refused(board: Callable[..., Path]) -> None:
+    board("finch", 0, 0.4, "ladder", kappa=0.5)
+    table = read_table(board("sft", 0, 0.2))
+    assert not table.frontiers
+    (entry,) = table.not_shown
+    assert entry.path.startswith("ladder/Even-v1/finch+kappa=0.5/")
+    assert "step_factor" in entry.reason
