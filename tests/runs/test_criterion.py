@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from eager import EAGER
 
 from clbench.evaluation.rollouts import Evaluator
 from clbench.records.record import Record
@@ -17,24 +18,10 @@ from clbench.runs.spec import RunSpec
 from clbench.scoring.metrics import measure
 from clbench.scoring.scores import Scores
 from clbench.spec.protocol import Point, check_steps
-from clbench.spec.registry import load_scenario, register
-from clbench.testing.toy import TOY
+from clbench.spec.registry import load_scenario
 
 verification = importlib.import_module("clbench.leaderboard.submission.verify")
 tiers = importlib.import_module("clbench.leaderboard.board.tiers")
-
-EAGER = replace(
-    TOY,
-    id="me/Eager-v0",
-    balanced=True,
-    budget=replace(TOY.budget, criterion=0.75, adaptation_steps=200, validation_episodes=4),
-)
-"""The toy with a criterion of three successes in four episodes, and an order of the targets for each seed."""
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _registered() -> None:
-    register(EAGER.id, f"{__name__}:EAGER")
 
 
 @pytest.fixture(scope="module")

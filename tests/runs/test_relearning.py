@@ -1,11 +1,12 @@
 """Measurements around the stages of a run: the shift of the policy in each, and relearning after the last."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
 import torch
+from eager import EAGER
 
 from clbench.base.seeding import torch_generator
 from clbench.data.training_data import TrainingData
@@ -21,20 +22,6 @@ from clbench.runs.spec import RunSpec
 from clbench.scoring.metrics import measure
 from clbench.scoring.scores import Scores
 from clbench.spec.protocol import check_steps
-from clbench.spec.registry import register
-from clbench.testing.toy import TOY
-
-EAGER = replace(
-    TOY,
-    id="me/Forgetful-v0",
-    budget=replace(TOY.budget, criterion=0.75, adaptation_steps=200, validation_episodes=4),
-)
-"""The toy with a criterion of three successes in four episodes."""
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _registered() -> None:
-    register(EAGER.id, f"{__name__}:EAGER")
 
 
 @pytest.fixture(scope="module")

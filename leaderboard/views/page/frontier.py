@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 from ...board.frontier import Curve, Rung
 from ..format import format_interval, number_text
-from .charts import SYSTEM_FONT, Spec, axis, colour, layer, rounded, specification
+from .charts import SYSTEM_FONT, Size, Spec, axis, colour, layer, rounded, specification
 
 HUES, DASHES = ("mark-0", "mark-1", "mark-2", "mark-3"), ([1, 0], [6, 3], [2, 2], [8, 3, 2, 3])
 """Colours and dashes of the lines. Together they distinguish 16 methods, neighbours by both."""
@@ -22,18 +21,6 @@ HIGHEST_LOW = 0.8
 
 BESIDE = "mark-4"
 """Colour of plain fine-tuning, which lies under all others."""
-
-
-@dataclass(frozen=True)
-class Size:
-    """Size of the chart in pixels, without axes and legends."""
-
-    width: int
-    height: int
-    columns: int
-    """Number of columns of the legend of methods."""
-    titles: tuple[str, str]
-    """Titles of the axes."""
 
 
 WIDE = Size(
