@@ -146,7 +146,8 @@ def _tried(runs: Sequence[ResolvedRun], records: Path) -> Tried:
 
 def _table(scenario: str, chosen: Mapping[str, Tuned], seeds: int) -> Table:
     """Return all settings with their scores, the chosen ones in bold."""
-    table = Table(title=f"{scenario}, {seeds} tuning seeds, validation episodes")
+    title = f"{scenario}, {seeds} tuning seed{'' if seeds == 1 else 's'}, validation episodes"
+    table = Table(title=title)
     for title in ("method", "settings"):
         table.add_column(title, overflow="fold")
     for title in ("learned", "final average"):

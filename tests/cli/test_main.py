@@ -1,5 +1,6 @@
 """The command line as people type it; some tests need a process of their own."""
 
+import json
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -237,10 +238,25 @@ def test_tune_compares_settings_without_test_episodes(tmp_path: Path) -> None:
     result = _clbench(*arguments, folder=tmp_path)
     assert result.returncode == 0, result.stderr
     rows = [line.split() for line in result.stdout.splitlines() if "low_rate_sft" in line or " sft" in line]
-    settings = [row[:3:2] for row in rows]
+    settings = [row[1:4:2] for row in rows]
     assert settings == [["sft", "defaults"], ["low_rate_sft", "speed=0.2"], ["low_rate_sft", "speed=1.0"]]
-    assert rows[0][3:] == rows[2][3:]  # at full speed it is plain fine-tuning
+    assert rows[0][4:] == rows[2][4:]  # at full speed it is plain fine-tuning
     paths = list((tmp_path / "leaderboard" / "tuning").rglob("seed-3.json"))
     assert len(paths) == 3
     assert not any('"test"' in path.read_text().partition('"answers"')[0] for path in paths)
     assert "3 of 3 runs have a record already" in _clbench(*arguments, folder=tmp_path).stderr
+
+
+@pytest.mark.slow
+def test_tune_writes_the_best_of_six_settings(tmp_path: Path) -> None:
+    arguments = ("tune", TOY, "l2_sp", "--first-seed", "3", "--seeds", "1", "--write", "tuned/Toy-v0.json")
+    result = _clbench(*arguments, folder=tmp_path)
+    assert result.returncode == 0, result.stderr
+    file = json.loads((tmp_path / "tuned" / "Toy-v0.json").read_text())
+    assert (file["scenario"], file["seeds"]) == ("clbench/Toy-v0", [3])
+    found = file["methods"]["l2_sp"]
+    tried = [one["settings"] for one in found["tried"]]
+    assert [one["step_factor"] for one in tried[:4]] == [1.0, 0.3, 0.1, 0.03]
+    assert [one["strength"] for one in tried] == [0.3, 0.3, 0.3, 0.3, 0.1, 1.0]
+    assert found["settings"] in tried
+    assert "6 of 6 runs" not in result.stderr  # four, then two
