@@ -52,7 +52,7 @@ def tune(
     Args:
         scenario: Gymnasium id of the scenario; module:id imports the module first.
         methods: Names of installed methods, or module:Class.
-        every: Tune all installed methods but the references that have nothing to tune.
+        every: Tune all installed methods.
         seeds: Number of tuning seeds.
         first_seed: The first of them; the boards report seeds from 0.
         values: Hyper-parameters and the values to try, as --values.tau_start 0.3,1,3
@@ -124,7 +124,8 @@ def _run(
     every = [one for groups in runs.values() for group in groups for one in group]
     if not run_missing(every, records, lambda: Processes(workers)):
         sys.exit(1)
-    return {name: [_tried(group, records) for group in groups] for name, groups in runs.items()}
+    with checked_input():
+        return {name: [_tried(group, records) for group in groups] for name, groups in runs.items()}
 
 
 def _tried(runs: Sequence[ResolvedRun], records: Path) -> Tried:
@@ -139,15 +140,16 @@ def _tried(runs: Sequence[ResolvedRun], records: Path) -> Tried:
     def mean(metric: str) -> float:
         values = [measure(metric, one) for one in scores]
         known = [value for value in values if value is not None]
-        return round(sum(known) / len(values), 4) if len(known) == len(values) else 0.0
+        if len(known) < len(values):
+            raise InputError(f"{metric} has no value on {runs[0].scenario.id}: nothing can be chosen by it.")
+        return round(sum(known) / len(known), 4)
 
     return Tried(dict(runs[0].changes), mean("final_average"), mean("adaptation"))
 
 
 def _table(scenario: str, chosen: Mapping[str, Tuned], seeds: int) -> Table:
     """Return all settings with their scores, the chosen ones in bold."""
-    title = f"{scenario}, {seeds} tuning seed{'' if seeds == 1 else 's'}, validation episodes"
-    table = Table(title=title)
+    table = Table(title=f"{scenario}, {seeds} tuning seed{'' if seeds == 1 else 's'}, validation episodes")
     for title in ("method", "settings"):
         table.add_column(title, overflow="fold")
     for title in ("learned", "final average"):
