@@ -10,14 +10,16 @@ Details:
    most of the method.
 2. L_i is the mean over the valid steps and the dimensions of the action chunk, at the one draw of flow time
    and noise that the step trains on. The paper does not specify this reduction; openpi does it this way.
-3. The schedule restarts with each target. Its length T is the number of optimiser steps of the stage. The
-   paper tunes T for each task (2,000 steps there).
+3. The schedule restarts with each target. The paper tunes its length T for each task (2,000 steps there).
+   Here T is the length of the stage; if the stage ends when the target is learned, T is the number of steps
+   that plain fine-tuning takes to learn one. ConSFT learns later, so that it reaches its end temperature.
 4. Step size, optimiser and clipping are the benchmark's, the same for every method. Adam cancels a constant
    factor of the loss, so that weights which are all at the floor change nothing.
 
-`ConSFTCalibrated` changes the two constants that the authors tune for each task, `tau_start` and T. They were
-chosen on validation episodes of seed 100, which is not reported: docs/reference/methods/consft.md has the
-sweep.
+`ConSFTCalibrated` keeps the published constants and multiplies the loss by `loss_scale` inside the weight. The
+constants belong to the losses of policies with billions of parameters. This policy's losses are larger: with
+the constants as published, nearly all weights stay at the floor until the schedule ends. Multiplied by 0.003,
+a loss of 0.03 has the weight 0.5 at the start.
 """
 
 from dataclasses import dataclass
@@ -40,14 +42,11 @@ class ConSFT(WeightedSFT):
 
 @dataclass
 class ConSFTCalibrated(WeightedSFT):
-    """Weigh each sample's loss by confidence, with a temperature that fits the losses of this policy."""
+    """Weigh each sample's loss by confidence, with the loss in the unit of the published constants."""
 
-    tau_start: float = 1.0
-    """Chosen on validation episodes of seed 100."""
-    schedule: float = 1.0
-    """Chosen on the same episodes."""
+    loss_scale: float = 0.003
 
-    tunes = ("tau_start", (0.3, 3.0))
+    tunes = ("loss_scale", (0.001, 0.01))
 
     def weights(self, losses: Tensor, progress: Progress) -> Tensor:
         """Return the policy's confidence in each sample (B,)."""

@@ -4,7 +4,7 @@ A control. It separates the effect of weighing samples from the effect of a smal
 (arXiv 2605.08879) smaller loss, but prefers no sample.
 
 Details:
-1. The weights are ConSFT's, with its constants, for the losses of the same step. Each sample gets their mean.
+1. The weights are those of `ConSFTCalibrated`, for the losses of the same step. Each sample gets their mean.
 """
 
 from dataclasses import dataclass
@@ -13,11 +13,11 @@ from torch import Tensor
 
 from clbench.learning.method import Progress
 
-from ._consft_weights import WeightedSFT
+from .consft import ConSFTCalibrated
 
 
 @dataclass
-class ConstantWeight(WeightedSFT):
+class ConstantWeight(ConSFTCalibrated):
     """Weigh every sample by the mean of ConSFT's weights."""
 
     def weights(self, losses: Tensor, progress: Progress) -> Tensor:

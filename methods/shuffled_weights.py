@@ -4,7 +4,7 @@ A control. It separates the choice of which samples get a small weight from the 
 ConSFT's (arXiv 2605.08879) distribution of weights, but a weight no longer depends on its own sample.
 
 Details:
-1. The weights are ConSFT's, with its constants, for the losses of the same step, in a random order.
+1. The weights are those of `ConSFTCalibrated`, for the losses of the same step, in a random order.
 """
 
 from dataclasses import dataclass
@@ -14,11 +14,11 @@ from torch import Tensor
 
 from clbench.learning.method import Progress
 
-from ._consft_weights import WeightedSFT
+from .consft import ConSFTCalibrated
 
 
 @dataclass
-class ShuffledWeights(WeightedSFT):
+class ShuffledWeights(ConSFTCalibrated):
     """Give each sample the weight of another sample of the batch."""
 
     def weights(self, losses: Tensor, progress: Progress) -> Tensor:

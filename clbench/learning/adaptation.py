@@ -55,15 +55,18 @@ def adapt(
     loss: Tensor | None = None
     learning_rate: float | None = None
 
+    def progress(step: int) -> Progress:
+        return Progress(step, stage.steps, to_criterion)
+
     def loss_at(step: int) -> Tensor:
         nonlocal loss
         batch = method.batch(stage.target, stage.prior)
-        loss = method.loss(policy, batch, Progress(step, stage.steps))
+        loss = method.loss(policy, batch, progress(step))
         return loss
 
     def rate(scheduled: float, step: int) -> float:
         nonlocal learning_rate
-        learning_rate = method.learning_rate(method.step_factor * scheduled, Progress(step, stage.steps))
+        learning_rate = method.learning_rate(method.step_factor * scheduled, progress(step))
         return learning_rate
 
     learned = to_criterion and after(Step(0, None, None))

@@ -81,7 +81,9 @@ class Progress:
     step: int
     """Number of optimiser steps done in this stage."""
     steps: int
-    """Number of optimiser steps in the whole stage."""
+    """Number of optimiser steps in the whole stage, at most."""
+    to_criterion: bool = False
+    """Whether the stage ends as soon as the target is learned."""
 
 
 @dataclass(kw_only=True, eq=False)

@@ -106,6 +106,27 @@ def test_beyond_the_schedule_the_temperature_stays_at_its_end() -> None:
     assert method.temperature(Progress(0, 100)) == pytest.approx(0.003)
 
 
+@pytest.mark.parametrize(("factor", "length"), [(1.0, 11.5), (0.1, 47.5)])
+def test_of_a_stage_to_a_criterion_the_schedule_is_as_long_as_plain_fine_tuning_learns(
+    factor: float, length: float
+) -> None:
+    method: Any = build_method("consft", {"step_factor": factor})
+    for step in (0, 5, 11, 47, 60):
+        # 7.5 steps are lost in the warm-up, and the step factors then add up to 4
+        weight = _omega(1e-4, step / length, omega_min=0.0)
+        tau = -25.0 * 1e-4 / math.log(weight)
+        assert method.temperature(Progress(step, 1000, True)) == pytest.approx(tau, rel=1e-4)
+
+
+def test_the_scale_of_the_loss_has_the_effect_of_scaled_losses() -> None:
+    losses = torch.tensor(LOSSES)
+    scaled: Any = build_method("consft", {"loss_scale": 0.1})
+    published: Any = build_method("consft", {})
+    for step in (0, 90, 99):
+        expected = published.weights(0.1 * losses, Progress(step, 100))
+        torch.testing.assert_close(scaled.weights(losses, Progress(step, 100)), expected)
+
+
 def test_a_perfect_sample_weighs_1_and_a_hopeless_one_the_floor() -> None:
     method: Any = build_method("consft", {})
     losses = torch.tensor([0.0, math.inf])
@@ -170,7 +191,7 @@ def test_one_sample_disrupts_old_knowledge_by_the_square_of_its_weight(seed: int
     assert risks[0] == pytest.approx(omega**2 * risks[1], rel=1e-3)
 
 
-def test_the_histogram_counts_each_sample_of_each_step_in_its_part_of_the_stage() -> None:
+def test_the_histogram_counts_each_sample_of_each_step_in_its_part_of_the_schedule() -> None:
     method, policy = build_method("consft", {}), Policy(SMALL)
     assert method.diagnostics() == {}
     adapt(policy, method, _stage(25), Budget(learning_rate=1e-3))
@@ -180,6 +201,16 @@ def test_the_histogram_counts_each_sample_of_each_step_in_its_part_of_the_stage(
     assert [sum(counts) for counts in diagnostics["omega_counts"]] == (16 * steps).tolist()
     method.start_task(policy, _stage(25))
     assert not np.any(method.diagnostics()["omega_counts"])  # a new stage counts anew
+
+
+def test_the_last_part_of_the_histogram_also_counts_the_steps_after_the_schedule() -> None:
+    method, policy = build_method("consft", {}), Policy(SMALL)
+    budget = Budget(learning_rate=1e-3, criterion=0.9)
+    adapt(policy, method, _stage(30), budget, lambda step: step.done == 30)
+    counts = [sum(part) for part in method.diagnostics()["omega_counts"]]
+    # a schedule of 11.5 steps: the parts begin at 0, 1.15, 2.3, ...; the last at 10.35
+    steps = np.bincount([min(9, math.floor(step / 1.15)) for step in range(30)])
+    assert counts == (16 * steps).tolist()
 
 
 def test_the_histogram_counts_the_weights() -> None:
@@ -194,12 +225,12 @@ def test_the_histogram_counts_the_weights() -> None:
     assert not np.any(np.delete(diagnostics["omega_counts"], 7, axis=0))
 
 
-def test_the_calibrated_variant_changes_only_what_the_authors_tune() -> None:
-    published, calibrated = (
-        dataclasses.asdict(build_method(name, {})) for name in ("consft", "consft_calibrated")
+def test_the_calibrated_variant_and_the_controls_change_only_the_unit_of_the_loss() -> None:
+    published, *others = (
+        dataclasses.asdict(build_method(name, {}))
+        for name in ("consft", "consft_calibrated", "constant_weight", "shuffled_weights")
     )
-    changed = {name for name in published if published[name] != calibrated[name]}
-    assert changed <= {"tau_start", "schedule"}
+    assert others == [{**published, "loss_scale": 0.003}] * 3
     assert published == {
         "step_factor": 1.0,
         "tau_start": 0.003,
@@ -208,6 +239,7 @@ def test_the_calibrated_variant_changes_only_what_the_authors_tune() -> None:
         "decay": 0.8,
         "curvature": 3.5,
         "omega_min": 0.001,
+        "loss_scale": 1.0,
         "schedule": 1.0,
     }
 
@@ -215,7 +247,7 @@ def test_the_calibrated_variant_changes_only_what_the_authors_tune() -> None:
 def test_a_constant_weight_is_the_mean_weight_of_consft_for_every_sample() -> None:
     losses = Policy(SMALL).action_loss(toy_source("right", seed=2).sample(16))
     consft: Any = build_method("consft", UNEVEN)
-    constant: Any = build_method("constant_weight", UNEVEN)
+    constant: Any = build_method("constant_weight", {**UNEVEN, "loss_scale": 1.0})
     for step in (0, 60, 99):
         uneven, even = (method.weights(losses, Progress(step, 100)) for method in (consft, constant))
         assert uneven.std() > 0.01
@@ -224,7 +256,7 @@ def test_a_constant_weight_is_the_mean_weight_of_consft_for_every_sample() -> No
 
 def test_the_gradient_of_a_constant_weight_is_a_multiple_of_sfts() -> None:
     policy, batch = Policy(SMALL), toy_source("right", seed=2).sample(16)
-    found = _set_gradient(_started("constant_weight", **UNEVEN), policy, batch, Progress(0, 100))
+    found = _set_gradient(_started("constant_weight", **UNEVEN, loss_scale=1.0), policy, batch, Progress(0, 100))
     losses = policy.action_loss(batch)
     omega = np.mean([_omega(loss, 0.0, **UNEVEN) for loss in losses.tolist()])
     torch.testing.assert_close(found, float(omega) * _gradient(policy, losses.mean()), rtol=1e-3, atol=1e-6)
@@ -233,7 +265,7 @@ def test_the_gradient_of_a_constant_weight_is_a_multiple_of_sfts() -> None:
 def test_shuffled_weights_are_consfts_in_another_order() -> None:
     losses = Policy(SMALL).action_loss(toy_source("right", seed=2).sample(64))
     consft: Any = build_method("consft", UNEVEN)
-    shuffled: Any = build_method("shuffled_weights", UNEVEN)
+    shuffled: Any = build_method("shuffled_weights", {**UNEVEN, "loss_scale": 1.0})
     with seeded("shuffle"):
         theirs = shuffled.weights(losses, Progress(0, 100))
     ours = consft.weights(losses, Progress(0, 100))

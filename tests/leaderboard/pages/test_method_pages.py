@@ -150,8 +150,8 @@ def test_a_subclass_takes_the_docstring_and_has_its_own_defaults(bench: Bench) -
     pages = bench.pages()
     for heading in ("Rule", "Implementation details", "Paper"):
         assert part(pages["consft_calibrated"], heading) == part(pages["consft"], heading)
-    default = load_method("consft_calibrated").__dataclass_fields__["tau_start"].default
-    row = f"| `tau_start` | `{default}` | Temperature at the start (Table 5). Chosen on validation episodes"
+    default = load_method("consft_calibrated").__dataclass_fields__["loss_scale"].default
+    row = f"| `loss_scale` | `{default}` | Factor that converts the policy's loss to the unit"
     assert row in part(pages["consft_calibrated"], "Hyper-parameters")
     assert "`kappa`" in part(pages["consft_calibrated"], "Hyper-parameters")
 
@@ -211,27 +211,27 @@ def test_scalar_diagnostics_are_averaged_over_stages_and_seeds(bench: Bench) -> 
 
 def test_settings_that_were_tried_are_compared_on_validation_episodes(bench: Bench) -> None:
     bench.add("sft", kind="tuning", seed=100)
-    defaults = {"tau_end": 5.0, "kappa": 25.0, "decay": 0.8, "curvature": 3.5, "omega_min": 0.001}
+    defaults = dataclasses.asdict(load_method("consft")())
     calibrated = load_method("consft_calibrated")()
-    chosen = f"schedule={calibrated.schedule}+tau_start={calibrated.tau_start}"  # type: ignore[attr-defined]
+    chosen = f"loss_scale={calibrated.loss_scale}+schedule=1.0"  # type: ignore[attr-defined]
     for label, kept in (
-        ("schedule=1.0+tau_start=20.0", 0.6),
+        ("loss_scale=0.02+schedule=1.0", 0.6),
         (chosen, 0.4),
-        ("schedule=1.0+tau_start=0.5", 0.3),
+        ("loss_scale=0.0005+schedule=1.0", 0.3),
     ):
         bench.add(f"consft+{label}", kept=kept, kind="tuning", seed=100, settings=defaults)
     pages = bench.pages()
     for name in ("consft", "consft_calibrated"):
         tried = part(pages[name], "Results here").partition("### Settings tried")[2]
-        rows = [line for line in tried.splitlines() if line.startswith("| s")]
+        rows = [line for line in tried.splitlines() if line.startswith(("| s", "| loss"))]
         assert rows[0] == (
             "| settings | seed | targets | adaptation | retention | matched retention | question retention |"
         )
         assert rows[1] == "| sft, unchanged | 100 | 2 | 1.00 | 0.20 | 0.40 | 0.90 |"
-        assert [row.split(" | ")[4] for row in rows[2:]] == ["0.30", "0.40", "0.60"]  # by rising tau_start
+        assert [row.split(" | ")[4] for row in rows[2:]] == ["0.30", "0.40", "0.60"]  # by rising loss_scale
         assert "(consft_calibrated)" in rows[3]
     command = part(pages["consft"], "Command")
-    assert f"clbench tune {SCENARIO} consft --values.schedule 1.0 --values.tau_start 0.5," in command
+    assert f"clbench tune {SCENARIO} consft --values.loss_scale 0.0005," in command
     assert command.splitlines()[-2].endswith(" --targets 2")
     assert "Settings tried" not in pages["ewc"]
     assert "clbench tune" not in pages["consft_calibrated"]
