@@ -100,7 +100,7 @@ class WeightedSFT(Method, ABC):
         return (weights * losses).mean()
 
     def diagnostics(self) -> dict[str, Any]:
-        """Return the histogram of the weights, with the bins `omega_edges`, for each tenth of the schedule."""
+        """Return the histogram of the weights, with the bins `omega_edges`, by tenth of the schedule."""
         if not hasattr(self, "counts"):
             return {}
         return {"omega_edges": list(BINS), "omega_counts": self.counts.tolist()}

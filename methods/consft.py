@@ -16,10 +16,10 @@ Details:
 4. Step size, optimiser and clipping are the benchmark's, the same for every method. Adam cancels a constant
    factor of the loss, so that weights which are all at the floor change nothing.
 
-`ConSFTCalibrated` keeps the published constants and multiplies the loss by `loss_scale` inside the weight. The
-constants belong to the losses of policies with billions of parameters. This policy's losses are larger: with
-the constants as published, nearly all weights stay at the floor until the schedule ends. Multiplied by 0.003,
-a loss of 0.03 has the weight 0.5 at the start.
+`ConSFTCalibrated` keeps the published constants and multiplies the loss by `loss_scale` inside the weight.
+The constants belong to the losses of policies with billions of parameters. The losses of this policy are
+larger: with the constants as published, nearly all weights stay at the floor until the schedule ends.
+Multiplied by 0.003, a loss of 0.03 has a weight of 0.5 at the start.
 """
 
 from dataclasses import dataclass

@@ -256,7 +256,9 @@ def test_a_constant_weight_is_the_mean_weight_of_consft_for_every_sample() -> No
 
 def test_the_gradient_of_a_constant_weight_is_a_multiple_of_sfts() -> None:
     policy, batch = Policy(SMALL), toy_source("right", seed=2).sample(16)
-    found = _set_gradient(_started("constant_weight", **UNEVEN, loss_scale=1.0), policy, batch, Progress(0, 100))
+    found = _set_gradient(
+        _started("constant_weight", **UNEVEN, loss_scale=1.0), policy, batch, Progress(0, 100)
+    )
     losses = policy.action_loss(batch)
     omega = np.mean([_omega(loss, 0.0, **UNEVEN) for loss in losses.tolist()])
     torch.testing.assert_close(found, float(omega) * _gradient(policy, losses.mean()), rtol=1e-3, atol=1e-6)
