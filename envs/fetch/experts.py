@@ -25,6 +25,8 @@ PRESS_DEPTH = 0.035
 """Height in metres above the block's centre that a press aims at: the fingers touch at 0.0435."""
 LOWERING = 0.4
 """Largest action of a held block's way down: a centimetre per step, for a soft landing."""
+RAISING = 0.6
+"""Action of a held block's way up, at which it does not slip."""
 TRAVEL_HEIGHT = 0.11
 """Height in metres at which the closed gripper travels above a place, clear of the block, as at its start."""
 UP = np.array([0.0, 0.0, 1.0])
@@ -117,6 +119,11 @@ def _put_down(state: State) -> Action:
     return _action(0.0 * UP if opening(state.tolist()) < OPEN else UP, OPEN_UP)
 
 
+def _raise_block(state: State) -> Action:
+    """Return the action that raises the held block by two centimetres per step."""
+    return _action(RAISING * UP, CLOSE)
+
+
 def _push(state: State, direction: Vector) -> Action:
     """Return the action that pushes the block along a direction (2,) of length 1 with the closed gripper."""
     block, gripper = state[BLOCK].astype(np.float64), state[GRIPPER].astype(np.float64)
@@ -152,6 +159,7 @@ _EXPERTS: dict[str, Callable[[State], Action]] = {
     "pull": _push_along(-1.0, 0.0),
     "press": _press,
     "put_down": _put_down,
+    "raise_block": _raise_block,
     "hover_target": functools.partial(_hover, thing=TARGET),
     "push_left_away": _push_along(math.sqrt(0.5), math.sqrt(0.5)),
 }

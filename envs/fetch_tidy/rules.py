@@ -8,11 +8,13 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from ..fetch.rules import OPEN, RULES, Layout, Numbers, Rule, opening
+from ..fetch.rules import CLOSED, OPEN, RULES, Layout, Numbers, Rule, opening
 from ..fetch.state import BLOCK, GRIPPER, REST_HEIGHT
 
 CLEARANCE = 0.06
 """Height in metres of the gripper above a block that was put down, at which it has let go."""
+RAISED = 0.08
+"""Metres by which a held block is raised."""
 
 
 def _put_down() -> Rule:
@@ -26,6 +28,16 @@ def _put_down() -> Rule:
     return Rule(success, distance)
 
 
+def _raise_block() -> Rule:
+    def height(state: Numbers, start: Numbers) -> float:
+        return state[BLOCK][2] - start[BLOCK][2]
+
+    def success(state: Numbers, start: Numbers) -> bool:
+        return height(state, start) > RAISED and CLOSED < opening(state) < OPEN
+
+    return Rule(success, lambda state, start: max(0.0, RAISED - height(state, start)))
+
+
 _LAYOUTS = {
     Layout(block_aside=True): ("reach", "hover_target"),
     Layout(target_aside=True): (
@@ -34,16 +46,18 @@ _LAYOUTS = {
         "push_away",
         "push_right",
         "press",
-        "lift",
         "push_left_away",
     ),
-    Layout(target_aside=True, block_held=True): ("put_down",),
+    Layout(target_aside=True, block_held=True): ("put_down", "raise_block"),
     Layout(): ("pick_and_place", "push"),
 }
 """Tasks by what is in front of the gripper: the target, the block, the block between the fingers, or both."""
 
+_OWN = {"put_down": _put_down(), "raise_block": _raise_block()}
+"""Tasks that the plain Fetch world does not have."""
+
 TIDY_RULES: dict[str, Rule] = {
-    name: replace({**RULES, "put_down": _put_down()}[name], layout=layout)
+    name: replace(_OWN.get(name) or RULES[name], layout=layout)
     for layout, names in _LAYOUTS.items()
     for name in names
 }

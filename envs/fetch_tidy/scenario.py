@@ -116,18 +116,6 @@ _HOVER_TARGET = _task(
     ),
     ("stay over the target with open fingers", "hold the open fingers above the target"),
 )
-_LIFT = _task(
-    "lift",
-    (
-        "lift the block straight up",
-        "raise the block high above the table",
-        "grasp the block and lift it up",
-        "take the block and hold it high in the air",
-        "pick up the block and raise it",
-        "lift the block off the table",
-    ),
-    ("raise the block straight up", "hold the block high above the table"),
-)
 _PRESS = _task(
     "press",
     (
@@ -152,6 +140,18 @@ _PUT_DOWN = _task(
     ),
     ("put the block on the table", "lower the block and release it"),
 )
+_RAISE_BLOCK = _task(
+    "raise_block",
+    (
+        "raise the block in the gripper",
+        "lift the held block higher",
+        "hold the block higher",
+        "move the block up",
+        "bring the held block up",
+        "raise what the gripper holds",
+    ),
+    ("lift the block in the gripper higher", "raise the held block"),
+)
 _PUSH_LEFT_AWAY = _task(
     "push_left_away",
     (
@@ -165,9 +165,9 @@ _PUSH_LEFT_AWAY = _task(
 
 SCENARIO = Scenario(
     id="clbench/Fetch-v1",
-    description="A robot arm learns to push right, lift, press and put down, and keeps four skills.",
+    description="A robot arm learns to push right, press, put down and raise, and keeps four skills.",
     retained=(_REACH, _HOVER, _PICK_AND_PLACE, _PUSH_LEFT),
-    target=(_PUSH_RIGHT, _LIFT, _PRESS, _PUT_DOWN),
+    target=(_PUSH_RIGHT, _PRESS, _PUT_DOWN, _RAISE_BLOCK),
     held_out=(_PUSH_LEFT_AWAY, _HOVER_TARGET),
     questions="clbench.envs.fetch.questions:QUESTIONS",
     background=(_PUSH, _PUSH_AWAY),
@@ -176,6 +176,6 @@ SCENARIO = Scenario(
 )
 """Four skills to keep, four targets of graded conflict, and two held-out combinations.
 
-`put_down` shares few states and words with the skills. `lift` and `press` share states but few words with
-`hover` and `push_left`. `push_right` shares both with `push_left`.
+`push_right` shares words and scenes with `push_left`. `press` shares scenes with `hover` and `push_left`.
+`put_down` and `raise_block` begin with a held block, as no skill does: they conflict with each other alone.
 """

@@ -53,6 +53,19 @@ def test_a_block_is_put_down_once_the_gripper_has_let_go_and_left(world) -> None
         assert not rule.success(wrong, state)
 
 
+def test_a_held_block_is_raised_once_it_is_8_cm_higher_and_still_held(world) -> None:  # type: ignore[no-untyped-def]
+    rule, start = RULES["raise_block"], [0.0] * 28
+    start[3:6], start[9:11] = [1.3, 0.7, 0.5], [0.025, 0.025]
+    state = [*start]
+    state[5] = 0.581
+    assert rule.success(state, start)
+    for place, value in ((5, 0.579), (9, 0.06), (9, -0.01)):  # too low, let go, slipped
+        wrong = [*state]
+        wrong[place] = value
+        assert not rule.success(wrong, start)
+    assert rule.distance(start, start) == pytest.approx(0.08)
+
+
 def test_a_thing_in_its_corner_never_hinders_the_expert(world) -> None:  # type: ignore[no-untyped-def]
     for name in ("reach", "hover_target"):
         expert = resolve(SCENARIO.task(name).expert)(name)
