@@ -4,7 +4,7 @@ BIN := .venv/bin
 SCENARIO := clbench/Fetch-v0
 QUICK := build/quick
 
-.PHONY: leaderboard records controls docs benchmark test test-slow check wheel-test clean
+.PHONY: leaderboard tuning records ladder controls docs benchmark test test-slow check wheel-test clean
 
 # The main job: from nothing to a table in minutes, with one seed. The full board takes `make records`.
 leaderboard:
@@ -15,19 +15,39 @@ leaderboard:
 		&& seconds=$$(($$(date +%s) - start)) \
 		&& echo "This table took $$((seconds / 60)) min $$((seconds % 60)) s, installing included."
 
-# The committed board: every method, five seeds. Runs that have a record are skipped: a stopped command goes on.
+# Scenarios whose stages end when the target is learned: their methods are tuned, and judge the claims.
+BOARDS := clbench/Fetch-v1 clbench/MetaWorld-v1
+
+# The settings of every method, from validation episodes of seeds that no board has. Run it before `make records`.
+tuning: .venv/installed
+	for id in $(BOARDS); do $(BIN)/clbench tune $$id --all --write methods/tuned/$${id#clbench/}.json || exit; done
+
+# The committed boards. Runs that have a record are skipped: a stopped command goes on.
 records: .venv/installed
+	for id in $(BOARDS); do $(BIN)/clbench run $$id --all --seeds 8 || exit; done
+	$(BIN)/clbench run $(KNOWLEDGE) frozen sft stop_gradient aegis lora --seeds 4
 	$(BIN)/clbench run $(SCENARIO) --all --seeds 5
 	$(BIN)/clbench leaderboard
 
+# The frontier: what a smaller step size does, for plain fine-tuning and for the methods that compete with it.
+LADDER := aegis consft consft_calibrated experience_replay fast_dvla finch l2_sp lora sft stop_gradient
+ladder: .venv/installed
+	for id in $(BOARDS); do for factor in 1 0.3 0.1 0.03; do \
+		$(BIN)/clbench run $$id $(LADDER) --set.step_factor $$factor --seeds 4 --records leaderboard/ladder || exit; \
+	done; done
+
 # What else docs/reference/claims.md needs: methods with one thing changed that tells what their effect is due to.
-CONTROLS := $(BIN)/clbench run $(SCENARIO) --seeds 3 --records leaderboard/controls
+KNOWLEDGE := clbench/FetchKnowledge-v1
+CONTROLS := --seeds 4 --records leaderboard/controls
 controls: .venv/installed
-	$(CONTROLS) aegis --set.direction random
-	$(CONTROLS) fast_dvla --set.direction random
-	$(CONTROLS) fast_dvla --set.orthogonal 0
-	$(CONTROLS) lora --set.rank 4
-	$(CONTROLS) lora --set.rank 64
+	for id in $(BOARDS); do \
+		$(BIN)/clbench run $$id co_training --set.step_factor 1 $(CONTROLS) \
+		&& $(BIN)/clbench run $$id fast_dvla --set.direction random --set.step_factor 1 $(CONTROLS) \
+		&& $(BIN)/clbench run $$id fast_dvla --set.orthogonal 0 --set.step_factor 1 $(CONTROLS) || exit; \
+	done
+	$(BIN)/clbench run $(KNOWLEDGE) aegis --set.direction random $(CONTROLS)
+	$(BIN)/clbench run $(KNOWLEDGE) lora --set.rank 4 $(CONTROLS)
+	$(BIN)/clbench run $(KNOWLEDGE) lora --set.rank 64 $(CONTROLS)
 
 # docs/reference/claims.md, docs/reference/methods/ and docs/reference/scenarios/ from the records; experts are measured once.
 docs: .venv/installed

@@ -32,7 +32,7 @@ from clbench.jobs.work import collect_scenes
 from clbench.records.reader import read_record
 from clbench.runs.spec import RunSpec
 
-METHODS = ("sft", "l2_sp", "low_rate_sft", "constant_weight")
+METHODS = ("sft", "l2_sp", "stop_gradient", "constant_weight")
 
 
 def main() -> None:

@@ -4,6 +4,7 @@ from clbench.spec.registry import register
 
 register("clbench/Fetch-v0", "clbench.envs.fetch.scenario:SCENARIO")
 register("clbench/Fetch-v1", "clbench.envs.fetch_tidy.scenario:SCENARIO")
+register("clbench/FetchKnowledge-v1", "clbench.envs.fetch_tidy.scenario:KNOWLEDGE")
 register("clbench/FetchPixels-v0", "clbench.envs.fetch.pixel_scenario:SCENARIO")
 register("clbench/DMControl-v0", "clbench.envs.dm_control.scenario:SCENARIO")
 register("clbench/MetaWorld-v0", "clbench.envs.metaworld.scenario:SCENARIO")

@@ -152,7 +152,7 @@ def claims(
     *,
     records: Path = RECORDS,
     controls: Path = CONTROLS,
-    scenario: str = SCENARIO,
+    scenario: str | None = None,
     step_time: Path = STEP_TIME,
     output: Path = Path("docs/reference/claims.md"),
 ) -> None:
@@ -161,7 +161,7 @@ def claims(
     Args:
         records: Folder of the records of the leaderboard.
         controls: Folder of the records of changed settings.
-        scenario: Gymnasium id of the scenario.
+        scenario: Gymnasium id of the scenario on which all claims are judged (default: each names its own).
         step_time: Results of the speed benchmark.
         output: Path of the page.
     """
@@ -169,11 +169,10 @@ def claims(
     from .claims.judges import judge_all
     from .pages.claims_page import page, terminal
 
-    evidence = read_evidence(scenario, records, controls, step_time)
-    findings = judge_all(evidence)
+    judged = judge_all(lambda name: read_evidence(name, records, controls, step_time), scenario)
     console = _console()
-    console.print(terminal(findings))
-    _write(console, output, page(evidence, findings))
+    console.print(terminal(judged))
+    _write(console, output, page(judged))
 
 
 def method_pages(
@@ -201,8 +200,9 @@ def method_pages(
     from .views.descriptions import built_in_methods
     from .views.format import write_if_changed
 
+    judged = judge_all(lambda name: read_evidence(name, records, controls, step_time))
     evidence = read_evidence(scenario, records, controls, step_time)
-    sources = read_sources(evidence, judge_all(evidence), _table(records), tuning)
+    sources = read_sources(evidence, judged, _table(records), tuning)
     texts = pages(built_in_methods(), sources)
     output.mkdir(parents=True, exist_ok=True)
     for name, text in texts.items():

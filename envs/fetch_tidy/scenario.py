@@ -1,6 +1,8 @@
-"""The scenario clbench/Fetch-v1: targets of graded conflict with the skills to keep."""
+"""The scenarios clbench/Fetch-v1, with targets of graded conflict, and clbench/FetchKnowledge-v1."""
 
 from __future__ import annotations
+
+import dataclasses
 
 from clbench.spec.budget import Budget
 from clbench.spec.scenario import Scenario
@@ -178,4 +180,18 @@ SCENARIO = Scenario(
 
 `push_right` shares words and scenes with `push_left`. `press` shares scenes with `hover` and `push_left`.
 `put_down` and `raise_block` begin with a held block, as no skill does: they conflict with each other alone.
+"""
+
+KNOWLEDGE = dataclasses.replace(
+    SCENARIO,
+    id="clbench/FetchKnowledge-v1",
+    description="A robot arm goes on pushing right long after it has learned to, and forgets what it knew.",
+    target=(_PUSH_RIGHT,),
+    balanced=False,
+    budget=Budget(adaptation_steps=1280, evaluation_points=7, learning_rate=1e-3, validation_episodes=20),
+)
+"""The policy of `SCENARIO` and one long stage, in which plain fine-tuning loses answers to questions.
+
+Tried with sft on seed 100: .01 of the answers are lost after 80 steps, .03 after 320 and .10 after 1280. With
+a learning rate of 3e-4 it is .01 after 1280 steps.
 """

@@ -159,6 +159,7 @@ TO_CRITERION = dataclasses.replace(
     description="Meta-World's arm learns to close and press objects, after six other skills.",
     retained=SCENARIO.retained[:6],
     background=SCENARIO.retained[6:],
+    scenes=SCENARIO.retained,
     balanced=True,
     budget=dataclasses.replace(SCENARIO.budget, criterion=0.9, adaptation_steps=1000, validation_episodes=20),
 )

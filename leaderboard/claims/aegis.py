@@ -1,38 +1,61 @@
-"""The claims of AEGIS, each with a rule that was fixed before there were results to judge."""
+"""The claims of AEGIS, each with a rule that was fixed before there were results to judge.
+
+Claims about answers to questions are judged on the scenario of one long stage: on the boards, stages end
+before plain fine-tuning has forgotten any answer.
+"""
 
 from __future__ import annotations
 
-from .claim import Finding, Paper, claim, compared, decided
-from .evidence import Evidence
-from .figures import answer_curve, drift_ratio, question_drop
+from .claim import (
+    ANYWHERE,
+    KNOWLEDGE,
+    Finding,
+    Paper,
+    claim,
+    decided,
+    not_told_apart,
+    what_would_change,
+)
+from .evidence import Evidence, Figure
+from .figures import answer_curve, drift_ratio, early_success, question_drop
 
 AEGIS = Paper("AEGIS", ("2604.16067",))
+
+NOTHING_TO_KEEP = "sft does not certainly lose 0.01 of the answers: there is nothing to keep."
+LOSES_ANSWERS = "A longer or narrower fine-tuning, after which sft has certainly lost answers."
+
+
+def _loses_answers(evidence: Evidence) -> bool:
+    return question_drop(evidence, "sft").low > 0.01
 
 
 @claim(
     "A1",
     AEGIS,
     reported="OK-VQA 60.15 before, 57.36 after; the loss on held-out questions rises within 1,500 steps",
-    rule="Holds if the lower end of the drop in question accuracy after the last target is above 0.01; does "
-    "not hold if the upper end is below 0.01.",
+    rule="Holds if sft's drop in question accuracy certainly exceeds 0.01 within the first half of the "
+    "stage; holds in part, because it is not rapid, if it does so only by the end; does not hold if the "
+    "upper end of the drop at the end is below 0.01.",
+    margin="0.01 of the answers",
+    scenarios=KNOWLEDGE,
 )
 def action_loss_erodes_answers(evidence: Evidence) -> Finding:
     """The gradient of the action loss rapidly erodes question answering."""
     drop, stopped = (question_drop(evidence, method) for method in ("sft", "stop_gradient"))
+    curve = answer_curve(evidence, "sft")
     sentences = []
     if stopped.high < drop.low:
-        sentences.append(
-            "Without that gradient in the backbone, less is lost: the gradient causes the erosion."
-        )
-    if drop.low > 0.01 and not any(figure.low > 0.01 for figure in answer_curve(evidence, "sft")):
-        sentences.append(
-            "The erosion is not rapid: during the whole first stage, no drop is certainly above 0.01."
-        )
+        sentences.append("Without that gradient in the backbone less is lost: the gradient is the cause.")
     return Finding(
-        decided(holds=drop.low > 0.01, fails=drop.high < 0.01),
-        (drop, *answer_curve(evidence, "sft")),
+        decided(
+            holds=any(figure.low > 0.01 for figure in curve[:-1]),
+            in_part=drop.low > 0.01,
+            fails=drop.high < 0.01,
+        ),
+        (drop, *curve),
         (stopped, *answer_curve(evidence, "stop_gradient")),
         tuple(sentences),
+        what_would_change(drop, 0.01),
     )
 
 
@@ -40,24 +63,29 @@ def action_loss_erodes_answers(evidence: Evidence) -> Finding:
     "A2",
     AEGIS,
     reported="the loss on held-out questions stays roughly constant; success was not measured",
-    rule="Holds if question accuracy changes by at most 0.01 and the upper end of the difference in "
-    "adaptation to sft is below 0; does not hold if answers are kept and adaptation is not lower, or if "
-    "the lower end of the loss in question accuracy is above 0.01.",
+    rule="Supervision is lost if the upper end of the difference to sft in early success is below -0.05. "
+    "Holds if stop_gradient's drop in question accuracy has an upper end below 0.01 and supervision is "
+    "lost; does not hold if the lower end of the drop is above 0.01, or if the lower end of the difference "
+    "in early success is above -0.05. Cannot be shown here if sft does not certainly lose 0.01 of the "
+    "answers.",
+    margin="0.01 of the answers, 0.05 of the success",
+    scenarios=KNOWLEDGE,
 )
 def stop_gradient_keeps_and_wastes(evidence: Evidence) -> Finding:
     """Stopping the gradient keeps knowledge but throws away supervision."""
-    questions = question_drop(evidence, "stop_gradient")
-    adaptation = evidence.difference("adaptation", "stop_gradient", "sft")
-    kept, of_sft = abs(questions.value) <= 0.01, question_drop(evidence, "sft")
-    nothing_to_keep = of_sft.low <= questions.high
+    answers, early = question_drop(evidence, "stop_gradient"), early_success(evidence, "stop_gradient", "sft")
+    of_sft = question_drop(evidence, "sft")
+    if of_sft.high == of_sft.high and not _loses_answers(evidence):
+        return Finding("cannot be shown here", (early, answers), (of_sft,), (NOTHING_TO_KEEP,), LOSES_ANSWERS)
     return Finding(
         decided(
-            holds=kept and adaptation.high < 0,
-            fails=(kept and adaptation.high >= 0) or questions.low > 0.01,
+            holds=answers.high < 0.01 and early.high < -0.05,
+            fails=answers.low > 0.01 or early.low > -0.05,
         ),
-        (adaptation, questions),
+        (early, answers),
         (of_sft,),
-        ("sft does not lose certainly more, so there is little to keep.",) if nothing_to_keep else (),
+        (),
+        what_would_change(early, -0.05),
     )
 
 
@@ -65,38 +93,31 @@ def stop_gradient_keeps_and_wastes(evidence: Evidence) -> Finding:
     "A3",
     AEGIS,
     reported="with r = 16 the loss on held-out questions rises steadily, more slowly than with sft",
-    rule="Holds if, for every rank that was run, the upper end of the difference to the frozen policy is "
-    "below 0 in question accuracy or in retention; does not hold if, for one of them, both lower ends are at "
-    "least -0.01. Ranks that were not run cannot be judged.",
+    rule="Holds if, for ranks 4, 16 and 64, the upper end of the difference to the frozen policy is below "
+    "-0.01 in question accuracy; holds in part if it is so for some of them, or only in retention and below "
+    "-0.05; does not hold if, for every rank, both lower ends are above these margins.",
+    margin="0.01 of the answers, 0.05 of the retained success",
+    scenarios=KNOWLEDGE,
 )
 def lora_still_overwrites(evidence: Evidence) -> Finding:
     """LoRA limits the rank of an update, not its direction, and still overwrites knowledge."""
-    ranks = {"lora+rank=4": "r = 4", "lora": "r = 16", "lora+rank=64": "r = 64"}
-    figures = {
-        label: [
-            evidence.difference("question_retention", label, "frozen", form=".3f"),
-            evidence.difference("retention", label, "frozen"),
-        ]
-        for label in ranks
-    }
-    present = [both for label, both in figures.items() if label in evidence.runs]
-    untold = [words for label, words in ranks.items() if label not in evidence.runs]
-    controls = tuple(
-        evidence.difference(name, "sft", "frozen", form=form)
-        for name, form in (("question_retention", ".3f"), ("retention", ".2f"))
-    )
-    sentences = [f"There are no records for {', '.join(untold)}."] if present and untold else []
-    for number, words in enumerate(("answers", "skills")):
-        less = [ranks[label] for label, both in figures.items() if both[number].low > controls[number].high]
-        sentences += [f"With {', '.join(less)}, fewer {words} are lost than with sft."] if less else []
+    labels = ("lora+rank=4", "lora", "lora+rank=64")
+    answers = [evidence.difference("question_retention", label, "frozen", form=".3f") for label in labels]
+    skills = [evidence.difference("retention", label, "frozen") for label in labels]
+    of_sft = evidence.difference("question_retention", "sft", "frozen", form=".3f")
+    lost = [figure.high < -0.01 for figure in answers]
+    less = [figure.methods[0] for figure in answers if figure.low > of_sft.high]
     return Finding(
         decided(
-            holds=bool(present) and all(any(figure.high < 0 for figure in both) for both in present),
-            fails=any(all(figure.low >= -0.01 for figure in both) for both in present),
+            holds=all(lost),
+            in_part=any(lost) or any(figure.high < -0.05 for figure in skills),
+            fails=all(figure.low > -0.01 for figure in answers)
+            and all(figure.low > -0.05 for figure in skills),
         ),
-        tuple(figure for both in figures.values() for figure in both),
-        controls,
-        tuple(sentences),
+        (answers[1], answers[0], answers[2], *skills),
+        (of_sft, evidence.difference("retention", "sft", "frozen")),
+        (f"{', '.join(less)}: fewer answers are lost than with sft.",) if less else (),
+        what_would_change(answers[1], -0.01),
     )
 
 
@@ -105,22 +126,40 @@ def lora_still_overwrites(evidence: Evidence) -> Finding:
     AEGIS,
     reported="OK-VQA 60.15 before, 60.23 after",
     rule="Holds if the lower end of the difference in question accuracy to the frozen policy is at least "
-    "-0.01; does not hold if the upper end is below -0.01.",
+    "-0.01; does not hold if the upper end is below -0.01. Cannot be shown here if sft does not certainly "
+    "lose 0.01 of the answers.",
+    margin="0.01 of the answers",
+    scenarios=KNOWLEDGE,
 )
 def keeps_answers(evidence: Evidence) -> Finding:
     """Keeps question answering at the pretrained level although the action gradient reaches the backbone."""
-    aegis, sft, at_random = (
-        evidence.difference("question_retention", method, "frozen", form=".3f")
-        for method in ("aegis", "sft", "aegis+direction=random")
+    aegis, sft = (
+        evidence.difference("question_retention", method, "frozen", form=".3f") for method in ("aegis", "sft")
     )
+    gains: tuple[Figure, ...] = tuple(
+        evidence.difference("question_retention", "aegis", other, form=".3f")
+        for other in ("sft", "aegis+direction=random")
+    )
+    of_sft = question_drop(evidence, "sft")
+    if of_sft.high == of_sft.high and not _loses_answers(evidence):
+        return Finding("cannot be shown here", (aegis,), (sft, *gains), (NOTHING_TO_KEEP,), LOSES_ANSWERS)
     return Finding(
         decided(holds=aegis.low >= -0.01, fails=aegis.high < -0.01),
         (aegis,),
-        (sft, at_random),
+        (sft, *gains),
         (
-            compared(sft, aegis, does_as_well="the projection does not explain what is kept"),
-            compared(at_random, aegis, does_as_well="the anchor's direction does not explain what is kept"),
+            not_told_apart(
+                gains[0],
+                explains="the projection need not keep any answer",
+                does_not="the projection keeps answers",
+            ),
+            not_told_apart(
+                gains[1],
+                explains="the anchor's direction need not matter",
+                does_not="the anchor's direction matters",
+            ),
         ),
+        what_would_change(aegis, -0.01),
     )
 
 
@@ -128,46 +167,47 @@ def keeps_answers(evidence: Evidence) -> Finding:
     "A5",
     AEGIS,
     reported="0.62 % on average, at most 3.4 %; about half of the layers projected on a typical step",
-    rule="Holds if the mean share of the energy over steps, stages and seeds is below 0.01; otherwise it "
-    "does not hold.",
+    rule="Judged in the first stage, as the paper fine-tunes on one data set. Holds if the upper end of the "
+    "mean share over steps and seeds is below 0.01; does not hold if the lower end is above 0.01.",
+    margin="0.01 of the energy, the claim's own",
 )
 def sheds_little(evidence: Evidence) -> Finding:
     """Sheds less than 1 % of the gradient's energy on average."""
-    mean, highest, layers = (
-        evidence.diagnostic(name, "aegis", words, form=".2%")
-        for name, words in (
-            ("energy_shed_mean", "share of the energy that is shed, mean over steps"),
-            ("energy_shed_highest", "the same at the step of each stage that sheds most"),
-            ("layers_projected_mean", "share of the layers projected, mean over steps"),
-        )
+    shed = "share of the energy that is shed, mean over steps"
+    first = _of_stages(evidence, "energy_shed_mean", f"{shed}, first stage", stage=1)
+    highest = _of_stages(evidence, "energy_shed_highest", "the same at the step that sheds most", stage=1)
+    layers = _of_stages(
+        evidence, "layers_projected_mean", "share of the layers projected, first stage", stage=1
     )
-    return Finding(decided(holds=mean.value < 0.01, fails=mean.value >= 0.01), (mean, highest, layers))
+    everywhere = _of_stages(evidence, "energy_shed_mean", f"{shed}, all stages")
+    return Finding(
+        decided(holds=first.high < 0.01, fails=first.low > 0.01),
+        (first, everywhere, highest, layers),
+        change=what_would_change(first, 0.01),
+    )
+
+
+def _of_stages(evidence: Evidence, name: str, what: str, stage: int | None = None) -> Figure:
+    return evidence.diagnostic("aegis", what, lambda found: found.get(name), ".2%", stage)
 
 
 @claim(
     "A6",
     AEGIS,
     reported="stated about the projection; no number was found",
-    rule="Activation drift divided by that of sft with the same seed: holds if the upper end is below 0.5, "
-    "does not hold if the lower end is above 0.5.",
+    rule="Activation drift divided by sft's with the same seed: holds if the upper end is below 0.5; does "
+    "not hold if the lower end is above 0.5.",
+    margin="half of the drift",
+    scenarios=KNOWLEDGE,
 )
 def removes_drift(evidence: Evidence) -> Finding:
     """Removes the cumulative drift of activations."""
-    aegis, smaller, at_random = (
-        drift_ratio(evidence, method) for method in ("aegis", "low_rate_sft", "aegis+direction=random")
-    )
-    sentences = []
-    if smaller.low <= aegis.high:
-        sentences.append("low_rate_sft removes as much: smaller steps suffice.")
-    if at_random.low <= aegis.high:
-        sentences.append(
-            "A random direction removes as much: the anchor's direction does not explain the result."
-        )
+    aegis, at_random = (drift_ratio(evidence, method) for method in ("aegis", "aegis+direction=random"))
     return Finding(
         decided(holds=aegis.high < 0.5, fails=aegis.low > 0.5),
         (aegis,),
-        (smaller, at_random),
-        tuple(sentences),
+        (at_random,),
+        change=what_would_change(aegis, 0.5),
     )
 
 
@@ -175,10 +215,16 @@ def removes_drift(evidence: Evidence) -> Finding:
     "A7",
     AEGIS,
     reported="about 40 % more time; no buffer",
-    rule="Holds if a step takes at most 1.6 times as long as a step of sft; otherwise it does not hold.",
+    rule="Holds if the upper end of a step's time is at most 1.6 times sft's; does not hold if the lower "
+    "end is above 1.6.",
+    margin="0.2 of the time of a step",
+    scenarios=ANYWHERE,
 )
 def costs_40_percent(evidence: Evidence) -> Finding:
     """Costs about 40 % more time and needs no buffer."""
     time = evidence.step_time("aegis")
-    kept = evidence.cost("bytes_kept", "aegis", "bytes kept of aegis, the anchor")
-    return Finding(decided(holds=time.value <= 1.6, fails=time.value > 1.6), (time, kept))
+    return Finding(
+        decided(holds=time.high <= 1.6, fails=time.low > 1.6),
+        (time, evidence.cost("bytes_kept", "aegis", "bytes kept of aegis, the anchor")),
+        change=what_would_change(time, 1.6),
+    )

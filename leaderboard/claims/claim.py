@@ -2,7 +2,8 @@
 
 A new claim is one function with the decorator `claim` in the module of its paper; its docstring is the claim
 in our words. A comparison with a missing figure is never true, so a missing figure leaves a claim
-undecided.
+undecided. A rule asks first whether the setting could have shown the claim; where it could not, no figure
+counts for or against the paper.
 """
 
 from __future__ import annotations
@@ -14,7 +15,19 @@ from typing import Literal
 
 from .evidence import Evidence, Figure
 
-Verdict = Literal["holds", "does not hold", "undecided"]
+Verdict = Literal["holds", "holds in part", "does not hold", "undecided", "cannot be shown here"]
+
+BOARDS = ("clbench/Fetch-v1", "clbench/MetaWorld-v1")
+"""Scenarios whose stages end at a criterion, so that methods are compared at equal learning."""
+
+ANYWHERE = BOARDS[:1]
+"""Scenario of the claims that do not depend on one, such as the time of a step."""
+
+KNOWLEDGE = ("clbench/FetchKnowledge-v1",)
+"""Scenario with one long stage, in which plain fine-tuning forgets answers to questions."""
+
+MOST_SEEDS = 100
+"""More seeds than this count as out of reach."""
 
 
 @dataclass(frozen=True)
@@ -39,10 +52,10 @@ class Finding:
     """The same figures of methods that could explain the result."""
     sentences: tuple[str, ...] = ()
     """Conclusions from the figures."""
+    change: str = ""
+    """What would change the verdict."""
     about: tuple[str, ...] = ()
     """Methods of the claim, besides the first method of each figure."""
-    missing: tuple[str, ...] = ()
-    """What no record can show yet, in words."""
 
 
 @dataclass(frozen=True)
@@ -58,19 +71,29 @@ class Claim:
     reported: str
     """The paper's figure."""
     rule: str
-    """When the claim holds and when it does not; in all other cases it is undecided."""
+    """When the claim holds, when it does not, and when the setting cannot show it; else it is undecided."""
+    margin: str
+    """Smallest difference that counts."""
+    scenarios: tuple[str, ...]
+    """Gymnasium ids of the scenarios on which it is judged."""
     judge: Callable[[Evidence], Finding]
     """Function that applies the rule."""
 
 
 def claim(
-    identifier: str, paper: Paper, *, reported: str, rule: str
+    identifier: str,
+    paper: Paper,
+    *,
+    reported: str,
+    rule: str,
+    margin: str,
+    scenarios: tuple[str, ...] = BOARDS,
 ) -> Callable[[Callable[[Evidence], Finding]], Claim]:
     """Return a decorator that makes a claim of the function that judges it; its docstring is the claim."""
 
     def enter(judge: Callable[[Evidence], Finding]) -> Claim:
         words = " ".join((judge.__doc__ or "").split())
-        return Claim(identifier, paper, words, reported, rule, judge)
+        return Claim(identifier, paper, words, reported, rule, margin, scenarios, judge)
 
     return enter
 
@@ -78,32 +101,38 @@ def claim(
 # ---- parts of rules ----------------------------------------------------------------------------------------
 
 
-def decided(*, holds: bool, fails: bool) -> Verdict:
-    """Return the verdict of a rule."""
-    return "holds" if holds else "does not hold" if fails else "undecided"
+def decided(*, holds: bool, fails: bool, in_part: bool = False) -> Verdict:
+    """Return the verdict of a rule on a setting that could show the claim."""
+    return "holds" if holds else "holds in part" if in_part else "does not hold" if fails else "undecided"
 
 
-def either(
-    figures: Sequence[Figure], *, holds: Callable[[Figure], bool], fails: Callable[[Figure], bool]
-) -> tuple[Verdict, tuple[str, ...]]:
-    """Return the verdict of a claim that holds for any of the figures, and the sentence that names which."""
-    holding = [figure.methods[0] for figure in figures if holds(figure)]
-    verdict = decided(holds=bool(holding), fails=all(map(fails, figures)))
-    return verdict, (f"It holds for {' and '.join(holding)}.",) if holding else ()
+def what_would_change(figure: Figure, bar: float) -> str:
+    """Return the sentence that says how far the interval of the deciding figure is from the rule's bar."""
+    if math.isnan(figure.low) or math.isnan(figure.high):
+        return f"Records that give an interval for this figure: {figure.what}."
+    apart = max(figure.low - bar, bar - figure.high)
+    form = figure.form
+    if apart >= 0:
+        return f"The interval of the first figure would have to move by {apart:{form}} to reach {bar:{form}}."
+    half, gap = (figure.high - figure.low) / 2, abs(figure.value - bar)
+    seeds = len(figure.seeds)
+    needed = math.ceil(seeds * (half / gap) ** 2) if gap > 0 else MOST_SEEDS + 1
+    if not seeds:
+        return f"A narrower interval of the first figure: it contains {bar:{form}}."
+    how_many = f"about {needed}" if needed <= MOST_SEEDS else f"more than {MOST_SEEDS}"
+    return f"At this spread {how_many} seeds: the interval of the first figure contains {bar:{form}}."
 
 
-def compared(control: Figure, method: Figure, *, does_as_well: str) -> str:
-    """Return the sentence that compares a control with a method's figure; higher is better."""
-    name, subject = control.methods[0], method.methods[0]
-    if math.isnan(control.high) or math.isnan(method.low):
-        return f"The records cannot show whether {name} does as well as {subject}."
-    if control.high >= method.low:
-        return f"{name} does as well as {subject}: {does_as_well}."
-    return f"{name} does not reach {subject}, so it does not explain the result."
+def not_told_apart(control: Figure, *, explains: str, does_not: str) -> str:
+    """Return what a control says: the figure is the method's gain over the control, higher is better."""
+    name = control.methods[-1]
+    if math.isnan(control.low):
+        return f"The records cannot show what {name} says about it."
+    if control.low > 0:
+        return f"{name} does not reach it: {does_not}."
+    return f"{name} is not told apart from it: {explains}."
 
 
-def compared_gains(control: Figure, method: Figure, *, does_as_well: str) -> str:
-    """Return the same sentence for gains over sft, where there may be no gain to explain."""
-    if method.low <= 0:
-        return f"{method.methods[0]} has no certain gain over sft that {control.methods[0]} could explain."
-    return compared(control, method, does_as_well=does_as_well)
+def best_of(figures: Sequence[Figure]) -> Figure:
+    """Return the figure with the largest value; missing values come last."""
+    return max(figures, key=lambda one: -math.inf if math.isnan(one.value) else one.value)

@@ -12,13 +12,13 @@ from typing import Any
 import numpy as np
 
 from clbench.scoring.intervals import Estimate, bootstrap, interval, row_generator
-from clbench.scoring.layout import Array, average
+from clbench.scoring.layout import Array
 from clbench.scoring.metrics import load_metric
-from clbench.scoring.ours import matched_points
 from clbench.scoring.rates import Rates
 from clbench.scoring.scores import Scores, rates_of
 
 from ..board.costs import read_step_times
+from ..board.frontier import FACTOR, ladder_of
 from ..board.runs import (
     ALIKE,
     NotShown,
@@ -41,8 +41,6 @@ Of = Mapping[str, Rates]
 """Rates by label of the method: same seeds, same draws, batch axes (..., runs)."""
 Quantity = Callable[[Of], Array]
 """Maps rates with batch axes (..., runs) to values (...)."""
-Table = Callable[[Rates], Array]
-"""Maps rates (...) to values at the points of each stage (..., targets, points)."""
 
 
 @dataclass(frozen=True)
@@ -158,45 +156,35 @@ class Evidence:
         what = f"{_words(name)}, {method} - {other}"
         return self.figure(what, lambda of: one(of) - two(of), *methods, span=(-reach, reach), **rest)
 
-    def matched_difference(self, name: str, table: Table, method: str, other: str, **rest: Any) -> Figure:
-        """Return the difference of two methods where each has learned the target about as well as sft.
-
-        The mean is over the stages in which both reach such a point, for each seed, then over seeds.
-
-        Args:
-            name: Name of the compared values.
-            table: Function that gives the compared values.
-            method: Label of the method.
-            other: Label of the method it is compared with.
-            rest: Further fields of the figure.
-        """
-        methods = tuple(dict.fromkeys((method, other, "sft")))
-
-        def stages(of: Of) -> Array:
-            return at_matched_points(table, of, method) - at_matched_points(table, of, other)
-
-        seeds = self.common_seeds(methods)
-        if seeds:
-            reached = np.asarray(np.isfinite(stages(self.rates(methods, seeds))))
-            if not reached.all():
-                counts = f"{reached.sum()} of {reached.size} stages"
-                rest["note"] = f"over the {counts} in which both learn as well as sft"
-            seeds = tuple(np.array(seeds)[reached.any(axis=-1)].tolist())
-        what = f"{name} at matched adaptation, {method} - {other}"
-        return self.figure(what, lambda of: average(_mean(stages(of))), *methods, seeds=seeds, **rest)
-
     # ---- figures of costs and diagnostics ----------------------------------------------------------
 
     def cost(self, name: str, method: str, what: str, form: str = ",.0f") -> Figure:
         """Return the mean of a cost over seeds."""
         return self._mean_of(method, what, lambda run: [getattr(run.record.costs, name)], form)
 
-    def diagnostic(self, name: str, method: str, what: str, form: str = ".2f") -> Figure:
-        """Return the mean of a diagnostic over stages and seeds, with its interval over seeds."""
+    def diagnostic(
+        self,
+        method: str,
+        what: str,
+        read: Callable[[Mapping[str, Any]], Any],
+        form: str = ".2f",
+        stage: int | None = None,
+    ) -> Figure:
+        """Return the mean of a diagnostic over stages and seeds, with its interval over seeds.
+
+        Args:
+            method: Label of the method.
+            what: Name of the figure.
+            read: Returns the value from the diagnostics of a stage; None if they do not have it.
+            form: Format of the number.
+            stage: The only stage that counts; all count if None.
+        """
 
         def values(run: Run) -> list[Any]:
-            stages = run.record.diagnostics.values()
-            return [stage[name] for stage in stages if isinstance(stage, dict) and name in stage]
+            of_stages = run.record.diagnostics.items()
+            chosen = [found for name, found in of_stages if stage is None or name == str(stage)]
+            read_ones = [read(found) for found in chosen if isinstance(found, dict)]
+            return [value for value in read_ones if value is not None]
 
         return self._mean_of(method, what, values, form)
 
@@ -250,41 +238,42 @@ def measured(name: str, method: str) -> Quantity:
     return lambda of: metric.over_runs(replace(of[method], references=of))
 
 
-def at_matched_points(table: Table, of: Of, method: str) -> Array:
-    """Return the values (..., targets) where each target is first learned about as well as with sft."""
-    rates = replace(of[method], references=of)
-    points = matched_points(rates)
-    chosen = np.nan_to_num(points).astype(np.int64)[..., None]
-    values = np.take_along_axis(table(rates), chosen, axis=-1)[..., 0]
-    return np.where(np.isnan(points), np.nan, values)
-
-
-def _mean(values: Array) -> Array:
-    """Return the mean of the finite values along the last axis, NaN where there are none."""
-    known = np.isfinite(values)
-    counts = known.sum(axis=-1)
-    total = np.where(known, values, 0.0).sum(axis=-1)
-    return np.where(counts > 0, total / np.maximum(counts, 1), np.nan)
-
-
 # ---- reading -----------------------------------------------------------------------------------------------
 
 
 def read_evidence(scenario: str, records: Path, controls: Path, step_time: Path) -> Evidence:
-    """Return the evidence in the folders and files; missing ones count as empty."""
+    """Return the evidence in the folders and files; missing ones count as empty.
+
+    A run of the ladder has the label of `rung`. The ladder's folder lies beside that of the records.
+    """
     scored, refused = read_runs(records, read_run, ALIKE)
-    changed, refused_controls = read_runs(controls, partial(read_run, changed=True), (_like(scored), *ALIKE))
+    like = _like(scored)
+    changed, refused_controls = read_runs(controls, partial(read_run, changed=True), (like, *ALIKE))
+    ladder = ladder_of(records)
+    rungs, refused_rungs = read_runs(ladder, partial(read_run, changed=True), (like, *ALIKE))
     runs: dict[str, dict[int, Run]] = {}
-    for run in (*scored, *changed):
+    for label, run in (
+        *((run.method, run) for run in (*scored, *changed)),
+        *((rung(run.record.run.method, run.record.run.changes.get(FACTOR)), run) for run in rungs),
+    ):
         if run.scenario == scenario and run.scores.layout.target and not run.order:
-            runs.setdefault(run.method, {})[run.seed] = run
-    not_used = [("records", entry) for entry in refused] + [("controls", entry) for entry in refused_controls]
+            runs.setdefault(label, {})[run.seed] = run
+    not_used = [
+        NotShown(f"{name}/{entry.path}", entry.reason)
+        for name, entries in (("records", refused), ("controls", refused_controls), ("ladder", refused_rungs))
+        for entry in entries
+    ]
     return Evidence(
         scenario,
         {label: dict(sorted(seeds.items())) for label, seeds in sorted(runs.items())},
         read_step_times(step_time),
-        tuple(NotShown(f"{name}/{entry.path}", entry.reason) for name, entry in not_used),
+        tuple(not_used),
     )
+
+
+def rung(method: str, factor: Any) -> str:
+    """Return the label of a run of the ladder: the method and its factor of the step size, as "sft@0.3"."""
+    return f"{method}@{factor:g}" if is_number(factor) else f"{method}@{factor}"
 
 
 def _like(scored: Sequence[Run]) -> Sift:

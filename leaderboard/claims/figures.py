@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from typing import Any
 
 import numpy as np
 
@@ -11,15 +12,8 @@ from clbench.scoring.rates import Rates
 
 from .evidence import Evidence, Figure, Of
 
-
-def retained(rates: Rates) -> Array:
-    """Return the success on the retained skills at all points (..., targets, points)."""
-    return average(rates.retained_curves)
-
-
-def sparsity(rates: Rates) -> Array:
-    """Return the update sparsity at all points (..., targets, points)."""
-    return rates.update_sparsity
+PUBLISHED = 1.0
+"""Rung of the ladder with the step size that the papers' recipe gives, the benchmark's learning rate."""
 
 
 def retention_drop(evidence: Evidence, method: str) -> Figure:
@@ -30,6 +24,29 @@ def retention_drop(evidence: Evidence, method: str) -> Figure:
         return average(kept[..., 0] - kept[..., -1])
 
     return evidence.figure(f"retained success, pretrained - {method} after the last target", drop, method)
+
+
+def kept(evidence: Evidence, method: str, other: str) -> Figure:
+    """Return the difference in success on the retained skills after the last target."""
+
+    def difference(of: Of) -> Array:
+        first, second = (average(of[label].retained)[..., -1] for label in (method, other))
+        return average(first - second)
+
+    return evidence.figure(f"retained success, {method} - {other}", difference, method, other, span=(-1, 1))
+
+
+def share_of_steps(evidence: Evidence, method: str, other: str) -> Figure:
+    """Return the steps to the criterion of `method` divided by those of `other`, geometric mean over targets.
+
+    A target that is never learned counts with the budget's steps, and one that was known with one step.
+    """
+
+    def ratio(of: Of) -> Array:
+        first, second = (np.log(np.maximum(of[label].steps, 1.0)) for label in (method, other))
+        return np.exp(average(average(first - second)))
+
+    return evidence.figure(f"steps to the criterion, {method} / {other}", ratio, method, other)
 
 
 def question_drop(evidence: Evidence, method: str) -> Figure:
@@ -66,24 +83,29 @@ def _accuracy(rates: Rates, stage: int) -> Array:
     return np.where(asked > 0, correct / np.maximum(asked, 1), np.nan)
 
 
-def sparsity_after(evidence: Evidence, method: str) -> tuple[Figure, Figure]:
-    """Return the update sparsity at the end of the first stage and of the last."""
+def early_success(evidence: Evidence, method: str, other: str) -> Figure:
+    """Return the difference in success on the targets, averaged over the evaluated steps of a stage.
 
-    def after(stage: int) -> Callable[[Of], Array]:
-        return lambda of: average(of[method].update_sparsity[..., stage, -1])
+    The points halve towards the beginning, so that the mean tells how early a target is learned.
+    """
 
-    first, last = (
-        evidence.figure(
-            f"update sparsity of {method} after the {name} target", after(stage), method, form=".3f"
-        )
-        for name, stage in (("first", 0), ("last", -1))
-    )
-    return first, last
+    def difference(of: Of) -> Array:
+        first, second = (average(average(of[label].learning_curves)) for label in (method, other))
+        return average(first - second)
+
+    what = f"success on the targets, mean over the evaluated steps, {method} - {other}"
+    return evidence.figure(what, difference, method, other, span=(-1, 1))
 
 
-def matched_retention(evidence: Evidence, method: str, other: str) -> Figure:
-    """Return the difference in retention where both methods have learned the target about as well as sft."""
-    return evidence.matched_difference("retention", retained, method, other)
+def sparsity(evidence: Evidence, method: str, other: str) -> Figure:
+    """Return the difference in update sparsity after the last target."""
+
+    def difference(of: Of) -> Array:
+        first, second = (of[label].update_sparsity[..., -1, -1] for label in (method, other))
+        return average(first - second)
+
+    what = f"update sparsity, {method} - {other}"
+    return evidence.figure(what, difference, method, other, span=(-1, 1), form=".3f")
 
 
 def drift_ratio(evidence: Evidence, method: str) -> Figure:
@@ -96,6 +118,12 @@ def drift_ratio(evidence: Evidence, method: str) -> Figure:
     return evidence.figure(f"activation drift, {method} / sft", ratio, method, "sft")
 
 
-def gain_over_random(evidence: Evidence) -> Figure:
-    """Return the gain in forward transfer of the vector over a random vector of equal norms."""
-    return evidence.difference("forward_transfer", "fast_dvla", "fast_dvla+direction=random", form=".3f")
+def share_at_floor(evidence: Evidence, method: str) -> Figure:
+    """Return the share of ConSFT's weights that are below 0.01, over all samples of all steps."""
+
+    def share(stage: Mapping[str, Any]) -> float | None:
+        counts = np.asarray(stage.get("omega_counts", []), dtype=np.float64)
+        total = counts.sum() if counts.ndim == 2 else 0.0
+        return float(counts[:, 0].sum() / total) if total > 0 else None
+
+    return evidence.diagnostic(method, f"share of the weights of {method} below 0.01", share)

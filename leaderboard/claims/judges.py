@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache
+
 from . import aegis, consft, fast_dvla
 from .claim import Claim, Finding
 from .evidence import Evidence
@@ -15,6 +19,28 @@ CLAIMS: dict[str, Claim] = {
 """All claims by id, in the order of the page."""
 
 
-def judge_all(evidence: Evidence) -> dict[str, Finding]:
-    """Return the finding of every claim by id."""
-    return {identifier: one.judge(evidence) for identifier, one in CLAIMS.items()}
+@dataclass(frozen=True, eq=False)
+class Judged:
+    """A claim with the finding on one scenario."""
+
+    claim: Claim
+    """The claim."""
+    evidence: Evidence
+    """Records of the scenario."""
+    finding: Finding
+    """What they show."""
+
+
+def judge_all(read: Callable[[str], Evidence], scenario: str | None = None) -> tuple[Judged, ...]:
+    """Return the findings on all claims.
+
+    Args:
+        read: Returns the evidence of the scenario with a Gymnasium id.
+        scenario: The only scenario on which claims are judged; each claim names its own if None.
+    """
+    evidence = cache(read)
+    return tuple(
+        Judged(one, evidence(name), one.judge(evidence(name)))
+        for one in CLAIMS.values()
+        for name in ((scenario,) if scenario else one.scenarios)
+    )

@@ -14,9 +14,8 @@ from clbench.scoring.metrics import measure
 
 from ..board.rows import Row, Table
 from ..board.runs import DIVISIONS, Run, is_number, printable, read_run, read_runs
-from ..claims.claim import Finding
 from ..claims.evidence import Evidence
-from ..claims.judges import CLAIMS
+from ..claims.judges import Judged
 from ..views.descriptions import COMMON, Description, common_hyper_parameters, of_one_module
 from ..views.format import shown
 from ..views.markdown import arxiv_ids, templates
@@ -42,8 +41,8 @@ class Sources:
 
     evidence: Evidence
     """Records of the scenario."""
-    findings: Mapping[str, Finding]
-    """Findings on the claims, by id."""
+    judged: Sequence[Judged]
+    """Findings on the claims."""
     rows: Mapping[str, Row]
     """Rows of the board by method."""
     tuning: Sequence[Run]
@@ -78,11 +77,11 @@ class Tried:
     """Values of the metrics in `TRIED`."""
 
 
-def read_sources(evidence: Evidence, findings: Mapping[str, Finding], board: Table, tuning: Path) -> Sources:
+def read_sources(evidence: Evidence, judged: Sequence[Judged], board: Table, tuning: Path) -> Sources:
     """Return the sources; a missing folder counts as empty."""
     runs, _ = read_runs(tuning, partial(read_run, split="validation", changed=None), ())
     rows = {row.method: row for row in board.rows if row.scenario == evidence.scenario}
-    return Sources(evidence, findings, rows, [run for run in runs if run.scenario == evidence.scenario])
+    return Sources(evidence, judged, rows, [run for run in runs if run.scenario == evidence.scenario])
 
 
 def pages(methods: Sequence[Description], sources: Sources) -> dict[str, str]:
@@ -135,10 +134,12 @@ def _diagnostics(method: Description, sources: Sources) -> dict[str, Estimate]:
     runs = sources.evidence.runs.get(method.name, {}).values()
     stages = [stage for run in runs for stage in run.record.diagnostics.values() if isinstance(stage, dict)]
     names = dict.fromkeys(name for stage in stages for name, value in stage.items() if is_number(value))
-    return {
-        name: sources.evidence.diagnostic(name, method.name, f"{name} of {method.name}").estimate
-        for name in names
-    }
+    return {name: _mean_diagnostic(method.name, name, sources) for name in names}
+
+
+def _mean_diagnostic(method: str, name: str, sources: Sources) -> Estimate:
+    figure = sources.evidence.diagnostic(method, f"{name} of {method}", lambda stage: stage.get(name))
+    return figure.estimate
 
 
 # ---- claims ------------------------------------------------------------------------------------------------
@@ -146,21 +147,29 @@ def _diagnostics(method: Description, sources: Sources) -> dict[str, Estimate]:
 
 def _claims(method: Description, sources: Sources) -> list[Part]:
     """Return the part of the method in each claim, the claims about the method first."""
-    parts = []
-    for identifier, finding in sources.findings.items():
+    parts: dict[str, Part] = {}
+    for one in sources.judged:
+        finding = one.finding
         about = {_base(label) for label in finding.about}
         about |= {_base(figure.methods[0]) for figure in finding.figures}
         compared = {
             _base(label) for figure in (*finding.figures, *finding.controls) for label in figure.methods
         }
-        if method.name in about | compared:
-            words = CLAIMS[identifier].words
-            parts.append(Part(identifier, words, finding.verdict, subject=method.name in about))
-    return sorted(parts, key=lambda part: not part.subject)
+        if method.name not in about | compared:
+            continue
+        verdict = f"{finding.verdict} ({one.evidence.scenario.rpartition('/')[2]})"
+        known = parts.get(one.claim.id)
+        parts[one.claim.id] = Part(
+            one.claim.id,
+            one.claim.words,
+            f"{known.verdict}, {verdict}" if known else verdict,
+            subject=method.name in about or (known is not None and known.subject),
+        )
+    return sorted(parts.values(), key=lambda part: not part.subject)
 
 
 def _base(label: str) -> str:
-    return label.partition("+")[0]
+    return label.partition("+")[0].partition("@")[0]
 
 
 # ---- settings ----------------------------------------------------------------------------------------------

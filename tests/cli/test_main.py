@@ -234,13 +234,13 @@ def test_a_stranger_runs_a_class_from_the_working_directory_and_sees_it_on_the_b
 
 @pytest.mark.slow
 def test_tune_compares_settings_without_test_episodes(tmp_path: Path) -> None:
-    arguments = ("tune", TOY, "low_rate_sft", "--values.speed", "0.2,1", "--first-seed", "3", "--seeds", "1")
+    arguments = ("tune", TOY, "l2_sp", "--values.strength", "0,1", "--first-seed", "3", "--seeds", "1")
     result = _clbench(*arguments, folder=tmp_path)
     assert result.returncode == 0, result.stderr
-    rows = [line.split() for line in result.stdout.splitlines() if "low_rate_sft" in line or " sft" in line]
+    rows = [line.split() for line in result.stdout.splitlines() if "l2_sp" in line or " sft" in line]
     settings = [row[1:4:2] for row in rows]
-    assert settings == [["sft", "defaults"], ["low_rate_sft", "speed=0.2"], ["low_rate_sft", "speed=1.0"]]
-    assert rows[0][4:] == rows[2][4:]  # at full speed it is plain fine-tuning
+    assert settings == [["sft", "defaults"], ["l2_sp", "strength=0.0"], ["l2_sp", "strength=1.0"]]
+    assert rows[0][4:] == rows[1][4:]  # at strength 0 it is plain fine-tuning
     paths = list((tmp_path / "leaderboard" / "tuning").rglob("seed-3.json"))
     assert len(paths) == 3
     assert not any('"test"' in path.read_text().partition('"answers"')[0] for path in paths)

@@ -3,6 +3,7 @@
 A scenario that lacks an extra or a renderer here is skipped with the reason.
 """
 
+import dataclasses
 import itertools
 import re
 import subprocess
@@ -17,6 +18,8 @@ from gymnasium.utils.env_checker import check_env
 from numpy.typing import NDArray
 
 from clbench.base.entry_points import resolve
+from clbench.base.errors import InputError
+from clbench.data.questions import load_questions
 from clbench.spec.identifiers import scenario_ids
 from clbench.spec.language import encode
 from clbench.spec.registry import registered_scenario
@@ -347,3 +350,13 @@ def test_questions_answer_many_states_as_they_answer_each(scenario: Scenario) ->
         assert answers.dtype == np.int64
         assert set(answers.tolist()) <= set(range(-1, len(kind.answers)))
         np.testing.assert_array_equal(answers, [kind.answer(state[None])[0] for state in states])
+
+
+@pytest.mark.slow
+def test_scenes_of_background_tasks_give_the_answers_that_retained_skills_lack() -> None:
+    scenario = registered_scenario("clbench/MetaWorld-v1")
+    make(scenario.tasks[0].world).close()
+    few = dataclasses.replace(scenario, budget=dataclasses.replace(scenario.budget, question_episodes=64))
+    assert all(questions.kinds for questions in load_questions(few))
+    with pytest.raises(InputError, match="No state answers 'left' to 'target_side_of_object'"):
+        load_questions(dataclasses.replace(few, scenes=()))

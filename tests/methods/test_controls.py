@@ -14,7 +14,6 @@ from torch import Tensor
 
 from clbench.learning.adaptation import adapt
 from clbench.learning.method import Method, Progress, Stage
-from clbench.learning.optimise import learning_rate_factor
 from clbench.learning.prior import Prior
 from clbench.policy.batch import Batch
 from clbench.policy.policy import Policy
@@ -233,28 +232,19 @@ def test_finch_forgets_the_losses_of_the_last_target() -> None:
     assert rates[0] == rates[1]
 
 
-@pytest.mark.parametrize(("changes", "share"), [({}, 0.2), ({"speed": 0.5}, 0.5)])
-def test_low_rate_sft_moves_every_weight_by_its_share_of_a_step(
-    changes: dict[str, float], share: float
-) -> None:
+@pytest.mark.parametrize("factor", [0.2, 0.5])
+def test_the_step_factor_moves_every_weight_by_its_share_of_a_step(factor: float) -> None:
     start = _weights(Policy(SMALL))
     moves = []
-    for method in (build_method("sft", {}), build_method("low_rate_sft", changes)):
+    for changes in ({}, {"step_factor": factor}):
         policy = Policy(SMALL)
-        _adapt(policy, method, steps=1)
+        _adapt(policy, build_method("sft", changes), steps=1)
         moves.append({name: weight - start[name] for name, weight in _weights(policy).items()})
     plain, slow = moves
     # the first step of Adam is the step size, up or down
     assert plain["head.embed.weight"].abs().max() == pytest.approx(1e-3, rel=1e-3)
     for name, move in plain.items():
-        torch.testing.assert_close(slow[name], share * move, rtol=0, atol=1e-6)
-
-
-def test_low_rate_sft_keeps_the_form_of_the_schedule() -> None:
-    method = build_method("low_rate_sft", {})
-    for step in range(0, 100, 9):
-        scheduled = 1e-3 * learning_rate_factor(step, 100)
-        assert method.learning_rate(scheduled, Progress(step, 100)) == pytest.approx(0.2 * scheduled)
+        torch.testing.assert_close(slow[name], factor * move, rtol=0, atol=1e-6)
 
 
 # ---- sources of the backbone's gradient --------------------------------------------------------------------

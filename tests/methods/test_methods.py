@@ -226,7 +226,6 @@ def test_no_hyper_parameter_of_any_method_may_be_negative_or_no_number(
         ("lora", "rank", 0, "from 1, not 0"),
         ("lora", "speed", 0.0, "from 1e-09, not 0.0"),
         ("lora", "variant", "qlora", "one of lora, dora, rslora, not 'qlora'"),
-        ("low_rate_sft", "speed", 0.0, "from 1e-09, not 0.0"),
         ("weight_interpolation", "coefficient", 1.5, "from 0 to 1, not 1.5"),
     ],
 )
