@@ -73,7 +73,7 @@ def made_record(
 ) -> Record:
     """Return the record of a run in which each stage keeps the share `keeps` of the skills."""
     access = "throughout" if method == "joint" else "never"
-    policy = generator.random((len(GROUPS["target"]) * len(STEPS), 3))
+    policy = generator.random((len(GROUPS["target"]) * len(STEPS), 2))
     points = list(product(range(1, len(GROUPS["target"]) + 1), STEPS))
     record = Record(
         status="success",
@@ -116,9 +116,9 @@ def made_record(
     for (stage, step), kind in product([(0, 0), *points], range(KINDS)):
         correct = int(generator.binomial(ASKED, 0.95))
         record.add_answers(AnswerRow(stage, step, f"kind_{kind}", ASKED, correct))
-    record.add_policy(PolicyRow(0, 0, 1.0, 0.0, None))
+    record.add_policy(PolicyRow(0, 0, 1.0, 0.0, None, None))
     for point, row in zip(points, policy, strict=True):
-        record.add_policy(PolicyRow(*point, *map(float, row)))
+        record.add_policy(PolicyRow(*point, float(row[0]), float(row[1]), None, None))
     return record
 
 

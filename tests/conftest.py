@@ -196,6 +196,7 @@ def _make_record(
     sparsity: Any = None,
     drift: Any = None,
     shift: Any = None,
+    captured: Any = None,
     relearning: Relearning | None = None,
     steps: tuple[int, ...] = (100, 200, 300, 400),
     answers: Mapping[tuple[int, str], tuple[int, int]] | None = None,
@@ -214,10 +215,11 @@ def _make_record(
         retained_curves: The same for the retained skills, (targets, points before the end, retained).
         validation: The same for the targets on validation episodes, (targets, points).
         perturbed: The same for the retained skills in perturbed episodes at the ends, (stages + 1, retained).
-        sparsity: Update sparsity, (targets, points). No policy was looked at if this and the next two are
-            None.
+        sparsity: Update sparsity, (targets, points). No policy was looked at if this and the next three
+            are None.
         drift: Activation drift, (targets, points).
         shift: Shift of the policy in each stage, (targets,).
+        captured: Captured share in each stage, (targets,).
         relearning: Relearning after the last stage.
         steps: Steps of the evaluation points; the last one ends a stage.
         answers: Questions asked and answered rightly by stage and kind, at the end of the stage.
@@ -295,7 +297,7 @@ def _make_record(
             if step <= end:
                 met = step == end < steps[-1]
                 record.add_check(CheckRow(stage, step, validation_episodes if met else 2, 9 if met else 0))
-    for values in _policy_rows(sparsity, drift, shift, (stages, len(steps)), steps, at_end):
+    for values in _policy_rows((sparsity, drift), (shift, captured), (stages, len(steps)), steps, at_end):
         record.add_policy(PolicyRow(*values))
     return record
 
@@ -322,21 +324,21 @@ def _each(values: Any, axes: int, episodes: int) -> list[tuple[tuple[int, ...], 
 
 
 def _policy_rows(
-    sparsity: Any,
-    drift: Any,
-    shift: Any,
+    at_points: tuple[Any, ...],
+    of_stages: tuple[Any, ...],
     shape: tuple[int, int],
     steps: tuple[int, ...],
     at_end: tuple[int, ...],
 ) -> list[tuple[Any, ...]]:
     """Return the rows of the policy table, including the pretrained policy's; none without values."""
-    if sparsity is None and drift is None and shift is None:
+    if all(values is None for values in (*at_points, *of_stages)):
         return []
-    tables = np.full((3, *shape), np.nan)
-    for table, values in zip(tables, (sparsity, drift), strict=False):
+    tables = np.full((len(at_points) + len(of_stages), *shape), np.nan)
+    for table, values in zip(tables, at_points, strict=False):
         table[:] = np.nan if values is None else values
-    tables[2, :, -1] = np.nan if shift is None else shift
-    rows: list[tuple[Any, ...]] = [(0, 0, 1.0, 0.0, None)]
+    for table, values in zip(tables[len(at_points) :], of_stages, strict=True):
+        table[:, -1] = np.nan if values is None else values
+    rows: list[tuple[Any, ...]] = [(0, 0, 1.0, 0.0, None, None)]
     for target, point in np.ndindex(shape):
         step = at_end[target + 1] if point == shape[1] - 1 else steps[point]
         values = (None if np.isnan(value) else float(value) for value in tables[:, target, point])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Sequence
 from functools import cached_property
@@ -73,8 +74,8 @@ class Examiner:
             policy: Policy to evaluate.
             point: Point of the run.
             record: Record of the run.
-            velocities_before: `velocities` before the stage, at the end of which the shift is measured; None
-                elsewhere.
+            velocities_before: `velocities` before the stage, at the end of which the shift and the captured
+                share are measured; None elsewhere.
         """
         keys = self._protocol.episodes(point)
         episodes = self._play(policy, [(self._scenario.task(key.task), *key[1:]) for key in keys])
@@ -83,8 +84,12 @@ class Examiner:
         for kind, asked, correct in answer(policy, self._data.questions.kinds, *self._asked):
             record.add_answers(AnswerRow(*point, kind, asked, correct))
         drift = float(self._activations(policy).distance(self._anchor).mean())
-        moved = None if velocities_before is None else self._shift(policy, point.stage, velocities_before)
-        record.add_policy(PolicyRow(*point, update_sparsity(policy, self._pretrained), drift, moved))
+        moved = captured = None
+        if velocities_before is not None:
+            moved = self._shift(policy, point.stage, velocities_before)
+            captured = self._captured(policy, point.stage)
+        sparsity = update_sparsity(policy, self._pretrained)
+        record.add_policy(PolicyRow(*point, sparsity, drift, moved, captured))
 
     def velocities(self, policy: Policy, stage: int) -> Tensor:
         """Return the velocities (B, H, A) that `policy` predicts on a fixed batch of a stage's target."""
@@ -112,6 +117,25 @@ class Examiner:
         """Return the shift since `before`, None for a diverged policy, whose velocities are not finite."""
         moved = shift(before, self.velocities(policy, stage), self._batch(stage).valid)
         return moved if math.isfinite(moved) else None
+
+    def _captured(self, policy: Policy, stage: int) -> float | None:
+        """Return the share of episodes in which `policy` does a stage's target though told to do a skill.
+
+        The episodes begin as the scored ones of the target do; the instructions of the skills take turns.
+        """
+        if not self._protocol.captured_episodes:
+            return None
+        target, skills = self._scenario.target[stage - 1], self._scenario.retained
+        told = [
+            dataclasses.replace(
+                target, instructions=skill.instructions, test_instructions=skill.test_instructions
+            )
+            for skill in skills
+        ]
+        numbers = range(self._protocol.captured_episodes)
+        split = self._protocol.split
+        episodes = self._play(policy, [(told[number % len(told)], split, number) for number in numbers])
+        return sum(episode.success for episode in episodes) / len(episodes)
 
     def _batch(self, stage: int) -> Batch:
         """Return the batch of a stage's target on which the shift is measured: the same at each call."""

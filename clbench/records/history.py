@@ -1,5 +1,7 @@
 """Records of older schemas, converted to the present one while they are read. Their files stay as they are.
 
+Schema 3 did not measure how often the latest target captures the instructions of other skills.
+
 Schema 2 wrote "report" for the split "test" and "selection" for "validation", named four fields of the budget
 after these words, and left out `order`, `perturb` and costs where they had their usual values. Its stages had
 no criterion, the shift of the policy was not measured, and nothing was relearned.
@@ -135,7 +137,16 @@ def _from_2(values: _Values) -> _Values:
     return {**_with(values, changed), "checks": checks, "relearning": None}
 
 
-_STEPS: tuple[Callable[[_Values], _Values], ...] = (_from_1, _from_2)
+def _from_3(values: _Values) -> _Values:
+    """Convert schema 3 to schema 4."""
+    policy = _part(values, "policy")
+    if policy is not None and isinstance(policy.get("stage"), list):
+        _refuse_later("policy", policy, ("captured",), 3)
+        policy["captured"] = [None] * len(policy["stage"])
+    return _with(values, {"policy": policy})
+
+
+_STEPS: tuple[Callable[[_Values], _Values], ...] = (_from_1, _from_2, _from_3)
 """Functions that convert each schema, from 1, to the next one."""
 
 

@@ -25,6 +25,9 @@ from clbench.spec.identifiers import check_plain
 MOST_ROWS = 200_000
 """Rows of a table. A record of Fetch-v0 has 1,780 episodes."""
 
+FIRST_HASHED = 3
+"""Schema whose records, and those of later ones, have a hash of their content."""
+
 ERROR_FIELDS = ("where", "type", "message", "traceback")
 """Names of the texts in `Record.error`."""
 
@@ -73,16 +76,16 @@ def _record(values: Any) -> Record:
     _check_names("kind of question", set(record.answers["kind"]))
     if record.run.order < 0:
         raise RecordError("run: order must not be below 0.")
-    if schema == SCHEMA:
-        _check_content(values)
+    if schema >= FIRST_HASHED:
+        _check_content(values, schema)
     elif "content" in values:
         raise RecordError(f"a record of schema {schema} has no content: only later ones are hashed.")
     return record
 
 
-def _check_content(values: dict[str, Any]) -> None:
+def _check_content(values: dict[str, Any], schema: int) -> None:
     if "content" not in values:
-        raise RecordError(f"a record of schema {SCHEMA}: content is missing.")
+        raise RecordError(f"a record of schema {schema}: content is missing.")
     if values["content"] != content_hash(values):
         raise RecordError("its content does not match its hash: the file was changed or damaged.")
 

@@ -11,7 +11,7 @@ from typing import Any, Literal, NamedTuple
 
 from clbench.spec.protocol import Point, Protocol, ScoredSplit, Split
 
-SCHEMA = 3
+SCHEMA = 4
 """Version of the file format. A reader refuses a newer one, and converts older ones
 (`clbench.records.history`)."""
 
@@ -23,14 +23,15 @@ point has."""
 ANSWER_COLUMNS = ("stage", "step", "kind", "asked", "correct")
 """One row for each evaluation point and kind of question; an agent that learned online is asked 0."""
 
-POLICY_COLUMNS = ("stage", "step", "update_sparsity", "activation_drift", "shift")
+POLICY_COLUMNS = ("stage", "step", "update_sparsity", "activation_drift", "shift", "captured")
 """One row for each evaluation point: how far the policy has moved.
 
 `update_sparsity` is the share of its parameters whose relative change from pretraining is below 1e-3.
 `activation_drift` is the squared 2-Wasserstein distance between its and the pretrained policy's hidden states
 on the questions, averaged over layers. `shift` is the mean squared change of the predicted velocity on 256
-samples of the stage's target since the beginning of the stage, in normalised actions; only the ends of stages
-have one. Each may be None.
+samples of the stage's target since the beginning of the stage, in normalised actions. `captured` is the
+share of episodes in which the policy does the stage's target although it is told to do a retained skill. Only
+the ends of stages have the last two. Each may be None.
 """
 
 
@@ -76,6 +77,7 @@ class PolicyRow(NamedTuple):
     update_sparsity: float | None
     activation_drift: float | None
     shift: float | None
+    captured: float | None
 
 
 class CheckRow(NamedTuple):

@@ -25,7 +25,8 @@ def training_length(scenario: Scenario) -> float:
 
 def point_length(protocol: Protocol, point: Point) -> float:
     """Return the length of the evaluation at one point."""
-    return EPISODE_WEIGHT * len(protocol.episodes(point))
+    captured = protocol.captured_episodes if point.stage and protocol.is_end(point) else 0
+    return EPISODE_WEIGHT * (len(protocol.episodes(point)) + captured)
 
 
 def relearns(protocol: Protocol) -> bool:

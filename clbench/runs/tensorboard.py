@@ -102,6 +102,7 @@ def _report(record: Record, point: Point) -> Iterator[tuple[str, float | None]]:
         yield "policy/update_sparsity", row["update_sparsity"]
         yield "policy/activation_drift", row["activation_drift"]
         yield "policy/shift", row["shift"]
+        yield "policy/captured", row["captured"]
 
 
 def _rows(columns: Mapping[str, list[Any]], point: Point) -> Iterator[dict[str, Any]]:

@@ -392,6 +392,18 @@ def shift(rates: Rates) -> Array:
 
 
 @metric(
+    formula="mean over the stages k of the share of episodes at the end of stage k, in target k's scenes, in "
+    "which target k is done although the instruction asks for a retained skill, the skills in turn",
+    source="clbench",
+    higher_is_better=False,
+    missing="The scenario has no criterion or retains no skill, or the record is older than this.",
+)
+def instruction_capture(rates: Rates) -> Array:
+    """Episodes in which the latest target is done although a retained skill is asked for."""
+    return average(rates.captured)
+
+
+@metric(
     formula="optimiser steps of plain fine-tuning on the skill's demonstrations until the criterion is met, "
     "from a copy of the policy at the end of stage K; the skill is the one with the fewest successes in its "
     "validation episodes then; if it never meets the criterion, all steps of a stage",

@@ -32,6 +32,8 @@ class Measured:
     """Distance of the hidden states from the pretrained policy's, (..., targets, points)."""
     shift: Array
     """Change of the policy on each stage's target in the stage, (..., targets)."""
+    captured: Array
+    """Share of episodes after each stage that do its target though asked for a skill, (..., targets)."""
     steps: Array
     """Optimiser steps of each stage, (..., targets); NaN without a criterion."""
     met: Array

@@ -26,7 +26,7 @@ Fetch-v0 has 240, a sequence of 40 targets among 50 tasks 8,200."""
 FARTHEST = 1e18
 """A greater activation drift or shift than any policy has whose outputs are numbers of any use."""
 
-_HIGHEST = {"update_sparsity": 1.0, "activation_drift": FARTHEST, "shift": FARTHEST}
+_HIGHEST = {"update_sparsity": 1.0, "activation_drift": FARTHEST, "shift": FARTHEST, "captured": 1.0}
 """Greatest possible value of each change of the policy, in the order of the columns."""
 
 
@@ -285,12 +285,12 @@ def read_answers(record: Record, protocol: Protocol) -> tuple[tuple[str, ...], A
     return kinds, counts
 
 
-def read_policy(record: Record, protocol: Protocol) -> tuple[Array, Array, Array]:
+def read_policy(record: Record, protocol: Protocol) -> tuple[Array, Array, Array, Array]:
     """Return the changes of the policy.
 
     Returns:
         The update sparsity and the activation drift at the points of each stage, both (targets, points), and
-        the shift in each stage, (targets,).
+        the shift and the captured share in each stage, both (targets,).
 
     Raises:
         RecordError: A value is impossible, or a point occurs twice.
@@ -303,13 +303,13 @@ def read_policy(record: Record, protocol: Protocol) -> tuple[Array, Array, Array
         for value, (name, high) in zip(values, _HIGHEST.items(), strict=True):
             if value is not None and not _is_number(value, high):
                 raise RecordError(f"{where} has an impossible {name}.")
-        if values[-1] is not None and not (stage and protocol.is_end(point)):
-            raise RecordError(f"{where} has a shift, which only the end of a target's stage has.")
+        if values[2:] != [None, None] and not (stage and protocol.is_end(point)):
+            raise RecordError(f"{where} has a shift or a share, which only the end of a target's stage has.")
         found[:, stage, place(protocol, point)] = [np.nan if value is None else value for value in values]
     if len({row[:2] for row in rows}) != len(rows):
         raise RecordError("policy: an evaluation point is there twice.")
-    sparsity, drift, shift = found[:, 1:]
-    return sparsity, drift, shift[:, -1]
+    sparsity, drift, shift, captured = found[:, 1:]
+    return sparsity, drift, shift[:, -1], captured[:, -1]
 
 
 def _is_number(value: Any, high: float, low: float = 0) -> bool:

@@ -72,7 +72,7 @@ class Scores(Measured):
         success = _success(protocol, scored, layout)
         perturbed = _perturbed(read_perturbed(protocol, rows, episodes), layout)
         in_curves = [episodes.index(number) for number in layout.curve_episodes]
-        sparsity, drift, shift = read_policy(record, protocol)
+        sparsity, drift, shift, captured = read_policy(record, protocol)
         steps, met = read_checks(record, protocol)
         return cls(
             layout=layout,
@@ -86,6 +86,7 @@ class Scores(Measured):
             update_sparsity=sparsity,
             activation_drift=drift,
             shift=shift,
+            captured=captured,
             steps=steps,
             met=met,
             relearning_steps=read_relearning(record, protocol),

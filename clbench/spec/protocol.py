@@ -180,6 +180,11 @@ class Protocol:
             return self.validation_episodes
         return self.test_episodes if at_end else self.curve_episodes
 
+    @property
+    def captured_episodes(self) -> int:
+        """Episodes at the end of each stage that ask for skills in the scenes of its target."""
+        return self.scored_episodes(True) if self.criterion is not None and self.retained else 0
+
     @staticmethod
     def _each(tasks: Sequence[str], split: Split, count: int) -> list[EpisodeKey]:
         return [EpisodeKey(task, split, number) for task in tasks for number in range(count)]

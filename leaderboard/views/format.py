@@ -44,6 +44,7 @@ TO_CRITERION = (
     "steps_to_criterion",
     "speed",
     "question_retention",
+    "instruction_capture",
     "relearning_steps",
 )
 """Metrics in the tables of scenarios whose stages end when the target is learned."""

@@ -69,9 +69,9 @@ def test_the_frozen_policy_forgets_exactly_nothing_and_does_not_know_the_targets
 
 
 def test_every_built_in_method_has_a_row(board: Any) -> None:
-    assert set(board.index[board["division"] != "online"]) == {
-        name for name in method_names() if "/" not in name
-    }
+    changed = {"consft_calibrated"}  # its constants have another unit than in the records of Fetch-v0
+    rows = set(board.index[board["division"] != "online"])
+    assert rows == {name for name in method_names() if "/" not in name} - changed
 
 
 @pytest.mark.parametrize("scenario", sorted(path.name for path in RECORDS.glob("*")))

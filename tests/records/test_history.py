@@ -31,6 +31,12 @@ VALUES: dict[str, dict[str, float | None]] = {
         "question_retention": 0.989,
         "activation_drift": 7.534790515899658,
     },
+    "schema-3/Fetch-v1-sft-tuning.json": {
+        "final_average": 0.24375,
+        "retention": 0.2625,
+        "shift": 1.3276978582143784,
+        "instruction_capture": None,
+    },
     "schema-2/MetaWorld-v0-sft-order-1.json": {
         "final_average": 0.5333333333333333,
         "retention": 0.41875,
@@ -96,6 +102,7 @@ def test_fields_that_follow_from_the_budget_of_schema_1_are_filled_in() -> None:
 
 
 OLD = {1: HISTORIC / "schema-1" / "Fetch-v0-sft-seed-0.json"}
+OLD[3] = HISTORIC / "schema-3" / "Fetch-v1-sft-tuning.json"
 OLD[2] = HISTORIC / "schema-2" / "DMControl-v0-sac-online.json"
 
 
@@ -120,6 +127,8 @@ def put(values: dict[str, Any], place: str, value: Any) -> None:
         (2, "costs.parametres", 1, "No field of costs is called 'parametres'"),
         (2, "relearning", None, "a record: schema 2 has no relearning"),
         (2, "policy.shift", [], "policy: schema 2 has no shift"),
+        (3, "policy.captured", [], "policy: schema 3 has no captured"),
+        (3, "content", None, "its content does not match its hash"),
         (2, "content", "0123", "a record of schema 2 has no content"),
         (2, "scenario", [], "scenario must be an object"),
         (2, "episodes", None, "episodes must be an object"),

@@ -70,9 +70,9 @@ def test_a_path_that_is_no_file_is_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("fields", "words"),
     [
-        ({"schema": 4}, "is of schema 4, newer than 3: update clbench"),
-        ({"schema": 0}, "is no record of schema 3"),
-        ({"schema": True}, "is no record of schema 3"),
+        ({"schema": 5}, "is of schema 5, newer than 4: update clbench"),
+        ({"schema": 0}, "is no record of schema 4"),
+        ({"schema": True}, "is no record of schema 4"),
         ({"score": 0.99}, "score"),
         ({"status": "great"}, "great"),
         ({"run": None}, "run"),
@@ -193,7 +193,7 @@ def test_a_record_without_its_hash_is_refused(record: Record, tmp_path: Path) ->
     values = json.loads(path.read_text(encoding="utf-8"))
     del values["content"]
     path.write_text(json.dumps(values), encoding="utf-8")
-    with pytest.raises(RecordError, match="a record of schema 3: content is missing"):
+    with pytest.raises(RecordError, match="a record of schema 4: content is missing"):
         read_record(path)
 
 

@@ -1,5 +1,6 @@
 """Measurements around the stages of a run: the shift of the policy in each, and relearning after the last."""
 
+import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -61,6 +62,24 @@ def test_the_shift_is_the_mean_squared_change_of_velocity_on_the_new_targets_dat
         assert record.policy["shift"][stage] == pytest.approx(sum(samples) / 256, rel=1e-4)
     mean = sum(record.policy["shift"][1:]) / 2
     assert measure("shift", Scores.from_record(record)) == pytest.approx(mean)
+
+
+@pytest.mark.usefixtures("one_thread")
+def test_an_instruction_is_captured_where_the_target_is_done_though_a_skill_is_asked(
+    record: Record, policies: list[Policy]
+) -> None:
+    evaluator, skills, shares = Evaluator(EAGER, seed=0), EAGER.retained, []
+    for policy, target in zip(policies[1:], EAGER.target, strict=True):
+        done = []
+        for number in range(EAGER.budget.test_episodes):
+            skill = skills[number % len(skills)]
+            wordings = {name: getattr(skill, name) for name in ("instructions", "test_instructions")}
+            (episode,) = evaluator.play(policy, [(dataclasses.replace(target, **wordings), "test", number)])
+            done.append(episode.success)
+        shares.append(sum(done) / len(done))
+    assert record.policy["captured"] == [None, *shares]
+    assert any(shares)  # else words are read so well that the loop shows nothing
+    assert measure("instruction_capture", Scores.from_record(record)) == pytest.approx(sum(shares) / 2)
 
 
 @pytest.mark.usefixtures("one_thread")

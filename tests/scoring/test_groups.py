@@ -64,6 +64,7 @@ def run(final: Any) -> Scores:
         steps=missing[0],
         met=missing[0],
         shift=missing[0],
+        captured=missing[0],
         relearning_steps=missing[0, 0],
     )
 

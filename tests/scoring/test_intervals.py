@@ -58,6 +58,7 @@ def whole_run(shape: Layout, success: Any, **arrays: Any) -> Scores:
         "steps": np.full(targets, np.nan),
         "met": np.full(targets, np.nan),
         "shift": np.full(targets, np.nan),
+        "captured": np.full(targets, np.nan),
         "relearning_steps": np.array(np.nan),
         **missing,
         **arrays,
@@ -85,6 +86,7 @@ def random_run(generator: np.random.Generator, shape: Layout) -> Scores:
         steps=generator.integers(1, 100, targets).astype(float),
         met=np.ones(targets),
         shift=generator.random(targets),
+        captured=generator.random(targets),
         relearning_steps=np.array(float(generator.integers(1, 100))),
     )
 

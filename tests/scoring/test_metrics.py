@@ -67,6 +67,7 @@ def pairs_with_a_criterion(scores: Callable[..., Scores]) -> Pairs:
             scores(
                 generator.integers(0, 2, size=(4, 6, 2)),
                 steps=(100,),
+                captured=generator.random(3),
                 ends=tuple(int(end) for end in generator.choice(check_steps(100), size=3)),
                 relearning=Relearning("skill_0", 3, int(generator.choice(check_steps(100))), True),
             )

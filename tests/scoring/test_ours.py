@@ -49,7 +49,7 @@ def test_a_metric_has_the_value_worked_out_by_hand(name: str, scores: Callable[.
 def test_every_metric_of_the_leaderboard_is_worked_out_by_hand() -> None:
     others = {"forward_transfer", "question_retention", "retention_at_matched_adaptation"}
     others |= {"perturbed_retention", "update_sparsity", "activation_drift"}
-    others |= {"gain", "steps_to_criterion", "speed", "shift", "relearning_steps"}
+    others |= {"gain", "steps_to_criterion", "speed", "shift", "relearning_steps", "instruction_capture"}
     found = {name for name, metric in METRICS.items() if metric.function.__module__ == MODULE}
     assert {*BY_HAND, *others} == found
 
@@ -88,6 +88,12 @@ def test_the_shift_is_the_mean_over_the_stages(scores: Callable[..., Scores]) ->
     assert measure("shift", scores(MATRIX, steps=(100,), ends=(8, 12), shift=[2.0, 3.0])) == 2.5
     assert measure("shift", scores(MATRIX, shift=[0.5, np.nan])) is None
     assert measure("shift", scores(MATRIX)) is None
+
+
+def test_instruction_capture_is_the_mean_share_over_the_stages(scores: Callable[..., Scores]) -> None:
+    assert measure("instruction_capture", scores(MATRIX, captured=[0.5, 0.25])) == (0.5 + 0.25) / 2
+    assert measure("instruction_capture", scores(MATRIX, captured=[0.5, np.nan])) is None
+    assert measure("instruction_capture", scores(MATRIX)) is None
 
 
 def test_relearning_that_fails_counts_with_all_the_steps_of_a_stage(scores: Callable[..., Scores]) -> None:

@@ -24,8 +24,10 @@ VALIDATION = [[0.1, 0.2, 0.3, 0.9], [0.4, 0.5, 0.6, 1.0]]
 SPARSITY = [[0.9, 0.8, 0.7, 0.6], [0.5, 0.4, 0.3, 0.2]]
 DRIFT = [[0.5, 1.0, 2.0, 4.0], [5.0, 6.0, 7.0, 8.0]]
 SHIFT = [0.25, 0.75]
+CAPTURED = [0.5, 0.25]
 ON_THE_WAY = {"curves": CURVES, "retained_curves": RETAINED_CURVES}
 ALL = {**ON_THE_WAY, "validation": VALIDATION, "sparsity": SPARSITY, "drift": DRIFT, "shift": SHIFT}
+ALL["captured"] = CAPTURED
 ARRAYS = (
     "success",
     "on_the_way",
@@ -37,6 +39,7 @@ ARRAYS = (
     "update_sparsity",
     "activation_drift",
     "shift",
+    "captured",
 )
 
 
@@ -69,6 +72,7 @@ def test_the_axes_of_scores_follow_the_scenario(scores: Callable[..., Scores]) -
     np.testing.assert_array_equal(run.update_sparsity, SPARSITY)
     np.testing.assert_array_equal(run.activation_drift, DRIFT)
     np.testing.assert_array_equal(run.shift, SHIFT)
+    np.testing.assert_array_equal(run.captured, CAPTURED)
 
 
 def test_the_curves_of_rates_end_with_the_end_of_the_stage(scores: Callable[..., Scores]) -> None:
@@ -311,20 +315,22 @@ def test_an_impossible_answer_count_is_refused(row: tuple[Any, ...], make_record
 @pytest.mark.parametrize(
     "row",
     [
-        (1, 100, 0.5, 0.1, None),
-        (3, 400, 0.5, 0.1, None),
-        (1, 150, 0.5, 0.1, None),
-        (0, 100, 0.5, 0.1, None),
-        (2, 400, 1.5, 0.1, None),
-        (2, 400, -0.5, 0.1, None),
-        (2, 400, True, 0.1, None),
-        (2, 400, "0.5", 0.1, None),
-        (2, 400, 0.5, -0.1, None),
-        (2, 400, 0.5, float("nan"), None),
-        (2, 400, 0.5, 10**300, None),
-        (2, 400, 0.5, [1], None),
-        (2, 400, 0.5, 0.1, -0.5),
-        (2, 400, 0.5, 0.1, 10**300),
+        (1, 100, 0.5, 0.1, None, None),
+        (3, 400, 0.5, 0.1, None, None),
+        (1, 150, 0.5, 0.1, None, None),
+        (0, 100, 0.5, 0.1, None, None),
+        (2, 400, 1.5, 0.1, None, None),
+        (2, 400, -0.5, 0.1, None, None),
+        (2, 400, True, 0.1, None, None),
+        (2, 400, "0.5", 0.1, None, None),
+        (2, 400, 0.5, -0.1, None, None),
+        (2, 400, 0.5, float("nan"), None, None),
+        (2, 400, 0.5, 10**300, None, None),
+        (2, 400, 0.5, [1], None, None),
+        (2, 400, 0.5, 0.1, -0.5, None),
+        (2, 400, 0.5, 0.1, 10**300, None),
+        (2, 400, 0.5, 0.1, 0.5, -0.1),
+        (2, 400, 0.5, 0.1, 0.5, 1.1),
     ],
 )
 def test_an_impossible_row_of_the_policy_table_is_refused(
@@ -339,9 +345,12 @@ def test_an_impossible_row_of_the_policy_table_is_refused(
 
 
 @pytest.mark.parametrize("row", [0, 1])
-def test_a_shift_before_the_end_of_a_targets_stage_is_refused(row: int, make_record: MakeRecord) -> None:
-    record = make_record(MATRIX, shift=SHIFT)
-    record.policy["shift"][row] = 0.5
+@pytest.mark.parametrize("column", ["shift", "captured"])
+def test_what_only_the_end_of_a_targets_stage_has_is_refused_before(
+    row: int, column: str, make_record: MakeRecord
+) -> None:
+    record = make_record(MATRIX, shift=SHIFT, captured=CAPTURED)
+    record.policy[column][row] = 0.5
     with pytest.raises(RecordError, match="only the end of a target's stage has"):
         Scores.from_record(record)
 
