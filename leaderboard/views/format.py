@@ -16,6 +16,7 @@ from clbench.scoring.metric import Metric
 from clbench.scoring.metrics import METRICS
 
 from ..board.overall import OverallRow
+from ..board.predictors import predictions
 from ..board.rows import Row, agreement, standing_of
 from ..board.runs import DIVISIONS
 
@@ -120,6 +121,22 @@ def agreement_text(rows: Iterable[Row]) -> str:
     return (
         f"The two halves of the {found.seeds} seeds {how} the {found.rows} methods alike: "
         f"Kendall's tau {interval}."
+    )
+
+
+def prediction_text(rows: Iterable[Row]) -> str:
+    """Return a sentence on what predicts forgetting among the methods; empty if nothing is known."""
+    found = predictions(rows)
+    if not found:
+        return ""
+    parts = [
+        f"{one.predictor} {format_interval(Estimate(one.tau, one.low, one.high))}"
+        + ("" if one.low > 0 else ", which cannot be told from chance")
+        for one in found
+    ]
+    return (
+        f"What orders the {found[0].rows} methods as the share that a stage forgets does (Kendall's tau): "
+        f"{'; '.join(parts)}."
     )
 
 

@@ -21,7 +21,16 @@ from clbench.scoring.metric import Metric
 from ..board.overall import overall
 from ..board.rows import Row, Table
 from ..board.runs import printable
-from .format import MISSING, Column, agreement_text, format_interval, number_text, shown, title_of
+from .format import (
+    MISSING,
+    Column,
+    agreement_text,
+    format_interval,
+    number_text,
+    prediction_text,
+    shown,
+    title_of,
+)
 
 _ARXIV = re.compile(r"arXiv (\d{4}\.\d{5})")
 
@@ -44,6 +53,7 @@ def markdown(table: Table) -> str:
         shown=shown,
         all_shown=_all_shown(by_scenario.values()),
         agreement_text=agreement_text,
+        prediction_text=prediction_text,
         direction=_direction,
         ends=_ends,
     )

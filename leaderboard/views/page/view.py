@@ -28,6 +28,7 @@ from ..format import (
     aligned,
     format_interval,
     number_text,
+    prediction_text,
     scaled,
     shown,
     standing_text,
@@ -248,6 +249,11 @@ class ScenarioView:
     def agreement(self) -> str:
         """Sentence on how alike two halves of the seeds order the methods, empty if it is not known."""
         return agreement_text(self.table)
+
+    @property
+    def prediction(self) -> str:
+        """Sentence on what predicts forgetting among the methods, empty if nothing is known."""
+        return prediction_text(self.table)
 
     @property
     def others(self) -> list[Metric]:

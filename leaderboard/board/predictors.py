@@ -1,0 +1,102 @@
+"""Predictors of forgetting: how alike they order the methods as what the methods forget does."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from clbench.scoring.metrics import measure
+from clbench.scoring.scores import Scores
+from clbench.spec.references import BASELINE
+
+from .agreement import REPLICATES, Array, kendall_tau
+from .rows import Row
+from .runs import METHODS
+
+LEAST_SEEDS, LEAST_ROWS = 2, 6
+"""Fewest seeds and rows: the interval draws seeds, and five rows have few orders."""
+
+Quantity = Callable[[Scores], float | None]
+
+
+def _metric(name: str) -> Quantity:
+    return lambda scores: measure(name, scores)
+
+
+def _less(name: str) -> Quantity:
+    """Return 1 minus a metric."""
+
+    def quantity(scores: Scores) -> float | None:
+        value = measure(name, scores)
+        return None if value is None else 1.0 - value
+
+    return quantity
+
+
+PREDICTORS: dict[str, Quantity] = {
+    "the shift of the policy on the new data": _metric("shift"),
+    "the share of the weights that changed": _less("update_sparsity"),
+    "activation drift": _metric("activation_drift"),
+}
+"""Quantities of a run that may predict what it forgets, by their names in a sentence."""
+
+FORGETTING = _less("kept_share")
+"""Share of what was known before a stage that is lost at its end, mean over the stages."""
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """Kendall's tau between a predictor and forgetting over the methods, with its 95 % interval."""
+
+    predictor: str
+    tau: float
+    low: float
+    high: float
+    seeds: int
+    rows: int
+
+
+def predictions(rows: Iterable[Row]) -> list[Prediction]:
+    """Return how well each predictor orders the competing rows of a scenario as forgetting does.
+
+    The seeds are the baseline's. A row without one of them, or without a value, is left out.
+    """
+    competing = [row for row in rows if row.division in METHODS and row.to_criterion]
+    seeds = next((row.seeds for row in competing if row.method == BASELINE), ())
+    whole = [row for row in competing if set(row.seeds).issuperset(seeds)]
+    found = []
+    for name, quantity in PREDICTORS.items():
+        pairs = [
+            [[quantity(row.scores[seed]), FORGETTING(row.scores[seed])] for seed in seeds] for row in whole
+        ]
+        known = [pair for pair in pairs if all(None not in values for values in pair)]
+        if len(known) >= LEAST_ROWS and len(seeds) >= LEAST_SEEDS:
+            prediction = prediction_of(name, np.array(known, dtype=float))
+            found += [prediction] if prediction else []
+    return found
+
+
+def prediction_of(name: str, values: Array, replicates: int = REPLICATES) -> Prediction | None:
+    """Return Kendall's tau between the means over seeds of a predictor and of forgetting.
+
+    The interval holds the percentiles of `replicates` draws of seeds with replacement. All rows and both
+    quantities share the draws.
+
+    Args:
+        name: Name of the predictor.
+        values: The predictor and forgetting by row and seed, (rows, seeds, 2).
+        replicates: Number of draws.
+
+    Returns:
+        None if one of the two does not order the rows at all.
+    """
+    rows, seeds, _ = values.shape
+    tau = float(kendall_tau(*np.moveaxis(values.mean(axis=1), -1, 0)))
+    if not np.isfinite(tau):
+        return None
+    draws = np.random.default_rng(0).integers(seeds, size=(replicates, seeds))
+    drawn = values[:, draws].mean(axis=2)  # (rows, replicates, 2)
+    low, high = np.nanpercentile(kendall_tau(drawn[..., 0].T, drawn[..., 1].T), (2.5, 97.5))
+    return Prediction(name, tau, float(low), float(high), seeds, rows)

@@ -1,0 +1,82 @@
+"""Predictors of forgetting, on made-up values and on boards of made-up records."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.stats import kendalltau
+
+from clbench.base.entry_points import resolve
+
+prediction_of = resolve("clbench.leaderboard.board.predictors:prediction_of")
+predictions = resolve("clbench.leaderboard.board.predictors:predictions")
+
+
+def test_tau_is_that_of_the_means_over_seeds_by_scipy() -> None:
+    values = np.random.default_rng(0).random((8, 4, 2))
+    means = values.mean(axis=1)
+    expected = kendalltau(means[:, 0], means[:, 1]).statistic
+    assert prediction_of("x", values).tau == pytest.approx(expected)
+
+
+def test_the_interval_is_that_of_draws_of_seeds_shared_by_rows_and_quantities() -> None:
+    values = np.random.default_rng(1).random((6, 3, 2))
+    found = prediction_of("x", values, replicates=200)
+    draws = np.random.default_rng(0).integers(3, size=(200, 3))
+    taus = []
+    for draw in draws:
+        means = values[:, draw].mean(axis=1)
+        taus.append(kendalltau(means[:, 0], means[:, 1]).statistic)
+    assert (found.low, found.high) == pytest.approx(tuple(np.percentile(taus, (2.5, 97.5))))
+
+
+def test_a_predictor_that_is_equal_everywhere_predicts_nothing() -> None:
+    values = np.random.default_rng(2).random((6, 3, 2))
+    values[..., 0] = 1.0
+    assert prediction_of("x", values) is None
+
+
+class _Row:
+    """A row of the board, as far as predictors read it."""
+
+    def __init__(self, method: str, division: str, scores: dict[int, Any], to_criterion: bool = True) -> None:
+        self.method, self.division, self.scores, self.to_criterion = method, division, scores, to_criterion
+        self.seeds = tuple(scores)
+
+
+@pytest.fixture
+def rows(scores: Any) -> list[_Row]:
+    """Seven methods, of which those with the greater shift and drift forget more, and a reference."""
+
+    def run(number: int, seed: int) -> Any:
+        left = 1 - 0.1 * number
+        matrix = [[1, 1, 0, 0, 0], [left, left, 1, 0, 0], [left, left, left, 1, 0]]
+        moved = number + 0.1 * seed
+        options = {"sparsity": np.full((2, 1), 0.5), "drift": np.full((2, 1), moved), "shift": [moved, moved]}
+        return scores(matrix, groups=(2, 2, 1), steps=(100,), ends=(8, 12), seed=seed, **options)
+
+    names = ["sft", "ewc", "lora", "aegis", "lwf", "finch", "consft"]
+    made = [
+        _Row(name, "prior-data-free", {seed: run(number, seed) for seed in range(3)})
+        for number, name in enumerate(names)
+    ]
+    return [*made, _Row("joint", "reference", {seed: run(9, seed) for seed in range(3)})]
+
+
+def test_predictors_that_order_the_methods_as_forgetting_does_have_tau_1(rows: list[_Row]) -> None:
+    found = {one.predictor: one for one in predictions(rows)}
+    assert set(found) == {"the shift of the policy on the new data", "activation drift"}  # sparsity is equal
+    for one in found.values():
+        assert (one.tau, one.low, one.high, one.seeds, one.rows) == (1.0, 1.0, 1.0, 3, 7)
+
+
+def test_few_rows_and_rows_of_equal_stages_have_no_prediction(rows: list[_Row]) -> None:
+    assert predictions(rows[:5]) == []
+    for row in rows:
+        row.to_criterion = False
+    assert predictions(rows) == []
+
+
+def test_a_row_without_a_seed_of_the_baseline_is_left_out(rows: list[_Row]) -> None:
+    rows[1].seeds = (0,)
+    assert {one.rows for one in predictions(rows)} == {6}

@@ -1,0 +1,198 @@
+"""The rules of the claims: every verdict follows from records."""
+
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+from claims_bench import Bench, verdicts
+
+from clbench.records.record import AnswerRow, Record
+
+Given = dict[str, dict[str, Any]]
+
+SFT: Given = {"sft": {}, "sft@1": {}}
+"""Plain fine-tuning that keeps .2 of the skills, at its best step size and at the published one."""
+ACTIVE = {"1": {"omega_counts": [[5, 5], [5, 5]]}}
+AT_FLOOR = {"1": {"omega_counts": [[99, 1], [100, 0]]}}
+STEADY: Given = {"sft@1": {"took": (20, 20)}, "co_training+step_factor=1.0": {"took": (12, 12)}}
+"""The auxiliary objective saves steps, so that there is a capability for a vector to carry."""
+VECTOR, AT_RANDOM = "fast_dvla@1", "fast_dvla+direction=random+step_factor=1.0"
+NO_REGULARISER = "fast_dvla+orthogonal=0.0+step_factor=1.0"
+LOSES: Given = {"sft": {"right": (500, 400)}, "frozen": {"right": (500, 500)}}
+"""Plain fine-tuning forgets a fifth of the answers."""
+KEEPS: Given = {"sft": {"right": (500, 500)}, "frozen": {"right": (500, 500)}}
+
+
+def _early_loss(record: Record) -> None:
+    """Let the policy have lost the answers half way through the first stage."""
+    record.add_answers(AnswerRow(1, 50, "left", 500, 400))
+
+
+def _shed(first: float, later: float) -> Callable[[Record], None]:
+    """Return the edit that writes the mean energy shed in the first stage and in the second."""
+
+    def edit(record: Record) -> None:
+        for stage, value in (("1", first), ("2", later)):
+            record.diagnostics[stage] = {"energy_shed_mean": value + 0.001 * record.run.seed}
+
+    return edit
+
+
+CASES: list[tuple[str, str, Given]] = [
+    ("C1", "holds", {"sft": {"kept": 0.2}}),
+    ("C1", "does not hold", {"sft": {"kept": 1.0}}),
+    ("C1", "undecided", {"sft": {"kept": 0.95}}),
+    ("C2", "holds", {**SFT, "consft": {"kept": 0.8}, "consft_calibrated": {}}),
+    (
+        "C2",
+        "does not hold",
+        {**SFT, "consft": {}, "consft_calibrated": {}, "consft@1": {}, "consft_calibrated@1": {}},
+    ),
+    (
+        "C2",
+        "holds in part",
+        {**SFT, "consft": {}, "consft_calibrated": {}, "consft@1": {}, "consft_calibrated@1": {"kept": 0.8}},
+    ),
+    ("C2", "undecided", {**SFT, "consft": {"kept": (0.0, 0.4, 0.8)}, "consft_calibrated": {}}),
+    ("C2", "undecided", {"sft": {}, "consft": {}}),
+    (
+        "C2",
+        "cannot be shown here",
+        {
+            "sft": {"kept": 0.95},
+            "sft@1": {"kept": 0.95},
+            "consft": {"kept": 1.0},
+            "consft_calibrated": {"kept": 1.0},
+        },
+    ),
+    (
+        "C2",
+        "cannot be shown here",
+        {
+            **SFT,
+            "consft": {"kept": 0.8, "diagnostics": AT_FLOOR},
+            "consft_calibrated": {"kept": 0.8, "diagnostics": AT_FLOOR},
+        },
+    ),
+    (
+        "C2",
+        "undecided",
+        {
+            **SFT,
+            "consft": {"kept": 0.8, "diagnostics": AT_FLOOR},
+            "consft_calibrated": {"diagnostics": ACTIVE},
+        },
+    ),
+    (
+        "C3",
+        "holds",
+        {
+            "consft": {"kept": 1.0},
+            "consft_calibrated": {},
+            "experience_replay": {"kept": 1.0},
+            "buffered_replay": {"kept": 1.0},
+        },
+    ),
+    (
+        "C3",
+        "does not hold",
+        {"consft": {}, "consft_calibrated": {}, "experience_replay": {"kept": 1.0}, "buffered_replay": {}},
+    ),
+    ("C3", "undecided", {"consft": {"kept": 1.0}, "consft_calibrated": {}, "experience_replay": {}}),
+    (
+        "C4",
+        "holds",
+        {
+            "sft@0.03": {"sparsity": 0.9},
+            "sft@1": {"sparsity": 0.3},
+            "sft": {"sparsity": 0.3},
+            "consft": {"sparsity": 0.5},
+        },
+    ),
+    (
+        "C4",
+        "does not hold",
+        {
+            "sft@0.03": {"sparsity": 0.9},
+            "sft@1": {"sparsity": 0.3},
+            "sft": {"sparsity": 0.3},
+            "consft": {"sparsity": 0.3},
+            "consft_calibrated": {"sparsity": 0.3},
+        },
+    ),
+    (
+        "C4",
+        "cannot be shown here",
+        {
+            "sft@0.03": {"sparsity": 0.3},
+            "sft@1": {"sparsity": 0.3},
+            "sft": {"sparsity": 0.3},
+            "consft": {"sparsity": 0.5},
+        },
+    ),
+    ("C4", "undecided", {"sft": {"sparsity": 0.3, "seeds": 1}, "consft": {"sparsity": 0.9, "seeds": 1}}),
+    ("C6", "does not hold", {"sft": {}, "consft": {"costs": {"bytes_kept": 8}}}),
+    ("C6", "undecided", {"sft": {}, "consft": {}}),
+    ("C7", "holds", {"consft": {"earlier": 1.0}, "consft_calibrated": {"earlier": 0.4}}),
+    ("C7", "does not hold", {"consft": {"earlier": 0.5}, "consft_calibrated": {"earlier": 0.4}}),
+    ("A1", "holds", {"sft": {"right": (500, 400), "edit": _early_loss}}),
+    ("A1", "holds in part", LOSES),
+    ("A1", "does not hold", KEEPS),
+    ("A1", "undecided", {"sft": {"right": (490, 485)}}),
+    ("A2", "holds", {**LOSES, "stop_gradient": {"right": (500, 500), "curve": 0.1}}),
+    ("A2", "does not hold", {**LOSES, "stop_gradient": {"right": (500, 500)}}),
+    ("A2", "does not hold", {**LOSES, "stop_gradient": {"right": (490, 300), "curve": 0.1}}),
+    ("A2", "cannot be shown here", {**KEEPS, "stop_gradient": {"right": (500, 500), "curve": 0.1}}),
+    ("A2", "undecided", {"stop_gradient": {"right": (500, 500), "curve": 0.1}}),
+    ("A3", "holds", {**LOSES, "lora": {}, "lora+rank=4": {}, "lora+rank=64": {}}),
+    ("A3", "holds in part", {**LOSES, "lora": {}, "lora+rank=4": {"right": (500, 500)}, "lora+rank=64": {}}),
+    (
+        "A3",
+        "does not hold",
+        {
+            "frozen": {"right": (500, 500), "kept": 0.2},
+            "lora": {"right": (500, 500)},
+            "lora+rank=4": {"right": (500, 500)},
+            "lora+rank=64": {"right": (500, 500)},
+        },
+    ),
+    ("A3", "undecided", {"lora": {}}),
+    ("A4", "holds", {**LOSES, "aegis": {"right": (500, 500)}}),
+    ("A4", "does not hold", {**LOSES, "aegis": {"right": (500, 450)}}),
+    ("A4", "cannot be shown here", {**KEEPS, "aegis": {"right": (500, 500)}}),
+    ("A4", "undecided", {**LOSES, "frozen": {"right": (500, 490)}, "aegis": {"right": (500, 486)}}),
+    ("A5", "holds", {"aegis": {"edit": _shed(0.002, 0.06)}}),
+    ("A5", "does not hold", {"aegis": {"edit": _shed(0.06, 0.002)}}),
+    ("A5", "undecided", {"aegis": {"edit": _shed(0.009, 0.002)}}),
+    ("A5", "undecided", {"aegis": {"diagnostics": {"1": {"energy_shed_mean": "little"}}}}),
+    ("A6", "holds", {"sft": {"drift": (8, 9, 10)}, "aegis": {"drift": 1.0}}),
+    ("A6", "does not hold", {"sft": {"drift": (8, 9, 10)}, "aegis": {"drift": 7.0}}),
+    ("A6", "undecided", {"sft": {"drift": 0.0}, "aegis": {"drift": 1.0}}),
+    ("F1", "holds in part", STEADY),
+    ("F1", "undecided", {"sft@1": {"took": (20, 20)}}),
+    ("F2", "holds", {**STEADY, VECTOR: {"took": (10, 10)}, AT_RANDOM: {"took": (20, 20)}}),
+    ("F2", "does not hold", {**STEADY, VECTOR: {"took": (10, 10)}, AT_RANDOM: {"took": (10, 10)}}),
+    (
+        "F2",
+        "cannot be shown here",
+        {**STEADY, "co_training+step_factor=1.0": {"took": (20, 20)}, VECTOR: {"took": (10, 10)}},
+    ),
+    ("F2", "undecided", {**STEADY, VECTOR: {"took": (10, 10)}}),
+    ("F3", "holds", {**STEADY, VECTOR: {"took": (10, 10)}, NO_REGULARISER: {"took": (12, 12)}}),
+    ("F3", "does not hold", {**STEADY, VECTOR: {"took": (12, 12)}, NO_REGULARISER: {"took": (12, 12)}}),
+    ("F5", "holds", {**STEADY, VECTOR: {"took": (10, 10)}, AT_RANDOM: {"took": (12, 12)}}),
+    ("F5", "does not hold", {**STEADY, VECTOR: {"took": (12, 12)}, AT_RANDOM: {"took": (10, 10)}}),
+]
+
+
+@pytest.mark.parametrize(
+    ("identifier", "verdict", "given"),
+    CASES,
+    ids=[f"{identifier}-{verdict}-{number}" for number, (identifier, verdict, _) in enumerate(CASES)],
+)
+def test_a_verdict_follows_from_the_records_by_the_rule(
+    identifier: str, verdict: str, given: Given, bench: Bench
+) -> None:
+    for label, values in given.items():
+        bench.add(label, **values)
+    assert verdicts(bench.page())[identifier] == verdict

@@ -1,0 +1,135 @@
+"""Records from which claims are judged, and the page made from them."""
+
+import dataclasses
+import json
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from clbench.base.entry_points import resolve
+from clbench.records.paths import label_of, record_path
+from clbench.records.record import Record
+from clbench.records.writer import write_record
+
+SCENARIO = "clbench/Toy-v0"
+IDS = [*(f"C{number}" for number in range(1, 9)), *(f"A{number}" for number in range(1, 8))]
+IDS += [f"F{number}" for number in range(1, 6)]
+
+
+class Bench:
+    """Folders of records, and the page made from them."""
+
+    def __init__(self, folder: Path, make_record: Callable[..., Record]) -> None:
+        self.folder = folder
+        self.make_record = make_record
+
+    def add(
+        self,
+        label: str,
+        *,
+        seeds: int = 3,
+        kept: Any = 0.2,
+        earlier: float = 1.0,
+        curve: float = 0.5,
+        took: tuple[int, int] | None = None,
+        right: tuple[int, int] = (500, 400),
+        sparsity: Any = 0.5,
+        drift: Any = 1.0,
+        costs: dict[str, Any] | None = None,
+        diagnostics: dict[str, Any] | None = None,
+        edit: Callable[[Record], None] | None = None,
+    ) -> None:
+        """Add the records of a method, or of changed settings of one.
+
+        Args:
+            label: Name with changed settings, such as "lora", "lora+rank=4" or "sft@0.3" of the ladder.
+            seeds: Number of seeds.
+            kept: Success on the two skills at the end, a number or one for each seed; it is 1 before.
+            earlier: Success on the first target at the end.
+            curve: Success on a target on the way.
+            took: Steps of each stage to the criterion; stages are equally long if None.
+            right: Questions of 500 answered rightly at the start and at the end.
+            sparsity: Update sparsity at all points, a number or one for each seed.
+            drift: Activation drift, likewise.
+            costs: Fields of `Record.costs` that differ.
+            diagnostics: `Record.diagnostics`.
+            edit: Changes each record before it is written.
+        """
+        name, _, factor = label.partition("@")
+        method, *changes = name.split("+")
+        changed: dict[str, Any] = dict(change.split("=") for change in changes)
+        if factor:
+            changed["step_factor"] = float(factor)
+        for seed in range(seeds):
+            left = float(np.broadcast_to(kept, seeds)[seed])
+            shape = (2, 1) if took else (2, 2)
+            on_the_way = (
+                {}
+                if took
+                else {"curves": np.full((2, 1), curve), "retained_curves": np.full((2, 1, 2), left)}
+            )
+            record = self.make_record(
+                [[1, 1, 0, 0, 0], [1, left, 1, 0, 0], [left, left, earlier, 1, 0]],
+                groups=(2, 2, 1),
+                steps=(100,) if took else (50, 100),
+                ends=took,
+                validation=None if took else np.ones((2, 2)),
+                sparsity=np.full(shape, np.broadcast_to(sparsity, seeds)[seed]),
+                drift=np.full(shape, np.broadcast_to(drift, seeds)[seed]),
+                answers={
+                    (0, "left"): (500, right[0]),
+                    (1, "left"): (500, right[1]),
+                    (2, "left"): (500, right[1]),
+                },
+                method=method,
+                seed=seed,
+                changes=changed,
+                settings=changed,
+                **on_the_way,
+            )
+            record.costs = dataclasses.replace(record.costs, **(costs or {}))
+            record.diagnostics.update(diagnostics or {})
+            if edit:
+                edit(record)
+            path = record_path(self.folder / self.kind(label), SCENARIO, label_of(method, changed), seed)
+            write_record(record, path)
+
+    def kind(self, label: str) -> str:
+        return "ladder" if "@" in label else "controls" if "+" in label else "records"
+
+    def step_times(self, **ratios: float) -> None:
+        """Leave what the speed benchmark leaves."""
+        entries = {
+            method: {"median_ratio": ratio, "low": ratio - 0.01, "high": ratio + 0.01}
+            for method, ratio in ratios.items()
+        }
+        (self.folder / "step_time.json").write_text(json.dumps({"ratios": entries}), encoding="utf-8")
+
+    def page(self) -> str:
+        """Return the page."""
+        output = self.folder / "docs" / "claims.md"
+        resolve("clbench.leaderboard.cli:claims")(
+            records=self.folder / "records",
+            controls=self.folder / "controls",
+            step_time=self.folder / "step_time.json",
+            scenario=SCENARIO,
+            output=output,
+        )
+        return output.read_text(encoding="utf-8")
+
+
+def verdicts(page: str) -> dict[str, str]:
+    """Return the verdicts in the table at the top."""
+    return {
+        line.split("]")[0][3:]: line.split(" | ")[3] for line in page.splitlines() if line.startswith("| [")
+    }
+
+
+def section(page: str, identifier: str) -> str:
+    """Return the page's text on a claim, without the backslashes of Markdown."""
+    found = re.search(rf"^### {identifier}\n(.*?)(?=^#|\Z)", page, re.MULTILINE | re.DOTALL)
+    assert found
+    return found[1].replace("\\", "")
