@@ -24,6 +24,7 @@ tuning: .venv/installed
 
 # The committed boards. Runs that have a record are skipped: a stopped command goes on.
 records: .venv/installed
+	$(BIN)/clbench run clbench/Fetch-v1 sft consft consft_calibrated --seeds 8 --perturb
 	for id in $(BOARDS); do $(BIN)/clbench run $$id --all --seeds 8 || exit; done
 	$(BIN)/clbench run $(KNOWLEDGE) frozen sft stop_gradient aegis lora --seeds 4
 	$(BIN)/clbench run $(SCENARIO) --all --seeds 5

@@ -193,6 +193,7 @@ def _make_record(
     retained_curves: Any = None,
     validation: Any = None,
     perturbed: Any = None,
+    perturbed_learned: Any = None,
     sparsity: Any = None,
     drift: Any = None,
     shift: Any = None,
@@ -215,6 +216,7 @@ def _make_record(
         retained_curves: The same for the retained skills, (targets, points before the end, retained).
         validation: The same for the targets on validation episodes, (targets, points).
         perturbed: The same for the retained skills in perturbed episodes at the ends, (stages + 1, retained).
+        perturbed_learned: The same for each target at the end of its stage, (targets,); 0 if None.
         sparsity: Update sparsity, (targets, points). No policy was looked at if this and the next three
             are None.
         drift: Activation drift, (targets, points).
@@ -264,6 +266,21 @@ def _make_record(
         (stage, at_end[stage], names[task], "perturbed", episode, int(value), value, 50)
         for (stage, task, episode), value in _each(perturbed, 2, outcomes.shape[2])
     ]
+    if perturbed is not None:
+        of_targets = np.zeros(targets) if perturbed_learned is None else perturbed_learned
+        rows += [
+            (
+                target + 1,
+                at_end[target + 1],
+                names[retained + target],
+                "perturbed",
+                episode,
+                int(value),
+                value,
+                50,
+            )
+            for (target, episode), value in _each(of_targets, 1, outcomes.shape[2])
+        ]
     run |= {} if perturbed is None else {"perturb": True}
     budget = {
         "adaptation_steps": steps[-1],

@@ -55,9 +55,9 @@ def run(
         order: Order in which the targets are learned. 0 is the published order, which the rows of the
             leaderboard use. Other numbers are permutations: from them the leaderboard reports how much scores
             depend on the order.
-        perturb: Also evaluate the retained skills in perturbed worlds: other start poses, heavier or lighter
-            objects and, in pictures, another camera and light. Such a record replaces a record without
-            perturbed episodes, as it holds the same episodes and more.
+        perturb: Also evaluate the skills and each new target in perturbed worlds: other start poses, heavier
+            or lighter objects and, in pictures, another camera and light. Such a record replaces a record
+            without perturbed episodes, as it holds the same episodes and more.
         workers: Number of runs at once, each a process with one thread; all cores if not given.
         shard: Do only part i of n of the runs, for example 2/8: for array jobs with one folder of records.
         ray: Do the runs on a Ray cluster: its address, auto for a cluster on this machine, or local to start

@@ -49,7 +49,7 @@ class RunSpec:
     order: int = 0
     """Order of the targets, see `Scenario.in_order`; 0 is the published one."""
     perturb: bool = False
-    """Whether the retained skills also meet perturbed episodes."""
+    """Whether the retained skills and each stage's target also meet perturbed episodes."""
 
     @property
     def label(self) -> str:
@@ -82,10 +82,8 @@ class RunSpec:
         """
         published = load_scenario(self.scenario)
         scenario = published.in_order(self.order).for_seed(self.seed)
-        if self.perturb and not scenario.retained:
-            raise InputError(f"{scenario.id} retains no skills that could be perturbed: leave out --perturb.")
         if self.perturb:
-            check_perturbable(scenario.retained)
+            check_perturbable(scenario.retained + scenario.target)
         return (
             dataclasses.replace(scenario, target=scenario.target[: self.targets]),
             dataclasses.replace(published, target=published.target[: self.targets]),

@@ -199,7 +199,22 @@ def perturbed_retention(rates: Rates) -> Array:
     perturbation. The success of the pretrained policy shows how much of that loss was there before any
     target.
     """
-    return average(rates.perturbed[..., -1, :])
+    return average(rates.perturbed[..., -1, rates.layout.columns("retained")])
+
+
+@metric(
+    formula="mean over the targets k of the success on target k at the end of stage k in perturbed episodes",
+    source="clbench; the spatial overfitting of ConSFT, arXiv 2605.08879, Sec. 5.5",
+    missing="The run has no perturbed episodes; `clbench run --perturb` adds them.",
+)
+def perturbed_adaptation(rates: Rates) -> Array:
+    """Success on each target after it was learned, with perturbed start poses, masses and views.
+
+    The episodes are the same as for `adaptation`, number by number: the difference is what the policy has
+    learned for the demonstrated starts alone.
+    """
+    of_targets = rates.perturbed[..., 1:, rates.layout.columns("target")]
+    return average(np.diagonal(of_targets, axis1=-2, axis2=-1))
 
 
 @metric(

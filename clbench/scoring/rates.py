@@ -59,7 +59,7 @@ class Rates(Measured):
     curves: Array
     """Success rate at the points of each stage, (..., targets, points, tasks); the last one is its end."""
     perturbed: Array
-    """Success rate on the retained skills in perturbed episodes, (..., stages + 1, retained)."""
+    """Success rate in perturbed episodes on the skills and each stage's target, (..., stages + 1, tasks)."""
     references: Mapping[str, Rates] = field(default_factory=dict)
     """Rates of reference methods with the same seeds, by the method's name."""
 

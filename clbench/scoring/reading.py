@@ -237,16 +237,18 @@ def read_perturbed(protocol: Protocol, rows: Iterable[Row], episodes: Iterable[i
     Raises:
         RecordError: One is missing, or must not be there.
     """
-    rule = "each retained skill has perturbed test episodes at the end of each stage"
-    scored, retained = set(episodes), set(protocol.retained)
+    rule = "the retained skills and the stage's target have perturbed test episodes at the end of each stage"
+    scored = set(episodes)
     found = [row for row in rows if row.split == "perturbed"]
     for row in found:
-        if not (protocol.is_end(row.point) and row.task in retained and row.episode in scored):
+        tasks = protocol.perturbed_tasks(row.point.stage)
+        if not (protocol.is_end(row.point) and row.task in tasks and row.episode in scored):
             where = f"of {row.task} at stage {row.point.stage}, step {row.point.step}"
             raise RecordError(
                 f"episodes: the perturbed episode {row.episode} {where}, must not be there: {rule}."
             )
-    count = len(protocol.stages) * len(retained) * len(scored) if protocol.perturb else 0
+    tasks_played = sum(len(protocol.perturbed_tasks(stage)) for stage in protocol.stages)
+    count = tasks_played * len(scored) if protocol.perturb else 0
     if len(found) != count:
         raise RecordError(f"episodes: {len(found):,} are perturbed, not {count:,}: {rule}.")
     return found

@@ -39,7 +39,7 @@ class Scores(Measured):
     on_the_way: Array
     """Success at the points of each stage before its end, (targets, points - 1, tasks, curve episodes)."""
     perturbed: Array
-    """Success on the retained skills at the ends of stages, perturbed, (stages + 1, retained, episodes)."""
+    """Success in perturbed episodes at the ends of stages, (stages + 1, tasks, episodes)."""
 
     @classmethod
     def from_record(cls, record: Record) -> Scores:
@@ -115,8 +115,7 @@ class Scores(Measured):
         if np.isnan(self.perturbed).all():  # most runs have none, and to count them takes long
             perturbed = spread(np.full(self.perturbed.shape[:-1], np.nan))
         else:
-            of_retained = counts[..., layout.columns("retained"), :]
-            perturbed = np.einsum("lre,...re->...lr", self.perturbed, of_retained) / number
+            perturbed = np.einsum("lte,...te->...lt", self.perturbed, counts) / number
         if layout.curve_episodes:
             weights = counts[..., np.searchsorted(layout.episodes, layout.curve_episodes)]
             weights = np.where(weights.sum(axis=-1, keepdims=True) > 0, weights, 1.0)
@@ -157,9 +156,9 @@ def _success(protocol: Protocol, rows: Sequence[Row], layout: Layout) -> Array:
 
 
 def _perturbed(rows: Sequence[Row], layout: Layout) -> Array:
-    """Return the success in perturbed episodes, (stages + 1, retained, episodes)."""
-    found = np.full((len(layout.target) + 1, len(layout.retained), len(layout.episodes)), np.nan)
-    of_task, of_episode = _places(layout.retained), _places(layout.episodes)
+    """Return the success in perturbed episodes, (stages + 1, tasks, episodes)."""
+    found = np.full((len(layout.target) + 1, len(layout.tasks), len(layout.episodes)), np.nan)
+    of_task, of_episode = _places(layout.tasks), _places(layout.episodes)
     for row in rows:
         found[row.point.stage, of_task[row.task], of_episode[row.episode]] = row.success
     return found

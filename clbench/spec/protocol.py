@@ -83,7 +83,7 @@ class Protocol:
     split: ScoredSplit = "test"
     """The split that is scored: "test", or "validation" in a tuning run."""
     perturb: bool = False
-    """Whether the retained skills also meet perturbed episodes at the end of each stage."""
+    """Whether the skills and the stage's target also meet perturbed episodes at the end of each stage."""
     criterion: float | None = None
     """Success rate on the target's validation episodes that ends a stage before its last step."""
     ends: tuple[int, ...] | None = None
@@ -96,7 +96,7 @@ class Protocol:
         Args:
             scenario: Scenario with the targets that are learned, in their order.
             split: The split that is scored.
-            perturb: Whether the retained skills also meet perturbed episodes.
+            perturb: Whether the retained skills and each stage's target also meet perturbed episodes.
         """
         budget = scenario.budget
         retained, target, held_out = (
@@ -149,11 +149,11 @@ class Protocol:
         """Return the episodes to play at `point`, in their order.
 
         At the end of a stage these are all scored episodes of all tasks, and the perturbed ones of the
-        retained skills. Before the end they are the first scored episodes of what the stage can change: the
-        retained skills and its target. Without a criterion the target has all its validation episodes at
-        every point, so that choices need not look at test episodes.
+        retained skills and the stage's target. Before the end they are the first scored episodes of what the
+        stage can change: the retained skills and its target. Without a criterion the target has all its
+        validation episodes at every point, so that choices need not look at test episodes.
         """
-        target = self.target[point.stage - 1 : point.stage] if point.stage else ()
+        target = self.learned(point.stage)
         at_end = self.is_end(point)
         keys = self._each(
             self.tasks if at_end else self.retained + target, self.split, self.scored_episodes(at_end)
@@ -161,8 +161,16 @@ class Protocol:
         if self.split == "test" and self.criterion is None:
             keys += self._each(target, "validation", self.validation_episodes)
         if self.perturb and at_end:
-            keys += self._each(self.retained, "perturbed", self.test_episodes)
+            keys += self._each(self.perturbed_tasks(point.stage), "perturbed", self.test_episodes)
         return keys
+
+    def learned(self, stage: int) -> tuple[str, ...]:
+        """Return the target of a stage, as a tuple; nothing is learned in stage 0."""
+        return self.target[stage - 1 : stage] if stage else ()
+
+    def perturbed_tasks(self, stage: int) -> tuple[str, ...]:
+        """Return the tasks with perturbed episodes at the end of a stage of a run that perturbs."""
+        return self.retained + self.learned(stage)
 
     def is_learned(self, successes: int) -> bool:
         """Return whether so many successes in the validation episodes of a target meet the criterion."""

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from clbench.scoring.layout import Array, average
+from clbench.scoring.metrics import load_metric
 from clbench.scoring.rates import Rates
 
 from .evidence import Evidence, Figure, Of
@@ -95,6 +96,27 @@ def early_success(evidence: Evidence, method: str, other: str) -> Figure:
 
     what = f"success on the targets, mean over the evaluated steps, {method} - {other}"
     return evidence.figure(what, difference, method, other, span=(-1, 1))
+
+
+def spatial_loss(evidence: Evidence, method: str) -> Figure:
+    """Return the success on each new target minus its success from displaced starts."""
+    what = f"success on new targets, plain - perturbed, {method}"
+    return evidence.figure(what, lambda of: average(_lost_by_perturbation(of[method])), method, span=(-1, 1))
+
+
+def spatial_gain(evidence: Evidence, method: str, other: str) -> Figure:
+    """Return how much less success on new targets `method` loses from displaced starts than `other`."""
+
+    def gain(of: Of) -> Array:
+        return average(_lost_by_perturbation(of[other]) - _lost_by_perturbation(of[method]))
+
+    what = f"loss from displaced starts, {other} - {method}"
+    return evidence.figure(what, gain, method, other, span=(-1, 1))
+
+
+def _lost_by_perturbation(rates: Rates) -> Array:
+    perturbed = load_metric("perturbed_adaptation").function(rates)
+    return average(rates.learned) - perturbed
 
 
 def sparsity(evidence: Evidence, method: str, other: str) -> Figure:

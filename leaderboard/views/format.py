@@ -37,6 +37,7 @@ TO_CRITERION = (
     "final_average",
     "gain",
     "adaptation",
+    "perturbed_adaptation",
     "retention",
     "perturbed_retention",
     "kept_targets",

@@ -47,7 +47,7 @@ def test_a_row_has_every_metric_with_its_interval_and_the_costs(four_methods: Pa
     assert np.isnan(row.perturbed_retention)
     to_criterion = {"steps_to_criterion", "speed", "relearning_steps", "instruction_capture", "shift"}
     assert row[sorted(to_criterion)].isna().all()
-    missing = {"intransigence", "perturbed_retention", "gain", *to_criterion}
+    missing = {"intransigence", "perturbed_retention", "perturbed_adaptation", "gain", *to_criterion}
     for name in set(METRICS) - missing:
         assert row[f"{name}_low"] <= row[name] <= row[f"{name}_high"]
 

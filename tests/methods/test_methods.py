@@ -130,7 +130,7 @@ def test_a_run_records_its_uses_and_costs_and_has_every_metric(
     adapted = {"update_sparsity"} if record.costs.parameters_added else set()
     # the stages of the toy have no criterion
     to_criterion = {"steps_to_criterion", "instruction_capture", "relearning_steps"}
-    assert missing == {"perturbed_retention", *to_criterion, *adapted}
+    assert missing == {"perturbed_retention", "perturbed_adaptation", *to_criterion, *adapted}
     assert all(
         METRICS[metric].low <= value <= METRICS[metric].high for metric, value in values.items() if value
     )

@@ -152,14 +152,17 @@ def test_a_run_with_perturbed_episodes_has_everything_that_a_plain_run_has(tmp_p
     assert [row for row in rows if row[3] != "perturbed"] == list(zip(*plain.episodes.values(), strict=True))
     assert [row[:5] for row in rows if row[3] == "perturbed"] == [
         (stage, 60 * bool(stage), task, "perturbed", number)
-        for stage in range(3)
-        for task in ("left", "up")
+        for stage, learned in enumerate(((), ("right",), ("down",)))
+        for task in ("left", "up", *learned)
         for number in range(perturbed.scenario.budget["test_episodes"])
     ]
     assert (perturbed.answers, perturbed.policy) == (plain.answers, plain.policy)
-    retained = Scores.from_record(perturbed).rates().perturbed
-    assert retained[0].mean() > 0.5
-    assert np.isfinite(retained).all()
+    rates = Scores.from_record(perturbed).rates().perturbed
+    assert rates[0, :2].mean() > 0.5
+    played = np.isfinite(rates)
+    assert played.tolist() == [
+        [True, True, stage == 1, stage == 2, *[False] * (rates.shape[1] - 4)] for stage in range(3)
+    ]
 
 
 def test_a_record_with_perturbed_episodes_counts_as_a_plain_one_but_not_vice_versa(
@@ -185,9 +188,10 @@ def test_a_scenario_that_cannot_be_perturbed_is_refused_before_any_work(
         "clbench.testing.Steady", lambda render_mode=None: ToyWorld(render_mode), raising=False
     )
     steady = dataclasses.replace(toy, retained=(dataclasses.replace(toy.retained[1], world=world),))
+    steady_target = dataclasses.replace(toy, target=(dataclasses.replace(toy.target[0], world=world),))
     for scenario, message in (
-        (dataclasses.replace(toy, retained=()), "clbench/Toy-v0 retains no skills that could be perturbed"),
         (steady, f"The task 'up' cannot be perturbed: {world} does not declare `perturbable = True`."),
+        (steady_target, f"The task 'right' cannot be perturbed: {world} does not declare"),
     ):
         monkeypatch.setattr("clbench.testing.TOY", scenario)
         with pytest.raises(SystemExit) as left:

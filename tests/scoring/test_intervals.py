@@ -49,7 +49,7 @@ def whole_run(shape: Layout, success: Any, **arrays: Any) -> Scores:
     on_the_way = np.full((targets, points - 1, len(shape.tasks), len(shape.curve_episodes)), np.nan)
     curves = ("validation", "answer_curves", "update_sparsity", "activation_drift")
     missing = {name: np.full((targets, points), np.nan) for name in curves}
-    perturbed = np.full((targets + 1, len(shape.retained), len(shape.episodes)), np.nan)
+    perturbed = np.full((targets + 1, len(shape.tasks), len(shape.episodes)), np.nan)
     given = {
         "perturbed": perturbed,
         "on_the_way": on_the_way,
@@ -70,7 +70,7 @@ def random_run(generator: np.random.Generator, shape: Layout) -> Scores:
     """Return a run of coin flips; plain fine-tuning's final success is reached somewhere in each stage."""
     targets, points, tasks = len(shape.target), len(shape.steps), len(shape.tasks)
     on_the_way = (targets, points - 1, tasks, len(shape.curve_episodes))
-    perturbed = (targets + 1, len(shape.retained), len(shape.episodes))
+    perturbed = (targets + 1, len(shape.tasks), len(shape.episodes))
     selection = generator.random((targets, points))
     selection[:, -1] = 1.0
     return whole_run(

@@ -48,17 +48,19 @@ def test_a_metric_has_the_value_worked_out_by_hand(name: str, scores: Callable[.
 
 def test_every_metric_of_the_leaderboard_is_worked_out_by_hand() -> None:
     others = {"forward_transfer", "question_retention", "retention_at_matched_adaptation"}
-    others |= {"perturbed_retention", "update_sparsity", "activation_drift"}
+    others |= {"perturbed_retention", "perturbed_adaptation", "update_sparsity", "activation_drift"}
     others |= {"gain", "steps_to_criterion", "speed", "shift", "relearning_steps", "instruction_capture"}
     found = {name for name, metric in METRICS.items() if metric.function.__module__ == MODULE}
     assert {*BY_HAND, *others} == found
 
 
-def test_perturbed_retention_has_the_value_worked_out_by_hand(scores: Callable[..., Scores]) -> None:
-    run = scores(MATRIX, perturbed=[[0.9, 0.7], [0.5, 0.8], [0.4, 0.2]])
+def test_perturbed_success_has_the_values_worked_out_by_hand(scores: Callable[..., Scores]) -> None:
+    run = scores(MATRIX, perturbed=[[0.9, 0.7], [0.5, 0.8], [0.4, 0.2]], perturbed_learned=[0.6, 0.3])
     assert measure("perturbed_retention", run) == pytest.approx((0.4 + 0.2) / 2)
+    assert measure("perturbed_adaptation", run) == pytest.approx((0.6 + 0.3) / 2)
     assert measure("retention", run) == pytest.approx(BY_HAND["retention"])
     assert measure("perturbed_retention", scores(MATRIX)) is None
+    assert measure("perturbed_adaptation", scores(MATRIX)) is None
 
 
 def test_gain_is_the_final_average_beyond_that_of_plain_fine_tuning(scores: Callable[..., Scores]) -> None:

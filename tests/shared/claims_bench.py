@@ -35,6 +35,7 @@ class Bench:
         earlier: float = 1.0,
         curve: float = 0.5,
         took: tuple[int, int] | None = None,
+        displaced: float | None = None,
         right: tuple[int, int] = (500, 400),
         sparsity: Any = 0.5,
         drift: Any = 1.0,
@@ -51,6 +52,7 @@ class Bench:
             earlier: Success on the first target at the end.
             curve: Success on a target on the way.
             took: Steps of each stage to the criterion; stages are equally long if None.
+            displaced: Success on each new target from displaced starts; no episode is perturbed if None.
             right: Questions of 500 answered rightly at the start and at the end.
             sparsity: Update sparsity at all points, a number or one for each seed.
             drift: Activation drift, likewise.
@@ -88,6 +90,8 @@ class Bench:
                 seed=seed,
                 changes=changed,
                 settings=changed,
+                perturbed=None if displaced is None else np.full((3, 2), left),
+                perturbed_learned=None if displaced is None else np.full(2, displaced),
                 **on_the_way,
             )
             record.costs = dataclasses.replace(record.costs, **(costs or {}))
@@ -107,6 +111,14 @@ class Bench:
             for method, ratio in ratios.items()
         }
         (self.folder / "step_time.json").write_text(json.dumps({"ratios": entries}), encoding="utf-8")
+
+    def judge(self, identifier: str) -> Any:
+        """Return the finding on one claim."""
+        read = resolve("clbench.leaderboard.claims.evidence:read_evidence")
+        evidence = read(
+            SCENARIO, self.folder / "records", self.folder / "controls", self.folder / "step_time.json"
+        )
+        return resolve("clbench.leaderboard.claims.judges:CLAIMS")[identifier].judge(evidence)
 
     def page(self) -> str:
         """Return the page."""

@@ -50,9 +50,11 @@ def test_a_tuning_run_has_validation_episodes_alone() -> None:
 
 
 def test_perturbed_episodes_repeat_the_test_episodes_on_the_skills_at_the_ends() -> None:
-    perturbed = dataclasses.replace(PROTOCOL, perturb=True)
+    perturbed, target = dataclasses.replace(PROTOCOL, perturb=True), PROTOCOL.target[0]
     extra = set(perturbed.episodes(Point(1, 20))) - set(PROTOCOL.episodes(Point(1, 20)))
-    assert extra == {EpisodeKey(task, "perturbed", number) for task in "ab" for number in range(3)}
+    assert extra == {
+        EpisodeKey(task, "perturbed", number) for task in ("a", "b", target) for number in range(3)
+    }
     assert perturbed.episodes(Point(1, 10)) == PROTOCOL.episodes(Point(1, 10))
 
 

@@ -4,7 +4,7 @@ from collections.abc import Callable
 from typing import Any
 
 import pytest
-from claims_bench import Bench, verdicts
+from claims_bench import Bench
 
 from clbench.records.record import AnswerRow, Record
 
@@ -135,6 +135,14 @@ CASES: list[tuple[str, str, Given]] = [
     ("C6", "undecided", {"sft": {}, "consft": {}}),
     ("C7", "holds", {"consft": {"earlier": 1.0}, "consft_calibrated": {"earlier": 0.4}}),
     ("C7", "does not hold", {"consft": {"earlier": 0.5}, "consft_calibrated": {"earlier": 0.4}}),
+    ("C8", "holds", {"sft": {"displaced": 0.5}, "consft": {"displaced": 0.8}}),
+    (
+        "C8",
+        "does not hold",
+        {"sft": {"displaced": 0.5}, "consft": {"displaced": 0.5}, "consft_calibrated": {"displaced": 0.45}},
+    ),
+    ("C8", "cannot be shown here", {"sft": {"displaced": 1.0}, "consft": {"displaced": 1.0}}),
+    ("C8", "undecided", {"sft": {}, "consft": {}}),
     ("A1", "holds", {"sft": {"right": (500, 400), "edit": _early_loss}}),
     ("A1", "holds in part", LOSES),
     ("A1", "does not hold", KEEPS),
@@ -195,4 +203,4 @@ def test_a_verdict_follows_from_the_records_by_the_rule(
 ) -> None:
     for label, values in given.items():
         bench.add(label, **values)
-    assert verdicts(bench.page())[identifier] == verdict
+    assert bench.judge(identifier).verdict == verdict

@@ -57,7 +57,8 @@ def test_perturbed_retention_follows_retention_where_a_row_has_it(
     assert cells["sft"].startswith("0.30 [")
     assert (cells["asks"], cells["replay"]) == ("-", "-")
     assert "**perturbed retention** (higher is better" in page
-    changed = [f"perturbed_retention{end}" for end in ("", "_low", "_high")]
+    names = ("perturbed_retention", "perturbed_adaptation")
+    changed = [f"{name}{end}" for name in names for end in ("", "_low", "_high")]
     pandas.testing.assert_frame_equal(after.drop(columns=changed), before.drop(columns=changed))
     assert before.perturbed_retention.isna().all()
     assert after.set_index("method").perturbed_retention["sft"] == pytest.approx(0.3)
