@@ -6,28 +6,28 @@ import math
 
 from .claim import ANYWHERE, Finding, Paper, best_of, claim, decided, not_told_apart, what_would_change
 from .evidence import Evidence, Figure, rung
-from .figures import PUBLISHED, kept, retention_drop, share_at_floor, sparsity, spatial_gain, spatial_loss
+from .figures import PUBLISHED, kept, retention_drop, share_between, sparsity, spatial_gain, spatial_loss
 
 CONSFT = Paper("ConSFT", ("2605.08879",))
 
 ARMS = ("consft", "consft_calibrated")
 """The constants as published, and the same constants with the loss in their unit."""
 
-FLOOR = 0.9
-"""Share of the weights below 0.01 from which an arm is plain fine-tuning without clipping: Adam cancels a
-factor that all samples share."""
+LEAST_BETWEEN = 0.1
+"""Share of the weights between 0.01 and 0.9 below which an arm is plain fine-tuning: its samples all weigh
+nothing, which Adam cancels, or all weigh 1."""
 
 
 def _active(evidence: Evidence, arm: str) -> bool:
     """Return whether the weights of an arm differ between samples."""
-    share = share_at_floor(evidence, arm).value
-    return math.isnan(share) or share < FLOOR
+    share = share_between(evidence, arm).value
+    return math.isnan(share) or share >= LEAST_BETWEEN
 
 
-def _floor_sentences(evidence: Evidence) -> list[str]:
+def _inactive_sentences(evidence: Evidence) -> list[str]:
     return [
-        f"{share_at_floor(evidence, arm).value:.0%} of the weights of {arm} are below 0.01: this arm is "
-        "plain fine-tuning without clipping, and its figures do not count."
+        f"Only {share_between(evidence, arm).value:.0%} of the weights of {arm} lie between 0.01 and 0.9: "
+        "this arm is plain fine-tuning, and its figures do not count."
         for arm in ARMS
         if not _active(evidence, arm)
     ]
@@ -64,11 +64,11 @@ def sft_degrades(evidence: Evidence) -> Finding:
     "C2",
     CONSFT,
     reported="over 20 points on average; the visible margins are +25, +20, +10 and +14 (Table 2)",
-    rule="An arm (consft as published, or consft_calibrated) counts unless 90 % of its weights are below "
-    "0.01. Holds if the lower end of the difference in retained success to sft, each at its best settings, "
-    "is at least 0.20 for an arm; holds in part if it is so only with both at the published step size; does "
-    "not hold if all upper ends are below 0.20. Cannot be shown here if no arm counts, or if sft certainly "
-    "keeps more than 0.80 at both settings.",
+    rule="An arm (consft as published, or consft_calibrated) counts if 10 % of its weights are between 0.01 "
+    "and 0.9. Holds if the lower end of the difference in retained success to sft, each at its best "
+    "settings, is at least 0.20 for an arm; holds in part if it is so only with both at the published step "
+    "size; does not hold if all upper ends are below 0.20. Cannot be shown here if no arm counts, or if sft "
+    "certainly keeps more than 0.80 at both settings.",
     margin="0.20 of the retained success, the claim's own",
 )
 def keeps_20_points_more(evidence: Evidence) -> Finding:
@@ -79,21 +79,22 @@ def keeps_20_points_more(evidence: Evidence) -> Finding:
     sft = [evidence.metric("retention", label) for label in ("sft", rung("sft", PUBLISHED))]
     counting = [figure for figure in at_best if figure.methods[0] in arms]
     published = [figure for figure in at_one if figure.methods[0] in {rung(arm, PUBLISHED) for arm in arms}]
-    figures = (*at_best, *at_one)
+    best = best_of(counting or at_best)
+    figures = (best, *(one for one in (*at_best, *at_one) if one is not best))
     controls = tuple(
         kept(evidence, "consft_calibrated", control)
         for control in ("constant_weight", "shuffled_weights", "finch")
     )
+    shown = (*sft, *controls, *(share_between(evidence, arm) for arm in ARMS))
     if not arms or all(one.low > 0.80 for one in sft):
         reason = "sft keeps too much for a gain of 0.20." if arms else "No arm has weights that differ."
         return Finding(
             "cannot be shown here",
             figures,
-            (*sft, *controls),
-            (*_floor_sentences(evidence), reason),
+            shown,
+            (*_inactive_sentences(evidence), reason),
             "A setting in which sft keeps less than 0.80, and weights that differ between samples.",
         )
-    best = best_of(counting)
     return Finding(
         decided(
             holds=any(one.low >= 0.20 for one in counting),
@@ -101,8 +102,8 @@ def keeps_20_points_more(evidence: Evidence) -> Finding:
             fails=all(one.high < 0.20 for one in (*counting, *published)),
         ),
         figures,
-        (*sft, *controls),
-        (*_floor_sentences(evidence), *_controls(controls)),
+        shown,
+        (*_inactive_sentences(evidence), *_controls(controls)),
         what_would_change(best, 0.20),
         about=ARMS,
     )

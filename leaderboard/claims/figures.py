@@ -140,12 +140,15 @@ def drift_ratio(evidence: Evidence, method: str) -> Figure:
     return evidence.figure(f"activation drift, {method} / sft", ratio, method, "sft")
 
 
-def share_at_floor(evidence: Evidence, method: str) -> Figure:
-    """Return the share of ConSFT's weights that are below 0.01, over all samples of all steps."""
+def share_between(evidence: Evidence, method: str) -> Figure:
+    """Return the share of ConSFT's weights between 0.01 and 0.9, over all samples of all steps.
+
+    Weights below are at the floor, alike for all samples, and weights above are those of plain fine-tuning.
+    """
 
     def share(stage: Mapping[str, Any]) -> float | None:
         counts = np.asarray(stage.get("omega_counts", []), dtype=np.float64)
-        total = counts.sum() if counts.ndim == 2 else 0.0
-        return float(counts[:, 0].sum() / total) if total > 0 else None
+        total = counts.sum() if counts.ndim == 2 and counts.shape[1] > 2 else 0.0
+        return float(counts[:, 1:-1].sum() / total) if total > 0 else None
 
-    return evidence.diagnostic(method, f"share of the weights of {method} below 0.01", share)
+    return evidence.diagnostic(method, f"share of the weights of {method} between 0.01 and 0.9", share)

@@ -13,8 +13,8 @@ from clbench.base.entry_points import resolve
 from clbench.records.paths import record_path
 from clbench.records.record import Record
 
-ACTIVE = {"1": {"omega_counts": [[5, 5], [5, 5]]}}
-AT_FLOOR = {"1": {"omega_counts": [[99, 1], [100, 0]]}}
+ACTIVE = {"1": {"omega_counts": [[5, 5, 0, 0, 0], [0, 5, 3, 1, 1]]}}
+SAME = {"1": {"omega_counts": [[98, 2, 0, 0, 0], [60, 0, 0, 0, 40]]}}
 
 
 @pytest.mark.parametrize(
@@ -76,14 +76,14 @@ def test_the_bound_of_a_step_names_a_test_that_exists(bench: Bench) -> None:
         assert f"def {test}(" in (Path(__file__).parents[3] / path).read_text(encoding="utf-8")
 
 
-def test_an_arm_with_all_weights_at_the_floor_does_not_count_and_the_page_says_so(bench: Bench) -> None:
+def test_an_arm_whose_samples_weigh_the_same_does_not_count_and_the_page_says_so(bench: Bench) -> None:
     bench.add("sft")
     bench.add("sft@1")
-    bench.add("consft", kept=0.8, diagnostics=AT_FLOOR)
+    bench.add("consft", kept=0.8, diagnostics=SAME)
     bench.add("consft_calibrated", diagnostics=ACTIVE)
     entry = section(bench.page(), "C2")
-    assert "100% of the weights of consft are below 0.01: this arm is plain fine-tuning" in entry
-    assert "weights of consft_calibrated are below" not in entry
+    assert "Only 1% of the weights of consft lie between 0.01 and 0.9: this arm is plain fine-tuning" in entry
+    assert "weights of consft_calibrated lie" not in entry
 
 
 def test_a_control_says_whether_it_explains_what_is_kept(bench: Bench) -> None:

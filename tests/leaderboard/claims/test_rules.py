@@ -12,8 +12,9 @@ Given = dict[str, dict[str, Any]]
 
 SFT: Given = {"sft": {}, "sft@1": {}}
 """Plain fine-tuning that keeps .2 of the skills, at its best step size and at the published one."""
-ACTIVE = {"1": {"omega_counts": [[5, 5], [5, 5]]}}
-AT_FLOOR = {"1": {"omega_counts": [[99, 1], [100, 0]]}}
+ACTIVE = {"1": {"omega_counts": [[5, 5, 0, 0, 0], [0, 5, 3, 1, 1]]}}
+SAME = {"1": {"omega_counts": [[98, 1, 0, 0, 1], [60, 0, 0, 0, 40]]}}
+"""Weights at the floor, or of 1."""
 STEADY: Given = {"sft@1": {"took": (20, 20)}, "co_training+step_factor=1.0": {"took": (12, 12)}}
 """The auxiliary objective saves steps, so that there is a capability for a vector to carry."""
 VECTOR, AT_RANDOM = "fast_dvla@1", "fast_dvla+direction=random+step_factor=1.0"
@@ -70,8 +71,8 @@ CASES: list[tuple[str, str, Given]] = [
         "cannot be shown here",
         {
             **SFT,
-            "consft": {"kept": 0.8, "diagnostics": AT_FLOOR},
-            "consft_calibrated": {"kept": 0.8, "diagnostics": AT_FLOOR},
+            "consft": {"kept": 0.8, "diagnostics": SAME},
+            "consft_calibrated": {"kept": 0.8, "diagnostics": SAME},
         },
     ),
     (
@@ -79,7 +80,7 @@ CASES: list[tuple[str, str, Given]] = [
         "undecided",
         {
             **SFT,
-            "consft": {"kept": 0.8, "diagnostics": AT_FLOOR},
+            "consft": {"kept": 0.8, "diagnostics": SAME},
             "consft_calibrated": {"diagnostics": ACTIVE},
         },
     ),
