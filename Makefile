@@ -1,7 +1,7 @@
 # Every target makes .venv and installs what it needs by itself.
 PYTHON ?= python3
 BIN := .venv/bin
-SCENARIO := clbench/Fetch-v0
+SCENARIO := clbench/Fetch-v1
 QUICK := build/quick
 
 .PHONY: leaderboard tuning records ladder controls docs benchmark test test-slow check wheel-test clean

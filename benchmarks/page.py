@@ -1,6 +1,6 @@
 """Size of the page, and time to make it from generated records: `python benchmarks/page.py`.
 
-The records have the shape of Fetch-v0's. A method is two numbers: how well it learns, and how much it keeps.
+The records have the shape of Fetch-v1's. A method is two numbers: how well it learns, and how much it keeps.
 The goal is less than 3 MB and 20 s with 15 methods, 5 seeds and 4 scenarios.
 """
 

@@ -154,7 +154,7 @@ def _metaworld_physics(env: Env) -> Physics:
 
 SUITES = {
     "fetch": Suite(
-        "clbench/Fetch-v0",
+        "clbench/Fetch-v1",
         None,
         "FetchPickAndPlace-v4",
         _fetch_peer,
@@ -175,7 +175,7 @@ SUITES = {
         _dm_control_physics,
     ),
     "metaworld": Suite(
-        "clbench/MetaWorld-v0", 1, "Meta-World/MT1 faucet-close-v3", _metaworld_peer, _metaworld_physics
+        "clbench/MetaWorld-v1", 1, "Meta-World/MT1 faucet-close-v3", _metaworld_peer, _metaworld_physics
     ),
 }
 

@@ -32,7 +32,7 @@ from clbench.learning.pretraining import policy_config
 from clbench.policy.policy import Policy
 from clbench.spec.registry import load_scenario
 
-FETCH, META_WORLD = "clbench/Fetch-v0", "clbench/MetaWorld-v0"
+FETCH, META_WORLD = "clbench/Fetch-v1", "clbench/MetaWorld-v1"
 
 
 def evaluation_of_tasks() -> Callable[[int], float]:

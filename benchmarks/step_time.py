@@ -115,7 +115,7 @@ class BareLoop:
 def main() -> None:
     """Measure, print a table and write results/step_time.json."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("--scenario", default="clbench/Fetch-v0")
+    parser.add_argument("--scenario", default="clbench/Fetch-v1")
     parser.add_argument("--rounds", type=int, default=15)
     parser.add_argument("--steps", type=int, default=8, help="timed steps in a block")
     arguments = parser.parse_args()

@@ -38,7 +38,7 @@ METHODS = ("sft", "l2_sp", "stop_gradient", "constant_weight")
 def main() -> None:
     """Measure, print the ratios and write results/workers.json."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("--scenario", default="clbench/Fetch-v0")
+    parser.add_argument("--scenario", default="clbench/Fetch-v1")
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
     arguments = parser.parse_args()

@@ -2,12 +2,10 @@
 
 from clbench.spec.registry import register
 
-register("clbench/Fetch-v0", "clbench.envs.fetch.scenario:SCENARIO")
-register("clbench/Fetch-v1", "clbench.envs.fetch_tidy.scenario:SCENARIO")
-register("clbench/FetchKnowledge-v1", "clbench.envs.fetch_tidy.scenario:KNOWLEDGE")
-register("clbench/FetchPixels-v0", "clbench.envs.fetch.pixel_scenario:SCENARIO")
+register("clbench/Fetch-v1", "clbench.envs.fetch.scenario:SCENARIO")
+register("clbench/FetchKnowledge-v1", "clbench.envs.fetch.scenario:KNOWLEDGE")
+register("clbench/FetchPixels-v0", "clbench.envs.fetch_pixels.scenario:SCENARIO")
 register("clbench/DMControl-v0", "clbench.envs.dm_control.scenario:SCENARIO")
-register("clbench/MetaWorld-v0", "clbench.envs.metaworld.scenario:SCENARIO")
-register("clbench/MetaWorld-v1", "clbench.envs.metaworld.scenario:TO_CRITERION")
+register("clbench/MetaWorld-v1", "clbench.envs.metaworld.scenario:SCENARIO")
 register("clbench/MetaWorldCW-v0", "clbench.envs.metaworld.scenario:CONTINUAL_WORLD")
 register("clbench/PointMaze-v0", "clbench.envs.point_maze.scenario:SCENARIO")

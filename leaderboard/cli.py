@@ -14,7 +14,7 @@ from rich.text import Text
 from clbench.base.entry_points import unknown
 from clbench.base.errors import InputError
 from clbench.cli.arguments import add_cwd_to_path, checked_input, whole_number
-from clbench.records.paths import RECORDS, TUNING, record_path
+from clbench.records.paths import RECORDS, record_path
 
 from .board.places import CONTROLS, SCENARIO, STEP_TIME
 
@@ -68,7 +68,7 @@ def submit(
 
     Args:
         method: module:Class, or the name of an installed method.
-        scenario: Gymnasium id of the scenario, for example clbench/Fetch-v0; module:id imports the module
+        scenario: Gymnasium id of the scenario, for example clbench/Fetch-v1; module:id imports the module
             first.
         seeds: Number of seeds.
         first_seed: The first seed.
@@ -179,7 +179,6 @@ def method_pages(
     *,
     records: Path = RECORDS,
     controls: Path = CONTROLS,
-    tuning: Path = TUNING,
     scenario: str = SCENARIO,
     step_time: Path = STEP_TIME,
     output: Path = Path("docs/reference/methods"),
@@ -189,7 +188,6 @@ def method_pages(
     Args:
         records: Folder of the records of the leaderboard.
         controls: Folder of the records of changed settings.
-        tuning: Folder of the records of tuning runs.
         scenario: Gymnasium id of the scenario.
         step_time: Results of the speed benchmark.
         output: Folder of the pages.
@@ -202,7 +200,7 @@ def method_pages(
 
     judged = judge_all(lambda name: read_evidence(name, records, controls, step_time))
     evidence = read_evidence(scenario, records, controls, step_time)
-    sources = read_sources(evidence, judged, _table(records), tuning)
+    sources = read_sources(evidence, judged, _table(records))
     texts = pages(built_in_methods(), sources)
     output.mkdir(parents=True, exist_ok=True)
     for name, text in texts.items():

@@ -23,7 +23,7 @@ def test_an_unknown_name_is_an_attribute_error() -> None:
 
 def test_importing_registers_the_scenarios_and_loads_nothing_heavy() -> None:
     heavy = "{'torch', 'mujoco', 'pandas', 'minari', 'gymnasium_robotics', 'psutil', 'rich'}"
-    code = "import clbench, gymnasium, sys; gymnasium.spec('clbench/Fetch-v0');"
+    code = "import clbench, gymnasium, sys; gymnasium.spec('clbench/Fetch-v1');"
     assert _run(f"{code} print({heavy} & set(sys.modules))") == "set()"
 
 

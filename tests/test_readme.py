@@ -22,7 +22,7 @@ def _python(code: str, folder: Path) -> str:
 def _console(block: str, folder: Path) -> str:
     line = (
         block.strip()
-        .replace("clbench/Fetch-v0", "clbench.testing:clbench/Toy-v0")
+        .replace("clbench/Fetch-v1", "clbench.testing:clbench/Toy-v0")
         .replace("--seeds 3", "--seeds 1")
     )
     command = [sys.executable, "-m", *line.split()]

@@ -46,7 +46,7 @@ def run(
     runs that have a record, so the same command continues a stopped one.
 
     Args:
-        scenarios: Gymnasium id of the scenario, for example clbench/Fetch-v0, or several ids separated by
+        scenarios: Gymnasium id of the scenario, for example clbench/Fetch-v1, or several ids separated by
             commas; module:id imports the module first.
         methods: Names of installed methods, or module:Class.
         every: Run all installed methods.

@@ -18,7 +18,7 @@ from clbench.spec.scenario import Scenario
 from clbench.spec.task import Task
 
 REPLAY_PACE = 0.75
-"""Pace of runs that replay demonstrations. They keep their skills, and success ends an episode: on Fetch-v0
+"""Pace of runs that replay demonstrations. They keep their skills, and success ends an episode: on Fetch-v1
 such a run takes 170 s, and plain fine-tuning, which forgets, takes 232 s."""
 
 

@@ -23,7 +23,7 @@ from clbench.records.record import (
 from clbench.spec.identifiers import check_plain
 
 MOST_ROWS = 200_000
-"""Rows of a table. A record of Fetch-v0 has 1,780 episodes."""
+"""Rows of a table. A record of Fetch-v1 has 1,780 episodes."""
 
 FIRST_HASHED = 3
 """Schema whose records, and those of later ones, have a hash of their content."""

@@ -107,7 +107,7 @@ def evaluate_agent(
     world = env.unwrapped
     if not isinstance(world, ScenarioEnv | ScenarioVectorEnv):
         raise WrongTypeError(
-            f"{env} does not belong to a scenario: make it with gymnasium.make('clbench/Fetch-v0', stage=0)."
+            f"{env} does not belong to a scenario: make it with gymnasium.make('clbench/Fetch-v1', stage=0)."
         )
     if world.stage is None:
         raise InputError(

@@ -51,7 +51,7 @@ LEVEL = 95.0
 """Nominal coverage of the intervals in per cent."""
 SEED_DEVIATION = 0.05
 """Standard deviation of a success rate between seeds, assumed where none is measured. In the committed
-records of Fetch-v0 retention deviates by 0.037 beyond the noise of episodes (root mean square over methods),
+records of Fetch-v1 retention deviates by 0.037 beyond the noise of episodes (root mean square over methods),
 and by 0.07 at most."""
 MANY = 10**6
 """Degrees of freedom of a standard deviation that is known."""

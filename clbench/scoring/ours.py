@@ -15,10 +15,6 @@ from clbench.scoring.metric import metric
 from clbench.scoring.rates import Rates
 from clbench.spec.references import BASELINE, FROM_SCRATCH
 
-MATCHED_SHARE = 0.9
-"""Share of plain fine-tuning's final success on a target at which a method counts as having learned it as
-well."""
-
 
 @metric(
     formula="mean of R[K][s] over the retained skills and the targets",
@@ -215,56 +211,6 @@ def perturbed_adaptation(rates: Rates) -> Array:
     """
     of_targets = rates.perturbed[..., 1:, rates.layout.columns("target")]
     return average(np.diagonal(of_targets, axis1=-2, axis2=-1))
-
-
-@metric(
-    formula="mean over the stages k of the success on the retained skills at the first evaluation point of "
-    f"stage k at which the success on target k is at least {MATCHED_SHARE:g} times the success of "
-    f"{BASELINE} on it at the end of stage k; the point is chosen on validation episodes, the success at it "
-    "is from test episodes",
-    source="the protocol of ConSFT, arXiv 2605.08879, Sec. 5.1: comparison at comparable target success",
-    references=(BASELINE,),
-    compares_itself=True,
-    missing=f"A target is never learned as well as by {BASELINE}, a rate up to that point is missing, "
-    f"or there is no {BASELINE}.",
-)
-def retention_at_matched_adaptation(rates: Rates) -> Array:
-    """Success on the retained skills at the point where the target is learned about as well as by sft.
-
-    It distinguishes a method that forgets less from one that merely learns less, or later. Conventions:
-
-    1. The value is missing if the target of any stage is never learned that well.
-    2. sft is compared with itself: its retention when it first came near its final success.
-    3. Earlier stages are not matched: each stage begins with the policy that the full stage before it left.
-    """
-    points = matched_points(rates)
-    kept = average(rates.retained_curves)
-    chosen = np.nan_to_num(points).astype(np.int64)[..., None]
-    values = np.take_along_axis(kept, chosen, axis=-1)[..., 0]
-    return average(np.where(np.isnan(points), np.nan, values))
-
-
-def matched_points(rates: Rates) -> Array:
-    """Return the evaluation point of each stage at which its target is first learned about as well as by sft.
-
-    At this point the success on the validation episodes first reaches `MATCHED_SHARE` times the success of
-    sft on them at the end of the stage. Test episodes, which make the scores, have no part in the choice.
-
-    Args:
-        rates: Success rates with the reference sft.
-
-    Returns:
-        Indices into `Layout.steps`, (..., targets); NaN where none reaches it, or where a rate is missing.
-    """
-    if BASELINE not in rates.references:
-        return np.full(rates.validation.shape[:-1], np.nan)
-    goal = MATCHED_SHARE * rates.references[BASELINE].validation[..., -1:]
-    # Rates are quotients of whole numbers: equal ones may differ in the last bit.
-    reached = rates.validation >= goal - 1e-9
-    # A missing rate may have been the first to reach it: no later one is known to be the first.
-    first = np.argmax(reached | np.isnan(rates.validation), axis=-1)
-    found = np.take_along_axis(reached, first[..., None], axis=-1)[..., 0]
-    return np.where(found, first, np.nan)
 
 
 @metric(

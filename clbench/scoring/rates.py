@@ -18,8 +18,6 @@ class Measured:
 
     layout: Layout
     """Meaning of the axes."""
-    validation: Array
-    """Success rate on target k over validation episodes at the points of stage k, (..., targets, points)."""
     asked: Array
     """Questions asked at the end of each stage, (..., stages + 1, kinds)."""
     correct: Array

@@ -21,7 +21,7 @@ MOST_POINTS = 100
 
 MOST_CELLS = 20_000
 """Cells of a table of rates, for example stages x points x tasks: 2,000 replicates of it take 320 MB.
-Fetch-v0 has 240, a sequence of 40 targets among 50 tasks 8,200."""
+Fetch-v1 has 240, a sequence of 40 targets among 50 tasks 8,200."""
 
 FARTHEST = 1e18
 """A greater activation drift or shift than any policy has whose outputs are numbers of any use."""

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from clbench.records.record import Record
-from clbench.scoring.layout import Array, Layout, average
+from clbench.scoring.layout import Array, Layout
 from clbench.scoring.rates import MEASURED, Measured, Rates, check_same, combine
 from clbench.scoring.reading import (
     Row,
@@ -51,7 +51,6 @@ class Scores(Measured):
         protocol = read_protocol(record)
         rows = read_episodes(record, protocol)
         scored = [row for row in rows if row.split == protocol.split]
-        chosen_on = [row for row in rows if _is_chosen_on(row, protocol)]
         on_the_way = [row for row in scored if not protocol.is_end(row.point)]
         kinds, counts = read_answers(record, protocol)
         episodes = numbers(scored)
@@ -64,7 +63,7 @@ class Scores(Measured):
             protocol.held_out,
             episodes=episodes,
             curve_episodes=numbers(on_the_way) or planned,
-            validation_episodes=numbers(chosen_on),
+            validation_episodes=numbers(_chosen_on(rows, protocol)),
             steps=protocol.steps,
             kinds=kinds,
         )
@@ -79,7 +78,6 @@ class Scores(Measured):
             success=success[:, -1],
             on_the_way=success[1:, :-1][..., in_curves],
             perturbed=perturbed,
-            validation=average(_validation(protocol, chosen_on, layout)),
             asked=counts[0, :, -1],
             correct=counts[1, :, -1],
             answer_curves=_shares(*counts[:, 1:]),
@@ -133,11 +131,10 @@ class Scores(Measured):
         )
 
 
-def _is_chosen_on(row: Row, protocol: Protocol) -> bool:
-    """Return whether choices may look at the episode: a validation episode of the stage's target."""
-    return (
-        row.split == "validation" and row.point.stage > 0 and row.task == protocol.target[row.point.stage - 1]
-    )
+def _chosen_on(rows: Sequence[Row], protocol: Protocol) -> list[Row]:
+    """Return the validation episodes of each stage's target, which choices may look at."""
+    own = [row for row in rows if row.split == "validation" and row.point.stage > 0]
+    return [row for row in own if row.task == protocol.target[row.point.stage - 1]]
 
 
 def _places(names: Sequence[Any]) -> dict[Any, int]:
@@ -161,15 +158,6 @@ def _perturbed(rows: Sequence[Row], layout: Layout) -> Array:
     of_task, of_episode = _places(layout.tasks), _places(layout.episodes)
     for row in rows:
         found[row.point.stage, of_task[row.task], of_episode[row.episode]] = row.success
-    return found
-
-
-def _validation(protocol: Protocol, rows: Sequence[Row], layout: Layout) -> Array:
-    """Return the success on each stage's target in validation episodes, (targets, points, episodes)."""
-    found = np.full((len(layout.target), len(layout.steps), len(layout.validation_episodes)), np.nan)
-    of_episode = _places(layout.validation_episodes)
-    for row in rows:
-        found[row.point.stage - 1, place(protocol, row.point), of_episode[row.episode]] = row.success
     return found
 
 

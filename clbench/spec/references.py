@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 BASELINE = "sft"
-"""Plain fine-tuning: the method that matched retention, relative cost and cards compare with."""
+"""Plain fine-tuning: the method that gain, relative cost and cards compare with."""
 
 JOINT = "joint"
 """Training on everything met so far: the limit of a method with all the data."""

@@ -27,7 +27,7 @@ class Scenario:
     """A named, versioned sequence of tasks with its budget: skills to keep, then tasks to learn in order."""
 
     id: str
-    """Gymnasium id, such as "clbench/Fetch-v0"."""
+    """Gymnasium id, such as "clbench/Fetch-v1"."""
     description: str
     """Description for lists, in one sentence."""
     retained: tuple[Task, ...]

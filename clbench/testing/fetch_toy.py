@@ -10,12 +10,12 @@ from clbench.spec.budget import Budget
 from clbench.spec.registry import load_scenario, register
 from clbench.spec.task import Task
 
-_FETCH = load_scenario("clbench/Fetch-v0")
+_FETCH = load_scenario("clbench/Fetch-v1")
 
 
 def _apart(tasks: tuple[Task, ...]) -> tuple[Task, ...]:
     """Return the tasks under another suite: their few demonstrations must not replace the full ones."""
-    return tuple(dataclasses.replace(task, suite="fetch-toy") for task in tasks)
+    return tuple(dataclasses.replace(task, suite="fetch-toy", seed_name=None) for task in tasks)
 
 
 FETCH_TOY = dataclasses.replace(
@@ -25,6 +25,8 @@ FETCH_TOY = dataclasses.replace(
     retained=_apart(_FETCH.retained),
     target=_apart(_FETCH.target[:1]),
     held_out=_apart(_FETCH.held_out[:1]),
+    background=(),
+    balanced=False,
     budget=Budget(
         demonstrations=4,
         question_episodes=36,

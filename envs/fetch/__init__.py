@@ -1,1 +1,1 @@
-"""The Fetch suite: a robot arm, a block and a target marker, shown as numbers or as a camera's pictures."""
+"""The Fetch robot, a block and a target marker, shown to a policy as numbers."""

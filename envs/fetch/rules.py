@@ -1,10 +1,14 @@
-"""The tasks of the Fetch world: the target's places, the condition of success and the distance to it."""
+"""The tasks of the Fetch world: where things lie at the start, the condition of success, the way left to it.
+
+What a task does not need lies in a corner of the table. A policy can therefore see something of the task in
+the state, as in most real scenes.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypeAlias
 
 import numpy as np
@@ -21,6 +25,10 @@ PRESS_HEIGHT = 0.047
 """Largest height in metres of the gripper above the block's centre in a press. The finger tips reach 0.0185
 below the gripper, and touch the top of the block at 0.0435."""
 LIFT_HEIGHT = 0.10
+CLEARANCE = 0.06
+"""Height in metres of the gripper above a block that was put down, at which it has let go."""
+RAISED = 0.08
+"""Metres by which a held block is raised."""
 PUSH_DISTANCE = 0.10
 PUSH_CONE = 0.4
 """Largest sideways error of a push per metre, 21.8 degrees, so that a diagonal push is not a straight one."""
@@ -170,7 +178,28 @@ def _lift() -> Rule:
     )
 
 
-RULES: dict[str, Rule] = {
+def _put_down() -> Rule:
+    def success(state: Numbers, _: Numbers) -> bool:
+        on_table = abs(state[BLOCK][2] - REST_HEIGHT) < 0.01
+        return on_table and opening(state) > OPEN and state[GRIPPER][2] - state[BLOCK][2] > CLEARANCE
+
+    def distance(state: Numbers, _: Numbers) -> float:
+        return max(0.0, state[BLOCK][2] - REST_HEIGHT) + max(0.0, 0.1 - opening(state))
+
+    return Rule(success, distance)
+
+
+def _raise_block() -> Rule:
+    def height(state: Numbers, start: Numbers) -> float:
+        return state[BLOCK][2] - start[BLOCK][2]
+
+    def success(state: Numbers, start: Numbers) -> bool:
+        return height(state, start) > RAISED and CLOSED < opening(state) < OPEN
+
+    return Rule(success, lambda state, start: max(0.0, RAISED - height(state, start)))
+
+
+_RULES = {
     "reach": _reach(),
     "hover": _hover(BLOCK),
     "pick_and_place": _pick_and_place(),
@@ -181,7 +210,28 @@ RULES: dict[str, Rule] = {
     "push_right": _push_along(0.0, -1.0),
     "pull": _push_along(-1.0, 0.0),
     "press": _press(),
+    "put_down": _put_down(),
+    "raise_block": _raise_block(),
     "hover_target": _hover(TARGET),
     "push_left_away": _push_along(math.sqrt(0.5), math.sqrt(0.5)),
+}
+
+_LAYOUTS = {
+    Layout(block_aside=True): ("reach", "hover_target"),
+    Layout(target_aside=True): (
+        "hover",
+        "push_left",
+        "push_away",
+        "push_right",
+        "press",
+        "push_left_away",
+    ),
+    Layout(target_aside=True, block_held=True): ("put_down", "raise_block"),
+    Layout(): ("pick_and_place", "push", "lift", "pull"),
+}
+"""Tasks by what is in front of the gripper: the target, the block, the block between the fingers, or both."""
+
+RULES: dict[str, Rule] = {
+    name: replace(_RULES[name], layout=layout) for layout, names in _LAYOUTS.items() for name in names
 }
 """The rule of each task, by name."""

@@ -1,116 +1,198 @@
-"""The scenario clbench/Fetch-v0: all tasks share one scene, and only the instruction distinguishes them."""
+"""The scenarios clbench/Fetch-v1, with targets of graded conflict, and clbench/FetchKnowledge-v1."""
 
 from __future__ import annotations
 
+import dataclasses
+
+from clbench.spec.budget import Budget
 from clbench.spec.scenario import Scenario
 from clbench.spec.task import Task
 
 
-def _task(name: str, *instructions: str) -> Task:
+def _task(name: str, instructions: tuple[str, ...], test_instructions: tuple[str, ...]) -> Task:
     return Task(
         name=name,
         suite="fetch",
+        seed_name="fetch_tidy",
         instructions=instructions,
-        horizon=60,
+        test_instructions=test_instructions,
+        horizon=40,
         world="clbench.envs.fetch.world:FetchWorld",
         expert="clbench.envs.fetch.experts:expert",
         packages=("gymnasium-robotics",),
     )
 
 
-SCENARIO = Scenario(
-    id="clbench/Fetch-v0",
-    description="A robot arm learns to lift, push, pull and press a block, after six skills in one scene.",
-    retained=(
-        _task(
-            "reach",
-            "move the gripper to the target",
-            "reach the target with the closed gripper",
-            "bring the closed gripper to the target",
-            "go to the target and leave the block alone",
-        ),
-        _task(
-            "hover",
-            "hold the open gripper above the block",
-            "hover over the block with open fingers",
-            "open the gripper and stay above the block",
-            "wait above the block with the gripper open",
-        ),
-        _task(
-            "pick_and_place",
-            "pick up the block and carry it to the target",
-            "grasp the block and bring it to the target",
-            "take the block and hold it at the target",
-            "carry the block to the target in the gripper",
-        ),
-        _task(
-            "push",
-            "push the block to the target",
-            "slide the block over the table to the target",
-            "shove the block until it is at the target",
-            "push the block along the table onto the target",
-        ),
-        _task(
-            "push_left",
-            "push the block to the left",
-            "slide the block left",
-            "shove the block toward the left side of the table",
-            "move the block left with the closed gripper",
-        ),
-        _task(
-            "push_away",
-            "push the block away from the robot",
-            "slide the block away",
-            "shove the block farther from the robot",
-            "move the block away with the closed gripper",
-        ),
+_REACH = _task(
+    "reach",
+    (
+        "move the gripper to the target",
+        "reach the target with the closed gripper",
+        "bring the closed gripper to the target",
+        "go to the target with closed fingers",
+        "touch the target with the fingers",
+        "approach the target until the gripper is there",
     ),
-    target=(
-        _task(
-            "lift",
-            "lift the block straight up",
-            "raise the block high above the table",
-            "grasp the block and lift it up",
-            "take the block and hold it high in the air",
-        ),
-        _task(
-            "push_right",
-            "push the block to the right",
-            "slide the block right",
-            "shove the block toward the right side of the table",
-            "move the block right with the closed gripper",
-        ),
-        _task(
-            "pull",
-            "pull the block toward the robot",
-            "drag the block back",
-            "bring the block nearer to the robot",
-            "move the block back with the closed gripper",
-        ),
-        _task(
-            "press",
-            "press on the block from above",
-            "touch the top of the block",
-            "press the closed gripper down on the block",
-            "put the closed fingers on top of the block",
-        ),
-    ),
-    held_out=(
-        _task(
-            "hover_target",
-            "hold the open gripper above the target",
-            "hover over the target with open fingers",
-            "open the gripper and stay above the target",
-            "wait above the target with the gripper open",
-        ),
-        _task(
-            "push_left_away",
-            "push the block to the left and away",
-            "slide the block left and away from the robot",
-            "shove the block away and to the left",
-            "move the block left and away with the closed gripper",
-        ),
-    ),
-    questions="clbench.envs.fetch.questions:QUESTIONS",
+    ("guide the closed gripper to the target", "reach for the target"),
 )
-"""Six skills to keep, four tasks to learn in order, and two held-out combinations of learned skills."""
+_HOVER = _task(
+    "hover",
+    (
+        "hold the open gripper above the block",
+        "hover over the block with open fingers",
+        "open the gripper and stay above the block",
+        "wait above the block with the gripper open",
+        "keep the open fingers over the block",
+        "stop above the block and open the fingers",
+    ),
+    ("stay over the block with open fingers", "hold the open fingers above the block"),
+)
+_PICK_AND_PLACE = _task(
+    "pick_and_place",
+    (
+        "pick up the block and carry it to the target",
+        "grasp the block and bring it to the target",
+        "take the block and hold it at the target",
+        "carry the block to the target in the gripper",
+        "pick the block and place it at the target",
+        "grip the block and move it to the target",
+    ),
+    ("take the block to the target in the gripper", "grasp the block and hold it at the target"),
+)
+_PUSH = _task(
+    "push",
+    (
+        "push the block to the target",
+        "slide the block over the table to the target",
+        "shove the block until it is at the target",
+        "push the block along the table onto the target",
+        "push the block until it is on the target",
+        "sweep the block over the table onto the target",
+    ),
+    ("shove the block to the target", "slide the block onto the target"),
+)
+_PUSH_LEFT = _task(
+    "push_left",
+    (
+        "push the block to the left",
+        "slide the block left",
+        "shove the block toward the left side of the table",
+        "move the block left with the closed gripper",
+        "push the block leftward",
+        "sweep the block to the left side",
+    ),
+    ("shove the block left", "slide the block to the left side"),
+)
+_PUSH_AWAY = _task(
+    "push_away",
+    (
+        "push the block away from the robot",
+        "slide the block away",
+        "shove the block farther from the robot",
+        "move the block away with the closed gripper",
+        "push the block forward",
+        "sweep the block away from the robot",
+    ),
+    ("shove the block away", "slide the block farther away from the robot"),
+)
+_PUSH_RIGHT = _task(
+    "push_right",
+    (
+        "push the block to the right",
+        "slide the block right",
+        "shove the block toward the right side of the table",
+        "move the block right with the closed gripper",
+        "push the block rightward",
+        "sweep the block to the right side",
+    ),
+    ("shove the block right", "slide the block to the right side"),
+)
+_HOVER_TARGET = _task(
+    "hover_target",
+    (
+        "hold the open gripper above the target",
+        "hover over the target with open fingers",
+        "open the gripper and stay above the target",
+        "wait above the target with the gripper open",
+        "keep the open fingers over the target",
+        "stop above the target and open the fingers",
+    ),
+    ("stay over the target with open fingers", "hold the open fingers above the target"),
+)
+_PRESS = _task(
+    "press",
+    (
+        "press on the block from above",
+        "touch the top of the block",
+        "press the closed gripper down on the block",
+        "put the closed fingers on top of the block",
+        "press the top of the block",
+        "touch the block from above with closed fingers",
+    ),
+    ("press down on the block", "put the fingers on top of the block"),
+)
+_PUT_DOWN = _task(
+    "put_down",
+    (
+        "put the block down",
+        "lower the block onto the table",
+        "set the block on the table and open the gripper",
+        "place the block on the table and release it",
+        "lay the block on the table",
+        "release the block on the table",
+    ),
+    ("put the block on the table", "lower the block and release it"),
+)
+_RAISE_BLOCK = _task(
+    "raise_block",
+    (
+        "raise the block in the gripper",
+        "lift the held block higher",
+        "hold the block higher",
+        "move the block up",
+        "bring the held block up",
+        "raise what the gripper holds",
+    ),
+    ("lift the block in the gripper higher", "raise the held block"),
+)
+_PUSH_LEFT_AWAY = _task(
+    "push_left_away",
+    (
+        "push the block to the left and away",
+        "slide the block left and away from the robot",
+        "shove the block away and to the left",
+        "move the block left and away with the closed gripper",
+    ),
+    ("sweep the block away and to the left",),
+)
+
+SCENARIO = Scenario(
+    id="clbench/Fetch-v1",
+    description="A robot arm learns to push right, press, put down and raise, and keeps four skills.",
+    retained=(_REACH, _HOVER, _PICK_AND_PLACE, _PUSH_LEFT),
+    target=(_PUSH_RIGHT, _PRESS, _PUT_DOWN, _RAISE_BLOCK),
+    held_out=(_PUSH_LEFT_AWAY, _HOVER_TARGET),
+    questions="clbench.envs.fetch.questions:QUESTIONS",
+    background=(_PUSH, _PUSH_AWAY),
+    balanced=True,
+    budget=Budget(criterion=0.9, adaptation_steps=1000, validation_episodes=20),
+)
+"""Four skills to keep, four targets of graded conflict, and two held-out combinations.
+
+`push_right` shares words and scenes with `push_left`. `press` shares scenes with `hover` and `push_left`.
+`put_down` and `raise_block` begin with a held block, as no skill does: they conflict with each other alone.
+"""
+
+KNOWLEDGE = dataclasses.replace(
+    SCENARIO,
+    id="clbench/FetchKnowledge-v1",
+    description="A robot arm goes on pushing right long after it has learned to, and forgets what it knew.",
+    target=(_PUSH_RIGHT,),
+    balanced=False,
+    budget=Budget(adaptation_steps=1280, evaluation_points=7, learning_rate=1e-3, validation_episodes=20),
+)
+"""The policy of `SCENARIO` and one long stage, in which plain fine-tuning loses answers to questions.
+
+Tried with sft on seed 100: .01 of the answers are lost after 80 steps, .03 after 320 and .10 after 1280. With
+a learning rate of 3e-4 it is .01 after 1280 steps.
+"""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-SCENARIO = "clbench/Fetch-v0"
+SCENARIO = "clbench/Fetch-v1"
 """Scenario whose records judge the claims and describe the methods."""
 
 CONTROLS = Path("leaderboard/controls")

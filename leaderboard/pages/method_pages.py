@@ -4,28 +4,27 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 
 from jinja2 import Template
 
+from clbench.runs.tuning import Tried as Setting
+from clbench.runs.tuning import tuned
 from clbench.scoring.intervals import Estimate
-from clbench.scoring.metrics import measure
+from clbench.spec.identifiers import folder_name
 
 from ..board.rows import Row, Table
-from ..board.runs import DIVISIONS, Run, is_number, printable, read_run, read_runs
+from ..board.runs import DIVISIONS, is_number
+from ..claims.claim import BOARDS
 from ..claims.evidence import Evidence
 from ..claims.judges import Judged
-from ..views.descriptions import COMMON, Description, common_hyper_parameters, of_one_module
+from ..views.descriptions import Description, common_hyper_parameters
 from ..views.format import shown
 from ..views.markdown import arxiv_ids, templates
 from .commands import run_command
 
 COMPARISONS = ("sft", "experience_replay", "frozen")
 """Methods whose rows are next to the method's own."""
-
-TRIED = ("adaptation", "retention", "retention_at_matched_adaptation", "question_retention")
-"""Metrics that settings are compared by."""
 
 USED = {
     "never": "It never uses prior {}.",
@@ -45,8 +44,6 @@ class Sources:
     """Findings on the claims."""
     rows: Mapping[str, Row]
     """Rows of the board by method."""
-    tuning: Sequence[Run]
-    """Runs on validation episodes; their method is a label, for example "consft+tau_start=0.1"."""
 
 
 @dataclass(frozen=True)
@@ -65,28 +62,30 @@ class Part:
 
 @dataclass(frozen=True)
 class Tried:
-    """Settings that were compared on validation episodes."""
+    """A setting that tuning tried, with its scores on validation episodes."""
 
+    scenario: str
+    """Scenario that it was tried on."""
     settings: str
-    """Changed settings, with the methods that have them by default."""
-    seed: int
-    """Seed of the run."""
-    targets: int
-    """Number of targets that were learned."""
-    metrics: tuple[float | None, ...]
-    """Values of the metrics in `TRIED`."""
+    """Hyper-parameters that tuning sets."""
+    learned: float
+    """Success on each target right after it was learned."""
+    final_average: float
+    """Success after the last target on everything that was ever trained."""
+    chosen: bool
+    """Whether tuning chose it."""
 
 
-def read_sources(evidence: Evidence, judged: Sequence[Judged], board: Table, tuning: Path) -> Sources:
+def read_sources(evidence: Evidence, judged: Sequence[Judged], board: Table) -> Sources:
     """Return the sources; a missing folder counts as empty."""
-    runs, _ = read_runs(tuning, partial(read_run, split="validation", changed=None), ())
-    rows = {row.method: row for row in board.rows if row.scenario == evidence.scenario}
-    return Sources(evidence, judged, rows, [run for run in runs if run.scenario == evidence.scenario])
+    return Sources(
+        evidence, judged, {row.method: row for row in board.rows if row.scenario == evidence.scenario}
+    )
 
 
 def pages(methods: Sequence[Description], sources: Sources) -> dict[str, str]:
     """Return the pages by file name."""
-    of_methods = {f"{method.name}.md": _page(method, methods, sources) for method in methods}
+    of_methods = {f"{method.name}.md": _page(method, sources) for method in methods}
     return {"README.md": _contents(methods), **of_methods}
 
 
@@ -97,7 +96,7 @@ def _contents(methods: Sequence[Description]) -> str:
     return _template("methods.md.jinja").render(divisions=present, common=common_hyper_parameters())
 
 
-def _page(method: Description, methods: Sequence[Description], sources: Sources) -> str:
+def _page(method: Description, sources: Sources) -> str:
     """Return the page of one method."""
     text, uses, scenario = method.text, method.cls.uses, sources.evidence.scenario
     papers = arxiv_ids(" ".join((text.idea, *text.rule)))
@@ -117,9 +116,8 @@ def _page(method: Description, methods: Sequence[Description], sources: Sources)
         shown=shown,
         command=run_command(scenario, method.name),
         claims=_claims(method, sources),
-        tried=_tried(method, methods, sources),
-        tried_metrics=TRIED,
-        commands=_commands(method, sources),
+        tried=_tried(method.name),
+        commands=_commands(method.name, scenario),
     )
 
 
@@ -175,58 +173,27 @@ def _base(label: str) -> str:
 # ---- settings ----------------------------------------------------------------------------------------------
 
 
-def _tried(method: Description, methods: Sequence[Description], sources: Sources) -> list[Tried]:
-    """Return the settings that were compared on validation episodes."""
-    mates = {one.name: one for one in of_one_module(methods, method)}
-    runs = [run for run in sources.tuning if run.record.run.method in mates and _has_changes(run)]
+def _tried(method: str) -> list[Tried]:
+    """Return the settings that tuning tried, board by board."""
     rows = []
-    for seed in sorted({run.seed for run in runs}):
-        baseline = next((run for run in sources.tuning if (run.method, run.seed) == ("sft", seed)), None)
-        members = sorted((run for run in runs if run.seed == seed), key=_order)
-        rows += [_tried_row("sft, unchanged", baseline, baseline)] if baseline else []
-        rows += [_tried_row(_settings(run, mates), run, baseline) for run in members]
+    for scenario in BOARDS:
+        if found := tuned(scenario).get(method):
+            rows += [
+                Tried(scenario, _words(one), one.learned, one.final_average, one.settings == found.settings)
+                for one in found.tried
+            ]
     return rows
 
 
-def _has_changes(run: Run) -> bool:
-    return bool(run.record.run.changes)
+def _words(tried: Setting) -> str:
+    return ", ".join(f"{name} = {value:g}" for name, value in sorted(tried.settings.items()))
 
 
-def _order(run: Run) -> list[tuple[str, str, float, str]]:
-    """Return the sort key of settings: numbers by size."""
-    changes = sorted(run.record.run.changes.items())
-    return [
-        (run.record.run.method, name, value if is_number(value) else 0.0, str(value))
-        for name, value in changes
+def _commands(method: str, scenario: str) -> list[str]:
+    """Return the commands that make the records, also those that tuned the method."""
+    lines = [run_command(scenario, method)]
+    boards = [one for one in BOARDS if method in tuned(one)]
+    return lines + [
+        f"clbench tune {one} {method} --write {Path('methods/tuned', folder_name(one))}.json"
+        for one in boards
     ]
-
-
-def _settings(run: Run, mates: Mapping[str, Description]) -> str:
-    """Return the changed settings, and the methods of the module that have exactly these."""
-    changes = ", ".join(f"{name} = {value}" for name, value in sorted(run.record.run.changes.items()))
-    settings = {**COMMON, **run.record.run.settings}  # an older record lacks what was added later
-    same = [name for name, one in mates.items() if one.defaults == settings]
-    return changes + (f" ({' and '.join(same)})" if same else "")
-
-
-def _tried_row(settings: str, run: Run, baseline: Run | None) -> Tried:
-    comparable = baseline is not None and baseline.scores.layout == run.scores.layout
-    references = {"sft": baseline.scores} if comparable and baseline else {}
-    values = tuple(measure(name, run.scores, references) for name in TRIED)
-    return Tried(settings, run.seed, len(run.scores.layout.target), values)
-
-
-def _commands(method: Description, sources: Sources) -> list[str]:
-    """Return the commands that make the records, also for the settings tried."""
-    scenario = sources.evidence.scenario
-    lines = [run_command(scenario, method.name)]
-    runs = [run for run in sources.tuning if run.record.run.method == method.name and _has_changes(run)]
-    tried: dict[str, dict[str, None]] = {}
-    for run in sorted(runs, key=_order):
-        for name, value in run.record.run.changes.items():
-            tried.setdefault(printable(name), {})[printable(str(value))] = None
-    if tried:
-        values = [f"--values.{name} {','.join(values)}" for name, values in sorted(tried.items())]
-        targets = max(len(run.scores.layout.target) for run in runs)
-        lines.append(" ".join(["clbench tune", scenario, method.name, *values, f"--targets {targets}"]))
-    return lines

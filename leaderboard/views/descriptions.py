@@ -6,7 +6,7 @@ import dataclasses
 import inspect
 import re
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from itertools import groupby
 from typing import Any
@@ -154,8 +154,3 @@ def _default(field: dataclasses.Field[Any]) -> str:
     if field.default_factory is not dataclasses.MISSING:
         return repr(field.default_factory())
     return "must be given"
-
-
-def of_one_module(descriptions: Sequence[Description], one: Description) -> list[Description]:
-    """Return the methods in the module of `one`, including `one`; they share its docstring."""
-    return [other for other in descriptions if other.cls.__module__ == one.cls.__module__]

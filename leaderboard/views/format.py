@@ -25,7 +25,6 @@ FIXED = (
     "adaptation",
     "retention",
     "perturbed_retention",
-    "retention_at_matched_adaptation",
     "forgetting",
     "forward_transfer",
     "question_retention",
@@ -56,9 +55,6 @@ FITTING = ("final_average", "gain", "adaptation", "retention", "kept")
 
 NOT_FITTING = ("perturbed_retention", "forward_transfer", "zero_shot")
 """Metrics of `FIXED` that it has no room for."""
-
-SHORT_TITLES = {"retention_at_matched_adaptation": "matched retention"}
-"""Titles of metrics whose names are too long for the head of a column."""
 
 TITLES_TO_CRITERION = {"adaptation": "learned", "retention": "kept skills"}
 """Titles of metrics in the tables of `TO_CRITERION`, where they are beside `kept` and `kept_targets`."""
@@ -143,7 +139,7 @@ def prediction_text(rows: Iterable[Row]) -> str:
 
 def title_of(name: str) -> str:
     """Return the title of a metric or a cost."""
-    return SHORT_TITLES.get(name, name.replace("_", " "))
+    return name.replace("_", " ")
 
 
 def number_text(value: float | None, form: str, missing: str = MISSING) -> str:

@@ -25,55 +25,55 @@ def _clbench(*arguments: str, folder: Path | None = None) -> subprocess.Complete
     ("arguments", "message"),
     [
         (
-            ["run", "clbench/Fecth-v0", "sft"],
-            "No scenario is called 'clbench/Fecth-v0'. Did you mean 'clbench/Fetch-v0'",
+            ["run", "clbench/Fecth-v1", "sft"],
+            "No scenario is called 'clbench/Fecth-v1'. Did you mean 'clbench/Fetch-v1'",
         ),
-        (["run", "clbench/Fetch-v0", "stf"], "No method is called 'stf'. Did you mean 'sft'?"),
-        (["run", "clbench/Fetch-v0"], "Name at least one method"),
+        (["run", "clbench/Fetch-v1", "stf"], "No method is called 'stf'. Did you mean 'sft'?"),
+        (["run", "clbench/Fetch-v1"], "Name at least one method"),
         (
-            ["run", "clbench/Fetch-v0", "sft", "--sedes", "3"],
+            ["run", "clbench/Fetch-v1", "sft", "--sedes", "3"],
             "Unknown option: --sedes. Did you mean --seeds?",
         ),
-        (["run", "clbench/Fetch-v0", "sft", "--seeds", "0"], 'Invalid value "0" for --seeds. Must be >= 1.'),
-        (["run", "clbench/Fetch-v0", "sft", "--seeds", "many"], "--seeds"),
+        (["run", "clbench/Fetch-v1", "sft", "--seeds", "0"], 'Invalid value "0" for --seeds. Must be >= 1.'),
+        (["run", "clbench/Fetch-v1", "sft", "--seeds", "many"], "--seeds"),
         (
-            ["run", "clbench/Fetch-v0", "sft", "--workers", "0"],
+            ["run", "clbench/Fetch-v1", "sft", "--workers", "0"],
             'Invalid value "0" for --workers. Must be >= 1.',
         ),
-        (["run", "clbench/Fetch-v0", "sft", "--set.rate", "1"], "sft has no hyper-parameter 'rate'"),
+        (["run", "clbench/Fetch-v1", "sft", "--set.rate", "1"], "sft has no hyper-parameter 'rate'"),
         (
-            ["run", "clbench/Fetch-v0", "experience_replay", "--set.replay", "x"],
+            ["run", "clbench/Fetch-v1", "experience_replay", "--set.replay", "x"],
             "replay must be float, not 'x'",
         ),
         (
-            ["run", "clbench/Fetch-v0", "experience_replay", "--set.replay", "7"],
+            ["run", "clbench/Fetch-v1", "experience_replay", "--set.replay", "7"],
             "replay must be from 0 to 1, not 7.0",
         ),
-        (["run", "clbench/Fetch-v0", "sft", "--device", "gpu"], "The device 'gpu' cannot be used"),
-        (["run", "clbench/Fetch-v0,clbench/PointMase-v0", "sft"], "Did you mean 'clbench/PointMaze-v0'?"),
-        (["run", "clbench/Fetch-v0", "sft", "--shard", "0/8"], "--shard must be i/n with i from 1 to n"),
-        (["run", "clbench/Fetch-v0", "sft", "--shard", "9/8"], "--shard must be i/n with i from 1 to n"),
-        (["run", "clbench/Fetch-v0", "sft", "--shard", "half"], "for example 2/8, not 'half'"),
+        (["run", "clbench/Fetch-v1", "sft", "--device", "gpu"], "The device 'gpu' cannot be used"),
+        (["run", "clbench/Fetch-v1,clbench/PointMase-v0", "sft"], "Did you mean 'clbench/PointMaze-v0'?"),
+        (["run", "clbench/Fetch-v1", "sft", "--shard", "0/8"], "--shard must be i/n with i from 1 to n"),
+        (["run", "clbench/Fetch-v1", "sft", "--shard", "9/8"], "--shard must be i/n with i from 1 to n"),
+        (["run", "clbench/Fetch-v1", "sft", "--shard", "half"], "for example 2/8, not 'half'"),
         (["demonstrations", "clbench/Fetch"], "Did you mean 'clbench/Fetch-v"),
-        (["demonstrations", "clbench/Fetch-v0", "--workers", "0"], "Must be >= 1."),
+        (["demonstrations", "clbench/Fetch-v1", "--workers", "0"], "Must be >= 1."),
         (["pretrain", "clbench/Fetch"], "Did you mean 'clbench/Fetch-v"),
-        (["pretrain", "clbench/Fetch-v0", "--seed", "-1"], "Must be >= 0."),
+        (["pretrain", "clbench/Fetch-v1", "--seed", "-1"], "Must be >= 0."),
         (["submit", "sft", "--seeds", "0"], 'Invalid value "0" for --seeds. Must be >= 1.'),
         (["submit", "sft", "--first-seed", "-1"], "Must be >= 0."),
         (["verify", "x.json", "--episodes", "0"], 'Invalid value "0" for --episodes. Must be >= 1.'),
         (["scenario-card", "--episodes", "0"], 'Invalid value "0" for --episodes. Must be >= 1.'),
         (["cache", "--older-than", "-1"], "Must be >= 0."),
         (
-            ["film", "clbench/Fetch-v0", "sft", "--size", "20"],
+            ["film", "clbench/Fetch-v1", "sft", "--size", "20"],
             'Invalid value "20" for --size. Must be >= 96.',
         ),
-        (["tune", "clbench/Fetch-v0", "sft", "--values.x", "1", "--targets", "0"], "Must be >= 1."),
+        (["tune", "clbench/Fetch-v1", "sft", "--values.x", "1", "--targets", "0"], "Must be >= 1."),
         (
-            ["tune", "clbench/Fetch-v0", "consft", "--values.kapa", "1,2"],
+            ["tune", "clbench/Fetch-v1", "consft", "--values.kapa", "1,2"],
             "consft has no hyper-parameter 'kapa'. Did you mean 'kappa'?",
         ),
         (
-            ["tune", "clbench/Fetch-v0", "consft", "--values.omega_min", "0.1,2"],
+            ["tune", "clbench/Fetch-v1", "consft", "--values.omega_min", "0.1,2"],
             "omega_min must be from 0 to 1, not 2.0",
         ),
         (["metrics", "forgeting"], "No metric is called 'forgeting'. Did you mean 'forgetting'?"),
@@ -83,7 +83,7 @@ def _clbench(*arguments: str, folder: Path | None = None) -> subprocess.Complete
         (["experts", "train", "cartpole_lft"], "Did you mean 'cartpole_left'?"),
         (["experts", "train", "cartpole_left", "--steps", "1500"], "for a multiple of 1,000 steps"),
         (["experts", "measure", "clbench/Fetch"], "Did you mean 'clbench/Fetch-v"),
-        (["experts", "measure", "clbench/Fetch-v0", "pusch"], "Did you mean 'push'?"),
+        (["experts", "measure", "clbench/Fetch-v1", "pres"], "Did you mean 'press'?"),
     ],
 )
 def test_bad_input_ends_with_exit_code_2_and_the_nearest_right_name(
@@ -111,7 +111,7 @@ def test_a_bug_inside_checked_input_is_not_taken_for_wrong_input() -> None:
 
 
 def test_a_wrong_name_ends_the_process_without_a_traceback(tmp_path: Path) -> None:
-    result = _clbench("run", "clbench/Fecth-v0", "sft", folder=tmp_path)
+    result = _clbench("run", "clbench/Fecth-v1", "sft", folder=tmp_path)
     assert (result.returncode, result.stdout) == (2, "")
     assert result.stderr.startswith("error: No scenario is called ")
     assert "Traceback" not in result.stderr
@@ -129,7 +129,7 @@ def test_the_shards_of_a_command_do_each_of_its_runs_once(
         return {}
 
     monkeypatch.setattr("clbench.jobs.scheduler.run_with_bars", note)
-    runs = ["run", f"{TOY},clbench/Fetch-v0", "sft", "frozen", "lora", "--seeds", "3"]
+    runs = ["run", f"{TOY},clbench/Fetch-v1", "sft", "frozen", "lora", "--seeds", "3"]
     app(runs, result_action="return_value")
     whole, parts = sorted(done), []
     for part in range(1, 6):
@@ -167,7 +167,7 @@ def test_help_of_a_command_shows_its_limits_and_does_not_wait_for_pytorch(comman
 
 def test_list_shows_scenarios_and_methods() -> None:
     output = _clbench("list").stdout
-    assert "clbench/Fetch-v0" in output
+    assert "clbench/Fetch-v1" in output
     assert "experience_replay" in output
 
 

@@ -64,14 +64,14 @@ def test_a_torn_dataset_is_named_and_made_again(empty_caches: Path, caplog: pyte
 
 
 def test_every_kept_episode_succeeds_and_about_half_are_noisy() -> None:
-    episodes = collect(load_scenario("clbench/Fetch-v0").task("lift"), Budget(demonstrations=20))
+    episodes = collect(load_scenario("clbench/Fetch-v1").task("press"), Budget(demonstrations=20))
     assert len(episodes) == 20
     assert all(episode.success for episode in episodes)
     assert 3 <= sum(bool(episode.noisy.any()) for episode in episodes) <= 15
 
 
 def test_the_recorded_actions_replay_to_the_recorded_states_bit_for_bit() -> None:
-    task = load_scenario("clbench/Fetch-v0").task("push_left")
+    task = load_scenario("clbench/Fetch-v1").task("push_left")
     world = resolve(task.world)()
     episode = demonstrate(world, task, seed=7, noisy=True)
     state, _ = world.reset(seed=7, options={"task": task.name})

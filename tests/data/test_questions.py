@@ -9,7 +9,7 @@ from clbench.spec.language import word_id
 from clbench.spec.registry import load_scenario
 
 TOY = load_scenario("clbench.testing:clbench/Toy-v0")
-FETCH = load_scenario("clbench/Fetch-v0")
+FETCH = load_scenario("clbench/Fetch-v1")
 
 
 def test_an_answer_is_the_first_truth_that_holds_and_none_in_close_cases() -> None:
@@ -55,7 +55,7 @@ def test_an_answer_that_no_state_gives_is_named() -> None:
 
 
 def test_fetch_questions_have_balanced_answers_for_training_and_test() -> None:
-    few = dataclasses.replace(FETCH, budget=dataclasses.replace(FETCH.budget, question_episodes=48))
+    few = dataclasses.replace(FETCH, budget=dataclasses.replace(FETCH.budget, question_episodes=96))
     for questions in load_questions(few):
         kind, batch = scored_questions(questions, 1400)
         for index, entry in enumerate(questions.kinds):

@@ -39,7 +39,7 @@ every_scenario = pytest.mark.parametrize(
     "scenario", [registered_scenario(name) for name in BUILT_IN], ids=BUILT_IN
 )
 
-QUICK = ("clbench/Fetch-v0", "clbench/MetaWorld-v0")
+QUICK = ("clbench/Fetch-v1", "clbench/MetaWorld-v1")
 """Scenarios that a test in a process of its own tries by default."""
 
 Rows = NDArray[np.float64]

@@ -13,9 +13,10 @@ from clbench.worlds.lanes import vector_world
 from clbench.worlds.perturbation import draw_perturbation
 from clbench.worlds.world import VectorWorld
 
-SCENARIO = load_scenario("clbench:clbench/Fetch-v0")
+SCENARIO = load_scenario("clbench:clbench/Fetch-v1")
 NAMES = [task.name for task in SCENARIO.tasks]
 PlainWorld = resolve(SCENARIO.tasks[0].world)
+RULES = resolve("clbench.envs.fetch.rules:RULES")
 GRIPPER_VELOCITY = resolve("clbench.envs.fetch.state:GRIPPER_VELOCITY")
 LONGEST = 80
 """Steps after which an unfinished episode begins anew: more than the horizon."""
@@ -93,7 +94,7 @@ def compare(task: str, steps: int, threads: int, lanes: int = 8) -> tuple[int, i
     return followed, successes
 
 
-@pytest.mark.parametrize("task", ["lift", "push_left"])
+@pytest.mark.parametrize("task", ["pick_and_place", "push_left"])
 def test_it_is_the_plain_world_and_gymnasium_robotics_bit_for_bit(task: str) -> None:
     followed, successes = compare(task, steps=400, threads=2)
     assert followed > 200
@@ -104,7 +105,9 @@ def test_it_is_the_plain_world_and_gymnasium_robotics_bit_for_bit(task: str) -> 
 @pytest.mark.parametrize("task", NAMES)
 def test_it_stays_so_over_ten_thousand_steps_of_each_task(task: str) -> None:
     followed, successes = compare(task, steps=10_000, threads=2)
-    assert followed > 5_000
+    layout = RULES[task].layout
+    # gymnasium-robotics has its block in front of the gripper
+    assert followed > 5_000 or layout.block_aside or layout.block_held
     assert successes > 50
 
 

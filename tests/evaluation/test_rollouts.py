@@ -18,7 +18,7 @@ from clbench.spec.scenario import Scenario
 from clbench.spec.task import Task
 
 TOY = load_scenario("clbench.testing:clbench/Toy-v0")
-FETCH = load_scenario("clbench/Fetch-v0")
+FETCH = load_scenario("clbench/Fetch-v1")
 
 
 @pytest.fixture(scope="module")
@@ -43,15 +43,15 @@ def _with_episodes(**numbers: int) -> Scenario:
 
 
 def test_an_outcome_does_not_depend_on_other_episodes(fetch_policy: Policy) -> None:
-    scenario = _with_episodes(validation_episodes=4)
+    scenario = _with_episodes(validation_episodes=5)
     evaluator = Evaluator(scenario, seed=0)
     with deterministic():
-        together = evaluator.evaluate(fetch_policy, scenario.tasks)  # 48 episodes: more than lanes
+        together = evaluator.evaluate(fetch_policy, scenario.tasks)  # 50 episodes: more than lanes
         alone = Evaluator(scenario, seed=0).evaluate(fetch_policy, [scenario.tasks[5]])
         again = evaluator.evaluate(fetch_policy, reversed(scenario.tasks))
     assert len(together) > LANES
-    assert alone == together[20:24]
-    assert again == [episode for start in range(44, -4, -4) for episode in together[start : start + 4]]
+    assert alone == together[25:30]
+    assert again == [episode for start in range(45, -5, -5) for episode in together[start : start + 5]]
 
 
 def _played_alone(policy: Policy, task: Task, number: int, seed: int) -> Episode:
@@ -78,7 +78,7 @@ def _played_alone(policy: Policy, task: Task, number: int, seed: int) -> Episode
 
 def test_an_outcome_equals_the_outcome_in_the_plain_world_bit_for_bit(fetch_policy: Policy) -> None:
     trained, _ = pretrained_policy(TOY, 0)
-    cases = [(FETCH, fetch_policy, ["push", "pull"]), (TOY, trained, ["left", "right", "up_left"])]
+    cases = [(FETCH, fetch_policy, ["push", "press"]), (TOY, trained, ["left", "right", "up_left"])]
     for scenario, policy, names in cases:
         trials: list[Trial] = [
             (scenario.task(name), "validation", number) for name in names for number in (0, 3)
@@ -154,9 +154,9 @@ def test_a_pretrained_toy_policy_masters_its_skills_and_not_the_targets() -> Non
 def test_a_policy_that_returns_nan_fails_its_episodes_and_stops_nothing(fetch_policy: Policy) -> None:
     broken = Policy(fetch_policy.config)
     next(broken.head.parameters()).data.fill_(float("nan"))
-    episodes = Evaluator(_with_episodes(validation_episodes=2), 0).evaluate(broken, [FETCH.task("lift")])
+    episodes = Evaluator(_with_episodes(validation_episodes=2), 0).evaluate(broken, [FETCH.task("press")])
     assert not any(episode.success for episode in episodes)
-    assert {episode.length for episode in episodes} == {FETCH.task("lift").horizon}
+    assert {episode.length for episode in episodes} == {FETCH.task("press").horizon}
 
 
 def test_answers_are_counted_by_kind() -> None:

@@ -148,12 +148,12 @@ def test_jobs_on_the_longest_chain_start_first(bars: Bars) -> None:
 def test_runs_of_two_scenarios_have_separate_jobs_and_one_pretraining_for_each_seed(
     tmp_path: Path, empty_caches: Path
 ) -> None:
-    scenarios = ("clbench/Fetch-v0", TOY)
+    scenarios = ("clbench/Fetch-v1", TOY)
     specs = [RunSpec(name, method, 1) for name in scenarios for method in ("sft", "frozen")]
     names = [job.title for job in _plan(tmp_path, *specs)]
     assert len(set(names)) == len(names)
     assert [name for name in names if "pretraining" in name] == [
-        "Fetch-v0 pretraining seed 1",
+        "Fetch-v1 pretraining seed 1",
         "Toy-v0 pretraining seed 1",
     ]
 

@@ -63,7 +63,7 @@ def test_without_records_the_command_shows_what_to_run(
     captured = capsys.readouterr()
     assert not captured.out
     assert str(folder) in captured.err
-    assert "clbench run clbench/Fetch-v0 sft" in captured.err
+    assert "clbench run clbench/Fetch-v1 sft" in captured.err
     assert not (tmp_path / "LEADERBOARD.md").exists()
 
 

@@ -38,7 +38,6 @@ def test_a_row_has_every_metric_with_its_interval_and_the_costs(four_methods: Pa
     assert row.retention == pytest.approx(0.45)
     assert row.forgetting == pytest.approx(1.6 / 3)
     assert row.question_retention == pytest.approx(0.5)
-    assert row.retention_at_matched_adaptation == pytest.approx(0.7)
     assert row.update_sparsity == pytest.approx(0.6)
     assert row.activation_drift == pytest.approx(3.0)
     assert row.steps == 800
@@ -56,13 +55,6 @@ def test_without_from_scratch_forward_transfer_is_missing(four_methods: Path) ->
     assert load(four_methods).set_index("method").forward_transfer.notna().sum() == 3
     record_path(four_methods, "clbench/Toy-v0", "from_scratch", 1).unlink()
     assert load(four_methods).forward_transfer.isna().all()
-
-
-def test_without_plain_fine_tuning_matched_retention_is_missing(four_methods: Path) -> None:
-    assert load(four_methods).retention_at_matched_adaptation.notna().all()
-    record_path(four_methods, "clbench/Toy-v0", "sft", 1).unlink()
-    rows = load(four_methods).set_index("method")
-    assert rows.retention_at_matched_adaptation.dropna().index.tolist() == ["sft"]
 
 
 def test_a_row_does_not_depend_on_the_other_rows(four_methods: Path, add_full: Callable[..., Path]) -> None:

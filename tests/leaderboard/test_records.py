@@ -19,9 +19,9 @@ pytestmark = pytest.mark.skipif(not RECORDS.exists(), reason="records are not pa
 
 @pytest.fixture(scope="module")
 def board() -> Any:
-    """The board of Fetch-v0 by method."""
+    """The board of Fetch-v1 by method."""
     table = importlib.import_module("clbench.leaderboard").load(RECORDS)
-    return table[table["scenario"] == "clbench/Fetch-v0"].set_index("method")
+    return table[table["scenario"] == "clbench/Fetch-v1"].set_index("method")
 
 
 def test_every_method_has_the_same_seeds_and_the_same_pretrained_policies() -> None:
@@ -35,13 +35,13 @@ def test_every_method_has_the_same_seeds_and_the_same_pretrained_policies() -> N
     for record in records:
         seeds.setdefault((record.run.scenario, record.run.method), set()).add(record.run.seed)
     for (scenario, method), found in seeds.items():
-        assert found == set(range(5 if scenario == "clbench/Fetch-v0" else 3)), f"{scenario}, {method}"
+        assert found == set(range(5 if scenario == "clbench/Fetch-v1" else 3)), f"{scenario}, {method}"
     assert not any(record.run.changes for record in records)
     assert not any(record.fingerprint["commit"]["dirty"] for record in records)
 
 
 def test_the_pretrained_policy_has_its_skills_and_answers() -> None:
-    for path in (RECORDS / "Fetch-v0" / "frozen").glob("*.json"):
+    for path in (RECORDS / "Fetch-v1" / "frozen").glob("*.json"):
         rates = Scores.from_record(read_record(path)).rates()
         assert rates.retained[0].mean() >= 0.90
         assert rates.correct[0].sum() / rates.asked[0].sum() >= 0.95
@@ -57,7 +57,7 @@ def test_replay_keeps_the_skills(board: Any) -> None:
 
 
 def test_joint_training_does_everything() -> None:
-    runs = [Scores.from_record(read_record(path)) for path in (RECORDS / "Fetch-v0" / "joint").glob("*.json")]
+    runs = [Scores.from_record(read_record(path)) for path in (RECORDS / "Fetch-v1" / "joint").glob("*.json")]
     last = sum(run.success[-1].mean(axis=-1) for run in runs) / len(runs)
     trained = len(runs[0].layout.retained) + len(runs[0].layout.target)
     assert last[:trained].min() >= 0.90, dict(zip(runs[0].layout.tasks, last, strict=True))
@@ -69,7 +69,7 @@ def test_the_frozen_policy_forgets_exactly_nothing_and_does_not_know_the_targets
 
 
 def test_every_built_in_method_has_a_row(board: Any) -> None:
-    changed = {"consft_calibrated"}  # its constants have another unit than in the records of Fetch-v0
+    changed = {"consft_calibrated"}  # its constants have another unit than in the records of Fetch-v1
     rows = set(board.index[board["division"] != "online"])
     assert rows == {name for name in method_names() if "/" not in name} - changed
 
@@ -93,7 +93,7 @@ def test_stop_gradient_keeps_every_answer(board: Any) -> None:
 
 
 def test_a_row_may_touch_the_data_that_its_class_declares() -> None:
-    for path in (RECORDS / "Fetch-v0").rglob("*.json"):
+    for path in (RECORDS / "Fetch-v1").rglob("*.json"):
         run = read_record(path).run
         if "online" in run.uses:  # an agent, not a method
             continue
@@ -101,7 +101,7 @@ def test_a_row_may_touch_the_data_that_its_class_declares() -> None:
 
 
 def test_aegis_sheds_little_energy_at_every_stage() -> None:
-    for path in (RECORDS / "Fetch-v0" / "aegis").glob("*.json"):
+    for path in (RECORDS / "Fetch-v1" / "aegis").glob("*.json"):
         for stage in ("1", "2", "3", "4"):
             reported = read_record(path).diagnostics[stage]
             assert 0 < reported["energy_shed_mean"] <= reported["energy_shed_highest"] < 1

@@ -14,7 +14,7 @@ from clbench.learning.pretraining import (
     shipped_folder,
 )
 
-FETCH = load_scenario("clbench/Fetch-v0")
+FETCH = load_scenario("clbench/Fetch-v1")
 SHIPS = shipped_folder(FETCH, 0)
 
 
@@ -30,14 +30,14 @@ def test_this_source_makes_the_policies_that_ship() -> None:
     made_from, present = _made_from(SHIPS), json.loads(json.dumps(pretraining_inputs(FETCH, 0)))
     if made_from["versions"] != present["versions"]:
         pytest.skip(f"it was made with {made_from['versions']}, here are {present['versions']}")
-    assert made_from == present, "make it again: clbench pretrain clbench/Fetch-v0 --ship"
+    assert made_from == present, "make it again: clbench pretrain clbench/Fetch-v1 --ship"
     assert pretrained_folder(FETCH, 0) == SHIPS
     assert is_pretrained(FETCH, 0)
 
 
 def test_the_committed_records_of_a_seed_started_from_the_policy_that_ships() -> None:
     files = json.loads((SHIPS / "clbench.json").read_text(encoding="utf-8"))["files"]
-    records = Path(__file__).parents[2] / "leaderboard" / "records" / "Fetch-v0"
+    records = Path(__file__).parents[2] / "leaderboard" / "records" / "Fetch-v1"
     record = json.loads((records / "sft" / "seed-0.json").read_text(encoding="utf-8"))
     assert files["policy.safetensors"].startswith(record["fingerprint"]["pretrained"])
 

@@ -110,8 +110,8 @@ def test_an_agent_leaves_a_record_of_its_success_after_each_stage(
         "final_average": 0.75,
         "forgetting": pytest.approx(1 / 3),
     }
-    for missing in ("question_retention", "retention_at_matched_adaptation", "activation_drift"):
-        assert measure(missing, scores, {"sft": scores}) is None
+    for missing in ("question_retention", "forward_transfer", "activation_drift"):
+        assert measure(missing, scores, {"from_scratch": scores}) is None
     assert record.costs == Costs(environment_steps=60)
     assert record.diagnostics["1"] == {"environment_steps": 20}
     assert record.run.settings == {"speed": 3}

@@ -43,7 +43,7 @@ def _output(command: list[str], folder: Path) -> str:
 @pytest.mark.slow
 def test_the_code_of_the_page_makes_a_row(tmp_path: Path) -> None:
     learning, flat = _blocks("python")
-    small = learning.replace("clbench/Fetch-v0", ID).replace("range(5)", "range(3)").replace("5_000", "120")
+    small = learning.replace("clbench/Fetch-v1", ID).replace("range(5)", "range(3)").replace("5_000", "120")
     command = [sys.executable, "-c", small + flat + SHOW_FLAT]
     output = _output(command, tmp_path)
     assert output == "(16,)\n"
@@ -65,7 +65,7 @@ def test_the_program_of_the_page_makes_a_record_for_each_seed_and_skips_existing
     assert (python, script, scenario, seeds) == (
         "python",
         "docs/guide/online_sac.py",
-        "clbench/Fetch-v0",
+        "clbench/Fetch-v1",
         ["--seeds", "3"],
     )
     command = [sys.executable, str(DOCS.parents[1] / script), ID, "--seeds", "1", "--steps", "110"]

@@ -247,7 +247,7 @@ from clbench.policy.policy import Policy
 from clbench.learning.pretraining import policy_config
 from clbench.spec.registry import load_scenario
 
-scenario = load_scenario("clbench/Fetch-v0")
+scenario = load_scenario("clbench/Fetch-v1")
 policy = Policy(policy_config(scenario), seed=3)
 ((take,),) = shoot(scenario, 0, [policy], [(scenario.task("push"), "validation", 0)], 96)
 print(take.episode.length, len({picture.tobytes() for picture in take.pictures}), *take.pictures[0].size)
@@ -257,7 +257,7 @@ print(take.episode.length, len({picture.tobytes() for picture in take.pictures})
 @pytest.mark.slow
 def test_the_fetch_world_is_drawn_on_machines_that_can_draw() -> None:
     try:
-        choose_back_end([load_scenario("clbench/Fetch-v0").tasks[0].world])
+        choose_back_end([load_scenario("clbench/Fetch-v1").tasks[0].world])
     except RenderingError as error:
         pytest.skip(str(error))
     result = subprocess.run([sys.executable, "-c", FETCH], capture_output=True, text=True, check=True)
@@ -268,5 +268,5 @@ def test_the_fetch_world_is_drawn_on_machines_that_can_draw() -> None:
 
 
 def test_a_film_shows_at_most_as_many_steps_per_second_as_a_gif_can() -> None:
-    assert steps_per_second(load_scenario("clbench/Fetch-v0").target[0]) == 25
-    assert steps_per_second(load_scenario("clbench/MetaWorld-v0").target[0]) == FASTEST == 50
+    assert steps_per_second(load_scenario("clbench/Fetch-v1").target[0]) == 25
+    assert steps_per_second(load_scenario("clbench/MetaWorld-v1").target[0]) == FASTEST == 50

@@ -128,7 +128,6 @@ def test_retention_is_missing_and_forgetting_covers_earlier_targets(record: Reco
     scores = Scores.from_record(record)
     assert measure("retention", scores) is None
     assert measure("minimum_retention", scores) is None
-    assert measure("retention_at_matched_adaptation", scores, {"sft": scores}) is None
     assert measure("forgetting", scores) == pytest.approx((0.9 - 0.4 + 0.8 - 0.8) / 2)
     assert measure("adaptation", scores) == pytest.approx(0.8)
 

@@ -55,7 +55,6 @@ def run(final: Any) -> Scores:
         success=np.stack([np.ones_like(final), final]),
         on_the_way=np.zeros((1, 0, len(final), 0)),
         perturbed=np.full((2, len(final), final.shape[1]), np.nan),
-        validation=missing,
         asked=np.full((2, 1), 50.0),
         correct=np.full((2, 1), 25.0),
         answer_curves=missing,

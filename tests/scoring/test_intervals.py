@@ -47,7 +47,7 @@ def whole_run(shape: Layout, success: Any, **arrays: Any) -> Scores:
     targets, points = len(shape.target), len(shape.steps)
     counts = np.full((targets + 1, len(shape.kinds)), 100.0)
     on_the_way = np.full((targets, points - 1, len(shape.tasks), len(shape.curve_episodes)), np.nan)
-    curves = ("validation", "answer_curves", "update_sparsity", "activation_drift")
+    curves = ("answer_curves", "update_sparsity", "activation_drift")
     missing = {name: np.full((targets, points), np.nan) for name in curves}
     perturbed = np.full((targets + 1, len(shape.tasks), len(shape.episodes)), np.nan)
     given = {
@@ -67,18 +67,15 @@ def whole_run(shape: Layout, success: Any, **arrays: Any) -> Scores:
 
 
 def random_run(generator: np.random.Generator, shape: Layout) -> Scores:
-    """Return a run of coin flips; plain fine-tuning's final success is reached somewhere in each stage."""
+    """Return a run of coin flips."""
     targets, points, tasks = len(shape.target), len(shape.steps), len(shape.tasks)
     on_the_way = (targets, points - 1, tasks, len(shape.curve_episodes))
     perturbed = (targets + 1, len(shape.tasks), len(shape.episodes))
-    selection = generator.random((targets, points))
-    selection[:, -1] = 1.0
     return whole_run(
         shape,
         success=generator.integers(0, 2, (targets + 1, tasks, len(shape.episodes))).astype(float),
         on_the_way=generator.integers(0, 2, on_the_way).astype(float),
         perturbed=generator.integers(0, 2, perturbed).astype(float),
-        validation=selection,
         correct=generator.integers(0, 101, (targets + 1, 2)).astype(float),
         answer_curves=generator.random((targets, points)),
         update_sparsity=generator.random((targets, points)),
@@ -360,39 +357,6 @@ def test_a_difference_can_need_a_reference() -> None:
     assert difference.value == pytest.approx((values[0] or 0) - (values[1] or 0))
     assert width(difference) > 0
     assert paired_difference("forward_transfer", runs, others, generator) == NOTHING
-
-
-def test_the_matched_points_of_each_seed_are_its_own() -> None:
-    # The first seed reaches the goal at the first point, the second at the last: there they know all.
-    shape = layout(1, 4, points=2)
-    sft = {seed: random_run(np.random.default_rng(seed), shape) for seed in range(2)}
-    runs = {}
-    for seed, selection in enumerate(([[1.0, 1.0]], [[0.0, 1.0]])):
-        on_the_way = np.full((1, 1, 2, 2), 1.0 - seed)
-        success = np.full((2, 2, 4), float(seed))
-        runs[seed] = whole_run(shape, success, on_the_way=on_the_way, validation=np.array(selection))
-    got = estimate(
-        ["retention_at_matched_adaptation"], runs, np.random.default_rng(0), references={"sft": sft}
-    )
-    assert got["retention_at_matched_adaptation"] == Estimate(1.0, 1.0, 1.0)
-
-
-def test_matched_retention_has_no_value_if_one_seed_has_none() -> None:
-    generator = np.random.default_rng(0)
-    shape = layout(2, 10, targets=2, points=3)
-    sft, runs = ({seed: random_run(generator, shape) for seed in range(3)} for _ in range(2))
-    name = "retention_at_matched_adaptation"
-    whole = estimate([name], runs, generator, references={"sft": sft})[name]
-    assert width(whole) > 0
-    runs[1].validation[1] = 0.5
-    assert estimate([name], runs, generator, references={"sft": sft})[name] == NOTHING
-
-
-def test_matched_retention_of_plain_fine_tuning_differs_from_itself_by_nothing() -> None:
-    generator = np.random.default_rng(0)
-    sft = {seed: random_run(generator, layout(2, 10, targets=2, points=3)) for seed in range(3)}
-    got = paired_difference("retention_at_matched_adaptation", sft, sft, generator, references={"sft": sft})
-    assert got == Estimate(0.0, 0.0, 0.0)
 
 
 def test_only_seeds_that_both_have_are_compared() -> None:

@@ -45,8 +45,6 @@ def random_pairs(scores: Callable[..., Scores]) -> Pairs:
                 retained_curves=generator.integers(0, 2, size=(3, 3, 2, 2)),
                 perturbed=generator.integers(0, 2, size=(4, 2, 2)),
                 perturbed_learned=generator.integers(0, 2, size=(3, 2)),
-                # each target is learned in the end, as the matched point needs
-                validation=np.concatenate([generator.random((3, 3)), np.ones((3, 1))], axis=1),
                 sparsity=generator.random((3, 4)),
                 drift=generator.random((3, 4)),
                 shift=generator.random(3),

@@ -10,8 +10,7 @@ from scipy.integrate import trapezoid
 from clbench.records.reader import RecordError
 from clbench.records.record import Relearning
 from clbench.scoring.metrics import METRICS, measure
-from clbench.scoring.ours import matched_points
-from clbench.scoring.scores import Scores, rates_of
+from clbench.scoring.scores import Scores
 
 MODULE = "clbench.scoring.ours"
 
@@ -47,7 +46,7 @@ def test_a_metric_has_the_value_worked_out_by_hand(name: str, scores: Callable[.
 
 
 def test_every_metric_of_the_leaderboard_is_worked_out_by_hand() -> None:
-    others = {"forward_transfer", "question_retention", "retention_at_matched_adaptation"}
+    others = {"forward_transfer", "question_retention"}
     others |= {"perturbed_retention", "perturbed_adaptation", "update_sparsity", "activation_drift"}
     others |= {"gain", "steps_to_criterion", "speed", "shift", "relearning_steps", "instruction_capture"}
     found = {name for name, metric in METRICS.items() if metric.function.__module__ == MODULE}
@@ -145,102 +144,6 @@ def test_forward_transfer_has_the_value_worked_out_by_hand(scores: Callable[...,
 def test_questions_of_all_kinds_count_together_at_the_end_alone(scores: Callable[..., Scores]) -> None:
     answers = {(0, "left"): (10, 10), (2, "left"): (30, 15), (2, "above"): (10, 9)}
     assert measure("question_retention", scores(MATRIX, answers=answers)) == pytest.approx(24 / 40)
-
-
-# Two stages with three points each, of plain fine-tuning and of a gentler method.
-MATCHED_STEPS = (100, 200, 400)
-PLAIN = {"validation": [[0.4, 0.9, 1.0], [0.0, 0.7, 0.8]], "retained_curves": [[[0.9, 0.7], [0.5, 0.6]]] * 2}
-GENTLE = {
-    "validation": [[0.1, 0.6, 0.9], [0.3, 0.8, 0.9]],
-    "retained_curves": [[[1.0, 1.0], [0.9, 0.9]], [[0.8, 0.9], [0.7, 0.6]]],
-}
-
-
-def test_retention_at_matched_adaptation_has_the_value_worked_out_by_hand(
-    scores: Callable[..., Scores],
-) -> None:
-    sft = scores(MATRIX, steps=MATCHED_STEPS, **PLAIN)
-    run = scores(MATRIX, steps=MATCHED_STEPS, **GENTLE)
-    # The goals are 0.9 x 1.0, reached at the end of its stage, and 0.9 x 0.8, reached in the middle.
-    np.testing.assert_array_equal(matched_points(rates_of([run], {"sft": [sft]})), [[2, 1]])
-    expected = ((0.6 + 0.9) / 2 + (0.7 + 0.6) / 2) / 2
-    assert measure("retention_at_matched_adaptation", run, {"sft": sft}) == pytest.approx(expected)
-
-
-def test_plain_fine_tuning_is_matched_with_its_own_end(scores: Callable[..., Scores]) -> None:
-    sft = scores(MATRIX, steps=MATCHED_STEPS, **PLAIN)
-    # 0.9 of 1.0 after 200 steps, 0.72 of 0.8 not before the end
-    expected = ((0.5 + 0.6) / 2 + (0.5 + 0.4) / 2) / 2
-    assert measure("retention_at_matched_adaptation", sft, {"sft": sft}) == pytest.approx(expected)
-
-
-def test_a_method_that_never_learns_a_target_as_well_has_no_matched_point(
-    scores: Callable[..., Scores],
-) -> None:
-    sft = scores(MATRIX, steps=MATCHED_STEPS, **PLAIN)
-    run = scores(MATRIX, steps=MATCHED_STEPS, **{**GENTLE, "validation": [[0.1, 0.6, 0.8], [0.9, 0.9, 0.9]]})
-    np.testing.assert_array_equal(matched_points(rates_of([run], {"sft": [sft]})), [[np.nan, 0]])
-    assert measure("retention_at_matched_adaptation", run, {"sft": sft}) is None
-
-
-def test_the_matched_point_is_chosen_on_validation_episodes_and_not_on_test_episodes(
-    scores: Callable[..., Scores],
-) -> None:
-    sft = scores(MATRIX, steps=MATCHED_STEPS, curves=np.ones((2, 2)), **PLAIN)
-    first, last = (
-        scores(MATRIX, steps=MATCHED_STEPS, curves=curves, **GENTLE)
-        for curves in (np.ones((2, 2)), np.zeros((2, 2)))
-    )
-    points = matched_points(rates_of([first, last], {"sft": [sft, sft]}))
-    np.testing.assert_array_equal(points, [[2, 1], [2, 1]])
-
-
-def test_a_rate_that_just_reaches_the_goal_is_matched_whatever_its_last_bit(
-    scores: Callable[..., Scores],
-) -> None:
-    assert 36 / 50 < 0.9 * (40 / 50)
-    sft, run = (
-        scores(
-            [[1.0, 0.0, 0.0], [0.5, 1.0, 0.0]],
-            steps=(100,),
-            validation=[[right / 50]],
-            validation_episodes=50,
-        )
-        for right in (40, 36)
-    )
-    np.testing.assert_array_equal(matched_points(rates_of([run], {"sft": [sft]})), [[0]])
-
-
-@pytest.mark.parametrize(
-    ("method", "point", "points"),
-    [("run", 0, [np.nan, 1]), ("run", 2, [np.nan, 1]), ("sft", 2, [np.nan, 1]), ("sft", 0, [2, 1])],
-)
-def test_a_missing_validation_rate_leaves_no_point_that_could_be_another(
-    method: str, point: int, points: list[float], scores: Callable[..., Scores]
-) -> None:
-    selection = {"sft": np.array(PLAIN["validation"]), "run": np.array(GENTLE["validation"])}
-    selection[method][0, point] = np.nan
-    sft, run = (scores(MATRIX, steps=MATCHED_STEPS, validation=selection[name]) for name in ("sft", "run"))
-    np.testing.assert_array_equal(matched_points(rates_of([run], {"sft": [sft]})), [points])
-
-
-def test_a_missing_success_at_the_matched_point_leaves_no_value_and_elsewhere_does_not_matter(
-    scores: Callable[..., Scores],
-) -> None:
-    sft = scores(MATRIX, steps=MATCHED_STEPS, **PLAIN)
-    values = []
-    for point in (0, 1):
-        retained = np.array(GENTLE["retained_curves"])
-        retained[1, point, 0] = np.nan
-        run = scores(MATRIX, steps=MATCHED_STEPS, **{**GENTLE, "retained_curves": retained})
-        values.append(measure("retention_at_matched_adaptation", run, {"sft": sft}))
-    assert values == [pytest.approx(0.7), None]
-
-
-def test_without_plain_fine_tuning_there_is_no_matched_retention(scores: Callable[..., Scores]) -> None:
-    run = scores(MATRIX, steps=MATCHED_STEPS, **GENTLE)
-    assert measure("retention_at_matched_adaptation", run) is None
-    np.testing.assert_array_equal(matched_points(run.rates()), [np.nan, np.nan])
 
 
 @pytest.mark.parametrize(("name", "table"), [("update_sparsity", "sparsity"), ("activation_drift", "drift")])

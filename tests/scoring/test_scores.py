@@ -32,7 +32,6 @@ ARRAYS = (
     "success",
     "on_the_way",
     "perturbed",
-    "validation",
     "asked",
     "correct",
     "answer_curves",
@@ -66,7 +65,6 @@ def test_the_axes_of_scores_follow_the_scenario(scores: Callable[..., Scores]) -
     np.testing.assert_allclose(run.on_the_way[:, :, :2].mean(axis=-1), RETAINED_CURVES)
     assert np.isnan(run.on_the_way[0, :, 3:]).all()
     assert np.isnan(run.on_the_way[1, :, [2, 4]]).all()
-    np.testing.assert_allclose(run.validation, VALIDATION)
     np.testing.assert_array_equal(run.asked, [[0], [8], [0]])
     np.testing.assert_array_equal(run.correct, [[0], [6], [0]])
     np.testing.assert_array_equal(run.update_sparsity, SPARSITY)
@@ -85,7 +83,7 @@ def test_the_curves_of_rates_end_with_the_end_of_the_stage(scores: Callable[...,
 
 def test_values_that_the_record_lacks_are_missing_and_not_guessed(scores: Callable[..., Scores]) -> None:
     run = scores(MATRIX)
-    for name in ("validation", "answer_curves", "update_sparsity", "activation_drift"):
+    for name in ("answer_curves", "update_sparsity", "activation_drift"):
         assert getattr(run, name).shape == (2, 4)
         assert np.isnan(getattr(run, name)).all()
     assert np.isnan(run.rates().curves[:, :-1]).all()
@@ -96,17 +94,14 @@ def test_a_rate_that_lacks_an_episode_is_missing(make_record: MakeRecord) -> Non
     record = make_record(MATRIX, **ALL, curve_episodes=10)
     columns = record.episodes
     rows = list(zip(*columns.values(), strict=True))
-    lost = {(1, 200, "skill_1", "test", 3), (2, 300, "target_1", "validation", 7)}
+    lost = {(1, 200, "skill_1", "test", 3)}
     kept = [row for row in rows if row[:5] not in lost]
-    assert len(kept) == len(rows) - 2
+    assert len(kept) == len(rows) - 1
     record.episodes = {name: [row[number] for row in kept] for number, name in enumerate(columns)}
     rates = Scores.from_record(record).rates()
     expected = np.array(RETAINED_CURVES)
     expected[0, 1, 1] = np.nan
     np.testing.assert_allclose(rates.retained_curves[:, :-1], expected)
-    expected_selection = np.array(VALIDATION)
-    expected_selection[1, 2] = np.nan
-    np.testing.assert_allclose(rates.validation, expected_selection)
 
 
 def test_the_share_of_right_answers_is_missing_where_a_kind_was_not_asked(make_record: MakeRecord) -> None:
@@ -227,7 +222,6 @@ def test_a_tuning_run_is_scored_on_its_validation_episodes(scores: Callable[...,
     assert run.layout.episodes == run.layout.curve_episodes == run.layout.validation_episodes
     np.testing.assert_allclose(run.success.mean(axis=-1), MATRIX)
     np.testing.assert_allclose(run.rates().retained_curves[:, :-1], RETAINED_CURVES)
-    np.testing.assert_allclose(run.validation, run.rates().learning_curves)
 
 
 def test_a_tuning_run_with_a_test_episode_is_refused(make_record: MakeRecord) -> None:

@@ -35,7 +35,7 @@ def test_the_vocabulary_has_each_word_once() -> None:
 
 
 def test_the_vocabulary_covers_every_instruction_question_and_answer_of_the_fetch_scenario() -> None:
-    scenario = load_scenario("clbench/Fetch-v0")
+    scenario = load_scenario("clbench/Fetch-v1")
     for task in scenario.tasks:
         encode(task.instructions)
     for kind in resolve(scenario.questions):

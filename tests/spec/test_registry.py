@@ -54,10 +54,10 @@ def test_nothing_is_imported_before_it_is_used() -> None:
         ("me/Mine", "strangers_module:MINE", "must be of the form namespace/Name-v0"),
         ("me/../x-v0", "strangers_module:MINE", "must be of the form namespace/Name-v0"),
         ("c1bench/Mine-v0", "strangers_module:MINE", "can be taken for a scenario of clbench"),
-        ("clbench/fetch-v0", "strangers_module:MINE", "can be taken for the scenario 'clbench/Fetch-v0'"),
+        ("clbench/fetch-v1", "strangers_module:MINE", "can be taken for the scenario 'clbench/Fetch-v1'"),
         ("clbench/Mine-v0", "strangers_module:MINE", "in the namespace of clbench: choose your own"),
         (
-            "clbench/Fetch-v0",
+            "clbench/Fetch-v1",
             "clbench.testing:TOY",
             "is registered already, and not for 'clbench.testing:TOY'",
         ),

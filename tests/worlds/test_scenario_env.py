@@ -13,7 +13,7 @@ from clbench.spec.language import encode
 from clbench.spec.registry import load_scenario
 from clbench.worlds.scenario_env import ScenarioEnv
 
-FETCH = "clbench/Fetch-v0"
+FETCH = "clbench/Fetch-v1"
 
 
 def _toy(**options: Any) -> ScenarioEnv:
@@ -102,9 +102,9 @@ def test_an_episode_ends_with_success_or_at_the_horizon() -> None:
 
 def test_observation_and_info_carry_the_instruction() -> None:
     env = gymnasium.make(FETCH, instruction="tokens")
-    observation, info = env.reset(seed=0, options={"task": "lift"})
-    lift = load_scenario(FETCH).task("lift")
-    assert info["instruction"] in lift.instructions
+    observation, info = env.reset(seed=0, options={"task": "press"})
+    press = load_scenario(FETCH).task("press")
+    assert info["instruction"] in press.instructions
     assert np.array_equal(observation["instruction"], encode([info["instruction"]])[0])
     assert set(info) == {"task", "stage", "instruction", "success"}
     assert isinstance(env.unwrapped, ScenarioEnv)
@@ -149,8 +149,8 @@ def test_the_scene_renders_without_changing_the_episode() -> None:
     """In a process of its own: a rendering back end that does not work may kill it."""
     code = """
 import gymnasium, numpy as np
-env = gymnasium.make("clbench:clbench/Fetch-v0", render_mode="rgb_array")
-twin = gymnasium.make("clbench/Fetch-v0")
+env = gymnasium.make("clbench:clbench/Fetch-v1", render_mode="rgb_array")
+twin = gymnasium.make("clbench/Fetch-v1")
 env.reset(seed=0), twin.reset(seed=0)
 for action in np.random.default_rng(0).uniform(-1, 1, (20, 4)).astype(np.float32):
     state, other = env.step(action)[0]["state"], twin.step(action)[0]["state"]

@@ -9,7 +9,7 @@ from gymnasium.vector import VectorEnv
 
 from clbench.worlds.scenario_vector_env import ScenarioVectorEnv
 
-FETCH = "clbench/Fetch-v0"
+FETCH = "clbench/Fetch-v1"
 TOY = "clbench.testing:clbench/Toy-v0"
 
 

@@ -111,7 +111,7 @@ NAMES = [
     ("run.scenario", "Toy-v0", "cannot be the id of a scenario"),
     ("run.scenario", "clbench/../../Toy-v0", "cannot be the id of a scenario"),
     ("run.scenario", "clbench/Toy-v0\n## Toy", "cannot be the id of a scenario"),
-    ("run.scenario", "clbench/fetch-v0", "can be taken for the scenario 'clbench/Fetch-v0'"),
+    ("run.scenario", "clbench/fetch-v1", "can be taken for the scenario 'clbench/Fetch-v1'"),
     ("run.scenario", "c1bench/Unknown-v0", "can be taken for a scenario of clbench"),
     ("run.scenario", "theirs/Toy-v0", "its id is 'clbench/Toy-v0', but 'theirs/Toy-v0' was run"),
     ("scenario.retained.0", "<script>", "'<script>' cannot be the name of a task"),

@@ -17,6 +17,7 @@ from clbench.learning.registry import load_method, method_names
 from clbench.records.paths import record_path
 from clbench.records.record import Record
 from clbench.records.writer import write_record
+from clbench.runs.tuning import Tried, Tuned
 
 SCENARIO = "clbench/Toy-v0"
 HEADINGS = [
@@ -40,13 +41,10 @@ class Bench:
         self.folder = folder
         self.make_record = make_record
 
-    def add(
-        self, label: str, kept: float = 0.2, seed: int = 0, kind: str = "records", **values: Any
-    ) -> Record:
+    def add(self, label: str, kept: float = 0.2, seed: int = 0, **values: Any) -> Record:
         """Add a record of a method, or of changed settings of one, and return it."""
         method, *changes = label.split("+")
         changed = {name: float(value) for name, value in (change.split("=") for change in changes)}
-        selection = kind == "tuning"
         fields = {"diagnostics": {}, "costs": {}, **values}
         record = self.make_record(
             [[1, 1, 0, 0, 0], [1, kept, 1, 0, 0], [kept, kept, 1, 1, 0]],
@@ -54,17 +52,15 @@ class Bench:
             steps=(50, 100),
             curves=np.full((2, 1), 0.5),
             retained_curves=np.full((2, 1, 2), kept),
-            validation=None if selection else np.ones((2, 2)),
             answers={(stage, "left"): (100, 90) for stage in range(3)},
             method=method,
             seed=seed,
             changes=changed,
             settings={**fields.pop("settings", {}), **changed},
-            split="validation" if selection else "test",
         )
         record.costs = dataclasses.replace(record.costs, **fields["costs"])
         record.diagnostics.update(fields["diagnostics"])
-        write_record(record, record_path(self.folder / kind, SCENARIO, label, seed))
+        write_record(record, record_path(self.folder / "records", SCENARIO, label, seed))
         return record
 
     def pages(self) -> dict[str, str]:
@@ -73,7 +69,6 @@ class Bench:
         resolve("clbench.leaderboard.cli:method_pages")(
             records=self.folder / "records",
             controls=self.folder / "controls",
-            tuning=self.folder / "tuning",
             step_time=self.folder / "step_time.json",
             scenario=SCENARIO,
             output=output,
@@ -208,48 +203,29 @@ def test_scalar_diagnostics_are_averaged_over_stages_and_seeds(bench: Bench) -> 
     assert "| anchor_distance" not in section
 
 
-def test_settings_that_were_tried_are_compared_on_validation_episodes(bench: Bench) -> None:
-    bench.add("sft", kind="tuning", seed=100)
-    defaults = dataclasses.asdict(load_method("consft")())
-    calibrated = load_method("consft_calibrated")()
-    chosen = f"loss_scale={calibrated.loss_scale}+schedule=1.0"  # type: ignore[attr-defined]
-    for label, kept in (
-        ("loss_scale=0.02+schedule=1.0", 0.6),
-        (chosen, 0.4),
-        ("loss_scale=0.0005+schedule=1.0", 0.3),
-    ):
-        bench.add(f"consft+{label}", kept=kept, kind="tuning", seed=100, settings=defaults)
+def test_the_settings_that_tuning_tried_are_listed_with_the_chosen_one(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tried = Tried({"step_factor": 1.0}, 0.36, 0.96), Tried({"step_factor": 0.055}, 0.61, 0.94)
+    found = {"clbench/MetaWorld-v1": {"consft": Tuned({"step_factor": 0.055}, tried)}}
+    monkeypatch.setattr(
+        "clbench.leaderboard.pages.method_pages.tuned", lambda scenario: found.get(scenario, {})
+    )
     pages = bench.pages()
-    for name in ("consft", "consft_calibrated"):
-        tried = part(pages[name], "Results here").partition("### Settings tried")[2]
-        rows = [line for line in tried.splitlines() if line.startswith(("| s", "| loss"))]
-        assert rows[0] == (
-            "| settings | seed | targets | adaptation | retention | matched retention | question retention |"
-        )
-        assert rows[1] == "| sft, unchanged | 100 | 2 | 1.00 | 0.20 | 0.40 | 0.90 |"
-        assert [row.split(" | ")[4] for row in rows[2:]] == ["0.30", "0.40", "0.60"]  # by rising loss_scale
-        assert "(consft_calibrated)" in rows[3]
-    command = part(pages["consft"], "Command")
-    assert f"clbench tune {SCENARIO} consft --values.loss_scale 0.0005," in command
-    assert command.splitlines()[-2].endswith(" --targets 2")
+    section = part(pages["consft"], "Results here").partition("### Settings tried")[2]
+    assert [line for line in section.splitlines() if line.startswith("| clbench")] == [
+        "| clbench/MetaWorld-v1 | step_factor = 1 | 0.96 | 0.360 |  |",
+        "| clbench/MetaWorld-v1 | step_factor = 0.055 | 0.94 | 0.610 | yes |",
+    ]
+    command = "clbench tune clbench/MetaWorld-v1 consft --write methods/tuned/MetaWorld-v1.json"
+    assert command in part(pages["consft"], "Command")
     assert "Settings tried" not in pages["ewc"]
-    assert "clbench tune" not in pages["consft_calibrated"]
-
-
-def test_records_of_the_board_are_not_settings_that_were_tried(bench: Bench) -> None:
-    bench.add("ewc+strength=2.0", kind="controls")
-    (bench.folder / "controls").rename(bench.folder / "tuning")
-    assert "Settings tried" not in bench.pages()["ewc"]
+    assert "clbench tune" not in pages["ewc"]
 
 
 def test_words_of_strangers_in_records_are_no_markup(bench: Bench) -> None:
     hostile = "x | y\n## z <b> ```"
-    record = bench.add("aegis", diagnostics={"1": {hostile: 0.5}})
-    record.run.changes, record.run.split = {hostile: hostile}, "validation"
-    record.episodes["split"] = ["validation" for _ in record.episodes["split"]]
-    for name in record.episodes:
-        record.episodes[name] = record.episodes[name][:5]
-    write_record(record, bench.folder / "tuning" / "strange.json")
+    bench.add("aegis", diagnostics={"1": {hostile: 0.5}})
     page = bench.pages()["aegis"]
     assert re.findall(r"^## (.+)$", page, re.MULTILINE) == HEADINGS
     assert "<b>" not in page.replace("\\<", "").partition("```console")[0]
@@ -259,8 +235,6 @@ def test_words_of_strangers_in_records_are_no_markup(bench: Bench) -> None:
 def test_the_same_content_gives_the_same_bytes_and_no_place_or_date(bench: Bench) -> None:
     for method in ("sft", "consft", "aegis"):
         bench.add(method)
-    bench.add("sft", kind="tuning", seed=100)
-    bench.add("consft+tau_start=0.5", kind="tuning", seed=100)
     first = bench.pages()
     assert bench.pages() == first
     for page in first.values():

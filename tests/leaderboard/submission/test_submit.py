@@ -106,7 +106,7 @@ def test_a_method_that_goes_beyond_the_limits_of_its_scenario_is_stopped(
         ("submitted:Mind", {}, "Did you mean 'Mine'?"),
         ("submited:Mine", {}, "No module 'submited' can be imported"),
         ("submitted:Größe", {}, "'submitted:Größe' cannot be the name of a method"),
-        ("submitted:Mine", {"scenario": "clbench/Fetsch-v0"}, "Did you mean 'clbench/Fetch-v0'?"),
+        ("submitted:Mine", {"scenario": "clbench/Fetsch-v0"}, "Did you mean 'clbench/Fetch-v1'?"),
     ],
 )
 def test_a_wrong_word_is_named(

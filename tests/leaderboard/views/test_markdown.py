@@ -17,15 +17,6 @@ PERTURBED = [[0.9, 0.8], [0.5, 0.7], [0.4, 0.2]]
 load = resolve("clbench.leaderboard:load")
 
 
-def test_a_method_that_does_not_learn_as_well_as_plain_fine_tuning_has_no_matched_retention(
-    four_methods: Path, add_full: Callable[..., Path], shown: Callable[[], tuple[str, str]]
-) -> None:
-    add_full("slow", 0, validation=np.array(VALIDATION) / 2)
-    assert np.isnan(load(four_methods).set_index("method").retention_at_matched_adaptation["slow"])
-    _, page = shown()
-    assert "**matched retention** (higher is better; from 0 to 1; version 0)" in page
-
-
 def test_the_markdown_has_values_with_intervals_and_explains_them(
     shown: Callable[[], tuple[str, str]],
 ) -> None:

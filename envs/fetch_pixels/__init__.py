@@ -1,0 +1,1 @@
+"""The Fetch robot and a block, seen by a camera."""

@@ -1,1 +1,0 @@
-"""The tidy Fetch world: what a task does not need lies in a corner of the table."""
