@@ -22,12 +22,16 @@ BOARDS := clbench/Fetch-v1 clbench/MetaWorld-v1
 tuning: .venv/installed
 	for id in $(BOARDS); do $(BIN)/clbench tune $$id --all --write methods/tuned/$${id#clbench/}.json || exit; done
 
+# Scenarios whose stages have a fixed number of steps: plain fine-tuning, replay and the references.
+FIXED := clbench/DMControl-v0,clbench/FetchPixels-v0,clbench/PointMaze-v0
+
 # The committed boards. Runs that have a record are skipped: a stopped command goes on.
 records: .venv/installed
 	$(BIN)/clbench run clbench/Fetch-v1 sft consft consft_calibrated --seeds 8 --perturb
 	for id in $(BOARDS); do $(BIN)/clbench run $$id --all --seeds 8 || exit; done
 	$(BIN)/clbench run $(KNOWLEDGE) frozen sft stop_gradient aegis lora --seeds 4
-	$(BIN)/clbench run $(SCENARIO) --all --seeds 5
+	$(BIN)/clbench run $(FIXED),clbench/MetaWorldCW-v0 sft frozen joint from_scratch --seeds 3
+	$(BIN)/clbench run $(FIXED) experience_replay --seeds 3
 	$(BIN)/clbench leaderboard
 
 # The frontier: what a smaller step size does, for plain fine-tuning and for the methods that compete with it.
@@ -60,7 +64,9 @@ docs: .venv/installed
 benchmark: .venv/installed-dev
 	$(BIN)/python benchmarks/rollouts.py
 	$(BIN)/python benchmarks/step_time.py
-	for id in Fetch PointMaze DMControl MetaWorld MetaWorldCW; do $(BIN)/python benchmarks/whole_run.py clbench/$$id-v0 || exit; done
+	for id in Fetch-v1 MetaWorld-v1 PointMaze-v0 DMControl-v0 MetaWorldCW-v0; do \
+		$(BIN)/python benchmarks/whole_run.py clbench/$$id || exit; \
+	done
 	$(BIN)/python benchmarks/workers.py
 	$(BIN)/python benchmarks/scaling.py
 	$(BIN)/python benchmarks/report.py

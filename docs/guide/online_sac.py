@@ -1,6 +1,6 @@
 """Stable-Baselines3's SAC learns a scenario by trial and error, stage by stage, and leaves a record.
 
-    python docs/guide/online_sac.py clbench/Fetch-v0 --seeds 3
+    python docs/guide/online_sac.py clbench/Fetch-v1 --seeds 3
 
 This is the simplest baseline: SAC with its default settings continues to train from task to task. Its replay
 buffer is emptied at each stage, so that only its weights remember. Word ids are names, not amounts, and go
@@ -80,7 +80,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("scenario", help="Gymnasium id of the scenario, for example clbench/Fetch-v0")
+    parser.add_argument("scenario", help="Gymnasium id of the scenario, for example clbench/Fetch-v1")
     parser.add_argument("--seeds", type=int, default=3, help="number of seeds")
     parser.add_argument("--first-seed", type=int, default=0, help="first seed")
     parser.add_argument("--steps", type=int, default=6000, help="environment steps per stage")

@@ -291,7 +291,15 @@ def test_a_scenario_with_a_criterion_has_bars_and_orders_of_its_own(
     make_record: Callable[..., Record], tmp_path: Path
 ) -> None:
     budget = dataclasses.replace(TOY.budget, adaptation_steps=20, criterion=0.9)
-    scenario = dataclasses.replace(TOY, id="clbench/Even-v1", budget=budget, balanced=True)
+    skill = dataclasses.replace(TOY.retained[0], test_instructions=("a wording of the test",))
+    scenario = dataclasses.replace(
+        TOY,
+        id="clbench/Even-v1",
+        retained=(skill, *TOY.retained[1:]),
+        budget=budget,
+        background=(dataclasses.replace(skill, name="practised"),),
+        balanced=True,
+    )
     for method, kept in (("sft", 0.5), ("experience_replay", 1.0), ("frozen", 0.2)):
         for seed in range(3):
             success = [[1, 1, 0.1, 0, 0], [kept, kept, 0.9, 0.3, 0], [kept, kept, kept, 0.9, 0]]
@@ -311,3 +319,6 @@ def test_a_scenario_with_a_criterion_has_bars_and_orders_of_its_own(
         "checks of sft until a target is learned": ("at least 8.00", "8.00", "holds"),
     }
     assert "Latin square" in part(card.page(), "Order of the targets")
+    assert "<br>in test episodes:<br>a wording of the test |" in part(card.page(), "Tasks")
+    assert "Pretrained with the retained skills, and not scored: practised." in part(card.page(), "Tasks")
+    assert "The policy is evaluated at the end of each stage." in part(card.page(), "Budget")
