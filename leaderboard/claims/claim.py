@@ -133,6 +133,7 @@ def not_told_apart(control: Figure, *, explains: str, does_not: str) -> str:
     return f"{name} is not told apart from it: {explains}."
 
 
-def best_of(figures: Sequence[Figure]) -> Figure:
-    """Return the figure with the largest value; missing values come last."""
-    return max(figures, key=lambda one: -math.inf if math.isnan(one.value) else one.value)
+def best_first(figures: Sequence[Figure]) -> tuple[Figure, ...]:
+    """Return the figures with the largest value in front; missing values are never the largest."""
+    best = max(figures, key=lambda one: -math.inf if math.isnan(one.value) else one.value)
+    return (best, *(one for one in figures if one is not best))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from .claim import ANYWHERE, Finding, Paper, best_of, claim, decided, not_told_apart, what_would_change
+from .claim import ANYWHERE, Finding, Paper, best_first, claim, decided, not_told_apart, what_would_change
 from .evidence import Evidence, Figure, rung
 from .figures import PUBLISHED, kept, retention_drop, share_between, sparsity, spatial_gain, spatial_loss
 
@@ -79,7 +79,7 @@ def keeps_20_points_more(evidence: Evidence) -> Finding:
     sft = [evidence.metric("retention", label) for label in ("sft", rung("sft", PUBLISHED))]
     counting = [figure for figure in at_best if figure.methods[0] in arms]
     published = [figure for figure in at_one if figure.methods[0] in {rung(arm, PUBLISHED) for arm in arms}]
-    best = best_of(counting or at_best)
+    best = best_first(counting or at_best)[0]
     figures = (best, *(one for one in (*at_best, *at_one) if one is not best))
     controls = tuple(
         kept(evidence, "consft_calibrated", control)
@@ -139,14 +139,14 @@ def as_good_as_replay(evidence: Evidence) -> Finding:
         [kept(evidence, arm, replay) for replay in ("experience_replay", "buffered_replay")] for arm in ARMS
     ]
     holding = [arm[0].methods[0] for arm in arms if all(figure.low >= -0.05 for figure in arm)]
-    best = best_of([arm[0] for arm in arms])
+    figures = best_first([arm[0] for arm in arms])
     sentences = [f"It holds for {' and '.join(holding)}."] if holding else []
     return Finding(
         decided(holds=bool(holding), fails=all(any(figure.high < -0.05 for figure in arm) for arm in arms)),
-        (best, *(arm[0] for arm in arms if arm[0] is not best)),
+        figures,
         tuple(arm[1] for arm in arms),
         tuple(sentences),
-        what_would_change(best, -0.05),
+        what_would_change(figures[0], -0.05),
         about=ARMS,
     )
 
@@ -165,8 +165,7 @@ def stays_sparse(evidence: Evidence) -> Finding:
     """Updates stay sparse."""
     both = [sparsity(evidence, arm, "sft") for arm in ARMS]
     response = sparsity(evidence, rung("sft", 0.03), rung("sft", PUBLISHED))
-    best = best_of(both)
-    figures = (best, *(one for one in both if one is not best))
+    figures = best_first(both)
     if response.high < 0.05:
         return Finding(
             "cannot be shown here",
@@ -177,11 +176,11 @@ def stays_sparse(evidence: Evidence) -> Finding:
             about=ARMS,
         )
     return Finding(
-        decided(holds=best.low > 0.05, fails=all(one.high < 0.05 for one in both)),
+        decided(holds=figures[0].low > 0.05, fails=all(one.high < 0.05 for one in both)),
         figures,
         (response,),
         (),
-        what_would_change(best, 0.05),
+        what_would_change(figures[0], 0.05),
         about=ARMS,
     )
 
@@ -256,11 +255,11 @@ def costs_nothing(evidence: Evidence) -> Finding:
 def keeps_earlier_targets(evidence: Evidence) -> Finding:
     """Learns several targets in sequence and keeps the earlier ones."""
     both = [evidence.metric("backward_transfer", arm) for arm in ARMS]
-    best = best_of(both)
-    over_sft = evidence.difference("backward_transfer", best.methods[0], "sft")
+    figures = best_first(both)
+    over_sft = evidence.difference("backward_transfer", figures[0].methods[0], "sft")
     return Finding(
         decided(holds=any(one.low >= -0.10 for one in both), fails=all(one.high < -0.10 for one in both)),
-        (best, *(one for one in both if one is not best)),
+        figures,
         (
             over_sft,
             *(evidence.metric("backward_transfer", control) for control in ("sft", "experience_replay")),
@@ -272,7 +271,7 @@ def keeps_earlier_targets(evidence: Evidence) -> Finding:
                 does_not="weighing samples keeps earlier targets",
             ),
         ),
-        what_would_change(best, -0.10),
+        what_would_change(figures[0], -0.10),
         about=ARMS,
     )
 
@@ -292,8 +291,7 @@ def prevents_spatial_overfitting(evidence: Evidence) -> Finding:
     """Prevents overfitting to the positions in the demonstrations."""
     of_sft = spatial_loss(evidence, "sft")
     both = [spatial_gain(evidence, arm, "sft") for arm in ARMS]
-    best = best_of(both)
-    figures = (best, *(one for one in both if one is not best))
+    figures = best_first(both)
     if of_sft.high < 0.05:
         return Finding(
             "cannot be shown here",
@@ -304,10 +302,10 @@ def prevents_spatial_overfitting(evidence: Evidence) -> Finding:
             about=ARMS,
         )
     return Finding(
-        decided(holds=best.low > 0.05, fails=all(one.high < 0.05 for one in both)),
+        decided(holds=figures[0].low > 0.05, fails=all(one.high < 0.05 for one in both)),
         figures,
         (of_sft,),
         (),
-        what_would_change(best, 0.05),
+        what_would_change(figures[0], 0.05),
         about=ARMS,
     )

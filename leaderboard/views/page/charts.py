@@ -281,27 +281,28 @@ SERIES = ("old skills", "target of the stage", "old skills under sft")
 """Lines in the chart of a run; the last one is for comparison."""
 
 
-def along_a_run(targets: Sequence[str], steps: int) -> Spec:
+def along_a_run(targets: Sequence[str], steps: int | None) -> Spec:
     """Return the chart of a run without its points, which the page adds for each row.
 
-    The points are the named data `points`: `x` (steps since the first stage), `y` with `low` and `high`, one
+    The points are the named data `points`: `x` (steps since the first stage, or stages), `y` with `low` and `high`, one
     of `SERIES`, and the `stage`, which separates the curve of a target from the next; the parameter `shown`
     lists the series that have points.
 
     Args:
         targets: Names of the targets in order.
-        steps: Optimiser steps of a stage.
+        steps: Optimiser steps of a stage; None if a stage ends when its target is learned, and is one wide.
     """
+    width = steps or 1
     stages = [
-        {"begin": number * steps, "end": (number + 1) * steps, "name": f"{number + 1} {name}"}
+        {"begin": number * width, "end": (number + 1) * width, "name": f"{number + 1} {name}"}
         for number, name in enumerate(targets)
     ]
     count = max(len(targets), 1)
     x = axis(
         "x",
-        "optimiser steps, stage after stage",
-        scale={"domain": [0, count * steps], "nice": False},
-        axis={"values": [number * steps for number in range(count + 1)], "grid": False},
+        "optimiser steps, stage after stage" if steps else "stages, each until its target is learned",
+        scale={"domain": [0, count * width], "nice": False},
+        axis={"values": [number * width for number in range(count + 1)], "grid": False},
     )
     y = axis("y", "success", scale={"domain": [0, 1]})
     hues = [colour(f"mark-{number}") for number in (0, 1, 4)]
@@ -314,7 +315,7 @@ def along_a_run(targets: Sequence[str], steps: int) -> Spec:
     begin = x | {"field": "begin"}
     lines: Spec = {"x": x, "y": y, "color": series, "detail": {"field": "stage"}}
     area = lines | {"y": y | {"field": "low"}, "y2": {"field": "high"}}
-    tooltip = [{"field": field} for field in ("series", "steps", "success")]
+    tooltip = [{"field": field} for field in ("series", "at", "success")]
     layers = [
         layer(stages[1::2], {"type": "rect", "color": colour("raised")}, x=begin, x2={"field": "end"}),
         layer(stages, name, x=begin, y={"value": 0}, text={"field": "name", "type": "nominal"}),

@@ -192,13 +192,15 @@ def _scenario_data(one: ScenarioView) -> dict[str, Any]:
     if one.frontier:
         frontiers["wide_frontier"] = frontier(one.frontier, WIDE_FRONTIER)
         frontiers["narrow_frontier"] = frontier(one.frontier, NARROW_FRONTIER)
+    steps = (1,) if one.to_criterion else one.steps
     return {
         **frontiers,
+        "to_criterion": one.to_criterion,
         "metrics": [[title_of(metric.name), metric.description, metric.missing] for metric in one.others],
         "sft": anchors.get("sft"),
-        "steps": one.steps,
+        "steps": steps,
         "targets": one.tasks["target"],
-        "run": along_a_run(one.tasks["target"], one.steps[-1]),
+        "run": along_a_run(one.tasks["target"], None if one.to_criterion else one.steps[-1]),
         "wide": plane(rows, WIDE, anchors),
         "narrow": plane(rows, NARROW, anchors),
     }

@@ -139,14 +139,17 @@
     return { retained: [[0, 0], ...each(steps)], target: each([0, ...steps]) };
   }
 
-  function points(series, numbers, at, length, perStage) {
+  /* Where stages end when the target is learned, their length differs between runs: a stage is one step long. */
+  const when = (one, step) => one.to_criterion ? ["start", "end"][step] : String(step);
+
+  function points(series, numbers, at, one, perStage) {
     return numbers.flatMap(([y, low, high], index) => {
       if (y === null) return [];
       const [stage, step] = at[index];
-      const x = stage * length + step;
+      const x = stage * one.steps.at(-1) + step;
       return [{
         series, x, y, low: low ?? y, high: high ?? y, stage: series + (perStage ? stage : ""),
-        steps: x, success: words([y, low, high]),
+        at: one.to_criterion ? `${when(one, step)} of stage ${stage + 1}` : `step ${x}`, success: words([y, low, high]),
       }];
     });
   }
@@ -154,15 +157,15 @@
   function drawRun(element) {
     const row = data.rows[element.dataset.run];
     const one = data.scenarios[row.scenario];
-    const at = places(one), length = one.steps.at(-1);
+    const at = places(one);
     const [retained, target, beside] = data.series;
     const all = [
-      ...points(retained, row.retained, at.retained, length, false),
-      ...points(target, row.target, at.target, length, true),
+      ...points(retained, row.retained, at.retained, one, false),
+      ...points(target, row.target, at.target, one, true),
     ];
     if (one.sft && one.sft !== element.dataset.run) {
       const values = data.rows[one.sft].retained.map(([value]) => [value, null, null]);
-      all.push(...points(beside, values, at.retained, length, false));
+      all.push(...points(beside, values, at.retained, one, false));
     }
     const shown = [...new Set(all.map((point) => point.series))];
     draw(element, { ...one.run, params: [{ name: "shown", value: shown }], datasets: { points: all } });
@@ -198,7 +201,7 @@
       const one = data.scenarios[row.scenario], count = one.steps.length;
       const rows = places(one).target.map(([stage, step], index) => {
         const place = index - stage * (count + 1);
-        return { texts: [one.targets[stage], step, words(row.target[index]), words(row.retained[stage * count + place])] };
+        return { texts: [one.targets[stage], when(one, step), words(row.target[index]), words(row.retained[stage * count + place])] };
       });
       return table("The curves", ["target", "step", "success on the target", "on the old skills"], rows);
     },
