@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
-from itertools import groupby
+from itertools import chain, groupby
 from pathlib import Path
 
 import numpy as np
@@ -81,7 +81,7 @@ class Table:
     scenarios: Mapping[str, ScenarioInfo]
     """`Record.scenario`, which the rows of a scenario share, by its id."""
     rows: tuple[Row, ...]
-    """Rows by scenario, division and falling final average."""
+    """Rows by scenario, division and falling final average; scenarios with a criterion come first."""
     not_shown: tuple[NotShown, ...]
     """Files that make no row, by path."""
     frontiers: Mapping[str, tuple[Curve, ...]] = field(default_factory=dict)
@@ -99,13 +99,13 @@ def read_table(records: Path) -> Table:
     runs, not_shown = read_runs(records, read_run, ALIKE)
     runs, alone = _beside_rows(runs)
     times = read_step_times(step_time_of(records))
-    rows: list[Row] = []
-    for _, members in groupby(sorted(runs, key=lambda run: run.scenario), key=lambda run: run.scenario):
-        rows += _scenario_rows(list(members), times)
+    by_scenario = groupby(sorted(runs, key=lambda run: run.scenario), key=lambda run: run.scenario)
+    found = [_scenario_rows(list(members), times) for _, members in by_scenario]
+    found.sort(key=lambda rows: not rows[0].to_criterion)  # they have tuned methods, and judge the claims
     frontiers, without = read_frontiers(ladder_of(records))
     return Table(
         scenarios={run.scenario: run.published for run in runs},
-        rows=tuple(rows),
+        rows=tuple(chain.from_iterable(found)),
         not_shown=tuple(sorted([*not_shown, *alone, *without], key=lambda entry: entry.path)),
         frontiers=frontiers,
     )

@@ -53,7 +53,7 @@ TO_CRITERION = (
 FITTING = ("final_average", "gain", "adaptation", "retention", "kept")
 """Metrics of `TO_CRITERION` in a terminal of 108 columns."""
 
-NOT_FITTING = ("perturbed_retention", "forward_transfer", "zero_shot")
+NOT_FITTING = ("perturbed_retention", "zero_shot")
 """Metrics of `FIXED` that it has no room for."""
 
 TITLES_TO_CRITERION = {"adaptation": "learned", "retention": "kept skills"}

@@ -15,7 +15,7 @@ from clbench.worlds.lanes import vector_world
 from clbench.worlds.perturbation import draw_perturbation
 from clbench.worlds.world import VectorWorld
 
-SCENARIOS = [load_scenario(f"clbench:clbench/{name}-v0") for name in ("MetaWorld", "MetaWorldCW")]
+SCENARIOS = [load_scenario(f"clbench:clbench/{name}") for name in ("MetaWorld-v1", "MetaWorldCW-v0")]
 TASKS = {task.name: task for one in SCENARIOS for task in one.tasks}
 WORLD = SCENARIOS[0].tasks[0].world
 PlainWorld = resolve(WORLD)

@@ -13,8 +13,12 @@ from clbench.worlds.lanes import vector_world
 from clbench.worlds.perturbation import draw_perturbation
 from clbench.worlds.world import VectorWorld
 
-SCENARIOS = [load_scenario(f"clbench:clbench/{name}-v0") for name in ("MetaWorld", "MetaWorldCW")]
-TASKS = [*{task.name: task for one in SCENARIOS for task in one.tasks}, "reach", "pick_place"]
+SCENARIOS = [load_scenario(f"clbench:clbench/{name}") for name in ("MetaWorld-v1", "MetaWorldCW-v0")]
+TASKS = [
+    *{task.name: task for one in SCENARIOS for task in one.tasks + one.background},
+    "reach",
+    "pick_place",
+]
 WORLD = SCENARIOS[0].tasks[0].world
 RULES = resolve("clbench.envs.metaworld.rules:RULES")
 new_episode = resolve("clbench.envs.metaworld.episode:new_episode")

