@@ -121,10 +121,11 @@ def test_with_complete_boards_rows_are_told_apart_as_by_tukeys_test() -> None:
         values = values[np.argsort(-values.mean(axis=1))]
         residuals = values - values.mean(axis=1, keepdims=True) - values.mean(axis=0) + values.mean()
         error = np.sqrt((residuals**2).sum() / 12 / 5)
-        differences = values[:, None] - values
-        own_is_larger = differences.std(axis=2, ddof=1) / np.sqrt(10) > error
-        p_values = stats.studentized_range.sf(abs(differences.mean(axis=2)) / error, 4, 12)
-        found = told_apart(values, np.repeat(values[..., None], 2, axis=2))
+        pairs = np.triu_indices(4, 1)  # SciPy takes 0.05 s for each
+        differences = (values[:, None] - values)[pairs]
+        own_is_larger = differences.std(axis=1, ddof=1) / np.sqrt(10) > error
+        p_values = stats.studentized_range.sf(abs(differences.mean(axis=1)) / error, 4, 12)
+        found = told_apart(values, np.repeat(values[..., None], 2, axis=2))[pairs]
         assert (found == (p_values < 0.05))[~own_is_larger].all()
         agreed += int((found & ~own_is_larger).any())
     assert agreed > 10
