@@ -54,10 +54,12 @@ def rollout_hash(world: str, task: str) -> str:
 
 
 def fingerprint(scenario: Scenario) -> dict[str, Any]:
-    """Return versions, commit, hardware and the rollout hash of every world of the scenario.
+    """Return versions, commit, hardware, the rollout hash of every world of the scenario, and its definition.
 
     For a world with a camera, the hash of a picture is added under the name of the camera.
     """
+    from clbench.evaluation.definition import definition  # imports torch, see `_hardware`
+
     packages = {*PACKAGES, *(package for task in scenario.tasks for package in task.packages)}
     worlds: dict[str, Task] = {}
     for task in scenario.tasks:
@@ -70,6 +72,7 @@ def fingerprint(scenario: Scenario) -> dict[str, Any]:
         "commit": _commit(),
         "hardware": _hardware(),
         "rollouts": {**rollouts, **frames},
+        "definition": definition(scenario),
     }
 
 

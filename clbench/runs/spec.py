@@ -12,8 +12,9 @@ from typing import TYPE_CHECKING, Any
 
 from clbench.base.errors import InputError
 from clbench.records.paths import label_of, record_path
+from clbench.records.pinned import other_parts
 from clbench.records.reader import RecordError, read_record
-from clbench.records.record import RunInfo, ScenarioInfo
+from clbench.records.record import Record, RunInfo, ScenarioInfo
 from clbench.runs.tuning import tuned_settings
 from clbench.spec.protocol import Protocol, ScoredSplit
 from clbench.spec.registry import load_scenario
@@ -172,13 +173,33 @@ def has_record(run: ResolvedRun, records: Path) -> bool:
 
     A record does not count if its run failed, if it cannot be read, or if its budget, device or settings
     differ.
+
+    Raises:
+        InputError: The record was made with another definition of the scenario.
     """
+    path = run.path(records)
     try:
-        record = read_record(run.path(records))
+        record = read_record(path)
     except RecordError:
         return False
     found = record.run if run.spec.perturb else dataclasses.replace(record.run, perturb=False)
-    return record.status == "success" and (found, record.scenario) == (run.info, run.scenario_info)
+    if record.status != "success" or (found, record.scenario) != (run.info, run.scenario_info):
+        return False
+    _check_definition(record, run.published, path)
+    return True
+
+
+def _check_definition(record: Record, published: Scenario, path: Path) -> None:
+    """Refuse a record of another definition of its scenario."""
+    from clbench.evaluation.definition import definition
+
+    recorded = record.fingerprint.get("definition")
+    other = [] if recorded is None else other_parts(recorded, definition(published))
+    if other:
+        raise InputError(
+            f"{path} was made with another {published.id}: {', '.join(other)} differ. Give the changed "
+            "scenario a new version, or choose another folder with --records."
+        )
 
 
 def check_device(device: str) -> None:

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from clbench.records.paths import label_of, record_name
+from clbench.records.pinned import other_parts, pinned
 from clbench.records.reader import RecordError, read_record
 from clbench.records.record import Record, RunInfo, ScenarioInfo
 from clbench.runs.tuning import tuned_settings
@@ -267,6 +268,37 @@ def same_simulator(runs: list[Run]) -> Sifted:
     return _most(runs, lambda run: run.scenario, lambda run: _text(rollouts(run)), reason)
 
 
+def same_definition(runs: list[Run]) -> Sifted:
+    """Keep the runs whose scenario is defined as here, or, if it is not the project's, as in most records.
+
+    An older record has no definition, and is kept.
+    """
+
+    def defined(run: Run) -> Any:
+        return run.record.fingerprint.get("definition")
+
+    def reason(run: Run, other: Run) -> str:
+        parts = ", ".join(differences(defined(run), defined(other)))
+        return f"its scenario is not that of most records: {parts} differ."
+
+    kept, refused = _most(
+        [run for run in runs if run.scenario not in pinned() and defined(run) is not None],
+        lambda run: run.scenario,
+        lambda run: _text(defined(run)),
+        reason,
+    )
+    kept += [run for run in runs if run.scenario not in pinned() and defined(run) is None]
+    for run in runs:
+        if run.scenario in pinned():
+            if other := other_parts(defined(run), pinned()[run.scenario]):
+                refused.append(
+                    no_row(run.path, f"it was made with another {run.scenario}: {', '.join(other)} differ.")
+                )
+            else:
+                kept.append(run)
+    return kept, refused
+
+
 def same_layout(runs: list[Run]) -> Sifted:
     """Keep the runs that were evaluated on the usual episodes, points and questions."""
 
@@ -297,7 +329,7 @@ def same_settings(runs: list[Run]) -> Sifted:
     return _most(runs, lambda run: (run.scenario, run.method), lambda run: _text(parts(run)), reason)
 
 
-ALIKE: tuple[Sift, ...] = (same_scenario, same_simulator, same_layout, same_settings)
+ALIKE: tuple[Sift, ...] = (same_scenario, same_definition, same_simulator, same_layout, same_settings)
 """What runs must share to be compared."""
 
 

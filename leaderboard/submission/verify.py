@@ -34,6 +34,7 @@ from clbench.learning.pretraining import pretrained_policy
 from clbench.learning.registry import method_names
 from clbench.learning.trainer import repeatable
 from clbench.policy.policy import Policy
+from clbench.records.pinned import other_parts
 from clbench.records.reader import RecordError
 from clbench.records.record import EpisodeRow, Record
 from clbench.runs.checkpoints import kept_stages, load_stages, stage_policies
@@ -226,7 +227,21 @@ def _recompute(subject: _Subject, _: ProgressCallback) -> list[Check]:
     result = (
         "same rollouts as here" if recorded == found else f"the rollouts of {worlds} differ from those here"
     )
-    return [*checks, Check("simulator", result, recorded == found)]
+    return [*checks, Check("simulator", result, recorded == found), _check_definition(subject)]
+
+
+def _check_definition(subject: _Subject) -> Check:
+    """Check that the tasks and questions of the record are those of the installed scenario."""
+    recorded = subject.run.record.fingerprint.get("definition")
+    if recorded is None:
+        return Check("definition", "the record is older than definitions: not compared", True)
+    other = other_parts(recorded, subject.here["definition"])
+    result = (
+        f"{', '.join(other)} differ from the installed code"
+        if other
+        else "tasks and questions are those here"
+    )
+    return Check("definition", result, not other)
 
 
 def _check_horizons(record: Record, scenario: Scenario) -> Check:

@@ -185,6 +185,11 @@ FORGERIES = [
     ),
     (
         "recomputed",
+        "definition: task left, questions differ from the installed code",
+        lambda values: values["fingerprint"]["definition"].update({"task left": "0", "questions": "1"}),
+    ),
+    (
+        "recomputed",
         "what was run: scenario.budget",
         lambda values: values["scenario"]["budget"].update(adaptation_steps=61),
     ),

@@ -15,6 +15,7 @@ from helpers import sealed
 
 from clbench.base.entry_points import resolve
 from clbench.records.paths import record_path
+from clbench.records.pinned import pinned
 from clbench.records.record import Record
 from clbench.records.writer import write_record
 
@@ -133,6 +134,36 @@ def test_a_record_that_cannot_be_a_row_is_listed_with_its_reason_and_hides_no_ot
         assert "Not shown" in text
         assert "\x1b" not in text
         assert "\n| best" not in text
+
+
+def test_a_record_of_another_definition_than_most_of_a_strangers_scenario_is_not_shown(
+    four_methods: Path, add_full: Callable[..., Path], shown: Callable[[], tuple[str, str]]
+) -> None:
+    for seed, of_task in ((0, "a"), (1, "a"), (2, "b")):
+        edit = set_in("fingerprint", "definition", {"task skill_0": of_task, "questions": "c"})
+        add_full("lora", seed, edit=edit, place=f"Toy-v0/lora/seed-{seed}.json")
+    for text in shown():
+        reason = "its scenario is not that of most records: task skill_0 differ."
+        assert f"Toy-v0/lora/seed-2.json: {reason}" in flat(text)
+        assert "Toy-v0/lora/seed-0.json" not in flat(text)
+
+
+def test_a_record_of_another_definition_of_a_scenario_of_the_project_is_not_shown(
+    four_methods: Path, add_full: Callable[..., Path], shown: Callable[[], tuple[str, str]]
+) -> None:
+    ours = pinned()["clbench/Fetch-v1"]
+    for seed, definition in enumerate(
+        (None, ours, {**ours, "task press": "0", "questions": "1"}, {"\x1b[2J": ""})
+    ):
+        edit = set_in("fingerprint", "definition", definition)
+        add_full("sft", seed, edit=edit, scenario="clbench/Fetch-v1", place=f"Fetch-v1/sft/seed-{seed}.json")
+    for text in shown():
+        assert "Fetch-v1/sft/seed-0.json" not in flat(text)  # older than definitions
+        assert "Fetch-v1/sft/seed-1.json" not in flat(text)
+        words = "it was made with another clbench/Fetch-v1"
+        assert f"Fetch-v1/sft/seed-2.json: {words}: task press, questions differ." in flat(text)
+        assert f"Fetch-v1/sft/seed-3.json: {words}: the tasks themselves differ." in flat(text)
+        assert "\x1b" not in text
 
 
 @pytest.mark.parametrize("content", ["", "{", "[]", '{"a": 1}', '{"schema": 99}', "[" * 99_999, "\x00"])

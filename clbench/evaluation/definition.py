@@ -1,0 +1,133 @@
+"""The definition of a scenario: a hash of each task and of the questions, by their words and what they do.
+
+A hash covers what a score depends on besides the budget: instructions, horizon and seeds of a task, resets,
+rewards and successes of its world, plain and perturbed, the actions of its expert, and the answers to
+questions. It is a hash of behaviour in fixed episodes, so an edit that moves nothing keeps it. A change that
+no fixed episode meets keeps it too: a threshold must move far enough to move a success.
+
+`python -m clbench.evaluation.definition` pins the definitions of the project's scenarios in
+`envs/definitions.json`. A changed scenario gets a new version instead, once records of it are public.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clbench.base.cache import cache_folder, cached, hash_of
+from clbench.base.entry_points import resolve
+from clbench.base.source import DATA_SOURCES, package_of, source_hash
+from clbench.base.strict_json import read_json
+from clbench.data.demonstrations import simulator_versions
+from clbench.records.pinned import pinned_file
+from clbench.spec.identifiers import scenario_ids
+from clbench.spec.registry import load_scenario
+from clbench.spec.scenario import Scenario
+from clbench.spec.task import Task, packages_of
+from clbench.worlds.lanes import vector_world
+
+CODE = (*DATA_SOURCES, "clbench.evaluation.definition")
+"""Code that a definition depends on, besides the suites of the tasks."""
+
+EPISODES = 4
+"""Fixed episodes of each task, and as many perturbed ones."""
+
+GRID = 16
+"""Actions of the expert are rounded to multiples of 1/16. An expert that is a network differs in its last
+bits between processors, which would otherwise grow along an episode."""
+
+RANDOM = 5
+"""Every fifth action is random, so that episodes leave the way of the expert."""
+
+
+def definition(scenario: Scenario) -> dict[str, str]:
+    """Return the hashes of a scenario by part: "task NAME" for each task, and "questions"."""
+    tasks = (*scenario.tasks, *scenario.background, *scenario.scenes)
+    suites = packages_of(tasks, "world", "expert", "camera")
+    inputs = {
+        "tasks": [_words(task) for task in tasks],
+        "scenes": [task.name for task in scenario.scene_tasks],
+        "questions": scenario.questions,
+        "source": source_hash(*CODE, package_of(scenario.questions), *suites),
+        "versions": simulator_versions(tasks),
+    }
+
+    def write(folder: Path) -> None:
+        (folder / "definition.json").write_text(json.dumps(_hashes(scenario)), encoding="utf-8")
+
+    folder = cached(cache_folder() / "definitions" / hash_of(inputs), inputs, write)
+    return {**read_json(folder / "definition.json")}
+
+
+def _hashes(scenario: Scenario) -> dict[str, str]:
+    found: dict[str, str] = {}
+    states: dict[str, NDArray[np.float32]] = {}
+    scored = (*scenario.tasks, *scenario.background)
+    for task in {task.name: task for task in (*scenario.scenes, *scored)}.values():
+        found[f"task {task.name}"], states[task.name] = _hash_of_task(task)
+    digest = hashlib.sha256()
+    shown = np.concatenate([states[task.name] for task in scenario.scene_tasks])
+    for kind in resolve(scenario.questions):
+        digest.update(json.dumps([kind.name, kind.wordings, kind.answers]).encode())
+        digest.update(kind.answer(shown).astype(np.int8).tobytes())
+    hashes = {name: found[name] for name in (f"task {task.name}" for task in scored)}
+    return {**hashes, "questions": digest.hexdigest()[:16]}
+
+
+def _hash_of_task(task: Task) -> tuple[str, NDArray[np.float32]]:
+    """Return the hash of a task, and the states of its fixed episodes."""
+    digest = hashlib.sha256(json.dumps(_words(task)).encode())
+    states = []
+    for perturbed in (False, True) if _is_perturbable(task) else (False,):
+        for moment in _moments(task, perturbed):
+            digest.update(b"".join(np.asarray(part, np.float32).tobytes() for part in moment))
+            states.append(moment[0])
+    return digest.hexdigest()[:16], np.stack(states)
+
+
+def _words(task: Task) -> list[object]:
+    """Return what defines a task besides its behaviour."""
+    wordings = [list(task.instructions), list(task.test_instructions)]
+    return [task.name, task.seed_suite, task.version, task.horizon, task.action_noise, wordings]
+
+
+def _is_perturbable(task: Task) -> bool:
+    world = resolve(task.world)
+    return bool(getattr(getattr(world, "vector_world", None) or world, "perturbable", False))
+
+
+def _moments(task: Task, perturbed: bool) -> Iterator[tuple[NDArray[Any], ...]]:
+    """Yield the steps of the fixed episodes: state, action, reward and success, and the last state alone."""
+    expert = resolve(task.expert)(task.name)
+    world = vector_world(task.world, 1, 1, perturbed)
+    space = world.single_action_space
+    generator = np.random.default_rng(0)
+    for seed in range(EPISODES):
+        state = world.reset([0], [seed], [task.name])[0].copy()
+        for step in range(task.horizon):
+            action = np.round(expert(state) * GRID) / GRID
+            if step % RANDOM == RANDOM - 1:
+                action = generator.uniform(space.low, space.high)
+            after, rewards, successes = world.step([0], action[None].astype(np.float32))
+            yield state, action, rewards, successes
+            state = after[0].copy()
+            if successes[0]:
+                break
+        yield (state,)
+    world.close()
+
+
+def main() -> None:
+    """Pin the definitions of the project's scenarios."""
+    found = {name: definition(load_scenario(name)) for name in scenario_ids()}
+    pinned_file().write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

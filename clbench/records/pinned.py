@@ -1,0 +1,40 @@
+"""The definitions of the project's scenarios, and the comparison of a record's definition with another."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import cache
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+from clbench.base.strict_json import read_json
+
+
+def pinned_file() -> Path:
+    """Return the path of the file with the definitions, by id of the scenario."""
+    envs = find_spec("clbench.envs")
+    assert envs is not None
+    assert envs.origin is not None
+    return Path(envs.origin).with_name("definitions.json")
+
+
+@cache
+def pinned() -> Mapping[str, Mapping[str, str]]:
+    """Return the definition of each scenario of the project, see `clbench.evaluation.definition`."""
+    return {**read_json(pinned_file())}
+
+
+def other_parts(recorded: Any, known: Mapping[str, str]) -> list[str]:
+    """Return the parts of the definition `known` that `recorded` defines otherwise.
+
+    Args:
+        recorded: `fingerprint["definition"]` of a record, which a stranger may have written. None in a record
+            that is older than definitions: it is not known to differ.
+        known: The definition to compare with. The names of all parts are from it.
+    """
+    if recorded is None:
+        return []
+    if not isinstance(recorded, dict) or recorded.keys() - known.keys():
+        return ["the tasks themselves"]
+    return [name for name, value in known.items() if recorded.get(name) != value]
