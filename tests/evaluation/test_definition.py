@@ -97,7 +97,8 @@ def test_a_definition_of_another_form_differs_as_a_whole() -> None:
     known = {"task left": "a", "questions": "b"}
     assert other_parts(None, known) == []  # an older record
     assert other_parts({"task left": "a"}, known) == ["questions"]
-    for strange in ([], "x", {"task left": "a", "questions": "b", "\x1b[2J": "c"}):
+    strangers: list[Any] = [[], "x", {"task left": "a", "questions": "b", "\x1b[2J": "c"}]
+    for strange in strangers:
         assert other_parts(strange, known) == ["the tasks themselves"]
 
 
