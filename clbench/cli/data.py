@@ -28,7 +28,7 @@ def demonstrations(scenario: str, /, *, workers: Annotated[int | None, whole_num
         scenario: Gymnasium id of the scenario.
         workers: Number of tasks to collect at once; all cores if not given.
     """
-    from clbench.data.demonstrations import dataset_folder, read_dataset
+    from clbench.data.demonstrations import dataset_folder, dataset_id, read_dataset
     from clbench.jobs.plan import Plan
     from clbench.jobs.processes import Processes
     from clbench.jobs.scheduler import run_with_bars
@@ -48,7 +48,7 @@ def demonstrations(scenario: str, /, *, workers: Annotated[int | None, whole_num
         episodes = read_dataset(dataset_folder(task, loaded.budget))
         lengths = [len(episode.executed) for episode in episodes]
         table.add_row(
-            task.dataset_id,
+            dataset_id(task, loaded.budget),
             loaded.group(task.name),
             str(len(episodes)),
             str(sum(bool(episode.noisy.any()) for episode in episodes)),

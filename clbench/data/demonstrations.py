@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import json
+import uuid
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
@@ -17,7 +18,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from clbench.base.cache import cached
+from clbench.base.cache import cached, hash_of
 from clbench.base.dependencies import versions
 from clbench.base.entry_points import resolve
 from clbench.base.progress import ProgressCallback, no_progress
@@ -143,10 +144,30 @@ def _collect(world: World, task: Task, budget: Budget, progress: ProgressCallbac
     )
 
 
+def dataset_id(task: Task, budget: Budget) -> str:
+    """Return the id of the task's Minari dataset. It has a hash of all that made the demonstrations.
+
+    Two versions of a task, or two budgets, therefore never share a folder.
+    """
+    namespace, _, name = task.dataset_id.rpartition("/")
+    return f"{namespace}/{hash_of(_inputs(task, budget))}/{name}"
+
+
+def _inputs(task: Task, budget: Budget) -> dict[str, Any]:
+    return {
+        "task": dataclasses.asdict(task),
+        "demonstrations": budget.demonstrations,
+        "noisy_demonstrations": budget.noisy_demonstrations,
+        "source": source_hash(*DATA_SOURCES, *packages_of([task], "world", "expert")),
+        "versions": simulator_versions([task]),
+    }
+
+
 def dataset_folder(task: Task, budget: Budget, progress: ProgressCallback = no_progress) -> Path:
     """Return the folder of the task's Minari dataset, which is collected on first use.
 
-    The folder is where Minari keeps its datasets, so that `minari.load_dataset(task.dataset_id)` finds it.
+    The folder is where Minari keeps its datasets, so that `minari.load_dataset(dataset_id(task, budget))`
+    finds it.
 
     Args:
         task: Task of the demonstrations.
@@ -155,21 +176,15 @@ def dataset_folder(task: Task, budget: Budget, progress: ProgressCallback = no_p
     """
     from minari.storage.datasets_root_dir import get_dataset_path
 
-    inputs = {
-        "task": dataclasses.asdict(task),
-        "demonstrations": budget.demonstrations,
-        "noisy_demonstrations": budget.noisy_demonstrations,
-        "source": source_hash(*DATA_SOURCES, *packages_of([task], "world", "expert")),
-        "versions": simulator_versions([task]),
-    }
-    folder = get_dataset_path(task.dataset_id)
-    _declare_namespaces(folder, task.dataset_id)
+    name = dataset_id(task, budget)
+    folder = get_dataset_path(name)
+    _declare_namespaces(folder, name)
 
     def make(partial: Path) -> None:
         with contextlib.closing(_world(task)) as world:
-            _write(partial / "data", task, world, _collect(world, task, budget, progress))
+            _write(partial / "data", name, task, world, _collect(world, task, budget, progress))
 
-    return cached(folder, inputs, make)
+    return cached(folder, _inputs(task, budget), make)
 
 
 def _declare_namespaces(folder: Path, dataset_id: str) -> None:
@@ -180,10 +195,14 @@ def _declare_namespaces(folder: Path, dataset_id: str) -> None:
         namespace.mkdir(parents=True, exist_ok=True)
         path = namespace / "namespace_metadata.json"
         if not path.exists():
-            path.write_text(json.dumps({"description": "Expert demonstrations of clbench"}), encoding="utf-8")
+            partial = path.with_name(f".{path.name}.{uuid.uuid4().hex}.partial")
+            partial.write_text(
+                json.dumps({"description": "Expert demonstrations of clbench"}), encoding="utf-8"
+            )
+            partial.replace(path)  # written in place, it would stay empty after a full disk
 
 
-def _write(folder: Path, task: Task, world: World, episodes: Sequence[Demonstration]) -> None:
+def _write(folder: Path, name: str, task: Task, world: World, episodes: Sequence[Demonstration]) -> None:
     """Write episodes as a Minari dataset: the executed actions as actions, the expert's among the infos."""
     from minari.data_collector import EpisodeBuffer
     from minari.dataset.minari_storage import MinariStorage
@@ -205,7 +224,7 @@ def _write(folder: Path, task: Task, world: World, episodes: Sequence[Demonstrat
         )
     storage.update_metadata(
         {
-            "dataset_id": task.dataset_id,
+            "dataset_id": name,
             "minari_version": version("minari"),
             "algorithm_name": f"expert {task.expert}",
             "description": f"{task.instructions[0]} (horizon {task.horizon})",

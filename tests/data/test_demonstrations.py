@@ -1,5 +1,6 @@
 import dataclasses
 import logging
+import re
 from pathlib import Path
 
 import minari
@@ -13,6 +14,7 @@ from clbench.data.demonstrations import (
     Demonstrations,
     collect,
     dataset_folder,
+    dataset_id,
     demonstrate,
     read_dataset,
 )
@@ -36,7 +38,7 @@ def _same(first: list[Demonstration], second: list[Demonstration]) -> bool:
 
 def test_demonstrations_are_made_once_and_come_back_as_they_were(empty_caches: Path) -> None:
     folder = dataset_folder(TASK, BUDGET)
-    assert folder == empty_caches / "minari" / "clbench" / "toy" / "left-v0"
+    assert folder == empty_caches / "minari" / dataset_id(TASK, BUDGET)
     written = (folder / "data" / "main_data.hdf5").stat().st_mtime_ns
     assert dataset_folder(TASK, BUDGET) == folder
     assert (folder / "data" / "main_data.hdf5").stat().st_mtime_ns == written
@@ -45,12 +47,27 @@ def test_demonstrations_are_made_once_and_come_back_as_they_were(empty_caches: P
 
 def test_others_read_them_with_minari(empty_caches: Path) -> None:
     dataset_folder(TASK, BUDGET)
-    assert list(minari.list_local_datasets()) == ["clbench/toy/left-v0"]
-    dataset = minari.load_dataset("clbench/toy/left-v0")
+    name = dataset_id(TASK, BUDGET)
+    assert re.fullmatch(r"clbench/toy/[0-9a-f]{16}/left-v0", name)
+    assert list(minari.list_local_datasets()) == [name]
+    dataset = minari.load_dataset(name)
     assert dataset.total_episodes == 5
     episode = dataset[0]
     assert episode.observations.shape[0] == len(episode.actions) + 1 == len(episode.infos["expert_action"])
     assert episode.terminations[-1]
+
+
+def test_two_budgets_or_versions_never_share_a_folder(empty_caches: Path) -> None:
+    others = (
+        (TASK, dataclasses.replace(BUDGET, demonstrations=3)),
+        (dataclasses.replace(TASK, horizon=TASK.horizon - 1), BUDGET),
+    )
+    first = dataset_folder(TASK, BUDGET)
+    written = (first / "data" / "main_data.hdf5").stat().st_mtime_ns
+    assert len({first, *(dataset_folder(task, budget) for task, budget in others)}) == 3
+    assert [len(read_dataset(dataset_folder(*one))) for one in ((TASK, BUDGET), *others)] == [5, 3, 5]
+    assert (first / "data" / "main_data.hdf5").stat().st_mtime_ns == written
+    assert not list((empty_caches / "minari").rglob("*.partial"))
 
 
 def test_a_torn_dataset_is_named_and_made_again(empty_caches: Path, caplog: pytest.LogCaptureFixture) -> None:
