@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import secrets
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -13,7 +13,7 @@ from rich.text import Text
 
 from clbench.base.entry_points import unknown
 from clbench.base.errors import InputError
-from clbench.cli.arguments import add_cwd_to_path, checked_input, whole_number
+from clbench.cli.arguments import add_cwd_to_path, check_folders, checked_input, data_folders, whole_number
 from clbench.records.paths import RECORDS, record_path
 
 from .board.places import CONTROLS, SCENARIO, STEP_TIME
@@ -44,9 +44,9 @@ def show(*, records: Path = RECORDS) -> None:
         Console(stderr=True, soft_wrap=True).print(Text(message))
         raise SystemExit(2)
     table = read_table(records)
-    console = _console()
-    console.print(terminal(table))
-    _write_table(console, table, records)
+    written = _write_table(table, records)
+    _console().print(terminal(table))
+    _print_written(written)
 
 
 def submit(
@@ -85,12 +85,13 @@ def submit(
     with checked_input():
         numbers = range(first_seed, first_seed + seeds)
         runs = [RunSpec(scenario, method, seed, order=order).resolve() for seed in numbers]
+        check_folders(records=records, **data_folders())
         went_well = run_submission(runs, records, workers)
     if records.is_dir():
-        table, console = read_table(records), _console()
-        _write_table(console, table, records)
+        table = read_table(records)
+        _print_written(_write_table(table, records))
         lines = placement(table, runs[0].scenario.id, method, records)
-        console.print(Text("\n".join(lines)), soft_wrap=True)
+        _console().print(Text("\n".join(lines)), soft_wrap=True)
     if not went_well:
         raise SystemExit(1)
 
@@ -131,7 +132,7 @@ def verify(
     with checked_input():
         if tier not in TIERS[1:]:
             raise unknown("tier", tier, TIERS[1:])
-        found = _found(paths, records)
+        found, records = _placed(_found(paths, records), records)
     seed = secrets.randbits(48) if seed is None else seed
     request = Request(tier, episodes, seed, method, scenario, checkpoints)
     if not run_verifications(found, records, request, workers):
@@ -146,6 +147,25 @@ def _found(paths: Sequence[Path], records: Path) -> list[Path]:
         what = f"There is no record at {absent[0]}." if absent else "There is no record to verify."
         raise InputError(f"{what} Give paths, for example {record_path(records, SCENARIO, 'sft', 0)}.")
     return found
+
+
+def _placed(found: list[Path], records: Path) -> tuple[list[Path], Path]:
+    """Return the records and their folder in one form, as typed or absolute.
+
+    Raises:
+        InputError: A record is not below the folder.
+    """
+    if all(path.is_relative_to(records) for path in found):
+        return found, records
+    folder = Path(os.path.abspath(records))
+    absolute = [Path(os.path.abspath(path)) for path in found]
+    for path in absolute:
+        if not path.is_relative_to(folder):
+            raise InputError(
+                f"{path} is not below {folder}: name its folder of records, in which it is "
+                "SCENARIO/METHOD/seed-N.json, with --records."
+            )
+    return absolute, folder
 
 
 def claims(
@@ -172,7 +192,7 @@ def claims(
     judged = judge_all(lambda name: read_evidence(name, records, controls, step_time), scenario)
     console = _console()
     console.print(terminal(judged))
-    _write(console, output, page(judged))
+    _write(output, page(judged))
 
 
 def method_pages(
@@ -247,7 +267,7 @@ def scenario_card(
         experts = make_missing(scenario, home, episodes, drawing=fault is None, console=console)
         drawn = {task.name for task in scenario.tasks if picture_path(home, task).is_file()}
         card = Card(scenario, board, experts, frozenset(drawn))
-        _write(_console(), output / f"{home.name}.md", card.page())
+        _write(output / f"{home.name}.md", card.page())
 
 
 def _table(records: Path) -> Table:
@@ -257,10 +277,11 @@ def _table(records: Path) -> Table:
     return read_table(records) if records.is_dir() else Table({}, (), ())
 
 
-def _write_table(console: Console, table: Table, records: Path) -> None:
-    """Write every form of the table to the folder `site` next to the records."""
+def _write_table(table: Table, records: Path) -> list[Path]:
+    """Write every form of the table to the folder `site` next to the records, and return the paths."""
     from .views import page as web_page
     from .views.csv import csv_text
+    from .views.format import write_all
     from .views.markdown import markdown
 
     folder = Path(os.path.normpath(records / "../site"))
@@ -270,8 +291,7 @@ def _write_table(console: Console, table: Table, records: Path) -> None:
         "index.html": web_page.page(table),
         **web_page.pictures(table),
     }
-    for name, text in texts.items():
-        _write(console, folder / name, text)
+    return write_all({folder / name: text for name, text in texts.items()})
 
 
 def _console() -> Console:
@@ -279,9 +299,13 @@ def _console() -> Console:
     return console if console.width >= WIDTH else Console(width=WIDTH)
 
 
-def _write(console: Console, path: Path, text: str) -> None:
-    from .views.format import write_if_changed
+def _write(path: Path, text: str) -> None:
+    from .views.format import write_all
 
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_if_changed(path, text)
-    console.print(Text(f"Written: {path}"), soft_wrap=True)
+    _print_written(write_all({path: text}))
+
+
+def _print_written(paths: Iterable[Path]) -> None:
+    console = _console()
+    for path in paths:
+        console.print(Text(f"Written: {path}"), soft_wrap=True)

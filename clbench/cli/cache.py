@@ -23,7 +23,7 @@ from safetensors import SafetensorError, safe_open
 
 from clbench.base.cache import cache_folder, hash_of
 from clbench.base.errors import InputError
-from clbench.cli.arguments import checked_input, whole_number
+from clbench.cli.arguments import checked_input, minari_folder, whole_number
 from clbench.records.reader import RecordError, read_record
 
 DEMONSTRATIONS = "demonstrations"
@@ -329,11 +329,6 @@ def find_stale(found: Iterable[Entry], days: int, now: float) -> dict[Entry, str
         elif newer is not None and newer.origin != entry.origin and entry.used < newer.made:
             stale[entry] = f"replaced by {newer.path.name}, which newer code made"
     return stale
-
-
-def minari_folder() -> Path:
-    """Return the folder of all Minari datasets."""
-    return Path(os.environ.get("MINARI_DATASETS_PATH") or "~/.minari/datasets").expanduser()
 
 
 def _table(found: Sequence[Entry], stale: Mapping[Entry, str], now: float) -> Table:

@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.table import Table
 
 from clbench.base.errors import InputError
-from clbench.cli.arguments import add_cwd_to_path, checked_input, whole_number
+from clbench.cli.arguments import add_cwd_to_path, check_folders, checked_input, data_folders, whole_number
 
 if TYPE_CHECKING:
     from clbench.data.expert_rates import Measurement
@@ -37,6 +37,7 @@ def demonstrations(scenario: str, /, *, workers: Annotated[int | None, whole_num
     add_cwd_to_path()
     with checked_input():
         loaded = load_scenario(scenario)
+        check_folders(**data_folders())
     plan = Plan()
     plan.add_demonstrations(scenario, loaded, loaded.tasks)
     if run_with_bars(plan.jobs, Processes(workers)):

@@ -50,7 +50,7 @@ def _machine() -> Table:
     import torch
 
     from clbench.base.cache import cache_folder
-    from clbench.cli.cache import minari_folder
+    from clbench.cli.arguments import minari_folder
     from clbench.worlds.gl_backend import DEBIAN_PACKAGES, rendering_fault
 
     table = Table(title="Machine", show_header=False)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import io
 import os
 import signal
 import sys
@@ -22,6 +23,9 @@ def main() -> None:
     is nothing to clean up: the process ends at once.
     """
     _end_at_once_when_stopped()
+    for stream in (sys.stdout, sys.stderr):  # a terminal may lack a sign, such as that of plus and minus
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")
     from clbench.cli.main import main as run_command  # takes 0.1 s, in which Ctrl-C must not show a traceback
 
     try:

@@ -12,7 +12,7 @@ from cyclopts import Parameter
 from rich.console import Console
 
 from clbench.base.errors import InputError
-from clbench.cli.arguments import add_cwd_to_path, checked_input, whole_number
+from clbench.cli.arguments import add_cwd_to_path, check_folders, checked_input, data_folders, whole_number
 from clbench.records.paths import RECORDS
 
 if TYPE_CHECKING:
@@ -157,6 +157,7 @@ def run_missing(
     begin = time.monotonic()
     plan = Plan()
     with checked_input():  # refuses a scenario with a camera on a machine that cannot render
+        check_folders(records=records, checkpoints=checkpoints, tensorboard=tensorboard, **data_folders())
         for one in missing:
             plan.add_run(one, records, checkpoints=checkpoints, tensorboard=tensorboard)
         for one in bare:
@@ -164,7 +165,9 @@ def run_missing(
     failed = run_with_bars(plan.jobs, workers(), console)
     seconds = time.monotonic() - begin
     done = f"{len(missing)} runs" + (f" and the policies of {len(bare)}" if bare else "")
-    console.print(f"{done} in {seconds / 60:.1f} minutes; records in {records}.", highlight=False)
+    console.print(
+        f"{done} in {seconds / 60:.1f} minutes; records in {records}.", highlight=False, markup=False
+    )
     if failed:
         names = ", ".join(map(str, failed))
         console.print(f"{len(failed)} failed: {names}.", style="bold red", highlight=False, markup=False)

@@ -45,6 +45,7 @@ def run_submission(runs: Sequence[ResolvedRun], records: Path, workers: int | No
     console.print(
         f"{counted(len(missing), 'run')} in {seconds / 60:.1f} minutes; records in {records}.",
         highlight=False,
+        markup=False,
     )
     return not failed
 

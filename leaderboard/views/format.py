@@ -5,8 +5,8 @@ The same rows give the same bytes: no date, no absolute path, fixed digits.
 
 from __future__ import annotations
 
-import os
-from collections.abc import Iterable, Sequence
+import uuid
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeAlias
@@ -203,9 +203,26 @@ def scaled(count: float) -> tuple[str, str]:
 
 def write_if_changed(path: Path, text: str) -> None:
     """Write `text` to `path` in one step, unless the file has this text already."""
-    content = text.encode("utf-8")
-    if path.is_file() and path.read_bytes() == content:
-        return
-    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
-    partial.write_bytes(content)
-    os.replace(partial, path)
+    write_all({path: text})
+
+
+def write_all(texts: Mapping[Path, str]) -> list[Path]:
+    """Write the texts to their paths, all or none, except those that are there already; return the paths.
+
+    Nothing is replaced before everything is written beside its place: a full disk leaves the old files.
+    """
+    partials: dict[Path, Path] = {}
+    try:
+        for path, text in texts.items():
+            content = text.encode("utf-8")
+            if path.is_file() and path.read_bytes() == content:
+                continue
+            path.parent.mkdir(parents=True, exist_ok=True)
+            partials[path] = path.with_name(f".{path.name}.{uuid.uuid4().hex}.partial")
+            partials[path].write_bytes(content)
+        for path, partial in partials.items():
+            partial.replace(path)
+    finally:
+        for partial in partials.values():
+            partial.unlink(missing_ok=True)
+    return list(texts)

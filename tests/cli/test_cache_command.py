@@ -10,7 +10,8 @@ import pytest
 from safetensors.numpy import save_file
 
 from clbench.base.cache import cache_folder, cached, hash_of
-from clbench.cli.cache import entries, find_stale, minari_folder
+from clbench.cli.arguments import minari_folder
+from clbench.cli.cache import entries, find_stale
 from clbench.cli.main import app
 from clbench.records.record import Record
 from clbench.records.writer import record_text

@@ -1,5 +1,6 @@
 """Ctrl-C at any moment of a command: exit code 130 and no traceback."""
 
+import os
 import random
 import signal
 import subprocess
@@ -119,3 +120,11 @@ def test_a_bug_shows_its_traceback() -> None:
     code, _, err = _exit_code(process)
     assert code == 1
     assert err.rstrip().endswith("KeyError: 'key'")
+
+
+def test_a_terminal_without_a_sign_gets_another_and_no_traceback() -> None:
+    program = f"import clbench.cli.main as m, sys; m.main = lambda: print('0.5 \\u00b1 0.1'); {RUN}"
+    environment = {**os.environ, "PYTHONIOENCODING": "ascii"}
+    command = [sys.executable, "-c", program]
+    found = subprocess.run(command, capture_output=True, text=True, check=True, env=environment)
+    assert found.stdout == "0.5 ? 0.1\n"

@@ -141,6 +141,39 @@ def test_the_shards_of_a_command_do_each_of_its_runs_once(
     assert {len(part) for part in parts} == {3, 4}
 
 
+@pytest.mark.parametrize("option", ["--records", "--checkpoints", "CLBENCH_CACHE", "MINARI_DATASETS_PATH"])
+def test_a_folder_that_cannot_be_written_to_is_named_before_work_begins(
+    option: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("clbench.jobs.scheduler.run_with_bars", lambda *_: pytest.fail("work began"))
+    file = tmp_path / "a file"
+    file.write_text("precious")
+    before = sorted(tmp_path.iterdir())
+    arguments = ["run", TOY, "sft", "--seeds", "1"]
+    if option.startswith("--"):
+        arguments += [option, str(file)]
+    else:
+        monkeypatch.setenv(option, str(file))
+    with pytest.raises(SystemExit) as stopped:
+        app(arguments, result_action="return_value")
+    assert stopped.value.code == 2
+    message = " ".join(capsys.readouterr().err.split())
+    assert f"error: {option} {file} cannot be written to: Not a directory." in message
+    assert file.read_text() == "precious"
+    assert sorted(tmp_path.iterdir()) == before
+
+
+def test_a_folder_with_markup_in_its_name_is_shown_as_it_is(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("COLUMNS", "200")
+    monkeypatch.setattr("clbench.jobs.scheduler.run_with_bars", lambda *_: {})
+    records = tmp_path / "[" / "red]x"
+    app(["run", TOY, "sft", "--seeds", "1", "--records", str(records)], result_action="return_value")
+    assert f"records in {records}." in capsys.readouterr().err.replace("\n", "")
+
+
 def test_help_shows_every_command_with_its_summary_and_imports_none() -> None:
     program = "import sys; from clbench.cli.main import app; app('--help', result_action='return_value')"
     command = [sys.executable, "-c", f"{program}; print({{'clbench.cli.runs', 'torch'}} & set(sys.modules))"]

@@ -1,5 +1,6 @@
 """The command `clbench leaderboard`: the same records give the same files."""
 
+import errno
 import os
 from collections.abc import Callable
 from pathlib import Path
@@ -48,6 +49,27 @@ def test_a_folder_without_rows_lists_why(tmp_path: Path, capsys: pytest.CaptureF
     assert "torn.json: cannot be read as JSON" in capsys.readouterr().out
     assert load(tmp_path / "records").empty
     assert "retention_low" in load(tmp_path / "records")
+
+
+def test_a_full_disk_leaves_every_file_of_the_board_as_it_was(
+    four_methods: Path, shown: Callable[[], tuple[str, str]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shown()
+    site = four_methods.parent / "site"
+    before = {path.name: path.read_bytes() for path in site.iterdir()}
+    next(four_methods.rglob("seed-1.json")).unlink()
+    write, written = Path.write_bytes, []
+
+    def fill(path: Path, content: bytes) -> int:
+        written.append(path)
+        if len(written) == 2:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return write(path, content)
+
+    monkeypatch.setattr(Path, "write_bytes", fill)
+    with pytest.raises(OSError, match="No space left"):
+        shown()
+    assert {path.name: path.read_bytes() for path in site.iterdir()} == before
 
 
 @pytest.mark.parametrize("exists", [True, False])

@@ -325,6 +325,7 @@ def test_the_command_lists_its_checks(mine: Path, honest: Path, capsys: pytest.C
         ({"tier": "replay"}, "Did you mean 'replayed'?"),
         ({"paths": ["nowhere.json"]}, "There is no record at nowhere.json"),
         ({"paths": []}, "There is no record to verify"),
+        ({"records": Path("elsewhere/records")}, "elsewhere/records: name its folder of records"),
     ],
 )
 def test_a_wrong_word_on_the_command_line_is_named(
