@@ -175,8 +175,12 @@ def stays_sparse(evidence: Evidence) -> Finding:
             "A measure of sparsity that responds to the step size.",
             about=ARMS,
         )
+    responds = response.high >= 0.05  # not known without the ladder
     return Finding(
-        decided(holds=figures[0].low > 0.05, fails=all(one.high < 0.05 for one in both)),
+        decided(
+            holds=responds and figures[0].low > 0.05,
+            fails=responds and all(one.high < 0.05 for one in both),
+        ),
         figures,
         (response,),
         (),

@@ -131,6 +131,12 @@ CASES: list[tuple[str, str, Given]] = [
             "consft": {"sparsity": 0.5},
         },
     ),
+    # without the ladder it is not known whether the measure responds
+    (
+        "C4",
+        "undecided",
+        {"sft": {"sparsity": 0.3}, "consft": {"sparsity": 0.3}, "consft_calibrated": {"sparsity": 0.3}},
+    ),
     ("C4", "undecided", {"sft": {"sparsity": 0.3, "seeds": 1}, "consft": {"sparsity": 0.9, "seeds": 1}}),
     ("C6", "does not hold", {"sft": {}, "consft": {"costs": {"bytes_kept": 8}}}),
     ("C6", "undecided", {"sft": {}, "consft": {}}),
