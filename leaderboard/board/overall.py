@@ -22,7 +22,7 @@ class OverallRow:
     division: str
     """One of `DIVISIONS`."""
     groups: tuple[str | None, ...]
-    """Letters of its groups in the scenarios, sorted by the scenario's id."""
+    """Letters of its groups in the scenarios, in the order of the board."""
     estimates: Mapping[str, Estimate]
     """Mean over scenarios and interval of every metric."""
     to_criterion: bool
@@ -50,7 +50,7 @@ def _place(row: OverallRow) -> tuple[int, float, str]:
 
 
 def _overall_row(found: Mapping[str, Row]) -> OverallRow:
-    rows = [row for _, row in sorted(found.items())]
+    rows = list(found.values())
     estimates = {name: mean_estimate([row.estimates[name] for row in rows]) for name in METRICS}
     return OverallRow(
         rows[0].method,

@@ -128,7 +128,7 @@ def prediction_text(rows: Iterable[Row]) -> str:
         return ""
     parts = [
         f"{one.predictor} {format_interval(Estimate(one.tau, one.low, one.high))}"
-        + ("" if one.low > 0 else ", which cannot be told from chance")
+        + (", the other way round" if one.high < 0 else "" if one.low > 0 else ", which may be chance")
         for one in found
     ]
     return (

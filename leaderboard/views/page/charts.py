@@ -289,12 +289,12 @@ def along_a_run(targets: Sequence[str], steps: int | None) -> Spec:
     parameter `shown` lists the series that have points.
 
     Args:
-        targets: Names of the targets in order.
+        targets: Titles of the stages.
         steps: Optimiser steps of a stage; None if a stage ends when its target is learned, and is one wide.
     """
     width = steps or 1
     stages = [
-        {"begin": number * width, "end": (number + 1) * width, "name": f"{number + 1} {name}"}
+        {"begin": number * width, "end": (number + 1) * width, "name": name}
         for number, name in enumerate(targets)
     ]
     count = max(len(targets), 1)

@@ -192,6 +192,8 @@ def _scenario_data(one: ScenarioView) -> dict[str, Any]:
     if one.frontier:
         frontiers["wide_frontier"] = frontier(one.frontier, WIDE_FRONTIER)
         frontiers["narrow_frontier"] = frontier(one.frontier, NARROW_FRONTIER)
+    names = one.tasks["target"]
+    titles = names if one.balanced else [f"{number} {name}" for number, name in enumerate(names, 1)]
     steps = (1,) if one.to_criterion else one.steps
     return {
         **frontiers,
@@ -200,7 +202,7 @@ def _scenario_data(one: ScenarioView) -> dict[str, Any]:
         "sft": anchors.get("sft"),
         "steps": steps,
         "targets": one.tasks["target"],
-        "run": along_a_run(one.tasks["target"], None if one.to_criterion else one.steps[-1]),
+        "run": along_a_run(titles, None if one.to_criterion else one.steps[-1]),
         "wide": plane(rows, WIDE, anchors),
         "narrow": plane(rows, NARROW, anchors),
     }

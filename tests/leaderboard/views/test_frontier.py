@@ -18,6 +18,7 @@ SCENARIO = "clbench/Even-v1"
 page = resolve("clbench.leaderboard.views.page:page")
 pictures = resolve("clbench.leaderboard.views.page:pictures")
 markdown = resolve("clbench.leaderboard.views.markdown:markdown")
+overall = resolve("clbench.leaderboard.board.overall:overall")
 read_table = resolve("clbench.leaderboard.board.rows:read_table")
 show = resolve("clbench.leaderboard.cli:show")
 
@@ -74,7 +75,11 @@ def test_scenarios_with_a_criterion_come_first(records: Path, make_record: Calla
     path.write_text(
         record_text(make_record([[1, 0], [1, 1]], scenario=fixed, groups=(1, 1, 0))), encoding="utf-8"
     )
-    assert list(dict.fromkeys(row.scenario for row in read_table(records).rows)) == [SCENARIO, fixed]
+    rows = read_table(records).rows
+    assert list(dict.fromkeys(row.scenario for row in rows)) == [SCENARIO, fixed]
+    (whole,) = overall(rows)
+    assert whole.groups == tuple(row.groups for row in rows if row.method == "sft") == ("c", "a")
+    assert f"Means over {SCENARIO}, {fixed}, for methods" in markdown(read_table(records))
 
 
 def test_a_scenario_with_a_criterion_has_its_own_columns(records: Path) -> None:
