@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
-from clbench.base.errors import ClbenchError
+from clbench.base.errors import ClbenchError, InputError
 from clbench.base.progress import ProgressCallback, no_progress
 from clbench.data.questions import load_questions, scored_questions
 from clbench.evaluation.answers import answer
@@ -41,7 +41,7 @@ from clbench.runs.checkpoints import kept_stages, load_stages, stage_policies
 from clbench.runs.fingerprint import fingerprint
 from clbench.runs.length import run_length
 from clbench.runs.run import execute, pretrained_hash
-from clbench.runs.spec import ResolvedRun, RunSpec
+from clbench.runs.spec import ResolvedRun, RunSpec, check_device
 from clbench.scoring.metrics import measure
 from clbench.scoring.reading import read_protocol
 from clbench.spec.protocol import Point, Protocol
@@ -277,6 +277,10 @@ def _replay(subject: _Subject, progress: ProgressCallback) -> list[Check]:
     if not subject.may_import:
         result = f"{run.method} is not installed: name it with --method to import and run its code"
         return [Check("policies", result, False)]
+    try:
+        check_device(spec.device)
+    except InputError as error:  # the rest needs the device of the run
+        return [Check("policies", str(error), False)]
     kept = kept_stages(subject.resolved, subject.request.checkpoints)
     if kept is None:
         _, folder = pretrained_policy(subject.scenario, spec.seed)

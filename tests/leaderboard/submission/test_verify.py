@@ -307,6 +307,12 @@ def test_a_module_that_a_record_names_is_not_imported_unless_the_verifier_allows
     assert (tmp_path / "ran").exists()
 
 
+def test_a_run_on_a_device_that_is_missing_here_is_recomputed_and_no_more(mine: Path, honest: Path) -> None:
+    edit(mine, lambda values: values["run"].update(device="cuda:9"))
+    assert "policies: The device 'cuda:9' cannot be used" in failures(verify(mine, "retrained", honest))
+    assert tiers.tier_of(mine) == "recomputed"
+
+
 def test_the_command_lists_its_checks(mine: Path, honest: Path, capsys: pytest.CaptureFixture[str]) -> None:
     command = importlib.import_module("clbench.leaderboard.cli").verify
     records = next(folder for folder in mine.parents if folder.name == "records")
