@@ -80,7 +80,12 @@ def cached(folder: Path, inputs: Mapping[str, Any], make: Callable[[Path], None]
 
 def is_cached(folder: Path, inputs: Mapping[str, Any]) -> bool:
     """Return whether `folder` is whole and was made from `inputs`."""
-    return _fault(folder, hash_of(inputs)) is None
+    return fault_of(folder, inputs) is None
+
+
+def fault_of(folder: Path, inputs: Mapping[str, Any]) -> str | None:
+    """Return why `folder` cannot serve as the result of `inputs`, as the end of a sentence, or None."""
+    return _fault(folder, hash_of(inputs))
 
 
 def _fault(folder: Path, key: str) -> str | None:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+import logging
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from torch import Tensor
 
-from clbench.base.cache import cache_folder, cached, hash_of, is_cached
+from clbench.base.cache import cache_folder, cached, fault_of, hash_of, is_cached
 from clbench.base.dependencies import versions
 from clbench.base.entry_points import resolve
 from clbench.base.progress import ProgressCallback, no_progress
@@ -26,6 +27,8 @@ from clbench.spec.scenario import Scenario
 from clbench.spec.task import packages_of
 from clbench.worlds.camera import load_camera
 from clbench.worlds.observation import Observer, frame_hash
+
+LOG = logging.getLogger("clbench")
 
 SHIPPED = Path(__file__).parents[1] / "pretrained"
 """Folder of the policies that ship with the package."""
@@ -100,11 +103,14 @@ def pretrained_policy(
         progress: Called with the number of steps done since its last call.
     """
     inputs = pretraining_inputs(scenario, seed)
-    folder = cached(
-        _folder(scenario, seed, inputs),
-        inputs,
-        lambda partial: save_policy(_pretrain(scenario, seed, progress), partial),
-    )
+    shipped = shipped_folder(scenario, seed)
+
+    def make(partial: Path) -> None:
+        if shipped.exists():
+            LOG.warning("%s %s: pretraining the policy again.", shipped, fault_of(shipped, inputs))
+        save_policy(_pretrain(scenario, seed, progress), partial)
+
+    folder = cached(_folder(scenario, seed, inputs), inputs, make)
     return load_policy(folder), folder
 
 

@@ -1,4 +1,5 @@
 import json
+import logging
 import shutil
 from pathlib import Path
 
@@ -10,6 +11,7 @@ from clbench.learning.pretraining import (
     SHIPPED,
     is_pretrained,
     pretrained_folder,
+    pretrained_policy,
     pretraining_inputs,
     shipped_folder,
 )
@@ -46,9 +48,20 @@ def test_other_seeds_are_pretrained_in_the_cache() -> None:
     assert pretrained_folder(FETCH, 1).parent == cache_folder() / "pretrained"
 
 
-def test_a_torn_shipped_policy_is_not_used(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_torn_shipped_policy_is_not_used_and_the_log_says_why(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
     torn = Path(shutil.copytree(SHIPS, tmp_path / SHIPS.name))
     weights = torn / "policy.safetensors"
     weights.write_bytes(weights.read_bytes()[:-1])
     monkeypatch.setattr("clbench.learning.pretraining.SHIPPED", tmp_path)
     assert pretrained_folder(FETCH, 0).parent == cache_folder() / "pretrained"
+
+    def stop(*_: object) -> None:
+        raise RuntimeError("pretraining began")
+
+    monkeypatch.setattr("clbench.learning.pretraining._pretrain", stop)
+    monkeypatch.setenv("CLBENCH_CACHE", str(tmp_path / "cache"))
+    with pytest.raises(RuntimeError, match="pretraining began"), caplog.at_level(logging.WARNING):
+        pretrained_policy(FETCH, 0)
+    assert f"{torn} is torn: its files are not those that were written: pretraining" in caplog.text
