@@ -1,6 +1,7 @@
 """The command line as people type it; some tests need a process of their own."""
 
 import json
+import re
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -221,7 +222,7 @@ def test_doctor_shows_versions_and_rendering() -> None:
 def test_demonstrations_are_collected_and_shown(empty_caches: Path) -> None:
     result = _clbench("demonstrations", TOY)
     assert result.returncode == 0, result.stderr
-    assert "clbench/toy/left-v0" in result.stdout
+    assert re.search(r"clbench/toy/[0-9a-f]{16}/left-v0 ", result.stdout)
     assert "demonstrations left: 10 episodes" in result.stderr
 
 
