@@ -2,15 +2,23 @@
 
 from __future__ import annotations
 
+import glob
 import hashlib
 import json
 import logging
 import os
 import shutil
 import uuid
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+from safetensors import SafetensorError
+
+from clbench.base.errors import ClbenchError
+from clbench.base.lease import Lease
+from clbench.base.leftovers import finished_name, is_unfinished
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -19,6 +27,10 @@ if TYPE_CHECKING:
 LOG = logging.getLogger("clbench")
 
 _MANIFEST = "clbench.json"
+
+
+class CacheError(ClbenchError, OSError):
+    """The file system refused to keep a result: the disk is full, or the folder may not be written."""
 
 
 def cache_folder() -> Path:
@@ -46,36 +58,65 @@ def cached(folder: Path, inputs: Mapping[str, Any], make: Callable[[Path], None]
     """Return `folder`, filled by `make` unless it already holds the result of the same `inputs`.
 
     A folder that is torn, foreign or made from other inputs is named in the log and made again. The new one
-    appears in one step, so that a reader, or a second maker, never meets half of it.
+    appears in one step, so that a reader never meets half of it. If another process is making it, this one
+    waits and uses its result.
 
     Args:
         folder: Folder of the result.
         inputs: All that the result depends on, as JSON.
         make: Fills an empty folder.
+
+    Raises:
+        CacheError: The file system refuses to keep the result.
     """
     key = hash_of(inputs)
-    fault = _fault(folder, key)
-    if fault is None:
+    if _fault(folder, key) is None:
         return folder
-    if folder.exists():
-        LOG.warning("%s %s; making it again.", folder, fault)
+    lease = Lease(folder)
+    with _explained(folder), lease.held():
+        _remove_unfinished(folder)
+        fault = _fault(folder, key)
+        if fault is not None:
+            if folder.exists():
+                LOG.warning("%s %s; making it again.", folder, fault)
+            _make(folder, {"inputs": key, "made_from": dict(inputs)}, make, lease)
+    return folder
+
+
+def _remove_unfinished(folder: Path) -> None:
+    """Remove what earlier makers of `folder` left when they were killed: this process has the lease now."""
+    for path in folder.parent.glob(f".{glob.escape(folder.name)}.*"):
+        if is_unfinished(path.name) and finished_name(path.name) == folder.name:
+            shutil.rmtree(path, ignore_errors=True)
+
+
+def _make(folder: Path, manifest: Mapping[str, Any], make: Callable[[Path], None], lease: Lease) -> None:
+    """Fill `folder` in one step; what is there is removed."""
     partial = folder.with_name(f".{folder.name}.{uuid.uuid4().hex}.partial")
-    partial.mkdir(parents=True)
+    partial.mkdir()
     try:
         make(partial)
-        manifest = {"inputs": key, "files": _file_hashes(partial), "made_from": dict(inputs)}
-        (partial / _MANIFEST).write_text(json.dumps(manifest, indent=1), encoding="utf-8")
-        if folder.exists() and _fault(folder, key) is not None:
+        text = json.dumps({**manifest, "files": _file_hashes(partial)}, indent=1)
+        (partial / _MANIFEST).write_text(text, encoding="utf-8")
+        lease.check()
+        if folder.exists():
             folder.rename(partial.with_suffix(".old"))
-        try:
-            partial.rename(folder)
-        except OSError:  # another process was faster: its result from the same inputs is as good
-            if _fault(folder, key) is not None:
-                raise
+        partial.rename(folder)
     finally:
         shutil.rmtree(partial, ignore_errors=True)
         shutil.rmtree(partial.with_suffix(".old"), ignore_errors=True)
-    return folder
+
+
+@contextmanager
+def _explained(folder: Path) -> Iterator[None]:
+    """Name what cannot be kept if the file system fails inside."""
+    try:
+        yield
+    except CacheError:  # of another result, which `make` needs
+        raise
+    except (OSError, SafetensorError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise CacheError(f"{folder} cannot be written: {reason}.") from error
 
 
 def is_cached(folder: Path, inputs: Mapping[str, Any]) -> bool:

@@ -42,6 +42,17 @@ def quoted(text: str) -> str:
     return repr(text) if len(text) <= 60 else f"{text[:60]!r}..."
 
 
+def printable(text: str) -> str:
+    """Return a stranger's text in one line, without characters that control a terminal."""
+    visible = (one if one.isprintable() else one.encode("unicode_escape").decode("ascii") for one in text)
+    return "".join(visible)
+
+
+def printable_lines(text: str) -> str:
+    """Return a stranger's text with its lines, but without characters that control a terminal."""
+    return "\n".join(map(printable, text.splitlines()))
+
+
 def read_json(path: Path) -> Any:
     """Return the JSON in the regular file at `path`.
 

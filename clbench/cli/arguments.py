@@ -17,6 +17,7 @@ from rich.text import Text
 from clbench.base.cache import cache_folder
 from clbench.base.entry_points import unknown
 from clbench.base.errors import ClbenchError, InputError
+from clbench.base.strict_json import printable
 
 
 def whole_number(least: int) -> Parameter:
@@ -26,7 +27,7 @@ def whole_number(least: int) -> Parameter:
 
 def error_line(message: object) -> Text:
     """Return an error message as one line."""
-    return Text(f"error: {' '.join(str(message).split())}", style="bold red")
+    return Text(f"error: {printable(' '.join(str(message).split()))}", style="bold red")
 
 
 def parsing_error(error: CycloptsError) -> Text:
@@ -63,7 +64,7 @@ def check_folders(**options: Path | None) -> None:
         if folder is None:
             continue
         there = next(one for one in (folder, *folder.absolute().parents) if os.path.lexists(one))
-        probe = there / f".{uuid.uuid4().hex}.partial"
+        probe = there / f".probe.{uuid.uuid4().hex}.partial"
         try:
             probe.touch()
             probe.unlink()

@@ -23,6 +23,7 @@ from safetensors import SafetensorError, safe_open
 
 from clbench.base.cache import cache_folder, hash_of
 from clbench.base.errors import InputError
+from clbench.base.leftovers import finished_name, is_left_behind, is_unfinished
 from clbench.cli.arguments import checked_input, minari_folder, whole_number
 from clbench.records.reader import RecordError, read_record
 
@@ -47,13 +48,10 @@ KINDS = {
 _MANIFEST = "clbench.json"
 _NAME = re.compile(r"(?:.*-)?[0-9a-f]{16}(?:\.\w+)?")
 """Names of entries: they end with a hash. Nothing else is shown or deleted."""
-_LEFTOVER = re.compile(r"\.(.+)\.[0-9a-f]{32}\.(?:partial|old)")
 _READ_HERE = ("ray", "experts")
 """Kinds without manifests: this command itself reads their files. A run or a training writes them again."""
 _CODE = ("source", "versions", "torch")
 _DAY = 24 * 60 * 60
-_LEFTOVER_DAYS = 7
-"""Days after which an unfinished entry counts as left behind: a process may fill it at its very end."""
 
 
 def cache(
@@ -65,10 +63,10 @@ def cache(
     """Show what the cache and the Minari datasets of clbench hold, and which entries are stale.
 
     An entry is stale if it has not been used for --older-than days, if newer code has made its replacement
-    since its last use, or if a killed process left it behind more than a week ago. The cache holds no
-    records, and everything in it can be made again. Files that clbench did not make are never deleted: an
-    entry that holds one is named, and left as it is. Where the file system does not note when a file is read,
-    an entry counts as used when it was made.
+    since its last use, or if a killed process left it behind. The cache holds no records, and everything in
+    it can be made again. Files that clbench did not make are never deleted: an entry that holds one is named,
+    and left as it is. Where the file system does not note when a file is read, an entry counts as used when
+    it was made.
 
     Args:
         prune: List the stale entries, and delete them.
@@ -165,7 +163,7 @@ class Entry:
     @property
     def is_leftover(self) -> bool:
         """Whether a process is filling it, or was killed while it did."""
-        return _LEFTOVER.fullmatch(self.path.name) is not None
+        return is_unfinished(self.path.name)
 
     @cached_property
     def origin(self) -> tuple[str, str] | None:
@@ -278,7 +276,7 @@ def _listed(manifest: Path) -> set[Path]:
 def _walk(folder: Path) -> Iterator[Path]:
     """Yield everything below a folder, except leftovers; what vanishes meanwhile is left out."""
     for place, folders, files in os.walk(folder):
-        folders[:] = [name for name in folders if not _LEFTOVER.fullmatch(name)]
+        folders[:] = [name for name in folders if not is_unfinished(name)]
         yield from (Path(place, name) for name in (*folders, *files))
 
 
@@ -287,10 +285,9 @@ def _leftovers(kind: str, folder: Path) -> Iterator[Entry]:
     for place, folders, _ in os.walk(folder):
         above = Path(place).relative_to(folder).parts
         for name in sorted(folders):
-            leftover = _LEFTOVER.fullmatch(name)
-            if leftover is None or Path(place, name).is_symlink():
+            if not is_unfinished(name) or Path(place, name).is_symlink():
                 continue
-            if kind == DEMONSTRATIONS or _NAME.fullmatch([*above, leftover[1]][0]):
+            if kind == DEMONSTRATIONS or _NAME.fullmatch([*above, finished_name(name)][0]):
                 yield Entry(kind, Path(place, name))
 
 
@@ -322,7 +319,7 @@ def find_stale(found: Iterable[Entry], days: int, now: float) -> dict[Entry, str
     for entry in found:
         newer = newest.get(entry.origin[0]) if entry.origin is not None else None
         if entry.is_leftover:
-            if now - entry.made > _LEFTOVER_DAYS * _DAY:
+            if is_left_behind(entry.path):
                 stale[entry] = "left behind by a killed process"
         elif now - entry.used > days * _DAY:
             stale[entry] = f"not used for {_days(now - entry.used)}"

@@ -12,6 +12,7 @@ from rich.console import Console
 from rich.logging import RichHandler
 
 import clbench
+from clbench.base.strict_json import printable_lines
 from clbench.cli.arguments import parsing_error
 
 if TYPE_CHECKING:
@@ -23,6 +24,7 @@ COMMANDS = {
     "list": "clbench.cli.catalogue:list_",
     "metrics": "clbench.cli.catalogue:metrics",
     "run": "clbench.cli.runs:run",
+    "status": "clbench.cli.status:status",
     "tune": "clbench.cli.tune:tune",
     "film": "clbench.cli.film:film",
     "new-method": "clbench.cli.new_method:new_method",
@@ -49,8 +51,15 @@ EXPERTS = {
 def main() -> None:
     """Run the command line."""
     handler = RichHandler(console=Console(stderr=True), show_time=False, show_path=False)
+    handler.addFilter(_made_printable)
     logging.basicConfig(level=logging.WARNING, format="%(message)s", handlers=[handler])
     app()
+
+
+def _made_printable(record: logging.LogRecord) -> bool:
+    """Rid a message of characters that control the terminal: it may quote a stranger's text."""
+    record.msg, record.args = printable_lines(record.getMessage()), ()
+    return True
 
 
 class _Summaries:

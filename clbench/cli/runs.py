@@ -5,19 +5,29 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 from rich.console import Console
 
+from clbench.base.cache import cache_folder
 from clbench.base.errors import InputError
-from clbench.cli.arguments import add_cwd_to_path, check_folders, checked_input, data_folders, whole_number
+from clbench.base.leftovers import sweep
+from clbench.cli.arguments import (
+    add_cwd_to_path,
+    check_folders,
+    checked_input,
+    data_folders,
+    minari_folder,
+    whole_number,
+)
 from clbench.records.paths import RECORDS
 
 if TYPE_CHECKING:
     from clbench.jobs.job import Workers
-    from clbench.runs.spec import ResolvedRun
+    from clbench.runs.spec import ResolvedRun, RunSpec
 
 # Modules with PyTorch or SciPy are imported where they are needed: `--help` does not wait for them.
 
@@ -70,33 +80,54 @@ def run(
             record are made again.
         tensorboard: Log the runs for TensorBoard below this folder while they run.
     """
-    from clbench.learning.registry import method_names
     from clbench.runs.spec import RunSpec, check_device
     from clbench.runs.tensorboard import require_tensorboard
     from clbench.scoring.intervals import expected_precision
 
     add_cwd_to_path()
     with checked_input():
-        names = dict.fromkeys([*methods, *(method_names() if every else ())])
-        if not names:
-            raise InputError("Name at least one method, or --all; `clbench list` shows them.")
         check_device(device)
         if tensorboard:
             require_tensorboard()
-        runs = [
-            RunSpec(scenario, name, seed, changes or {}, device, order=order, perturb=perturb).resolve()
-            for scenario in dict.fromkeys(scenarios.split(","))
-            for seed in range(first_seed, first_seed + seeds)
-            for name in names
-        ]
-        # one scenario may be named twice, once with its module
-        runs = list({run.path(records): run for run in runs}.values())
+        spec = RunSpec("", "", first_seed, changes or {}, device, order=order, perturb=perturb)
+        runs = requested(scenarios, methods, every, seeds, spec, records)
         chosen = _part(shard, runs)
     console = Console(stderr=True)
     for scenario in {run.spec.scenario: run.scenario for run in runs}.values():
         console.print(expected_precision(scenario, seeds), highlight=False)
     if not run_missing(chosen, records, lambda: _workers(workers, ray), checkpoints, tensorboard):
         sys.exit(1)
+
+
+def requested(
+    scenarios: str, methods: Sequence[str], every: bool, seeds: int, first: RunSpec, records: Path
+) -> list[ResolvedRun]:
+    """Return the runs of methods on scenarios, neighbours of one seed together.
+
+    Args:
+        scenarios: Ids of the scenarios, separated by commas.
+        methods: Names of methods.
+        every: Whether all installed methods are meant.
+        seeds: Number of seeds.
+        first: A run with the first seed, and with all else that the runs have in common.
+        records: Folder of the records.
+
+    Raises:
+        InputError: No method is named.
+    """
+    from clbench.learning.registry import method_names
+
+    names = dict.fromkeys([*methods, *(method_names() if every else ())])
+    if not names:
+        raise InputError("Name at least one method, or --all; `clbench list` shows them.")
+    runs = [
+        replace(first, scenario=scenario, method=name, seed=seed).resolve()
+        for scenario in dict.fromkeys(scenarios.split(","))
+        for seed in range(first.seed, first.seed + seeds)
+        for name in names
+    ]
+    # one scenario may be named twice, once with its module
+    return list({run.path(records): run for run in runs}.values())
 
 
 def _part(shard: str, runs: Sequence[ResolvedRun]) -> Sequence[ResolvedRun]:
@@ -158,6 +189,7 @@ def run_missing(
     plan = Plan()
     with checked_input():  # refuses a scenario with a camera on a machine that cannot render
         check_folders(records=records, checkpoints=checkpoints, tensorboard=tensorboard, **data_folders())
+        sweep(records, cache_folder(), minari_folder() / "clbench")
         for one in missing:
             plan.add_run(one, records, checkpoints=checkpoints, tensorboard=tensorboard)
         for one in bare:

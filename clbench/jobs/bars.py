@@ -8,8 +8,11 @@ from types import TracebackType
 from typing import Self
 
 from rich.console import Console
+from rich.markup import escape
 from rich.progress import BarColumn, Progress, TaskID, TaskProgressColumn, TextColumn, TimeElapsedColumn
 from rich.progress import TimeRemainingColumn as TimeLeftColumn
+
+from clbench.base.strict_json import printable, printable_lines
 
 LINE_SECONDS = 30.0
 """Seconds between two lines without a terminal."""
@@ -33,6 +36,7 @@ class Bars:
         self._started = self._last_line = clock()
         self._bars: dict[Hashable, TaskID] = {}
         self._left: dict[Hashable, float] = {}
+        self._length: dict[Hashable, float] = {}
         self._progress = Progress(
             TextColumn("{task.description}"),
             BarColumn(),
@@ -56,8 +60,12 @@ class Bars:
 
     def start(self, piece: Hashable, length: float) -> None:
         """Show a new piece of work under its text, `str(piece)`."""
-        self._bars[piece] = self._progress.add_task(str(piece), total=length)
-        self._left[piece] = length
+        self._bars[piece] = self._progress.add_task(escape(printable(str(piece))), total=length)
+        self._left[piece] = self._length[piece] = length
+
+    def share(self, piece: Hashable) -> float:
+        """Return the share of a piece that is done."""
+        return 1.0 - self._left[piece] / max(self._length[piece], 1e-9)
 
     def advance(self, piece: Hashable, amount: float) -> None:
         """Show that `amount` of a piece was done."""
@@ -73,16 +81,21 @@ class Bars:
             left = f", about {_minutes((now - self._started) * (1 - share) / share)} left" if share else ""
             self.say(f"{share:4.0%}{left}: {', '.join(map(str, self._bars))}")
 
+    def skip(self, piece: Hashable, length: float, text: str) -> None:
+        """Count a piece of work that need not be done, and print why."""
+        self.start(piece, length)
+        self.finish(piece, text)
+
     def finish(self, piece: Hashable, text: str) -> None:
         """Complete and remove the bar of a piece, and print the outcome."""
         self.advance(piece, self._left[piece])
-        del self._left[piece]
+        del self._left[piece], self._length[piece]
         self._progress.remove_task(self._bars.pop(piece))
         self.say(f"{piece}: {text}")
 
     def say(self, line: str) -> None:
-        """Print a line unchanged: names may look like markup, and the lines of a log must not wrap."""
-        self.console.print(line, highlight=False, markup=False, soft_wrap=True)
+        """Print a text without markup, wrapping or characters that control the terminal."""
+        self.console.print(printable_lines(line), highlight=False, markup=False, soft_wrap=True)
 
 
 def _minutes(seconds: float) -> str:

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Literal, NamedTuple, Protocol
 
+from clbench.base.lease import Lease
 from clbench.spec.limits import Limits
 
 
@@ -33,17 +35,27 @@ class Job:
     """Device on which the job computes."""
     pace: float = 1.0
     """Time of a unit of length, relative to other jobs."""
+    makes: Path | None = None
+    """File that the job makes, which one command at a time may do: others wait, and do other jobs
+    meanwhile. None lets several do the job."""
+    is_done: Callable[[], bool] | None = None
+    """Returns whether another command has made the file."""
 
     def __str__(self) -> str:
         return self.title
+
+    def new_lease(self) -> Lease | None:
+        """Return the lease that a command needs to do the job, None if it needs none."""
+        return None if self.makes is None else Lease(self.makes)
 
 
 class Event(NamedTuple):
     """A message from a worker."""
 
     job: Job
-    kind: Literal["progress", "done", "failed", "lost"]
-    """All kinds but the first end the job. A job is lost if its process ended without a result."""
+    kind: Literal["progress", "done", "failed", "lost", "taken"]
+    """All kinds but the first end the job. A job is lost if its process ended without a result, and taken if
+    another process took its work over."""
     value: Any
     """Length done since the last event, the text that the job returned, or the reason of the failure."""
 

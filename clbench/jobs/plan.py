@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,7 @@ from clbench.jobs import work
 from clbench.jobs.job import Job
 from clbench.learning.pretraining import is_pretrained, vision_steps
 from clbench.runs.length import point_length, run_length, training_length
-from clbench.runs.spec import ResolvedRun
+from clbench.runs.spec import ResolvedRun, has_record
 from clbench.runs.start import is_evaluated
 from clbench.spec.identifiers import folder_name
 from clbench.spec.limits import Limits
@@ -80,6 +81,7 @@ class Plan:
             (*self._needs(run), *((start,) if start else ())),
             limits,
             REPLAY_PACE if run.method.uses.demonstrations == "throughout" else 1.0,
+            records,
         )
 
     def add_stages(self, run: ResolvedRun, checkpoints: Path | None) -> Job:
@@ -113,9 +115,12 @@ class Plan:
         needs: tuple[Job, ...],
         limits: Limits | None = None,
         pace: float = 1.0,
+        records: Path | None = None,
     ) -> Job:
         title = _title(run.spec.scenario, title)
         job = Job(title, function, {**arguments}, length, needs, limits, run.spec.device, pace)
+        if records is not None:
+            job = replace(job, makes=run.path(records), is_done=lambda: has_record(run, records))
         self._runs.append(job)
         return job
 

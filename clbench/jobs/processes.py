@@ -16,6 +16,7 @@ from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from typing import Any, Literal
 
+from clbench.base.lease import LeaseLostError
 from clbench.base.progress import ProgressCallback
 from clbench.jobs.job import Event, Job, JobError
 from clbench.jobs.process_limits import end, exceeded
@@ -184,7 +185,7 @@ def _work(
 
 def _do_job(
     function: Callable[..., str], arguments: dict[str, Any], send: ProgressCallback
-) -> tuple[Literal["done", "failed"], str]:
+) -> tuple[Literal["done", "failed", "taken"], str]:
     """Do one job in this process, and return how it ended and its result.
 
     Args:
@@ -204,6 +205,8 @@ def _do_job(
     try:
         text = function(**arguments, progress=progress)
         send(owed)
+    except LeaseLostError as error:
+        return "taken", str(error)
     except JobError as error:
         return "failed", str(error)
     except Exception as error:

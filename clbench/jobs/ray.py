@@ -20,7 +20,7 @@ from clbench.jobs.job import Event, Job
 from clbench.jobs.processes import Processes
 from clbench.records.reader import read_record
 from clbench.records.record import Record
-from clbench.records.writer import write_record
+from clbench.records.writer import write_result
 
 RETRIES = 3
 """How often a job starts again after its worker was lost. A run continues from its last finished stage."""
@@ -32,6 +32,8 @@ _INSTRUCTIONS = (
     "NPY_DISABLE_CPU_FEATURES",
 )
 """Variables that select the instructions of the processor, and so affect the bits of trained weights."""
+Outcome = Literal["done", "failed", "taken"]
+"""How a job ended."""
 _PASSED_ON = ("CLBENCH_CACHE", "MINARI_DATASETS_PATH", "MUJOCO_GL", *_INSTRUCTIONS)
 
 
@@ -94,7 +96,9 @@ class RayWorkers:
             name: value.absolute() if isinstance(value, Path) else value
             for name, value in job.arguments.items()
         }
-        self._running[task.remote(self._progress_actor, replace(job, arguments=arguments, needs=()))] = job
+        # the driver has the lease
+        bare = replace(job, arguments=arguments, needs=(), makes=None, is_done=None)
+        self._running[task.remote(self._progress_actor, bare)] = job
 
     def events(self) -> Iterator[Event]:
         """Yield the events since the last call; wait at most a second for one."""
@@ -119,7 +123,7 @@ class RayWorkers:
         self._running.clear()
         self._ray.shutdown()
 
-    def _end(self, job: Job, reference: Any) -> tuple[Literal["done", "failed"], str]:
+    def _end(self, job: Job, reference: Any) -> tuple[Outcome, str]:
         """Write the records of a job that ended, and return its outcome."""
         lost = f"its worker was lost {RETRIES + 1} times: "
         try:
@@ -132,14 +136,14 @@ class RayWorkers:
             first = str(error).strip().partition("\n")[0]
             return "failed", f"{lost}{type(error).__name__}: {first}"
         for path, record in result.records.items():
-            write_record(record, job.arguments["records"] / path)
+            write_result(record, job.arguments["records"] / path)
         return result.kind, result.value
 
 
 class _Result(NamedTuple):
     """The result of a task."""
 
-    kind: Literal["done", "failed"]
+    kind: Outcome
     value: str
     records: dict[str, Record]
     """Records by their path below the folder of records."""
@@ -179,7 +183,7 @@ def _do(actor: Any, job: Job) -> _Result:
     return _Result(*ended, records)
 
 
-def _do_apart(actor: Any, job: Job) -> tuple[Literal["done", "failed"], str]:
+def _do_apart(actor: Any, job: Job) -> tuple[Outcome, str]:
     """Do a job in its own process, as on one machine, so that no method affects another.
 
     The process is forked from one that this worker keeps and that has imported everything; a new worker for

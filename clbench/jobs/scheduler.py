@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from functools import cache
 
 from rich.console import Console
@@ -12,12 +12,16 @@ from clbench.base import interrupts
 from clbench.jobs.bars import Bars
 from clbench.jobs.job import Job, Workers
 
+WAIT_SECONDS = 1.0
+"""Seconds between two looks at jobs that other commands do."""
+
 
 def run_jobs(jobs: Sequence[Job], workers: Workers, bars: Bars) -> dict[Job, str]:
     """Do all jobs, and return the reason of each failure by job.
 
-    A job that fails, or whose process dies, does not stop the others; jobs that need it are left out. This
-    function leaves no process behind, even after Ctrl-C.
+    A job that fails, or whose process dies, does not stop the others; jobs that need it are left out. A job
+    that another command is doing waits until that command has done it or has died. This function leaves no
+    process behind, even after Ctrl-C.
 
     Args:
         jobs: Jobs in any order, with all jobs that they need. Jobs on the critical path start first.
@@ -27,27 +31,83 @@ def run_jobs(jobs: Sequence[Job], workers: Workers, bars: Bars) -> dict[Job, str
     waiting, started = _by_urgency(jobs), dict[Job, float]()
     succeeded: set[Job] = set()
     failed: dict[Job, str] = {}
+    leases = _Leases(jobs)
     try:
         while waiting or started:
             interrupts.check()
             waiting = _drop_hopeless(waiting, failed)
-            for job in _ready(waiting, succeeded, workers.free()):
+            for job in leases.take(_ready(waiting, succeeded), workers.free()):
                 waiting.remove(job)
+                if job.is_done is not None and job.is_done():
+                    succeeded.add(job)
+                    leases.release(job)
+                    bars.skip(job, job.length, "done by another command")
+                    continue
                 workers.start(job)
                 started[job] = time.monotonic()
                 bars.start(job, job.length)
-            for job, kind, value in workers.events():
+            if not started and waiting:
+                leases.wait(waiting, bars)
+            for job, kind, value in workers.events() if started else ():
                 if kind == "progress":
                     bars.advance(job, value)
+                    leases.report(job, bars.share(job))
                     continue
+                leases.release(job)
                 if kind == "done":
                     succeeded.add(job)
+                elif kind == "taken":
+                    waiting.append(job)
                 else:
                     failed[job] = value
                 bars.finish(job, f"{value} ({time.monotonic() - started.pop(job):.0f} s)")
     finally:
         workers.close()
+        leases.close()
     return failed
+
+
+class _Leases:
+    """The leases of jobs that one command at a time may do."""
+
+    def __init__(self, jobs: Sequence[Job]) -> None:
+        self._all = {job: lease for job in jobs if (lease := job.new_lease()) is not None}
+        self._told = False
+
+    def take(self, ready: Iterable[Job], most: int) -> list[Job]:
+        """Take the leases of as many of the jobs as can be had, in their order, and return these jobs."""
+        taken: list[Job] = []
+        for job in ready:
+            if len(taken) == most:
+                break
+            if job not in self._all or self._all[job].take():
+                taken.append(job)
+        return taken
+
+    def wait(self, waiting: Sequence[Job], bars: Bars) -> None:
+        """Wait a moment, as other commands do all that is left, and say so the first time."""
+        if not self._told:
+            self._told = True
+            owners = {lease.owner for job in waiting if (lease := self._all.get(job)) is not None}
+            names = ", ".join(sorted(str(owner) for owner in owners if owner is not None))
+            left = "job" if len(waiting) == 1 else f"{len(waiting)} jobs"
+            bars.say(f"Another command does the last {left}; waiting for {names or 'it'}.")
+        time.sleep(WAIT_SECONDS)
+
+    def report(self, job: Job, share: float) -> None:
+        """Tell other commands which share of a job is done."""
+        if job in self._all:
+            self._all[job].report(share)
+
+    def release(self, job: Job) -> None:
+        """Give the lease of a job back."""
+        if job in self._all:
+            self._all[job].release()
+
+    def close(self) -> None:
+        """Give all leases back."""
+        for lease in self._all.values():
+            lease.release()
 
 
 def run_with_bars(jobs: Sequence[Job], workers: Workers, console: Console | None = None) -> dict[Job, str]:
@@ -85,6 +145,6 @@ def _drop_hopeless(waiting: list[Job], failed: dict[Job, str]) -> list[Job]:
     return kept
 
 
-def _ready(waiting: Sequence[Job], succeeded: set[Job], free: int) -> list[Job]:
-    """Return the jobs to start: those whose needs have succeeded, in their order."""
-    return [job for job in waiting if succeeded.issuperset(job.needs)][:free]
+def _ready(waiting: Sequence[Job], succeeded: set[Job]) -> list[Job]:
+    """Return the jobs whose needs have succeeded, in their order."""
+    return [job for job in waiting if succeeded.issuperset(job.needs)]

@@ -138,11 +138,14 @@ class Trainer:
         generator = torch_generator(name, self.seed, number)
         return Source(data, generator, self.scenario.budget.batch_size, self.device)
 
-    def save(self, folder: Path, number: int) -> None:
-        """Write the `STAGE_FILES` of stage `number` to `folder`."""
+    def state(self, number: int) -> MethodState:
+        """Return what the method keeps after stage `number`."""
         self.where = f"state() after stage {number}"
+        return self.method.state()
+
+    def save(self, folder: Path, state: MethodState) -> None:
+        """Write the policy and the state of the method to the `STAGE_FILES` of `folder`."""
         save_policy(self.policy, folder)
-        state = self.method.state()
         tensors = {name: value for name, value in state.items() if isinstance(value, torch.Tensor)}
         copies = {name: value.detach().clone().contiguous() for name, value in tensors.items()}
         save_file(copies, folder / "method.safetensors")

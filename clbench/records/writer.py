@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import logging
 import os
 import uuid
 from pathlib import Path
@@ -14,6 +15,8 @@ from clbench.base.strict_json import LONGEST_TEXT, check_json
 from clbench.records.content import content_hash
 from clbench.records.reader import RecordError, read_record
 from clbench.records.record import SCHEMA, Record
+
+LOG = logging.getLogger("clbench")
 
 MOST_DIAGNOSTICS = 2 * 2**20
 """Most bytes of the diagnostics of a run, as JSON. The committed records have 1,506 at most."""
@@ -44,6 +47,25 @@ def write_record(record: Record, path: Path) -> None:
         os.replace(partial, path)
     finally:
         partial.unlink(missing_ok=True)
+
+
+def write_result(record: Record, path: Path) -> None:
+    """Write the record of a run, but leave the record of a run that succeeded if this one failed.
+
+    Raises:
+        InputError: As for `write_record`.
+    """
+    if record.status == "failed" and _has_succeeded(path):
+        LOG.warning("%s stays: it is of a run that succeeded, and the new one failed.", path)
+        return
+    write_record(record, path)
+
+
+def _has_succeeded(path: Path) -> bool:
+    try:
+        return read_record(path).status == "success"
+    except RecordError:
+        return False
 
 
 def record_text(record: Record) -> str:

@@ -114,7 +114,7 @@ def make_stages(run: ResolvedRun, progress: ProgressCallback = no_progress) -> P
                 progress(scenario.budget.adaptation_steps - steps if scenario.budget.criterion else 0)
             else:
                 trainer.prepare()
-            trainer.save(folder, number)
+            trainer.save(folder, trainer.state(number))
         except Exception as error:
             message = f"{run.label} failed in {trainer.where}: {type(error).__name__}: {error}"
             raise MethodError(message) from error

@@ -13,8 +13,9 @@ from typing import Any
 
 import torch
 
-from clbench.base.cache import cache_folder, cached, hash_of, is_cached
+from clbench.base.cache import CacheError, cache_folder, cached, hash_of, is_cached
 from clbench.base.errors import WrongTypeError
+from clbench.base.lease import Lease, LeaseLostError
 from clbench.base.progress import ProgressCallback, no_progress
 from clbench.data.training_data import TrainingData
 from clbench.evaluation.checks import Checker
@@ -23,9 +24,10 @@ from clbench.learning.adaptation import Step
 from clbench.learning.pretraining import pretrained_policy
 from clbench.learning.registry import describe_method, method_packages
 from clbench.learning.trainer import Trainer, repeatable, sources
+from clbench.policy.checkpoint import CheckpointError
 from clbench.records.reader import read_record
 from clbench.records.record import Costs, Record
-from clbench.records.writer import check_diagnostics, write_record
+from clbench.records.writer import check_diagnostics, write_record, write_result
 from clbench.runs.checkpoints import drop_stages, has_stages, keep_stage
 from clbench.runs.fingerprint import fingerprint
 from clbench.runs.length import relearning_length, relearns, run_length
@@ -34,6 +36,10 @@ from clbench.runs.spec import ResolvedRun, RunSpec
 from clbench.runs.start import evaluate_start
 from clbench.runs.tensorboard import Log, require_tensorboard
 from clbench.spec.protocol import Point
+from clbench.worlds.gl_backend import RenderingError
+
+NOT_THE_METHOD = (CacheError, CheckpointError, LeaseLostError, RenderingError)
+"""Failures of the machine: the run can be done again, and leaves no record that blames its method."""
 
 
 def execute(
@@ -46,7 +52,8 @@ def execute(
 ) -> Record:
     """Do a run, or continue an interrupted one, and write its record.
 
-    A run that fails leaves a record of status "failed" that names the place.
+    A run that fails leaves a record of status "failed" that names the place. The record of a run that
+    succeeded stays. If another process does the same run with the same folders, this one waits for its turn.
 
     Args:
         run: The run, by name or resolved.
@@ -55,16 +62,32 @@ def execute(
             `clbench.runs.length.run_length` returns the total.
         checkpoints: Folder below which the policies of all stages are kept; None keeps none.
         tensorboard: Folder below which the run is logged for TensorBoard; None logs nothing.
+
+    Raises:
+        CacheError: The file system refuses a checkpoint. This is no failure of the method, and leaves no
+            record.
+        CheckpointError: A checkpoint of this run cannot be read.
+        LeaseLostError: Another process took the run over.
     """
     if tensorboard is not None:
         require_tensorboard()
     resolved = run.resolve() if isinstance(run, RunSpec) else run
-    with repeatable(resolved.spec.device):
-        under_way = _Run.start(resolved, Path(records), progress, checkpoints, tensorboard)
-        record = under_way.go()
-    write_record(record, resolved.path(Path(records)))
-    under_way.forget()
+    folder = _checkpoints(resolved, Path(records))
+    lease = Lease(folder)
+    with lease.held():
+        with repeatable(resolved.spec.device):
+            under_way = _Run.start(resolved, folder, lease, progress, checkpoints, tensorboard)
+            record = under_way.go()
+        lease.check()
+        write_result(record, resolved.path(Path(records)))
+        under_way.forget()
     return record
+
+
+def _checkpoints(run: ResolvedRun, records: Path) -> Path:
+    """Return the folder of the checkpoints of a run in the cache."""
+    # two commands may do the same run for different folders at once
+    return cache_folder() / "runs" / hash_of({**_inputs(run, 0), "records": str(records.resolve())})
 
 
 def pretrained_hash(folder: Path) -> str:
@@ -111,6 +134,8 @@ class _Run:
     progress: ProgressCallback
     checkpoints: Path
     """Folder of the checkpoints in the cache."""
+    lease: Lease
+    """The right to write the checkpoints."""
     kept: Path | None
     """Folder below which the policies of all stages are kept."""
     tensorboard: Path | None
@@ -122,7 +147,8 @@ class _Run:
     def start(
         cls,
         run: ResolvedRun,
-        records: Path,
+        checkpoints: Path,
+        lease: Lease,
         progress: ProgressCallback,
         kept: Path | None,
         tensorboard: Path | None,
@@ -136,16 +162,17 @@ class _Run:
         examiner = Examiner(scenario, run.protocol, data, pretrained, spec.seed, progress)
         checker = Checker(scenario, run.protocol, spec.seed)
         record = _new_record(run, trainer, folder)
-        # two commands may do the same run for different folders at once
-        key = {**_inputs(run, 0), "records": str(records.resolve())}
-        checkpoints = cache_folder() / "runs" / hash_of(key)
-        return cls(run, trainer, examiner, checker, record, Log(), progress, checkpoints, kept, tensorboard)
+        return cls(
+            run, trainer, examiner, checker, record, Log(), progress, checkpoints, lease, kept, tensorboard
+        )
 
     def go(self) -> Record:
         """Go through all stages without a checkpoint, and return the record."""
         self.record.timing["started"] = datetime.now(UTC).isoformat(timespec="seconds")
         try:
             self._go_through()
+        except NOT_THE_METHOD:
+            raise
         except Exception as error:
             self.record.status = "failed"
             self.record.error = {
@@ -276,9 +303,11 @@ class _Run:
 
     def _save(self, number: int) -> None:
         """Write a checkpoint after stage `number`, and keep its policy if asked to; remove the one before."""
+        state = self.trainer.state(number)
+        self.lease.check()
 
         def write(folder: Path) -> None:
-            self.trainer.save(folder, number)
+            self.trainer.save(folder, state)
             self._count_seconds()
             write_record(self.record, folder / "record.json")
             if self.kept is not None:

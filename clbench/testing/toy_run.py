@@ -113,7 +113,7 @@ class ToyRun:
                     self.outcomes["prepare", "steps"] = self.trainer.prepare()
                 stage = self.trainer.where
                 self._keep(stage, "diagnostics", self.trainer.method.diagnostics())
-                self.trainer.save(folder, number)
+                self.trainer.save(folder, self.trainer.state(number))
                 for name, value in self.trainer.policy.state_dict().items():
                     self._keep(stage, name, value)
                 if resumed:

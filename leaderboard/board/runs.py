@@ -11,6 +11,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+from clbench.base.strict_json import printable
 from clbench.records.paths import label_of, record_name
 from clbench.records.pinned import other_parts, pinned
 from clbench.records.reader import RecordError, read_record
@@ -234,12 +235,6 @@ def no_row(path: str, reason: str) -> NotShown:
     reason = printable(reason)
     reason = reason if len(reason) <= LONGEST_REASON else f"{reason[:LONGEST_REASON]}…"
     return NotShown(printable(path), reason)
-
-
-def printable(text: str) -> str:
-    """Return `text`, which a stranger may have written, without control characters and line breaks."""
-    visible = (one if one.isprintable() else one.encode("unicode_escape").decode("ascii") for one in text)
-    return "".join(visible)
 
 
 def same_scenario(runs: list[Run]) -> Sifted:

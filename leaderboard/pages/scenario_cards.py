@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from clbench.base.entry_points import resolve
+from clbench.base.strict_json import printable
 from clbench.scoring.groups import deviation_of_differences
 from clbench.scoring.intervals import Estimate, bootstrap, paired_difference, row_generator, student_quantile
 from clbench.scoring.layout import Array, average
@@ -26,7 +27,7 @@ from clbench.spec.protocol import check_steps
 from clbench.spec.scenario import Scenario
 
 from ..board.rows import RANKED_BY, Row, Table
-from ..board.runs import METHODS, differences, printable
+from ..board.runs import METHODS, differences
 from ..views.descriptions import field_docstrings
 from ..views.format import MISSING
 from ..views.markdown import templates

@@ -15,12 +15,12 @@ from typing import Any
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
+from clbench.base.strict_json import printable
 from clbench.scoring.intervals import Estimate
 from clbench.scoring.metric import Metric
 
 from ..board.overall import overall
 from ..board.rows import Row, Table
-from ..board.runs import printable
 from .format import (
     MISSING,
     Column,

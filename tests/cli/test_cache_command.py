@@ -10,6 +10,7 @@ import pytest
 from safetensors.numpy import save_file
 
 from clbench.base.cache import cache_folder, cached, hash_of
+from clbench.base.lease import Lease
 from clbench.cli.arguments import minari_folder
 from clbench.cli.cache import entries, find_stale
 from clbench.cli.main import app
@@ -103,17 +104,17 @@ def test_an_entry_of_older_code_is_stale_unless_it_was_used_since(
 
 
 @pytest.mark.usefixtures("empty_caches")
-def test_leftovers_of_killed_processes_are_deleted_after_a_week(capsys: pytest.CaptureFixture[str]) -> None:
+def test_leftovers_of_killed_processes_are_deleted(capsys: pytest.CaptureFixture[str]) -> None:
     root, whole = cache_folder() / "stages" / hash_of("run"), "f" * 32
     _write(root / "stage-0" / "data")
     old, fresh = root / f".stage-1.{whole}.partial", root / f".stage-2.{whole}.partial"
     dataset = minari_folder() / "clbench" / "toy" / f".left-v0.{whole}.old"
     for folder in (old, fresh, dataset):
         _write(folder / "data")
-    _age(old, 8)
-    _age(fresh, 2)
-    _age(dataset, 8)
+    maker = Lease(root / "stage-2")
+    assert maker.take()
     out = _cache(capsys, "--prune")
+    maker.release()
     assert f"{old}: left behind by a killed process" in out
     assert "Deleted 2 stale entries" in out
     assert sorted(path.name for path in root.iterdir()) == [fresh.name, "stage-0"]

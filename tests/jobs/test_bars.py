@@ -41,3 +41,14 @@ def test_a_terminal_shows_bars_with_the_time_left() -> None:
     assert "sft seed 0" in text
     assert "40%" in text
     assert "left" in text
+
+
+def test_no_text_controls_the_terminal() -> None:
+    file = io.StringIO()
+    with Bars(1, Console(file=file, width=100, force_terminal=True)) as bars:
+        bars.start("[red]x\x1b[2Jy", 1)
+        bars.finish("[red]x\x1b[2Jy", "failed: \x1b]0;title\x07[bold]\nsecond line")
+    assert "\x1b[2J" not in file.getvalue()
+    assert "\x1b]0" not in file.getvalue()
+    assert "[red]x\\x1b[2Jy: failed: \\x1b]0;title\\x07[bold]" in file.getvalue()
+    assert "second line" in file.getvalue()

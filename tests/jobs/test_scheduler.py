@@ -1,5 +1,6 @@
 """The scheduler: processes that work, fail, die and are stopped."""
 
+import dataclasses
 import importlib
 import io
 import os
@@ -34,6 +35,12 @@ def good(progress, path=None):
     progress(1)
     if path: Path(path).write_text("done")
     return "went well"
+
+def loses_its_lease(progress, path):
+    from clbench.base.lease import LeaseLostError
+    if Path(path).exists(): return "went well"
+    Path(path).write_text("tried")
+    raise LeaseLostError("lost to another process")
 
 def bad(progress):
     raise ValueError("went wrong")
@@ -95,6 +102,51 @@ def test_a_job_that_fails_or_is_killed_does_not_stop_the_others(bars: Bars) -> N
     assert "exit code -9" in failed["dead"]
     assert failed["hopeless"] == "left out, because dead failed"
     assert "fine: went well" in _printed(bars)
+
+
+def _claimed(title: str, makes: Path) -> Job:
+    job = _job(title, "good", path=str(makes))
+    return dataclasses.replace(job, makes=makes, is_done=makes.exists)
+
+
+HOLD = """
+import sys, time
+from pathlib import Path
+from clbench.base.lease import Lease
+made = Path(sys.argv[1])
+lease = Lease(made)
+assert lease.take()
+print("taken", flush=True)
+while not made.with_name("other").exists(): time.sleep(0.05)
+time.sleep(1)
+if sys.argv[2] == "finish": made.write_text("made elsewhere")
+"""
+
+
+@pytest.mark.parametrize(("end", "text"), [("finish", "made elsewhere"), ("die", "done")])
+def test_a_job_that_another_command_does_waits_for_it(
+    tmp_path: Path, bars: Bars, end: str, text: str
+) -> None:
+    made = tmp_path / "made"
+    command = [sys.executable, "-c", HOLD, str(made), end]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as other:
+        assert other.stdout is not None
+        assert other.stdout.readline() == "taken\n"
+        jobs = [_claimed("claimed", made), _claimed("other", tmp_path / "other")]
+        assert run_jobs(jobs, Processes(1), bars) == {}
+    assert made.read_text() == text
+    printed = _printed(bars)
+    assert printed.index("other: went well") < printed.index("claimed: ")
+    assert f"Another command does the last job; waiting for process {other.pid} on " in printed
+    assert ("claimed: done by another command" in printed) == (end == "finish")
+    assert {path.name for path in tmp_path.iterdir()} <= {"made", "other", "some_jobs.py", "__pycache__"}
+
+
+def test_a_job_whose_work_another_process_took_over_is_done_later(tmp_path: Path, bars: Bars) -> None:
+    taken = _job("taken", "loses_its_lease", path=str(tmp_path / "x"))
+    assert run_jobs([taken], Processes(1), bars) == {}
+    assert "taken: lost to another process" in _printed(bars)
+    assert "taken: went well" in _printed(bars)
 
 
 def test_a_job_that_leaves_a_thread_behind_ends_with_its_result(

@@ -225,9 +225,9 @@ def test_an_outcome_does_not_depend_on_what_else_is_seen() -> None:
 def test_every_method_learns_from_pictures(name: str, tmp_path: Path) -> None:
     trainer = Trainer.open(SHORT, lambda: build_method(name, FEWER.get(name, {})), 0, "cpu")
     trainer.prepare()
-    trainer.save(tmp_path / "0", 0)
+    trainer.save(tmp_path / "0", trainer.state(0))
     trainer.load(tmp_path / "0", 0)
     trainer.learn(1, lambda _: None)
     assert trainer.policy.config == policy_config(SEEN_TOY)
-    trainer.save(tmp_path / "1", 1)
+    trainer.save(tmp_path / "1", trainer.state(1))
     trainer.load(tmp_path / "1", 1)

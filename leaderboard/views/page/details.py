@@ -15,8 +15,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from clbench.base.strict_json import printable
+
 from ...board.rows import Row
-from ...board.runs import Run, is_number, printable
+from ...board.runs import Run, is_number
 from ..format import number_text
 
 LONGEST = 160

@@ -10,6 +10,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from clbench.base.strict_json import printable
 from clbench.learning.registry import load_method
 from clbench.scoring.intervals import Estimate, needed_references, row_generator
 from clbench.scoring.metric import Metric
@@ -19,7 +20,7 @@ from clbench.spec.identifiers import built_in_methods
 
 from ...board.frontier import Curve
 from ...board.rows import Row, Table, standing_of
-from ...board.runs import DIVISIONS, METHODS, printable
+from ...board.runs import DIVISIONS, METHODS
 from ..descriptions import Description, describe
 from ..format import (
     Column,

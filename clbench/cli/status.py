@@ -1,0 +1,134 @@
+"""The command `clbench status`: how far the runs of a folder are."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+from cyclopts import Parameter
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from clbench.base.errors import InputError
+from clbench.base.strict_json import printable
+from clbench.cli.arguments import add_cwd_to_path, checked_input, whole_number
+from clbench.cli.runs import requested
+from clbench.records.paths import RECORDS
+from clbench.records.status import RunState, State, found_runs, run_state, seconds_left
+
+STATES: tuple[State, ...] = ("done", "running", "failed", "damaged", "to do")
+
+
+def status(
+    scenarios: str | None = None,
+    /,
+    *methods: str,
+    every: Annotated[bool, Parameter(name="--all", negative="")] = False,
+    seeds: Annotated[int, whole_number(1)] = 3,
+    first_seed: Annotated[int, whole_number(0)] = 0,
+    order: Annotated[int, whole_number(0)] = 0,
+    records: Path = RECORDS,
+    changes: Annotated[dict[str, str] | None, Parameter(name="--set")] = None,
+    as_json: Annotated[bool, Parameter(name="--json", negative="")] = False,
+) -> None:
+    """Show which runs are done, running, failed and to do, and the time left.
+
+    Without arguments the command shows every run in the folder of records. With the arguments of
+    `clbench run` it shows those runs, also those that nobody has begun. It may be asked while other commands
+    or machines work in the same folder.
+
+    Args:
+        scenarios: Gymnasium id of the scenario, or several ids separated by commas.
+        methods: Names of installed methods, or module:Class.
+        every: All installed methods.
+        seeds: Number of seeds.
+        first_seed: The first seed.
+        order: Order in which the targets are learned.
+        records: Folder of the records.
+        changes: Hyper-parameters that differ from the defaults of the methods, as --set.name value.
+        as_json: Print one JSON object for each run instead of the table.
+    """
+    add_cwd_to_path()
+    with checked_input():
+        if scenarios is None:
+            paths = found_runs(records)
+            if not paths:
+                raise InputError(f"There are no runs in {records}: `clbench run` makes them.")
+        else:
+            from clbench.runs.spec import RunSpec
+
+            spec = RunSpec("", "", first_seed, changes or {}, order=order)
+            paths = [one.path(records) for one in requested(scenarios, methods, every, seeds, spec, records)]
+        states = [run_state(path) for path in paths]
+    if as_json:
+        values = [_values(state, records) for state in states]
+        sys.stdout.write(f"{json.dumps(values, indent=1)}\n")
+        return
+    console = Console()
+    console.print(_table(states))
+    for state in states:
+        line = _line(state, records)
+        if line:
+            console.print(line, markup=False, highlight=False, soft_wrap=True)
+    console.print(_summary(states), highlight=False)
+
+
+def _table(states: Sequence[RunState]) -> Table:
+    """Return the number of runs in each state, by scenario and method."""
+    shown = [name for name in STATES if any(state.state == name for state in states)]
+    table = Table()
+    table.add_column("scenario", no_wrap=True)
+    table.add_column("method", overflow="fold")
+    for name in shown:
+        table.add_column(name, justify="right", no_wrap=True)
+    for folder in dict.fromkeys(state.path.parent for state in states):
+        counts = Counter(state.state for state in states if state.path.parent == folder)
+        names = (escape(folder.parent.name), escape(folder.name))
+        table.add_row(*names, *(str(counts[name] or "") for name in shown))
+    return table
+
+
+def _line(state: RunState, records: Path) -> str | None:
+    """Return a line about a run that is running or that went wrong."""
+    name = state.path.relative_to(records).with_suffix("").as_posix()
+    if state.owner is not None:
+        if state.progress is None:
+            return f"{name}: begun by {state.owner}"
+        left = state.seconds_left
+        rest = "" if left is None else f", about {_minutes(left)} left"
+        spent = _minutes(state.progress.seconds)
+        return f"{name}: {state.progress.share:.0%} after {spent}{rest}, {state.owner}"
+    if state.reason is not None:
+        return f"{name}: {state.state}, {printable(state.reason.partition(chr(10))[0])}"
+    return None
+
+
+def _summary(states: Sequence[RunState]) -> str:
+    counts = Counter(state.state for state in states)
+    parts = [f"{counts[name]} {name}" for name in STATES if counts[name]]
+    text = f"{len(states)} runs: {', '.join(parts)}."
+    left = seconds_left(states)
+    return text if left is None else f"{text} About {_minutes(left)} left with {counts['running']} at once."
+
+
+def _values(state: RunState, records: Path) -> dict[str, Any]:
+    """Return a run's state as JSON."""
+    return {
+        "run": state.path.relative_to(records).with_suffix("").as_posix(),
+        "state": state.state,
+        "process": None if state.owner is None else state.owner.process,
+        "host": None if state.owner is None else state.owner.host,
+        "share": None if state.progress is None else round(state.progress.share, 3),
+        "seconds": state.seconds if state.progress is None else round(state.progress.seconds, 1),
+        "seconds_left": None if state.seconds_left is None else round(state.seconds_left, 1),
+        "reason": state.reason,
+    }
+
+
+def _minutes(seconds: float) -> str:
+    return f"{int(seconds) // 60}:{int(seconds) % 60:02d}"

@@ -1,0 +1,107 @@
+"""Leases, with owners in other processes."""
+
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from clbench.base import lease as leases
+from clbench.base.lease import Lease, LeaseLostError, lease_path
+
+HOLD = """
+import sys, time
+from pathlib import Path
+from clbench.base.lease import Lease
+lease = Lease(Path(sys.argv[1]))
+assert lease.take()
+lease.report(0.25)
+print("taken", flush=True)
+time.sleep(60)
+"""
+
+
+@pytest.fixture
+def other(tmp_path: Path) -> Iterator[subprocess.Popen[str]]:
+    """Return a process that holds the lease of the file x."""
+    process = subprocess.Popen(
+        [sys.executable, "-c", HOLD, str(tmp_path / "x")], stdout=subprocess.PIPE, text=True
+    )
+    assert process.stdout is not None
+    assert process.stdout.readline() == "taken\n"
+    yield process
+    process.kill()
+    process.wait()
+    process.stdout.close()
+
+
+def test_a_lease_has_one_owner(tmp_path: Path, other: subprocess.Popen[str]) -> None:
+    lease = Lease(tmp_path / "x")
+    assert not lease.take()
+    owner, progress = lease.owner, lease.progress
+    assert owner is not None
+    assert owner.process == other.pid
+    assert progress is not None
+    assert progress.share == 0.25
+
+
+def test_the_lease_of_a_dead_process_is_taken_over_at_once(
+    tmp_path: Path, other: subprocess.Popen[str]
+) -> None:
+    lease = Lease(tmp_path / "x")
+    other.kill()
+    other.wait()
+    assert lease.owner is None
+    assert lease.take()
+    lease.release()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_lease_that_is_waited_for_comes_when_its_owner_ends(
+    tmp_path: Path, other: subprocess.Popen[str]
+) -> None:
+    begin = time.monotonic()
+    with subprocess.Popen(["sh", "-c", f"sleep 0.5; kill -9 {other.pid}"]), Lease(tmp_path / "x").held():
+        assert time.monotonic() - begin > 0.3
+
+
+def test_an_owner_learns_that_it_lost_its_lease(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(leases, "SECONDS", 0.3)
+    lease = Lease(tmp_path / "x")
+    assert lease.take()
+    lease.check()
+    lease_path(tmp_path / "x").unlink()
+    with pytest.raises(LeaseLostError, match=r"\.x\.lease was lost"):
+        _check_for_a_while(lease)
+    lease.release()
+
+
+def _check_for_a_while(lease: Lease) -> None:
+    deadline = time.monotonic() + 20
+    while time.monotonic() < deadline:
+        lease.check()
+        time.sleep(0.05)
+
+
+def test_a_foreign_file_in_the_place_of_a_lease_is_left_alone(tmp_path: Path) -> None:
+    lease_path(tmp_path / "x").write_text("mine")
+    assert Lease(tmp_path / "x").owner is None
+    assert lease_path(tmp_path / "x").read_text() == "mine"
+
+
+def test_a_lease_whose_owner_is_on_another_machine_counts_while_it_is_fresh(tmp_path: Path) -> None:
+    lease = Lease(tmp_path / "x")
+    assert lease.take()
+    text = lease_path(tmp_path / "x").read_text()
+    lease.release()
+    host = next(line for line in text.splitlines() if line.startswith("host="))
+    lease_path(tmp_path / "x").write_text(text.replace(host, "host=elsewhere"))
+    owner = lease.owner
+    assert owner is not None
+    assert str(owner) == f"process {os.getpid()} on elsewhere"
+    long_ago = time.time() - 3 * leases.SECONDS
+    os.utime(lease_path(tmp_path / "x"), (long_ago, long_ago))
+    assert lease.owner is None

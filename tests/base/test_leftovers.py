@@ -1,0 +1,54 @@
+"""Leftovers of killed processes, of which some are still being made."""
+
+import os
+import time
+from pathlib import Path
+
+from clbench.base.cache import cached
+from clbench.base.lease import Lease
+from clbench.base.leftovers import FILE_SECONDS, sweep
+
+HEX = "0123456789abcdef" * 2
+
+
+def _age(path: Path) -> None:
+    long_ago = time.time() - 2 * FILE_SECONDS
+    os.utime(path, (long_ago, long_ago))
+
+
+def test_what_a_killed_process_left_is_removed(tmp_path: Path) -> None:
+    for name in (f".x.{HEX}.partial", f".y.{HEX}.old"):
+        (tmp_path / "below" / name).mkdir(parents=True)
+        (tmp_path / "below" / name / "half.txt").write_text("half")
+    record = tmp_path / f".seed-0.json.{HEX}.partial"
+    record.write_text("{")
+    _age(record)
+    (tmp_path / ".seed-0.json.progress").write_text("[0.5, 1.0]")
+    assert sweep(tmp_path) == 4
+    assert [path.name for path in tmp_path.rglob("*")] == ["below"]
+
+
+def test_what_is_being_made_stays(tmp_path: Path) -> None:
+    lease = Lease(tmp_path / "x")
+    assert lease.take()
+    lease.report(0.5)
+    (tmp_path / f".x.{HEX}.partial").mkdir()
+    (tmp_path / f".seed-0.json.{HEX}.partial").write_text("{")
+    assert sweep(tmp_path) == 0
+    assert len(list(tmp_path.iterdir())) == 4
+    lease.release()
+
+
+def test_nothing_else_is_touched(tmp_path: Path) -> None:
+    for name in ("notes.partial", ".x.123.partial", ".config.lease", "seed-0.json", f"x.{HEX}.partial"):
+        (tmp_path / name).write_text("mine")
+        _age(tmp_path / name)
+    assert sweep(tmp_path) == 0
+    assert len(list(tmp_path.iterdir())) == 5
+
+
+def test_a_result_that_is_made_again_removes_what_its_dead_makers_left(tmp_path: Path) -> None:
+    for name in (f".x.{HEX}.partial", f".x.{HEX}.old", f".xy.{HEX}.partial"):
+        (tmp_path / name).mkdir()
+    cached(tmp_path / "x", {}, lambda folder: None)
+    assert sorted(path.name for path in tmp_path.iterdir()) == [f".xy.{HEX}.partial", "x"]

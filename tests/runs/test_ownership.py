@@ -1,0 +1,93 @@
+"""Runs that meet each other, or a machine that fails: nothing is lost, and no method is blamed."""
+
+import contextlib
+import dataclasses
+import resource
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from clbench.base.cache import CacheError, cache_folder
+from clbench.learning.method import Method
+from clbench.policy.policy import Policy
+from clbench.records.reader import read_record
+from clbench.runs.run import execute
+from clbench.runs.spec import RunSpec
+
+TOY = "clbench.testing:clbench/Toy-v0"
+
+COMMAND = [sys.executable, "-m", "clbench", "run", TOY, "sft", "frozen", "--seeds", "1", "--workers", "2"]
+
+
+@contextlib.contextmanager
+def _largest_file(size: int) -> Iterator[None]:
+    """Let no file grow beyond `size` bytes inside, as on a full disk."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+@dataclasses.dataclass
+class _Raises(Method):
+    """A method whose own file is missing."""
+
+    def prepare(self, policy: Policy, prior: Any) -> None:
+        Path("/nowhere/weights").read_bytes()
+
+
+def test_commands_that_start_together_do_each_run_once(tmp_path: Path) -> None:
+    # their workers import the toy, pretrained in the cache of the tests
+    command = [*COMMAND, "--records", str(tmp_path / "records")]
+    processes = [subprocess.Popen(command, stderr=subprocess.PIPE, text=True) for _ in range(3)]
+    said = [process.communicate()[1] for process in processes]
+    assert [process.returncode for process in processes] == [0, 0, 0], said
+    lines = [line for text in said for line in text.splitlines()]
+    for label in ("sft", "frozen"):
+        ends = [line for line in lines if line.startswith(f"Toy-v0 {label} seed 0: ")]
+        assert sum("adaptation" in line for line in ends) == 1, lines
+        record = read_record(tmp_path / "records" / "Toy-v0" / label / "seed-0.json")
+        assert record.status == "success"
+    assert len(list((tmp_path / "records").rglob(".*"))) == 0
+
+
+def test_a_full_disk_is_no_failure_of_the_method(tmp_path: Path) -> None:
+    spec = RunSpec(TOY, "sft", seed=0)
+    execute(dataclasses.replace(spec, method="frozen"), tmp_path)  # the policy and the data are in the cache
+    with _largest_file(2000), pytest.raises(CacheError, match="cannot be written"):
+        execute(spec, tmp_path)
+    assert not spec.path(tmp_path).exists()
+    assert [path for path in cache_folder().rglob("*.partial") if path.is_dir()] == []
+    assert execute(spec, tmp_path).status == "success"
+
+
+def test_an_error_of_the_file_system_inside_a_hook_is_a_failure_of_the_method(
+    tmp_path: Path, stranger: Callable[[type[Method]], str]
+) -> None:
+    record = execute(RunSpec(TOY, stranger(_Raises), seed=0), tmp_path)
+    assert record.error is not None
+    assert record.error["type"] == "FileNotFoundError"
+    assert record.error["where"] == "prepare"
+
+
+def test_a_run_that_fails_leaves_a_good_record_of_another_configuration_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    spec = RunSpec(TOY, "sft", seed=0)
+    execute(spec, tmp_path)
+    before = spec.path(tmp_path).read_bytes()
+
+    def fail(*_: Any) -> None:
+        raise ValueError("went wrong")
+
+    monkeypatch.setattr("clbench.learning.trainer.Trainer.learn", fail)
+    record = execute(dataclasses.replace(spec, perturb=True), tmp_path)
+    assert record.status == "failed"
+    assert spec.path(tmp_path).read_bytes() == before
+    assert "stays: it is of a run that succeeded" in caplog.text
