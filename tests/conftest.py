@@ -1,6 +1,7 @@
 """Fixtures that several test files share."""
 
 import dataclasses
+import functools
 import io
 import json
 import sys
@@ -12,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from helpers import complete_record
 from rich.console import Console
 
 from clbench.jobs.bars import Bars
@@ -183,7 +185,8 @@ def make_record() -> Callable[..., Record]:
 @pytest.fixture(scope="session")
 def scores(make_record: Callable[..., Record]) -> Callable[..., Scores]:
     """Return a function that makes the scores of a record out of matrices, see `make_record`."""
-    return lambda *arguments, **options: Scores.from_record(make_record(*arguments, **options))
+    make = functools.partial(make_record, complete=False)
+    return lambda *arguments, **options: Scores.from_record(make(*arguments, **options), partial=True)
 
 
 def _make_record(
@@ -206,6 +209,7 @@ def _make_record(
     curve_episodes: int | None = None,
     validation_episodes: int = 10,
     ends: tuple[int, ...] | None = None,
+    complete: bool = True,
     **run: Any,
 ) -> Record:
     """Return a record. Where a value is NaN there is no row, or None in it.
@@ -230,6 +234,8 @@ def _make_record(
         curve_episodes: Episodes per task on the way, where rates are given; as many as at the end if None.
         validation_episodes: Validation episodes, where rates are given.
         ends: Steps of each stage if stages have a criterion, of .9; it is met at steps before the last one.
+        complete: Whether to add what the budget demands: failures, the answers before the stage at its
+            points on the way, and None for changes of the policy.
         run: Fields of `Record.run`, for example method="ewc"; split="validation" holds for all episodes.
             A built-in method uses what it declares.
     """
@@ -316,6 +322,8 @@ def _make_record(
                 record.add_check(CheckRow(stage, step, validation_episodes if met else 2, 9 if met else 0))
     for values in _policy_rows((sparsity, drift), (shift, captured), (stages, len(steps)), steps, at_end):
         record.add_policy(PolicyRow(*values))
+    if complete:
+        complete_record(record)
     return record
 
 

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from clbench.records.record import Record
+from clbench.scoring.completeness import check_complete
 from clbench.scoring.layout import Array, Layout
 from clbench.scoring.rates import MEASURED, Measured, Rates, check_same, combine
 from clbench.scoring.reading import (
@@ -42,17 +43,26 @@ class Scores(Measured):
     """Success in perturbed episodes at the ends of stages, (stages + 1, tasks, episodes)."""
 
     @classmethod
-    def from_record(cls, record: Record) -> Scores:
+    def from_record(cls, record: Record, partial: bool = False) -> Scores:
         """Return the scores in `record`.
 
+        Args:
+            record: A record.
+            partial: Accept a record that lacks some of the results that its budget demands; metrics that need
+                them have no value.
+
         Raises:
-            RecordError: The record contradicts itself: impossible tasks, stages, steps or values.
+            RecordError: The record contradicts itself: impossible tasks, stages, steps or values, or results
+                that are missing or must not be there.
         """
         protocol = read_protocol(record)
         rows = read_episodes(record, protocol)
+        kinds, counts = read_answers(record, protocol)
+        sparsity, drift, shift, captured = read_policy(record, protocol)
+        if not partial:
+            check_complete(record, rows, protocol)
         scored = [row for row in rows if row.split == protocol.split]
         on_the_way = [row for row in scored if not protocol.is_end(row.point)]
-        kinds, counts = read_answers(record, protocol)
         episodes = numbers(scored)
         # a method that is evaluated at the ends alone has none, and belongs to the others all the same
         count = protocol.scored_episodes(at_end=False)
@@ -71,7 +81,6 @@ class Scores(Measured):
         success = _success(protocol, scored, layout)
         perturbed = _perturbed(read_perturbed(protocol, rows, episodes), layout)
         in_curves = [episodes.index(number) for number in layout.curve_episodes]
-        sparsity, drift, shift, captured = read_policy(record, protocol)
         steps, met = read_checks(record, protocol)
         return cls(
             layout=layout,

@@ -154,8 +154,9 @@ def test_a_function_is_an_agent_and_observes_what_its_env_returns(evaluate: Call
 
     record = evaluate(act, env)
     assert all(seen)
-    rates = Scores.from_record(record).success[0].mean(axis=-1)
-    assert dict(zip(Scores.from_record(record).layout.tasks, rates, strict=True))["left"] == 1.0
+    scores = Scores.from_record(record, partial=True)  # its stages are still to come
+    rates = scores.success[0].mean(axis=-1)
+    assert dict(zip(scores.layout.tasks, rates, strict=True))["left"] == 1.0
 
 
 def test_an_agent_receives_its_memory_except_at_the_first_step_of_an_episode(

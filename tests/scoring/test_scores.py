@@ -1,5 +1,6 @@
 """Scores: the values in a record, and no others."""
 
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -43,8 +44,14 @@ ARRAYS = (
 
 
 @pytest.fixture
+def make_record(make_record: MakeRecord) -> MakeRecord:
+    """Return the function that makes records, which may lack results here."""
+    return functools.partial(make_record, complete=False)
+
+
+@pytest.fixture
 def scores(make_record: MakeRecord) -> Callable[..., Scores]:
-    return lambda *arguments, **options: Scores.from_record(make_record(*arguments, **options))
+    return lambda *arguments, **options: Scores.from_record(make_record(*arguments, **options), partial=True)
 
 
 def append(columns: dict[str, list[Any]], *row: Any) -> None:
@@ -98,7 +105,7 @@ def test_a_rate_that_lacks_an_episode_is_missing(make_record: MakeRecord) -> Non
     kept = [row for row in rows if row[:5] not in lost]
     assert len(kept) == len(rows) - 1
     record.episodes = {name: [row[number] for row in kept] for number, name in enumerate(columns)}
-    rates = Scores.from_record(record).rates()
+    rates = Scores.from_record(record, partial=True).rates()
     expected = np.array(RETAINED_CURVES)
     expected[0, 1, 1] = np.nan
     np.testing.assert_allclose(rates.retained_curves[:, :-1], expected)
@@ -109,7 +116,7 @@ def test_the_share_of_right_answers_is_missing_where_a_kind_was_not_asked(make_r
     for step, kind, correct in ((100, "left", 9), (100, "above", 6), (200, "left", 8), (400, "above", 0)):
         append(record.answers, 1, step, kind, 10, correct)
     append(record.answers, 1, 400, "left", 10, 7)
-    run = Scores.from_record(record)
+    run = Scores.from_record(record, partial=True)
     np.testing.assert_allclose(run.answer_curves, [[0.75, np.nan, np.nan, 0.35], [np.nan] * 4])
     np.testing.assert_array_equal(run.correct, [[10, 10], [0, 7], [0, 0]])
 
@@ -188,17 +195,17 @@ def test_perturbed_episodes_other_than_the_test_episodes_are_refused(
     if change:
         append(record.episodes, *{**last, **change}.values())
     with pytest.raises(RecordError, match=words):
-        Scores.from_record(record)
+        Scores.from_record(record, partial=True)
 
 
 def test_a_perturb_run_without_perturbed_episodes_is_refused(make_record: MakeRecord) -> None:
     with pytest.raises(RecordError, match="0 are perturbed, not 160"):
-        Scores.from_record(make_record(MATRIX, perturb=True))
+        Scores.from_record(make_record(MATRIX, perturb=True), partial=True)
 
 
 def test_a_tuning_run_with_perturbed_episodes_is_refused(make_record: MakeRecord) -> None:
     with pytest.raises(RecordError, match="a tuning run has validation episodes alone"):
-        Scores.from_record(make_record(MATRIX, perturbed=PERTURBED, split="validation"))
+        Scores.from_record(make_record(MATRIX, perturbed=PERTURBED, split="validation"), partial=True)
 
 
 def test_a_stage_ends_at_the_last_of_the_evaluation_steps(scores: Callable[..., Scores]) -> None:
@@ -209,9 +216,9 @@ def test_a_stage_ends_at_the_last_of_the_evaluation_steps(scores: Callable[..., 
 
 def test_validation_episodes_are_no_scores(make_record: MakeRecord) -> None:
     record = make_record(MATRIX, **ALL)
-    before = Scores.from_record(record)
+    before = Scores.from_record(record, partial=True)
     append(record.episodes, 2, 400, "skill_0", "validation", 20, 1, 1.0, 5)
-    after = Scores.from_record(record)
+    after = Scores.from_record(record, partial=True)
     assert after.layout == before.layout
     for name in ARRAYS:
         np.testing.assert_array_equal(getattr(after, name), getattr(before, name))
@@ -228,17 +235,17 @@ def test_a_tuning_run_with_a_test_episode_is_refused(make_record: MakeRecord) ->
     record = make_record(MATRIX, episodes=10, split="validation")
     record.episodes["split"][0] = "test"
     with pytest.raises(RecordError, match="tuning run"):
-        Scores.from_record(record)
+        Scores.from_record(record, partial=True)
 
 
 def test_the_order_of_rows_does_not_matter(make_record: MakeRecord) -> None:
     record = make_record(MATRIX, **ALL, answers={(2, "b"): (9, 3), (2, "a"): (5, 4)})
-    scores = Scores.from_record(record)
+    scores = Scores.from_record(record, partial=True)
     order = np.random.default_rng(0).permutation(len(record.episodes["stage"]))
     record.episodes = {name: [column[n] for n in order] for name, column in record.episodes.items()}
     record.answers = {name: column[::-1] for name, column in record.answers.items()}
     record.policy = {name: column[::-1] for name, column in record.policy.items()}
-    shuffled = Scores.from_record(record)
+    shuffled = Scores.from_record(record, partial=True)
     assert shuffled.layout == scores.layout
     for name in ARRAYS:
         np.testing.assert_array_equal(getattr(shuffled, name), getattr(scores, name))
@@ -271,7 +278,7 @@ def test_an_impossible_episode_is_refused(
     record = make_record(MATRIX)
     record.episodes[column][0] = value
     with pytest.raises(RecordError, match=words):
-        Scores.from_record(record)
+        Scores.from_record(record, partial=True)
 
 
 @pytest.mark.parametrize("split", ["test", "validation"])
@@ -281,7 +288,7 @@ def test_an_episode_at_a_step_between_the_evaluation_points_is_refused(
     record = make_record(MATRIX)
     append(record.episodes, 1, 150, "target_0", split, 0, 1, 1.0, 5)
     with pytest.raises(RecordError, match="stage 1, step 150, which is no evaluation point"):
-        Scores.from_record(record)
+        Scores.from_record(record, partial=True)
 
 
 @pytest.mark.parametrize(
@@ -303,7 +310,7 @@ def test_an_impossible_answer_count_is_refused(row: tuple[Any, ...], make_record
     record = make_record(MATRIX, answers={(0, "left"): (10, 9)})
     append(record.answers, *row)
     with pytest.raises(RecordError, match="answers"):
-        Scores.from_record(record)
+        Scores.from_record(record, partial=True)
 
 
 @pytest.mark.parametrize(
@@ -332,10 +339,10 @@ def test_an_impossible_row_of_the_policy_table_is_refused(
 ) -> None:
     record = make_record(MATRIX, sparsity=[[0.5] * 4, [np.nan] * 4])
     record.policy = {name: column[:-1] for name, column in record.policy.items()}
-    Scores.from_record(record)
+    Scores.from_record(record, partial=True)
     append(record.policy, *row)
     with pytest.raises(RecordError, match="policy"):
-        Scores.from_record(record)
+        Scores.from_record(record, partial=True)
 
 
 @pytest.mark.parametrize("row", [0, 1])
@@ -346,7 +353,7 @@ def test_what_only_the_end_of_a_targets_stage_has_is_refused_before(
     record = make_record(MATRIX, shift=SHIFT, captured=CAPTURED)
     record.policy[column][row] = 0.5
     with pytest.raises(RecordError, match="only the end of a target's stage has"):
-        Scores.from_record(record)
+        Scores.from_record(record, partial=True)
 
 
 @pytest.mark.parametrize("names", [None, "skill_0", [1], ["target_0"]])
@@ -354,7 +361,7 @@ def test_a_scenario_without_clear_task_names_is_refused(names: Any, make_record:
     record = make_record(MATRIX)
     record.scenario.retained = names
     with pytest.raises(RecordError, match="scenario"):
-        Scores.from_record(record)
+        Scores.from_record(record, partial=True)
 
 
 @pytest.mark.parametrize("steps", [None, 400, [], [400, 100], [400, 400], [0, 400], [100.0], ["400"], [True]])
@@ -362,21 +369,21 @@ def test_a_scenario_without_clear_evaluation_steps_is_refused(steps: Any, make_r
     record = make_record(MATRIX)
     record.scenario.evaluation_steps = steps
     with pytest.raises(RecordError, match="evaluation_steps"):
-        Scores.from_record(record)
+        Scores.from_record(record, partial=True)
 
 
 def test_a_run_of_an_unknown_split_is_refused(make_record: MakeRecord) -> None:
     record = make_record(MATRIX)
     record.run.split = "all"  # type: ignore[assignment] # the fault
     with pytest.raises(RecordError, match="split must be test or validation"):
-        Scores.from_record(record)
+        Scores.from_record(record, partial=True)
 
 
 def test_a_record_without_test_episodes_is_refused(make_record: MakeRecord) -> None:
     record = make_record(MATRIX)
     record.episodes["split"] = ["validation"] * len(record.episodes["split"])
     with pytest.raises(RecordError, match="no test episode"):
-        Scores.from_record(record)
+        Scores.from_record(record, partial=True)
 
 
 def test_runs_of_different_layouts_do_not_mix(scores: Callable[..., Scores]) -> None:

@@ -6,6 +6,8 @@ from typing import Any
 from clbench.learning.method import Method
 from clbench.learning.registry import load_method, new_method, read_changes
 from clbench.records.content import content_hash
+from clbench.records.record import AnswerRow, EpisodeRow, PolicyRow, Record
+from clbench.scoring.reading import read_protocol
 
 
 def build_method(spec: str, changes: Mapping[str, Any]) -> Method:
@@ -17,3 +19,22 @@ def build_method(spec: str, changes: Mapping[str, Any]) -> Method:
 def sealed(values: Mapping[str, Any]) -> dict[str, Any]:
     """Return a record's JSON with the hash of its content as `content`."""
     return {**values, "content": content_hash(values)}
+
+
+def complete_record(record: Record) -> None:
+    """Add what a record lacks of its budget."""
+    protocol = read_protocol(record)
+    played = {(row.point, row.task, row.split, row.episode) for row in record.episode_rows()}
+    moved = set(zip(record.policy["stage"], record.policy["step"], strict=True))
+    answers = [AnswerRow(*row) for row in zip(*record.answers.values(), strict=True)]
+    asked = sum(row.asked for row in answers if row.stage == 0)
+    record.scenario.budget.setdefault("test_questions", asked)
+    for point in (point for stage in protocol.stages for point in protocol.points(stage)):
+        for key in protocol.episodes(point):
+            if (point, *key) not in played:
+                record.add_episode(EpisodeRow(*point, key.task, key.split, key.number, 0, 0.0, 50))
+        if point not in moved and not record.run.uses.get("online"):
+            record.add_policy(PolicyRow(*point, None, None, None, None))
+        for row in answers:
+            if row.stage == point.stage - 1 and not protocol.is_end(point):
+                record.add_answers(row._replace(stage=point.stage, step=point.step))

@@ -164,7 +164,7 @@ ROWS = [
     ("episodes.split.0", "train", "row 0 has the split 'train'"),
     ("episodes.episode.0", -1, "row 0 has an impossible number of an episode"),
     ("episodes.episode.0", 1, "an episode is there twice"),
-    ("episodes.episode.0", 7, "it was not evaluated like most records: episodes differ"),
+    ("episodes.episode.0", 7, "the test episode 0 of skill_0 is missing at stage 0, step 0"),
     ("episodes.success.0", 0.5, "row 0 has the success 0.5"),
     ("episodes.return.0", "1.0", "row 0 has an impossible return"),
     ("episodes.length.0", -5, "row 0 has an impossible length"),

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pandas
 import pytest
-from helpers import sealed
+from helpers import complete_record, sealed
 
 from clbench.base.entry_points import resolve
 from clbench.records.paths import record_path
@@ -29,10 +29,11 @@ def add(make_record: Callable[..., Record], tmp_path: Path) -> Callable[..., Pat
 
     def add(final: float, order: int = 0, seed: int = 0, method: str = "sft") -> Path:
         matrix = np.full((4, 6), final)
-        record = make_record(matrix, groups=(2, 3, 1), method=method, seed=seed)
+        record = make_record(matrix, groups=(2, 3, 1), method=method, seed=seed, complete=False)
         if order:
             record.run.order = order
             record.scenario.target = [TARGETS[place] for place in target_order(3, order)]
+        complete_record(record)
         path = record_path(tmp_path / "leaderboard" / "records", SCENARIO, method, seed, order)
         write_record(record, path)
         return path

@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 from claims_bench import Bench
 
-from clbench.records.record import AnswerRow, Record
+from clbench.records.record import Record
 
 Given = dict[str, dict[str, Any]]
 
@@ -26,7 +26,8 @@ KEEPS: Given = {"sft": {"right": (500, 500)}, "frozen": {"right": (500, 500)}}
 
 def _early_loss(record: Record) -> None:
     """Let the policy have lost the answers half way through the first stage."""
-    record.add_answers(AnswerRow(1, 50, "left", 500, 400))
+    rows = zip(record.answers["stage"], record.answers["step"], strict=True)
+    record.answers["correct"][list(rows).index((1, 50))] = 400
 
 
 def _shed(first: float, later: float) -> Callable[[Record], None]:

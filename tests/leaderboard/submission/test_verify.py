@@ -91,8 +91,10 @@ def test_a_run_in_another_order_of_the_targets_is_verified_in_that_order(tmp_pat
     path = spec.path(tmp_path / "records")
     assert failures(verify(path, "retrained")) == ""
     assert tiers.tier_of(path) == "retrained"
+    edit(path, lambda values: values["scenario"].update(balanced=True))
+    assert "scenario.balanced differ from the installed code" in failures(verify(path, "recomputed"))
     edit(path, lambda values: values["scenario"]["target"].reverse())
-    assert "scenario.target differ from the installed code" in failures(verify(path, "recomputed"))
+    assert "is missing at stage 1" in failures(verify(path, "recomputed"))
 
 
 def test_perturbed_episodes_are_replayed_like_test_episodes(tmp_path: Path) -> None:

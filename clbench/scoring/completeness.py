@@ -1,0 +1,85 @@
+"""Completeness: a record holds exactly the results that its budget demands."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterable, Sequence
+
+from clbench.records.reader import RecordError
+from clbench.records.record import Record
+from clbench.scoring.reading import Row
+from clbench.spec.protocol import EpisodeKey, Point, Protocol
+
+
+def check_complete(record: Record, rows: Iterable[Row], protocol: Protocol) -> None:
+    """Refuse a record that is not what its budget demands: results that are left out change the scores.
+
+    A method of whole stages, and an agent that learned online, is evaluated at the ends of stages alone. An
+    agent has no answers and no changes of the policy.
+
+    Args:
+        record: The record; its values have been checked one by one.
+        rows: Its episodes.
+        protocol: Its protocol.
+
+    Raises:
+        RecordError: Something is missing, or must not be there.
+    """
+    points = _check_episodes(rows, protocol)
+    online = bool(record.run.uses.get("online"))
+    _check_answers(record, points, 0 if online else record.scenario.budget.get("test_questions", 0))
+    moved = [Point(*place) for place in zip(record.policy["stage"], record.policy["step"], strict=True)]
+    _check_points("policy", moved, () if online else points)
+
+
+def _check_answers(record: Record, points: Sequence[Point], demanded: int) -> None:
+    """Check that the same questions were asked at all points, and as many as the budget demands."""
+    asked: dict[Point, dict[str, int]] = {}
+    stages, steps, kinds, counts, _ = record.answers.values()
+    for stage, step, kind, count in zip(stages, steps, kinds, counts, strict=True):
+        asked.setdefault(Point(stage, step), {})[kind] = count
+    if not asked and not demanded:  # a scenario without questions
+        return
+    _check_points("answers", asked, points)
+    for point in points:
+        if asked[point] != asked[points[0]]:
+            raise RecordError(f"answers: {_at(point)} other questions were asked than before any target.")
+    total = sum(asked[points[0]].values())
+    if total != demanded:
+        raise RecordError(f"answers: {total:,} questions were asked, not {demanded:,}.")
+
+
+def _check_episodes(rows: Iterable[Row], protocol: Protocol) -> Sequence[Point]:
+    """Check the episodes, and return the points at which the policy was evaluated, in their order."""
+    played: dict[Point, set[EpisodeKey]] = defaultdict(set)
+    for row in rows:
+        played[row.point].add(EpisodeKey(row.task, row.split, row.episode))  # type: ignore[arg-type]
+    ends = [protocol.end(stage) for stage in protocol.stages]
+    every = [point for stage in protocol.stages for point in protocol.points(stage)]
+    expected = ends if set(played) <= set(ends) else every
+    _check_points("episodes", played, expected)
+    for point in expected:
+        demanded = set(protocol.episodes(point))
+        _refuse(demanded - played[point], "is missing", point)
+        _refuse(played[point] - demanded, "must not be there", point)
+    return expected
+
+
+def _refuse(keys: set[EpisodeKey], why: str, point: Point) -> None:
+    """Refuse a record with wrong episodes at a point, if there are any."""
+    if keys:
+        task, split, number = min(keys)
+        others = f" (and {len(keys) - 1} others)" if len(keys) > 1 else ""
+        raise RecordError(f"episodes: the {split} episode {number} of {task}{others} {why} {_at(point)}.")
+
+
+def _check_points(table: str, found: Iterable[Point], expected: Sequence[Point]) -> None:
+    missing, foreign = set(expected) - set(found), set(found) - set(expected)
+    if missing:
+        raise RecordError(f"{table}: there are none {_at(min(missing))}.")
+    if foreign:
+        raise RecordError(f"{table}: there must be none {_at(min(foreign))}.")
+
+
+def _at(point: Point) -> str:
+    return f"at stage {point.stage}, step {point.step}"
