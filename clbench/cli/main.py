@@ -31,7 +31,7 @@ COMMANDS = {
     "demonstrations": "clbench.cli.data:demonstrations",
     "pretrain": "clbench.cli.data:pretrain",
     "cache": "clbench.cli.cache:cache",
-    "doctor": "clbench.cli.doctor:doctor",
+    "doctor": "clbench.cli.catalogue:doctor",
     "leaderboard": "clbench.leaderboard.cli:show",
     "submit": "clbench.leaderboard.cli:submit",
     "verify": "clbench.leaderboard.cli:verify",

@@ -15,6 +15,7 @@ from rich.console import Console
 from clbench.base.cache import cache_folder
 from clbench.base.errors import InputError
 from clbench.base.leftovers import sweep
+from clbench.base.strict_json import printable
 from clbench.cli.arguments import (
     add_cwd_to_path,
     check_folders,
@@ -174,7 +175,7 @@ def run_missing(
     from clbench.jobs.plan import Plan
     from clbench.jobs.scheduler import run_with_bars
     from clbench.runs.checkpoints import has_stages
-    from clbench.runs.spec import has_record
+    from clbench.runs.spec import has_record, set_damaged_aside
 
     console = Console(stderr=True)
     with checked_input():
@@ -190,6 +191,10 @@ def run_missing(
     with checked_input():  # refuses a scenario with a camera on a machine that cannot render
         check_folders(records=records, checkpoints=checkpoints, tensorboard=tensorboard, **data_folders())
         sweep(records, cache_folder(), minari_folder() / "clbench")
+        for one in missing:
+            damage = set_damaged_aside(one, records)
+            if damage is not None:
+                console.print(printable(damage), highlight=False, markup=False, soft_wrap=True)
         for one in missing:
             plan.add_run(one, records, checkpoints=checkpoints, tensorboard=tensorboard)
         for one in bare:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -16,6 +17,7 @@ from clbench.records.pinned import other_parts
 from clbench.records.reader import RecordError, read_record
 from clbench.records.record import Record, RunInfo, ScenarioInfo
 from clbench.runs.tuning import tuned_settings
+from clbench.scoring.scores import Scores
 from clbench.spec.protocol import Protocol, ScoredSplit
 from clbench.spec.registry import load_scenario
 from clbench.spec.scenario import Scenario
@@ -171,8 +173,8 @@ def _plain(value: Any) -> Any:
 def has_record(run: ResolvedRun, records: Path) -> bool:
     """Return whether exactly this run has completed, or the same run with perturbed episodes.
 
-    A record does not count if its run failed, if it cannot be read, or if its budget, device or settings
-    differ.
+    A record does not count if its run failed, if it cannot be read or contradicts itself, or if its budget,
+    device or settings differ.
 
     Raises:
         InputError: The record was made with another definition of the scenario.
@@ -180,6 +182,7 @@ def has_record(run: ResolvedRun, records: Path) -> bool:
     path = run.path(records)
     try:
         record = read_record(path)
+        Scores.from_record(record)
     except RecordError:
         return False
     found = record.run if run.spec.perturb else dataclasses.replace(record.run, perturb=False)
@@ -187,6 +190,26 @@ def has_record(run: ResolvedRun, records: Path) -> bool:
         return False
     _check_definition(record, run.published, path)
     return True
+
+
+def set_damaged_aside(run: ResolvedRun, records: Path) -> str | None:
+    """Rename the record of a run if it is damaged, so that the run can be done again.
+
+    Returns:
+        A sentence that says what was damaged and where it is now; None if there is no damaged record.
+    """
+    path = run.path(records)
+    if not os.path.lexists(path):
+        return None
+    try:
+        record = read_record(path)
+        if record.status == "success":
+            Scores.from_record(record)
+    except RecordError as error:
+        aside = path.with_name(f"{path.name}.damaged")
+        path.replace(aside)
+        return f"{str(error).rstrip('.')}. It is set aside as {aside.name}, and the run is done again."
+    return None
 
 
 def _check_definition(record: Record, published: Scenario, path: Path) -> None:

@@ -12,11 +12,14 @@ from typing import Any
 import pytest
 
 from clbench.base.cache import CacheError, cache_folder
+from clbench.base.entry_points import resolve
 from clbench.learning.method import Method
 from clbench.policy.policy import Policy
 from clbench.records.reader import read_record
+from clbench.records.writer import write_record
 from clbench.runs.run import execute
 from clbench.runs.spec import RunSpec
+from clbench.scoring.scores import Scores
 
 TOY = "clbench.testing:clbench/Toy-v0"
 
@@ -91,3 +94,24 @@ def test_a_run_that_fails_leaves_a_good_record_of_another_configuration_alone(
     assert record.status == "failed"
     assert spec.path(tmp_path).read_bytes() == before
     assert "stays: it is of a run that succeeded" in caplog.text
+
+
+@pytest.mark.parametrize("damage", ["torn", "incomplete"])
+def test_a_damaged_record_is_named_set_aside_and_made_again(
+    tmp_path: Path, damage: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = RunSpec(TOY, "frozen", seed=0).path(tmp_path)
+    record = execute(RunSpec(TOY, "frozen", seed=0), tmp_path)
+    if damage == "torn":
+        path.write_text("{", encoding="utf-8")
+    else:
+        for column in record.episodes.values():
+            del column[-1]
+        write_record(record, path)
+    damaged = path.read_bytes()
+    resolve("clbench.cli.runs:run")(TOY, "frozen", seeds=1, records=tmp_path)
+    said = capsys.readouterr().err
+    assert f"{path.name}.damaged, and the run is done again." in said
+    assert ("cannot be read as JSON" if damage == "torn" else "is missing at stage 2, step 60") in said
+    assert path.with_name(f"{path.name}.damaged").read_bytes() == damaged
+    assert Scores.from_record(read_record(path)).success.shape[0] == 3
