@@ -126,7 +126,8 @@ def verify(
         records: Folder of the records.
     """
     from .board.tiers import TIERS
-    from .submission.verify import Request, run_verifications
+    from .submission.subject import Request
+    from .submission.verify import run_verifications
 
     add_cwd_to_path()
     with checked_input():

@@ -11,48 +11,30 @@ import hashlib
 import json
 import tempfile
 from collections.abc import Sequence
-from contextlib import closing
-from dataclasses import asdict, dataclass, is_dataclass, replace
-from functools import cached_property
+from dataclasses import asdict, is_dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from rich.console import Console
 
-from clbench.base.errors import ClbenchError, InputError
+from clbench.base.errors import ClbenchError
 from clbench.base.progress import ProgressCallback, no_progress
-from clbench.data.questions import load_questions, scored_questions
-from clbench.evaluation.answers import answer
-from clbench.evaluation.checks import Checker
-from clbench.evaluation.examiner import episode_row
-from clbench.evaluation.rollouts import Evaluator, Trial
 from clbench.jobs.job import Job, JobError
 from clbench.jobs.processes import Processes
 from clbench.jobs.scheduler import run_with_bars
-from clbench.learning.pretraining import pretrained_policy
-from clbench.learning.registry import method_names
-from clbench.learning.trainer import repeatable
-from clbench.policy.policy import Policy
 from clbench.records.pinned import other_parts
 from clbench.records.reader import RecordError
-from clbench.records.record import EpisodeRow, Record
-from clbench.runs.checkpoints import kept_stages, load_stages, stage_policies
-from clbench.runs.fingerprint import fingerprint
+from clbench.records.record import Record
 from clbench.runs.length import run_length
-from clbench.runs.run import execute, pretrained_hash
-from clbench.runs.spec import ResolvedRun, RunSpec, check_device
+from clbench.runs.run import execute
 from clbench.scoring.metrics import measure
-from clbench.scoring.reading import read_protocol
-from clbench.spec.protocol import Point, Protocol
 from clbench.spec.scenario import Scenario
 
-from ..board.runs import Run, differences, read_run
+from ..board.runs import differences, read_run
 from ..board.tiers import TIERS, tier_of, verification_path
 from ..views.format import write_if_changed
-
-SHOWN = 3
-"""Number of differences that a check reports in full."""
+from .replay import replay
+from .subject import Check, Request, Subject, some
 
 PARTS = (
     "run",
@@ -67,88 +49,12 @@ PARTS = (
 )
 """Parts that two records of one run share to the last bit."""
 
-
-@dataclass(frozen=True)
-class Check:
-    """The result of one check."""
-
-    name: str
-    """Subject of the check."""
-    found: str
-    """Result in words."""
-    passed: bool
-    """Whether the record passed."""
-
-
-@dataclass(frozen=True)
-class Request:
-    """The options of a verification."""
-
-    tier: str
-    """Highest of `TIERS` to check."""
-    episodes: int
-    """Number of episodes to replay; all replayable ones if there are fewer."""
-    seed: int
-    """Random seed that selects these episodes. The submitter must not know it."""
-    method: str | None
-    """module:Class of a method that is not installed; the name in a record alone is never imported."""
-    scenario: str | None
-    """module:id of the scenario; None if clbench registers it."""
-    checkpoints: Path | None
-    """Folder of kept policies; if None, they are trained again."""
-
-
-@dataclass(frozen=True)
-class _Subject:
-    """A record under verification, with values that several checks need."""
-
-    run: Run
-    request: Request
-
-    @property
-    def spec(self) -> RunSpec:
-        """The run that makes the record again."""
-        values = self.run.record.run
-        return RunSpec(
-            self.request.scenario or values.scenario,
-            values.method,
-            values.seed,
-            values.changes,
-            values.device,
-            order=values.order,
-            perturb=values.perturb,
-        )
-
-    @property
-    def may_import(self) -> bool:
-        """Whether its method may be imported: it is installed, or the verifier named it."""
-        return self.run.record.run.method in (*method_names(), self.request.method)
-
-    @cached_property
-    def resolved(self) -> ResolvedRun:
-        """The run, whose method is imported."""
-        return self.spec.resolve()
-
-    @cached_property
-    def scenarios(self) -> tuple[Scenario, Scenario]:
-        """The verifier's scenario, with the targets in the order of the run and in the published order."""
-        return self.spec.scenarios()
-
-    @property
-    def scenario(self) -> Scenario:
-        """The verifier's scenario, with the targets in the order of the run."""
-        return self.scenarios[0]
-
-    @property
-    def protocol(self) -> Protocol:
-        """The evaluation protocol of the run, with the ends of its stages."""
-        planned = Protocol.of(self.scenario, self.spec.split, self.spec.perturb)
-        return replace(planned, ends=read_protocol(self.run.record).ends)
-
-    @cached_property
-    def here(self) -> dict[str, Any]:
-        """The fingerprint of this machine; it plays a rollout of every world."""
-        return fingerprint(self.scenarios[1])
+ORIGIN = {
+    "versions": (),
+    "hardware": ("machine", "system", "instructions"),
+    "method": ("authors", "link", "licence", "version"),
+}
+"""Entries of a fingerprint that a repetition confirms on the same kind of machine; () stands for all."""
 
 
 def verify(
@@ -169,9 +75,9 @@ def verify(
         run = read_run(records, path, changed=None)
     except RecordError as error:
         return [Check("record", str(error), False)]
-    subject = _Subject(run, request)
+    subject = Subject(run, request)
     checks: list[Check] = []
-    looks = {"recomputed": _recompute, "replayed": _replay, "retrained": _retrain}
+    looks = {"recomputed": _recompute, "replayed": replay, "retrained": _retrain}
     for tier in TIERS[1 : TIERS.index(request.tier) + 1]:
         checks += looks[tier](subject, progress)
         if not all(check.passed for check in checks):
@@ -180,7 +86,7 @@ def verify(
     return checks
 
 
-def _write(path: Path, subject: _Subject, tier: str, checks: Sequence[Check]) -> None:
+def _write(path: Path, subject: Subject, tier: str, checks: Sequence[Check]) -> None:
     """Write the file with the tier of a record, the checks, and the verifier's fingerprint."""
     values = {
         "tier": tier,
@@ -195,7 +101,7 @@ def _write(path: Path, subject: _Subject, tier: str, checks: Sequence[Check]) ->
 # ---- recomputed --------------------------------------------------------------------------------------------
 
 
-def _recompute(subject: _Subject, _: ProgressCallback) -> list[Check]:
+def _recompute(subject: Subject, _: ProgressCallback) -> list[Check]:
     """Check that a record is consistent, and that it belongs to this version of its scenario."""
     run = subject.run
     values = {name: measure(name, run.scores) for name in ("final_average", "adaptation", "retention")}
@@ -230,7 +136,7 @@ def _recompute(subject: _Subject, _: ProgressCallback) -> list[Check]:
     return [*checks, Check("simulator", result, recorded == found), _check_definition(subject)]
 
 
-def _check_definition(subject: _Subject) -> Check:
+def _check_definition(subject: Subject) -> Check:
     """Check that the tasks and questions of the record are those of the installed scenario."""
     recorded = subject.run.record.fingerprint.get("definition")
     if recorded is None:
@@ -259,122 +165,13 @@ def _check_horizons(record: Record, scenario: Scenario) -> Check:
         return Check(
             "ends of episodes", f"all {len(record.episodes['task'])} end as the task's horizon allows", True
         )
-    return Check("ends of episodes", f"failed before the horizon or ran beyond it: {_some(wrong)}", False)
-
-
-# ---- replayed ----------------------------------------------------------------------------------------------
-
-
-def _replay(subject: _Subject, progress: ProgressCallback) -> list[Check]:
-    """Replay episodes of a record with the policies of its stages, and ask the questions again."""
-    run, spec = subject.run, subject.spec
-    if run.division == "online":
-        return [
-            Check(
-                "policies", "an agent that learned online has none, so its highest tier is recomputed", False
-            )
-        ]
-    if not subject.may_import:
-        result = f"{run.method} is not installed: name it with --method to import and run its code"
-        return [Check("policies", result, False)]
-    try:
-        check_device(spec.device)
-    except InputError as error:  # the rest needs the device of the run
-        return [Check("policies", str(error), False)]
-    kept = kept_stages(subject.resolved, subject.request.checkpoints)
-    if kept is None:
-        _, folder = pretrained_policy(subject.scenario, spec.seed)
-        if pretrained_hash(folder) != run.record.fingerprint.get("pretrained"):
-            result = (
-                "pretraining does not give the same policy here as on the machine of the record, perhaps "
-                "because of another processor: ask the submitter for the policies of its stages "
-                "(--checkpoints)"
-            )
-            return [Check("policies", result, False)]
-    with repeatable(spec.device):
-        policies = (
-            load_stages(subject.resolved, kept)
-            if kept
-            else stage_policies(subject.resolved, progress=progress)
-        )
-        episodes = _replay_episodes(subject, policies)
-        answers = _replay_answers(subject, policies)
-    origin = "kept by the run" if kept else "trained again"
-    checks = _replay_checks(subject, policies) if subject.scenario.budget.criterion else []
-    return [Check("policies", origin, True), episodes, answers, *checks]
-
-
-def _replay_episodes(subject: _Subject, policies: Sequence[Policy]) -> Check:
-    scenario, protocol, request = subject.scenario, subject.protocol, subject.request
-    every = subject.run.record.episode_rows()
-    at_ends = [row for row in every if protocol.is_end(row.point) and row.split != "validation"]
-    generator = np.random.default_rng(request.seed)
-    chosen = generator.permutation(len(at_ends))[: request.episodes]
-    rows = [at_ends[index] for index in sorted(chosen)]
-    again: list[EpisodeRow] = []
-    with closing(Evaluator(scenario, subject.spec.seed)) as evaluator:
-        for stage, policy in enumerate(policies):
-            trials: list[Trial] = [
-                (scenario.task(row.task), row.split, row.episode) for row in rows if row.stage == stage
-            ]
-            policy.eval()
-            again += [episode_row(protocol.end(stage), episode) for episode in evaluator.play(policy, trials)]
-    wrong = [
-        f"{theirs.task} {theirs.split} episode {theirs.episode} of stage {theirs.stage} has "
-        f"{_outcome(theirs)}, not {_outcome(ours)}"
-        for theirs, ours in zip(rows, again, strict=True)
-        if theirs != ours
-    ]
-    if wrong:
-        return Check("episodes", f"{len(wrong)} of {len(rows)} ended differently: {_some(wrong)}", False)
-    return Check("episodes", f"{len(rows)} of {len(at_ends)} replayed, all ended as recorded", True)
-
-
-def _replay_checks(subject: _Subject, policies: Sequence[Policy]) -> list[Check]:
-    """Repeat the last check of each stage with the policy that the stage left."""
-    if subject.resolved.method.whole_stages:
-        return []  # the policy changed after the last check
-    last = {row.stage: row for row in subject.run.record.check_rows()}
-    targets = subject.scenario.target
-    with closing(Checker(subject.scenario, subject.protocol, subject.spec.seed)) as checker:
-        wrong = [
-            f"stage {stage}"
-            for stage, row in last.items()
-            if checker.check(policies[stage], targets[stage - 1], subject.protocol.end(stage)) != row
-        ]
-    if wrong:
-        return [Check("ends of stages", f"another outcome of the last check: {_some(wrong)}", False)]
-    return [Check("ends of stages", f"the last checks of all {len(last)} stages repeat themselves", True)]
-
-
-def _outcome(row: EpisodeRow) -> str:
-    return f"{'success' if row.success else 'failure'} after {row.length} steps, return {row.total_reward}"
-
-
-def _replay_answers(subject: _Subject, policies: Sequence[Policy]) -> Check:
-    scenario = subject.scenario
-    _, questions = load_questions(scenario)
-    kind, asked = scored_questions(questions, scenario.budget.test_questions)
-    protocol = subject.protocol
-    again = [
-        (*protocol.end(stage), *counts)
-        for stage, policy in enumerate(policies)
-        for counts in answer(policy, questions.kinds, kind, asked)
-    ]
-    rows = zip(*subject.run.record.answers.values(), strict=True)
-    theirs = {row for row in rows if protocol.is_end(Point(*row[:2]))}
-    wrong = [f"{row[2]} after stage {row[0]}" for row in sorted(theirs.symmetric_difference(again))]
-    if wrong:
-        return Check(
-            "answers", f"different counts of correct answers: {_some(list(dict.fromkeys(wrong)))}", False
-        )
-    return Check("answers", f"asked again after all {len(policies) - 1} stages, same counts", True)
+    return Check("ends of episodes", f"failed before the horizon or ran beyond it: {some(wrong)}", False)
 
 
 # ---- retrained ---------------------------------------------------------------------------------------------
 
 
-def _retrain(subject: _Subject, progress: ProgressCallback) -> list[Check]:
+def _retrain(subject: Subject, progress: ProgressCallback) -> list[Check]:
     """Repeat the whole run, and compare the records."""
     with tempfile.TemporaryDirectory() as folder:
         again = execute(subject.resolved, Path(folder), progress)
@@ -388,16 +185,37 @@ def _retrain(subject: _Subject, progress: ProgressCallback) -> list[Check]:
         return [Check("whole run", f"it failed: {again.error['type']}: {again.error['message']}", False)]
     if wrong:
         return [Check("whole run", f"repeated, {', '.join(wrong)} differ", False)]
-    return [Check("whole run", f"repeated, equal in {', '.join(PARTS)}", True)]
+    return [Check("whole run", f"repeated, equal in {', '.join(PARTS)}", True), _check_origin(subject, again)]
+
+
+def _check_origin(subject: Subject, again: Record) -> Check:
+    """Compare what a record says about its software, hardware and method with this repetition."""
+    theirs, ours = (_origin(record) for record in (subject.run.record, again))
+    wrong = [f"{name} {theirs.get(name)} is {ours.get(name)} here" for name in differences(theirs, ours)]
+    if wrong:
+        return Check("origin", f"the record states what is not so here: {some(wrong)}", False)
+    source = [record.fingerprint.get("method", {}).get("source") for record in (subject.run.record, again)]
+    same = "the method's source is the same" if source[0] == source[1] else "the method's source has changed"
+    return Check(
+        "origin",
+        f"versions, instructions and metadata are those here; {same}; commit, processor, Python and times "
+        "cannot be compared",
+        True,
+    )
+
+
+def _origin(record: Record) -> dict[str, Any]:
+    """Return what a record says about itself and a repetition can confirm."""
+    found: dict[str, Any] = {}
+    for part, names in ORIGIN.items():
+        values = record.fingerprint.get(part)
+        entries = values if isinstance(values, dict) else {}
+        found |= {f"{part} {name}": entries.get(name) for name in names or sorted(entries)}
+    return {**found, "pretrained": record.fingerprint.get("pretrained")}
 
 
 def _as_dictionary(part: Any) -> Any:
     return asdict(part) if is_dataclass(part) and not isinstance(part, type) else part
-
-
-def _some(wrong: Sequence[str]) -> str:
-    more = f", and {len(wrong) - SHOWN} more" if len(wrong) > SHOWN else ""
-    return f"{'; '.join(wrong[:SHOWN])}{more}"
 
 
 # ---- the job -----------------------------------------------------------------------------------------------
@@ -413,7 +231,7 @@ def _job(path: Path, records: Path, request: Request) -> Job:
     """Return the job that verifies a record; its length is known if the record can be read."""
     length = 1.0
     try:
-        subject = _Subject(read_run(records, path, changed=None), request)
+        subject = Subject(read_run(records, path, changed=None), request)
         scenario = subject.scenario
         if request.tier in TIERS[2:]:
             length += len(scenario.target) * scenario.budget.adaptation_steps

@@ -2,6 +2,7 @@
 
 import importlib
 import json
+import math
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -46,7 +47,7 @@ def mine(honest: Path, tmp_path: Path) -> Path:
 def verify(path: Path, tier: str, honest: Path | None = None, **rest: Any) -> list[Any]:
     """Return the checks of a verification, with the kept policies if their folder is given."""
     checkpoints = honest / "checkpoints" if honest else None
-    request = verification.Request(
+    request = importlib.import_module("clbench.leaderboard.submission.subject").Request(
         **{
             "tier": tier,
             "episodes": ALL,
@@ -103,7 +104,7 @@ def test_perturbed_episodes_are_replayed_like_test_episodes(tmp_path: Path) -> N
     path = spec.path(tmp_path / "records")
     checks = verify(path, "retrained")
     assert failures(checks) == ""
-    assert any(check.found.startswith("138 of 138 replayed") for check in checks)  # 90 and 48
+    assert any(check.found.startswith("146 of 146 replayed") for check in checks)  # 90, 48 and 8
     edit(path, lambda values: flip_perturbed(values))
     assert "left perturbed episode " in failures(verify(path, "replayed"))
     assert tiers.tier_of(path) == "recomputed"
@@ -161,15 +162,29 @@ def test_the_table_shows_the_least_tier_of_a_row(mine: Path, honest: Path) -> No
     assert list(load(records).tier) == ["self-reported"]
 
 
-def flip(values: dict[str, Any], success: int, step: int | None = None) -> None:
+def flip(values: dict[str, Any], success: int, step: int | None = None, split: str = "test") -> None:
     """Turn the first episode with this outcome into its opposite, at this step of a stage if one is given."""
     episodes = values["episodes"]
     rows = [
         row
         for row, outcome in enumerate(episodes["success"])
-        if outcome == success and episodes["split"][row] == "test" and step in (None, episodes["step"][row])
+        if outcome == success and episodes["split"][row] == split and step in (None, episodes["step"][row])
     ]
     episodes["success"][rows[0]] = 1 - success
+
+
+def shorten(values: dict[str, Any], split: str, step: int) -> None:
+    """Let the first success of a split at a step of a stage come a step earlier."""
+    episodes = values["episodes"]
+    rows = zip(episodes["split"], episodes["step"], episodes["success"], strict=True)
+    episodes["length"][list(rows).index((split, step, 1))] -= 1
+
+
+def drop_failures(values: dict[str, Any]) -> None:
+    """Leave out all failures."""
+    episodes = values["episodes"]
+    kept = [row for row, outcome in enumerate(episodes["success"]) if outcome]
+    values["episodes"] = {name: [column[row] for row in kept] for name, column in episodes.items()}
 
 
 def more_right_answers(values: dict[str, Any]) -> None:
@@ -208,7 +223,24 @@ FORGERIES = [
     ("recomputed", "and must be there", lambda values: values["run"].update(seed=7)),
     ("recomputed", "record: ", lambda values: values["episodes"]["success"].pop()),
     ("replayed", "episodes: 1 of ", lambda values: flip(values, 0, 60)),
+    ("replayed", "episodes: 1 of ", lambda values: shorten(values, "validation", 60)),
     ("replayed", "answers: different counts", more_right_answers),
+    ("recomputed", "episodes: there are none at stage 1", lambda values: drop_failures(values)),
+    *(
+        ("retrained", f"origin: the record states what is not so here: {what}", change)
+        for what, change in (
+            ("versions torch 1.0 is ", lambda values: values["fingerprint"]["versions"].update(torch="1.0")),
+            (
+                "hardware instructions NEON is ",
+                lambda values: values["fingerprint"]["hardware"].update(instructions="NEON"),
+            ),
+            (
+                "method authors somebody is None here",
+                lambda values: values["fingerprint"]["method"].update(authors="somebody"),
+            ),
+            ("hardware instructions None", lambda values: values["fingerprint"].update(hardware=[])),
+        )
+    ),
 ]
 
 
@@ -233,6 +265,15 @@ def test_a_fault_that_only_the_whole_run_shows_is_found_by_doing_it_again(mine: 
     assert tiers.tier_of(mine) == "replayed"
 
 
+@pytest.mark.parametrize(("count", "looked_at"), [(90, 10), (1160, 40), (40, 40), (5, 1)])
+def test_the_least_lie_that_is_found_is_the_least_whose_chance_to_hide_is_5_percent(
+    count: int, looked_at: int
+) -> None:
+    found = importlib.import_module("clbench.leaderboard.submission.replay").least_found(count, looked_at)
+    hides = [math.comb(count - lies, looked_at) / math.comb(count, looked_at) for lies in range(count + 1)]
+    assert hides[found] <= 0.05 < hides[found - 1]
+
+
 def test_the_worlds_are_closed_if_a_replay_fails(
     mine: Path, honest: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -246,7 +287,7 @@ def test_the_worlds_are_closed_if_a_replay_fails(
             closed.append(self)
             super().close()
 
-    monkeypatch.setattr(verification, "Evaluator", Broken)
+    monkeypatch.setattr("clbench.leaderboard.submission.replay.Evaluator", Broken)
     with pytest.raises(RuntimeError, match="the simulator crashed"):
         verify(mine, "replayed", honest)
     assert len(closed) == 1

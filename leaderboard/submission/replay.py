@@ -1,0 +1,157 @@
+"""The tier "replayed": episodes, questions and checks, once more with the policies of the stages."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import closing
+
+import numpy as np
+from scipy.stats import hypergeom
+
+from clbench.base.errors import InputError
+from clbench.base.progress import ProgressCallback
+from clbench.data.questions import load_questions, scored_questions
+from clbench.evaluation.answers import answer
+from clbench.evaluation.checks import Checker
+from clbench.evaluation.examiner import episode_row
+from clbench.evaluation.rollouts import Evaluator, Trial
+from clbench.learning.pretraining import pretrained_policy
+from clbench.learning.trainer import repeatable
+from clbench.policy.policy import Policy
+from clbench.records.record import EpisodeRow
+from clbench.runs.checkpoints import kept_stages, load_stages, stage_policies
+from clbench.runs.run import pretrained_hash
+from clbench.runs.spec import check_device
+from clbench.spec.protocol import Point
+
+from .subject import Check, Subject, some
+
+MISSED = 0.05
+"""Probability at which a look at some episodes may miss made-up ones."""
+
+
+def replay(subject: Subject, progress: ProgressCallback) -> list[Check]:
+    """Replay episodes of a record with the policies of its stages, and ask the questions again."""
+    run, spec = subject.run, subject.spec
+    if run.division == "online":
+        return [
+            Check(
+                "policies", "an agent that learned online has none, so its highest tier is recomputed", False
+            )
+        ]
+    if not subject.may_import:
+        result = f"{run.method} is not installed: name it with --method to import and run its code"
+        return [Check("policies", result, False)]
+    try:
+        check_device(spec.device)
+    except InputError as error:  # the rest needs the device of the run
+        return [Check("policies", str(error), False)]
+    kept = kept_stages(subject.resolved, subject.request.checkpoints)
+    if kept is None:
+        _, folder = pretrained_policy(subject.scenario, spec.seed)
+        if pretrained_hash(folder) != run.record.fingerprint.get("pretrained"):
+            result = (
+                "pretraining does not give the same policy here as on the machine of the record, perhaps "
+                "because of another processor: ask the submitter for the policies of its stages "
+                "(--checkpoints)"
+            )
+            return [Check("policies", result, False)]
+    with repeatable(spec.device):
+        policies = (
+            load_stages(subject.resolved, kept)
+            if kept
+            else stage_policies(subject.resolved, progress=progress)
+        )
+        episodes = _replay_episodes(subject, policies)
+        answers = _replay_answers(subject, policies)
+    origin = "kept by the run" if kept else "trained again"
+    checks = _replay_checks(subject, policies) if subject.scenario.budget.criterion else []
+    return [Check("policies", origin, True), episodes, answers, *checks]
+
+
+def _replay_episodes(subject: Subject, policies: Sequence[Policy]) -> Check:
+    """Play randomly chosen episodes again, of all splits, at the ends of all stages."""
+    scenario, protocol, request = subject.scenario, subject.protocol, subject.request
+    every = subject.run.record.episode_rows()
+    at_ends = [row for row in every if protocol.is_end(row.point)]
+    generator = np.random.default_rng(request.seed)
+    chosen = generator.permutation(len(at_ends))[: request.episodes]
+    rows = [at_ends[index] for index in sorted(chosen)]
+    again: list[EpisodeRow] = []
+    with closing(Evaluator(scenario, subject.spec.seed)) as evaluator:
+        for stage, policy in enumerate(policies):
+            trials: list[Trial] = [
+                (scenario.task(row.task), row.split, row.episode) for row in rows if row.stage == stage
+            ]
+            policy.eval()
+            again += [episode_row(protocol.end(stage), episode) for episode in evaluator.play(policy, trials)]
+    wrong = [
+        f"{theirs.task} {theirs.split} episode {theirs.episode} of stage {theirs.stage} has "
+        f"{_outcome(theirs)}, not {_outcome(ours)}"
+        for theirs, ours in zip(rows, again, strict=True)
+        if theirs != ours
+    ]
+    if wrong:
+        return Check("episodes", f"{len(wrong)} of {len(rows)} ended differently: {some(wrong)}", False)
+    unseen = len(every) - len(at_ends)
+    found = [
+        f"{len(rows)} of {len(at_ends)} replayed, all ended as recorded",
+        *([f"{unseen} before the ends of stages have no policy to replay"] if unseen else []),
+        f"{least_found(len(at_ends), len(rows))} made-up ones would have been found with 95 %",
+    ]
+    return Check("episodes", "; ".join(found), True)
+
+
+def least_found(count: int, looked_at: int) -> int:
+    """Return the least number of made-up episodes that a random look finds with a probability of 95 %.
+
+    Args:
+        count: Number of episodes.
+        looked_at: Number of them that were replayed, chosen at random.
+    """
+    return next(
+        made_up
+        for made_up in range(1, count + 1)
+        if hypergeom.pmf(0, count, made_up, looked_at) <= MISSED or made_up == count
+    )
+
+
+def _replay_checks(subject: Subject, policies: Sequence[Policy]) -> list[Check]:
+    """Repeat the last check of each stage with the policy that the stage left."""
+    if subject.resolved.method.whole_stages:
+        return []  # the policy changed after the last check
+    last = {row.stage: row for row in subject.run.record.check_rows()}
+    targets = subject.scenario.target
+    with closing(Checker(subject.scenario, subject.protocol, subject.spec.seed)) as checker:
+        wrong = [
+            f"stage {stage}"
+            for stage, row in last.items()
+            if checker.check(policies[stage], targets[stage - 1], subject.protocol.end(stage)) != row
+        ]
+    if wrong:
+        return [Check("ends of stages", f"another outcome of the last check: {some(wrong)}", False)]
+    return [Check("ends of stages", f"the last checks of all {len(last)} stages repeat themselves", True)]
+
+
+def _outcome(row: EpisodeRow) -> str:
+    return f"{'success' if row.success else 'failure'} after {row.length} steps, return {row.total_reward}"
+
+
+def _replay_answers(subject: Subject, policies: Sequence[Policy]) -> Check:
+    scenario = subject.scenario
+    _, questions = load_questions(scenario)
+    kind, asked = scored_questions(questions, scenario.budget.test_questions)
+    protocol = subject.protocol
+    again = [
+        (*protocol.end(stage), *counts)
+        for stage, policy in enumerate(policies)
+        for counts in answer(policy, questions.kinds, kind, asked)
+    ]
+    rows = zip(*subject.run.record.answers.values(), strict=True)
+    theirs = {row for row in rows if protocol.is_end(Point(*row[:2]))}
+    wrong = [f"{row[2]} after stage {row[0]}" for row in sorted(theirs.symmetric_difference(again))]
+    if wrong:
+        return Check(
+            "answers", f"different counts of correct answers: {some(list(dict.fromkeys(wrong)))}", False
+        )
+    return Check("answers", f"asked again after all {len(policies) - 1} stages, same counts", True)

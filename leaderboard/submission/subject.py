@@ -1,0 +1,110 @@
+"""The subject of a verification: a record, the run that makes it again, and the results of checks."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from clbench.learning.registry import method_names
+from clbench.runs.fingerprint import fingerprint
+from clbench.runs.spec import ResolvedRun, RunSpec
+from clbench.scoring.reading import read_protocol
+from clbench.spec.protocol import Protocol
+from clbench.spec.scenario import Scenario
+
+from ..board.runs import Run
+
+SHOWN = 3
+"""Number of differences that a check reports in full."""
+
+
+@dataclass(frozen=True)
+class Check:
+    """The result of one check."""
+
+    name: str
+    """Subject of the check."""
+    found: str
+    """Result in words."""
+    passed: bool
+    """Whether the record passed."""
+
+
+@dataclass(frozen=True)
+class Request:
+    """The options of a verification."""
+
+    tier: str
+    """Highest of `TIERS` to check."""
+    episodes: int
+    """Number of episodes to replay; all replayable ones if there are fewer."""
+    seed: int
+    """Random seed that selects these episodes. The submitter must not know it."""
+    method: str | None
+    """module:Class of a method that is not installed; the name in a record alone is never imported."""
+    scenario: str | None
+    """module:id of the scenario; None if clbench registers it."""
+    checkpoints: Path | None
+    """Folder of kept policies; if None, they are trained again."""
+
+
+@dataclass(frozen=True)
+class Subject:
+    """A record under verification, with values that several checks need."""
+
+    run: Run
+    request: Request
+
+    @property
+    def spec(self) -> RunSpec:
+        """The run that makes the record again."""
+        values = self.run.record.run
+        return RunSpec(
+            self.request.scenario or values.scenario,
+            values.method,
+            values.seed,
+            values.changes,
+            values.device,
+            order=values.order,
+            perturb=values.perturb,
+        )
+
+    @property
+    def may_import(self) -> bool:
+        """Whether its method may be imported: it is installed, or the verifier named it."""
+        return self.run.record.run.method in (*method_names(), self.request.method)
+
+    @cached_property
+    def resolved(self) -> ResolvedRun:
+        """The run, whose method is imported."""
+        return self.spec.resolve()
+
+    @cached_property
+    def scenarios(self) -> tuple[Scenario, Scenario]:
+        """The verifier's scenario, with the targets in the order of the run and in the published order."""
+        return self.spec.scenarios()
+
+    @property
+    def scenario(self) -> Scenario:
+        """The verifier's scenario, with the targets in the order of the run."""
+        return self.scenarios[0]
+
+    @property
+    def protocol(self) -> Protocol:
+        """The evaluation protocol of the run, with the ends of its stages."""
+        planned = Protocol.of(self.scenario, self.spec.split, self.spec.perturb)
+        return replace(planned, ends=read_protocol(self.run.record).ends)
+
+    @cached_property
+    def here(self) -> dict[str, Any]:
+        """The fingerprint of this machine; it plays a rollout of every world."""
+        return fingerprint(self.scenarios[1])
+
+
+def some(wrong: Sequence[str]) -> str:
+    """Return the first differences in words, and the number of the others."""
+    more = f", and {len(wrong) - SHOWN} more" if len(wrong) > SHOWN else ""
+    return f"{'; '.join(wrong[:SHOWN])}{more}"
