@@ -1,0 +1,139 @@
+"""One run that dies, or meets a full disk, at any operation that changes files: nothing is lost or torn."""
+
+import json
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import fault_server
+import pytest
+
+from clbench.base.leftovers import sweep
+
+POINTS = 4
+"""Operations that the quick test tries, spread over the run; the slow one tries all."""
+
+FULL_DISKS = 20
+
+
+class Runs:
+    """Runs of the toy in forked processes."""
+
+    def __init__(self, process: subprocess.Popen[str]) -> None:
+        self.process = process
+
+    def do(self, folder: Path, method: str = "sft", seed: int = 0, **fault: Any) -> tuple[int | None, str]:
+        """Do a run in the caches and the records of a folder; return its operations and how it ended."""
+        caches = {"CLBENCH_CACHE": "cache", "MINARI_DATASETS_PATH": "minari"}
+        order = {
+            "environment": {name: str(folder / place) for name, place in caches.items()},
+            "records": str(folder / "records"),
+            "method": method,
+            "seed": seed,
+            **fault,
+        }
+        assert self.process.stdin is not None
+        assert self.process.stdout is not None
+        self.process.stdin.write(json.dumps(order) + "\n")
+        self.process.stdin.flush()
+        count, end = json.loads(self.process.stdout.readline())
+        return count, end
+
+
+@pytest.fixture(scope="module")
+def runs() -> Iterator[Runs]:
+    command = [sys.executable, fault_server.__file__]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
+        yield Runs(process)
+        assert process.stdin is not None
+        process.stdin.close()
+
+
+@pytest.fixture(scope="module")
+def whole(runs: Runs, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, int]:
+    """Return the folder of a run that nothing disturbed, and the number of its operations."""
+    folder = tmp_path_factory.mktemp("whole")
+    count, end = runs.do(folder)
+    assert end == "success"
+    assert count is not None
+    return folder, count
+
+
+def _leftovers(folder: Path) -> list[str]:
+    """Return the names of what killed processes left."""
+    return sorted(path.name for path in folder.rglob(".*"))
+
+
+def _check_next_start(
+    runs: Runs, folder: Path, whole: Path, lasting_records: Callable[[Path], dict[str, Any]]
+) -> None:
+    """Check that the next start gives the record of an undisturbed run, and leaves nothing else."""
+    assert all(path.name == "seed-0.json" for path in folder.glob("records/*/*/[!.]*"))
+    assert runs.do(folder)[1] == "success"
+    assert lasting_records(folder / "records") == lasting_records(whole / "records")
+    assert _leftovers(folder) == []
+    assert list((folder / "cache" / "runs").iterdir()) == []
+
+
+def _die(
+    points: list[int],
+    runs: Runs,
+    tmp_path: Path,
+    whole: Path,
+    lasting_records: Callable[[Path], dict[str, Any]],
+) -> None:
+    for point in points:
+        folder = tmp_path / str(point)
+        assert runs.do(folder, at=point, fault=fault_server.DIES) == (None, "killed")
+        _check_next_start(runs, folder, whole, lasting_records)
+
+
+def test_a_run_that_dies_at_some_operation_is_completed_by_the_next_start(
+    runs: Runs,
+    whole: tuple[Path, int],
+    tmp_path: Path,
+    lasting_records: Callable[[Path], dict[str, Any]],
+) -> None:
+    folder, count = whole
+    points = [1 + point * (count - 1) // (POINTS - 1) for point in range(POINTS)]
+    _die(points, runs, tmp_path, folder, lasting_records)
+
+
+@pytest.mark.slow
+def test_a_run_that_dies_at_any_operation_is_completed_by_the_next_start(
+    runs: Runs,
+    whole: tuple[Path, int],
+    tmp_path: Path,
+    lasting_records: Callable[[Path], dict[str, Any]],
+    record_property: Callable[[str, object], None],
+) -> None:
+    folder, count = whole
+    _die(list(range(1, count + 1)), runs, tmp_path, folder, lasting_records)
+    record_property("crash_points", count)
+
+
+@pytest.mark.parametrize("share", [0.5, pytest.param(None, marks=pytest.mark.slow)])
+def test_a_full_disk_ends_a_run_without_a_record_and_the_next_start_completes_it(
+    runs: Runs,
+    whole: tuple[Path, int],
+    tmp_path: Path,
+    lasting_records: Callable[[Path], dict[str, Any]],
+    share: float | None,
+) -> None:
+    folder, count = whole
+    shares = [share] if share else [(number + 0.5) / FULL_DISKS for number in range(FULL_DISKS)]
+    for number, place in enumerate(shares):
+        mine = tmp_path / str(number)
+        _, end = runs.do(mine, at=1 + int(place * count), fault=fault_server.FULL)
+        assert end.startswith("refused: ")
+        assert not list(mine.glob("records/*/*/*.json"))
+        _check_next_start(runs, mine, folder, lasting_records)
+
+
+def test_sweeping_a_folder_of_finished_runs_removes_nothing(whole: tuple[Path, int]) -> None:
+    folder, _ = whole
+    before = sorted(folder.rglob("*"))
+    assert sweep(folder) == 0
+    assert sorted(folder.rglob("*")) == before

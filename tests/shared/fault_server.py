@@ -1,0 +1,91 @@
+"""A process that forks runs of the toy and lets the file system fail, or the process die, at one operation.
+
+It reads one order per line, as JSON, from standard input, and answers each with a line: how many operations
+that change files the run began, and how it ended. Forking takes milliseconds; a new Python takes seconds to
+import PyTorch.
+"""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import signal
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from clbench.base.leftovers import sweep
+from clbench.runs.run import execute
+from clbench.runs.spec import RunSpec
+
+TOY = "clbench.testing:clbench/Toy-v0"
+
+CHANGES = {"os.mkdir", "os.rename", "os.remove", "os.rmdir", "os.link"}
+"""Audit events of operations that change files, besides opening a file to write. The heartbeat of a lease is
+none: it would make the count depend on the clock."""
+
+WRITES = os.O_WRONLY | os.O_RDWR
+
+DIES, FULL = "dies", "full"
+KILLED = '[null, "killed"]'
+
+
+def _watch(at: int | None, fault: str) -> Callable[[], int]:
+    """Let the process die before operation `at`, or let that and all later ones meet a full disk.
+
+    Returns:
+        A function that returns the number of operations so far.
+    """
+    count = 0
+
+    def look(event: str, arguments: tuple[Any, ...]) -> None:
+        nonlocal count
+        writes = event == "open" and isinstance(arguments[2], int) and arguments[2] & WRITES
+        if not (writes or event in CHANGES):
+            return
+        count += 1
+        if at is None or count < at:
+            return
+        if fault == DIES:
+            os.kill(os.getpid(), signal.SIGKILL)
+        if event not in ("os.remove", "os.rmdir"):  # a full disk lets files be removed
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    sys.addaudithook(look)
+    return lambda: count
+
+
+def _run(order: dict[str, Any], answer: int) -> None:
+    """Do a run in this process, and write how it ended."""
+    os.environ.update(order["environment"])
+    records = Path(order["records"])
+    operations = _watch(order.get("at"), order.get("fault", DIES))
+    try:
+        sweep(records, *map(Path, order["environment"].values()))
+        end: str = execute(RunSpec(TOY, order["method"], order["seed"]), records).status
+    except OSError as error:  # such as CacheError
+        end = f"refused: {error}"
+    os.write(answer, json.dumps([operations(), end]).encode())
+    os._exit(0)
+
+
+def serve() -> None:
+    """Answer orders until standard input ends."""
+    for line in sys.stdin:
+        reading, writing = os.pipe()
+        child = os.fork()
+        if not child:
+            os.close(reading)
+            _run(json.loads(line), writing)
+        os.close(writing)
+        with os.fdopen(reading) as pipe:
+            said = pipe.read()
+        os.waitpid(child, 0)
+        sys.stdout.write(f"{said or KILLED}\n")
+        sys.stdout.flush()
+
+
+if __name__ == "__main__":
+    serve()
