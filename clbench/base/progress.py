@@ -11,3 +11,18 @@ ProgressCallback: TypeAlias = Callable[[float], None]
 
 def no_progress(amount: float) -> None:
     """Report nothing."""
+
+
+_listener: Callable[[str], None] | None = None
+
+
+def listen(listener: Callable[[str], None] | None) -> None:
+    """Let `listener` hear every place that the work of this process reaches; None ends that."""
+    global _listener
+    _listener = listener
+
+
+def announce(place: str) -> None:
+    """Say which hook of a method runs next, so that a process that dies in it can be explained."""
+    if _listener is not None:
+        _listener(place)

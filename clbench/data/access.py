@@ -1,9 +1,9 @@
 """Access rules: the data that the hooks of a stage must not see. Every run checks them.
 
 The hooks of a method may use the objects that the runner passes to them, and no data of a later stage. They
-may read the demonstrations and run the validation episodes of tasks up to their own, but no test episode and
-no test question. After each hook the policy must still have the normalisation of the retained skills, its
-vocabulary and its sizes.
+may run the validation episodes of tasks up to their own, but no test episode, and ask no test question. They
+may read the demonstrations of their own target, and of earlier tasks if `uses` declares it. After each hook
+the policy must still have the normalisation of the retained skills, its vocabulary and its sizes.
 
 These checks find mistakes. They do not stop a method that avoids the functions of clbench, see
 `docs/guide/security.md`.
@@ -14,7 +14,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 
@@ -24,8 +24,21 @@ if TYPE_CHECKING:
     from clbench.policy.policy import Policy
     from clbench.spec.protocol import Split
 
-_known: ContextVar[frozenset[str] | None] = ContextVar("known", default=None)
-"""Names of the tasks that the running hooks may know; None outside of hooks."""
+
+class _Rights(NamedTuple):
+    """What the running hooks may use."""
+
+    known: frozenset[str]
+    """Names of the tasks that they may know."""
+    readable: frozenset[str]
+    """Names of those whose demonstrations they may read."""
+
+
+_rights: ContextVar[_Rights | None] = ContextVar("rights", default=None)
+"""Rights of the running hooks; None outside of hooks."""
+
+_ours: ContextVar[BaseException | None] = ContextVar("ours", default=None)
+"""Exception that leaves the runner's own code inside a hook."""
 
 NORMALISATION = ("state_mean", "state_std", "action_mean", "action_std")
 """Buffers of a policy that the demonstrations of the retained skills alone determine."""
@@ -35,35 +48,59 @@ class LeakError(ClbenchError, RuntimeError):
     """A method used data that its stage must not know."""
 
 
+class HookExitError(ClbenchError, RuntimeError):
+    """A hook tried to end the process, which is not a method's to end."""
+
+
 @contextmanager
-def hooks(known: Iterable[str]) -> Iterator[None]:
-    """Restrict the code inside to the data of the tasks called `known`."""
-    token = _known.set(frozenset(known))
+def hooks(known: Iterable[str], readable: Iterable[str]) -> Iterator[None]:
+    """Restrict the code inside to the data of some tasks.
+
+    Args:
+        known: Names of the tasks that it may know.
+        readable: Names of those whose demonstrations it may read.
+
+    Raises:
+        HookExitError: The code raises what is no `Exception`, such as `SystemExit`.
+    """
+    token = _rights.set(_Rights(frozenset(known), frozenset(readable)))
     try:
         yield
+    except Exception:
+        raise
+    except BaseException as error:
+        if error is _ours.get():
+            raise
+        raise HookExitError(f"The hook raised {type(error).__name__}({error}).") from error
     finally:
-        _known.reset(token)
+        _rights.reset(token)
 
 
 @contextmanager
 def outside() -> Iterator[None]:
     """Lift the restriction for the runner's own code that a hook calls."""
-    token = _known.set(None)
+    token = _rights.set(None)
     try:
         yield
+    except BaseException as error:
+        _ours.set(error)
+        raise
     finally:
-        _known.reset(token)
+        _rights.reset(token)
 
 
 def check_demonstrations(task: str) -> None:
-    """Refuse the demonstrations of a task that comes after the stage of the running hooks.
+    """Refuse the demonstrations of a task that the running hooks must not read.
 
     Raises:
-        LeakError: The task comes later.
+        LeakError: The task comes after their stage, or the method does not declare that it reads them.
     """
-    known = _known.get()
-    if known is not None and task not in known:
+    rights = _rights.get()
+    if rights is None or task in rights.readable:
+        return
+    if task not in rights.known:
         raise LeakError(f"The method reads demonstrations of {task}, which its stage must not know yet.")
+    raise LeakError(f"The method reads demonstrations of {task}, which its `uses` does not declare.")
 
 
 def check_episodes(episodes: Iterable[tuple[str, Split]]) -> None:
@@ -75,13 +112,13 @@ def check_episodes(episodes: Iterable[tuple[str, Split]]) -> None:
     Raises:
         LeakError: An episode is refused.
     """
-    known = _known.get()
-    if known is None:
+    rights = _rights.get()
+    if rights is None:
         return
     for task, split in episodes:
         if split != "validation":
             raise LeakError(f"The method runs {split} episodes of {task}: nothing may be chosen on them.")
-        if task not in known:
+        if task not in rights.known:
             raise LeakError(f"The method runs episodes of {task}, which its stage must not know yet.")
 
 
@@ -91,7 +128,7 @@ def check_questions() -> None:
     Raises:
         LeakError: Hooks are running.
     """
-    if _known.get() is not None:
+    if _rights.get() is not None:
         raise LeakError("The method loads questions by itself, the test questions too: `prior` has its own.")
 
 

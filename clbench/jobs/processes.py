@@ -17,7 +17,7 @@ from multiprocessing.process import BaseProcess
 from typing import Any, Literal
 
 from clbench.base.lease import LeaseLostError
-from clbench.base.progress import ProgressCallback
+from clbench.base.progress import ProgressCallback, listen
 from clbench.jobs.job import Event, Job, JobError
 from clbench.jobs.process_limits import end, exceeded
 
@@ -37,6 +37,8 @@ class _Worker:
     looked: float = field(default_factory=time.monotonic)
     broken: str | None = None
     """Limit that its process exceeded, in words; None if it exceeded none."""
+    place: str | None = None
+    """Hook of a method that it announced last."""
 
 
 class Processes:
@@ -66,7 +68,11 @@ class Processes:
         for connection in wait(list(self._running), timeout=1.0):
             assert isinstance(connection, Connection)
             worker = self._running[connection]
-            event = Event(worker.job, *_receive(worker))
+            kind, value = _receive(worker)
+            if kind == "at":
+                worker.place = value
+                continue
+            event = Event(worker.job, kind, value)
             if event.kind != "progress":
                 del self._running[connection]
                 _leave(worker.process)
@@ -158,8 +164,16 @@ def _receive(worker: _Worker) -> tuple[Any, Any]:
         worker.process.join()
         if worker.broken:
             return "failed", f"stopped, because {worker.broken}"
-        return "lost", f"its process ended without a result (exit code {worker.process.exitcode})"
+        place = f" in {worker.place}" if worker.place else ""
+        return "lost", f"its process ended{place} without a result ({_exit(worker.process.exitcode)})"
     return kind, value
+
+
+def _exit(code: int | None) -> str:
+    """Return an exit code in words, with the name of the signal if one ended the process."""
+    if code is None or code >= 0:
+        return f"exit code {code}"
+    return f"exit code {code}, {signal.Signals(-code).name}"
 
 
 def _work(
@@ -180,6 +194,7 @@ def _work(
         except OSError:  # the parent is gone: stop as if killed, so that the run can be resumed
             sys.exit(1)
 
+    listen(lambda place: connection.send(("at", place)))
     connection.send(_do_job(function, arguments, send))
 
 

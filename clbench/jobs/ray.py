@@ -106,15 +106,23 @@ class RayWorkers:
             time.sleep(1.0)
             return
         ended, _ = self._ray.wait(list(self._running), num_returns=1, timeout=1.0)
-        done = self._ray.get(self._progress_actor.amounts.remote())
+        done = self._amounts()
         for job in self._running.values():
-            amount = done.get(job.title, 0.0) - self._shown[job]
+            amount = done.get(job.title, self._shown[job]) - self._shown[job]
             self._shown[job] += amount
             if amount:  # negative after a worker was lost
                 yield Event(job, "progress", amount)
         for reference in ended:
             job = self._running.pop(reference)
             yield Event(job, *self._end(job, reference))
+
+    def _amounts(self) -> dict[str, float]:
+        """Return the progress of each job, nothing if what keeps it is lost: the jobs go on without bars."""
+        try:
+            found: dict[str, float] = self._ray.get(self._progress_actor.amounts.remote())
+        except self._ray.exceptions.RayError:
+            return {}
+        return found
 
     def close(self) -> None:
         """End all tasks, and Ray if it was started here."""

@@ -7,7 +7,7 @@ import dataclasses
 import json
 import os
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +15,7 @@ import torch
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 
+from clbench.base.progress import announce
 from clbench.base.seeding import derive_seed, seeded, torch_generator
 from clbench.base.source import RUN_SOURCES, source_hash
 from clbench.base.strict_json import check_json, read_json
@@ -61,7 +62,16 @@ class Trainer:
         self.pretrained, self.new_method = pretrained, new_method
         self.policy, self.method = copy.deepcopy(pretrained), new_method()
         self.where = "start"
+
+    @property
+    def where(self) -> str:
         """Hook or stage that is running; a failed run records it."""
+        return self._where
+
+    @where.setter
+    def where(self, place: str) -> None:
+        self._where = place
+        announce(place)
 
     @classmethod
     def open(cls, scenario: Scenario, new_method: Callable[[], Method], seed: int, device: str) -> Trainer:
@@ -86,7 +96,7 @@ class Trainer:
         """Let the method prepare for the sequence, and return the number of optimiser steps that it took."""
         self.where = "prepare"
         prior = self.prior(0, ("prepare", "throughout"))
-        with seeded("method", self.seed, 0), hooks(self._known(0)):
+        with seeded("method", self.seed, 0), self._hooks(0):
             steps = self.method.prepare(self.policy, prior) or 0
         prior.close()
         check_policy(self.policy, self.pretrained)
@@ -110,16 +120,20 @@ class Trainer:
             with outside():
                 return after(step)
 
-        with seeded("method", self.seed, number), hooks(self._known(number)):
+        with seeded("method", self.seed, number), self._hooks(number):
             steps = adapt(self.policy, self.method, stage, budget, report)
         target.close()
         prior.close()
         check_policy(self.policy, self.pretrained)
         return steps
 
-    def _known(self, number: int) -> list[str]:
-        """Return the names of the tasks that the hooks of stage `number` may know."""
-        return [task.name for task in self.scenario.retained + self.scenario.target[:number]]
+    def _hooks(self, number: int) -> AbstractContextManager[None]:
+        """Restrict the code inside to what the hooks of stage `number` may know, and may read."""
+        earlier = [task.name for task in self.scenario.retained + self.scenario.target[: max(0, number - 1)]]
+        own = [task.name for task in self.scenario.target[number - 1 : number]] if number else []
+        allowed = ("throughout",) if number else ("prepare", "throughout")
+        declared = earlier if self.method.uses.demonstrations in allowed else []
+        return hooks(earlier + own, declared + own)
 
     def prior(self, number: int, when: tuple[Access, ...]) -> Prior:
         """Return the prior data that the method declares for the hooks of stage `number`."""

@@ -15,6 +15,7 @@ import dataclasses
 from clbench.data.demonstrations import load_demonstrations
 from clbench.evaluation.rollouts import Evaluator
 from clbench.learning.method import Method
+from clbench.learning.prior import Uses
 from clbench.data.questions import load_questions
 from clbench.testing import TOY
 
@@ -27,6 +28,26 @@ class Ahead(Method):
         following = TOY.target[stage.number % len(TOY.target)]
         load_demonstrations(following, TOY, policy.config)
         return policy.parameters()
+
+
+@dataclasses.dataclass
+class Undeclared(Method):
+    """It reads the demonstrations of a skill, which `uses` does not declare."""
+
+    def start_task(self, policy, stage):
+        load_demonstrations(TOY.retained[0], TOY, policy.config)
+        return policy.parameters()
+
+
+@dataclasses.dataclass
+class Declared(Undeclared):
+    """The same, declared; it also reads its own target."""
+
+    uses = Uses(demonstrations="throughout")
+
+    def start_task(self, policy, stage):
+        load_demonstrations(stage.task, TOY, policy.config)
+        return super().start_task(policy, stage)
 
 
 @dataclasses.dataclass
@@ -103,6 +124,7 @@ def _methods(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     ("method", "message"),
     [
         ("Ahead", "reads demonstrations of down, which its stage must not know yet"),
+        ("Undeclared", "reads demonstrations of left, which its `uses` does not declare"),
         ("Chooser", "runs test episodes of right: nothing may be chosen on them"),
         ("RobustChooser", "runs perturbed episodes of right: nothing may be chosen on them"),
         ("EarlyChooser", "runs episodes of down, which its stage must not know yet"),
@@ -119,5 +141,6 @@ def test_a_planted_leak_ends_the_run_and_is_named(method: str, message: str, tmp
     assert message in record.error["message"]
 
 
-def test_a_stage_may_use_everything_that_it_may_know(tmp_path: Path) -> None:
-    assert execute(RunSpec(TOY, "leaky:FairChooser", 0, targets=1), tmp_path).status == "success"
+@pytest.mark.parametrize("method", ["FairChooser", "Declared"])
+def test_a_stage_may_use_everything_that_it_may_know(method: str, tmp_path: Path) -> None:
+    assert execute(RunSpec(TOY, f"leaky:{method}", 0, targets=1), tmp_path).status == "success"

@@ -31,6 +31,16 @@ def good(progress):
     progress(1)
     return "went well"
 
+def waits(progress, started, until):
+    Path(started).touch()
+    deadline = time.monotonic() + 60
+    while time.monotonic() < deadline and not Path(until).exists():
+        time.sleep(0.05)
+    for _ in range(20):
+        progress(0.01)
+        time.sleep(0.1)
+    return "waited"
+
 def bad(progress):
     raise ValueError("went wrong")
 
@@ -101,6 +111,26 @@ def test_a_job_that_fails_leaves_the_others_alone_and_one_whose_worker_is_killed
     assert len(path.read_text().split()) == 2
     assert isinstance(bars.console.file, io.StringIO)
     assert "lost: went well in the end" in bars.console.file.getvalue()
+
+
+def test_jobs_go_on_without_the_actor_that_shows_their_progress(tmp_path: Path, bars: Bars) -> None:
+    some, started = importlib.import_module("some_jobs"), tmp_path / "started"
+
+    def kill_the_actor() -> None:
+        deadline = time.monotonic() + 100
+        while time.monotonic() < deadline and not started.exists():
+            time.sleep(0.05)
+        for process in psutil.process_iter(["cmdline"]):
+            if any("_ProgressActor" in part for part in process.info["cmdline"] or ()):
+                process.kill()
+                (tmp_path / "killed").touch()
+
+    killer = threading.Thread(target=kill_the_actor)
+    killer.start()
+    job = Job("patient", some.waits, {"started": str(started), "until": str(tmp_path / "killed")}, 1)
+    assert run_jobs([job, Job("fine", some.good, {}, 1)], RayWorkers("local", 2), bars) == {}
+    killer.join()
+    assert (tmp_path / "killed").exists()
 
 
 def test_the_records_equal_those_of_one_machine(

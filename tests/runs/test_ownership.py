@@ -23,6 +23,16 @@ from clbench.scoring.scores import Scores
 
 TOY = "clbench.testing:clbench/Toy-v0"
 
+DEADLY = """
+import dataclasses, os, signal
+from clbench.learning.method import Method
+
+@dataclasses.dataclass
+class Deadly(Method):
+    def start_task(self, policy, stage):
+        {death}
+"""
+
 COMMAND = [sys.executable, "-m", "clbench", "run", TOY, "sft", "frozen", "--seeds", "1", "--workers", "2"]
 
 
@@ -77,6 +87,41 @@ def test_an_error_of_the_file_system_inside_a_hook_is_a_failure_of_the_method(
     assert record.error is not None
     assert record.error["type"] == "FileNotFoundError"
     assert record.error["where"] == "prepare"
+
+
+@dataclasses.dataclass
+class _Exits(Method):
+    """A method that wants to end the process."""
+
+    def end_task(self, policy: Policy, stage: Any) -> None:
+        raise SystemExit(3)
+
+
+def test_a_method_that_exits_is_named_with_its_hook(
+    tmp_path: Path, stranger: Callable[[type[Method]], str]
+) -> None:
+    record = execute(RunSpec(TOY, stranger(_Exits), seed=0), tmp_path)
+    assert record.error is not None
+    assert record.error["where"] == "stage 1 (right)"
+    assert record.error["message"] == "The hook raised SystemExit(3)."
+
+
+@pytest.mark.parametrize(
+    ("death", "end"),
+    [("os._exit(3)", "exit code 3"), ("os.kill(os.getpid(), signal.SIGSEGV)", "exit code -11, SIGSEGV")],
+)
+def test_a_method_that_kills_its_process_is_named_with_its_hook(
+    tmp_path: Path,
+    write_module: Callable[[str, str], None],
+    capsys: pytest.CaptureFixture[str],
+    death: str,
+    end: str,
+) -> None:
+    write_module("deadly", DEADLY.format(death=death))
+    with pytest.raises(SystemExit):
+        resolve("clbench.cli.runs:run")(TOY, "deadly:Deadly", seeds=1, records=tmp_path / "records")
+    assert f"its process ended in stage 1 (right) without a result ({end})" in capsys.readouterr().err
+    assert not list(tmp_path.glob("records/*/*/*.json"))
 
 
 def test_a_run_that_fails_leaves_a_good_record_of_another_configuration_alone(
