@@ -178,6 +178,7 @@ def run_missing(
     from clbench.runs.spec import has_record, set_damaged_aside
 
     console = Console(stderr=True)
+    sweep(records, cache_folder(), minari_folder() / "clbench")
     with checked_input():
         missing = [run for run in runs if not has_record(run, records)]
     if len(missing) < len(runs):
@@ -190,7 +191,6 @@ def run_missing(
     plan = Plan()
     with checked_input():  # refuses a scenario with a camera on a machine that cannot render
         check_folders(records=records, checkpoints=checkpoints, tensorboard=tensorboard, **data_folders())
-        sweep(records, cache_folder(), minari_folder() / "clbench")
         for one in missing:
             damage = set_damaged_aside(one, records)
             if damage is not None:
@@ -201,7 +201,10 @@ def run_missing(
             plan.add_stages(one, checkpoints)
     failed = run_with_bars(plan.jobs, workers(), console)
     seconds = time.monotonic() - begin
-    done = f"{len(missing)} runs" + (f" and the policies of {len(bare)}" if bare else "")
+    with checked_input():
+        good = sum(has_record(run, records) for run in missing)
+    done = f"{good} of {len(missing)} runs" if good < len(missing) else f"{len(missing)} runs"
+    done += f" and the policies of {len(bare)}" if bare else ""
     console.print(
         f"{done} in {seconds / 60:.1f} minutes; records in {records}.", highlight=False, markup=False
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import json
 import os
@@ -207,7 +208,8 @@ def set_damaged_aside(run: ResolvedRun, records: Path) -> str | None:
             Scores.from_record(record)
     except RecordError as error:
         aside = path.with_name(f"{path.name}.damaged")
-        path.replace(aside)
+        with contextlib.suppress(FileNotFoundError):  # another command was faster
+            path.replace(aside)
         return f"{str(error).rstrip('.')}. It is set aside as {aside.name}, and the run is done again."
     return None
 

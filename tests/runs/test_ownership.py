@@ -120,7 +120,9 @@ def test_a_method_that_kills_its_process_is_named_with_its_hook(
     write_module("deadly", DEADLY.format(death=death))
     with pytest.raises(SystemExit):
         resolve("clbench.cli.runs:run")(TOY, "deadly:Deadly", seeds=1, records=tmp_path / "records")
-    assert f"its process ended in stage 1 (right) without a result ({end})" in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert f"its process ended in stage 1 (right) without a result ({end})" in said
+    assert "0 of 1 runs in 0." in said
     assert not list(tmp_path.glob("records/*/*/*.json"))
 
 

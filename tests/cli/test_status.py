@@ -1,0 +1,52 @@
+"""`clbench status`: what is done, running, failed and to do."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from clbench.base.entry_points import resolve
+from clbench.base.lease import Lease
+from clbench.runs.run import execute
+from clbench.runs.spec import RunSpec
+
+TOY = "clbench.testing:clbench/Toy-v0"
+
+
+@pytest.fixture
+def records(tmp_path: Path) -> Path:
+    """Return a folder with one run of frozen that is done, and one of sft that cannot be read."""
+    execute(RunSpec(TOY, "frozen", seed=0), tmp_path)
+    damaged = RunSpec(TOY, "sft", seed=0).path(tmp_path)
+    damaged.parent.mkdir()
+    damaged.write_text("{", encoding="utf-8")
+    return tmp_path
+
+
+def test_it_counts_the_runs_of_a_request_by_their_states(
+    records: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    lease = Lease(RunSpec(TOY, "frozen", seed=1).path(records))
+    assert lease.take()
+    lease.report(0.25)
+    resolve("clbench.cli.status:status")(TOY, "frozen", "sft", seeds=3, records=records)
+    lease.release()
+    shown = capsys.readouterr().out
+    assert "Toy-v0/frozen/seed-1: 25% after 0:0" in shown
+    assert "Toy-v0/sft/seed-0: damaged, " in shown
+    assert "6 runs: 1 done, 1 running, 1 damaged, 3 to do. About 0:0" in shown
+
+
+def test_without_a_request_it_shows_what_is_in_the_folder(
+    records: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    resolve("clbench.cli.status:status")(records=records, as_json=True)
+    found = {entry["run"]: entry["state"] for entry in json.loads(capsys.readouterr().out)}
+    assert found == {"Toy-v0/frozen/seed-0": "done", "Toy-v0/sft/seed-0": "damaged"}
+
+
+def test_an_empty_folder_is_said_to_be_empty(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as stopped:
+        resolve("clbench.cli.status:status")(records=tmp_path)
+    assert stopped.value.code == 2
+    assert "There are no runs in" in capsys.readouterr().err
