@@ -173,9 +173,9 @@ def run_missing(
         tensorboard: Folder below which the runs are logged; None logs nothing.
     """
     from clbench.jobs.plan import Plan
+    from clbench.jobs.recorded import has_record, set_damaged_aside
     from clbench.jobs.scheduler import run_with_bars
     from clbench.runs.checkpoints import has_stages
-    from clbench.runs.spec import has_record, set_damaged_aside
 
     console = Console(stderr=True)
     sweep(records, cache_folder(), minari_folder() / "clbench")

@@ -9,9 +9,10 @@ from typing import Any
 
 from clbench.jobs import work
 from clbench.jobs.job import Job
+from clbench.jobs.recorded import has_record
 from clbench.learning.pretraining import is_pretrained, vision_steps
 from clbench.runs.length import point_length, run_length, training_length
-from clbench.runs.spec import ResolvedRun, has_record
+from clbench.runs.spec import ResolvedRun
 from clbench.runs.start import is_evaluated
 from clbench.spec.identifiers import folder_name
 from clbench.spec.limits import Limits

@@ -11,10 +11,11 @@ from rich.console import Console
 from clbench.jobs.job import Job, JobError
 from clbench.jobs.plan import Plan
 from clbench.jobs.processes import Processes
+from clbench.jobs.recorded import has_record
 from clbench.jobs.scheduler import run_with_bars
 from clbench.learning.registry import load_method
 from clbench.records.paths import label_of, record_path
-from clbench.runs.spec import ResolvedRun, has_record
+from clbench.runs.spec import ResolvedRun
 from clbench.scoring.metrics import METRICS
 from clbench.testing import ContractError, check_method
 

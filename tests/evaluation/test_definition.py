@@ -10,10 +10,11 @@ import pytest
 
 from clbench.base.errors import InputError
 from clbench.evaluation.definition import definition
+from clbench.jobs.recorded import has_record
 from clbench.records.pinned import other_parts, pinned
 from clbench.records.reader import read_record
 from clbench.runs.run import execute
-from clbench.runs.spec import RunSpec, has_record
+from clbench.runs.spec import RunSpec
 from clbench.spec.identifiers import scenario_ids
 from clbench.spec.registry import load_scenario
 from clbench.spec.scenario import Scenario

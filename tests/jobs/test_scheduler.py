@@ -18,10 +18,11 @@ from clbench.jobs.bars import Bars
 from clbench.jobs.job import Job
 from clbench.jobs.plan import Plan
 from clbench.jobs.processes import Processes
+from clbench.jobs.recorded import has_record
 from clbench.jobs.scheduler import run_jobs
 from clbench.learning.pretraining import pretrained_policy
 from clbench.runs.run import execute
-from clbench.runs.spec import RunSpec, has_record
+from clbench.runs.spec import RunSpec
 from clbench.runs.start import evaluate_pretrained
 from clbench.spec.registry import load_scenario
 

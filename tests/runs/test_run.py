@@ -14,13 +14,14 @@ import torch
 from torch import Tensor
 
 from clbench.base.cache import cache_folder
+from clbench.jobs.recorded import has_record
 from clbench.learning.method import Method, MethodState, Stage
 from clbench.learning.prior import Uses
 from clbench.policy.policy import Policy
 from clbench.records.reader import read_record
 from clbench.records.writer import write_record
 from clbench.runs.run import execute
-from clbench.runs.spec import RunSpec, has_record
+from clbench.runs.spec import RunSpec
 from clbench.scoring.scores import Scores
 from clbench.spec.registry import load_scenario
 from clbench.testing import ToyWorld

@@ -6,7 +6,6 @@ import json
 import re
 import sys
 from collections.abc import Callable
-from dataclasses import replace
 from itertools import combinations, product
 from pathlib import Path
 from types import ModuleType
@@ -17,8 +16,7 @@ import pytest
 from scipy import stats
 
 from clbench.cli.runs import run as run_command
-from clbench.records.record import Record
-from clbench.records.writer import write_record
+from clbench.runs.run import execute
 from clbench.runs.spec import RunSpec
 from clbench.scoring.groups import (
     UNKNOWN_DEVIATION,
@@ -367,18 +365,12 @@ def test_the_examples_of_the_page_give_its_results() -> None:
 
 
 def test_the_command_line_shows_the_width_to_expect_of_intervals_before_a_run(
-    tmp_path: Path,
-    make_record: Callable[..., Record],
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     scenario = "clbench.testing:clbench/Toy-v0"
-    spec = RunSpec(scenario, "sft", 0)
-    run = spec.resolve()
-    record = replace(make_record(np.ones((3, 5))), run=run.info, scenario=run.scenario_info)
-    write_record(record, spec.path(tmp_path))
+    execute(RunSpec(scenario, "frozen", 0), tmp_path)
     monkeypatch.setattr(sys, "path", [*sys.path])  # the command adds the working directory
-    run_command(scenario, "sft", seeds=1, records=tmp_path)
+    run_command(scenario, "frozen", seeds=1, records=tmp_path)
     said = " ".join(capsys.readouterr().err.split())
     assert said == f"{expected_precision(TOY, 1)} 1 of 1 runs have a record already."
 

@@ -136,7 +136,11 @@ def edit(path: Path, part: str, **values: Any) -> None:
         ("run", {"order": 2}, "it is the record of Toy-v0/sft/seed-0-order-2.json"),
         ("run", {"order": 6}, "3 targets have orders 0 to 5, not 6"),
         ("run", {"order": 10**12}, "3 targets have orders 0 to 5"),
-        ("scenario", {"target": TARGETS}, "its scenario does not match most records: target differ."),
+        (
+            "scenario",
+            {"target": TARGETS},
+            "the test episode 0 of target_0 (and 29 others) is missing at stage 1",
+        ),
         ("scenario", {"budget": BUDGET}, "its scenario does not match most records: budget"),
     ],
 )
