@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import closing
+from pathlib import Path
 
 import numpy as np
 from scipy.stats import hypergeom
 
+from clbench.base.cache import hash_of_tensors
 from clbench.base.errors import InputError
 from clbench.base.progress import ProgressCallback
 from clbench.data.questions import load_questions, scored_questions
@@ -15,8 +17,9 @@ from clbench.evaluation.answers import answer
 from clbench.evaluation.checks import Checker
 from clbench.evaluation.examiner import episode_row
 from clbench.evaluation.rollouts import Evaluator, Trial
+from clbench.learning.adaptation import Step
 from clbench.learning.pretraining import pretrained_policy
-from clbench.learning.trainer import repeatable
+from clbench.learning.trainer import Trainer, load_stage, repeatable
 from clbench.policy.policy import Policy
 from clbench.records.record import EpisodeRow
 from clbench.runs.checkpoints import kept_stages, load_stages, stage_policies
@@ -66,6 +69,8 @@ def replay(subject: Subject, progress: ProgressCallback) -> list[Check]:
         answers = _replay_answers(subject, policies)
     origin = "kept by the run" if kept else "trained again"
     checks = _replay_checks(subject, policies) if subject.scenario.budget.criterion else []
+    if kept is not None:
+        checks.append(_go_on(subject, kept))
     return [Check("policies", origin, True), episodes, answers, *checks]
 
 
@@ -131,6 +136,33 @@ def _replay_checks(subject: Subject, policies: Sequence[Policy]) -> list[Check]:
     if wrong:
         return [Check("ends of stages", f"another outcome of the last check: {some(wrong)}", False)]
     return [Check("ends of stages", f"the last checks of all {len(last)} stages repeat themselves", True)]
+
+
+def _go_on(subject: Subject, kept: Path) -> Check:
+    """Train a randomly chosen stage again from the kept policy before it, and compare the policies after it.
+
+    Policies of another method, under this one's name, do not follow from each other.
+    """
+    run = subject.resolved
+    number = int(np.random.default_rng(subject.request.seed).integers(len(run.scenario.target))) + 1
+    task = run.scenario.target[number - 1]
+    trainer = Trainer.open(run.scenario, run.new_method, run.spec.seed, run.spec.device)
+    with repeatable(run.spec.device), closing(Checker(run.scenario, run.protocol, run.spec.seed)) as checker:
+
+        def after(step: Step) -> bool:
+            point = Point(number, step.done)
+            return checker.is_due(point) and checker.is_learned(checker.check(trainer.policy, task, point))
+
+        trainer.load(kept / f"stage-{number - 1}", number - 1)
+        trainer.learn(number, after)
+        theirs = load_stage(kept / f"stage-{number}", run.new_method(), run.spec.device)
+    same = hash_of_tensors(trainer.policy.state_dict()) == hash_of_tensors(theirs.state_dict())
+    found = "gives" if same else "does not give"
+    return Check(
+        "from stage to stage",
+        f"training stage {number} ({task.name}) again {found} the policy that was kept after it",
+        same,
+    )
 
 
 def _outcome(row: EpisodeRow) -> str:

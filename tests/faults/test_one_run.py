@@ -72,7 +72,10 @@ def _check_next_start(
     """Check that the next start gives the record of an undisturbed run, and leaves nothing else."""
     assert all(path.name == "seed-0.json" for path in folder.glob("records/*/*/[!.]*"))
     assert runs.do(folder)[1] == "success"
-    assert lasting_records(folder / "records") == lasting_records(whole / "records")
+    found, expected = lasting_records(folder / "records"), lasting_records(whole / "records")
+    for record in (*found.values(), *expected.values()):
+        del record["fingerprint"]["commit"]  # who works on clbench may commit while this test runs
+    assert found == expected
     assert _leftovers(folder) == []
     assert list((folder / "cache" / "runs").iterdir()) == []
 
@@ -107,11 +110,9 @@ def test_a_run_that_dies_at_any_operation_is_completed_by_the_next_start(
     whole: tuple[Path, int],
     tmp_path: Path,
     lasting_records: Callable[[Path], dict[str, Any]],
-    record_property: Callable[[str, object], None],
 ) -> None:
     folder, count = whole
     _die(list(range(1, count + 1)), runs, tmp_path, folder, lasting_records)
-    record_property("crash_points", count)
 
 
 @pytest.mark.parametrize("share", [0.5, pytest.param(None, marks=pytest.mark.slow)])
@@ -127,8 +128,9 @@ def test_a_full_disk_ends_a_run_without_a_record_and_the_next_start_completes_it
     for number, place in enumerate(shares):
         mine = tmp_path / str(number)
         _, end = runs.do(mine, at=1 + int(place * count), fault=fault_server.FULL)
-        assert end.startswith("refused: ")
-        assert not list(mine.glob("records/*/*/*.json"))
+        # at its very end a run only removes files, which a full disk allows
+        assert end.startswith("refused: ") or (end == "success" and place > 0.9), end
+        assert len(list(mine.glob("records/*/*/*.json"))) == (end == "success")
         _check_next_start(runs, mine, folder, lasting_records)
 
 

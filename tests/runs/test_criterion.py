@@ -12,7 +12,7 @@ from eager import EAGER
 from clbench.evaluation.rollouts import Evaluator
 from clbench.records.record import Record
 from clbench.records.writer import write_record
-from clbench.runs.checkpoints import stage_policies
+from clbench.runs.checkpoints import keep_stage, stage_policies
 from clbench.runs.run import execute
 from clbench.runs.spec import RunSpec
 from clbench.scoring.metrics import measure
@@ -21,6 +21,7 @@ from clbench.spec.protocol import Point, check_steps
 from clbench.spec.registry import load_scenario
 
 verification = importlib.import_module("clbench.leaderboard.submission.verify")
+subject = importlib.import_module("clbench.leaderboard.submission.subject")
 tiers = importlib.import_module("clbench.leaderboard.board.tiers")
 
 
@@ -138,7 +139,7 @@ def test_a_record_with_a_criterion_reaches_every_tier(
     spec = RunSpec(EAGER.id, "sft", seed=0)
     execute(spec, records)
     for tier in ("replayed", "retrained"):
-        request = verification.Request(tier, 20, 7, None, None, None)
+        request = subject.Request(tier, 20, 7, None, None, None)
         checks = verification.verify(spec.path(records), records, request)
         assert all(check.passed for check in checks), checks
     assert "ends of stages" in [check.name for check in checks]
@@ -152,6 +153,27 @@ def test_a_record_whose_last_check_does_not_repeat_itself_stays_recomputed(
     checks = {name: list(column) for name, column in record.checks.items()}
     checks["episodes"][-1] = 7 - checks["episodes"][-1]  # 3 episodes instead of 4, or the reverse
     write_record(replace(record, checks=checks), spec.path(tmp_path))
-    request = verification.Request("replayed", 20, 7, None, None, None)
+    request = subject.Request("replayed", 20, 7, None, None, None)
     found = verification.verify(spec.path(tmp_path), tmp_path, request)
     assert [check.name for check in found if not check.passed] == ["ends of stages"]
+
+
+def test_kept_policies_of_other_settings_under_this_name_are_found_by_going_on_from_them(
+    tmp_path: Path,
+) -> None:
+    spec, other = RunSpec(EAGER.id, "sft", seed=0), RunSpec(EAGER.id, "sft", 0, {"step_factor": 0.2})
+    honest = execute(spec, tmp_path / "records", checkpoints=tmp_path / "kept")
+    request = subject.Request("replayed", 20, 7, None, None, tmp_path / "kept")
+    found = verification.verify(spec.path(tmp_path / "records"), tmp_path / "records", request)
+    assert all(check.passed for check in found), found
+    assert "from stage to stage" in [check.name for check in found]
+
+    made = execute(other, tmp_path / "others", checkpoints=tmp_path / "others_kept")
+    forged = replace(made, run=honest.run)
+    write_record(forged, spec.path(tmp_path / "forged"))
+    for number in range(3):
+        stage = other.path(tmp_path / "others_kept").with_suffix("") / f"stage-{number}"
+        keep_stage(spec.resolve(), tmp_path / "forged_kept", number, stage)
+    request = subject.Request("replayed", 20, 7, None, None, tmp_path / "forged_kept")
+    found = verification.verify(spec.path(tmp_path / "forged"), tmp_path / "forged", request)
+    assert [check.name for check in found if not check.passed] == ["from stage to stage"]
