@@ -8,7 +8,6 @@ import json
 import logging
 import os
 import shutil
-import uuid
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -18,7 +17,7 @@ from safetensors import SafetensorError
 
 from clbench.base.errors import ClbenchError
 from clbench.base.lease import Lease
-from clbench.base.leftovers import finished_name, is_unfinished
+from clbench.base.leftovers import finished_name, is_unfinished, unfinished
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -92,7 +91,7 @@ def _remove_unfinished(folder: Path) -> None:
 
 def _make(folder: Path, manifest: Mapping[str, Any], make: Callable[[Path], None], lease: Lease) -> None:
     """Fill `folder` in one step; what is there is removed."""
-    partial = folder.with_name(f".{folder.name}.{uuid.uuid4().hex}.partial")
+    partial = unfinished(folder)
     partial.mkdir()
     try:
         make(partial)

@@ -3,21 +3,41 @@
 from __future__ import annotations
 
 import contextlib
+import functools
+import hashlib
 import os
 import re
 import shutil
+import socket
 import time
+import uuid
 from collections.abc import Iterator
 from pathlib import Path
+
+import psutil
 
 from clbench.base.lease import Lease
 
 FILE_SECONDS = 60.0
-"""Seconds after which an unfinished file counts as left behind: writing one takes less than a second. Folders
-have leases, which tell whether their maker lives."""
+"""Seconds after which an unfinished file of another machine counts as left behind: writing one takes less
+than a second. Folders have leases, which tell whether their maker lives."""
 
-_UNFINISHED = re.compile(r"\.(?P<name>.+)\.[0-9a-f]{32}\.(?:partial|old)")
+_MAKER = r"(?P<host>[0-9a-f]{8})(?P<process>[0-9a-f]{8})[0-9a-f]{16}"
+_UNFINISHED = re.compile(rf"\.(?P<name>.+)\.{_MAKER}\.(?:partial|old)")
 _TRACE = re.compile(r"\.(?P<name>.+)\.(?:lease|progress)")
+
+
+def unfinished(path: Path) -> Path:
+    """Return a new path, beside `path`, at which this process can make it."""
+    return path.with_name(f".{path.name}.{_host()}{os.getpid():08x}{uuid.uuid4().hex[:16]}.partial")
+
+
+@functools.cache
+def _host() -> str:
+    """Return a hash of what process numbers belong to: a machine, or a container on it."""
+    namespace = Path("/proc/self/ns/pid")
+    place = f"{socket.gethostname()} {os.readlink(namespace) if namespace.is_symlink() else ''}"
+    return hashlib.sha256(place.encode(errors="surrogateescape")).hexdigest()[:8]
 
 
 def is_unfinished(name: str) -> bool:
@@ -34,6 +54,9 @@ def finished_name(name: str) -> str:
 def is_left_behind(path: Path) -> bool:
     """Return whether the process that was making or removing `path` is gone."""
     if not path.is_dir():
+        found = _UNFINISHED.fullmatch(path.name)
+        if found is not None and found["host"] == _host():
+            return not psutil.pid_exists(int(found["process"], 16))
         with contextlib.suppress(OSError):
             return time.time() - path.stat().st_mtime > FILE_SECONDS
         return False

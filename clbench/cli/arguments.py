@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import sys
-import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -17,6 +16,7 @@ from rich.text import Text
 from clbench.base.cache import cache_folder
 from clbench.base.entry_points import unknown
 from clbench.base.errors import ClbenchError, InputError
+from clbench.base.leftovers import unfinished
 from clbench.base.strict_json import printable
 
 
@@ -64,7 +64,7 @@ def check_folders(**options: Path | None) -> None:
         if folder is None:
             continue
         there = next(one for one in (folder, *folder.absolute().parents) if os.path.lexists(one))
-        probe = there / f".probe.{uuid.uuid4().hex}.partial"
+        probe = unfinished(there / "probe")
         try:
             probe.touch()
             probe.unlink()

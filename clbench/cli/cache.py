@@ -8,7 +8,6 @@ import os
 import re
 import shutil
 import time
-import uuid
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -23,7 +22,7 @@ from safetensors import SafetensorError, safe_open
 
 from clbench.base.cache import cache_folder, hash_of
 from clbench.base.errors import InputError
-from clbench.base.leftovers import finished_name, is_left_behind, is_unfinished
+from clbench.base.leftovers import finished_name, is_left_behind, is_unfinished, unfinished
 from clbench.cli.arguments import checked_input, minari_folder, whole_number
 from clbench.records.reader import RecordError, read_record
 
@@ -182,7 +181,7 @@ class Entry:
         Raises:
             InputError: The file system refuses.
         """
-        doomed = self.path.with_name(f".{self.path.name.lstrip('.')}.{uuid.uuid4().hex}.old")
+        doomed = unfinished(self.path.with_name(finished_name(self.path.name))).with_suffix(".old")
         try:
             self.path.rename(doomed)
             if doomed.is_dir():

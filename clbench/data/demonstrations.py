@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import json
-import uuid
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
@@ -21,6 +20,7 @@ from torch import Tensor
 from clbench.base.cache import cached, hash_of
 from clbench.base.dependencies import versions
 from clbench.base.entry_points import resolve
+from clbench.base.leftovers import unfinished
 from clbench.base.progress import ProgressCallback, no_progress
 from clbench.base.seeding import derive_seed, numpy_generator
 from clbench.base.source import DATA_SOURCES, source_hash
@@ -195,7 +195,7 @@ def _declare_namespaces(folder: Path, dataset_id: str) -> None:
         namespace.mkdir(parents=True, exist_ok=True)
         path = namespace / "namespace_metadata.json"
         if not path.exists():
-            partial = path.with_name(f".{path.name}.{uuid.uuid4().hex}.partial")
+            partial = unfinished(path)
             partial.write_text(
                 json.dumps({"description": "Expert demonstrations of clbench"}), encoding="utf-8"
             )

@@ -6,11 +6,11 @@ import dataclasses
 import json
 import logging
 import os
-import uuid
 from pathlib import Path
 from typing import Any
 
 from clbench.base.errors import InputError
+from clbench.base.leftovers import unfinished
 from clbench.base.strict_json import LONGEST_TEXT, check_json
 from clbench.records.content import content_hash
 from clbench.records.reader import RecordError, read_record
@@ -39,7 +39,7 @@ def write_record(record: Record, path: Path) -> None:
     check_diagnostics(record.diagnostics)
     text = record_text(record)
     path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f".{path.name}.{uuid.uuid4().hex}.partial")
+    partial = unfinished(path)
     try:
         with open(partial, "x", encoding="utf-8") as file:
             file.write(text)

@@ -1,12 +1,14 @@
 """Leftovers of killed processes, of which some are still being made."""
 
 import os
+import subprocess
+import sys
 import time
 from pathlib import Path
 
 from clbench.base.cache import cached
 from clbench.base.lease import Lease
-from clbench.base.leftovers import FILE_SECONDS, sweep
+from clbench.base.leftovers import FILE_SECONDS, sweep, unfinished
 
 HEX = "0123456789abcdef" * 2
 
@@ -37,6 +39,17 @@ def test_what_is_being_made_stays(tmp_path: Path) -> None:
     assert sweep(tmp_path) == 0
     assert len(list(tmp_path.iterdir())) == 4
     lease.release()
+
+
+def test_an_unfinished_file_goes_at_once_if_its_process_is_dead(tmp_path: Path) -> None:
+    code = "import sys; from pathlib import Path; from clbench.base.leftovers import unfinished; "
+    code += "unfinished(Path(sys.argv[1])).touch()"
+    subprocess.run([sys.executable, "-c", code, str(tmp_path / "theirs")], check=True)
+    mine = unfinished(tmp_path / "mine")
+    mine.touch()
+    _age(mine)
+    assert sweep(tmp_path) == 1
+    assert list(tmp_path.iterdir()) == [mine]
 
 
 def test_nothing_else_is_touched(tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ import pytest
 
 from clbench.base.leftovers import sweep
 
-POINTS = 4
+POINTS = 3
 """Operations that the quick test tries, spread over the run; the slow one tries all."""
 
 FULL_DISKS = 20

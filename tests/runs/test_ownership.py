@@ -108,7 +108,10 @@ def test_a_method_that_exits_is_named_with_its_hook(
 
 @pytest.mark.parametrize(
     ("death", "end"),
-    [("os._exit(3)", "exit code 3"), ("os.kill(os.getpid(), signal.SIGSEGV)", "exit code -11, SIGSEGV")],
+    [
+        ("os.kill(os.getpid(), signal.SIGSEGV)", "exit code -11, SIGSEGV"),
+        pytest.param("os._exit(3)", "exit code 3", marks=pytest.mark.slow),
+    ],
 )
 def test_a_method_that_kills_its_process_is_named_with_its_hook(
     tmp_path: Path,
