@@ -69,9 +69,11 @@ def learn(scenario: str, seed: int, steps: int, records: Path) -> None:
             agent, env, method="sac", seed=seed, settings=settings, records=records
         )
         env.close()
-        success = Scores.from_record(record).success[stage].mean(axis=-1)
-        tasks = Scores.from_record(record).layout.tasks
-        rates = ", ".join(f"{task} {rate:.2f}" for task, rate in zip(tasks, success, strict=True))
+        scores = Scores.from_record(record, partial=True)  # later stages are still to come
+        success = scores.success[stage].mean(axis=-1)
+        rates = ", ".join(
+            f"{task} {rate:.2f}" for task, rate in zip(scores.layout.tasks, success, strict=True)
+        )
         print(f"seed {seed}, stage {stage}: {rates}", flush=True)
 
 
