@@ -8,6 +8,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
+from cyclopts import Parameter
 from rich.console import Console
 from rich.text import Text
 
@@ -104,6 +105,8 @@ def verify(
     method: str | None = None,
     scenario: str | None = None,
     checkpoints: Path | None = None,
+    pretrain: Annotated[bool, Parameter(negative="")] = False,
+    by: str | None = None,
     workers: Annotated[int | None, whole_number(1)] = None,
     records: Path = RECORDS,
 ) -> None:
@@ -122,6 +125,8 @@ def verify(
         method: module:Class of the method, if it is not installed: it is imported, and its code runs as you.
         scenario: module:id of the scenario, if clbench does not register it.
         checkpoints: Folder of policies from `clbench run --checkpoints` (default: train them again).
+        pretrain: At the tier retrained, also repeat the pretraining (default: use the cached policy).
+        by: Your name, for the file (default: none).
         workers: Number of verifications at once, each a process with one thread (default: all cores).
         records: Folder of the records.
     """
@@ -133,9 +138,13 @@ def verify(
     with checked_input():
         if tier not in TIERS[1:]:
             raise unknown("tier", tier, TIERS[1:])
+        if pretrain and tier != "retrained":
+            raise InputError(
+                "--pretrain repeats the pretraining at the tier retrained: add --tier retrained."
+            )
         found, records = _placed(_found(paths, records), records)
     seed = secrets.randbits(48) if seed is None else seed
-    request = Request(tier, episodes, seed, method, scenario, checkpoints)
+    request = Request(tier, episodes, seed, method, scenario, checkpoints, pretrain, by)
     if not run_verifications(found, records, request, workers):
         raise SystemExit(1)
 

@@ -108,7 +108,7 @@ def pretrained_policy(
     def make(partial: Path) -> None:
         if shipped.exists():
             LOG.warning("%s %s: pretraining the policy again.", shipped, fault_of(shipped, inputs))
-        save_policy(_pretrain(scenario, seed, progress), partial)
+        save_policy(pretrain(scenario, seed, progress), partial)
 
     folder = cached(_folder(scenario, seed, inputs), inputs, make)
     return load_policy(folder), folder
@@ -136,7 +136,8 @@ def policy_config(scenario: Scenario) -> PolicyConfig:
     return config
 
 
-def _pretrain(scenario: Scenario, seed: int, progress: ProgressCallback) -> Policy:
+def pretrain(scenario: Scenario, seed: int, progress: ProgressCallback = no_progress) -> Policy:
+    """Return the policy of `pretrained_policy`, trained now even if it is in the cache or ships."""
     config, budget = policy_config(scenario), scenario.budget
     questions, _ = load_questions(scenario)
     policy = Policy(config, seed=derive_seed("weights", seed))

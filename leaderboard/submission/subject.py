@@ -49,6 +49,10 @@ class Request:
     """module:id of the scenario; None if clbench registers it."""
     checkpoints: Path | None
     """Folder of kept policies; if None, they are trained again."""
+    pretrain: bool = False
+    """Whether the tier "retrained" repeats the pretraining, too, and reads no policy from the cache."""
+    by: str | None = None
+    """Name of the verifier, if he gives one."""
 
 
 @dataclass(frozen=True)

@@ -1,8 +1,8 @@
 """Verification: a record is read again, replayed from its policies, or made a second time.
 
 Each check reports its result. A method that a record names is imported only if it is installed or if the
-verifier names it too. The results go into a file next to the record, with the verifier's fingerprint; the
-record is never changed.
+verifier names it too. The results go into a file next to the record, with the verifier's name, if given, the
+time, and the fingerprint of the machine; the record is never changed.
 """
 
 from __future__ import annotations
@@ -12,21 +12,25 @@ import json
 import tempfile
 from collections.abc import Sequence
 from dataclasses import asdict, is_dataclass
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console
 
+from clbench.base.cache import cached
 from clbench.base.errors import ClbenchError
 from clbench.base.progress import ProgressCallback, no_progress
 from clbench.jobs.job import Job, JobError
 from clbench.jobs.processes import Processes
 from clbench.jobs.scheduler import run_with_bars
+from clbench.learning.pretraining import pretrain
+from clbench.policy.checkpoint import save_policy
 from clbench.records.pinned import other_parts
 from clbench.records.reader import RecordError
 from clbench.records.record import Record
 from clbench.runs.length import run_length
-from clbench.runs.run import execute
+from clbench.runs.run import execute, pretrained_hash
 from clbench.scoring.metrics import measure
 from clbench.spec.scenario import Scenario
 
@@ -87,12 +91,14 @@ def verify(
 
 
 def _write(path: Path, subject: Subject, tier: str, checks: Sequence[Check]) -> None:
-    """Write the file with the tier of a record, the checks, and the verifier's fingerprint."""
+    """Write the file with the tier of a record, the checks, and who did them when and with what."""
     values = {
         "tier": tier,
         "record": hashlib.sha256(path.read_bytes()).hexdigest(),
         "seed": subject.request.seed,
         "checks": [asdict(check) for check in checks],
+        "by": subject.request.by,
+        "time": datetime.now(UTC).isoformat(timespec="seconds"),
         "verifier": subject.here,
     }
     write_if_changed(verification_path(path), json.dumps(values, indent=1) + "\n")
@@ -172,7 +178,10 @@ def _check_horizons(record: Record, scenario: Scenario) -> Check:
 
 
 def _retrain(subject: Subject, progress: ProgressCallback) -> list[Check]:
-    """Repeat the whole run, and compare the records."""
+    """Repeat the whole run, on request with its pretraining, and compare the records."""
+    before = [_pretrain(subject, progress)] if subject.request.pretrain else []
+    if not all(check.passed for check in before):
+        return before
     with tempfile.TemporaryDirectory() as folder:
         again = execute(subject.resolved, Path(folder), progress)
     wrong = []
@@ -182,10 +191,24 @@ def _retrain(subject: Subject, progress: ProgressCallback) -> list[Check]:
             names = ", ".join(differences(theirs, ours))
             wrong.append(f"{part} ({names})" if names else part)
     if again.error is not None:
-        return [Check("whole run", f"it failed: {again.error['type']}: {again.error['message']}", False)]
+        failure = f"it failed: {again.error['type']}: {again.error['message']}"
+        return [*before, Check("whole run", failure, False)]
     if wrong:
-        return [Check("whole run", f"repeated, {', '.join(wrong)} differ", False)]
-    return [Check("whole run", f"repeated, equal in {', '.join(PARTS)}", True), _check_origin(subject, again)]
+        return [*before, Check("whole run", f"repeated, {', '.join(wrong)} differ", False)]
+    equal = Check("whole run", f"repeated, equal in {', '.join(PARTS)}", True)
+    return [*before, equal, _check_origin(subject, again)]
+
+
+def _pretrain(subject: Subject, progress: ProgressCallback) -> Check:
+    """Pretrain the policy that the run began with, and compare its weights."""
+    recorded = subject.run.record.fingerprint.get("pretrained")
+    policy = pretrain(subject.scenario, subject.spec.seed, progress)
+    with tempfile.TemporaryDirectory() as folder:
+        found = pretrained_hash(cached(Path(folder) / "policy", {}, lambda here: save_policy(policy, here)))
+    if found != recorded:
+        result = f"repeated, it gives the policy {found}; the record began with {recorded}"
+        return Check("pretraining", result, False)
+    return Check("pretraining", f"repeated, it gives the same policy {found}", True)
 
 
 def _check_origin(subject: Subject, again: Record) -> Check:
@@ -237,6 +260,7 @@ def _job(path: Path, records: Path, request: Request) -> Job:
             length += len(scenario.target) * scenario.budget.adaptation_steps
         if request.tier == "retrained":
             length += run_length(scenario, subject.protocol)
+            length += scenario.budget.pretraining_steps * request.pretrain
     except ClbenchError:
         pass  # the job itself reports the error
     arguments = {"path": str(path), "records": str(records), "request": request}

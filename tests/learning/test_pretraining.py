@@ -60,7 +60,7 @@ def test_a_torn_shipped_policy_is_not_used_and_the_log_says_why(
     def stop(*_: object) -> None:
         raise RuntimeError("pretraining began")
 
-    monkeypatch.setattr("clbench.learning.pretraining._pretrain", stop)
+    monkeypatch.setattr("clbench.learning.pretraining.pretrain", stop)
     monkeypatch.setenv("CLBENCH_CACHE", str(tmp_path / "cache"))
     with pytest.raises(RuntimeError, match="pretraining began"), caplog.at_level(logging.WARNING):
         pretrained_policy(FETCH, 0)

@@ -5,6 +5,7 @@ import json
 import math
 import shutil
 from collections.abc import Callable
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ import pytest
 from helpers import sealed
 
 from clbench.evaluation.rollouts import Evaluator
+from clbench.learning.pretraining import pretrained_policy
 from clbench.records.paths import record_path
 from clbench.records.reader import read_record
 from clbench.runs.run import execute
@@ -255,6 +257,35 @@ def test_a_forged_record_is_denied_the_tier_and_its_fault_is_named(
     assert tiers.tier_of(mine) == below
 
 
+def test_the_pretraining_is_repeated_on_request_and_its_policy_compared(mine: Path, honest: Path) -> None:
+    checks = verify(mine, "retrained", honest, pretrain=True)
+    assert not failures(checks)
+    (pretraining,) = (check for check in checks if check.name == "pretraining")
+    pretrained = read_record(mine).fingerprint["pretrained"]
+    assert pretraining.found == f"repeated, it gives the same policy {pretrained}"
+
+
+def test_a_policy_that_pretraining_does_not_give_is_found_before_the_run_is_repeated(
+    mine: Path, honest: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(
+        "clbench.leaderboard.submission.verify.pretrain",
+        lambda scenario, seed, progress: pretrained_policy(scenario, seed + 1)[0],
+    )
+    checks = verify(mine, "retrained", honest, pretrain=True)
+    assert "pretraining: repeated, it gives the policy " in failures(checks)
+    assert checks[-1].name == "pretraining"
+    assert tiers.tier_of(mine) == "replayed"
+
+
+def test_the_file_says_who_verified_when_and_with_which_versions(mine: Path, honest: Path) -> None:
+    verify(mine, "recomputed", by="Ada")
+    found = json.loads(tiers.verification_path(mine).read_text(encoding="utf-8"))
+    assert found["by"] == "Ada"
+    assert datetime.now(UTC) - datetime.fromisoformat(found["time"]) < timedelta(minutes=5)
+    assert found["verifier"]["versions"] == read_record(mine).fingerprint["versions"]
+
+
 def test_a_fault_that_only_the_whole_run_shows_is_found_by_doing_it_again(mine: Path, honest: Path) -> None:
     edit(mine, lambda values: flip(values, 0, 30))  # on the way: no policy of that moment is kept
     edit(mine, lambda values: values["costs"].update(bytes_kept=1))
@@ -371,6 +402,7 @@ def test_the_command_lists_its_checks(mine: Path, honest: Path, capsys: pytest.C
 @pytest.mark.parametrize(
     ("arguments", "reason"),
     [
+        ({"pretrain": True}, "add --tier retrained"),
         ({"tier": "replay"}, "Did you mean 'replayed'?"),
         ({"paths": ["nowhere.json"]}, "There is no record at nowhere.json"),
         ({"paths": []}, "There is no record to verify"),
