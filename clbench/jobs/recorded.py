@@ -55,7 +55,8 @@ def set_damaged_aside(run: ResolvedRun, records: Path) -> str | None:
         aside = path.with_name(f"{path.name}.damaged")
         with contextlib.suppress(FileNotFoundError):  # another command was faster
             path.replace(aside)
-        return f"{str(error).rstrip('.')}. It is set aside as {aside.name}, and the run is done again."
+        fault = str(error).removeprefix(f"{path}: ").rstrip(".")
+        return f"{path}: {fault}. It is set aside as {aside.name}, and the run is done again."
     return None
 
 

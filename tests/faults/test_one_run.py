@@ -1,14 +1,12 @@
 """One run that dies, or meets a full disk, at any operation that changes files: nothing is lost or torn."""
 
-import json
-import subprocess
-import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import fault_server
 import pytest
+from fault_server import Runs
 
 from clbench.base.leftovers import sweep
 
@@ -18,37 +16,10 @@ POINTS = 3
 FULL_DISKS = 20
 
 
-class Runs:
-    """Runs of the toy in forked processes."""
-
-    def __init__(self, process: subprocess.Popen[str]) -> None:
-        self.process = process
-
-    def do(self, folder: Path, method: str = "sft", seed: int = 0, **fault: Any) -> tuple[int | None, str]:
-        """Do a run in the caches and the records of a folder; return its operations and how it ended."""
-        caches = {"CLBENCH_CACHE": "cache", "MINARI_DATASETS_PATH": "minari"}
-        order = {
-            "environment": {name: str(folder / place) for name, place in caches.items()},
-            "records": str(folder / "records"),
-            "method": method,
-            "seed": seed,
-            **fault,
-        }
-        assert self.process.stdin is not None
-        assert self.process.stdout is not None
-        self.process.stdin.write(json.dumps(order) + "\n")
-        self.process.stdin.flush()
-        count, end = json.loads(self.process.stdout.readline())
-        return count, end
-
-
 @pytest.fixture(scope="module")
 def runs() -> Iterator[Runs]:
-    command = [sys.executable, fault_server.__file__]
-    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
-        yield Runs(process)
-        assert process.stdin is not None
-        process.stdin.close()
+    with fault_server.start() as runs:
+        yield runs
 
 
 @pytest.fixture(scope="module")

@@ -11,8 +11,10 @@ import errno
 import json
 import os
 import signal
+import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -85,6 +87,40 @@ def serve() -> None:
         os.waitpid(child, 0)
         sys.stdout.write(f"{said or KILLED}\n")
         sys.stdout.flush()
+
+
+class Runs:
+    """Runs of the toy in forked processes."""
+
+    def __init__(self, process: subprocess.Popen[str]) -> None:
+        self.process = process
+
+    def do(self, folder: Path, method: str = "sft", seed: int = 0, **fault: Any) -> tuple[int | None, str]:
+        """Do a run in the caches and the records of a folder; return its operations and how it ended."""
+        caches = {"CLBENCH_CACHE": "cache", "MINARI_DATASETS_PATH": "minari"}
+        order = {
+            "environment": {name: str(folder / place) for name, place in caches.items()},
+            "records": str(folder / "records"),
+            "method": method,
+            "seed": seed,
+            **fault,
+        }
+        assert self.process.stdin is not None
+        assert self.process.stdout is not None
+        self.process.stdin.write(json.dumps(order) + "\n")
+        self.process.stdin.flush()
+        count, end = json.loads(self.process.stdout.readline())
+        return count, end
+
+
+@contextmanager
+def start() -> Iterator[Runs]:
+    """Start the process, and end it with the block."""
+    command = [sys.executable, __file__]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
+        yield Runs(process)
+        assert process.stdin is not None
+        process.stdin.close()
 
 
 if __name__ == "__main__":
