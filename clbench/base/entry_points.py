@@ -36,6 +36,8 @@ def import_module(module: str, needed_for: str) -> Any:
         UnknownNameError: The module, or a module that it imports, does not exist.
         InputError: A module that is not part of clbench raises an error while it is imported.
     """
+    if not all(map(str.isidentifier, module.split("."))):
+        raise UnknownNameError(f"No module {module!r} can be imported for {needed_for!r}.")
     try:
         return importlib.import_module(module)
     except ClbenchError:
@@ -45,8 +47,6 @@ def import_module(module: str, needed_for: str) -> Any:
     except Exception as error:
         if module.partition(".")[0] == "clbench":  # a bug of ours shows its traceback
             raise
-        if not module:
-            raise UnknownNameError(f"No module '' can be imported for {needed_for!r}.") from error
         what = f"{type(error).__name__}: {error}"
         raise InputError(f"The module {module!r} cannot be imported for {needed_for!r}: {what}") from error
 

@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from clbench.policy.backbone import Backbone
 from clbench.policy.batch import Batch, QuestionBatch
 from clbench.policy.flow import FlowHead
+from clbench.spec.budget import HEADS
 from clbench.spec.language import TEXT_LENGTH, VOCABULARY_SIZE
 
 
@@ -27,7 +28,7 @@ class PolicyConfig:
     """Channels of each token."""
     layers: int = 3
     """Layers of the backbone, and also of the action head."""
-    heads: int = 4
+    heads: int = HEADS
     """Attention heads."""
     chunk: int = 8
     """Actions that a forward predicts."""

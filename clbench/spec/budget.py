@@ -5,7 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from clbench.base.errors import InputError
+from clbench.spec.fields import check_positive, check_share, check_whole
 from clbench.spec.protocol import Split, check_steps
+
+HEADS = 4
+"""Attention heads of a policy, which share its width."""
 
 
 @dataclass(frozen=True)
@@ -47,10 +51,21 @@ class Budget:
     """Test episodes per task at the points before the end of a stage: the first ones."""
 
     def __post_init__(self) -> None:
+        check_whole(self, 1, "demonstrations", "question_episodes", "test_questions")
+        check_whole(self, 1, "adaptation_steps", "batch_size", "policy_width", "policy_layers")
+        check_whole(self, 1, "evaluation_points", "validation_episodes", "test_episodes")
+        check_whole(self, 0, "pretraining_steps", "curve_episodes")
+        check_positive(self, "pretraining_learning_rate", "learning_rate")
+        check_share(self, "noisy_demonstrations")
         if self.curve_episodes > self.test_episodes:
             raise InputError(
                 f"curve_episodes are the first of the {self.test_episodes} test episodes: "
                 f"{self.curve_episodes} are too many."
+            )
+        if self.policy_width % HEADS:
+            raise InputError(
+                f"Budget.policy_width must be a multiple of {HEADS}, the number of attention heads, not "
+                f"{self.policy_width}."
             )
         if self.criterion is not None and not 0 < self.criterion <= 1:
             raise InputError(f"criterion must be a success rate above 0, at most 1, not {self.criterion}.")

@@ -12,6 +12,7 @@ from clbench.base.dependencies import require_packages
 from clbench.base.entry_points import unknown
 from clbench.base.errors import InputError
 from clbench.spec.budget import Budget
+from clbench.spec.fields import check_entry_point
 from clbench.spec.limits import Limits
 from clbench.spec.task import Task
 
@@ -56,6 +57,12 @@ class Scenario:
         for name in names:
             if names.count(name) > 1:
                 raise InputError(f"{self.id}: two tasks are called {name!r}.")
+        check_entry_point(self, "questions")
+        if not self.scene_tasks:
+            raise InputError(
+                f"{self.id}: without retained tasks it needs scenes, tasks whose states are asked about, "
+                "for example scenes=target."
+            )
         cameras = {task.camera or "none" for task in self.tasks + self.background + self.scenes}
         if len(cameras) > 1:
             raise InputError(f"{self.id}: all tasks must have the same camera, not {sorted(cameras)}.")

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 from clbench.base.errors import InputError, WrongTypeError
 from clbench.base.source import package_of
+from clbench.spec.fields import check_entry_point, check_share, check_whole
 from clbench.spec.identifiers import check_plain
 from clbench.spec.protocol import Split
 
@@ -57,8 +58,10 @@ class Task:
             words.strip() for words in self.instructions + self.test_instructions
         ):
             raise InputError(f"The task {self.name} needs an instruction, and none of them may be empty.")
-        if self.horizon < 1:
-            raise InputError(f"horizon of the task {self.name} must be at least 1 step, not {self.horizon}.")
+        check_whole(self, 1, "horizon")
+        check_whole(self, 0, "version")
+        check_share(self, "action_noise")
+        check_entry_point(self, "world", "expert", *(("camera",) if self.camera is not None else ()))
 
     def wordings(self, split: Split) -> tuple[str, ...]:
         """Return the wordings of the instruction in the episodes of a split, which take turns."""

@@ -40,13 +40,14 @@ class ScenarioError(AssertionError):
 def check_scenario(scenario: Scenario, *, episodes: int = 10, success: float = 0.9) -> None:
     """Check a scenario: its worlds, every task with its expert, and its questions.
 
-    Worlds: all have spaces of numbers, of one size in the whole scenario, and actions from -1 to 1. Tasks:
-        the
-    expert succeeds often enough, and doing nothing does not; `terminated` and `info["success"]` both mean
-    success and nothing else; observations are in their space and rewards are numbers; the initial state
-    depends on the seed; an episode depends only on the seed and the actions, also after other episodes, in a
-    new world, and side by side in a vector world. Questions: all words are in the vocabulary, and every
-    answer occurs in the experts' noisy episodes.
+    Worlds: all have spaces of numbers, of one size in the whole scenario, and actions from -1 to 1.
+
+    Tasks: no two have an instruction in common; the expert succeeds often enough, and doing nothing does not;
+    `terminated` and `info["success"]` both mean success and nothing else; observations are in their space and
+    rewards are numbers; the initial state depends on the seed; an episode depends only on the seed and the
+    actions, also after other episodes, in a new world, and side by side in a vector world.
+
+    Questions: all words are in the vocabulary, and every answer occurs in the experts' noisy episodes.
 
     Args:
         scenario: Scenario to check.
@@ -63,6 +64,14 @@ def check_scenario(scenario: Scenario, *, episodes: int = 10, success: float = 0
             encode(task.instructions)
     except ValueError as error:
         raise ScenarioError(f"{scenario.id}: {error}") from error
+    wordings: dict[str, str] = {}
+    for task in scenario.tasks + scenario.background:
+        for words in task.instructions + task.test_instructions:
+            if wordings.setdefault(words, task.name) != task.name:
+                raise ScenarioError(
+                    f"{scenario.id}: {wordings[words]} and {task.name} share the instruction {words!r}: a "
+                    "policy could not tell them apart."
+                )
     if not scenario.target:
         raise ScenarioError(f"{scenario.id}: there is no target to learn.")
     sizes: dict[tuple[int, ...], str] = {}

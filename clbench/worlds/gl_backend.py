@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+import importlib
 import os
 import subprocess
 import sys
@@ -58,6 +60,26 @@ def environment_of(back_end: str) -> dict[str, str]:
     """Return the environment of a process that draws with a back end and imports from the same places."""
     path = os.pathsep.join(entry for entry in sys.path if entry)
     return {**os.environ, "MUJOCO_GL": back_end, "PYTHONPATH": path}
+
+
+@functools.cache
+def draw_without_display() -> None:
+    """Let MuJoCo draw in this process if there is neither a display nor a choice of `MUJOCO_GL`.
+
+    Sets `MUJOCO_GL` to the first back end that can draw, which worlds look at when they draw first. If none
+    can, nothing is set, and the world's own error stands.
+    """
+    if sys.platform != "linux" or any(
+        os.environ.get(name) for name in ("MUJOCO_GL", "DISPLAY", "WAYLAND_DISPLAY")
+    ):
+        return
+    for back_end in _BACK_ENDS:
+        if rendering_fault(back_end) is None:
+            os.environ["MUJOCO_GL"] = back_end
+            bound = sys.modules.get("mujoco.rendering.classic.gl_context")
+            if bound is not None:  # MuJoCo's own renderer takes the back end of the time of its import
+                importlib.reload(bound)
+            return
 
 
 def choose_back_end(worlds: Iterable[str]) -> str:

@@ -15,6 +15,7 @@ from clbench.base.entry_points import resolve
 from clbench.spec.registry import opened_scenario
 from clbench.spec.scenario import Scenario
 from clbench.spec.task import Task
+from clbench.worlds.gl_backend import draw_without_display
 from clbench.worlds.observation import Observer
 from clbench.worlds.schedule import InstructionFormat, Schedule, Start
 from clbench.worlds.world import World
@@ -34,7 +35,8 @@ class ScenarioEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
     with `instruction="tokens"` the word ids, int64 (L,), for agents that need numbers. Where the task has a
     camera, `state` holds only the numbers that a policy may see, and `image`, uint8 (N, N, 3), the picture.
     Reward: the task's dense reward. An episode is terminated by success and truncated at the task's horizon.
-    Info: `task`, `stage`, `instruction`, `success`.
+    Info: `task`, `stage`, `instruction`, `success`. A copy made by pickle is a new environment, which begins
+    with its own first `reset()`.
 
     Args:
         scenario: Scenario, or its entry point "module:attribute".
@@ -59,6 +61,7 @@ class ScenarioEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         order: int = 0,
         render_mode: str | None = None,
     ) -> None:
+        self._arguments = (scenario, instruction, episodes_per_stage, stage, order, render_mode)
         self.scenario = opened_scenario(scenario, order)
         self.render_mode = render_mode
         self.instruction: InstructionFormat = instruction
@@ -78,6 +81,13 @@ class ScenarioEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         self.action_space = world.action_space
         shown = self._observers[task.world].spaces(world.observation_space)
         self.observation_space = spaces.Dict({**shown, "instruction": self._schedule.instruction_space})
+
+    def __getstate__(self) -> dict[str, Any]:  # Gymnasium's EzPickle forgets the spec
+        return {"arguments": self._arguments, "spec": self.spec}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        ScenarioEnv.__init__(self, *state["arguments"])
+        self.spec = state["spec"]
 
     def _world(self, task: Task) -> World:
         """Return the world of a task, which is made on first use."""
@@ -125,7 +135,8 @@ class ScenarioEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         return {"state": shown[0], **image, "instruction": copy(self._start.observed_instruction)}
 
     def render(self) -> Any:
-        """Return the rendering of the current world."""
+        """Return the rendering of the current world; without a display MuJoCo draws off screen."""
+        draw_without_display()
         return self._world(self._start.task).render()
 
     def close(self) -> None:

@@ -42,6 +42,7 @@ class ScenarioVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]
         stage: Stage to stay in, for an agent that is trained stage by stage; None goes through all stages.
         order: Order of the targets, see `Scenario.in_order`; 0 is the published order.
         threads: Threads that step the worlds, by default one per core. Results do not depend on it.
+        render_mode: None; environments side by side cannot be drawn.
 
     Raises:
         LookupError: A package that the tasks need is not installed; the message says how to get it.
@@ -58,7 +59,13 @@ class ScenarioVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]
         stage: int | None = None,
         order: int = 0,
         threads: int | None = None,
+        render_mode: str | None = None,
     ) -> None:
+        if render_mode is not None:
+            raise InputError(
+                "Many environments side by side cannot be drawn. Draw one with gymnasium.make(...), or give "
+                'gymnasium.make_vec(..., vectorization_mode="sync").'
+            )
         self.scenario = opened_scenario(scenario, order)
         self.num_envs = num_envs
         self.instruction: InstructionFormat = instruction

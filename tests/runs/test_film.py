@@ -109,7 +109,7 @@ def test_a_gif_has_every_step_and_holds_its_last_frame(drawn: Film, tmp_path: Pa
     assert one == two
     assert len(list((tmp_path / "films").iterdir())) == 2
     with Image.open(tmp_path / "films" / "one.gif") as gif:
-        assert (gif.size, gif.n_frames, gif.info["loop"]) == (drawn.size, 5, 0)  # type: ignore[attr-defined]
+        assert (gif.size, gif.n_frames, gif.info["loop"]) == (drawn.size, 5, 0)
         durations = []
         for number in range(5):
             gif.seek(number)

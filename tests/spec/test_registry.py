@@ -99,10 +99,19 @@ def test_a_word_outside_the_vocabulary_is_named_with_the_nearest(module: types.M
         opened_scenario("strangers_module:ODD")
 
 
+def _lambda(state: object) -> object:
+    """Return nothing of use: an expert must be named, not given."""
+    return state
+
+
 @pytest.mark.parametrize(
     ("changes", "error", "message"),
     [
-        ({"horizon": 0}, ValueError, "horizon of the task right must be at least 1 step, not 0"),
+        ({"horizon": 0}, ValueError, "horizon of right must be at least 1, not 0"),
+        ({"horizon": 2.5}, TypeError, "horizon of right must be a whole number, not 2.5"),
+        ({"action_noise": 2}, ValueError, "action_noise of right must be from 0 to 1, not 2"),
+        ({"expert": _lambda}, TypeError, "expert of right must be a text 'module:name' such as '.*:_lambda'"),
+        ({"world": "toy"}, ValueError, "world of right must have the form 'module:name', not 'toy'"),
         ({"instructions": ()}, ValueError, "task right needs an instruction"),
         ({"instructions": ("go right", " ")}, ValueError, "none of them may be empty"),
         ({"instructions": "go right"}, TypeError, "must be a tuple of texts, not one text"),
@@ -114,6 +123,14 @@ def test_an_impossible_task_is_refused_where_it_is_built(
 ) -> None:
     with pytest.raises(error, match=message):
         dataclasses.replace(TOY.target[0], **changes)
+
+
+def test_a_scenario_that_has_nothing_to_ask_about_is_refused_where_it_is_built() -> None:
+    with pytest.raises(ValueError, match=r"without retained tasks it needs scenes, .* scenes=target"):
+        dataclasses.replace(TOY, retained=())
+    assert dataclasses.replace(TOY, retained=(), scenes=TOY.target).scene_tasks == TOY.target
+    with pytest.raises(TypeError, match="questions of clbench/Toy-v0 must be a text 'module:name'"):
+        dataclasses.replace(TOY, questions=None)  # type: ignore[arg-type]
 
 
 def test_two_tasks_of_one_name_are_refused_where_the_scenario_is_built() -> None:

@@ -1,6 +1,8 @@
 import dataclasses
 import importlib.metadata
+import math
 from collections.abc import Iterator
+from typing import Any
 
 import gymnasium
 import pytest
@@ -110,6 +112,27 @@ def test_evaluation_points_double_and_end_with_the_stage(
 def test_a_budget_cannot_have_more_episodes_on_the_way_than_at_the_end() -> None:
     with pytest.raises(ValueError, match="first of the 5 test episodes: 6 are too many"):
         Budget(test_episodes=5, curve_episodes=6)
+
+
+@pytest.mark.parametrize(
+    ("changes", "error", "message"),
+    [
+        ({"demonstrations": 0}, ValueError, "Budget.demonstrations must be at least 1, not 0"),
+        ({"adaptation_steps": -5}, ValueError, "Budget.adaptation_steps must be at least 1, not -5"),
+        ({"batch_size": 2.5}, TypeError, r"Budget.batch_size must be a whole number, not 2\.5"),
+        ({"batch_size": True}, TypeError, "Budget.batch_size must be a whole number, not True"),
+        ({"policy_width": 97}, ValueError, "Budget.policy_width must be a multiple of 4, .* not 97"),
+        ({"noisy_demonstrations": 2}, ValueError, "Budget.noisy_demonstrations must be from 0 to 1, not 2"),
+        ({"learning_rate": 0.0}, ValueError, "Budget.learning_rate must be above 0, not 0"),
+        ({"learning_rate": math.nan}, ValueError, "Budget.learning_rate must be above 0, not nan"),
+        ({"learning_rate": "fast"}, TypeError, "Budget.learning_rate must be a number, not 'fast'"),
+    ],
+)
+def test_an_impossible_budget_is_refused_where_it_is_built(
+    changes: dict[str, Any], error: type[Exception], message: str
+) -> None:
+    with pytest.raises(error, match=message):
+        Budget(**changes)
 
 
 @pytest.mark.parametrize(("count", "orders"), [(1, 1), (2, 2), (4, 24), (10, 1 + MOST_ORDERS)])

@@ -207,6 +207,12 @@ def test_a_missing_entry_point_is_named() -> None:
         check_scenario(with_parts(world="Giveing"))
 
 
+def test_two_tasks_that_no_instruction_tells_apart_are_named() -> None:
+    alike = dataclasses.replace(TOY.target[0], instructions=("go there", *TOY.retained[0].instructions[:1]))
+    with pytest.raises(ScenarioError, match="left and right share the instruction 'go left'"):
+        check_scenario(dataclasses.replace(TOY, target=(alike, *TOY.target[1:])))
+
+
 def test_a_scenario_without_a_target_is_named() -> None:
     with pytest.raises(ScenarioError, match="no target to learn"):
         check_scenario(dataclasses.replace(TOY, target=()))

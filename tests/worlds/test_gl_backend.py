@@ -1,10 +1,11 @@
 """The choice of the rendering back end: the user's setting, then EGL, then OSMesa."""
 
 import os
+import sys
 
 import pytest
 
-from clbench.worlds.gl_backend import RenderingError, choose_back_end, rendering_fault
+from clbench.worlds.gl_backend import RenderingError, choose_back_end, draw_without_display, rendering_fault
 
 WORLD = "clbench.testing:ToyWorld"
 
@@ -18,7 +19,7 @@ def _only(monkeypatch: pytest.MonkeyPatch, *working: str) -> list[str]:
     """Let only some back ends work, and return the list of those that are tried."""
     tried: list[str] = []
 
-    def fault(back_end: str, world: str) -> str | None:
+    def fault(back_end: str, world: str | None = None) -> str | None:
         tried.append(back_end)
         return None if back_end in working else f"ImportError: no {back_end}"
 
@@ -63,3 +64,30 @@ def test_the_fault_is_the_last_line_of_the_process_that_tried() -> None:
     assert fault is not None
     error = "UnknownNameError: No entry point 'clbench.testing:NoWorld': module"
     assert fault.startswith(error)
+
+
+@pytest.mark.parametrize(
+    ("variables", "working", "expected"),
+    [
+        ({}, ("egl", "osmesa"), "egl"),
+        ({}, ("osmesa",), "osmesa"),
+        ({}, (), ""),
+        ({"DISPLAY": ":0"}, ("egl",), ""),
+        ({"WAYLAND_DISPLAY": "wayland-0"}, ("egl",), ""),
+        ({"MUJOCO_GL": "glfw"}, ("egl",), "glfw"),
+    ],
+)
+def test_a_back_end_is_chosen_where_there_is_neither_a_display_nor_a_choice(
+    variables: dict[str, str], working: tuple[str, ...], expected: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    for name, value in variables.items():
+        monkeypatch.setenv(name, value)
+    _only(monkeypatch, *working)
+    # the tests of this process may have drawn with another back end, which cannot be changed
+    monkeypatch.delitem(sys.modules, "mujoco.rendering.classic.gl_context", raising=False)
+    draw_without_display.cache_clear()
+    draw_without_display()
+    draw_without_display.cache_clear()
+    assert os.environ["MUJOCO_GL"] == expected

@@ -1,14 +1,17 @@
 """Scenarios as Gymnasium environments, for Gymnasium's own tools and for Stable-Baselines3."""
 
 import os
+import pickle
 import subprocess
 import sys
+from pathlib import Path
 from typing import Any
 
 import gymnasium
 import numpy as np
 import pytest
 
+from clbench.spec.identifiers import scenario_ids
 from clbench.spec.language import encode
 from clbench.spec.registry import load_scenario
 from clbench.worlds.scenario_env import ScenarioEnv
@@ -164,3 +167,64 @@ print(frame.shape, frame.std() > 10)
     if result.returncode and "Assert" not in result.stderr:
         pytest.skip(f"nothing renders here: {result.stderr.strip().splitlines()[-1:]}")
     assert result.stdout.strip() == "(480, 480, 3) True", result.stderr
+
+
+def test_a_pickled_environment_is_a_new_one_with_the_same_options() -> None:
+    env = gymnasium.make("clbench.testing:clbench/Toy-v0", instruction="tokens", stage=1, order=1)
+    env.reset(seed=5)
+    copy = pickle.loads(pickle.dumps(env))
+    assert copy.spec == env.spec
+    assert copy.unwrapped.scenario == env.unwrapped.scenario  # type: ignore[attr-defined]
+    with pytest.raises(gymnasium.error.ResetNeeded):
+        copy.step(np.zeros(2, np.float32))
+    for mine, theirs in zip(env.reset(seed=7), copy.reset(seed=7), strict=True):
+        assert str(mine) == str(theirs)
+
+
+DRAW = """
+import pickle, sys
+import gymnasium, clbench
+from gymnasium.wrappers import RecordVideo
+
+name, folder, side_by_side = sys.argv[1:]
+def make():
+    return gymnasium.make(name, render_mode="rgb_array")
+
+if side_by_side == "yes":  # before this process draws: a fork of one that draws may hang
+    envs = gymnasium.vector.AsyncVectorEnv([make] * 2)
+    envs.reset(seed=0)
+    envs.step(envs.action_space.sample())
+    assert [picture.shape for picture in envs.render()] == [(480, 480, 3)] * 2
+    envs.close()
+env = RecordVideo(pickle.loads(pickle.dumps(make())), folder)
+env.reset(seed=0)
+first = env.render()
+for _ in range(5):
+    env.step(env.action_space.sample())
+assert first.shape == env.render().shape == (480, 480, 3)
+assert len({*first.ravel()}) > 10, "it is blank"
+env.close()
+"""
+
+
+@pytest.mark.parametrize("scenario", ["clbench/PointMaze-v0"])
+def test_without_a_display_or_a_variable_environments_draw_and_are_recorded(
+    scenario: str, tmp_path: Path
+) -> None:
+    _draw(scenario, tmp_path, "no")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("scenario", scenario_ids())
+def test_every_scenario_draws_and_is_recorded_alone_and_side_by_side(scenario: str, tmp_path: Path) -> None:
+    _draw(scenario, tmp_path, "yes")
+
+
+def _draw(scenario: str, folder: Path, side_by_side: str) -> None:
+    """Draw and record a scenario in a new process that knows nothing of displays."""
+    hidden = ("MUJOCO_GL", "DISPLAY", "WAYLAND_DISPLAY")
+    environment = {name: value for name, value in os.environ.items() if name not in hidden}
+    command = [sys.executable, "-c", DRAW, scenario, str(folder), side_by_side]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False, timeout=300)
+    assert done.returncode == 0, done.stderr
+    assert [path.suffix for path in folder.iterdir()] == [".mp4"]

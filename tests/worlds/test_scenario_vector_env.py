@@ -77,6 +77,11 @@ def test_options_choose_for_all_and_seeds_for_each() -> None:
     assert not np.array_equal(third["state"], first["state"])
 
 
+def test_drawing_many_environments_is_refused_with_what_draws() -> None:
+    with pytest.raises(ValueError, match=r"vectorization_mode=.sync"):
+        gymnasium.make_vec(TOY, num_envs=2, render_mode="rgb_array")
+
+
 def test_wrong_calls_are_refused_by_name() -> None:
     env = _toy()
     with pytest.raises(gymnasium.error.ResetNeeded, match="call reset"):

@@ -1,0 +1,70 @@
+"""Checks of the fields of a dataclass, so that a wrong value is named where it is written."""
+
+from __future__ import annotations
+
+import math
+
+from clbench.base.errors import InputError, WrongTypeError
+
+
+def check_whole(part: object, least: int, *fields: str) -> None:
+    """Check that fields of `part` are whole numbers that are at least `least`.
+
+    Raises:
+        WrongTypeError: A field is no whole number.
+        InputError: A field is too small.
+    """
+    for name in fields:
+        value = getattr(part, name)
+        if not isinstance(value, int) or isinstance(value, bool):
+            raise WrongTypeError(f"{_place(part, name)} must be a whole number, not {value!r}.")
+        if value < least:
+            raise InputError(f"{_place(part, name)} must be at least {least}, not {value}.")
+
+
+def check_positive(part: object, *fields: str) -> None:
+    """Check that fields of `part` are finite numbers above 0."""
+    for name in fields:
+        _check_number(part, name)
+        if not 0 < getattr(part, name) < math.inf:
+            raise InputError(f"{_place(part, name)} must be above 0, not {getattr(part, name)}.")
+
+
+def check_share(part: object, *fields: str) -> None:
+    """Check that fields of `part` are numbers from 0 to 1."""
+    for name in fields:
+        _check_number(part, name)
+        if not 0 <= getattr(part, name) <= 1:
+            raise InputError(f"{_place(part, name)} must be from 0 to 1, not {getattr(part, name)}.")
+
+
+def check_entry_point(part: object, *fields: str) -> None:
+    """Check that fields of `part` are texts of the form "module:attribute".
+
+    Raises:
+        WrongTypeError: A field is no text, but perhaps the object itself.
+        InputError: A text has another form.
+    """
+    for name in fields:
+        value = getattr(part, name)
+        if not isinstance(value, str):
+            own = f"{getattr(value, '__module__', 'module')}:{getattr(value, '__qualname__', 'name')}"
+            raise WrongTypeError(
+                f"{_place(part, name)} must be a text 'module:name' such as {own!r}, not {value!r}: "
+                "other processes import it by its name."
+            )
+        module, _, attribute = value.partition(":")
+        if not (attribute.isidentifier() and all(map(str.isidentifier, module.split(".")))):
+            raise InputError(f"{_place(part, name)} must have the form 'module:name', not {value!r}.")
+
+
+def _check_number(part: object, name: str) -> None:
+    value = getattr(part, name)
+    if not isinstance(value, int | float) or isinstance(value, bool):
+        raise WrongTypeError(f"{_place(part, name)} must be a number, not {value!r}.")
+
+
+def _place(part: object, name: str) -> str:
+    """Return the name of a field for a message, with the name of its owner if it has one."""
+    owner = getattr(part, "name", None) or getattr(part, "id", None)
+    return f"{name} of {owner}" if owner else f"{type(part).__name__}.{name}"
