@@ -17,7 +17,7 @@ from clbench.base.errors import InputError
 from clbench.cli.arguments import add_cwd_to_path, check_folders, checked_input, data_folders, whole_number
 from clbench.records.paths import RECORDS, record_path
 
-from .board.places import CONTROLS, SCENARIO, STEP_TIME
+from .board.places import CONTROLS, SCENARIO
 
 if TYPE_CHECKING:
     from .board.rows import Table
@@ -183,7 +183,6 @@ def claims(
     records: Path = RECORDS,
     controls: Path = CONTROLS,
     scenario: str | None = None,
-    step_time: Path = STEP_TIME,
     output: Path = Path("docs/reference/claims.md"),
 ) -> None:
     """Judge the claims of the papers by the records, and write a page with the verdicts and figures.
@@ -192,14 +191,13 @@ def claims(
         records: Folder of the records of the leaderboard.
         controls: Folder of the records of changed settings.
         scenario: Gymnasium id of the scenario on which all claims are judged (default: each names its own).
-        step_time: Results of the speed benchmark.
         output: Path of the page.
     """
     from .claims.evidence import read_evidence
     from .claims.judges import judge_all
     from .pages.claims_page import page, terminal
 
-    judged = judge_all(lambda name: read_evidence(name, records, controls, step_time), scenario)
+    judged = judge_all(lambda name: read_evidence(name, records, controls), scenario)
     console = _console()
     console.print(terminal(judged))
     _write(output, page(judged))
@@ -210,7 +208,6 @@ def method_pages(
     records: Path = RECORDS,
     controls: Path = CONTROLS,
     scenario: str = SCENARIO,
-    step_time: Path = STEP_TIME,
     output: Path = Path("docs/reference/methods"),
 ) -> None:
     """Write a page for each built-in method, from its code and its records.
@@ -219,7 +216,6 @@ def method_pages(
         records: Folder of the records of the leaderboard.
         controls: Folder of the records of changed settings.
         scenario: Gymnasium id of the scenario.
-        step_time: Results of the speed benchmark.
         output: Folder of the pages.
     """
     from .claims.evidence import read_evidence
@@ -228,8 +224,8 @@ def method_pages(
     from .views.descriptions import built_in_methods
     from .views.format import write_if_changed
 
-    judged = judge_all(lambda name: read_evidence(name, records, controls, step_time))
-    evidence = read_evidence(scenario, records, controls, step_time)
+    judged = judge_all(lambda name: read_evidence(name, records, controls))
+    evidence = read_evidence(scenario, records, controls)
     sources = read_sources(evidence, judged, _table(records))
     texts = pages(built_in_methods(), sources)
     output.mkdir(parents=True, exist_ok=True)

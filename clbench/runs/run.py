@@ -34,8 +34,10 @@ from clbench.runs.length import relearning_length, relearns, run_length
 from clbench.runs.relearning import relearn
 from clbench.runs.spec import ResolvedRun, RunSpec
 from clbench.runs.start import evaluate_start
+from clbench.runs.step_time import step_ratio
 from clbench.runs.tensorboard import Log, require_tensorboard
 from clbench.spec.protocol import Point
+from clbench.spec.references import BASELINE
 from clbench.worlds.gl_backend import RenderingError
 
 NOT_THE_METHOD = (CacheError, CheckpointError, LeaseLostError, RenderingError)
@@ -212,6 +214,9 @@ class _Run:
         self._count_costs()
         if relearns(self.run.protocol):
             self._relearn()
+        if self.run.protocol.split == "test" and scenario.target and self.run.spec.method != BASELINE:
+            folder = self._checkpoint(len(scenario.target))
+            self.record.timing["step_ratio"] = step_ratio(self.trainer, folder)
 
     def _prepare(self) -> None:
         """Let the method prepare, and evaluate the policy before any target."""

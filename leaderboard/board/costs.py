@@ -1,18 +1,13 @@
-"""The costs of a method: from its records, and from the speed benchmark for the time of a step.
-
-All but `relative_cost` is made from the records alone.
-"""
+"""The costs of a method, from its records."""
 
 from __future__ import annotations
 
-import json
 import math
-from collections.abc import Mapping, Sequence
-from pathlib import Path
+from collections.abc import Sequence
+from typing import Any
 
-from clbench.scoring.intervals import Estimate
+from clbench.spec.references import BASELINE
 
-from .places import STEP_TIME
 from .runs import Run, is_number
 
 COSTS = {
@@ -25,50 +20,33 @@ COSTS = {
 """Fields of `Record.costs` by column of the table."""
 
 
-def step_time_of(records: Path) -> Path:
-    """Return the path of the benchmark's result for a folder of records, from any working directory."""
-    return records.resolve().parents[1] / STEP_TIME
+def step_ratio(run: Run) -> float | None:
+    """Return the time of a step of a run divided by plain fine-tuning's, None if it was not measured."""
+    if run.method == BASELINE:
+        return 1.0
+    value: Any = run.record.timing.get("step_ratio")
+    return float(value) if is_number(value) and value > 0 else None
 
 
-def read_step_times(path: Path) -> dict[str, Estimate]:
-    """Return the time of a step over the baseline's, by method; empty if the file is missing or torn."""
-    try:
-        ratios = json.loads(path.read_text(encoding="utf-8"))["ratios"]
-        found = {
-            method: tuple(entry.get(key) for key in ("median_ratio", "low", "high"))
-            for method, entry in ratios.items()
-        }
-    except (OSError, ValueError, RecursionError, KeyError, TypeError, AttributeError):
-        return {}
-    return {
-        method: Estimate(*(value if is_number(value) else None for value in values))
-        for method, values in found.items()
-        if is_number(values[0])
-    }
-
-
-def costs_of(
-    runs: Sequence[Run], baseline: Sequence[Run], times: Mapping[str, Estimate]
-) -> dict[str, float | None]:
+def costs_of(runs: Sequence[Run], baseline: Sequence[Run]) -> dict[str, float | None]:
     """Return the costs of the runs of a method, each a mean over seeds.
 
-    `relative_cost` is the time of all optimiser steps, preparation included, divided by the baseline's. The
-    number of steps comes from the records, the time of one step from the speed benchmark. Without a result of
-    that benchmark `relative_cost` is None, unless the method takes no steps.
+    `relative_cost` is the time of all optimiser steps, preparation included, divided by the baseline's: the
+    ratio of the steps times the ratio of the time of one, which each run measures on its own machine. It is
+    None where no run measured it, unless the method takes no steps.
 
     Args:
         runs: Runs of the method.
         baseline: Runs of plain fine-tuning on the same scenario; may be empty.
-        times: Time of a step divided by the baseline's, by method.
     """
     costs = {column: _mean(runs, name) for column, name in COSTS.items()}
     steps, usual = costs["steps"], _mean(baseline, "optimiser_steps")
-    time = times.get(runs[0].method, Estimate(None, None, None)).value
+    times = [ratio for run in runs if (ratio := step_ratio(run)) is not None]
     relative = None
     if steps == 0:
         relative = 0.0
-    elif steps is not None and usual and time is not None:
-        relative = steps / usual * time
+    elif steps is not None and usual and times:
+        relative = steps / usual * math.fsum(times) / len(times)
     return {"relative_cost": relative, **costs}
 
 

@@ -12,6 +12,3 @@ CONTROLS = Path("leaderboard/controls")
 
 LADDER = Path("leaderboard/ladder")
 """Folder of records with the step sizes of the ladder, next to the folder of records."""
-
-STEP_TIME = Path("benchmarks/results/step_time.json")
-"""Results of the speed benchmark."""

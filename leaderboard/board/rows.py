@@ -21,7 +21,7 @@ from clbench.scoring.metrics import METRICS, measure
 from clbench.spec.references import BASELINE
 
 from .agreement import Agreement, agreement_of
-from .costs import COSTS, costs_of, read_step_times, step_time_of
+from .costs import COSTS, costs_of
 from .frontier import Curve, ladder_of, read_frontiers
 from .orders import Orders, orders_of
 from .runs import ALIKE, DIVISIONS, METHODS, NotShown, Run, Sifted, no_row, read_run, read_runs
@@ -98,9 +98,8 @@ def read_table(records: Path) -> Table:
         raise FileNotFoundError(f"There is no folder of records at {records}.")
     runs, not_shown = read_runs(records, read_run, ALIKE)
     runs, alone = _beside_rows(runs)
-    times = read_step_times(step_time_of(records))
     by_scenario = groupby(sorted(runs, key=lambda run: run.scenario), key=lambda run: run.scenario)
-    found = [_scenario_rows(list(members), times) for _, members in by_scenario]
+    found = [_scenario_rows(list(members)) for _, members in by_scenario]
     found.sort(key=lambda rows: not rows[0].to_criterion)  # they have tuned methods, and judge the claims
     frontiers, without = read_frontiers(ladder_of(records))
     return Table(
@@ -120,7 +119,7 @@ def _beside_rows(runs: list[Run]) -> Sifted:
     return kept, [no_row(run.path, reason) for run in alone]
 
 
-def _scenario_rows(runs: list[Run], times: Mapping[str, Estimate]) -> list[Row]:
+def _scenario_rows(runs: list[Run]) -> list[Row]:
     """Return the rows of the runs of one scenario, by division and falling final average."""
     by_method: dict[str, list[Run]] = {}
     for run in sorted(runs, key=lambda run: run.seed):
@@ -134,7 +133,7 @@ def _scenario_rows(runs: list[Run], times: Mapping[str, Estimate]) -> list[Row]:
         letters = groups(RANKED_BY, competing)
         order = sorted(members, key=lambda method: (_falling(estimates[method][RANKED_BY]), method))
         for method in order:
-            costs = costs_of(members[method], by_method.get(BASELINE, []), times)
+            costs = costs_of(members[method], by_method.get(BASELINE, []))
             scenario = members[method][0].scenario
             rows.append(
                 Row(

@@ -17,7 +17,7 @@ from clbench.scoring.metrics import load_metric
 from clbench.scoring.rates import Rates
 from clbench.scoring.scores import Scores, rates_of
 
-from ..board.costs import read_step_times
+from ..board.costs import step_ratio
 from ..board.frontier import FACTOR, ladder_of
 from ..board.runs import (
     ALIKE,
@@ -56,7 +56,7 @@ class Figure:
     seeds: tuple[int, ...] = ()
     """Seeds of the figure; empty if it does not depend on seeds."""
     missing: tuple[str, ...] = ()
-    """Labels without runs, or "step time"."""
+    """Labels without runs."""
     note: str = ""
     """Restriction of the figure, in words."""
     form: str = ".2f"
@@ -83,14 +83,12 @@ class Figure:
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """All comparable runs of one scenario, and the time that a step of each method takes."""
+    """All comparable runs of one scenario."""
 
     scenario: str
     """Gymnasium id."""
     runs: Mapping[str, Mapping[int, Run]]
     """Runs by label of the method ("lora", "lora+rank=4") and by seed."""
-    step_times: Mapping[str, Estimate]
-    """Median time of a step divided by sft's, by method."""
     not_used: tuple[NotShown, ...]
     """Records that are left out, with their reasons."""
 
@@ -211,10 +209,8 @@ class Evidence:
 
     def step_time(self, method: str) -> Figure:
         """Return the time of a step of the method, divided by sft's."""
-        found = self.step_times.get(method)
-        missing = () if found else ("step time",)
         what = f"time of a step of {method} divided by sft's"
-        return Figure(what, (method, "sft"), found or NO_ESTIMATE, (), missing)
+        return self._mean_of(method, what, lambda run: [step_ratio(run)], ".2f")
 
 
 def number_mean(values: Sequence[Any]) -> float:
@@ -241,7 +237,7 @@ def measured(name: str, method: str) -> Quantity:
 # ---- reading -----------------------------------------------------------------------------------------------
 
 
-def read_evidence(scenario: str, records: Path, controls: Path, step_time: Path) -> Evidence:
+def read_evidence(scenario: str, records: Path, controls: Path) -> Evidence:
     """Return the evidence in the folders and files; missing ones count as empty.
 
     A run of the ladder has the label of `rung`. The ladder's folder lies beside that of the records.
@@ -266,7 +262,6 @@ def read_evidence(scenario: str, records: Path, controls: Path, step_time: Path)
     return Evidence(
         scenario,
         {label: dict(sorted(seeds.items())) for label, seeds in sorted(runs.items())},
-        read_step_times(step_time),
         tuple(not_used),
     )
 

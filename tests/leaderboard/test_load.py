@@ -1,6 +1,5 @@
 """The table as a data frame: one row for each scenario and method, with every metric and cost."""
 
-import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -70,26 +69,34 @@ def test_a_row_does_not_depend_on_the_other_rows(four_methods: Path, add_full: C
 def test_the_relative_cost_counts_all_steps_with_the_time_of_one(
     four_methods: Path, add_full: Callable[..., Path]
 ) -> None:
-    for seed in range(2):
-        add_full("sft", seed, edit=set_in("costs", "optimiser_steps", 400))
-        add_full("slow", seed, edit=set_in("costs", "optimiser_steps", 600))
-        add_full("unknown", seed, edit=set_in("costs", "optimiser_steps", 400))
-        add_full("idle", seed, edit=set_in("costs", "optimiser_steps", 0))
-    assert load(four_methods).relative_cost.isna().sum() == len(load(four_methods)) - 1
-    ratios = {name: {"median_ratio": ratio} for name, ratio in (("sft", 1.0), ("slow", 1.4))}
-    path = four_methods.parents[1] / "benchmarks" / "results" / "step_time.json"
-    path.parent.mkdir(parents=True)
-    path.write_text(json.dumps({"ratios": ratios}), encoding="utf-8")
+    for method, steps, ratios in (
+        ("sft", 400, (None, None)),
+        ("slow", 600, (1.3, 1.5)),
+        ("unknown", 400, (None, None)),
+        ("torn", 400, ("fast", -1.0)),
+        ("idle", 0, (None, None)),
+    ):
+        for seed, ratio in enumerate(ratios):
+            add_full(method, seed, edit=measured(steps, ratio))
     costs = load(four_methods).set_index("method").relative_cost
     assert costs["sft"] == 1.0
     assert costs["slow"] == pytest.approx(1.5 * 1.4)
     assert costs["idle"] == 0.0
     assert np.isnan(costs["unknown"])
+    assert np.isnan(costs["torn"])
 
 
 def test_loading_a_folder_that_is_not_there_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match="nowhere"):
         load(tmp_path / "nowhere")
+
+
+def measured(steps: int, ratio: float | str | None) -> Callable[[Record], None]:
+    def edit(record: Record) -> None:
+        record.costs.optimiser_steps = steps
+        record.timing["step_ratio"] = ratio
+
+    return edit
 
 
 def set_in(name: str, key: str, value: Any) -> Callable[[Record], None]:

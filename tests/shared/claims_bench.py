@@ -1,7 +1,6 @@
 """Records from which claims are judged, and the page made from them."""
 
 import dataclasses
-import json
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -11,6 +10,7 @@ import numpy as np
 
 from clbench.base.entry_points import resolve
 from clbench.records.paths import label_of, record_path
+from clbench.records.reader import read_record
 from clbench.records.record import Record
 from clbench.records.writer import write_record
 
@@ -104,20 +104,18 @@ class Bench:
     def kind(self, label: str) -> str:
         return "ladder" if "@" in label else "controls" if "+" in label else "records"
 
-    def step_times(self, **ratios: float) -> None:
-        """Leave what the speed benchmark leaves."""
-        entries = {
-            method: {"median_ratio": ratio, "low": ratio - 0.01, "high": ratio + 0.01}
-            for method, ratio in ratios.items()
-        }
-        (self.folder / "step_time.json").write_text(json.dumps({"ratios": entries}), encoding="utf-8")
+    def step_ratio(self, method: str, ratio: float) -> None:
+        """Let the runs of a method have measured about this time of a step, divided by sft's."""
+        folder = record_path(self.folder / "records", SCENARIO, method, 0).parent
+        for number, path in enumerate(sorted(folder.iterdir())):
+            record = read_record(path)
+            record.timing["step_ratio"] = ratio + 0.001 * (number % 3 - 1)
+            write_record(record, path)
 
     def judge(self, identifier: str) -> Any:
         """Return the finding on one claim."""
         read = resolve("clbench.leaderboard.claims.evidence:read_evidence")
-        evidence = read(
-            SCENARIO, self.folder / "records", self.folder / "controls", self.folder / "step_time.json"
-        )
+        evidence = read(SCENARIO, self.folder / "records", self.folder / "controls")
         return resolve("clbench.leaderboard.claims.judges:CLAIMS")[identifier].judge(evidence)
 
     def page(self) -> str:
@@ -126,7 +124,6 @@ class Bench:
         resolve("clbench.leaderboard.cli:claims")(
             records=self.folder / "records",
             controls=self.folder / "controls",
-            step_time=self.folder / "step_time.json",
             scenario=SCENARIO,
             output=output,
         )

@@ -390,7 +390,7 @@ def _tried(row: Row) -> tuple[Number, ...]:
 def _costs(row: Row) -> tuple[Number, Number]:
     """Return the relative cost and the bytes kept."""
     relative, kept = row.costs["relative_cost"], row.costs["bytes_kept"]
-    cost = Number(MISSING, note="missing: there is no step time, or no run of sft")
+    cost = Number(MISSING, note="missing: its runs did not measure the time of a step, or sft has none")
     size = Number(MISSING, note="missing: a record has no value")
     if relative is not None:
         cost = Number(number_text(relative, ".2f") + "\N{MULTIPLICATION SIGN}", number_text(relative, ".6f"))

@@ -164,7 +164,7 @@ def test_claims_are_judged_in_the_published_order_alone(
     add: Callable[..., Path], records: Path, tmp_path: Path
 ) -> None:
     claims = resolve("clbench.leaderboard.cli:claims")
-    folders = {"controls": tmp_path / "none", "step_time": tmp_path / "none.json", "scenario": SCENARIO}
+    folders = {"controls": tmp_path / "none", "scenario": SCENARIO}
     add(0.5)
     claims(records=records, output=tmp_path / "before.md", **folders)
     add(0.9, order=1)

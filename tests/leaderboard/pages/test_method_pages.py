@@ -69,7 +69,6 @@ class Bench:
         resolve("clbench.leaderboard.cli:method_pages")(
             records=self.folder / "records",
             controls=self.folder / "controls",
-            step_time=self.folder / "step_time.json",
             scenario=SCENARIO,
             output=output,
         )

@@ -1,0 +1,79 @@
+"""The time of a step is measured in the run, for any method, and changes nothing in it."""
+
+import dataclasses
+import json
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, ClassVar
+
+import pytest
+import torch
+
+from clbench.learning.method import Method
+from clbench.runs.run import execute
+from clbench.runs.spec import RunSpec
+
+TOY = "clbench.testing:clbench/Toy-v0"
+
+
+@dataclasses.dataclass
+class Slow(Method):
+    """Plain fine-tuning that sleeps as long as several steps of the toy take."""
+
+    def loss(self, policy: Any, batch: Any, progress: Any) -> torch.Tensor:
+        time.sleep(0.05)
+        return super().loss(policy, batch, progress)
+
+
+@dataclasses.dataclass
+class OnlyOnce(Method):
+    """A method that fails if its last stage begins twice in a process."""
+
+    begun: ClassVar[list[int]] = []
+
+    def start_task(self, policy: Any, stage: Any) -> Any:
+        if stage.number == 2 and stage.number in self.begun:
+            raise RuntimeError("twice")
+        self.begun.append(stage.number)
+        return super().start_task(policy, stage)
+
+
+def _timing(method: str, folder: Path, **options: Any) -> Any:
+    record = execute(RunSpec(TOY, method, 0, **options), folder)
+    assert record.status == "success"
+    return record.timing
+
+
+def test_a_slow_method_of_a_stranger_has_its_ratio_in_the_record(
+    tmp_path: Path, stranger: Callable[[type[Method]], str]
+) -> None:
+    assert _timing(stranger(Slow), tmp_path)["step_ratio"] > 2
+
+
+def test_a_method_that_trains_nothing_takes_no_time_and_plain_fine_tuning_is_the_unit(tmp_path: Path) -> None:
+    assert _timing("frozen", tmp_path)["step_ratio"] < 0.1
+    assert "step_ratio" not in _timing("sft", tmp_path)
+
+
+def test_a_tuning_run_does_not_measure(tmp_path: Path) -> None:
+    assert "step_ratio" not in _timing("lora", tmp_path, split="validation")
+
+
+def test_a_method_that_cannot_be_measured_keeps_its_record(
+    tmp_path: Path,
+    stranger: Callable[[type[Method]], str],
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    assert _timing(stranger(OnlyOnce), tmp_path)["step_ratio"] is None
+    assert "The time of a step could not be measured: RuntimeError: twice" in caplog.text
+
+
+def test_the_measurement_changes_nothing_else(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, lasting_records: Callable[[Path], dict[str, Any]]
+) -> None:
+    for name in ("with", "without"):
+        if name == "without":
+            monkeypatch.setattr("clbench.runs.run.step_ratio", lambda trainer, folder: None)
+        execute(RunSpec(TOY, "experience_replay", 0), tmp_path / name)
+    assert json.dumps(lasting_records(tmp_path / "with")) == json.dumps(lasting_records(tmp_path / "without"))
