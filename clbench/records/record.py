@@ -213,8 +213,8 @@ class Record:
     """Commit, package versions, hardware, `rollouts` (a hash for each world), `method` (authors, version,
     hash of the source), and the hash of the pretrained policy."""
     timing: dict[str, Any] = field(default_factory=dict)
-    """All that may differ between equal runs: dates, seconds, and `step_ratio`, the time of a step divided by that of
-    plain fine-tuning on the same machine."""
+    """All that may differ between equal runs: dates, seconds, and `step_ratio`, the time of a step divided by
+    that of plain fine-tuning on the same machine."""
     error: dict[str, str] | None = None
     """For a failed run: `where` (the hook and stage), `type`, `message`, `traceback`."""
 
