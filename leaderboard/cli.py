@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import secrets
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -16,6 +17,7 @@ from clbench.base.entry_points import unknown
 from clbench.base.errors import InputError
 from clbench.cli.arguments import add_cwd_to_path, check_folders, checked_input, data_folders, whole_number
 from clbench.records.paths import RECORDS, record_path
+from clbench.spec.identifiers import check_known
 
 from .board.places import CONTROLS, SCENARIO
 
@@ -60,6 +62,8 @@ def submit(
     order: Annotated[int, whole_number(0)] = 0,
     workers: Annotated[int | None, whole_number(1)] = None,
     records: Path = RECORDS,
+    device: str = "cpu",
+    checkpoints: Path | None = None,
 ) -> None:
     """Check METHOD, run it, and print its row and place, or the reason why it has no row.
 
@@ -76,22 +80,28 @@ def submit(
         order: Order in which the targets are learned, as for `clbench run`; rows use the published order, 0.
         workers: Number of runs at once, each a process with one thread (default: all cores).
         records: Folder of the records.
+        device: Device on which policies are computed, for example cpu or cuda.
+        checkpoints: Keep the policies of all stages below this folder, so that `clbench verify` need not make
+            them again.
     """
-    from clbench.runs.spec import RunSpec
+    with checked_input():
+        check_known([scenario], [method])
+    from clbench.runs.spec import RunSpec, check_device
 
     from .board.rows import read_table
     from .submission.submit import placement, run_submission
 
     add_cwd_to_path()
     with checked_input():
-        numbers = range(first_seed, first_seed + seeds)
-        runs = [RunSpec(scenario, method, seed, order=order).resolve() for seed in numbers]
-        check_folders(records=records, **data_folders())
-        went_well = run_submission(runs, records, workers)
+        check_device(device)
+        first = RunSpec(scenario, method, first_seed, device=device, order=order)
+        runs = [replace(first, seed=first_seed + number).resolve() for number in range(seeds)]
+        check_folders(records=records, checkpoints=checkpoints, **data_folders())
+        went_well = run_submission(runs, records, workers, checkpoints)
     if records.is_dir():
         table = read_table(records)
         _print_written(_write_table(table, records))
-        lines = placement(table, runs[0].scenario.id, method, records)
+        lines = placement(table, runs[0], records)
         _console().print(Text("\n".join(lines)), soft_wrap=True)
     if not went_well:
         raise SystemExit(1)
@@ -264,6 +274,7 @@ def scenario_card(
         if not names:
             raise InputError(f"No scenario has records in {records}. Name one, for example {SCENARIO}.")
         loaded = [load_scenario(name) for name in names]
+    typed = {scenario.id: name for name, scenario in zip(names, loaded, strict=True)}
     homes = {output / folder_name(scenario.id): scenario for scenario in loaded}
     console = Console(stderr=True, soft_wrap=True)
     fault = choose_renderer([task for home, scenario in homes.items() for task in undrawn(scenario, home)])
@@ -272,7 +283,7 @@ def scenario_card(
     for home, scenario in homes.items():
         experts = make_missing(scenario, home, episodes, drawing=fault is None, console=console)
         drawn = {task.name for task in scenario.tasks if picture_path(home, task).is_file()}
-        card = Card(scenario, board, experts, frozenset(drawn))
+        card = Card(scenario, board, experts, frozenset(drawn), typed[scenario.id], records)
         _write(output / f"{home.name}.md", card.page())
 
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
-from cyclopts import CycloptsError, Parameter, UnknownCommandError
+from cyclopts import CycloptsError, Parameter, Token, UnknownCommandError
 from cyclopts.validators import Number
 from rich.console import Console
 from rich.text import Text
@@ -22,7 +22,19 @@ from clbench.base.strict_json import printable
 
 def whole_number(least: int) -> Parameter:
     """Return the annotation of a whole number that is at least `least`; `--help` shows the limit."""
-    return Parameter(validator=Number(gte=least), metavar=f"INT>={least}")
+    return Parameter(
+        converter=_whole_number,
+        validator=Number(gte=least),
+        metavar=f"INT>={least}",
+    )
+
+
+def _whole_number(_: object, tokens: Sequence[Token]) -> int:
+    """Return the number that a token spells; cyclopts would round 1.5."""
+    try:
+        return int(tokens[0].value)
+    except ValueError:
+        raise ValueError(f"it must be a whole number, not {tokens[0].value!r}") from None
 
 
 def error_line(message: object) -> Text:

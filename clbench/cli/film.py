@@ -11,6 +11,7 @@ from rich.console import Console
 
 from clbench.base.errors import InputError
 from clbench.cli.arguments import add_cwd_to_path, checked_input, whole_number
+from clbench.spec.identifiers import check_known
 
 if TYPE_CHECKING:
     from clbench.runs.spec import ResolvedRun
@@ -52,6 +53,8 @@ def film(
         device: Device on which the policies were computed, and are computed now.
         changes: Hyper-parameters that differ from the defaults of the method, as --set.name value.
     """
+    with checked_input():
+        check_known([scenario], [method])
     from clbench.jobs.bars import Bars
     from clbench.runs.checkpoints import load_stages
     from clbench.runs.film import FASTEST, FILMS, check_format, film_run, steps_per_second

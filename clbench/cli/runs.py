@@ -25,6 +25,7 @@ from clbench.cli.arguments import (
     whole_number,
 )
 from clbench.records.paths import RECORDS
+from clbench.spec.identifiers import check_known
 
 if TYPE_CHECKING:
     from clbench.jobs.job import Workers
@@ -81,6 +82,8 @@ def run(
             record are made again.
         tensorboard: Log the runs for TensorBoard below this folder while they run.
     """
+    with checked_input():  # before PyTorch is imported, which takes seconds
+        check_known(scenarios.split(","), methods)
     from clbench.runs.spec import RunSpec, check_device
     from clbench.runs.tensorboard import require_tensorboard
     from clbench.scoring.intervals import expected_precision

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import sys
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -16,10 +17,11 @@ from clbench.base.errors import InputError
 from clbench.cli.arguments import add_cwd_to_path, checked_input, whole_number
 from clbench.cli.runs import run_missing
 from clbench.records.paths import TUNING
+from clbench.spec.identifiers import check_known
 from clbench.spec.references import BASELINE
 
 if TYPE_CHECKING:
-    from clbench.runs.spec import ResolvedRun
+    from clbench.runs.spec import ResolvedRun, RunSpec
     from clbench.runs.tuning import Settings, Tried, Tuned
 
 FIRST_SEED = 100
@@ -36,6 +38,7 @@ def tune(
     values: dict[str, str] | None = None,
     targets: Annotated[int | None, whole_number(1)] = None,
     workers: Annotated[int | None, whole_number(1)] = None,
+    device: str = "cpu",
     records: Path = TUNING,
     write: Path | None = None,
 ) -> None:
@@ -58,34 +61,40 @@ def tune(
         values: Hyper-parameters and the values to try, as --values.tau_start 0.3,1,3
         targets: Number of targets to learn, from the first, with --values; all if not given.
         workers: Number of runs at once, each a process with one thread; all cores if not given.
+        device: Device on which policies are computed, for example cpu or cuda.
         records: Folder of the records.
         write: File that receives the chosen settings; those of other methods in it stay. For built-in methods
             `clbench run` reads methods/tuned/.
     """
+    with checked_input():
+        check_known([scenario], methods)
     from clbench.learning.registry import load_method, method_names
+    from clbench.runs.spec import RunSpec, check_device
     from clbench.runs.tuning import Tuned, best_of, refinements, rungs, write_tuned
 
     numbers = range(first_seed, first_seed + seeds)
+    first = RunSpec(scenario, "", first_seed, device=device, split="validation", targets=targets)
 
     def run(wanted: Mapping[str, Sequence[Settings]]) -> dict[str, list[Tried]]:
-        return _run(wanted, scenario, numbers, targets, workers, records)
+        return _run(wanted, first, numbers, workers, records)
 
     add_cwd_to_path()
     with checked_input():
         names = list(dict.fromkeys([*methods, *(method_names() if every else ())]))
         if not names:
             raise InputError("Name at least one method, or --all; `clbench list` shows them.")
+        check_device(device)
         classes = {name: load_method(name) for name in names}
     if values:
         combinations = _combinations(values)
         found = run({BASELINE: [{}], **dict.fromkeys(names, combinations)})
         Console().print(_table(scenario, {name: Tuned({}, tuple(one)) for name, one in found.items()}, seeds))
         return
-    first = run({name: rungs(cls) for name, cls in classes.items()})
-    second = run({name: refinements(cls, best_of(first[name]).settings) for name, cls in classes.items()})
+    begun = run({name: rungs(cls) for name, cls in classes.items()})
+    refined = run({name: refinements(cls, best_of(begun[name]).settings) for name, cls in classes.items()})
     chosen: dict[str, Tuned] = {}
     for name in names:
-        tried = (*first[name], *second[name])
+        tried = (*begun[name], *refined[name])
         chosen[name] = Tuned(best_of(tried).settings, tried)
     Console().print(_table(scenario, chosen, seeds))
     if write is not None:
@@ -100,23 +109,18 @@ def _combinations(values: Mapping[str, str]) -> list[dict[str, str]]:
 
 def _run(
     wanted: Mapping[str, Sequence[Settings]],
-    scenario: str,
+    first: RunSpec,
     seeds: Sequence[int],
-    targets: int | None,
     workers: int | None,
     records: Path,
 ) -> dict[str, list[Tried]]:
     """Do the runs of all settings that have no record, and return the scores of each setting."""
     from clbench.jobs.processes import Processes
-    from clbench.runs.spec import RunSpec
 
     with checked_input():
         runs = {
             name: [
-                [
-                    RunSpec(scenario, name, seed, dict(one), split="validation", targets=targets).resolve()
-                    for seed in seeds
-                ]
+                [replace(first, method=name, seed=seed, changes=dict(one)).resolve() for seed in seeds]
                 for one in settings
             ]
             for name, settings in wanted.items()

@@ -14,7 +14,7 @@ from typing import Any, Union, get_args, get_origin, get_type_hints
 from clbench.base.errors import InputError, UnknownNameError, WrongTypeError
 from clbench.base.source import package_of, source_hash
 from clbench.learning.method import Method
-from clbench.spec.identifiers import built_in_methods, installed_methods
+from clbench.spec.identifiers import built_in_methods, installed_methods, unknown_method
 
 
 def method_names() -> list[str]:
@@ -34,12 +34,7 @@ def load_method(spec: str) -> type[Method]:
     elif spec in (installed := built_in_methods()) or spec in (installed := installed_methods()):
         cls = _guarded(spec, installed[spec].load)
     else:
-        near = difflib.get_close_matches(spec, installed, n=1)
-        hint = f" Did you mean {near[0]!r}?" if near else ""
-        names = ", ".join(sorted(installed)) or "none; run `pip install -e .` in the checkout"
-        raise UnknownNameError(
-            f"No method is called {spec!r}.{hint} Installed: {names}. Or give module:Class."
-        )
+        raise unknown_method(spec)
     if not (isinstance(cls, type) and issubclass(cls, Method)):
         raise WrongTypeError(f"{spec!r} is not a subclass of clbench.Method.")
     if "__dataclass_fields__" not in vars(cls):  # it inherits those of Method

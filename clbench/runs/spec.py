@@ -177,5 +177,5 @@ def check_device(device: str) -> None:
     try:
         torch.zeros(1, device=device)
     except (RuntimeError, AssertionError) as error:
-        reason = str(error).partition("\n")[0]
-        raise InputError(f"The device {device!r} cannot be used: {reason}") from error
+        reason = str(error).partition("\n")[0].partition(". ")[0]  # PyTorch goes on for pages
+        raise InputError(f"The device {device!r} cannot be used: {reason.rstrip('.')}.") from error

@@ -7,12 +7,14 @@ the letters of another alphabet.
 
 from __future__ import annotations
 
+import difflib
 import re
 from collections.abc import Iterable
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
 
-from clbench.base.errors import InputError
+from clbench.base.entry_points import unknown
+from clbench.base.errors import InputError, UnknownNameError
 from clbench.base.strict_json import quoted
 
 LONGEST = 100
@@ -49,6 +51,31 @@ def installed_methods() -> dict[str, EntryPoint]:
 def built_in_methods() -> dict[str, EntryPoint]:
     """Return the entry points of the methods that are part of clbench, by name; nothing is imported."""
     return {name: entry for name, entry in installed_methods().items() if "/" not in name}
+
+
+def check_known(scenarios: Iterable[str] = (), methods: Iterable[str] = ()) -> None:
+    """Refuse names that are not registered or installed; nothing is imported.
+
+    Names with their module, "module:id" and "module:Class", pass: only the import can tell.
+
+    Raises:
+        UnknownNameError: Nothing has the name; the message names the nearest one.
+    """
+    for name in scenarios:
+        if ":" not in name and name not in scenario_ids():
+            raise unknown("scenario", name, scenario_ids())
+    for name in methods:
+        if ":" not in name and name not in built_in_methods() and name not in installed_methods():
+            raise unknown_method(name)
+
+
+def unknown_method(name: str) -> UnknownNameError:
+    """Return the error for a name that no installed method has, with the nearest one."""
+    installed = sorted(installed_methods())
+    near = difflib.get_close_matches(name, installed, n=1)
+    hint = f" Did you mean {near[0]!r}?" if near else ""
+    names = ", ".join(installed) or "none; run `pip install -e .` in the checkout"
+    return UnknownNameError(f"No method is called {name!r}.{hint} Installed: {names}. Or give module:Class.")
 
 
 def check_scenario_id(scenario: str) -> None:

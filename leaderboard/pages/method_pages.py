@@ -13,6 +13,7 @@ from clbench.runs.tuning import tuned
 from clbench.scoring.intervals import Estimate
 from clbench.spec.identifiers import folder_name
 
+from ..board.commands import run_command
 from ..board.rows import Row, Table
 from ..board.runs import DIVISIONS, is_number
 from ..claims.claim import BOARDS
@@ -21,7 +22,6 @@ from ..claims.judges import Judged
 from ..views.descriptions import Description, common_hyper_parameters
 from ..views.format import shown
 from ..views.markdown import arxiv_ids, templates
-from .commands import run_command
 
 COMPARISONS = ("sft", "experience_replay", "frozen")
 """Methods whose rows are next to the method's own."""

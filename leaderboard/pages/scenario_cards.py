@@ -17,6 +17,7 @@ import numpy as np
 
 from clbench.base.entry_points import resolve
 from clbench.base.strict_json import printable
+from clbench.records.paths import RECORDS
 from clbench.scoring.groups import deviation_of_differences
 from clbench.scoring.intervals import Estimate, bootstrap, paired_difference, row_generator, student_quantile
 from clbench.scoring.layout import Array, average
@@ -26,12 +27,12 @@ from clbench.spec.identifiers import folder_name
 from clbench.spec.protocol import check_steps
 from clbench.spec.scenario import Scenario
 
+from ..board.commands import run_command
 from ..board.rows import RANKED_BY, Row, Table
 from ..board.runs import METHODS, differences
 from ..views.descriptions import field_docstrings
 from ..views.format import MISSING
 from ..views.markdown import templates
-from .commands import run_command
 from .scenario_tasks import Experts, picture_path
 
 GROUPS = {
@@ -107,11 +108,18 @@ class Card:
     """Measured success of the experts."""
     pictures: frozenset[str]
     """Names of the tasks that have a picture."""
+    typed: str = ""
+    """The scenario as a command names it, with its module if it has one; its id if empty."""
+    records: Path = RECORDS
+    """Folder of the records."""
 
     @cached_property
     def rows(self) -> dict[str, Row]:
         """Rows of the scenario by method, in the order of the board."""
         return {row.method: row for row in self.board.rows if row.scenario == self.scenario.id}
+
+    def _command(self, methods: Sequence[str]) -> str:
+        return run_command(self.typed or self.scenario.id, *methods, records=self.records)
 
     def page(self) -> str:
         """Return the card as Markdown."""
@@ -125,6 +133,7 @@ class Card:
         template = templates(Path(__file__).with_name("templates")).get_template("scenario.md.jinja")
         return template.render(
             scenario=self.scenario,
+            typed=self.typed or self.scenario.id,
             groups=GROUPS | ({"target": OWN_ORDERS} if self.scenario.balanced else {}),
             experts=self.experts,
             pictures={
@@ -138,7 +147,7 @@ class Card:
             references=[*self._pretrained(), *references],
             bars=self._bars(),
             missing=missing,
-            missing_command=run_command(self.scenario.id, *missing) if missing else "",
+            missing_command=self._command(missing) if missing else "",
             other_version=self._other_version(),
             seed_counts=SEEDS,
             competing=len(competing),

@@ -19,6 +19,7 @@ from clbench.runs.spec import ResolvedRun
 from clbench.scoring.metrics import METRICS
 from clbench.testing import ContractError, check_method
 
+from ..board.commands import run_command
 from ..board.rows import Row, Table
 from ..views.format import counted, fitting, fitting_names, format_interval, standing_text
 
@@ -26,10 +27,18 @@ CHECK_STEPS = 100.0
 """Duration of the check in optimiser steps, for the time left that the progress bar shows."""
 
 
-def run_submission(runs: Sequence[ResolvedRun], records: Path, workers: int | None) -> bool:
+def run_submission(
+    runs: Sequence[ResolvedRun], records: Path, workers: int | None, checkpoints: Path | None
+) -> bool:
     """Check the method of `runs`, do the runs that have no record, and return whether all succeeded.
 
     Each run has its own process, which is stopped if it exceeds the scenario's limits.
+
+    Args:
+        runs: Runs of one method.
+        records: Folder of the records.
+        workers: Number of runs at once; None for all cores.
+        checkpoints: Folder below which the policies of all stages are kept; None keeps none.
     """
     console = Console(stderr=True)
     missing = [run for run in runs if not has_record(run, records)]
@@ -39,7 +48,7 @@ def run_submission(runs: Sequence[ResolvedRun], records: Path, workers: int | No
     limits, name = missing[0].scenario.limits, missing[0].spec.method
     plan = Plan(Job("check", check_job, {"method": name}, CHECK_STEPS, limits=limits))
     for run in missing:
-        plan.add_run(run, records, limits)
+        plan.add_run(run, records, limits, checkpoints=checkpoints)
     begin = time.monotonic()
     failed = run_with_bars(plan.jobs, Processes(workers), console)
     seconds = time.monotonic() - begin
@@ -61,13 +70,14 @@ def check_job(method: str, progress: Callable[[float], None]) -> str:
     return "the method keeps the contract"
 
 
-def placement(table: Table, scenario: str, method: str, records: Path) -> list[str]:
-    """Return lines with the place of a method on the board, or with the reason why it has no row."""
+def placement(table: Table, run: ResolvedRun, records: Path) -> list[str]:
+    """Return lines with the place of the method of `run` on the board, or why it has no row."""
+    scenario, method = run.scenario.id, run.spec.method
     rows = [row for row in table.rows if row.scenario == scenario]
     mine = [row for row in rows if row.method == method]
     folder = record_path(Path(), scenario, label_of(method, {}), 0).parent.as_posix()
     refused = [entry for entry in table.not_shown if entry.path.startswith(f"{folder}/")]
-    lines = [line for row in mine for line in _row_lines(row, rows)]
+    lines = [line for row in mine for line in _row_lines(row, rows, run.spec.scenario, records)]
     if not mine:
         lines.append(f"{method} has no row on the board of {scenario}.")
         if not refused:
@@ -76,7 +86,7 @@ def placement(table: Table, scenario: str, method: str, records: Path) -> list[s
     return lines
 
 
-def _row_lines(row: Row, rows: Sequence[Row]) -> list[str]:
+def _row_lines(row: Row, rows: Sequence[Row], scenario: str, records: Path) -> list[str]:
     lines = [f"{row.method} on {row.scenario}, {counted(len(row.seeds), 'seed')}, {row.tier}"]
     lines.append(f"Division {row.division}: {standing_text(row, rows)}.")
     columns = fitting(rows)
@@ -86,6 +96,6 @@ def _row_lines(row: Row, rows: Sequence[Row]) -> list[str]:
     needed = {name for metric in fitting_names(rows) for name in METRICS[metric].references}
     absent = sorted(needed - {other.method for other in rows})
     if absent:
-        command = f"clbench run {row.scenario} {' '.join(absent)}"
+        command = run_command(scenario, *absent, records=records)
         lines.append(f"Metrics that compare with {', '.join(absent)} need its records: {command}")
     return lines

@@ -38,6 +38,12 @@ def _clbench(*arguments: str, folder: Path | None = None) -> subprocess.Complete
         (["run", "clbench/Fetch-v1", "sft", "--seeds", "0"], 'Invalid value "0" for --seeds. Must be >= 1.'),
         (["run", "clbench/Fetch-v1", "sft", "--seeds", "many"], "--seeds"),
         (
+            ["run", "clbench/Fetch-v1", "sft", "--seeds", "1.5"],
+            "--seeds: it must be a whole number, not '1.5'",
+        ),
+        (["run", "clbench/Fetch-v1", "sft", "--workers", "1.4"], "it must be a whole number, not '1.4'"),
+        (["run", "../../etc:clbench/X-v0", "sft"], "No module '../../etc' can be imported for"),
+        (
             ["run", "clbench/Fetch-v1", "sft", "--workers", "0"],
             'Invalid value "0" for --workers. Must be >= 1.',
         ),
@@ -51,6 +57,9 @@ def _clbench(*arguments: str, folder: Path | None = None) -> subprocess.Complete
             "replay must be from 0 to 1, not 7.0",
         ),
         (["run", "clbench/Fetch-v1", "sft", "--device", "gpu"], "The device 'gpu' cannot be used"),
+        (["run", "clbench/Fetch-v1", "sft", "--device", "mps"], "from the 'MPS' backend.\n"),
+        (["tune", "clbench/Fetch-v1", "sft", "--device", "gpu"], "The device 'gpu' cannot be used"),
+        (["submit", "sft", "--device", "gpu"], "The device 'gpu' cannot be used"),
         (["run", "clbench/Fetch-v1,clbench/PointMase-v0", "sft"], "Did you mean 'clbench/PointMaze-v0'?"),
         (["run", "clbench/Fetch-v1", "sft", "--shard", "0/8"], "--shard must be i/n with i from 1 to n"),
         (["run", "clbench/Fetch-v1", "sft", "--shard", "9/8"], "--shard must be i/n with i from 1 to n"),
@@ -104,6 +113,29 @@ def test_bad_input_ends_with_exit_code_2_and_the_nearest_right_name(
     assert len(printed.splitlines()) == 1
     assert message in printed
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["run", "clbench/Fetch-v1", "sfft"],
+        ["tune", "clbench/Fetsch-v1", "sft"],
+        ["film", "clbench/Fetch-v1", "sfft"],
+        ["submit", "sfft"],
+    ],
+)
+def test_names_are_checked_before_pytorch_is_imported(arguments: list[str]) -> None:
+    code = f"""
+import sys
+from clbench.cli.main import app
+try:
+    app({arguments})
+except SystemExit as end:
+    print(end.code, "torch" in sys.modules)
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "2 False"
+    assert "Did you mean" in done.stderr
 
 
 def test_a_bug_inside_checked_input_is_not_taken_for_wrong_input() -> None:

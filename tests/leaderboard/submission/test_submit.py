@@ -64,7 +64,8 @@ def test_a_sound_class_gets_a_row_and_a_place(
     printed = capsys.readouterr()
     assert "the method keeps the contract" in printed.err
     assert "Division prior-data-free: place 1 of 1." in printed.out
-    assert "Metrics that compare with from_scratch need its records" in printed.out
+    hint = "clbench run clbench.testing:clbench/Toy-v0 from_scratch --records board/records"
+    assert f"Metrics that compare with from_scratch need its records: {hint}" in printed.out
     path = record_path(Path("board/records"), "clbench/Toy-v0", "submitted:Mine", 0)
     record = read_record(path)
     assert record.status == "success"

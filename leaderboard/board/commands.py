@@ -1,0 +1,30 @@
+"""The commands that make missing records, as pages and the terminal name them."""
+
+from __future__ import annotations
+
+import shlex
+from pathlib import Path
+
+from clbench.records.paths import RECORDS
+
+from .frontier import FACTOR
+from .places import CONTROLS, LADDER
+
+
+def run_command(scenario: str, *labels: str, records: Path = RECORDS) -> str:
+    """Return the command that makes the records of `labels`, which all have the same changed settings.
+
+    Args:
+        scenario: Scenario as it was typed, with its module if it has one.
+        labels: Methods with their settings. A label such as "sft@0.3" belongs to the ladder of step sizes.
+        records: Folder of the records of the board.
+    """
+    names = [label.partition("@")[0] for label in labels]
+    methods = [name.partition("+")[0] for name in names]
+    changes = [tuple(change.split("=", 1)) for change in names[0].split("+")[1:]]
+    factor = labels[0].partition("@")[2]
+    changes += [(FACTOR, factor)] if factor else []
+    settings = [f"--set.{name} {value}" for name, value in changes]
+    folder = (LADDER if factor else CONTROLS) if changes else records
+    option = [] if folder == RECORDS else [f"--records {shlex.quote(folder.as_posix())}"]
+    return " ".join(["clbench run", scenario, *methods, *settings, *option])
