@@ -15,9 +15,17 @@ from rich.text import Text
 
 from clbench.base.entry_points import unknown
 from clbench.base.errors import InputError
-from clbench.cli.arguments import add_cwd_to_path, check_folders, checked_input, data_folders, whole_number
+from clbench.cli.arguments import (
+    MethodName,
+    ScenarioId,
+    add_cwd_to_path,
+    check_folders,
+    check_names,
+    checked_input,
+    data_folders,
+    whole_number,
+)
 from clbench.records.paths import RECORDS, record_path
-from clbench.spec.identifiers import check_known
 
 from .board.places import CONTROLS, SCENARIO
 
@@ -53,10 +61,10 @@ def show(*, records: Path = RECORDS) -> None:
 
 
 def submit(
-    method: str,
+    method: MethodName,
     /,
     *,
-    scenario: str = SCENARIO,
+    scenario: ScenarioId = SCENARIO,
     seeds: Annotated[int, whole_number(1)] = 3,
     first_seed: Annotated[int, whole_number(0)] = 0,
     order: Annotated[int, whole_number(0)] = 0,
@@ -84,8 +92,7 @@ def submit(
         checkpoints: Keep the policies of all stages below this folder, so that `clbench verify` need not make
             them again.
     """
-    with checked_input():
-        check_known([scenario], [method])
+    check_names([scenario], [method])
     from clbench.runs.spec import RunSpec, check_device
 
     from .board.rows import read_table
@@ -112,8 +119,8 @@ def verify(
     tier: str = "replayed",
     episodes: Annotated[int, whole_number(1)] = 40,
     seed: Annotated[int | None, whole_number(0)] = None,
-    method: str | None = None,
-    scenario: str | None = None,
+    method: MethodName | None = None,
+    scenario: ScenarioId | None = None,
     checkpoints: Path | None = None,
     pretrain: Annotated[bool, Parameter(negative="")] = False,
     by: str | None = None,
@@ -192,7 +199,7 @@ def claims(
     *,
     records: Path = RECORDS,
     controls: Path = CONTROLS,
-    scenario: str | None = None,
+    scenario: ScenarioId | None = None,
     output: Path = Path("docs/reference/claims.md"),
 ) -> None:
     """Judge the claims of the papers by the records, and write a page with the verdicts and figures.
@@ -217,7 +224,7 @@ def method_pages(
     *,
     records: Path = RECORDS,
     controls: Path = CONTROLS,
-    scenario: str = SCENARIO,
+    scenario: ScenarioId = SCENARIO,
     output: Path = Path("docs/reference/methods"),
 ) -> None:
     """Write a page for each built-in method, from its code and its records.
@@ -245,7 +252,7 @@ def method_pages(
 
 
 def scenario_card(
-    *scenarios: str,
+    *scenarios: ScenarioId,
     episodes: Annotated[int, whole_number(1)] = 100,
     records: Path = RECORDS,
     output: Path = Path("docs/reference/scenarios"),

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import json
 import os
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Annotated
 
 from cyclopts import CycloptsError, Parameter, Token, UnknownCommandError
 from cyclopts.validators import Number
@@ -35,6 +37,42 @@ def _whole_number(_: object, tokens: Sequence[Token]) -> int:
         return int(tokens[0].value)
     except ValueError:
         raise ValueError(f"it must be a whole number, not {tokens[0].value!r}") from None
+
+
+def _known_scenarios(_: object) -> tuple[str, ...]:
+    """Return the names that TAB completes; they are looked up when it is pressed."""
+    from clbench.spec.identifiers import scenario_ids
+
+    return tuple(scenario_ids())
+
+
+def _known_methods(_: object) -> tuple[str, ...]:
+    from clbench.spec.identifiers import installed_methods
+
+    return tuple(sorted(installed_methods()))
+
+
+ScenarioId = Annotated[str, Parameter(completer=_known_scenarios)]
+"""Gymnasium id of a scenario on the command line."""
+MethodName = Annotated[str, Parameter(completer=_known_methods)]
+"""Name of a method on the command line."""
+
+
+AsJson = Annotated[bool, Parameter(name="--json", negative="")]
+"""Switch of a command that can print JSON instead of tables."""
+
+
+def print_json(values: object) -> None:
+    """Print a value as JSON for other programs; what is missing is null."""
+    sys.stdout.write(f"{json.dumps(values, indent=1, allow_nan=False)}\n")
+
+
+def check_names(scenarios: Iterable[str], methods: Iterable[str]) -> None:
+    """End with exit code 2 if a name is not known, before anything heavy is imported."""
+    from clbench.spec.identifiers import check_known
+
+    with checked_input():
+        check_known(scenarios, methods)
 
 
 def error_line(message: object) -> Text:

@@ -4,55 +4,87 @@ from __future__ import annotations
 
 import os
 import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, requires, version
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from clbench import __version__
 from clbench.base.errors import InputError
-from clbench.cli.arguments import checked_input
+from clbench.base.strict_json import printable
+from clbench.cli.arguments import AsJson, checked_input, print_json
+
+if TYPE_CHECKING:
+    from packaging.requirements import Requirement
 
 
-def list_() -> None:
-    """List the scenarios with their tasks, and the methods with the prior data that they use."""
-    from clbench.learning.registry import load_method, method_names
+def list_(*, as_json: AsJson = False) -> None:
+    """List the scenarios with their tasks, and the methods with the prior data that they use.
+
+    Args:
+        as_json: Print one JSON object with both, and no tables.
+    """
     from clbench.spec.identifiers import scenario_ids
     from clbench.spec.registry import registered_scenario
 
-    console = Console()
-    scenarios = Table(title="Scenarios", show_lines=True)
+    found = [registered_scenario(name) for name in scenario_ids()]
+    groups = ("retained", "target", "held_out")
+    scenarios = [
+        {"id": one.id, **{group: [task.name for task in getattr(one, group)] for group in groups}}
+        for one in found
+    ]
+    methods = _methods()
+    if as_json:
+        print_json({"scenarios": scenarios, "methods": methods})
+        return
+    table = Table(title="Scenarios", show_lines=True)
     for column in ("id", "retained", "target, in order", "held out"):
-        scenarios.add_column(column, no_wrap=column == "id")
-    for scenario in map(registered_scenario, scenario_ids()):
-        groups = (scenario.retained, scenario.target, scenario.held_out)
-        scenarios.add_row(scenario.id, *(", ".join(task.name for task in group) for group in groups))
-    console.print(scenarios)
-    methods = Table(title="Methods")
+        table.add_column(column, no_wrap=column == "id")
+    for values in scenarios:
+        table.add_row(str(values["id"]), *(", ".join(values[group]) for group in groups))
+    Console().print(table)
+    table = Table(title="Methods")
     for column in ("name", "prior demonstrations", "prior questions", "what it does"):
-        methods.add_column(column, no_wrap=column == "name")
+        table.add_column(column, no_wrap=column == "name")
+    for method in methods:
+        table.add_row(*(value or "?" for value in method.values()))
+    Console().print(table)
+
+
+def _methods() -> list[dict[str, str | None]]:
+    """Return the installed methods, each with the prior data that it uses and its summary."""
+    from clbench.learning.registry import load_method, method_names
+
+    found: list[dict[str, str | None]] = []
     for name in method_names():
+        values: dict[str, str | None] = {"name": name, "demonstrations": None, "questions": None}
         try:
             method = load_method(name)
+            values |= {"demonstrations": method.uses.demonstrations, "questions": method.uses.questions}
             summary = (method.__doc__ or "").strip().partition("\n")[0]
-            row: tuple[str, str, str] = (method.uses.demonstrations, method.uses.questions, summary)
         except Exception as error:  # a broken plug-in must not hide the others
-            row = ("?", "?", f"cannot be loaded: {error}")
-        methods.add_row(name, *row)
-    console.print(methods)
+            summary = f"cannot be loaded: {error}"
+        found.append({**values, "summary": printable(summary)})
+    return found
 
 
-def metrics(name: str | None = None, /, *, markdown: Path | None = None) -> None:
+def metrics(name: str | None = None, /, *, markdown: Path | None = None, as_json: AsJson = False) -> None:
     """Show a table of all metrics, or everything about the metric NAME.
 
     Args:
         name: Name of a metric, for example forgetting.
         markdown: Write the page of all metrics to this file, for example docs/reference/metrics.md, and show
             nothing.
+        as_json: Print JSON: one object for each metric.
     """
     from clbench.cli import metric_pages
-    from clbench.scoring.metrics import load_metric
+    from clbench.cli.metric_pages import facts
+    from clbench.scoring.metrics import METRICS, load_metric
 
     console = Console()
     with checked_input():
@@ -62,6 +94,9 @@ def metrics(name: str | None = None, /, *, markdown: Path | None = None) -> None
     if markdown:
         markdown.parent.mkdir(parents=True, exist_ok=True)
         markdown.write_text(metric_pages.page(), encoding="utf-8", newline="\n")
+    elif as_json:
+        chosen = [metric] if metric else METRICS.values()
+        print_json([{"name": one.name, "description": one.description, **facts(one)} for one in chosen])
     elif metric:
         console.print(metric_pages.text(metric), end="", soft_wrap=True, highlight=False, markup=False)
     else:
@@ -69,60 +104,127 @@ def metrics(name: str | None = None, /, *, markdown: Path | None = None) -> None
         Console(width=width).print(metric_pages.table())
 
 
-def doctor() -> None:
-    """Show package versions, threads, rendering and folders, and how to install missing parts."""
+def doctor(*, as_json: AsJson = False) -> None:
+    """Show package versions, threads, rendering and folders, and how to install missing parts.
+
+    The last line says whether clbench can run here. If not, the command ends with exit code 1.
+
+    Args:
+        as_json: Print one JSON object, and no tables.
+    """
     from clbench.learning.registry import method_names
 
+    packages, machine = _packages(), _machine()
+    faults = [f"pip install '{one.requirement}'" for one in packages if one.is_wrong]
+    faults += [] if method_names() else ["pip install -e . in the checkout, as no method is installed"]
+    if as_json:
+        print_json(
+            {
+                "clbench": __version__,
+                "ready": not faults,
+                "mend": faults,
+                "packages": {
+                    one.requirement.name: {"found": one.found, "tested": str(one.requirement.specifier)}
+                    for one in packages
+                },
+                "machine": machine,
+            }
+        )
+    else:
+        _print_doctor(packages, machine, faults)
+    if faults:
+        raise SystemExit(1)
+
+
+def _print_doctor(packages: Sequence[_Package], machine: Mapping[str, str], faults: Sequence[str]) -> None:
     console = Console()
-    console.print(_packages())
-    console.print(_machine())
-    if not method_names():
-        console.print("No method is installed: run `pip install -e .` in the checkout.", style="bold red")
+    table = Table("package", "found", "tested", "", title="Packages")
+    for one in packages:
+        table.add_row(one.requirement.name, one.found or "-", str(one.requirement.specifier), one.verdict)
+    console.print(table)
+    table = Table(title="Machine", show_header=False)
+    for name, value in machine.items():
+        table.add_row(name, escape(value))
+    console.print(table)
+    if faults:
+        console.print(f"clbench {__version__} cannot run here yet: {'; '.join(faults)}", style="bold red")
+    else:
+        console.print(f"clbench {__version__} is ready.", style="bold green", highlight=False)
 
 
-def _packages() -> Table:
+@dataclass(frozen=True)
+class _Package:
+    """A package that clbench needs, or that an extra brings."""
+
+    requirement: Requirement
+    extra: str
+    """Extra of clbench that brings it, empty if all need it."""
+    found: str | None
+    """The installed version."""
+
+    @property
+    def fits(self) -> bool:
+        """Whether the installed version is one that was tried."""
+        return self.found is not None and self.requirement.specifier.contains(self.found, prereleases=True)
+
+    @property
+    def is_wrong(self) -> bool:
+        """Whether clbench cannot do without what is missing or wrong."""
+        return not self.fits and not self.extra
+
+    @property
+    def verdict(self) -> str:
+        """The last cell of its row."""
+        if self.fits:
+            return "[green]fits[/]"
+        if self.found is None and self.extra:
+            return escape(f"pip install 'clbench[{self.extra}]'")
+        return f"[red]pip install '{escape(self.requirement.name)}{self.requirement.specifier}'[/]"
+
+
+def _packages() -> list[_Package]:
     from packaging.requirements import Requirement
 
     from clbench.base.dependencies import extra_of
 
-    table = Table("package", "found", "tested", "", title="Packages")
+    found = []
     for text in requires("clbench") or []:
         requirement = Requirement(text)
         extra = extra_of(requirement)
         if extra == "dev":
             continue
+        requirement.marker = None
         try:
-            found = version(requirement.name)
-            fits = requirement.specifier.contains(found, prereleases=True)
-            install = f"[red]pip install '{requirement.name}{requirement.specifier}'[/]"
-            verdict = "[green]fits[/]" if fits else install
+            installed = version(requirement.name)
         except PackageNotFoundError:
-            found = "-"
-            verdict = escape(f"pip install 'clbench[{extra}]'") if extra else "[red]pip install clbench[/]"
-        table.add_row(requirement.name, found, str(requirement.specifier), verdict)
-    return table
+            installed = None
+        found.append(_Package(requirement, extra, installed))
+    return found
 
 
-def _machine() -> Table:
+def _machine() -> dict[str, str]:
+    """Return what matters of this machine."""
     import torch
 
     from clbench.base.cache import cache_folder
     from clbench.cli.arguments import minari_folder
     from clbench.worlds.gl_backend import DEBIAN_PACKAGES, rendering_fault
 
-    table = Table(title="Machine", show_header=False)
-    table.add_row("python", sys.version.split()[0])
-    table.add_row("cores", f"{os.cpu_count()} ({torch.get_num_threads()} threads in PyTorch; a run uses one)")
-    cuda = torch.cuda.get_device_name() if torch.cuda.is_available() else "none (and none is needed)"
-    table.add_row("cuda", cuda)
     faults = {back_end: rendering_fault(back_end) for back_end in DEBIAN_PACKAGES}
+    working = [back_end for back_end, fault in faults.items() if fault is None]
+    rendering = {}
     for back_end, fault in faults.items():
-        missing = f"does not work; apt-get install {DEBIAN_PACKAGES[back_end]}"
-        table.add_row(f"rendering: {back_end}", "works" if fault is None else missing)
-    table.add_row("films", _films(faults))
-    table.add_row("cache", _folder(cache_folder(), "CLBENCH_CACHE"))
-    table.add_row("demonstrations", _folder(minari_folder() / "clbench", "MINARI_DATASETS_PATH"))
-    return table
+        help_ = "not needed" if working else f"apt-get install {DEBIAN_PACKAGES[back_end]}"
+        rendering[f"rendering: {back_end}"] = "works" if fault is None else f"does not work; {help_}"
+    return {
+        "python": sys.version.split()[0],
+        "cores": f"{os.cpu_count()} ({torch.get_num_threads()} threads in PyTorch; a run uses one)",
+        "cuda": torch.cuda.get_device_name() if torch.cuda.is_available() else "none (and none is needed)",
+        **rendering,
+        "films": _films(faults),
+        "cache": _folder(cache_folder(), "CLBENCH_CACHE"),
+        "demonstrations": _folder(minari_folder() / "clbench", "MINARI_DATASETS_PATH"),
+    }
 
 
 def _films(faults: dict[str, str | None]) -> str:

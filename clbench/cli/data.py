@@ -12,7 +12,14 @@ from rich.console import Console
 from rich.table import Table
 
 from clbench.base.errors import InputError
-from clbench.cli.arguments import add_cwd_to_path, check_folders, checked_input, data_folders, whole_number
+from clbench.cli.arguments import (
+    ScenarioId,
+    add_cwd_to_path,
+    check_folders,
+    checked_input,
+    data_folders,
+    whole_number,
+)
 
 if TYPE_CHECKING:
     from clbench.data.expert_rates import Measurement
@@ -21,7 +28,9 @@ if TYPE_CHECKING:
 # PyTorch and the simulators are imported where they are needed: `--help` does not wait for them.
 
 
-def demonstrations(scenario: str, /, *, workers: Annotated[int | None, whole_number(1)] = None) -> None:
+def demonstrations(
+    scenario: ScenarioId, /, *, workers: Annotated[int | None, whole_number(1)] = None
+) -> None:
     """Collect the expert demonstrations of SCENARIO as Minari datasets, and show a table of them.
 
     Args:
@@ -60,7 +69,7 @@ def demonstrations(scenario: str, /, *, workers: Annotated[int | None, whole_num
 
 
 def pretrain(
-    scenario: str,
+    scenario: ScenarioId,
     /,
     *,
     seed: Annotated[int, whole_number(0)] = 0,

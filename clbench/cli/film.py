@@ -10,8 +10,14 @@ from cyclopts import Parameter
 from rich.console import Console
 
 from clbench.base.errors import InputError
-from clbench.cli.arguments import add_cwd_to_path, checked_input, whole_number
-from clbench.spec.identifiers import check_known
+from clbench.cli.arguments import (
+    MethodName,
+    ScenarioId,
+    add_cwd_to_path,
+    check_names,
+    checked_input,
+    whole_number,
+)
 
 if TYPE_CHECKING:
     from clbench.runs.spec import ResolvedRun
@@ -20,8 +26,8 @@ if TYPE_CHECKING:
 
 
 def film(
-    scenario: str,
-    method: str,
+    scenario: ScenarioId,
+    method: MethodName,
     /,
     *,
     seed: Annotated[int, whole_number(0)] = 0,
@@ -53,8 +59,7 @@ def film(
         device: Device on which the policies were computed, and are computed now.
         changes: Hyper-parameters that differ from the defaults of the method, as --set.name value.
     """
-    with checked_input():
-        check_known([scenario], [method])
+    check_names([scenario], [method])
     from clbench.jobs.bars import Bars
     from clbench.runs.checkpoints import load_stages
     from clbench.runs.film import FASTEST, FILMS, check_format, film_run, steps_per_second

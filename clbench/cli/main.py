@@ -21,25 +21,33 @@ if TYPE_CHECKING:
 
 # Named, not imported: a command imports what it needs, and the core knows its parts by name alone.
 COMMANDS = {
-    "list": "clbench.cli.catalogue:list_",
-    "metrics": "clbench.cli.catalogue:metrics",
-    "run": "clbench.cli.runs:run",
-    "status": "clbench.cli.status:status",
-    "tune": "clbench.cli.tune:tune",
-    "film": "clbench.cli.film:film",
-    "new-method": "clbench.cli.new_method:new_method",
-    "demonstrations": "clbench.cli.data:demonstrations",
-    "pretrain": "clbench.cli.data:pretrain",
-    "cache": "clbench.cli.cache:cache",
-    "doctor": "clbench.cli.catalogue:doctor",
-    "leaderboard": "clbench.leaderboard.cli:show",
-    "submit": "clbench.leaderboard.cli:submit",
-    "verify": "clbench.leaderboard.cli:verify",
-    "claims": "clbench.leaderboard.cli:claims",
-    "method-pages": "clbench.leaderboard.cli:method_pages",
-    "scenario-card": "clbench.leaderboard.cli:scenario_card",
+    "Measure": {
+        "list": "clbench.cli.catalogue:list_",
+        "run": "clbench.cli.runs:run",
+        "status": "clbench.cli.status:status",
+        "leaderboard": "clbench.leaderboard.cli:show",
+        "metrics": "clbench.cli.catalogue:metrics",
+        "film": "clbench.cli.film:film",
+    },
+    "Add a method": {
+        "new-method": "clbench.cli.new_method:new_method",
+        "submit": "clbench.leaderboard.cli:submit",
+        "tune": "clbench.cli.tune:tune",
+        "verify": "clbench.leaderboard.cli:verify",
+    },
+    "Inputs and machine": {
+        "doctor": "clbench.cli.catalogue:doctor",
+        "demonstrations": "clbench.cli.data:demonstrations",
+        "pretrain": "clbench.cli.data:pretrain",
+        "cache": "clbench.cli.cache:cache",
+    },
+    "Pages": {
+        "claims": "clbench.leaderboard.cli:claims",
+        "method-pages": "clbench.leaderboard.cli:method_pages",
+        "scenario-card": "clbench.leaderboard.cli:scenario_card",
+    },
 }
-"""Entry points of the commands."""
+"""Entry points of the commands, in the groups of `clbench --help`."""
 
 EXPERTS = {
     "measure": "clbench.cli.data:measure",
@@ -93,23 +101,39 @@ def _summary(entry_point: str) -> str:
     return (ast.get_docstring(next(found)) or "").partition("\n")[0]
 
 
-def _app(name: str, text: str, commands: dict[str, str]) -> App:
-    """Return the command `name` with lazy subcommands."""
+def _app(name: str, text: str, commands: dict[Group, dict[str, str]]) -> App:
+    """Return the command `name` with lazy subcommands in groups."""
     made = App(
         name=name,
         help=text,
         version=clbench.__version__,
-        group_commands=Group("Commands", help_formatter=_Summaries(commands)),
+        group_commands=Group("Options"),
         error_console=Console(stderr=True, soft_wrap=True),
         error_formatter=parsing_error,
         suppress_keyboard_interrupt=False,  # `clbench.cli.entry` reports it
     )
-    for command, entry_point in commands.items():
-        made.command(entry_point, name=command)
+    for group, members in commands.items():
+        for number, (command, entry_point) in enumerate(members.items()):
+            made.command(entry_point, name=command, group=group, sort_key=number)
     return made
 
 
-app = _app("clbench", clbench.__doc__ or "", COMMANDS)
-app.command(
-    _app("experts", "Measure the experts that demonstrate tasks, and train learned experts.", EXPERTS)
+def _grouped(commands: dict[str, dict[str, str]]) -> dict[Group, dict[str, str]]:
+    """Return commands by the group that `--help` shows them in, in this order."""
+    return {
+        Group.create_ordered(title, help_formatter=_Summaries(members)): members
+        for title, members in commands.items()
+    }
+
+
+GROUPS = _grouped(COMMANDS)
+app = _app("clbench", clbench.__doc__ or "", GROUPS)
+experts = _app(
+    "experts",
+    "Measure the experts that demonstrate tasks, and train learned experts.",
+    _grouped({"Commands": EXPERTS}),
 )
+experts.group = next(group for group in GROUPS if group.name == "Inputs and machine")
+experts.sort_key = len(COMMANDS["Inputs and machine"])
+app.command(experts)
+app.register_install_completion_command(help="Let TAB complete commands, options, methods and scenarios.")

@@ -17,15 +17,17 @@ from clbench.base.errors import InputError
 from clbench.base.leftovers import sweep
 from clbench.base.strict_json import printable
 from clbench.cli.arguments import (
+    MethodName,
+    ScenarioId,
     add_cwd_to_path,
     check_folders,
+    check_names,
     checked_input,
     data_folders,
     minari_folder,
     whole_number,
 )
 from clbench.records.paths import RECORDS
-from clbench.spec.identifiers import check_known
 
 if TYPE_CHECKING:
     from clbench.jobs.job import Workers
@@ -35,9 +37,9 @@ if TYPE_CHECKING:
 
 
 def run(
-    scenarios: str,
+    scenarios: ScenarioId,
     /,
-    *methods: str,
+    *methods: MethodName,
     every: Annotated[bool, Parameter(name="--all", negative="")] = False,
     seeds: Annotated[int, whole_number(1)] = 3,
     first_seed: Annotated[int, whole_number(0)] = 0,
@@ -82,8 +84,7 @@ def run(
             record are made again.
         tensorboard: Log the runs for TensorBoard below this folder while they run.
     """
-    with checked_input():  # before PyTorch is imported, which takes seconds
-        check_known(scenarios.split(","), methods)
+    check_names(scenarios.split(","), methods)
     from clbench.runs.spec import RunSpec, check_device
     from clbench.runs.tensorboard import require_tensorboard
     from clbench.scoring.intervals import expected_precision

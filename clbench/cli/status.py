@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import sys
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
@@ -16,7 +14,15 @@ from rich.table import Table
 
 from clbench.base.errors import InputError
 from clbench.base.strict_json import printable
-from clbench.cli.arguments import add_cwd_to_path, checked_input, whole_number
+from clbench.cli.arguments import (
+    AsJson,
+    MethodName,
+    ScenarioId,
+    add_cwd_to_path,
+    checked_input,
+    print_json,
+    whole_number,
+)
 from clbench.cli.runs import requested
 from clbench.records.paths import RECORDS
 from clbench.records.status import RunState, State, found_runs, run_state, seconds_left
@@ -25,16 +31,16 @@ STATES: tuple[State, ...] = ("done", "running", "failed", "damaged", "to do")
 
 
 def status(
-    scenarios: str | None = None,
+    scenarios: ScenarioId | None = None,
     /,
-    *methods: str,
+    *methods: MethodName,
     every: Annotated[bool, Parameter(name="--all", negative="")] = False,
     seeds: Annotated[int, whole_number(1)] = 3,
     first_seed: Annotated[int, whole_number(0)] = 0,
     order: Annotated[int, whole_number(0)] = 0,
     records: Path = RECORDS,
     changes: Annotated[dict[str, str] | None, Parameter(name="--set")] = None,
-    as_json: Annotated[bool, Parameter(name="--json", negative="")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Show which runs are done, running, failed and to do, and the time left.
 
@@ -51,7 +57,7 @@ def status(
         order: Order in which the targets are learned.
         records: Folder of the records.
         changes: Hyper-parameters that differ from the defaults of the methods, as --set.name value.
-        as_json: Print one JSON object for each run instead of the table.
+        as_json: Print one JSON object for each run, and no table.
     """
     add_cwd_to_path()
     with checked_input():
@@ -66,8 +72,7 @@ def status(
             paths = [one.path(records) for one in requested(scenarios, methods, every, seeds, spec, records)]
         states = [run_state(path) for path in paths]
     if as_json:
-        values = [_values(state, records) for state in states]
-        sys.stdout.write(f"{json.dumps(values, indent=1)}\n")
+        print_json([_values(state, records) for state in states])
         return
     console = Console()
     console.print(_table(states))

@@ -14,10 +14,16 @@ from rich.console import Console
 from rich.table import Table
 
 from clbench.base.errors import InputError
-from clbench.cli.arguments import add_cwd_to_path, checked_input, whole_number
+from clbench.cli.arguments import (
+    MethodName,
+    ScenarioId,
+    add_cwd_to_path,
+    check_names,
+    checked_input,
+    whole_number,
+)
 from clbench.cli.runs import run_missing
 from clbench.records.paths import TUNING
-from clbench.spec.identifiers import check_known
 from clbench.spec.references import BASELINE
 
 if TYPE_CHECKING:
@@ -29,9 +35,9 @@ FIRST_SEED = 100
 
 
 def tune(
-    scenario: str,
+    scenario: ScenarioId,
     /,
-    *methods: str,
+    *methods: MethodName,
     every: Annotated[bool, Parameter(name="--all", negative="")] = False,
     seeds: Annotated[int, whole_number(1)] = 2,
     first_seed: Annotated[int, whole_number(0)] = FIRST_SEED,
@@ -66,8 +72,7 @@ def tune(
         write: File that receives the chosen settings; those of other methods in it stay. For built-in methods
             `clbench run` reads methods/tuned/.
     """
-    with checked_input():
-        check_known([scenario], methods)
+    check_names([scenario], methods)
     from clbench.learning.registry import load_method, method_names
     from clbench.runs.spec import RunSpec, check_device
     from clbench.runs.tuning import Tuned, best_of, refinements, rungs, write_tuned

@@ -5,16 +5,21 @@ import re
 import subprocess
 import sys
 from collections.abc import Sequence
+from importlib import metadata
 from pathlib import Path
 
 import pytest
 
+from clbench import __version__
 from clbench.cli.arguments import checked_input
 from clbench.cli.main import COMMANDS, app
 from clbench.jobs.job import Job
 from clbench.jobs.work import do_run
 
 TOY = "clbench.testing:clbench/Toy-v0"
+
+PLACES = {name: place for commands in COMMANDS.values() for name, place in commands.items()}
+"""Entry points of all commands."""
 
 
 def _clbench(*arguments: str, folder: Path | None = None) -> subprocess.CompletedProcess[str]:
@@ -211,14 +216,16 @@ def test_help_shows_every_command_with_its_summary_and_imports_none() -> None:
     program = "import sys; from clbench.cli.main import app; app('--help', result_action='return_value')"
     command = [sys.executable, "-c", f"{program}; print({{'clbench.cli.runs', 'torch'}} & set(sys.modules))"]
     lines = subprocess.run(command, capture_output=True, text=True, check=True).stdout.splitlines()
-    for name in (*COMMANDS, "experts"):
+    titles = [line.strip("╭─╮ ") for line in lines if line.startswith("╭")]
+    assert titles == [*COMMANDS, "Options"]
+    for name in (*PLACES, "experts"):
         (line,) = (line for line in lines if line.startswith(f"│ {name} "))
         assert line.removeprefix(f"│ {name} ").strip(" │")
     assert lines[-1] == "set()"
 
 
 @pytest.mark.parametrize(
-    "command", [name for name, place in COMMANDS.items() if place.startswith("clbench.cli.")]
+    "command", [name for name, place in PLACES.items() if place.startswith("clbench.cli.")]
 )
 def test_help_of_a_command_shows_its_limits_and_does_not_wait_for_pytorch(command: str) -> None:
     program = f"from clbench.cli.main import app; app(['{command}', '--help'], result_action='return_value')"
@@ -229,6 +236,49 @@ def test_help_of_a_command_shows_its_limits_and_does_not_wait_for_pytorch(comman
         assert "--workers INT>=1" in output
     if "--seed " in output:
         assert "--seed INT>=0" in output
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        (["run", "clbench/F"], "clbench/Fetch-v1"),
+        (["run", "clbench/Fetch-v1", "sft", "con"], "consft"),
+        (["submit", "con"], "consft"),
+        (["film", "clbench/Fetch-v1", ""], "lora"),
+        (["status", "clbench/F"], "clbench/Fetch-v1"),
+        (["scenario-card", ""], "clbench/PointMaze-v0"),
+    ],
+)
+def test_tab_completes_scenarios_and_methods(words: list[str], expected: str) -> None:
+    assert expected in _clbench("__complete", *words).stdout.splitlines()
+
+
+def test_lists_metrics_and_the_machine_come_as_json_too() -> None:
+    found = json.loads(_clbench("list", "--json").stdout)
+    (fetch,) = (one for one in found["scenarios"] if one["id"] == "clbench/Fetch-v1")
+    assert "push_right" in fetch["target"]
+    (replay,) = (one for one in found["methods"] if one["name"] == "experience_replay")
+    assert (replay["demonstrations"], replay["questions"]) == ("throughout", "never")
+    every = json.loads(_clbench("metrics", "--json").stdout)
+    (one,) = json.loads(_clbench("metrics", "forgetting", "--json").stdout)
+    assert one in every
+    machine = json.loads(_clbench("doctor", "--json").stdout)
+    assert (machine["ready"], machine["mend"]) == (True, [])
+    assert machine["clbench"] == __version__
+    assert "torch" in machine["packages"]
+
+
+def test_doctor_says_what_to_mend_if_something_needed_is_wrong(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(
+        "clbench.cli.catalogue.version", lambda name: "0.1" if name == "scipy" else metadata.version(name)
+    )
+    with pytest.raises(SystemExit) as ended:
+        app(["doctor"])
+    assert ended.value.code == 1
+    last = " ".join(capsys.readouterr().out.split("cannot run here yet:")[1].split())
+    assert last == "pip install 'scipy<2,>=1.17'"
 
 
 def test_list_shows_scenarios_and_methods() -> None:
@@ -248,6 +298,7 @@ def test_doctor_shows_versions_and_rendering() -> None:
     assert result.returncode == 0
     assert "mujoco" in result.stdout
     assert "rendering: egl" in result.stdout
+    assert f"clbench {__version__} is ready." in result.stdout
 
 
 @pytest.mark.slow
