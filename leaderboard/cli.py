@@ -16,6 +16,7 @@ from rich.text import Text
 from clbench.base.entry_points import unknown
 from clbench.base.errors import InputError
 from clbench.cli.arguments import (
+    AsJson,
     MethodName,
     ScenarioId,
     add_cwd_to_path,
@@ -23,6 +24,7 @@ from clbench.cli.arguments import (
     check_names,
     checked_input,
     data_folders,
+    print_json,
     whole_number,
 )
 from clbench.records.paths import RECORDS, record_path
@@ -34,20 +36,28 @@ if TYPE_CHECKING:
 
 # Whatever imports PyTorch, SciPy or the charts is imported where it is needed: `--help` does not wait for it.
 
-WIDTH = 108
-"""Least width of the console in characters: a narrower table loses metrics, and a long line only wraps."""
 
-
-def show(*, records: Path = RECORDS) -> None:
+def show(
+    scenario: ScenarioId | None = None,
+    /,
+    *,
+    sort: str | None = None,
+    records: Path = RECORDS,
+    as_json: AsJson = False,
+) -> None:
     """Show the leaderboard, and write it to the folder `site` next to the records.
 
     Files: LEADERBOARD.md; leaderboard.csv with every metric; index.html, a page for the browser with the
-    details of every row, which needs no network; pareto.svg and pareto-dark.svg, its chart as pictures.
+    details of every row, which needs no network; pareto.svg and pareto-dark.svg, its chart as pictures. They
+    always hold all scenarios.
 
     Args:
+        scenario: Show this scenario alone.
+        sort: Name of the metric that orders the rows of each division, for example kept.
         records: Folder of the records.
+        as_json: Print JSON, one object for each row with every metric and cost, and write no files.
     """
-    from .board.rows import read_table
+    from .board.rows import column_names, read_table, values_of
     from .views.terminal import terminal
 
     if not any(records.rglob("*.json")):
@@ -55,9 +65,33 @@ def show(*, records: Path = RECORDS) -> None:
         Console(stderr=True, soft_wrap=True).print(Text(message))
         raise SystemExit(2)
     table = read_table(records)
+    with checked_input():
+        shown = _chosen(table, scenario, sort)
+    if as_json:
+        print_json([dict(zip(column_names(), values_of(row), strict=True)) for row in shown.rows])
+        return
     written = _write_table(table, records)
-    _console().print(terminal(table))
+    console = Console()
+    console.print(terminal(shown, console.width, sort))
     _print_written(written)
+
+
+def _chosen(table: Table, scenario: str | None, sort: str | None) -> Table:
+    """Return the part of the table that is asked for, if there is such a scenario and such a metric.
+
+    Raises:
+        UnknownNameError: The table has no rows of the scenario, or no metric has the name of `sort`.
+    """
+    from clbench.scoring.metrics import load_metric
+
+    if sort is not None:
+        load_metric(sort)
+    if scenario is None:
+        return table
+    if scenario not in table.scenarios:
+        raise unknown("scenario with records", scenario, table.scenarios)
+    rows = tuple(row for row in table.rows if row.scenario == scenario)
+    return replace(table, rows=rows, not_shown=())
 
 
 def submit(
@@ -109,7 +143,7 @@ def submit(
         table = read_table(records)
         _print_written(_write_table(table, records))
         lines = placement(table, runs[0], records)
-        _console().print(Text("\n".join(lines)), soft_wrap=True)
+        Console().print(Text("\n".join(lines)), soft_wrap=True)
     if not went_well:
         raise SystemExit(1)
 
@@ -215,7 +249,7 @@ def claims(
     from .pages.claims_page import page, terminal
 
     judged = judge_all(lambda name: read_evidence(name, records, controls), scenario)
-    console = _console()
+    console = Console()
     console.print(terminal(judged))
     _write(output, page(judged))
 
@@ -248,7 +282,7 @@ def method_pages(
     output.mkdir(parents=True, exist_ok=True)
     for name, text in texts.items():
         write_if_changed(output / name, text)
-    _console().print(Text(f"Written: {len(texts)} pages in {output}"), soft_wrap=True)
+    Console().print(Text(f"Written: {len(texts)} pages in {output}"), soft_wrap=True)
 
 
 def scenario_card(
@@ -318,11 +352,6 @@ def _write_table(table: Table, records: Path) -> list[Path]:
     return write_all({folder / name: text for name, text in texts.items()})
 
 
-def _console() -> Console:
-    console = Console()
-    return console if console.width >= WIDTH else Console(width=WIDTH)
-
-
 def _write(path: Path, text: str) -> None:
     from .views.format import write_all
 
@@ -330,6 +359,6 @@ def _write(path: Path, text: str) -> None:
 
 
 def _print_written(paths: Iterable[Path]) -> None:
-    console = _console()
+    console = Console()
     for path in paths:
         console.print(Text(f"Written: {path}"), soft_wrap=True)

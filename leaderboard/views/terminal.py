@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from itertools import groupby
+from typing import Any
 
 from rich.box import SIMPLE_HEAD
-from rich.console import Group, RenderableType
+from rich.console import Console, Group, RenderableType
+from rich.measure import Measurement
 from rich.table import Table as TextTable
 from rich.text import Text
 
 from clbench.scoring.intervals import Estimate
+from clbench.scoring.metrics import METRICS
 
 from ..board.overall import OverallRow, overall
 from ..board.rows import Row, Table
@@ -29,19 +33,61 @@ TRIED = "Tried: settings that tuning tried. "
 """Its part on scenarios whose stages end when the target is learned."""
 
 
-def terminal(table: Table) -> RenderableType:
-    """Return the table for a terminal of 108 columns."""
+DROPPED_FIRST = (
+    "tier",
+    "tried",
+    "bytes kept",
+    "forward transfer",
+    "question retention",
+    "forgetting",
+    "cost",
+    "kept skills",
+    "seeds",
+    "retention",
+    "learned",
+    "adaptation",
+    "kept",
+    "gain",
+)
+"""Columns in the order in which a narrow terminal loses them; what stays longest matters most."""
+
+WIDEST_NAME = 20
+"""Characters of a method's name that a table keeps on one line if there is no room for more."""
+
+
+@dataclass(frozen=True)
+class _Head:
+    """A column after the method's name."""
+
+    title: str
+    cell: Callable[[Any], str]
+    """Returns the text in a row."""
+    value: Callable[[Any], float | None] = lambda _: None
+    """Returns the number in a row, of which the best of a division is bold."""
+    higher_is_better: bool | None = None
+
+
+def terminal(table: Table, width: int = 108, sort: str | None = None) -> RenderableType:
+    """Return the table for a terminal.
+
+    Args:
+        table: The table.
+        width: Width of the terminal in characters; columns that do not fit are named below each table.
+        sort: Name of the metric that orders the rows of each division, the best first; None for the board's
+            own order.
+    """
     # Text and not str: rich would obey markup in a stranger's words.
     parts: list[RenderableType] = []
     tables: list[Rows] = []
     for scenario, members in groupby(table.rows, key=lambda row: row.scenario):
         rows = list(members)
         tables.append(rows)
+        parts += _fitted(scenario, _sorted(rows, sort), _heads(rows), width)
         sentence = agreement_text(rows)
-        parts += [_scenario(scenario, rows), *([Text(sentence)] if sentence else []), Text()]
+        parts += [*([Text(sentence)] if sentence else []), Text()]
     over_scenarios = overall(table.rows)
     if over_scenarios:
-        parts += [_all_scenarios(over_scenarios), Text()]
+        parts += [*_fitted("All scenarios", over_scenarios, _overall_heads(over_scenarios), width), Text()]
     if parts:
         heads = [one for rows in tables for one in fitting(rows) if one.metric.higher_is_better is False]
         names = ", ".join(dict.fromkeys(one.title for one in heads))
@@ -55,49 +101,112 @@ def terminal(table: Table) -> RenderableType:
     return Group(*parts)
 
 
-def _scenario(scenario: str, rows: list[Row]) -> TextTable:
-    """Return the table of one scenario, with a section for each division."""
+def _sorted(rows: list[Row], metric: str | None) -> list[Row]:
+    """Return the rows with those of each division from the best to the worst; rows without a value last."""
+    if metric is None:
+        return rows
+    sign = -1 if METRICS[metric].higher_is_better is False else 1
+
+    def place(row: Row) -> tuple[bool, float]:
+        value = row.estimates[metric].value
+        return value is None, 0.0 if value is None else -sign * value
+
+    by_division = [list(members) for _, members in groupby(rows, key=lambda row: row.division)]
+    return [row for members in by_division for row in sorted(members, key=place)]
+
+
+def _fitted(
+    title: str, rows: Sequence[Row | OverallRow], heads: Sequence[_Head], width: int
+) -> list[RenderableType]:
+    """Return a table without the columns that do not fit, and a line that names them."""
+    kept, dropped = list(heads), []
+    for name in DROPPED_FIRST:
+        if _width(_table(title, rows, kept, WIDEST_NAME)) <= width:
+            break
+        dropped += [head.title for head in kept if head.title == name]
+        kept = [head for head in kept if head.title != name]
+    line = f"Too wide for {width} columns: {', '.join(dropped)}. The page and --json have all."
+    return [_table(title, rows, kept), *([Text(line, style="italic")] if dropped else [])]
+
+
+def _width(table: TextTable) -> int:
+    console = Console(width=1000)
+    return Measurement.get(console, console.options, table).maximum
+
+
+def _table(
+    title: str, rows: Sequence[Row | OverallRow], heads: Sequence[_Head], widest_name: int | None = None
+) -> TextTable:
+    """Return a table with a section for each division."""
     table = TextTable(
-        title=Text(scenario, style="bold"), box=SIMPLE_HEAD, padding=0, title_justify="left", show_edge=False
+        title=Text(title, style="bold"), box=SIMPLE_HEAD, padding=0, title_justify="left", show_edge=False
     )
     table.add_column("", no_wrap=True)  # letters of the groups: the legend explains them
-    table.add_column("method", overflow="fold", min_width=16)
-    columns, to_criterion = fitting(rows), rows[0].to_criterion
-    tried = ("tried",) if to_criterion else ()
-    for name in ("seeds", *(one.title for one in columns), *tried, "cost", "bytes kept", "tier"):
+    table.add_column("method", overflow="fold", min_width=16, max_width=widest_name)
+    for head in heads:
         # One word a line: a header must not make its column wider than the numbers.
-        table.add_column(name.replace(" ", "\n"), justify="right", no_wrap=True)
+        table.add_column(head.title.replace(" ", "\n"), justify="right", no_wrap=True)
     for division, members in groupby(rows, key=lambda row: row.division):
         table.add_section()
         table.add_row("", Text(division, style="italic"))
         division_rows = list(members)
+        best = [_best(head, division_rows) for head in heads]
         for row in division_rows:
-            cells = [aligned(row.groups, division_rows), row.method, str(len(row.seeds))]
-            cells += [_compact(row.estimates[one.metric.name], one) for one in columns]
-            cells += [number_text(row.tried, "d")] if to_criterion else []
-            kept = row.costs["bytes_kept"]
-            size = MISSING if kept is None else "".join(scaled(kept))
-            cells += [number_text(row.costs["relative_cost"], ".1f"), size]
-            table.add_row(*map(Text, cells), str(TIERS.index(row.tier)))
+            cells = [
+                Text(head.cell(row), style="bold" if top is not None and head.value(row) == top else "")
+                for head, top in zip(heads, best, strict=True)
+            ]
+            table.add_row(Text(_letters(row, division_rows)), Text(row.method), *cells)
     return table
 
 
-def _all_scenarios(rows: Sequence[OverallRow]) -> TextTable:
-    """Return the table over scenarios, with a section for each division."""
-    title = Text("All scenarios", style="bold")
-    table = TextTable(title=title, show_edge=False, box=SIMPLE_HEAD, padding=0, title_justify="left")
-    table.add_column("method", overflow="fold", min_width=20)
-    columns = fitting(rows)
-    for name in ("groups", *(one.title for one in columns)):
-        table.add_column(name.replace(" ", "\n"), justify="right")
-    for division, members in groupby(rows, key=lambda row: row.division):
-        table.add_section()
-        table.add_row(Text(division, style="italic"))
-        for row in members:
-            groups = ",".join(letters or MISSING for letters in row.groups)
-            cells = [_compact(row.estimates[one.metric.name], one) for one in columns]
-            table.add_row(*map(Text, [row.method, groups, *cells]))
-    return table
+def _best(head: _Head, rows: Sequence[Any]) -> float | None:
+    """Return the best number of a division in a column, None if there is nothing to compare."""
+    values = [value for value in map(head.value, rows) if value is not None]
+    if head.higher_is_better is None or len(values) < 2:
+        return None
+    return max(values) if head.higher_is_better else min(values)
+
+
+def _letters(row: Row | OverallRow, rows: Sequence[Any]) -> str:
+    return aligned(row.groups, rows) if isinstance(row, Row) else ""
+
+
+def _heads(rows: list[Row]) -> list[_Head]:
+    """Return the columns of the table of one scenario."""
+    tried = [_Head("tried", lambda row: number_text(row.tried, "d"))] if rows[0].to_criterion else []
+    return [
+        _Head("seeds", lambda row: str(len(row.seeds))),
+        *_metric_heads(rows),
+        *tried,
+        _Head("cost", lambda row: number_text(row.costs["relative_cost"], ".1f")),
+        _Head("bytes kept", _size),
+        _Head("tier", lambda row: str(TIERS.index(row.tier))),
+    ]
+
+
+def _overall_heads(rows: Sequence[OverallRow]) -> list[_Head]:
+    """Return the columns of the table over scenarios."""
+    groups = _Head("groups", lambda row: ",".join(letters or MISSING for letters in row.groups))
+    return [groups, *_metric_heads(rows)]
+
+
+def _metric_heads(rows: Rows) -> list[_Head]:
+    def head(column: Column) -> _Head:
+        name = column.metric.name
+        return _Head(
+            column.title,
+            lambda row: _compact(row.estimates[name], column),
+            lambda row: row.estimates[name].value,
+            column.metric.higher_is_better,
+        )
+
+    return [head(column) for column in fitting(rows)]
+
+
+def _size(row: Row) -> str:
+    kept = row.costs["bytes_kept"]
+    return MISSING if kept is None else "".join(scaled(kept))
 
 
 def _compact(estimate: Estimate, column: Column) -> str:

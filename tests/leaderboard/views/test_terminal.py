@@ -1,15 +1,24 @@
 """The table in the terminal."""
 
+import io
+import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import pytest
+from rich.console import Console
+
+from clbench.base.entry_points import resolve
+from clbench.cli.main import app
 from clbench.records.record import Record
 
 
 def test_the_terminal_shows_all_rows_in_108_columns(
-    add_full: Callable[..., Path], shown: Callable[[], tuple[str, str]]
+    add_full: Callable[..., Path], shown: Callable[[], tuple[str, str]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setenv("COLUMNS", "108")
     add_full("experience_replay", 0)
     printed, _ = shown()
     table, _, _ = printed.partition("Written: ")  # the paths below it are as long as they are
@@ -21,9 +30,95 @@ def test_the_terminal_shows_all_rows_in_108_columns(
     assert "…" not in printed
 
 
-def test_bytes_have_three_digits_and_go_on_to_the_next_unit(
-    four_methods: Path, add_full: Callable[..., Path], shown_with_page: Callable[[], tuple[str, str]]
+@pytest.mark.parametrize(
+    ("width", "lost"), [(60, "tier, bytes kept, forward transfer"), (80, "tier, bytes kept")]
+)
+def test_a_narrow_terminal_loses_whole_columns_and_says_which(
+    width: int,
+    lost: str,
+    add_full: Callable[..., Path],
+    shown: Callable[[], tuple[str, str]],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    monkeypatch.setenv("COLUMNS", str(width))
+    add_full("experience_replay", 0)
+    printed, _ = shown()
+    table, _, _ = printed.partition("Written: ")
+    assert max(map(len, table.splitlines())) <= width
+    assert f"Too wide for {width} columns: {lost}" in " ".join(printed.split())
+    row = next(line for line in printed.splitlines() if "experience_replay" in line)
+    assert "±" in row
+    assert "…" not in printed
+
+
+def test_the_best_of_a_division_is_bold_and_a_lone_row_is_not(
+    four_methods: Path, add_full: Callable[..., Path], matrix: Any
+) -> None:
+    add_full("better", 0, np.clip(matrix + 0.2, 0, 1))
+    table = resolve("clbench.leaderboard.board.rows:read_table")(four_methods)
+    console = Console(record=True, width=108, file=io.StringIO(), force_terminal=True)
+    console.print(resolve("clbench.leaderboard.views.terminal:terminal")(table, 108))
+    lines = console.export_text(styles=True).splitlines()
+    better, sft, lone = (next(line for line in lines if name in line) for name in ("better", "sft", "replay"))
+    assert "\x1b[1m" in better
+    assert "\x1b[1m" not in lone
+    assert better.count("\x1b[1m") > sft.count("\x1b[1m")
+
+
+def test_one_scenario_is_shown_in_the_order_of_a_metric(
+    four_methods: Path, add_full: Callable[..., Path], matrix: Any, capsys: pytest.CaptureFixture[str]
+) -> None:
+    add_full("eager", 0, matrix * np.array([0.0, 0.0, 1.0, 1.0, 1.0]))  # learns alike, and keeps no skill
+    other = np.clip(matrix * np.array([1.0, 1.0, 0.5, 0.5, 1.0]), 0, 1)
+    add_full("careful", 0, other)
+    order = {}
+    for metric in ("adaptation", "retention"):
+        app(
+            ["leaderboard", "clbench/Toy-v0", "--sort", metric, "--records", str(four_methods)],
+            result_action="return_value",
+        )
+        printed = capsys.readouterr().out
+        order[metric] = printed.index("careful") < printed.index("eager")
+    assert order == {"adaptation": False, "retention": True}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (
+            ["clbench/Toi-v0"],
+            "No scenario with records is called 'clbench/Toi-v0'. Did you mean 'clbench/Toy-v0'?",
+        ),
+        (["--sort", "retension"], "No metric is called 'retension'. Did you mean 'retention'?"),
+    ],
+)
+def test_a_wrong_scenario_or_metric_is_named_and_nothing_is_written(
+    arguments: list[str], message: str, four_methods: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as ended:
+        app(["leaderboard", *arguments, "--records", str(four_methods)])
+    assert ended.value.code == 2
+    assert message in capsys.readouterr().err
+    assert not (four_methods.parent / "site").exists()
+
+
+def test_the_rows_come_as_json_with_null_for_what_is_missing(
+    four_methods: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    app(["leaderboard", "--json", "--records", str(four_methods)], result_action="return_value")
+    rows = {row["method"]: row for row in json.loads(capsys.readouterr().out)}
+    assert rows["sft"]["retention"] == pytest.approx(0.45)
+    assert rows["sft"]["perturbed_retention"] is None
+    assert not (four_methods.parent / "site").exists()
+
+
+def test_bytes_have_three_digits_and_go_on_to_the_next_unit(
+    four_methods: Path,
+    add_full: Callable[..., Path],
+    shown_with_page: Callable[[], tuple[str, str]],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setenv("COLUMNS", "108")
     counts = {0: "0", 999: "999", 1234: "1.23k", 999_900: "1M", 45_678_901: "45.7M", 3 * 10**15: "3000T"}
     for number, count in enumerate(counts):
         add_full(f"size_{number}", 0, edit=set_in("costs", "bytes_kept", count))
