@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import sys
 import time
 from collections.abc import Callable, Sequence
@@ -100,7 +101,11 @@ def run(
     console = Console(stderr=True)
     for scenario in {run.spec.scenario: run.scenario for run in runs}.values():
         console.print(expected_precision(scenario, seeds), highlight=False)
-    if not run_missing(chosen, records, lambda: _workers(workers, ray), checkpoints, tensorboard):
+    went_well = run_missing(chosen, records, lambda: _workers(workers, ray), checkpoints, tensorboard)
+    if not changes:  # the board shows no run with changed settings
+        option = "" if records == RECORDS else f" --records {shlex.quote(str(records))}"
+        console.print(f"Next: clbench leaderboard{option}", highlight=False, markup=False, soft_wrap=True)
+    if not went_well:
         sys.exit(1)
 
 
@@ -160,6 +165,10 @@ def _workers(count: int | None, ray: str | None) -> Workers:
         return RayWorkers(ray, count)
 
 
+def _counted(runs: int) -> str:
+    return f"{runs} run" if runs == 1 else f"{runs} runs"
+
+
 def run_missing(
     runs: Sequence[ResolvedRun],
     records: Path,
@@ -186,7 +195,8 @@ def run_missing(
     with checked_input():
         missing = [run for run in runs if not has_record(run, records)]
     if len(missing) < len(runs):
-        console.print(f"{len(runs) - len(missing)} of {len(runs)} runs have a record already.")
+        have = "has" if len(runs) - len(missing) == 1 else "have"
+        console.print(f"{len(runs) - len(missing)} of {_counted(len(runs))} {have} a record already.")
     recorded = [run for run in runs if run not in missing]
     bare = [run for run in recorded if checkpoints and not has_stages(run, checkpoints)]
     if not missing and not bare:
@@ -207,7 +217,7 @@ def run_missing(
     seconds = time.monotonic() - begin
     with checked_input():
         good = sum(has_record(run, records) for run in missing)
-    done = f"{good} of {len(missing)} runs" if good < len(missing) else f"{len(missing)} runs"
+    done = f"{good} of {_counted(len(missing))}" if good < len(missing) else _counted(len(missing))
     done += f" and the policies of {len(bare)}" if bare else ""
     console.print(
         f"{done} in {seconds / 60:.1f} minutes; records in {records}.", highlight=False, markup=False

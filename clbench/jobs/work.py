@@ -42,9 +42,13 @@ def pretrain(scenario: str, seed: int, progress: ProgressCallback) -> str:
 def evaluate_policy(spec: RunSpec, progress: ProgressCallback) -> str:
     """Evaluate the pretrained policy that a run starts with, unless the cache has the evaluation."""
     from clbench.runs.start import evaluate_pretrained
+    from clbench.scoring.scores import WEAK, WEAK_WARNING
 
-    evaluate_pretrained(spec.resolve(), progress)
-    return "the start of most runs"
+    rate = evaluate_pretrained(spec.resolve(), progress)
+    if rate is None:
+        return "no skills are retained"
+    warning = f". {WEAK_WARNING}" if rate < WEAK else ""
+    return f"success {rate:.2f} on the retained skills{warning}"
 
 
 def do_run(
@@ -61,7 +65,7 @@ def do_run(
     """
     from clbench.runs.run import execute
     from clbench.scoring.metrics import measure
-    from clbench.scoring.scores import Scores
+    from clbench.scoring.scores import WEAK, Scores
 
     record = execute(spec, records, progress, checkpoints=checkpoints, tensorboard=tensorboard)
     if record.error is not None:
@@ -72,7 +76,10 @@ def do_run(
     names = ["adaptation", "retention", "question_retention"]
     names[2:2] = ["perturbed_retention"] if spec.perturb else []
     values = {name: measure(name, scores) for name in names}
-    return ", ".join(f"{name} {'-' if value is None else f'{value:.2f}'}" for name, value in values.items())
+    text = ", ".join(f"{name} {'-' if value is None else f'{value:.2f}'}" for name, value in values.items())
+    start = scores.retained_at_start()
+    weak = start is not None and start < WEAK
+    return f"{text}. The pretrained policy had only {start:.2f} of the skills" if weak else text
 
 
 def make_policies(spec: RunSpec, checkpoints: Path | None, progress: ProgressCallback) -> str:
