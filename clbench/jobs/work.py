@@ -12,13 +12,31 @@ from clbench.spec.registry import load_scenario
 # PyTorch and modules that need it are imported inside: a plan names these functions without waiting for it.
 
 
+class _Noticed:
+    """A callback that passes progress on, and knows whether there was any: cached results make none."""
+
+    def __init__(self, progress: ProgressCallback) -> None:
+        self._progress, self._made = progress, False
+
+    def __call__(self, amount: float) -> None:
+        self._made = True
+        self._progress(amount)
+
+    @property
+    def source(self) -> str:
+        """The end of a sentence about the result."""
+        return "" if self._made else ", from the cache"
+
+
 def collect_demonstrations(scenario: str, task: str, progress: ProgressCallback) -> str:
     """Collect the demonstrations of a task, unless they are in the cache."""
     from clbench.data.demonstrations import dataset_folder, read_dataset
 
     loaded = load_scenario(scenario)
-    episodes = read_dataset(dataset_folder(loaded.task(task), loaded.budget, progress))
-    return f"{len(episodes)} episodes, {sum(len(episode.executed) for episode in episodes)} steps"
+    noticed = _Noticed(progress)
+    episodes = read_dataset(dataset_folder(loaded.task(task), loaded.budget, noticed))
+    steps = sum(len(episode.executed) for episode in episodes)
+    return f"{len(episodes)} episodes, {steps} steps{noticed.source}"
 
 
 def collect_scenes(scenario: str, progress: ProgressCallback) -> str:
@@ -26,17 +44,20 @@ def collect_scenes(scenario: str, progress: ProgressCallback) -> str:
     from clbench.data.questions import load_questions, scenes_folder
 
     loaded = load_scenario(scenario)
-    scenes_folder(loaded, progress)
+    noticed = _Noticed(progress)
+    scenes_folder(loaded, noticed)
     train, test = load_questions(loaded)
-    return f"{len(train.kinds)} kinds about {len(train.scenes)} states, and {len(test.scenes)} for the test"
+    states = f"{len(train.scenes)} states, and {len(test.scenes)} for the test"
+    return f"{len(train.kinds)} kinds about {states}{noticed.source}"
 
 
 def pretrain(scenario: str, seed: int, progress: ProgressCallback) -> str:
     """Pretrain the policy of a seed, unless it is in the cache."""
     from clbench.learning.pretraining import pretrained_policy
 
-    policy, _ = pretrained_policy(load_scenario(scenario), seed, progress)
-    return f"{sum(parameter.numel() for parameter in policy.parameters()):,} parameters"
+    noticed = _Noticed(progress)
+    policy, _ = pretrained_policy(load_scenario(scenario), seed, noticed)
+    return f"{sum(parameter.numel() for parameter in policy.parameters()):,} parameters{noticed.source}"
 
 
 def evaluate_policy(spec: RunSpec, progress: ProgressCallback) -> str:
