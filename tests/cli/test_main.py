@@ -4,7 +4,7 @@ import json
 import re
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from importlib import metadata
 from pathlib import Path
 
@@ -299,6 +299,40 @@ def test_doctor_shows_versions_and_rendering() -> None:
     assert "mujoco" in result.stdout
     assert "rendering: egl" in result.stdout
     assert f"clbench {__version__} is ready." in result.stdout
+
+
+def test_a_dry_run_says_what_would_be_done_and_does_nothing(
+    empty_caches: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(empty_caches)
+    monkeypatch.syspath_prepend(empty_caches)
+    app(
+        ["run", TOY, "sft", "lora", "--seeds", "2", "--workers", "1", "--checkpoints", "kept", "--dry-run"],
+        result_action="return_value",
+    )
+    done, jobs, duration, disk = capsys.readouterr().out.splitlines()
+    assert done == "0 of 4 runs done already."
+    assert jobs == (
+        "To do: 4 datasets to collect, 1 set of questions to collect, 2 policies to pretrain, 2 pretrained "
+        "policies to evaluate, 4 runs."
+    )
+    assert re.fullmatch(
+        r"Time: about \d+ minutes with 1 at once, at \d+ ms for an optimiser step here\.", duration
+    )
+    assert re.fullmatch(r"Disk: about .* in the caches, 800 kB of records, .* of policies in kept\.", disk)
+    assert not any(path.is_file() for path in empty_caches.rglob("*"))
+
+
+def test_a_quiet_run_prints_failures_alone(
+    tmp_path: Path, write_module: Callable[[str, str], None], capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_module("mine", METHOD)
+    app(["run", TOY, "sft", "--seeds", "1", "-q", "--records", str(tmp_path)], result_action="return_value")
+    assert capsys.readouterr() == ("", "")
+    with pytest.raises(SystemExit):
+        app(["run", TOY, "mine:Broken", "--seeds", "1", "-q", "--records", str(tmp_path)])
+    said = capsys.readouterr().err
+    assert said.startswith("Toy-v0 mine:Broken seed 0: failed in stage 1 (right): ValueError: no idea")
 
 
 @pytest.mark.slow
