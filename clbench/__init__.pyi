@@ -14,6 +14,7 @@ from .policy.batch import Batch as Batch
 from .policy.batch import QuestionBatch as QuestionBatch
 from .policy.policy import Policy as Policy
 from .policy.policy import PolicyConfig as PolicyConfig
+from .records.frames import load_records as load_records
 from .records.reader import read_record as read_record
 from .records.record import Record as Record
 from .runs.agents import evaluate_agent as evaluate_agent

@@ -36,7 +36,7 @@ class RecordError(ClbenchError, ValueError):
     """A file is not a record that can be read."""
 
 
-def read_record(path: Path) -> Record:
+def read_record(path: Path | str) -> Record:
     """Read the record at `path`, which a stranger may have written.
 
     A record of an older schema is converted. The reader checks the form of a record. `Scores.from_record`
@@ -48,7 +48,7 @@ def read_record(path: Path) -> Record:
             not match its hash.
     """
     try:
-        return _record(read_json(path))
+        return _record(read_json(Path(path)))
     except (StrictJSONError, InputError, RecordError) as error:
         raise RecordError(f"{path}: {error}") from error
 

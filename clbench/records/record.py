@@ -6,10 +6,14 @@ be computed from these are not stored.
 
 from __future__ import annotations
 
+import html
 from dataclasses import dataclass, field
-from typing import Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 from clbench.spec.protocol import Point, Protocol, ScoredSplit, Split
+
+if TYPE_CHECKING:
+    import pandas
 
 SCHEMA = 4
 """Version of the file format. A reader refuses a newer one, and converts older ones
@@ -184,7 +188,7 @@ class Costs:
     """Environment steps of an agent that learned online."""
 
 
-@dataclass
+@dataclass(repr=False)
 class Record:
     """What one run did, and the outcome. The order of the fields is part of the file format."""
 
@@ -217,6 +221,29 @@ class Record:
     that of plain fine-tuning on the same machine."""
     error: dict[str, str] | None = None
     """For a failed run: `where` (the hook and stage), `type`, `message`, `traceback`."""
+
+    def __repr__(self) -> str:
+        name = f"{self.run.method} on {self.run.scenario}, seed {self.run.seed}"
+        return f"<Record of {name}: {self.status}, {len(self.episodes['task']):,} episodes>"
+
+    def _repr_html_(self) -> str:
+        """Return the success rates of the ends of stages as a table, for notebooks."""
+        from clbench.records.frames import matrix
+
+        table = matrix(self).map(lambda rate: f"{rate:.2f}").to_html(notebook=True)
+        return f"<p>{html.escape(repr(self))}</p>{table}"
+
+    def frame(self) -> pandas.DataFrame:
+        """Return its evaluation episodes as a table, see `clbench.load_records`."""
+        from clbench.records.frames import frame
+
+        return frame(self)
+
+    def matrix(self) -> pandas.DataFrame:
+        """Return its success rates at the ends of stages (rows) on all tasks (columns), with labels."""
+        from clbench.records.frames import matrix
+
+        return matrix(self)
 
     def episode_rows(self) -> list[EpisodeRow]:
         """Return the rows of `episodes`."""

@@ -104,7 +104,7 @@ def evaluate_agent(
         InputError: Another stage comes next, the targets are in another order, a record exists already, an
             action has the wrong shape, or the name, the seed, the steps or the settings are invalid.
     """
-    world = env.unwrapped
+    world = getattr(env, "unwrapped", None)
     if not isinstance(world, ScenarioEnv | ScenarioVectorEnv):
         raise WrongTypeError(
             f"{env} does not belong to a scenario: make it with gymnasium.make('clbench/Fetch-v1', stage=0)."

@@ -23,7 +23,7 @@ MOST_ORDERS = 99
 busy."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Scenario:
     """A named, versioned sequence of tasks with its budget: skills to keep, then tasks to learn in order."""
 
@@ -66,6 +66,13 @@ class Scenario:
         cameras = {task.camera or "none" for task in self.tasks + self.background + self.scenes}
         if len(cameras) > 1:
             raise InputError(f"{self.id}: all tasks must have the same camera, not {sorted(cameras)}.")
+
+    def __repr__(self) -> str:
+        groups = {"retained": self.retained, "targets": self.target, "held out": self.held_out}
+        names = "; ".join(
+            f"{name} {', '.join(task.name for task in group)}" for name, group in groups.items() if group
+        )
+        return f"<Scenario {self.id}: {names}>"
 
     @cached_property
     def tasks(self) -> tuple[Task, ...]:
