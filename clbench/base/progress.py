@@ -13,16 +13,21 @@ def no_progress(amount: float) -> None:
     """Report nothing."""
 
 
-_listener: Callable[[str], None] | None = None
+_listener: Callable[[str, str], None] | None = None
 
 
-def listen(listener: Callable[[str], None] | None) -> None:
-    """Let `listener` hear every place that the work of this process reaches; None ends that."""
+def listen(listener: Callable[[str, str], None] | None) -> None:
+    """Let `listener` hear every place that the work of this process reaches, and remarks; None ends that."""
     global _listener
     _listener = listener
 
 
-def announce(place: str) -> None:
-    """Say which hook of a method runs next, so that a process that dies in it can be explained."""
+def announce(place: str, remark: str = "") -> None:
+    """Say which hook of a method runs next, so that a process that dies in it can be explained.
+
+    Args:
+        place: The hook or the stage.
+        remark: What to show beside it while it runs, such as the last success.
+    """
     if _listener is not None:
-        _listener(place)
+        _listener(place, remark)

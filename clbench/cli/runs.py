@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import sys
 import time
 from collections.abc import Callable, Sequence
@@ -15,7 +16,7 @@ from rich.console import Console
 from clbench.base.cache import cache_folder
 from clbench.base.errors import InputError
 from clbench.base.leftovers import sweep
-from clbench.base.strict_json import printable
+from clbench.base.strict_json import printable, printable_lines
 from clbench.cli.arguments import (
     MethodName,
     ScenarioId,
@@ -53,6 +54,8 @@ def run(
     changes: Annotated[dict[str, str] | None, Parameter(name="--set")] = None,
     checkpoints: Path | None = None,
     tensorboard: Path | None = None,
+    dry_run: Annotated[bool, Parameter(negative="")] = False,
+    quiet: Annotated[bool, Parameter(name=("--quiet", "-q"), negative="")] = False,
 ) -> None:
     """Run METHODS on SCENARIOS, once per seed, and write a record of each run.
 
@@ -83,6 +86,8 @@ def run(
         checkpoints: Keep the policies of all stages below this folder. Policies of runs that already have a
             record are made again.
         tensorboard: Log the runs for TensorBoard below this folder while they run.
+        dry_run: Only say what would be done, with the time and the disk to expect.
+        quiet: Print nothing but failures.
     """
     check_names(scenarios.split(","), methods)
     from clbench.runs.spec import RunSpec, check_device
@@ -97,10 +102,17 @@ def run(
         spec = RunSpec("", "", first_seed, changes or {}, device, order=order, perturb=perturb)
         runs = requested(scenarios, methods, every, seeds, spec, records)
         chosen = _part(shard, runs)
-    console = Console(stderr=True)
+    console = Console(stderr=True, quiet=quiet)
     for scenario in {run.spec.scenario: run.scenario for run in runs}.values():
         console.print(expected_precision(scenario, seeds), highlight=False)
-    if not run_missing(chosen, records, lambda: _workers(workers, ray), checkpoints, tensorboard):
+    if dry_run:
+        _print_forecast(chosen, records, workers, checkpoints)
+        return
+    went_well = run_missing(chosen, records, lambda: _workers(workers, ray), checkpoints, tensorboard, quiet)
+    if not changes:  # the board shows no run with changed settings
+        option = "" if records == RECORDS else f" --records {shlex.quote(str(records))}"
+        console.print(f"Next: clbench leaderboard{option}", highlight=False, markup=False, soft_wrap=True)
+    if not went_well:
         sys.exit(1)
 
 
@@ -160,12 +172,35 @@ def _workers(count: int | None, ray: str | None) -> Workers:
         return RayWorkers(ray, count)
 
 
+def _print_forecast(
+    runs: Sequence[ResolvedRun], records: Path, workers: int | None, checkpoints: Path | None
+) -> None:
+    """Print what the runs without a record would take."""
+    from clbench.jobs.forecast import forecast
+    from clbench.jobs.plan import Plan
+    from clbench.jobs.recorded import has_record
+
+    with checked_input():
+        missing = [run for run in runs if not has_record(run, records)]
+        plan = Plan()
+        for one in missing:
+            plan.add_run(one, records, checkpoints=checkpoints)
+    lines = [f"{len(runs) - len(missing)} of {_counted(len(runs))} done already."]
+    lines += forecast(plan, missing, workers, checkpoints) if missing else []
+    Console(soft_wrap=True).print("\n".join(lines), highlight=False, markup=False)
+
+
+def _counted(runs: int) -> str:
+    return f"{runs} run" if runs == 1 else f"{runs} runs"
+
+
 def run_missing(
     runs: Sequence[ResolvedRun],
     records: Path,
     workers: Callable[[], Workers],
     checkpoints: Path | None = None,
     tensorboard: Path | None = None,
+    quiet: bool = False,
 ) -> bool:
     """Do the runs that have no record yet, and return whether all of them succeeded.
 
@@ -175,18 +210,20 @@ def run_missing(
         workers: Returns the workers, once there is something to do.
         checkpoints: Folder below which the policies of all stages are kept; None keeps none.
         tensorboard: Folder below which the runs are logged; None logs nothing.
+        quiet: Whether to print failures alone.
     """
     from clbench.jobs.plan import Plan
     from clbench.jobs.recorded import has_record, set_damaged_aside
     from clbench.jobs.scheduler import run_with_bars
     from clbench.runs.checkpoints import has_stages
 
-    console = Console(stderr=True)
+    console = Console(stderr=True, quiet=quiet)
     sweep(records, cache_folder(), minari_folder() / "clbench")
     with checked_input():
         missing = [run for run in runs if not has_record(run, records)]
     if len(missing) < len(runs):
-        console.print(f"{len(runs) - len(missing)} of {len(runs)} runs have a record already.")
+        have = "has" if len(runs) - len(missing) == 1 else "have"
+        console.print(f"{len(runs) - len(missing)} of {_counted(len(runs))} {have} a record already.")
     recorded = [run for run in runs if run not in missing]
     bare = [run for run in recorded if checkpoints and not has_stages(run, checkpoints)]
     if not missing and not bare:
@@ -207,11 +244,15 @@ def run_missing(
     seconds = time.monotonic() - begin
     with checked_input():
         good = sum(has_record(run, records) for run in missing)
-    done = f"{good} of {len(missing)} runs" if good < len(missing) else f"{len(missing)} runs"
+    done = f"{good} of {_counted(len(missing))}" if good < len(missing) else _counted(len(missing))
     done += f" and the policies of {len(bare)}" if bare else ""
     console.print(
         f"{done} in {seconds / 60:.1f} minutes; records in {records}.", highlight=False, markup=False
     )
+    if failed and quiet:
+        alarm = Console(stderr=True, soft_wrap=True)
+        for job, reason in failed.items():
+            alarm.print(printable_lines(f"{job}: {reason}"), highlight=False, markup=False)
     if failed:
         names = ", ".join(map(str, failed))
         console.print(f"{len(failed)} failed: {names}.", style="bold red", highlight=False, markup=False)

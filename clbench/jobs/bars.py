@@ -37,6 +37,7 @@ class Bars:
         self._bars: dict[Hashable, TaskID] = {}
         self._left: dict[Hashable, float] = {}
         self._length: dict[Hashable, float] = {}
+        self._text: dict[Hashable, str] = {}
         self._progress = Progress(
             TextColumn("{task.description}"),
             BarColumn(),
@@ -62,6 +63,12 @@ class Bars:
         """Show a new piece of work under its text, `str(piece)`."""
         self._bars[piece] = self._progress.add_task(escape(printable(str(piece))), total=length)
         self._left[piece] = self._length[piece] = length
+        self._text[piece] = str(piece)
+
+    def place(self, piece: Hashable, place: str) -> None:
+        """Show where a piece of work is, such as the stage of a run and its last success."""
+        self._text[piece] = f"{piece}, {place}"
+        self._progress.update(self._bars[piece], description=escape(printable(self._text[piece])))
 
     def share(self, piece: Hashable) -> float:
         """Return the share of a piece that is done."""
@@ -79,7 +86,7 @@ class Bars:
             share = min(1.0, self._done / self._total)
             # the time left is unknown before any work is done
             left = f", about {_minutes((now - self._started) * (1 - share) / share)} left" if share else ""
-            self.say(f"{share:4.0%}{left}: {', '.join(map(str, self._bars))}")
+            self.say(f"{share:4.0%}{left}: {'; '.join(self._text.values())}")
 
     def skip(self, piece: Hashable, length: float, text: str) -> None:
         """Count a piece of work that need not be done, and print why."""
@@ -89,7 +96,7 @@ class Bars:
     def finish(self, piece: Hashable, text: str) -> None:
         """Complete and remove the bar of a piece, and print the outcome."""
         self.advance(piece, self._left[piece])
-        del self._left[piece], self._length[piece]
+        del self._left[piece], self._length[piece], self._text[piece]
         self._progress.remove_task(self._bars.pop(piece))
         self.say(f"{piece}: {text}")
 

@@ -53,11 +53,12 @@ class Event(NamedTuple):
     """A message from a worker."""
 
     job: Job
-    kind: Literal["progress", "done", "failed", "lost", "taken"]
-    """All kinds but the first end the job. A job is lost if its process ended without a result, and taken if
-    another process took its work over."""
+    kind: Literal["progress", "at", "done", "failed", "lost", "taken"]
+    """All kinds but the first two end the job. A job is lost if its process ended without a result, and taken
+    if another process took its work over."""
     value: Any
-    """Length done since the last event, the text that the job returned, or the reason of the failure."""
+    """Length done since the last event, the place that the job has reached, the text that it returned, or the
+    reason of the failure."""
 
 
 class Workers(Protocol):

@@ -70,10 +70,10 @@ class Processes:
             worker = self._running[connection]
             kind, value = _receive(worker)
             if kind == "at":
-                worker.place = value
-                continue
+                worker.place, remark = value
+                value = f"{worker.place} {remark}".strip()
             event = Event(worker.job, kind, value)
-            if event.kind != "progress":
+            if event.kind not in ("progress", "at"):
                 del self._running[connection]
                 _leave(worker.process)
             yield event
@@ -194,7 +194,7 @@ def _work(
         except OSError:  # the parent is gone: stop as if killed, so that the run can be resumed
             sys.exit(1)
 
-    listen(lambda place: connection.send(("at", place)))
+    listen(lambda place, remark: connection.send(("at", (place, remark))))
     connection.send(_do_job(function, arguments, send))
 
 

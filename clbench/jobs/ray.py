@@ -209,6 +209,8 @@ def _do_apart(actor: Any, job: Job) -> tuple[Outcome, str]:
             for _, kind, value in processes.events():
                 if kind == "progress":
                     actor.add.remote(job.title, value)
+                elif kind == "at":
+                    continue
                 elif kind == "lost":
                     raise LostProcessError(value)
                 else:

@@ -53,6 +53,9 @@ def run_jobs(jobs: Sequence[Job], workers: Workers, bars: Bars) -> dict[Job, str
                     bars.advance(job, value)
                     leases.report(job, bars.share(job))
                     continue
+                if kind == "at":
+                    bars.place(job, value)
+                    continue
                 leases.release(job)
                 if kind == "done":
                     succeeded.add(job)

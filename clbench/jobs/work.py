@@ -12,13 +12,31 @@ from clbench.spec.registry import load_scenario
 # PyTorch and modules that need it are imported inside: a plan names these functions without waiting for it.
 
 
+class _Noticed:
+    """A callback that passes progress on, and knows whether there was any: cached results make none."""
+
+    def __init__(self, progress: ProgressCallback) -> None:
+        self._progress, self._made = progress, False
+
+    def __call__(self, amount: float) -> None:
+        self._made = True
+        self._progress(amount)
+
+    @property
+    def source(self) -> str:
+        """The end of a sentence about the result."""
+        return "" if self._made else ", from the cache"
+
+
 def collect_demonstrations(scenario: str, task: str, progress: ProgressCallback) -> str:
     """Collect the demonstrations of a task, unless they are in the cache."""
     from clbench.data.demonstrations import dataset_folder, read_dataset
 
     loaded = load_scenario(scenario)
-    episodes = read_dataset(dataset_folder(loaded.task(task), loaded.budget, progress))
-    return f"{len(episodes)} episodes, {sum(len(episode.executed) for episode in episodes)} steps"
+    noticed = _Noticed(progress)
+    episodes = read_dataset(dataset_folder(loaded.task(task), loaded.budget, noticed))
+    steps = sum(len(episode.executed) for episode in episodes)
+    return f"{len(episodes)} episodes, {steps} steps{noticed.source}"
 
 
 def collect_scenes(scenario: str, progress: ProgressCallback) -> str:
@@ -26,25 +44,32 @@ def collect_scenes(scenario: str, progress: ProgressCallback) -> str:
     from clbench.data.questions import load_questions, scenes_folder
 
     loaded = load_scenario(scenario)
-    scenes_folder(loaded, progress)
+    noticed = _Noticed(progress)
+    scenes_folder(loaded, noticed)
     train, test = load_questions(loaded)
-    return f"{len(train.kinds)} kinds about {len(train.scenes)} states, and {len(test.scenes)} for the test"
+    states = f"{len(train.scenes)} states, and {len(test.scenes)} for the test"
+    return f"{len(train.kinds)} kinds about {states}{noticed.source}"
 
 
 def pretrain(scenario: str, seed: int, progress: ProgressCallback) -> str:
     """Pretrain the policy of a seed, unless it is in the cache."""
     from clbench.learning.pretraining import pretrained_policy
 
-    policy, _ = pretrained_policy(load_scenario(scenario), seed, progress)
-    return f"{sum(parameter.numel() for parameter in policy.parameters()):,} parameters"
+    noticed = _Noticed(progress)
+    policy, _ = pretrained_policy(load_scenario(scenario), seed, noticed)
+    return f"{sum(parameter.numel() for parameter in policy.parameters()):,} parameters{noticed.source}"
 
 
 def evaluate_policy(spec: RunSpec, progress: ProgressCallback) -> str:
     """Evaluate the pretrained policy that a run starts with, unless the cache has the evaluation."""
     from clbench.runs.start import evaluate_pretrained
+    from clbench.scoring.scores import WEAK, WEAK_WARNING
 
-    evaluate_pretrained(spec.resolve(), progress)
-    return "the start of most runs"
+    rate = evaluate_pretrained(spec.resolve(), progress)
+    if rate is None:
+        return "no skills are retained"
+    warning = f". {WEAK_WARNING}" if rate < WEAK else ""
+    return f"success {rate:.2f} on the retained skills{warning}"
 
 
 def do_run(
@@ -61,7 +86,7 @@ def do_run(
     """
     from clbench.runs.run import execute
     from clbench.scoring.metrics import measure
-    from clbench.scoring.scores import Scores
+    from clbench.scoring.scores import WEAK, Scores
 
     record = execute(spec, records, progress, checkpoints=checkpoints, tensorboard=tensorboard)
     if record.error is not None:
@@ -72,7 +97,10 @@ def do_run(
     names = ["adaptation", "retention", "question_retention"]
     names[2:2] = ["perturbed_retention"] if spec.perturb else []
     values = {name: measure(name, scores) for name in names}
-    return ", ".join(f"{name} {'-' if value is None else f'{value:.2f}'}" for name, value in values.items())
+    text = ", ".join(f"{name} {'-' if value is None else f'{value:.2f}'}" for name, value in values.items())
+    start = scores.retained_at_start()
+    weak = start is not None and start < WEAK
+    return f"{text}. The pretrained policy had only {start:.2f} of the skills" if weak else text
 
 
 def make_policies(spec: RunSpec, checkpoints: Path | None, progress: ProgressCallback) -> str:

@@ -38,6 +38,15 @@ class _Rows:
         }
         return cls(**columns)
 
+    def __getitem__(self, rows: slice | Sequence[int] | Tensor) -> Self:
+        """Return some rows as a batch.
+
+        Args:
+            rows: A slice, the numbers of the rows, or a mask of them, bool (B,).
+        """
+        columns = {field.name: getattr(self, field.name)[rows] for field in dataclasses.fields(self)}  # type: ignore[arg-type]
+        return type(self)(**columns)
+
     def to(self, device: torch.device | str) -> Self:
         """Return the same rows on `device`."""
         columns = {field.name: getattr(self, field.name).to(device) for field in dataclasses.fields(self)}  # type: ignore[arg-type]

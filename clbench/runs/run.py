@@ -16,7 +16,7 @@ import torch
 from clbench.base.cache import CacheError, cache_folder, cached, hash_of, is_cached
 from clbench.base.errors import WrongTypeError
 from clbench.base.lease import Lease, LeaseLostError
-from clbench.base.progress import ProgressCallback, no_progress
+from clbench.base.progress import ProgressCallback, announce, no_progress
 from clbench.data.training_data import TrainingData
 from clbench.evaluation.checks import Checker
 from clbench.evaluation.examiner import Examiner
@@ -249,6 +249,7 @@ class _Run:
             paused = time.perf_counter()
             row = self.checker.check(self.trainer.policy, self.run.scenario.target[number - 1], point)
             self.record.add_check(row)
+            announce(self.trainer.where, f"{row.successes}/{row.episodes} after {point.step} steps")
             checking += time.perf_counter() - paused
             return self.checker.is_learned(row)
 

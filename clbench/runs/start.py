@@ -17,6 +17,7 @@ from clbench.policy.policy import Policy
 from clbench.records.record import Record
 from clbench.runs.length import point_length
 from clbench.runs.spec import ResolvedRun
+from clbench.scoring.scores import Scores
 
 TABLES = ("episodes", "answers", "policy")
 """Tables of a record that an evaluation fills."""
@@ -51,12 +52,15 @@ def evaluate_start(
         progress(point_length(run.protocol, run.protocol.end(0)))
 
 
-def evaluate_pretrained(run: ResolvedRun, progress: ProgressCallback = no_progress) -> None:
+def evaluate_pretrained(run: ResolvedRun, progress: ProgressCallback = no_progress) -> float | None:
     """Evaluate the pretrained policy, with which runs like `run` start, unless the cache has the evaluation.
 
     Args:
         run: One of the runs; its method makes no difference.
         progress: Called with the length of the work done since its last call, in optimiser steps.
+
+    Returns:
+        Its success on the retained skills; None without any.
     """
     with repeatable(run.spec.device):
         policy, _ = pretrained_policy(run.scenario, run.spec.seed)
@@ -68,6 +72,7 @@ def evaluate_pretrained(run: ResolvedRun, progress: ProgressCallback = no_progre
             evaluate_start(run, examiner, policy, record, progress)
         finally:
             examiner.close()
+    return Scores.from_record(record, partial=True).retained_at_start()
 
 
 def is_evaluated(run: ResolvedRun) -> bool:

@@ -27,6 +27,13 @@ from clbench.scoring.reading import (
 )
 from clbench.spec.protocol import Protocol
 
+WEAK = 0.8
+"""Success of the pretrained policy on the retained skills below which there is little to forget."""
+
+WEAK_WARNING = (
+    "That is little: what it never could do cannot be forgotten, and low retention need not mean forgetting."
+)
+
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Scores(Measured):
@@ -41,6 +48,11 @@ class Scores(Measured):
     """Success at the points of each stage before its end, (targets, points - 1, tasks, curve episodes)."""
     perturbed: Array
     """Success in perturbed episodes at the ends of stages, (stages + 1, tasks, episodes)."""
+
+    def retained_at_start(self) -> float | None:
+        """Return the success on the retained skills before the first target; None without any."""
+        count = len(self.layout.retained)
+        return float(self.success[0, :count].mean()) if count and self.success[0, :count].size else None
 
     @classmethod
     def from_record(cls, record: Record, partial: bool = False) -> Scores:

@@ -157,6 +157,20 @@ def _tried(scenario: str, method: str) -> int | None:
     return len(found.tried) if found else None
 
 
+def pretrained_success(rows: Iterable[Row]) -> float | None:
+    """Return the mean success of the pretrained policy on the retained skills, over the seeds of a row.
+
+    The row is that of plain fine-tuning or, without one, the first one of a method that fine-tunes.
+    """
+    begins = [row for row in rows if row.division in METHODS]
+    row = next((row for row in begins if row.method == BASELINE), begins[0] if begins else None)
+    if row is None:
+        return None
+    rates = [run.scores.retained_at_start() for run in row.runs]
+    known = [rate for rate in rates if rate is not None]
+    return math.fsum(known) / len(known) if known else None
+
+
 def _falling(one: Estimate) -> float:
     return math.inf if one.value is None else -one.value
 

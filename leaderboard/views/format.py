@@ -14,10 +14,11 @@ from typing import TypeAlias
 from clbench.scoring.intervals import Estimate
 from clbench.scoring.metric import Metric
 from clbench.scoring.metrics import METRICS
+from clbench.scoring.scores import WEAK, WEAK_WARNING
 
 from ..board.overall import OverallRow
 from ..board.predictors import predictions
-from ..board.rows import Row, agreement, standing_of
+from ..board.rows import Row, agreement, pretrained_success, standing_of
 from ..board.runs import DIVISIONS
 
 FIXED = (
@@ -106,6 +107,18 @@ def fitting_names(rows: Rows) -> list[str]:
 
 def _to_criterion(rows: Rows) -> bool:
     return bool(rows) and all(row.to_criterion for row in rows)
+
+
+def start_text(rows: Sequence[Row]) -> str:
+    """Return a sentence on what the pretrained policy can do, with a warning if it has little to forget.
+
+    It is empty if no row begins with the pretrained policy, or if no skill is retained.
+    """
+    rate = pretrained_success(rows)
+    if rate is None:
+        return ""
+    sentence = f"The pretrained policy succeeds in {number_text(rate, '.2f')} of the episodes of its skills."
+    return sentence if rate >= WEAK else f"{sentence} {WEAK_WARNING}"
 
 
 def agreement_text(rows: Iterable[Row]) -> str:

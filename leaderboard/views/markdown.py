@@ -29,6 +29,7 @@ from .format import (
     number_text,
     prediction_text,
     shown,
+    start_text,
     title_of,
 )
 
@@ -53,6 +54,7 @@ def markdown(table: Table) -> str:
         shown=shown,
         all_shown=_all_shown(by_scenario.values()),
         agreement_text=agreement_text,
+        start_text=start_text,
         prediction_text=prediction_text,
         direction=_direction,
         ends=_ends,

@@ -19,7 +19,7 @@ from clbench.scoring.metrics import METRICS
 from ..board.overall import OverallRow, overall
 from ..board.rows import Row, Table
 from ..board.tiers import TIERS
-from .format import MISSING, Column, Rows, agreement_text, aligned, fitting, number_text, scaled
+from .format import MISSING, Column, Rows, agreement_text, aligned, fitting, number_text, scaled, start_text
 
 LEGEND = (
     "Rows of a division that share a letter are not told apart. "
@@ -83,8 +83,8 @@ def terminal(table: Table, width: int = 108, sort: str | None = None) -> Rendera
         rows = list(members)
         tables.append(rows)
         parts += _fitted(scenario, _sorted(rows, sort), _heads(rows), width)
-        sentence = agreement_text(rows)
-        parts += [*([Text(sentence)] if sentence else []), Text()]
+        parts += [Text(sentence) for sentence in (start_text(rows), agreement_text(rows)) if sentence]
+        parts.append(Text())
     over_scenarios = overall(table.rows)
     if over_scenarios:
         parts += [*_fitted("All scenarios", over_scenarios, _overall_heads(over_scenarios), width), Text()]

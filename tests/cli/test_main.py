@@ -4,7 +4,7 @@ import json
 import re
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from importlib import metadata
 from pathlib import Path
 
@@ -301,6 +301,40 @@ def test_doctor_shows_versions_and_rendering() -> None:
     assert f"clbench {__version__} is ready." in result.stdout
 
 
+def test_a_dry_run_says_what_would_be_done_and_does_nothing(
+    empty_caches: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(empty_caches)
+    monkeypatch.syspath_prepend(empty_caches)
+    app(
+        ["run", TOY, "sft", "lora", "--seeds", "2", "--workers", "1", "--checkpoints", "kept", "--dry-run"],
+        result_action="return_value",
+    )
+    done, jobs, duration, disk = capsys.readouterr().out.splitlines()
+    assert done == "0 of 4 runs done already."
+    assert jobs == (
+        "To do: 4 datasets to collect, 1 set of questions to collect, 2 policies to pretrain, 2 pretrained "
+        "policies to evaluate, 4 runs."
+    )
+    assert re.fullmatch(
+        r"Time: about \d+ minutes with 1 at once, at \d+ ms for an optimiser step here\.", duration
+    )
+    assert re.fullmatch(r"Disk: about .* in the caches, 800 kB of records, .* of policies in kept\.", disk)
+    assert not any(path.is_file() for path in empty_caches.rglob("*"))
+
+
+def test_a_quiet_run_prints_failures_alone(
+    tmp_path: Path, write_module: Callable[[str, str], None], capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_module("mine", METHOD)
+    app(["run", TOY, "sft", "--seeds", "1", "-q", "--records", str(tmp_path)], result_action="return_value")
+    assert capsys.readouterr() == ("", "")
+    with pytest.raises(SystemExit):
+        app(["run", TOY, "mine:Broken", "--seeds", "1", "-q", "--records", str(tmp_path)])
+    said = capsys.readouterr().err
+    assert said.startswith("Toy-v0 mine:Broken seed 0: failed in stage 1 (right): ValueError: no idea")
+
+
 @pytest.mark.slow
 def test_demonstrations_are_collected_and_shown(empty_caches: Path) -> None:
     result = _clbench("demonstrations", TOY)
@@ -338,6 +372,8 @@ def test_a_stranger_runs_a_class_from_the_working_directory_and_sees_it_on_the_b
     assert records == [
         f"leaderboard/records/Toy-v0/{name}/seed-0.json" for name in ("mine.Broken", "mine.Gentle", "sft")
     ]
+    assert "success 1.00 on the retained skills" in result.stderr
+    assert "Next: clbench leaderboard\n" in result.stderr
     again = _clbench("run", TOY, "mine:Gentle", "sft", "--seeds", "1", folder=tmp_path)
     assert again.returncode == 0
     assert "2 of 2 runs have a record already" in again.stderr

@@ -1,4 +1,5 @@
 import io
+import itertools
 
 from rich.console import Console
 
@@ -41,6 +42,19 @@ def test_a_terminal_shows_bars_with_the_time_left() -> None:
     assert "sft seed 0" in text
     assert "40%" in text
     assert "left" in text
+
+
+def test_a_bar_and_a_line_say_where_a_run_is() -> None:
+    terminal, lines = io.StringIO(), io.StringIO()
+    for file, is_terminal in ((terminal, True), (lines, False)):
+        clock = itertools.count(step=2 * LINE_SECONDS)
+        console = Console(file=file, width=140, force_terminal=is_terminal)
+        with Bars(100, console, lambda clock=clock: next(clock)) as bars:  # type: ignore[misc]
+            bars.start("sft seed 0", 100)
+            bars.place("sft seed 0", "stage 2 (push) 17/20 after 32 steps")
+            bars.advance("sft seed 0", 50)
+    for text in (terminal.getvalue(), lines.getvalue()):
+        assert "sft seed 0, stage 2 (push) 17/20 after 32 steps" in text
 
 
 def test_no_text_controls_the_terminal() -> None:

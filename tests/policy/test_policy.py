@@ -244,3 +244,28 @@ def test_a_checkpoint_keeps_the_eyes(tmp_path: Path) -> None:
     loaded = load_policy(tmp_path)
     assert loaded.config == SEEING
     assert loaded.action_loss(batch).equal(policy.action_loss(batch))
+
+
+@pytest.mark.parametrize(
+    "rows", [slice(1, 3), [2, 0], torch.tensor([False, True, True, False]), torch.tensor([3])]
+)
+def test_batches_can_be_indexed_and_joined_so_that_a_buffer_takes_few_lines(rows: Any) -> None:
+    def sample(count: int) -> Batch:
+        size = (count, 8, 2)
+        words = torch.randint(9, (count, 12))
+        return Batch(
+            torch.randn(count, 4),
+            words,
+            torch.randn(size),
+            torch.ones(size[:2]),
+            torch.rand(count),
+            torch.randn(size),
+        )
+
+    batch = sample(4)
+    chosen = batch[rows]
+    assert torch.equal(chosen.state, batch.state[rows])
+    assert torch.equal(chosen.noise, batch.noise[rows])
+    joined = Batch.cat([chosen, batch])
+    assert len(joined) == len(chosen) + 4
+    assert torch.equal(joined.words[len(chosen) :], batch.words)

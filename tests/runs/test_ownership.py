@@ -125,7 +125,7 @@ def test_a_method_that_kills_its_process_is_named_with_its_hook(
         resolve("clbench.cli.runs:run")(TOY, "deadly:Deadly", seeds=1, records=tmp_path / "records")
     said = capsys.readouterr().err
     assert f"its process ended in stage 1 (right) without a result ({end})" in said
-    assert "0 of 1 runs in 0." in said
+    assert "0 of 1 run in 0." in said
     assert not list(tmp_path.glob("records/*/*/*.json"))
 
 

@@ -33,6 +33,7 @@ from ..format import (
     scaled,
     shown,
     standing_text,
+    start_text,
     title_of,
 )
 from ..markdown import arxiv_ids
@@ -245,6 +246,11 @@ class ScenarioView:
     def to_criterion(self) -> bool:
         """Whether its stages end when the target is learned."""
         return self.rows[0].row.to_criterion
+
+    @property
+    def start(self) -> str:
+        """Sentence on what the pretrained policy can do, empty if there is none."""
+        return start_text(self.table)
 
     @property
     def agreement(self) -> str:

@@ -112,6 +112,21 @@ def test_the_rows_come_as_json_with_null_for_what_is_missing(
     assert not (four_methods.parent / "site").exists()
 
 
+def test_a_weak_pretrained_policy_is_named_on_every_form_of_the_board(
+    four_methods: Path,
+    add_full: Callable[..., Path],
+    matrix: Any,
+    shown_with_page: Callable[[], tuple[str, str]],
+) -> None:
+    for seed in range(2):
+        add_full("sft", seed, np.vstack([np.full((1, 5), 0.3), matrix[1:]]))
+    printed, markdown = shown_with_page()
+    page = (four_methods.parent / "site" / "index.html").read_text(encoding="utf-8")
+    sentence = "The pretrained policy succeeds in 0.30 of the episodes of its skills. That is little: "
+    for text in (printed, markdown, page):
+        assert sentence in " ".join(text.split())
+
+
 def test_bytes_have_three_digits_and_go_on_to_the_next_unit(
     four_methods: Path,
     add_full: Callable[..., Path],

@@ -1,0 +1,120 @@
+"""What a command would do: its jobs, with the time and the disk to expect."""
+
+from __future__ import annotations
+
+import os
+import statistics
+import time
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+
+import torch
+
+from clbench.jobs import work
+from clbench.jobs.plan import Plan
+from clbench.learning.pretraining import policy_config
+from clbench.policy.batch import Batch
+from clbench.policy.policy import Policy
+from clbench.runs.spec import ResolvedRun
+from clbench.spec.language import encode
+from clbench.spec.scenario import Scenario
+
+STEPS = 8
+"""Optimiser steps that are timed."""
+
+RECORD_BYTES = 200_000
+"""Bytes of a record: those of Fetch-v1 have 100,000, the largest of the board twice as many."""
+
+KINDS = {
+    work.collect_demonstrations: ("dataset to collect", "datasets to collect"),
+    work.collect_scenes: ("set of questions to collect", "sets of questions to collect"),
+    work.pretrain: ("policy to pretrain", "policies to pretrain"),
+    work.evaluate_policy: ("pretrained policy to evaluate", "pretrained policies to evaluate"),
+    work.do_run: ("run", "runs"),
+}
+"""What one job does, and what several do, in words."""
+
+
+def forecast(
+    plan: Plan, runs: Sequence[ResolvedRun], workers: int | None, checkpoints: Path | None
+) -> list[str]:
+    """Return lines that say what a plan would do on this machine.
+
+    Args:
+        plan: The plan of the runs.
+        runs: Runs that have no record yet, of one scenario or of several.
+        workers: Number of jobs at once; None for all cores.
+        checkpoints: Folder that would keep the policies of all stages, or None.
+    """
+    counts = Counter(KINDS[job.function] for job in plan.jobs)
+    lines = [f"To do: {', '.join(f'{n} {one if n == 1 else many}' for (one, many), n in counts.items())}."]
+    scenarios = {run.scenario.id: run.scenario for run in runs}
+    speeds = {name: step_seconds(scenario) for name, scenario in scenarios.items()}
+    slowest = max(speeds.values(), default=0.0)
+    at_once = workers or os.cpu_count() or 1
+    seconds = slowest * sum(job.length * job.pace for job in plan.jobs) / min(at_once, max(len(plan.jobs), 1))
+    early = any(scenario.budget.criterion for scenario in scenarios.values())
+    bound = "up to about" if early else "about"
+    lines.append(
+        f"Time: {bound} {_duration(seconds)} with {at_once} at once, at {1000 * slowest:.0f} ms for an "
+        f"optimiser step here{'; a stage ends as soon as its target is learned' if early else ''}."
+    )
+    kept = sum(_policy_bytes(run.scenario) * (len(run.scenario.target) + 1) for run in runs)
+    made = sum(_data_bytes(scenario) for scenario in scenarios.values())
+    made += sum(
+        _policy_bytes(runs[0].scenario) for job in plan.jobs if job.function is work.pretrain and runs
+    )
+    parts = [f"about {_megabytes(made)} in the caches", f"{_megabytes(RECORD_BYTES * len(runs))} of records"]
+    parts += [f"{_megabytes(kept)} of policies in {checkpoints}"] if checkpoints else []
+    return [*lines, f"Disk: {', '.join(parts)}."]
+
+
+def step_seconds(scenario: Scenario) -> float:
+    """Return the time of an optimiser step of plain fine-tuning here, in seconds, on one thread."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        config, size = policy_config(scenario), scenario.budget.batch_size
+        policy = Policy(config)
+        chunk = (size, config.chunk, config.action_size)
+        batch = Batch(
+            state=torch.randn(size, config.state_size),
+            words=torch.as_tensor(encode(scenario.target[0].instructions[:1] * size)),
+            action=torch.randn(chunk),
+            valid=torch.ones(chunk[:2]),
+            draw=torch.rand(size),
+            noise=torch.randn(chunk),
+            image=torch.zeros((size, config.image_size, config.image_size, 3), dtype=torch.uint8),
+        )
+        optimiser = torch.optim.AdamW(policy.parameters())
+        taken = []
+        for _ in range(STEPS + 1):
+            begin = time.perf_counter()
+            optimiser.zero_grad()
+            torch.autograd.backward(policy.action_loss(batch).mean())
+            optimiser.step()
+            taken.append(time.perf_counter() - begin)
+    finally:
+        torch.set_num_threads(threads)
+    return statistics.median(taken[1:])
+
+
+def _policy_bytes(scenario: Scenario) -> int:
+    return 4 * sum(parameter.numel() for parameter in Policy(policy_config(scenario)).parameters())
+
+
+def _data_bytes(scenario: Scenario) -> int:
+    """Return the most bytes that the demonstrations of a scenario take: episodes as long as they may be."""
+    config = policy_config(scenario)
+    numbers = 4 * (config.state_size + 3 * config.action_size + 4)
+    tasks = scenario.tasks + scenario.background
+    return numbers * scenario.budget.demonstrations * sum(task.horizon for task in tasks)
+
+
+def _duration(seconds: float) -> str:
+    return f"{seconds / 60:.0f} minutes" if seconds < 5400 else f"{seconds / 3600:.1f} hours"
+
+
+def _megabytes(count: int) -> str:
+    return f"{count / 1e6:.0f} MB" if count >= 1e6 else f"{count / 1e3:.0f} kB"

@@ -1,0 +1,41 @@
+"""What the jobs of a run say when they are done."""
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from clbench.jobs.work import (
+    collect_demonstrations,
+    collect_scenes,
+    do_run,
+    evaluate_policy,
+    pretrain,
+)
+from clbench.runs.spec import RunSpec
+from clbench.scoring.scores import Scores
+
+SPEC = RunSpec("clbench.testing:clbench/Toy-v0", "sft", 0)
+
+
+def test_a_policy_that_can_do_little_is_called_weak_before_and_after_a_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    nothing: Any = lambda _: None  # noqa: E731
+    assert evaluate_policy(SPEC, nothing) == "success 1.00 on the retained skills"
+    assert "pretrained" not in do_run(SPEC, tmp_path / "strong", nothing)
+    monkeypatch.setattr(Scores, "retained_at_start", lambda _: 0.33)
+    said = evaluate_policy(SPEC, nothing)
+    assert said.startswith("success 0.33 on the retained skills. That is little: ")
+    said = do_run(SPEC, tmp_path / "weak", nothing)
+    assert said.endswith(". The pretrained policy had only 0.33 of the skills")
+
+
+def test_what_is_in_the_cache_is_not_said_to_be_made(empty_caches: Path) -> None:
+    nothing: Any = lambda _: None  # noqa: E731
+    for end in ("steps", "steps, from the cache"):
+        assert collect_demonstrations(SPEC.scenario, "left", nothing).endswith(end)
+    for end in ("for the test", "for the test, from the cache"):
+        assert collect_scenes(SPEC.scenario, nothing).endswith(end)
+    for end in ("parameters", "parameters, from the cache"):
+        assert pretrain(SPEC.scenario, 0, nothing).endswith(end)
