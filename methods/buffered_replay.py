@@ -35,7 +35,7 @@ class BufferedReplay(Method):
 
     uses = Uses(demonstrations="prepare")
     metadata = Metadata(link="https://arxiv.org/abs/2603.03818")
-    tunes = ("replay", (0.25, 0.75))
+    tunes = ("replay", (0.75, 0.9))
 
     def __post_init__(self) -> None:
         in_range("share", self.share, 1e-9, 1.0)

@@ -26,7 +26,7 @@ class ExperienceReplay(Method):
 
     uses = Uses(demonstrations="throughout")
     metadata = Metadata(link="https://arxiv.org/abs/1811.11682")
-    tunes = ("replay", (0.25, 0.75))
+    tunes = ("replay", (0.75, 0.9))
 
     def __post_init__(self) -> None:
         if not 0 <= self.replay <= 1:

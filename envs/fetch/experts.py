@@ -23,10 +23,8 @@ GAIN = 10.0
 CLOSE, OPEN_UP = -1.0, 1.0
 PRESS_DEPTH = 0.035
 """Height in metres above the block's centre that a press aims at: the fingers touch at 0.0435."""
-LOWERING = 0.4
-"""Largest action of a held block's way down: a centimetre per step, for a soft landing."""
-RAISING = 0.6
-"""Action of a held block's way up, at which it does not slip."""
+CARRYING = 0.6
+"""Action of a held block's way, at which it does not slip."""
 TRAVEL_HEIGHT = 0.11
 """Height in metres at which the closed gripper travels above a place, clear of the block, as at its start."""
 UP = np.array([0.0, 0.0, 1.0])
@@ -111,17 +109,9 @@ def _lift(state: State) -> Action:
     return _action(UP, CLOSE) if action is None else action
 
 
-def _put_down(state: State) -> Action:
-    """Return the action that lowers the block, opens the fingers on the table, and then rises."""
-    height = float(state[BLOCK][2]) - REST_HEIGHT
-    if height > 0.004:
-        return _action(-min(GAIN * height, LOWERING) * UP, CLOSE)
-    return _action(0.0 * UP if opening(state.tolist()) < OPEN else UP, OPEN_UP)
-
-
-def _raise_block(state: State) -> Action:
-    """Return the action that raises the held block by two centimetres per step."""
-    return _action(RAISING * UP, CLOSE)
+def _carry_back(state: State) -> Action:
+    """Return the action that carries the held block toward the robot, two centimetres per step."""
+    return _action(np.array([-CARRYING, 0.0, 0.0]), CLOSE)
 
 
 def _push(state: State, direction: Vector) -> Action:
@@ -158,8 +148,7 @@ _EXPERTS: dict[str, Callable[[State], Action]] = {
     "push_right": _push_along(0.0, -1.0),
     "pull": _push_along(-1.0, 0.0),
     "press": _press,
-    "put_down": _put_down,
-    "raise_block": _raise_block,
+    "carry_back": _carry_back,
     "hover_target": functools.partial(_hover, thing=TARGET),
     "push_left_away": _push_along(math.sqrt(0.5), math.sqrt(0.5)),
 }

@@ -50,7 +50,7 @@ least `APART` away, it stays farther than the 5 cm that count as success."""
 SETTLE = 10
 """Steps until the displaced gripper is at rest, as many as FetchPickAndPlace-v4 takes for its own start."""
 
-BLOCK_CORNER, TARGET_CORNER = (1.12, 1.03), (1.12, 0.47)
+BLOCK_CORNER, TARGET_CORNER = (1.12, 1.03), (1.48, 0.47)
 """Corners of the table, in metres, where things lie that a task does not need: out of the gripper's way."""
 HELD = 0.0249
 """Position of each finger in metres around the block, which is 0.05 wide."""

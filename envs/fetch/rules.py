@@ -25,10 +25,8 @@ PRESS_HEIGHT = 0.047
 """Largest height in metres of the gripper above the block's centre in a press. The finger tips reach 0.0185
 below the gripper, and touch the top of the block at 0.0435."""
 LIFT_HEIGHT = 0.10
-CLEARANCE = 0.06
-"""Height in metres of the gripper above a block that was put down, at which it has let go."""
-RAISED = 0.08
-"""Metres by which a held block is raised."""
+CARRY_DISTANCE = 0.10
+"""Metres by which a held block is carried toward the robot."""
 PUSH_DISTANCE = 0.10
 PUSH_CONE = 0.4
 """Largest sideways error of a push per metre, 21.8 degrees, so that a diagonal push is not a straight one."""
@@ -178,25 +176,14 @@ def _lift() -> Rule:
     )
 
 
-def _put_down() -> Rule:
-    def success(state: Numbers, _: Numbers) -> bool:
-        on_table = abs(state[BLOCK][2] - REST_HEIGHT) < 0.01
-        return on_table and opening(state) > OPEN and state[GRIPPER][2] - state[BLOCK][2] > CLEARANCE
-
-    def distance(state: Numbers, _: Numbers) -> float:
-        return max(0.0, state[BLOCK][2] - REST_HEIGHT) + max(0.0, 0.1 - opening(state))
-
-    return Rule(success, distance)
-
-
-def _raise_block() -> Rule:
-    def height(state: Numbers, start: Numbers) -> float:
-        return state[BLOCK][2] - start[BLOCK][2]
+def _carry_back() -> Rule:
+    def way(state: Numbers, start: Numbers) -> float:
+        return start[BLOCK][0] - state[BLOCK][0]
 
     def success(state: Numbers, start: Numbers) -> bool:
-        return height(state, start) > RAISED and CLOSED < opening(state) < OPEN
+        return way(state, start) > CARRY_DISTANCE and CLOSED < opening(state) < OPEN
 
-    return Rule(success, lambda state, start: max(0.0, RAISED - height(state, start)))
+    return Rule(success, lambda state, start: max(0.0, CARRY_DISTANCE - way(state, start)))
 
 
 _RULES = {
@@ -210,8 +197,7 @@ _RULES = {
     "push_right": _push_along(0.0, -1.0),
     "pull": _push_along(-1.0, 0.0),
     "press": _press(),
-    "put_down": _put_down(),
-    "raise_block": _raise_block(),
+    "carry_back": _carry_back(),
     "hover_target": _hover(TARGET),
     "push_left_away": _push_along(math.sqrt(0.5), math.sqrt(0.5)),
 }
@@ -224,10 +210,11 @@ _LAYOUTS = {
         "push_away",
         "push_right",
         "press",
+        "lift",
         "push_left_away",
     ),
-    Layout(target_aside=True, block_held=True): ("put_down", "raise_block"),
-    Layout(): ("pick_and_place", "push", "lift", "pull"),
+    Layout(target_aside=True, block_held=True): ("carry_back",),
+    Layout(): ("pick_and_place", "push", "pull"),
 }
 """Tasks by what is in front of the gripper: the target, the block, the block between the fingers, or both."""
 

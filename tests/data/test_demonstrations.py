@@ -88,7 +88,7 @@ def test_every_kept_episode_succeeds_and_about_half_are_noisy() -> None:
 
 
 def test_the_recorded_actions_replay_to_the_recorded_states_bit_for_bit() -> None:
-    task = load_scenario("clbench/Fetch-v1").task("push_left")
+    task = load_scenario("clbench/Fetch-v1").task("push_right")
     world = resolve(task.world)()
     episode = demonstrate(world, task, seed=7, noisy=True)
     state, _ = world.reset(seed=7, options={"task": task.name})

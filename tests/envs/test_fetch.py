@@ -136,14 +136,14 @@ def test_things_are_where_the_layout_puts_them(name: str) -> None:
         state, _ = world.reset(seed=seed, options={"task": name})
         gripper = state[:3]
         assert (np.linalg.norm(state[BLOCK][:2] - (1.12, 1.03)) < 0.001) == layout.block_aside
-        assert (np.linalg.norm(state[TARGET] - (1.12, 0.47, 0.425)) < 0.001) == layout.target_aside
+        assert (np.linalg.norm(state[TARGET] - (1.48, 0.47, 0.425)) < 0.001) == layout.target_aside
         assert (np.linalg.norm(state[BLOCK] - gripper) < 0.02) == layout.block_held
 
 
 def test_a_held_block_stays_in_the_gripper_until_it_opens() -> None:
     world = World()
     for seed in range(3):
-        state, _ = world.reset(seed=seed, options={"task": "put_down"})
+        state, _ = world.reset(seed=seed, options={"task": "carry_back"})
         for _ in range(10):
             state, *_ = world.step(np.array([0.3, 0.0, 0.5, -1.0], np.float32))
         assert np.linalg.norm(state[BLOCK] - state[:3]) < 0.02
@@ -152,28 +152,17 @@ def test_a_held_block_stays_in_the_gripper_until_it_opens() -> None:
         assert state[BLOCK][2] < 0.45  # it has fallen
 
 
-def test_a_block_is_put_down_once_the_gripper_has_let_go_and_left() -> None:
-    rule = RULES["put_down"]
-    state = [0.0] * 28
-    state[0:3], state[3:6], state[9:11] = [1.3, 0.7, 0.5], [1.3, 0.7, 0.425], [0.05, 0.05]
-    assert rule.success(state, state)
-    for place, value in ((2, 0.47), (9, 0.0), (5, 0.5)):  # too near, not open, in the air
-        wrong = [*state]
-        wrong[place] = value
-        assert not rule.success(wrong, state)
-
-
-def test_a_held_block_is_raised_once_it_is_8_cm_higher_and_still_held() -> None:
-    rule, start = RULES["raise_block"], [0.0] * 28
+def test_a_held_block_is_carried_back_once_it_is_10_cm_nearer_and_still_held() -> None:
+    rule, start = RULES["carry_back"], [0.0] * 28
     start[3:6], start[9:11] = [1.3, 0.7, 0.5], [0.025, 0.025]
     state = [*start]
-    state[5] = 0.581
+    state[3] = 1.199
     assert rule.success(state, start)
-    for place, value in ((5, 0.579), (9, 0.06), (9, -0.01)):  # too low, let go, slipped
+    for place, value in ((3, 1.201), (9, 0.06), (9, -0.01)):  # too far, let go, slipped
         wrong = [*state]
         wrong[place] = value
         assert not rule.success(wrong, start)
-    assert rule.distance(start, start) == pytest.approx(0.08)
+    assert rule.distance(start, start) == pytest.approx(0.10)
 
 
 def test_a_thing_in_its_corner_never_hinders_the_expert() -> None:
@@ -212,8 +201,6 @@ def test_the_reward_grows_while_the_expert_acts_and_is_highest_at_success() -> N
 def test_experts_of_retained_tasks_do_no_target_task_by_chance() -> None:
     world = World()
     for known, task in itertools.product(SCENARIO.retained, SCENARIO.target):
-        if (known.name, task.name) == ("hover", "put_down"):
-            continue  # it opens the fingers and rises: a held block is then put down
         expert, successes = resolve(known.expert)(known.name), 0
         for seed in (200, 201):
             state, _ = world.reset(seed=seed, options={"task": task.name})
