@@ -17,7 +17,6 @@ from clbench.policy.policy import Policy
 from clbench.records.record import Record
 from clbench.runs.length import point_length
 from clbench.runs.spec import ResolvedRun
-from clbench.scoring.scores import Scores
 
 TABLES = ("episodes", "answers", "policy")
 """Tables of a record that an evaluation fills."""
@@ -72,7 +71,9 @@ def evaluate_pretrained(run: ResolvedRun, progress: ProgressCallback = no_progre
             evaluate_start(run, examiner, policy, record, progress)
         finally:
             examiner.close()
-    return Scores.from_record(record, partial=True).retained_at_start()
+    skills, split = record.scenario.retained, run.protocol.split
+    found = [row.success for row in record.episode_rows() if row.split == split and row.task in skills]
+    return sum(found) / len(found) if found else None
 
 
 def is_evaluated(run: ResolvedRun) -> bool:

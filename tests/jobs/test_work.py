@@ -4,6 +4,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from eager import EAGER
 
 from clbench.jobs.work import (
     collect_demonstrations,
@@ -25,10 +26,16 @@ def test_a_policy_that_can_do_little_is_called_weak_before_and_after_a_run(
     assert evaluate_policy(SPEC, nothing) == "success 1.00 on the retained skills"
     assert "pretrained" not in do_run(SPEC, tmp_path / "strong", nothing)
     monkeypatch.setattr(Scores, "retained_at_start", lambda _: 0.33)
+    monkeypatch.setattr("clbench.runs.start.evaluate_pretrained", lambda *_: 0.33)
     said = evaluate_policy(SPEC, nothing)
     assert said.startswith("success 0.33 on the retained skills. That is little: ")
     said = do_run(SPEC, tmp_path / "weak", nothing)
     assert said.endswith(". The pretrained policy had only 0.33 of the skills")
+
+
+def test_a_policy_is_evaluated_where_stages_end_when_the_target_is_learned() -> None:
+    nothing: Any = lambda _: None  # noqa: E731
+    assert evaluate_policy(RunSpec(EAGER.id, "sft", 0), nothing) == "success 1.00 on the retained skills"
 
 
 def test_what_is_in_the_cache_is_not_said_to_be_made(empty_caches: Path) -> None:
