@@ -326,13 +326,13 @@ def test_a_dry_run_says_what_would_be_done_and_does_nothing(
 def test_a_quiet_run_prints_failures_alone(
     tmp_path: Path, write_module: Callable[[str, str], None], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    write_module("mine", METHOD)
+    write_module("loud", METHOD)  # a name of its own: the module stays imported
     app(["run", TOY, "sft", "--seeds", "1", "-q", "--records", str(tmp_path)], result_action="return_value")
     assert capsys.readouterr() == ("", "")
     with pytest.raises(SystemExit):
-        app(["run", TOY, "mine:Broken", "--seeds", "1", "-q", "--records", str(tmp_path)])
+        app(["run", TOY, "loud:Broken", "--seeds", "1", "-q", "--records", str(tmp_path)])
     said = capsys.readouterr().err
-    assert said.startswith("Toy-v0 mine:Broken seed 0: failed in stage 1 (right): ValueError: no idea")
+    assert said.startswith("Toy-v0 loud:Broken seed 0: failed in stage 1 (right): ValueError: no idea")
 
 
 @pytest.mark.slow
