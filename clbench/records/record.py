@@ -228,20 +228,20 @@ class Record:
 
     def _repr_html_(self) -> str:
         """Return the success rates of the ends of stages as a table, for notebooks."""
-        from clbench.records.frames import matrix
+        from clbench.records.tables import matrix
 
         table = matrix(self).map(lambda rate: f"{rate:.2f}").to_html(notebook=True)
         return f"<p>{html.escape(repr(self))}</p>{table}"
 
     def frame(self) -> pandas.DataFrame:
         """Return its evaluation episodes as a table, see `clbench.load_records`."""
-        from clbench.records.frames import frame
+        from clbench.records.tables import frame
 
         return frame(self)
 
     def matrix(self) -> pandas.DataFrame:
         """Return its success rates at the ends of stages (rows) on all tasks (columns), with labels."""
-        from clbench.records.frames import matrix
+        from clbench.records.tables import matrix
 
         return matrix(self)
 

@@ -21,7 +21,6 @@ from clbench.data.demonstrations import (
 from clbench.spec.budget import Budget
 from clbench.spec.language import encode
 from clbench.spec.registry import load_scenario
-from clbench.spec.task import Task
 
 TOY = load_scenario("clbench.testing:clbench/Toy-v0")
 TASK = TOY.task("left")
@@ -129,7 +128,7 @@ def test_actions_after_action_noise_inside_a_chunk_do_not_count() -> None:
 
 def _constant_task(name: str, steps: int) -> Demonstrations:
     words = ("go left", "move to the left") if name == "left" else ("go up",)
-    task = Task(name, "toy", words, 12, "", "")
+    task = dataclasses.replace(TASK, name=name, instructions=words)
     return Demonstrations.of_task(task, [_episode([False] * steps)], chunk=2)
 
 

@@ -1,0 +1,82 @@
+"""A record as tables of pandas."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from clbench.records.paths import label_of
+
+if TYPE_CHECKING:
+    import pandas
+
+    from clbench.records.record import Record
+
+COLUMNS = (
+    "scenario",
+    "method",
+    "seed",
+    "order",
+    "stage",
+    "step",
+    "task",
+    "group",
+    "split",
+    "episode",
+    "success",
+    "length",
+)
+"""Columns of `frame` and `load_records`."""
+
+
+def frame(record: Record) -> pandas.DataFrame:
+    """Return the evaluation episodes of a record, with the columns of `load_records`."""
+    import pandas
+
+    episodes, run, scenario = record.episodes, record.run, record.scenario
+    groups = {
+        task: group for group in ("retained", "target", "held_out") for task in getattr(scenario, group)
+    }
+    found = pandas.DataFrame(
+        {
+            "scenario": run.scenario,
+            "method": label_of(run.method, run.changes),
+            "seed": run.seed,
+            "order": run.order,
+            **{name: episodes[name] for name in ("stage", "step", "task")},
+            "group": [groups.get(task) for task in episodes["task"]],
+            **{name: episodes[name] for name in ("split", "episode", "success", "length")},
+        }
+    )
+    return typed(found)
+
+
+def matrix(record: Record) -> pandas.DataFrame:
+    """Return the success rates at the ends of stages: a row for each stage, a column for each task.
+
+    The first row is "pretrained", before any target; the others have the names of the targets in the order in
+    which the run learned them. Columns have two levels, the group and the task. Only the scored split counts:
+    test episodes or, in a tuning run, validation episodes.
+    """
+    import pandas
+
+    found = frame(record)
+    found = found[found.split == record.run.split]
+    ends = found.groupby("stage").step.transform("max")
+    rates = found[found.step == ends].groupby(["stage", "task"]).success.mean().unstack("task")
+    columns = [
+        (group, task)
+        for group in ("retained", "target", "held_out")
+        for task in getattr(record.scenario, group)
+    ]
+    rates = rates.reindex(columns=[task for _, task in columns])
+    rates.columns = pandas.MultiIndex.from_tuples(columns, names=("group", "task"))
+    names = ["pretrained", *record.scenario.target]
+    rates.index = pandas.Index([names[int(stage)] for stage in rates.index], name="after")
+    return rates
+
+
+def typed(found: pandas.DataFrame) -> pandas.DataFrame:
+    """Return a table whose columns have their types, also if it has no rows."""
+    numbers = dict.fromkeys(("seed", "order", "stage", "step", "episode", "length"), "int64")
+    texts = dict.fromkeys(("scenario", "method", "task", "group", "split"), "str")
+    return found.astype({**numbers, **texts, "success": "bool"})[list(COLUMNS)]
