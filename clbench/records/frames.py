@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from clbench.records.paths import RECORDS
 from clbench.records.reader import RecordError, read_record
-from clbench.records.tables import COLUMNS, frame, typed
+from clbench.records.tables import TYPES, frame, typed
 
 if TYPE_CHECKING:
     import pandas
@@ -46,4 +46,6 @@ def load_records(folder: Path | str = RECORDS) -> pandas.DataFrame:
             frames.append(frame(record))
         else:
             LOG.warning("%s: the run failed.", path)
-    return pandas.concat(frames, ignore_index=True) if frames else typed(pandas.DataFrame(columns=COLUMNS))
+    if not frames:
+        return typed(pandas.DataFrame(columns=list(TYPES)))
+    return pandas.concat(frames, ignore_index=True)

@@ -249,6 +249,15 @@ class Record:
         """Return the rows of `episodes`."""
         return [EpisodeRow(*values) for values in zip(*self.episodes.values(), strict=True)]
 
+    def retained_at_start(self) -> float | None:
+        """Return the success on the retained skills before the first target; None without any."""
+        found = [
+            row.success
+            for row in self.episode_rows()
+            if row.stage == 0 and row.split == self.run.split and row.task in self.scenario.retained
+        ]
+        return sum(found) / len(found) if found else None
+
     def add_episode(self, row: EpisodeRow) -> None:
         """Append a row to `episodes`."""
         _append(self.episodes, row)

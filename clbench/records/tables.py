@@ -2,30 +2,33 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, get_args
 
 from clbench.records.paths import label_of
+from clbench.spec.scenario import Group
 
 if TYPE_CHECKING:
     import pandas
 
     from clbench.records.record import Record
 
-COLUMNS = (
-    "scenario",
-    "method",
-    "seed",
-    "order",
-    "stage",
-    "step",
-    "task",
-    "group",
-    "split",
-    "episode",
-    "success",
-    "length",
-)
-"""Columns of `frame` and `load_records`."""
+GROUPS = get_args(Group)
+
+TYPES = {
+    "scenario": "str",
+    "method": "str",
+    "seed": "int64",
+    "order": "int64",
+    "stage": "int64",
+    "step": "int64",
+    "task": "str",
+    "group": "str",
+    "split": "str",
+    "episode": "int64",
+    "success": "bool",
+    "length": "int64",
+}
+"""Columns of `frame` and `load_records`, with their types."""
 
 
 def frame(record: Record) -> pandas.DataFrame:
@@ -33,18 +36,15 @@ def frame(record: Record) -> pandas.DataFrame:
     import pandas
 
     episodes, run, scenario = record.episodes, record.run, record.scenario
-    groups = {
-        task: group for group in ("retained", "target", "held_out") for task in getattr(scenario, group)
-    }
+    groups = {task: group for group in GROUPS for task in getattr(scenario, group)}
     found = pandas.DataFrame(
         {
             "scenario": run.scenario,
             "method": label_of(run.method, run.changes),
             "seed": run.seed,
             "order": run.order,
-            **{name: episodes[name] for name in ("stage", "step", "task")},
             "group": [groups.get(task) for task in episodes["task"]],
-            **{name: episodes[name] for name in ("split", "episode", "success", "length")},
+            **{name: episodes[name] for name in TYPES if name in episodes},
         }
     )
     return typed(found)
@@ -63,11 +63,7 @@ def matrix(record: Record) -> pandas.DataFrame:
     found = found[found.split == record.run.split]
     ends = found.groupby("stage").step.transform("max")
     rates = found[found.step == ends].groupby(["stage", "task"]).success.mean().unstack("task")
-    columns = [
-        (group, task)
-        for group in ("retained", "target", "held_out")
-        for task in getattr(record.scenario, group)
-    ]
+    columns = [(group, task) for group in GROUPS for task in getattr(record.scenario, group)]
     rates = rates.reindex(columns=[task for _, task in columns])
     rates.columns = pandas.MultiIndex.from_tuples(columns, names=("group", "task"))
     names = ["pretrained", *record.scenario.target]
@@ -76,7 +72,5 @@ def matrix(record: Record) -> pandas.DataFrame:
 
 
 def typed(found: pandas.DataFrame) -> pandas.DataFrame:
-    """Return a table whose columns have their types, also if it has no rows."""
-    numbers = dict.fromkeys(("seed", "order", "stage", "step", "episode", "length"), "int64")
-    texts = dict.fromkeys(("scenario", "method", "task", "group", "split"), "str")
-    return found.astype({**numbers, **texts, "success": "bool"})[list(COLUMNS)]
+    """Return a table with its columns in order and with their types, also if it has no rows."""
+    return found.astype(TYPES)[list(TYPES)]
