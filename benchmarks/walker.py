@@ -116,12 +116,14 @@ class WalkerWorld(OneLaneWorld):
         return picture
 
 
+WALK = Task("walk", "dm_control", ("walk",), 100, "walker:WalkerWorld", "walker:nobody")
 SCENARIO = Scenario(
     id=ID,
     description="A walker walks.",
     retained=(),
-    target=(Task("walk", "dm_control", ("walk",), 100, "walker:WalkerWorld", "walker:nobody"),),
+    target=(WALK,),
     held_out=(),
     questions="walker:nothing",
+    scenes=(WALK,),
 )
 clbench.register(ID, "walker:SCENARIO")

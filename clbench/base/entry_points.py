@@ -2,12 +2,23 @@
 
 from __future__ import annotations
 
-import difflib
 import importlib
 from collections.abc import Iterable
 from typing import Any
 
 from clbench.base.errors import ClbenchError, InputError, UnknownNameError
+from clbench.base.text import did_you_mean
+
+
+def is_entry_point(text: str) -> bool:
+    """Return whether a text has the form "module:attribute"."""
+    module, _, attribute = text.partition(":")
+    return attribute.isidentifier() and is_module(module)
+
+
+def is_module(text: str) -> bool:
+    """Return whether a text has the form of a module's name."""
+    return all(map(str.isidentifier, text.split(".")))
 
 
 def resolve(name: str) -> Any:
@@ -19,8 +30,7 @@ def resolve(name: str) -> Any:
     module, _, attribute = name.partition(":")
     found = import_module(module, name)
     if not hasattr(found, attribute):
-        near = difflib.get_close_matches(attribute, dir(found), n=1)
-        hint = f" Did you mean {near[0]!r}?" if near else ""
+        hint = did_you_mean(attribute, dir(found))
         raise UnknownNameError(f"No entry point {name!r}: module {module!r} has no {attribute!r}.{hint}")
     return getattr(found, attribute)
 
@@ -36,7 +46,7 @@ def import_module(module: str, needed_for: str) -> Any:
         UnknownNameError: The module, or a module that it imports, does not exist.
         InputError: A module that is not part of clbench raises an error while it is imported.
     """
-    if not all(map(str.isidentifier, module.split("."))):
+    if not is_module(module):
         raise UnknownNameError(f"No module {module!r} can be imported for {needed_for!r}.")
     try:
         return importlib.import_module(module)
@@ -60,6 +70,5 @@ def unknown(kind: str, name: str, known: Iterable[str]) -> UnknownNameError:
         known: Known names.
     """
     known = sorted(known)
-    near = difflib.get_close_matches(name, known, n=1)
-    hint = f" Did you mean {near[0]!r}?" if near else ""
+    hint = did_you_mean(name, known)
     return UnknownNameError(f"No {kind} is called {name!r}.{hint} Known: {', '.join(known)}.")

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from clbench.base.errors import ClbenchError, InputError
+from clbench.base.text import quoted
 
 MOST_BYTES = 8 * 2**20
 """Size limit of a file. A record of Fetch-v1 has 0.1 MB; 8 MB of brackets take 0.3 GB of memory and 3 s."""
@@ -35,22 +36,6 @@ _PLAINLY = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
 
 class StrictJSONError(ClbenchError, ValueError):
     """A file is not JSON, or exceeds a limit."""
-
-
-def quoted(text: str) -> str:
-    """Return a stranger's text as a Python literal, cut to 60 characters."""
-    return repr(text) if len(text) <= 60 else f"{text[:60]!r}..."
-
-
-def printable(text: str) -> str:
-    """Return a stranger's text in one line, without characters that control a terminal."""
-    visible = (one if one.isprintable() else one.encode("unicode_escape").decode("ascii") for one in text)
-    return "".join(visible)
-
-
-def printable_lines(text: str) -> str:
-    """Return a stranger's text with its lines, but without characters that control a terminal."""
-    return "\n".join(map(printable, text.splitlines()))
 
 
 def read_json(path: Path) -> Any:

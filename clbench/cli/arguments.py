@@ -19,7 +19,7 @@ from clbench.base.cache import cache_folder
 from clbench.base.entry_points import unknown
 from clbench.base.errors import ClbenchError, InputError
 from clbench.base.leftovers import unfinished
-from clbench.base.strict_json import printable
+from clbench.base.text import printable
 
 
 def whole_number(least: int) -> Parameter:

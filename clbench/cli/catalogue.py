@@ -16,7 +16,7 @@ from rich.table import Table
 
 from clbench import __version__
 from clbench.base.errors import InputError
-from clbench.base.strict_json import printable
+from clbench.base.text import printable
 from clbench.cli.arguments import AsJson, checked_input, print_json
 
 if TYPE_CHECKING:

@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.logging import RichHandler
 
 import clbench
-from clbench.base.strict_json import printable_lines
+from clbench.base.text import printable_lines
 from clbench.cli.arguments import parsing_error
 
 if TYPE_CHECKING:

@@ -10,7 +10,7 @@ from pathlib import Path
 from rich.console import Console
 
 from clbench.base.errors import InputError
-from clbench.base.strict_json import quoted
+from clbench.base.text import quoted
 from clbench.cli.arguments import checked_input
 from clbench.spec.identifiers import built_in_methods, check_method_name
 

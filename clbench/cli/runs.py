@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 from cyclopts import Parameter
 from rich.console import Console
@@ -16,7 +16,7 @@ from rich.console import Console
 from clbench.base.cache import cache_folder
 from clbench.base.errors import InputError
 from clbench.base.leftovers import sweep
-from clbench.base.strict_json import printable, printable_lines
+from clbench.base.text import counted, printable, printable_lines
 from clbench.cli.arguments import (
     MethodName,
     ScenarioId,
@@ -32,6 +32,7 @@ from clbench.records.paths import RECORDS
 
 if TYPE_CHECKING:
     from clbench.jobs.job import Workers
+    from clbench.jobs.plan import Plan
     from clbench.runs.spec import ResolvedRun, RunSpec
 
 # Modules with PyTorch or SciPy are imported where they are needed: `--help` does not wait for them.
@@ -172,26 +173,48 @@ def _workers(count: int | None, ray: str | None) -> Workers:
         return RayWorkers(ray, count)
 
 
+class _ToDo(NamedTuple):
+    """What a command still has to do."""
+
+    missing: list[ResolvedRun]
+    """Runs without a record."""
+    bare: list[ResolvedRun]
+    """Runs with a record whose policies are to be kept, and are not."""
+
+    def plan(self, records: Path, checkpoints: Path | None, tensorboard: Path | None = None) -> Plan:
+        """Return the plan of the jobs."""
+        from clbench.jobs.plan import Plan
+
+        plan = Plan()
+        for one in self.missing:
+            plan.add_run(one, records, checkpoints=checkpoints, tensorboard=tensorboard)
+        for one in self.bare:
+            plan.add_stages(one, checkpoints)
+        return plan
+
+
+def _to_do(runs: Sequence[ResolvedRun], records: Path, checkpoints: Path | None) -> _ToDo:
+    """Return what has to be done until all runs have a record and, with `checkpoints`, policies there."""
+    from clbench.jobs.recorded import has_record
+    from clbench.runs.checkpoints import has_stages
+
+    missing = [run for run in runs if not has_record(run, records)]
+    recorded = [run for run in runs if run not in missing]
+    return _ToDo(missing, [run for run in recorded if checkpoints and not has_stages(run, checkpoints)])
+
+
 def _print_forecast(
     runs: Sequence[ResolvedRun], records: Path, workers: int | None, checkpoints: Path | None
 ) -> None:
     """Print what the runs without a record would take."""
     from clbench.jobs.forecast import forecast
-    from clbench.jobs.plan import Plan
-    from clbench.jobs.recorded import has_record
 
     with checked_input():
-        missing = [run for run in runs if not has_record(run, records)]
-        plan = Plan()
-        for one in missing:
-            plan.add_run(one, records, checkpoints=checkpoints)
-    lines = [f"{len(runs) - len(missing)} of {_counted(len(runs))} done already."]
-    lines += forecast(plan, missing, workers, checkpoints) if missing else []
+        to_do = _to_do(runs, records, checkpoints)
+        plan = to_do.plan(records, checkpoints)
+    lines = [f"{len(runs) - len(to_do.missing)} of {counted(len(runs), 'run')} done already."]
+    lines += forecast(plan, [*to_do.missing, *to_do.bare], workers, checkpoints) if plan.jobs else []
     Console(soft_wrap=True).print("\n".join(lines), highlight=False, markup=False)
-
-
-def _counted(runs: int) -> str:
-    return f"{runs} run" if runs == 1 else f"{runs} runs"
 
 
 def run_missing(
@@ -212,39 +235,32 @@ def run_missing(
         tensorboard: Folder below which the runs are logged; None logs nothing.
         quiet: Whether to print failures alone.
     """
-    from clbench.jobs.plan import Plan
     from clbench.jobs.recorded import has_record, set_damaged_aside
     from clbench.jobs.scheduler import run_with_bars
-    from clbench.runs.checkpoints import has_stages
 
     console = Console(stderr=True, quiet=quiet)
     sweep(records, cache_folder(), minari_folder() / "clbench")
     with checked_input():
-        missing = [run for run in runs if not has_record(run, records)]
+        missing, bare = to_do = _to_do(runs, records, checkpoints)
     if len(missing) < len(runs):
         have = "has" if len(runs) - len(missing) == 1 else "have"
-        console.print(f"{len(runs) - len(missing)} of {_counted(len(runs))} {have} a record already.")
-    recorded = [run for run in runs if run not in missing]
-    bare = [run for run in recorded if checkpoints and not has_stages(run, checkpoints)]
+        console.print(f"{len(runs) - len(missing)} of {counted(len(runs), 'run')} {have} a record already.")
     if not missing and not bare:
         return True
     begin = time.monotonic()
-    plan = Plan()
     with checked_input():  # refuses a scenario with a camera on a machine that cannot render
         check_folders(records=records, checkpoints=checkpoints, tensorboard=tensorboard, **data_folders())
         for one in missing:
             damage = set_damaged_aside(one, records)
             if damage is not None:
                 console.print(printable(damage), highlight=False, markup=False, soft_wrap=True)
-        for one in missing:
-            plan.add_run(one, records, checkpoints=checkpoints, tensorboard=tensorboard)
-        for one in bare:
-            plan.add_stages(one, checkpoints)
+        plan = to_do.plan(records, checkpoints, tensorboard)
     failed = run_with_bars(plan.jobs, workers(), console)
     seconds = time.monotonic() - begin
     with checked_input():
         good = sum(has_record(run, records) for run in missing)
-    done = f"{good} of {_counted(len(missing))}" if good < len(missing) else _counted(len(missing))
+    done = f"{good} of " if good < len(missing) else ""
+    done += counted(len(missing), "run")
     done += f" and the policies of {len(bare)}" if bare else ""
     console.print(
         f"{done} in {seconds / 60:.1f} minutes; records in {records}.", highlight=False, markup=False

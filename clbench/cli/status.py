@@ -13,7 +13,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from clbench.base.errors import InputError
-from clbench.base.strict_json import printable
+from clbench.base.text import printable
 from clbench.cli.arguments import (
     AsJson,
     MethodName,

@@ -12,7 +12,7 @@ from rich.markup import escape
 from rich.progress import BarColumn, Progress, TaskID, TaskProgressColumn, TextColumn, TimeElapsedColumn
 from rich.progress import TimeRemainingColumn as TimeLeftColumn
 
-from clbench.base.strict_json import printable, printable_lines
+from clbench.base.text import printable, printable_lines
 
 LINE_SECONDS = 30.0
 """Seconds between two lines without a terminal."""

@@ -6,12 +6,14 @@ import os
 import statistics
 import time
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import torch
 
+from clbench.base.text import counted
 from clbench.jobs import work
+from clbench.jobs.job import Job
 from clbench.jobs.plan import Plan
 from clbench.learning.pretraining import policy_config
 from clbench.policy.batch import Batch
@@ -32,6 +34,7 @@ KINDS = {
     work.pretrain: ("policy to pretrain", "policies to pretrain"),
     work.evaluate_policy: ("pretrained policy to evaluate", "pretrained policies to evaluate"),
     work.do_run: ("run", "runs"),
+    work.make_policies: ("run to train again for its policies", "runs to train again for their policies"),
 }
 """What one job does, and what several do, in words."""
 
@@ -43,31 +46,46 @@ def forecast(
 
     Args:
         plan: The plan of the runs.
-        runs: Runs that have no record yet, of one scenario or of several.
+        runs: The runs, of one scenario or of several.
         workers: Number of jobs at once; None for all cores.
         checkpoints: Folder that would keep the policies of all stages, or None.
     """
     counts = Counter(KINDS[job.function] for job in plan.jobs)
-    lines = [f"To do: {', '.join(f'{n} {one if n == 1 else many}' for (one, many), n in counts.items())}."]
-    scenarios = {run.scenario.id: run.scenario for run in runs}
-    speeds = {name: step_seconds(scenario) for name, scenario in scenarios.items()}
-    slowest = max(speeds.values(), default=0.0)
-    at_once = workers or os.cpu_count() or 1
-    seconds = slowest * sum(job.length * job.pace for job in plan.jobs) / min(at_once, max(len(plan.jobs), 1))
-    early = any(scenario.budget.criterion for scenario in scenarios.values())
-    bound = "up to about" if early else "about"
-    lines.append(
-        f"Time: {bound} {_duration(seconds)} with {at_once} at once, at {1000 * slowest:.0f} ms for an "
-        f"optimiser step here{'; a stage ends as soon as its target is learned' if early else ''}."
+    scenarios = {run.spec.scenario: run.scenario for run in runs}
+    to_do = ", ".join(counted(count, *words) for words, count in counts.items())
+    return [
+        f"To do: {to_do}.",
+        _time(plan.jobs, list(scenarios.values()), workers or os.cpu_count() or 1),
+        _disk(plan.jobs, runs, scenarios, checkpoints),
+    ]
+
+
+def _time(jobs: Sequence[Job], scenarios: Sequence[Scenario], at_once: int) -> str:
+    slowest = max(map(step_seconds, scenarios))
+    seconds = slowest * sum(job.length * job.pace for job in jobs) / min(at_once, len(jobs))
+    early = any(scenario.budget.criterion for scenario in scenarios)
+    return (
+        f"Time: {'up to about' if early else 'about'} {_duration(seconds)} with {at_once} at once, at "
+        f"{1000 * slowest:.0f} ms for an optimiser step here"
+        f"{'; a stage ends as soon as its target is learned' if early else ''}."
     )
-    kept = sum(_policy_bytes(run.scenario) * (len(run.scenario.target) + 1) for run in runs)
-    made = sum(_data_bytes(scenario) for scenario in scenarios.values())
-    made += sum(
-        _policy_bytes(runs[0].scenario) for job in plan.jobs if job.function is work.pretrain and runs
-    )
-    parts = [f"about {_megabytes(made)} in the caches", f"{_megabytes(RECORD_BYTES * len(runs))} of records"]
-    parts += [f"{_megabytes(kept)} of policies in {checkpoints}"] if checkpoints else []
-    return [*lines, f"Disk: {', '.join(parts)}."]
+
+
+def _disk(
+    jobs: Sequence[Job],
+    runs: Sequence[ResolvedRun],
+    scenarios: Mapping[str, Scenario],
+    checkpoints: Path | None,
+) -> str:
+    policies = {name: _policy_bytes(scenario) for name, scenario in scenarios.items()}
+    made = sum(map(_data_bytes, scenarios.values()))
+    made += sum(policies[job.arguments["scenario"]] for job in jobs if job.function is work.pretrain)
+    records = RECORD_BYTES * sum(job.function is work.do_run for job in jobs)
+    parts = [f"about {_megabytes(made)} in the caches", f"{_megabytes(records)} of records"]
+    if checkpoints:
+        kept = sum(policies[run.spec.scenario] * (len(run.scenario.target) + 1) for run in runs)
+        parts.append(f"{_megabytes(kept)} of policies in {checkpoints}")
+    return f"Disk: {', '.join(parts)}."
 
 
 def step_seconds(scenario: Scenario) -> float:

@@ -98,7 +98,7 @@ def do_run(
     names[2:2] = ["perturbed_retention"] if spec.perturb else []
     values = {name: measure(name, scores) for name in names}
     text = ", ".join(f"{name} {'-' if value is None else f'{value:.2f}'}" for name, value in values.items())
-    start = scores.retained_at_start()
+    start = record.retained_at_start()
     weak = start is not None and start < WEAK
     return f"{text}. The pretrained policy had only {start:.2f} of the skills" if weak else text
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import difflib
 import importlib
 import math
 from collections.abc import Callable, Mapping
@@ -13,6 +12,7 @@ from typing import Any, Union, get_args, get_origin, get_type_hints
 
 from clbench.base.errors import InputError, UnknownNameError, WrongTypeError
 from clbench.base.source import package_of, source_hash
+from clbench.base.text import did_you_mean
 from clbench.learning.method import Method
 from clbench.spec.identifiers import built_in_methods, installed_methods, unknown_method
 
@@ -69,8 +69,7 @@ def _import_method(spec: str) -> Any:
     name, _, attribute = spec.partition(":")
     module = _guarded(spec, lambda: importlib.import_module(name))
     if not hasattr(module, attribute):
-        near = difflib.get_close_matches(attribute, dir(module), n=1)
-        hint = f" Did you mean {near[0]!r}?" if near else ""
+        hint = did_you_mean(attribute, dir(module))
         raise UnknownNameError(f"Module {name!r} has no {attribute!r}.{hint}")
     return getattr(module, attribute)
 
@@ -93,8 +92,7 @@ def read_changes(spec: str, cls: type[Method], changes: Mapping[str, Any]) -> di
     values = {}
     for name, value in changes.items():
         if name not in fields:
-            near = difflib.get_close_matches(name, fields, n=1)
-            hint = f" Did you mean {near[0]!r}?" if near else ""
+            hint = did_you_mean(name, fields)
             raise UnknownNameError(
                 f"{spec} has no hyper-parameter {name!r}.{hint} It has: {', '.join(fields) or 'none'}."
             )

@@ -9,7 +9,7 @@ from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 from clbench.base.entry_points import unknown
 from clbench.base.errors import InputError
-from clbench.base.strict_json import quoted
+from clbench.base.text import quoted
 
 _WORDS: dict[Any, str] = {
     str: "a text",

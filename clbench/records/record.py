@@ -228,26 +228,35 @@ class Record:
 
     def _repr_html_(self) -> str:
         """Return the success rates of the ends of stages as a table, for notebooks."""
-        from clbench.records.frames import matrix
+        from clbench.records.tables import matrix
 
         table = matrix(self).map(lambda rate: f"{rate:.2f}").to_html(notebook=True)
         return f"<p>{html.escape(repr(self))}</p>{table}"
 
     def frame(self) -> pandas.DataFrame:
         """Return its evaluation episodes as a table, see `clbench.load_records`."""
-        from clbench.records.frames import frame
+        from clbench.records.tables import frame
 
         return frame(self)
 
     def matrix(self) -> pandas.DataFrame:
         """Return its success rates at the ends of stages (rows) on all tasks (columns), with labels."""
-        from clbench.records.frames import matrix
+        from clbench.records.tables import matrix
 
         return matrix(self)
 
     def episode_rows(self) -> list[EpisodeRow]:
         """Return the rows of `episodes`."""
         return [EpisodeRow(*values) for values in zip(*self.episodes.values(), strict=True)]
+
+    def retained_at_start(self) -> float | None:
+        """Return the success on the retained skills before the first target; None without any."""
+        found = [
+            row.success
+            for row in self.episode_rows()
+            if row.stage == 0 and row.split == self.run.split and row.task in self.scenario.retained
+        ]
+        return sum(found) / len(found) if found else None
 
     def add_episode(self, row: EpisodeRow) -> None:
         """Append a row to `episodes`."""

@@ -71,9 +71,7 @@ def evaluate_pretrained(run: ResolvedRun, progress: ProgressCallback = no_progre
             evaluate_start(run, examiner, policy, record, progress)
         finally:
             examiner.close()
-    skills, split = record.scenario.retained, run.protocol.split
-    found = [row.success for row in record.episode_rows() if row.split == split and row.task in skills]
-    return sum(found) / len(found) if found else None
+    return record.retained_at_start()
 
 
 def is_evaluated(run: ResolvedRun) -> bool:

@@ -49,11 +49,6 @@ class Scores(Measured):
     perturbed: Array
     """Success in perturbed episodes at the ends of stages, (stages + 1, tasks, episodes)."""
 
-    def retained_at_start(self) -> float | None:
-        """Return the success on the retained skills before the first target; None without any."""
-        count = len(self.layout.retained)
-        return float(self.success[0, :count].mean()) if count and self.success[0, :count].size else None
-
     @classmethod
     def from_record(cls, record: Record, partial: bool = False) -> Scores:
         """Return the scores in `record`.

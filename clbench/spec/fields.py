@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+from clbench.base.entry_points import is_entry_point
 from clbench.base.errors import InputError, WrongTypeError
 
 
@@ -53,8 +54,7 @@ def check_entry_point(part: object, *fields: str) -> None:
                 f"{_place(part, name)} must be a text 'module:name' such as {own!r}, not {value!r}: "
                 "other processes import it by its name."
             )
-        module, _, attribute = value.partition(":")
-        if not (attribute.isidentifier() and all(map(str.isidentifier, module.split(".")))):
+        if not is_entry_point(value):
             raise InputError(f"{_place(part, name)} must have the form 'module:name', not {value!r}.")
 
 

@@ -7,7 +7,6 @@ the letters of another alphabet.
 
 from __future__ import annotations
 
-import difflib
 import re
 from collections.abc import Iterable
 from functools import cache
@@ -15,7 +14,7 @@ from importlib.metadata import EntryPoint, entry_points
 
 from clbench.base.entry_points import unknown
 from clbench.base.errors import InputError, UnknownNameError
-from clbench.base.strict_json import quoted
+from clbench.base.text import did_you_mean, quoted
 
 LONGEST = 100
 """Largest number of characters of a name."""
@@ -72,8 +71,7 @@ def check_known(scenarios: Iterable[str] = (), methods: Iterable[str] = ()) -> N
 def unknown_method(name: str) -> UnknownNameError:
     """Return the error for a name that no installed method has, with the nearest one."""
     installed = sorted(installed_methods())
-    near = difflib.get_close_matches(name, installed, n=1)
-    hint = f" Did you mean {near[0]!r}?" if near else ""
+    hint = did_you_mean(name, installed)
     names = ", ".join(installed) or "none; run `pip install -e .` in the checkout"
     return UnknownNameError(f"No method is called {name!r}.{hint} Installed: {names}. Or give module:Class.")
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Sequence
 from functools import cache
 from importlib.resources import files
@@ -11,6 +10,7 @@ from typing import TYPE_CHECKING
 from tokenizers import Tokenizer, models, normalizers, pre_tokenizers
 
 from clbench.base.errors import InputError
+from clbench.base.text import did_you_mean
 
 if TYPE_CHECKING:  # PyTorch takes seconds to import, and environments do not need it
     from torch import Tensor
@@ -71,8 +71,7 @@ def word_ids(texts: Sequence[str]) -> list[list[int]]:
         words = [text[start:end] for start, end in encoding.offsets if end > start]
         for word, number in zip(words, encoding.ids, strict=False):
             if number == 0:
-                near = difflib.get_close_matches(word.lower(), vocabulary(), n=1)
-                hint = f" Did you mean {near[0]!r}?" if near else ""
+                hint = did_you_mean(word.lower(), vocabulary())
                 raise UnknownWordError(f"The word {word!r} in {text!r} is not in the vocabulary.{hint}")
         if not 0 < len(words) <= TEXT_LENGTH:
             raise UnknownWordError(f"{text!r} has {len(words)} words; the policy reads 1 to {TEXT_LENGTH}.")

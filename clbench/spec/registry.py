@@ -5,7 +5,7 @@ from __future__ import annotations
 import gymnasium
 from gymnasium.envs import registration
 
-from clbench.base.entry_points import import_module, resolve, unknown
+from clbench.base.entry_points import import_module, is_entry_point, resolve, unknown
 from clbench.base.errors import InputError, UnknownNameError
 from clbench.spec.identifiers import check_scenario_id, scenario_ids
 from clbench.spec.scenario import Scenario
@@ -25,10 +25,9 @@ def register(scenario_id: str, entry_point: str) -> None:
             entry point, or uses our namespace; or the entry point has another form.
     """
     check_scenario_id(scenario_id)
-    module, colon, attribute = entry_point.partition(":")
-    if not (colon and attribute.isidentifier() and all(map(str.isidentifier, module.split(".")))):
+    if not is_entry_point(entry_point):
         raise InputError(f"{entry_point!r} must be the place of a scenario, as 'package.module:SCENARIO'.")
-    if scenario_id.startswith("clbench/") and module.partition(".")[0] != "clbench":
+    if scenario_id.startswith("clbench/") and not entry_point.startswith(("clbench.", "clbench:")):
         raise InputError(f"{scenario_id!r} is in the namespace of clbench: choose your own.")
     kwargs = {"scenario": entry_point}
     known = gymnasium.registry.get(scenario_id)

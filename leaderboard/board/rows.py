@@ -166,7 +166,7 @@ def pretrained_success(rows: Iterable[Row]) -> float | None:
     row = next((row for row in begins if row.method == BASELINE), begins[0] if begins else None)
     if row is None:
         return None
-    rates = [run.scores.retained_at_start() for run in row.runs]
+    rates = [run.record.retained_at_start() for run in row.runs]
     known = [rate for rate in rates if rate is not None]
     return math.fsum(known) / len(known) if known else None
 

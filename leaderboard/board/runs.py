@@ -11,7 +11,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from clbench.base.strict_json import printable
+from clbench.base.text import printable
 from clbench.records.paths import label_of, record_name
 from clbench.records.pinned import other_parts, pinned
 from clbench.records.reader import RecordError, read_record

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from clbench.base.entry_points import resolve
-from clbench.base.strict_json import printable
+from clbench.base.text import printable
 from clbench.records.paths import RECORDS
 from clbench.scoring.groups import deviation_of_differences
 from clbench.scoring.intervals import Estimate, bootstrap, paired_difference, row_generator, student_quantile

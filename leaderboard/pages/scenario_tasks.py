@@ -19,6 +19,7 @@ from clbench.base.dependencies import require
 from clbench.base.entry_points import resolve
 from clbench.base.errors import ClbenchError
 from clbench.base.seeding import derive_seed
+from clbench.base.text import counted
 from clbench.data.demonstrations import demonstrate
 from clbench.data.expert_rates import measure
 from clbench.jobs.bars import Bars
@@ -27,7 +28,7 @@ from clbench.spec.task import Task
 from clbench.worlds.gl_backend import choose_back_end
 from clbench.worlds.world import World
 
-from ..views.format import counted, write_if_changed
+from ..views.format import write_if_changed
 
 EXPERTS = "experts.json"
 """File with the measurements of the experts, in the folder of the card."""

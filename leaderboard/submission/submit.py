@@ -8,6 +8,7 @@ from pathlib import Path
 
 from rich.console import Console
 
+from clbench.base.text import counted
 from clbench.jobs.job import Job, JobError
 from clbench.jobs.plan import Plan
 from clbench.jobs.processes import Processes
@@ -21,7 +22,7 @@ from clbench.testing import ContractError, check_method
 
 from ..board.commands import run_command
 from ..board.rows import Row, Table
-from ..views.format import counted, fitting, fitting_names, format_interval, standing_text
+from ..views.format import fitting, fitting_names, format_interval, standing_text
 
 CHECK_STEPS = 100.0
 """Duration of the check in optimiser steps, for the time left that the progress bar shows."""

@@ -200,11 +200,6 @@ def standing_text(row: Row, rows: Iterable[Row], named: int | None = None) -> st
     return f"{text}; told apart from all others" if standing.count > 1 else text
 
 
-def counted(count: int, noun: str) -> str:
-    """Return a number of things: "1 seed", "2 seeds"."""
-    return f"{count} {noun}{'' if count == 1 else 's'}"
-
-
 def scaled(count: float) -> tuple[str, str]:
     """Return a number in three digits and the prefix of its unit: 1234.0 is ("1.23", "k")."""
     units = ("", "k", "M", "G", "T")

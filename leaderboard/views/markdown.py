@@ -15,7 +15,7 @@ from typing import Any
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
-from clbench.base.strict_json import printable
+from clbench.base.text import printable
 from clbench.scoring.intervals import Estimate
 from clbench.scoring.metric import Metric
 

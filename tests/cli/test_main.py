@@ -323,6 +323,21 @@ def test_a_dry_run_says_what_would_be_done_and_does_nothing(
     assert not any(path.is_file() for path in empty_caches.rglob("*"))
 
 
+def test_a_dry_run_counts_recorded_runs_whose_policies_would_be_made_again(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = ["run", TOY, "sft", "--seeds", "1", "--records", str(tmp_path / "records")]
+    app(command, result_action="return_value")
+    capsys.readouterr()
+    app([*command, "--dry-run"], result_action="return_value")
+    assert capsys.readouterr().out == "1 of 1 run done already.\n"
+    app([*command, "--dry-run", "--checkpoints", str(tmp_path / "kept")], result_action="return_value")
+    done, jobs, _, disk = capsys.readouterr().out.splitlines()
+    assert done == "1 of 1 run done already."
+    assert "1 run to train again for its policies." in jobs
+    assert " 0 kB of records, " in disk
+
+
 def test_a_quiet_run_prints_failures_alone(
     tmp_path: Path, write_module: Callable[[str, str], None], capsys: pytest.CaptureFixture[str]
 ) -> None:

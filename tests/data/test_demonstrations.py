@@ -7,6 +7,7 @@ import minari
 import numpy as np
 import pytest
 import torch
+from helpers import same_demonstrations
 
 from clbench.base.entry_points import resolve
 from clbench.data.demonstrations import (
@@ -21,19 +22,10 @@ from clbench.data.demonstrations import (
 from clbench.spec.budget import Budget
 from clbench.spec.language import encode
 from clbench.spec.registry import load_scenario
-from clbench.spec.task import Task
 
 TOY = load_scenario("clbench.testing:clbench/Toy-v0")
 TASK = TOY.task("left")
 BUDGET = dataclasses.replace(TOY.budget, demonstrations=5)
-
-
-def _same(first: list[Demonstration], second: list[Demonstration]) -> bool:
-    return all(
-        np.array_equal(a, b)
-        for one, other in zip(first, second, strict=True)
-        for a, b in zip(dataclasses.astuple(one), dataclasses.astuple(other), strict=True)
-    )
 
 
 def test_demonstrations_are_made_once_and_come_back_as_they_were(empty_caches: Path) -> None:
@@ -42,7 +34,7 @@ def test_demonstrations_are_made_once_and_come_back_as_they_were(empty_caches: P
     written = (folder / "data" / "main_data.hdf5").stat().st_mtime_ns
     assert dataset_folder(TASK, BUDGET) == folder
     assert (folder / "data" / "main_data.hdf5").stat().st_mtime_ns == written
-    assert _same(read_dataset(folder), collect(TASK, BUDGET))
+    assert same_demonstrations(read_dataset(folder), collect(TASK, BUDGET))
 
 
 def test_others_read_them_with_minari(empty_caches: Path) -> None:
@@ -76,7 +68,7 @@ def test_a_torn_dataset_is_named_and_made_again(empty_caches: Path, caplog: pyte
     data = folder / "data" / "main_data.hdf5"
     data.write_bytes(data.read_bytes()[: data.stat().st_size // 2])
     with caplog.at_level(logging.WARNING):
-        assert _same(read_dataset(dataset_folder(TASK, BUDGET)), before)
+        assert same_demonstrations(read_dataset(dataset_folder(TASK, BUDGET)), before)
     assert f"{folder} is torn" in caplog.text
 
 
@@ -129,7 +121,7 @@ def test_actions_after_action_noise_inside_a_chunk_do_not_count() -> None:
 
 def _constant_task(name: str, steps: int) -> Demonstrations:
     words = ("go left", "move to the left") if name == "left" else ("go up",)
-    task = Task(name, "toy", words, 12, "", "")
+    task = dataclasses.replace(TASK, name=name, instructions=words)
     return Demonstrations.of_task(task, [_episode([False] * steps)], chunk=2)
 
 

@@ -7,10 +7,10 @@ from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 
-import numpy as np
 import pytest
+from helpers import same_demonstrations
 
-from clbench.data.demonstrations import Demonstration, collect, dataset_folder, read_dataset
+from clbench.data.demonstrations import collect, dataset_folder, read_dataset
 from clbench.spec.registry import load_scenario
 
 PROCESSES, LOADS = 4, 250
@@ -21,14 +21,6 @@ VERSIONS = [dataclasses.replace(TOY.budget, noisy_demonstrations=share) for shar
 """Two budgets with equally many demonstrations, so that only their contents tell them apart."""
 
 
-def _same(first: list[Demonstration], second: list[Demonstration]) -> bool:
-    return all(
-        np.array_equal(a, b)
-        for one, other in zip(first, second, strict=True)
-        for a, b in zip(dataclasses.astuple(one), dataclasses.astuple(other), strict=True)
-    )
-
-
 def _load(seed: int) -> Counter[str]:
     """Load one or the other version many times, and count how often it was the right one."""
     chance = random.Random(seed)
@@ -37,7 +29,7 @@ def _load(seed: int) -> Counter[str]:
     for _ in range(LOADS):
         version = chance.randrange(len(VERSIONS))
         found = read_dataset(dataset_folder(TASK, VERSIONS[version]))
-        came["right" if _same(found, expected[version]) else "wrong"] += 1
+        came["right" if same_demonstrations(found, expected[version]) else "wrong"] += 1
     return came
 
 
@@ -45,7 +37,7 @@ def _load(seed: int) -> Counter[str]:
 def test_two_versions_of_demonstrations_are_never_mistaken_for_each_other(
     empty_caches: Path, record_property: Callable[[str, object], None]
 ) -> None:
-    assert not _same(*(collect(TASK, budget) for budget in VERSIONS))
+    assert not same_demonstrations(*(collect(TASK, budget) for budget in VERSIONS))
     with multiprocessing.get_context("spawn").Pool(PROCESSES) as pool:
         came = sum(pool.map(_load, range(PROCESSES)), Counter())
     record_property("counts", dict(came))

@@ -13,8 +13,8 @@ from clbench.jobs.work import (
     evaluate_policy,
     pretrain,
 )
+from clbench.records.record import Record
 from clbench.runs.spec import RunSpec
-from clbench.scoring.scores import Scores
 
 SPEC = RunSpec("clbench.testing:clbench/Toy-v0", "sft", 0)
 
@@ -25,8 +25,7 @@ def test_a_policy_that_can_do_little_is_called_weak_before_and_after_a_run(
     nothing: Any = lambda _: None  # noqa: E731
     assert evaluate_policy(SPEC, nothing) == "success 1.00 on the retained skills"
     assert "pretrained" not in do_run(SPEC, tmp_path / "strong", nothing)
-    monkeypatch.setattr(Scores, "retained_at_start", lambda _: 0.33)
-    monkeypatch.setattr("clbench.runs.start.evaluate_pretrained", lambda *_: 0.33)
+    monkeypatch.setattr(Record, "retained_at_start", lambda _: 0.33)
     said = evaluate_policy(SPEC, nothing)
     assert said.startswith("success 0.33 on the retained skills. That is little: ")
     said = do_run(SPEC, tmp_path / "weak", nothing)

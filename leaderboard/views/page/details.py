@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from clbench.base.strict_json import printable
+from clbench.base.text import printable
 
 from ...board.rows import Row
 from ...board.runs import Run, is_number

@@ -14,12 +14,13 @@ import vl_convert
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
+from clbench.base.text import counted
 from clbench.spec.identifiers import folder_name
 
 from ...board.overall import overall
 from ...board.rows import Row, Table
 from ...board.tiers import TIERS
-from ..format import counted, format_interval, number_text, title_of
+from ..format import format_interval, number_text, title_of
 from .charts import FONT, NARROW, PALETTE, SERIES, SHAPES, WIDE, along_a_run, colour, in_theme, plane
 from .frontier import NARROW as NARROW_FRONTIER
 from .frontier import WIDE as WIDE_FRONTIER

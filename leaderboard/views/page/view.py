@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from clbench.base.strict_json import printable
+from clbench.base.text import printable
 from clbench.learning.registry import load_method
 from clbench.scoring.intervals import Estimate, needed_references, row_generator
 from clbench.scoring.metric import Metric

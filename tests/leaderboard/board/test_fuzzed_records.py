@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pandas
 import pytest
-from helpers import sealed
+from helpers import resealed
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
@@ -142,15 +142,6 @@ def damaged(draw: Callable[[Any], Any], honest: str) -> bytes:
     else:
         edited(draw, values)
     return resealed(json.dumps(values).encode())
-
-
-def resealed(content: bytes) -> bytes:
-    """Return the file of a record with the hash of its content if it is one: a forger would not forget it."""
-    try:
-        values = json.loads(content)
-        return json.dumps(sealed(values)).encode() if isinstance(values, dict) else content
-    except (ValueError, TypeError, RecursionError):
-        return content
 
 
 # ---- the same numbers in another way -----------------------------------------------------------------------

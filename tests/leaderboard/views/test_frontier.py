@@ -93,7 +93,10 @@ def test_a_scenario_with_a_criterion_has_its_own_columns(records: Path) -> None:
     assert "retention" not in heads
 
 
-def test_the_terminal_shows_gain_and_kept(records: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_terminal_shows_gain_and_kept(
+    records: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "108")
     show(records=records)
     lines = capsys.readouterr().out.partition("Written")[0].splitlines()
     assert max(map(len, lines)) <= 108

@@ -1,0 +1,33 @@
+"""Texts in messages: names of strangers, counts, and the nearest right name."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+
+
+def quoted(text: str) -> str:
+    """Return a stranger's text as a Python literal, cut to 60 characters."""
+    return repr(text) if len(text) <= 60 else f"{text[:60]!r}..."
+
+
+def printable(text: str) -> str:
+    """Return a stranger's text in one line, without characters that control a terminal."""
+    visible = (one if one.isprintable() else one.encode("unicode_escape").decode("ascii") for one in text)
+    return "".join(visible)
+
+
+def printable_lines(text: str) -> str:
+    """Return a stranger's text with its lines, but without characters that control a terminal."""
+    return "\n".join(map(printable, text.splitlines()))
+
+
+def counted(count: int, noun: str, nouns: str = "") -> str:
+    """Return a number of things: "1 seed", "2 seeds"; `nouns` is the plural if it is not `noun` with an s."""
+    return f"{count} {noun if count == 1 else nouns or f'{noun}s'}"
+
+
+def did_you_mean(name: str, known: Iterable[str]) -> str:
+    """Return the end of a message with the known name that is nearest, empty if none is near."""
+    near = difflib.get_close_matches(name, known, n=1)
+    return f" Did you mean {near[0]!r}?" if near else ""

@@ -1,0 +1,76 @@
+"""A record as tables of pandas."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, get_args
+
+from clbench.records.paths import label_of
+from clbench.spec.scenario import Group
+
+if TYPE_CHECKING:
+    import pandas
+
+    from clbench.records.record import Record
+
+GROUPS = get_args(Group)
+
+TYPES = {
+    "scenario": "str",
+    "method": "str",
+    "seed": "int64",
+    "order": "int64",
+    "stage": "int64",
+    "step": "int64",
+    "task": "str",
+    "group": "str",
+    "split": "str",
+    "episode": "int64",
+    "success": "bool",
+    "length": "int64",
+}
+"""Columns of `frame` and `load_records`, with their types."""
+
+
+def frame(record: Record) -> pandas.DataFrame:
+    """Return the evaluation episodes of a record, with the columns of `load_records`."""
+    import pandas
+
+    episodes, run, scenario = record.episodes, record.run, record.scenario
+    groups = {task: group for group in GROUPS for task in getattr(scenario, group)}
+    found = pandas.DataFrame(
+        {
+            "scenario": run.scenario,
+            "method": label_of(run.method, run.changes),
+            "seed": run.seed,
+            "order": run.order,
+            "group": [groups.get(task) for task in episodes["task"]],
+            **{name: episodes[name] for name in TYPES if name in episodes},
+        }
+    )
+    return typed(found)
+
+
+def matrix(record: Record) -> pandas.DataFrame:
+    """Return the success rates at the ends of stages: a row for each stage, a column for each task.
+
+    The first row is "pretrained", before any target; the others have the names of the targets in the order in
+    which the run learned them. Columns have two levels, the group and the task. Only the scored split counts:
+    test episodes or, in a tuning run, validation episodes.
+    """
+    import pandas
+
+    found = frame(record)
+    found = found[found.split == record.run.split]
+    ends = found.groupby("stage").step.transform("max")
+    rates = found[found.step == ends].groupby(["stage", "task"]).success.mean().unstack("task")
+    columns = [(group, task) for group in GROUPS for task in getattr(record.scenario, group)]
+    rates = rates.reindex(columns=[task for _, task in columns])
+    rates.columns = pandas.MultiIndex.from_tuples(columns, names=("group", "task"))
+    names = ["pretrained", *record.scenario.target]
+    rates.index = pandas.Index([names[int(stage)] for stage in rates.index], name="after")
+    return rates
+
+
+def typed(found: pandas.DataFrame) -> pandas.DataFrame:
+    """Return a table with its columns in order and with their types, also if it has no rows."""
+    return found.astype(TYPES)[list(TYPES)]
