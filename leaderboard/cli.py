@@ -297,7 +297,7 @@ def scenario_card(
     Where no renderer works, a card lacks the missing pictures and reports it.
 
     Args:
-        scenarios: Gymnasium ids (default: all scenarios with records).
+        scenarios: Gymnasium ids (default: all scenarios with records, or with a card in the folder).
         episodes: Number of episodes of each task for measuring the experts.
         records: Folder of the records.
         output: Folder of the cards.
@@ -311,7 +311,11 @@ def scenario_card(
     add_cwd_to_path()
     with checked_input():
         board = _table(records)
-        names = scenarios or [name for name in scenario_ids() if name in board.scenarios]
+        names = scenarios or [
+            name
+            for name in scenario_ids()
+            if name in board.scenarios or (output / f"{folder_name(name)}.md").is_file()
+        ]
         if not names:
             raise InputError(f"No scenario has records in {records}. Name one, for example {SCENARIO}.")
         loaded = [load_scenario(name) for name in names]

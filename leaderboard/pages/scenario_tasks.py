@@ -84,6 +84,8 @@ def make_missing(
 ) -> Experts:
     """Measure the experts and draw the pictures that are missing from the folder of the card.
 
+    Pictures of tasks that the scenario no longer has are deleted.
+
     Args:
         scenario: Scenario with the tasks.
         folder: Folder of the card.
@@ -105,6 +107,8 @@ def make_missing(
         bars.finish(
             scenario.id, f"{counted(len(stale), 'expert')} measured, {counted(len(bare), 'picture')} drawn"
         )
+    for path in {*folder.glob("*.webp")} - {picture_path(folder, task) for task in scenario.tasks}:
+        path.unlink()
     found = {task.name: kept[task.name] for task in scenario.tasks}
     lines = (f"{json.dumps(name)}: {json.dumps(entry)}" for name, entry in found.items())
     write_if_changed(folder / EXPERTS, "{\n" + ",\n".join(lines) + "\n}\n")

@@ -271,6 +271,17 @@ def test_words_of_strangers_are_no_markup(bench: Bench) -> None:
     assert "## y" not in re.findall("^## .*", text, re.MULTILINE)
 
 
+def test_without_a_name_cards_that_are_there_are_made_again_without_pictures_of_former_tasks(
+    bench: Bench,
+) -> None:
+    new, picture = bench.card(), bench.output / "Toy-v0" / "former.webp"
+    picture.write_bytes((bench.output / "Toy-v0" / "up.webp").read_bytes())
+    (bench.output / "Toy-v0.md").write_text("old")
+    resolve("clbench.leaderboard.cli:scenario_card")(records=bench.records, output=bench.output, episodes=3)
+    assert (bench.output / "Toy-v0.md").read_text().replace("\\", "") == new
+    assert not picture.exists()
+
+
 def test_without_a_name_the_scenarios_with_records_have_cards(bench: Bench) -> None:
     with pytest.raises(SystemExit) as stopped:
         resolve("clbench.leaderboard.cli:scenario_card")(records=bench.records, output=bench.output)
