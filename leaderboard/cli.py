@@ -160,6 +160,7 @@ def verify(
     by: str | None = None,
     workers: Annotated[int | None, whole_number(1)] = None,
     records: Path = RECORDS,
+    as_json: AsJson = False,
 ) -> None:
     """Check the records at PATHS, and write the tier that each reaches into a file next to it.
 
@@ -180,8 +181,9 @@ def verify(
         by: Your name, for the file (default: none).
         workers: Number of verifications at once, each a process with one thread (default: all cores).
         records: Folder of the records.
+        as_json: Print JSON: of each record whether it passed, its tier, the checks and the failure.
     """
-    from .board.tiers import TIERS
+    from .board.tiers import TIERS, checks_of, tier_of
     from .submission.subject import Request
     from .submission.verify import run_verifications
 
@@ -196,7 +198,21 @@ def verify(
         found, records = _placed(_found(paths, records), records)
     seed = secrets.randbits(48) if seed is None else seed
     request = Request(tier, episodes, seed, method, scenario, checkpoints, pretrain, by)
-    if not run_verifications(found, records, request, workers):
+    failures = run_verifications(found, records, request, workers, Console(stderr=as_json))
+    if as_json:
+        print_json(
+            [
+                {
+                    "path": str(path),
+                    "passed": path not in failures,
+                    "tier": tier_of(path),
+                    "checks": checks_of(path),
+                    "failure": failures.get(path),
+                }
+                for path in found
+            ]
+        )
+    if failures:
         raise SystemExit(1)
 
 

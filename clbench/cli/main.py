@@ -49,6 +49,17 @@ COMMANDS = {
 }
 """Entry points of the commands, in the groups of `clbench --help`."""
 
+NAMES = {
+    "run": "SCENARIOS [METHODS...]",
+    "status": "[SCENARIOS] [METHODS...]",
+    "leaderboard": "[SCENARIO]",
+    "metrics": "[NAME]",
+    "tune": "SCENARIO [METHODS...]",
+    "verify": "PATHS...",
+    "scenario-card": "[SCENARIOS...]",
+}
+"""Arguments in the first line of a command's help, where Cyclopts would show [ARGS...]."""
+
 EXPERTS = {
     "measure": "clbench.cli.data:measure",
     "train": "clbench.envs.dm_control.expert_training.cli:train",
@@ -114,7 +125,9 @@ def _app(name: str, text: str, commands: dict[Group, dict[str, str]]) -> App:
     )
     for group, members in commands.items():
         for number, (command, entry_point) in enumerate(members.items()):
-            made.command(entry_point, name=command, group=group, sort_key=number)
+            names = NAMES.get(command)
+            usage = f"Usage: {name} {command} [OPTIONS] {names}\n" if names else None
+            made.command(entry_point, name=command, group=group, sort_key=number, usage=usage)
     return made
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 from pathlib import Path
+from typing import Any
 
 from clbench.base.strict_json import read_json
 
@@ -23,10 +24,20 @@ def verification_path(record: Path) -> Path:
 
 def tier_of(record: Path) -> str:
     """Return the tier of the record at `record`, "self-reported" if no verification holds for its bytes."""
+    return str(_verification(record).get("tier", TIERS[0]))
+
+
+def checks_of(record: Path) -> list[Any]:
+    """Return the checks that gave the record at `record` its tier; none if no verification holds for its bytes."""
+    return [*_verification(record).get("checks", ())]
+
+
+def _verification(record: Path) -> dict[str, Any]:
+    """Return the verification of a record, empty if it does not hold for its bytes."""
     try:
         values = read_json(verification_path(record))
         if values["record"] == hashlib.sha256(record.read_bytes()).hexdigest() and values["tier"] in TIERS:
-            return str(values["tier"])
+            return dict(values)
     except (OSError, ValueError, KeyError, TypeError):
         pass
-    return TIERS[0]
+    return {}

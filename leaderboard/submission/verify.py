@@ -244,10 +244,13 @@ def _as_dictionary(part: Any) -> Any:
 # ---- the job -----------------------------------------------------------------------------------------------
 
 
-def run_verifications(paths: Sequence[Path], records: Path, request: Request, workers: int | None) -> bool:
-    """Verify records, each in its own process, and return whether all of them passed."""
-    jobs = [_job(path, records, request) for path in paths]
-    return not run_with_bars(jobs, Processes(workers), Console())
+def run_verifications(
+    paths: Sequence[Path], records: Path, request: Request, workers: int | None, console: Console
+) -> dict[Path, str]:
+    """Verify records, each in its own process, and return why those failed that did."""
+    jobs = {_job(path, records, request): path for path in paths}
+    failed = run_with_bars([*jobs], Processes(workers), console)
+    return {jobs[job]: reason for job, reason in failed.items()}
 
 
 def _job(path: Path, records: Path, request: Request) -> Job:

@@ -224,6 +224,15 @@ def test_help_shows_every_command_with_its_summary_and_imports_none() -> None:
     assert lines[-1] == "set()"
 
 
+def test_the_first_line_of_a_commands_help_names_its_arguments(capsys: pytest.CaptureFixture[str]) -> None:
+    for name in PLACES:
+        app([name, "--help"], result_action="return_value")
+        assert "ARGS" not in capsys.readouterr().out
+    app(["run", "--help"], result_action="return_value")
+    first = capsys.readouterr().out.splitlines()[0]
+    assert first == "Usage: clbench run [OPTIONS] SCENARIOS [METHODS...]"
+
+
 @pytest.mark.parametrize(
     "command", [name for name, place in PLACES.items() if place.startswith("clbench.cli.")]
 )
