@@ -28,7 +28,7 @@ def tier_of(record: Path) -> str:
 
 
 def checks_of(record: Path) -> list[Any]:
-    """Return the checks that gave the record at `record` its tier; none if no verification holds for its bytes."""
+    """Return the checks that gave the record at `record` its tier, none without a valid verification."""
     return [*_verification(record).get("checks", ())]
 
 

@@ -400,13 +400,13 @@ def test_the_command_lists_its_checks(mine: Path, honest: Path, capsys: pytest.C
 
 
 def test_the_command_prints_json_of_good_and_bad_records(
-    mine: Path, honest: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    mine: Path, honest: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     command = importlib.import_module("clbench.leaderboard.cli").verify
     records = next(folder for folder in mine.parents if folder.name == "records")
+    bad = mine.with_name("seed-1.json")
+    bad.write_text("{}")
     with pytest.raises(SystemExit) as stopped:
-        bad = mine.with_name("seed-1.json")
-        bad.write_text("{}")
         command(mine, bad, tier="recomputed", scenario=TOY, records=records, workers=1, as_json=True)
     assert stopped.value.code == 1
     good, bad_one = json.loads(capsys.readouterr().out)
