@@ -194,6 +194,6 @@ KNOWLEDGE = dataclasses.replace(
 )
 """The policy of `SCENARIO` and one long stage, in which plain fine-tuning loses answers to questions.
 
-Tried with sft on seed 100: .01 of the answers are lost after 80 steps, .03 after 320 and .10 after 1280. With
-a learning rate of 3e-4 it is .01 after 1280 steps.
+Tried with sft on seed 100: .02 of the answers are lost after 80 steps, .06 after 320 and .12 after 1280. With
+a learning rate of 3e-4 it is .02 after 1280 steps.
 """
