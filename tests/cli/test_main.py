@@ -7,6 +7,7 @@ import sys
 from collections.abc import Callable, Sequence
 from importlib import metadata
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -15,6 +16,8 @@ from clbench.cli.arguments import checked_input
 from clbench.cli.main import COMMANDS, app
 from clbench.jobs.job import Job
 from clbench.jobs.work import do_run
+from clbench.runs.run import execute
+from clbench.runs.spec import RunSpec
 
 TOY = "clbench.testing:clbench/Toy-v0"
 
@@ -262,16 +265,20 @@ def test_tab_completes_scenarios_and_methods(words: list[str], expected: str) ->
     assert expected in _clbench("__complete", *words).stdout.splitlines()
 
 
-def test_lists_metrics_and_the_machine_come_as_json_too() -> None:
-    found = json.loads(_clbench("list", "--json").stdout)
+def test_lists_metrics_and_the_machine_come_as_json_too(capsys: pytest.CaptureFixture[str]) -> None:
+    def printed(*words: str) -> Any:
+        app([*words, "--json"], result_action="return_value")
+        return json.loads(capsys.readouterr().out)
+
+    found = printed("list")
     (fetch,) = (one for one in found["scenarios"] if one["id"] == "clbench/Fetch-v1")
     assert "push_right" in fetch["target"]
     (replay,) = (one for one in found["methods"] if one["name"] == "experience_replay")
     assert (replay["demonstrations"], replay["questions"]) == ("throughout", "never")
-    every = json.loads(_clbench("metrics", "--json").stdout)
-    (one,) = json.loads(_clbench("metrics", "forgetting", "--json").stdout)
+    every = printed("metrics")
+    (one,) = printed("metrics", "forgetting")
     assert one in every
-    machine = json.loads(_clbench("doctor", "--json").stdout)
+    machine = printed("doctor")
     assert (machine["ready"], machine["mend"]) == (True, [])
     assert machine["clbench"] == __version__
     assert "torch" in machine["packages"]
@@ -335,9 +342,8 @@ def test_a_dry_run_says_what_would_be_done_and_does_nothing(
 def test_a_dry_run_counts_recorded_runs_whose_policies_would_be_made_again(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    command = ["run", TOY, "sft", "--seeds", "1", "--records", str(tmp_path / "records")]
-    app(command, result_action="return_value")
-    capsys.readouterr()
+    execute(RunSpec(TOY, "frozen", 0), tmp_path / "records")
+    command = ["run", TOY, "frozen", "--seeds", "1", "--records", str(tmp_path / "records")]
     app([*command, "--dry-run"], result_action="return_value")
     assert capsys.readouterr().out == "1 of 1 run done already.\n"
     app([*command, "--dry-run", "--checkpoints", str(tmp_path / "kept")], result_action="return_value")
@@ -351,7 +357,9 @@ def test_a_quiet_run_prints_failures_alone(
     tmp_path: Path, write_module: Callable[[str, str], None], capsys: pytest.CaptureFixture[str]
 ) -> None:
     write_module("loud", METHOD)  # a name of its own: the module stays imported
-    app(["run", TOY, "sft", "--seeds", "1", "-q", "--records", str(tmp_path)], result_action="return_value")
+    app(
+        ["run", TOY, "frozen", "--seeds", "1", "-q", "--records", str(tmp_path)], result_action="return_value"
+    )
     assert capsys.readouterr() == ("", "")
     with pytest.raises(SystemExit):
         app(["run", TOY, "loud:Broken", "--seeds", "1", "-q", "--records", str(tmp_path)])
