@@ -1,8 +1,9 @@
-"""Texts in messages: names of strangers, counts, and the nearest right name."""
+"""Texts for people: names of strangers, counts, the nearest right name, and tables for notebooks."""
 
 from __future__ import annotations
 
 import difflib
+import html
 from collections.abc import Iterable
 
 
@@ -31,3 +32,15 @@ def did_you_mean(name: str, known: Iterable[str]) -> str:
     """Return the end of a message with the known name that is nearest, empty if none is near."""
     near = difflib.get_close_matches(name, known, n=1)
     return f" Did you mean {near[0]!r}?" if near else ""
+
+
+def html_table(title: str, columns: Iterable[str], rows: Iterable[Iterable[object]]) -> str:
+    """Return a title and a table as HTML, all texts escaped; a tuple in a cell gets a line for each item."""
+
+    def cell(value: object) -> str:
+        parts = value if isinstance(value, tuple) else (value,)
+        return f"<td>{'<br>'.join(html.escape(str(part)) for part in parts)}</td>"
+
+    head = "".join(f"<th>{html.escape(name)}</th>" for name in columns)
+    body = "".join(f"<tr>{''.join(map(cell, row))}</tr>" for row in rows)
+    return f"<p>{html.escape(title)}</p><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"

@@ -6,11 +6,12 @@ import math
 import random
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Literal
+from typing import Literal, get_args
 
 from clbench.base.dependencies import require_packages
 from clbench.base.entry_points import unknown
 from clbench.base.errors import InputError
+from clbench.base.text import html_table
 from clbench.spec.budget import Budget
 from clbench.spec.fields import check_entry_point
 from clbench.spec.limits import Limits
@@ -73,6 +74,16 @@ class Scenario:
             f"{name} {', '.join(task.name for task in group)}" for name, group in groups.items() if group
         )
         return f"<Scenario {self.id}: {names}>"
+
+    def _repr_html_(self) -> str:
+        """Return the tasks with their groups as a table, for notebooks."""
+        rows = [
+            (group.replace("_", " "), task.name, task.instructions[0], task.horizon)
+            for group in get_args(Group)
+            for task in getattr(self, group)
+        ]
+        title = f"{self.id}: {self.description}"
+        return html_table(title, ("group", "task", "instruction", "horizon in steps"), rows)
 
     @cached_property
     def tasks(self) -> tuple[Task, ...]:

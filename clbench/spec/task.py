@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 from clbench.base.errors import InputError, WrongTypeError
 from clbench.base.source import package_of
+from clbench.base.text import html_table
 from clbench.spec.fields import check_entry_point, check_share, check_whole
 from clbench.spec.identifiers import check_plain
 from clbench.spec.protocol import Split
@@ -62,6 +63,13 @@ class Task:
         check_whole(self, 0, "version")
         check_share(self, "action_noise")
         check_entry_point(self, "world", "expert", *(("camera",) if self.camera is not None else ()))
+
+    def _repr_html_(self) -> str:
+        """Return what defines the task as a table, for notebooks."""
+        names = ("instructions", "test_instructions", "horizon", "world", "expert", "camera", "version")
+        rows = [(name.replace("_", " "), getattr(self, name)) for name in names]
+        title = f"Task {self.name} of the suite {self.suite}"
+        return html_table(title, ("field", "value"), [row for row in rows if row[1] not in (None, ())])
 
     def wordings(self, split: Split) -> tuple[str, ...]:
         """Return the wordings of the instruction in the episodes of a split, which take turns."""

@@ -70,6 +70,18 @@ def test_records_and_scenarios_say_in_a_line_what_they_are(records: Path) -> Non
     assert text == "<Scenario clbench/Toy-v0: retained left, up; targets right, down; held out up_left>"
 
 
+def test_notebooks_show_scenarios_and_tasks_as_tables() -> None:
+    scenario = clbench.load_scenario("clbench.testing:clbench/Toy-v0")
+    shown = scenario._repr_html_()
+    assert shown.count("<tr>") == 1 + len(scenario.tasks)
+    assert "<td>held out</td><td>up_left</td>" in shown
+    task = scenario.task("right")
+    shown = task._repr_html_()
+    assert "<br>".join(task.instructions) in shown
+    assert f"<td>horizon</td><td>{task.horizon}</td>" in shown
+    assert "<td>camera</td>" not in shown
+
+
 def test_the_table_of_a_run_that_failed_at_once_is_empty(make_record: Callable[..., Record]) -> None:
     record = make_record(RATES, episodes=4)
     for column in record.episodes.values():
