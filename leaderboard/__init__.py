@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     import pandas
 
-__all__ = ["load"]
+    from .views.page.plot import Plot
+
+__all__ = ["load", "plot"]
 
 
 def load(records: Path | str = Path("leaderboard/records")) -> pandas.DataFrame:
@@ -37,3 +40,37 @@ def load(records: Path | str = Path("leaderboard/records")) -> pandas.DataFrame:
     frame = pandas.DataFrame(rows, columns=column_names(), dtype=object)
     kinds = {"seeds": "int64", **dict.fromkeys(("scenario", "method", "division", "groups", "tier"), "str")}
     return frame.astype({name: kinds.get(name, "float64") for name in column_names()})
+
+
+def plot(
+    records: Path | str = Path("leaderboard/records"), scenario: str | None = None, *, dark: bool = False
+) -> Plot:
+    """Return a chart of the methods of a scenario: kept skills against learned targets, with intervals.
+
+    Notebooks show it, and its `save` writes an SVG, PNG or PDF file.
+
+    Args:
+        records: Folder of the records.
+        scenario: Gymnasium id of the scenario (default: the one with most rows).
+        dark: Whether to use the colours for a dark page.
+
+    Raises:
+        FileNotFoundError: The folder does not exist.
+        InputError: No record makes a row.
+        UnknownNameError: The scenario has no row.
+    """
+    from clbench.base.entry_points import unknown
+    from clbench.base.errors import InputError
+
+    from .board.rows import read_table
+    from .views.page.charts import FONT, WIDE, plane
+    from .views.page.plot import themed
+
+    rows = read_table(Path(records)).rows
+    counts = Counter(row.scenario for row in rows)
+    if not counts:
+        raise InputError(f"No record in {records} makes a row; `clbench leaderboard` says why.")
+    chosen = scenario or max(counts, key=counts.__getitem__)
+    if chosen not in counts:
+        raise unknown("scenario with a row", chosen, counts)
+    return themed(plane([row for row in rows if row.scenario == chosen], WIDE, font=FONT), dark)

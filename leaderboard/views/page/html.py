@@ -21,10 +21,11 @@ from ...board.overall import overall
 from ...board.rows import Row, Table
 from ...board.tiers import TIERS
 from ..format import format_interval, number_text, title_of
-from .charts import FONT, NARROW, PALETTE, SERIES, SHAPES, WIDE, along_a_run, colour, in_theme, plane
+from .charts import FONT, NARROW, PALETTE, SERIES, SHAPES, WIDE, along_a_run, plane
 from .frontier import NARROW as NARROW_FRONTIER
 from .frontier import WIDE as WIDE_FRONTIER
 from .frontier import frontier
+from .plot import VEGA_LITE, themed
 from .view import SHADES, ScenarioView, columns, grouped, number, scenarios
 
 FOLDER = Path(__file__).parent
@@ -40,9 +41,6 @@ TIER_RULES = (
     "The whole runs were repeated.",
 )
 """How the rows of each tier were verified."""
-
-VEGA_LITE = "6.4"
-"""Version of Vega-Lite that the charts are written for."""
 
 CIVIDIS = (
     "#00204d",
@@ -96,10 +94,8 @@ def pictures(table: Table) -> dict[str, str]:
         specs[f"frontier-{folder_name(scenario)}"] = frontier(curves, WIDE_FRONTIER, FONT)
     found = {}
     for name, spec in specs.items():
-        spec["config"]["background"] = colour("paper")
-        svg = vl_convert.vegalite_to_svg(spec, vl_version=VEGA_LITE) + "\n"
-        found[f"{name}.svg"] = in_theme(svg, dark=False)
-        found[f"{name}-dark.svg"] = in_theme(svg, dark=True)
+        for dark in (False, True):
+            found[f"{name}{'-dark' * dark}.svg"] = themed(spec, dark).svg() + "\n"
     return found
 
 
