@@ -1,5 +1,8 @@
 """One run that dies, or meets a full disk, at any operation that changes files: nothing is lost or torn."""
 
+import random
+import time
+from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -14,6 +17,9 @@ POINTS = 3
 """Operations that the quick test tries, spread over the run; the slow one tries all."""
 
 FULL_DISKS = 20
+
+KILLS, PAST_A_CHECKPOINT = 60, 20
+"""Kills at random moments, and how many of them must come after the first checkpoint at least."""
 
 
 @pytest.fixture(scope="module")
@@ -81,6 +87,27 @@ def test_a_run_that_dies_at_any_operation_is_completed_by_the_next_start(
 ) -> None:
     folder, count = whole
     _die(list(range(1, count + 1)), runs, tmp_path, folder, lasting_records)
+
+
+@pytest.mark.slow
+def test_a_run_that_is_killed_at_a_random_moment_is_completed_by_the_next_start(
+    runs: Runs,
+    whole: tuple[Path, int],
+    tmp_path: Path,
+    lasting_records: Callable[[Path], dict[str, Any]],
+    record_property: Callable[[str, object], None],
+) -> None:
+    begin = time.monotonic()
+    assert runs.do(tmp_path / "timed")[1] == "success"
+    longest, moments = time.monotonic() - begin, random.Random(0)
+    came: Counter[str] = Counter()
+    while came["before a checkpoint"] + came["after one"] < KILLS or came["after one"] < PAST_A_CHECKPOINT:
+        folder = tmp_path / str(came.total())
+        _, end = runs.do(folder, after=moments.uniform(0, longest))
+        past = any(folder.glob("cache/runs/*/stage-*"))
+        came["too late" if end != "killed" else "after one" if past else "before a checkpoint"] += 1
+        _check_next_start(runs, folder, whole[0], lasting_records)
+    record_property("counts", dict(came))
 
 
 @pytest.mark.parametrize("share", [0.5, pytest.param(None, marks=pytest.mark.slow)])

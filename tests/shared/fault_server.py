@@ -13,6 +13,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -59,11 +60,20 @@ def _watch(at: int | None, fault: str) -> Callable[[], int]:
     return lambda: count
 
 
+def _die_after(seconds: float) -> None:
+    """Let the process be killed in some seconds, whatever it does then."""
+    timer = threading.Timer(seconds, os.kill, (os.getpid(), signal.SIGKILL))
+    timer.daemon = True
+    timer.start()
+
+
 def _run(order: dict[str, Any], answer: int) -> None:
     """Do a run in this process, and write how it ended."""
     os.environ.update(order["environment"])
     records = Path(order["records"])
     operations = _watch(order.get("at"), order.get("fault", DIES))
+    if "after" in order:
+        _die_after(order["after"])
     try:
         sweep(records, *map(Path, order["environment"].values()))
         end: str = execute(RunSpec(TOY, order["method"], order["seed"]), records).status
