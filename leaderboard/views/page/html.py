@@ -21,11 +21,11 @@ from ...board.overall import overall
 from ...board.rows import Row, Table
 from ...board.tiers import TIERS
 from ..format import format_interval, number_text, title_of
-from .charts import FONT, NARROW, PALETTE, SERIES, SHAPES, WIDE, along_a_run, plane
+from .charts import FONT, NARROW, PALETTE, SERIES, SHAPES, WIDE, along_a_run, in_theme, plane
 from .frontier import NARROW as NARROW_FRONTIER
 from .frontier import WIDE as WIDE_FRONTIER
 from .frontier import frontier
-from .plot import VEGA_LITE, themed
+from .plot import VEGA_LITE, on_paper
 from .view import SHADES, ScenarioView, columns, grouped, number, scenarios
 
 FOLDER = Path(__file__).parent
@@ -94,8 +94,9 @@ def pictures(table: Table) -> dict[str, str]:
         specs[f"frontier-{folder_name(scenario)}"] = frontier(curves, WIDE_FRONTIER, FONT)
     found = {}
     for name, spec in specs.items():
-        for dark in (False, True):
-            found[f"{name}{'-dark' * dark}.svg"] = themed(spec, dark).svg() + "\n"
+        svg = on_paper(spec).svg() + "\n"
+        found[f"{name}.svg"] = in_theme(svg, dark=False)
+        found[f"{name}-dark.svg"] = in_theme(svg, dark=True)
     return found
 
 

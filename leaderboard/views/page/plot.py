@@ -6,7 +6,6 @@ import json
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import vl_convert
 
@@ -56,7 +55,11 @@ class Plot:
         path.write_bytes(made.encode() if isinstance(made, str) else made)
 
 
-def themed(spec: dict[str, Any], dark: bool) -> Plot:
-    """Return a chart with the colours of a theme instead of their names, on its paper."""
-    spec["config"]["background"] = colour("paper")
-    return Plot(json.loads(in_theme(json.dumps(spec), dark)))
+def on_paper(spec: Spec) -> Plot:
+    """Return a chart with a background, its colours still the names of `PALETTE`."""
+    return Plot({**spec, "config": {**spec["config"], "background": colour("paper")}})
+
+
+def themed(spec: Spec, dark: bool) -> Plot:
+    """Return a chart with a background, in the colours of a theme."""
+    return Plot(json.loads(in_theme(json.dumps(on_paper(spec).spec), dark)))
