@@ -207,7 +207,7 @@ def _machine() -> dict[str, str]:
     import torch
 
     from clbench.base.cache import cache_folder
-    from clbench.cli.arguments import minari_folder
+    from clbench.jobs.folders import minari_folder
     from clbench.worlds.gl_backend import DEBIAN_PACKAGES, rendering_fault
 
     faults = {back_end: rendering_fault(back_end) for back_end in DEBIAN_PACKAGES}

@@ -171,7 +171,7 @@ class Evaluator:
         )
         lanes = []
         for (lane, trial), (seed, instruction), state in zip(starting, starts, states, strict=True):
-            words = encode([instruction])[0]
+            words = encode([instruction], policy.config.text_length)[0]
             forwards = -(-trial[0].horizon // policy.config.executed)
             shape = (forwards, policy.config.chunk, policy.config.action_size)
             noise = torch.randn(shape, generator=torch_generator("noise", seed))

@@ -113,7 +113,7 @@ def make_stages(run: ResolvedRun, progress: ProgressCallback = no_progress) -> P
                 steps = trainer.learn(number, after)
                 progress(scenario.budget.adaptation_steps - steps if scenario.budget.criterion else 0)
             else:
-                trainer.prepare()
+                trainer.prepare(progress)
             trainer.save(folder, trainer.state(number))
         except Exception as error:
             message = f"{run.label} failed in {trainer.where}: {type(error).__name__}: {error}"

@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 from clbench.spec.protocol import EPISODE_WEIGHT, Point, Protocol
 from clbench.spec.scenario import Scenario
+
+if TYPE_CHECKING:
+    from clbench.learning.method import Method
 
 
 def run_length(scenario: Scenario, protocol: Protocol) -> float:
@@ -16,6 +21,13 @@ def run_length(scenario: Scenario, protocol: Protocol) -> float:
     points = (point for stage in protocol.stages for point in protocol.points(stage))
     evaluation = sum(point_length(protocol, point) for point in points)
     return training_length(scenario) + evaluation + relearning_length(protocol)
+
+
+def watching_length(method: type[Method], scenario: Scenario) -> float:
+    """Return the length of the pretraining that is repeated for a method that watches it, else 0."""
+    from clbench.learning.watching import watches
+
+    return float(scenario.budget.pretraining_steps) if watches(method) else 0.0
 
 
 def training_length(scenario: Scenario) -> float:

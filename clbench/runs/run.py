@@ -221,7 +221,7 @@ class _Run:
     def _prepare(self) -> None:
         """Let the method prepare, and evaluate the policy before any target."""
         begin = time.perf_counter()
-        steps = self.trainer.prepare()
+        steps = self.trainer.prepare(self.progress)
         self.record.timing["preparation"] = round(time.perf_counter() - begin, 2)
         self.record.costs.preparation_steps = steps
         self._count_steps(steps)

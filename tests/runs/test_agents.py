@@ -1,7 +1,5 @@
-"""Agents that learn by trial and error: their observations, their records, and their rows on the board."""
+"""Agents that learn by trial and error: their observations and their records."""
 
-import importlib
-import json
 import os
 import subprocess
 import sys
@@ -12,38 +10,15 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
-from helpers import sealed
+from agents import ID, LEARNED, TOY, Knowing, stage_env, trained
 
-from clbench.base.entry_points import resolve
 from clbench.records.reader import read_record
 from clbench.records.record import Costs
 from clbench.runs.agents import evaluate_agent, next_stage
 from clbench.scoring.metrics import measure
 from clbench.scoring.scores import Scores
-from clbench.spec.registry import load_scenario
 from clbench.worlds.scenario_env import Observation, ScenarioEnv
 from clbench.worlds.scenario_vector_env import ScenarioVectorEnv
-
-ID = "clbench.testing:clbench/Toy-v0"
-TOY = load_scenario(ID)
-EXPERTS = {words: resolve(task.expert)(task.name) for task in TOY.tasks for words in task.instructions}
-
-
-class Knowing:
-    """An agent that acts like the experts of the tasks that it knows."""
-
-    def __init__(self, *tasks: str) -> None:
-        self.words = {words for name in tasks for words in TOY.task(name).instructions}
-
-    def predict(self, observation: Observation, *, deterministic: bool) -> tuple[Any, Any]:
-        assert deterministic
-        words = observation["instruction"]
-        action = EXPERTS[words](observation["state"]) if words in self.words else np.zeros(2)
-        return action, None
-
-
-def stage_env(stage: int, **options: Any) -> gymnasium.Env[Any, Any]:
-    return gymnasium.make(ID, stage=stage, **options)
 
 
 class Looking:
@@ -57,16 +32,6 @@ class Looking:
         return np.zeros(2), None
 
 
-def trained(stage: int, steps: int) -> gymnasium.Env[Any, Any]:
-    """Return the environment of a stage after `steps` steps."""
-    env = stage_env(stage)
-    env.reset(seed=0)
-    for _ in range(steps):
-        if any(env.step(np.zeros(2, np.float32))[2:4]):
-            env.reset()
-    return env
-
-
 @pytest.fixture
 def evaluate(tmp_path: Path, empty_caches: Path) -> Callable[..., Any]:
     """Return `evaluate_agent` for the method me/knows, with separate records and caches for the test."""
@@ -77,10 +42,6 @@ def evaluate(tmp_path: Path, empty_caches: Path) -> Callable[..., Any]:
         )
 
     return evaluate
-
-
-LEARNED = (("left", "up"), ("up", "right"), ("up", "right", "down"))
-"""Tasks that an agent knows after each stage: it forgets "left" when it learns "right"."""
 
 
 def test_an_agent_observes_exactly_what_the_environment_returns(evaluate: Callable[..., Any]) -> None:
@@ -175,6 +136,75 @@ def test_an_agent_receives_its_memory_except_at_the_first_step_of_an_episode(
     agent = Counting()
     evaluate(agent, stage_env(0))
     assert agent.longest == TOY.tasks[0].horizon - 1
+
+
+class Linear:
+    """An agent without memory, for one observation with tokens or for many."""
+
+    def __init__(self) -> None:
+        self.calls = 0
+
+    def predict(self, observation: Observation, *, deterministic: bool) -> tuple[Any, Any]:
+        self.calls += 1
+        words, state = observation["instruction"], observation["state"]
+        return state[..., :2] * np.where(words[..., 1:3] % 2 == 0, -1.0, 1.0), None
+
+
+def outcomes(record: Any) -> dict[str, list[Any]]:
+    return {name: list(values) for name, values in record.episodes.items()}
+
+
+def test_an_agent_that_acts_on_batches_has_the_same_outcomes_in_fewer_calls(
+    evaluate: Callable[..., Any], tmp_path: Path
+) -> None:
+    one, many = Linear(), Linear()
+    env = stage_env(0, instruction="tokens")
+    single = evaluate(one, env, batched=False, records=tmp_path / "single")
+    batch = evaluate(many, env, batched=True, records=tmp_path / "batch")
+    assert outcomes(batch) == outcomes(single)
+    assert 0 < many.calls < one.calls / 10
+    function = evaluate(
+        lambda observation: many.predict(observation, deterministic=True)[0],
+        env,
+        batched=True,
+        records=tmp_path / "function",
+    )
+    assert outcomes(function) == outcomes(single)
+
+
+def test_agents_of_stable_baselines3_act_on_batches_by_themselves(
+    evaluate: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stable_baselines3 = pytest.importorskip("stable_baselines3")
+    env = stage_env(0, instruction="tokens")
+    agent = stable_baselines3.PPO("MultiInputPolicy", env, n_steps=8, batch_size=8, seed=0)
+    predict, shapes = agent.predict, []
+
+    def watch(observation: Observation, **options: Any) -> Any:
+        shapes.append(observation["state"].shape)
+        return predict(observation, **options)
+
+    monkeypatch.setattr(agent, "predict", watch)
+    evaluate(agent, env)
+    assert {shape[0] for shape in shapes} == {40}
+
+
+@pytest.mark.parametrize(
+    ("agent", "message"),
+    [
+        (lambda _: np.zeros(2), r"has the shape \(2,\), not \(40, 2\)"),
+        (lambda _: np.zeros((3, 2)), r"has the shape \(3, 2\), not \(40, 2\)"),
+        (
+            type("Recurrent", (), {"predict": lambda *_, **__: (np.zeros((40, 2)), "memory")})(),
+            "has a memory",
+        ),
+    ],
+)
+def test_an_agent_that_cannot_act_on_batches_is_refused(
+    agent: Any, message: str, evaluate: Callable[..., Any]
+) -> None:
+    with pytest.raises(ValueError, match=message):
+        evaluate(agent, stage_env(0, instruction="tokens"), batched=True)
 
 
 def test_an_agent_that_returns_nan_fails_its_episodes(evaluate: Callable[..., Any]) -> None:
@@ -339,82 +369,3 @@ def test_a_killed_program_continues_with_the_stage_that_was_running(empty_caches
     record = read_record(records / "Toy-v0/me--still/seed-0.json")
     assert record.costs == Costs(environment_steps=3)
     assert not list((empty_caches / "cache" / "online").iterdir())
-
-
-# ---- on the board ------------------------------------------------------------------------------------------
-
-
-@pytest.fixture(scope="module")
-def board(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Folder of a board with a run of sft and a run of an agent."""
-    from clbench.runs.run import execute
-    from clbench.runs.spec import RunSpec
-
-    folder = tmp_path_factory.mktemp("board")
-    execute(RunSpec(ID, "sft", 0), folder / "records")
-    for stage, known in enumerate(LEARNED):
-        evaluate_agent(Knowing(*known), trained(stage, 7), method="me/knows", records=folder / "records")
-    return folder
-
-
-def test_an_agent_has_its_own_division_and_takes_no_part_in_others(board: Path) -> None:
-    table = importlib.import_module("clbench.leaderboard").load(board / "records").set_index("method")
-    assert dict(table["division"]) == {"sft": "prior-data-free", "me/knows": "online"}
-    assert list(table["groups"]) == ["a", "a"]
-    row = table.loc["me/knows"]
-    assert (row["retention"], row["environment_steps"], row["tier"]) == (0.5, 21, "self-reported")
-    for missing in (
-        "question_retention",
-        "forward_transfer",
-        "steps",
-        "bytes_kept",
-        "relative_cost",
-        "parameters",
-    ):
-        assert np.isnan(row[missing]), missing
-
-
-def test_the_page_marks_an_agent_and_shows_no_run_command_for_it(
-    board: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    importlib.import_module("clbench.leaderboard.cli").show(records=board / "records")
-    lines = [" ".join(line.split()) for line in capsys.readouterr().out.splitlines()]
-    assert lines[lines.index("online") + 1].startswith("a me/knows 1 0.75")
-    page = (board / "site" / "index.html").read_text(encoding="utf-8")
-    assert "# me/knows is a separate program: docs/guide/online.md" in page
-    assert "clbench run clbench/Toy-v0 me/knows" not in page
-    assert "| a | me/knows | online |" in (board / "site" / "LEADERBOARD.md").read_text(encoding="utf-8")
-
-
-def test_the_record_of_an_agent_is_recomputed_and_cannot_be_replayed(board: Path) -> None:
-    verify = importlib.import_module("clbench.leaderboard.submission.verify")
-    path = board / "records/Toy-v0/me--knows/seed-0.json"
-    request = verify.Request("replayed", 10, 0, None, ID, None)
-    *passed, last = verify.verify(path, board / "records", request)
-    assert all(check.passed for check in passed)
-    assert (last.passed, last.found) == (
-        False,
-        "an agent that learned online has none, so its highest tier is recomputed",
-    )
-    assert importlib.import_module("clbench.leaderboard.board.tiers").tier_of(path) == "recomputed"
-
-
-@pytest.mark.parametrize(
-    "uses",
-    [
-        {"demonstrations": "never", "questions": "never", "reference": False, "online": False},
-        {"demonstrations": "throughout", "questions": "never", "reference": False, "online": True},
-        {"online": True},
-    ],
-)
-def test_a_record_that_claims_online_learning_and_prior_data_is_refused(
-    uses: dict[str, Any], board: Path, tmp_path: Path
-) -> None:
-    values = json.loads((board / "records/Toy-v0/me--knows/seed-0.json").read_text(encoding="utf-8"))
-    values["run"]["uses"] = uses
-    path = tmp_path / "Toy-v0/me--knows/seed-0.json"
-    path.parent.mkdir(parents=True)
-    path.write_text(json.dumps(sealed(values)), encoding="utf-8")
-    table = importlib.import_module("clbench.leaderboard.board.rows").read_table(tmp_path)
-    assert not table.rows
-    assert table.not_shown[0].reason == "run: uses of an agent that learned online must be of nothing else."

@@ -1,0 +1,175 @@
+"""Episodes of an agent of any library: one after another, or in lock-step if it acts on batches."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing
+from dataclasses import dataclass
+from typing import Any, TypeAlias
+from typing import Protocol as Interface
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from clbench.base.errors import InputError
+from clbench.evaluation.rollouts import LANES, Episode, Trial, start_of
+from clbench.spec.scenario import Scenario
+from clbench.worlds.lanes import Lanes
+from clbench.worlds.scenario_env import Observation
+from clbench.worlds.schedule import InstructionFormat, observed
+
+
+class Predictor(Interface):
+    """An agent with the interface of Stable-Baselines3's algorithms."""
+
+    def predict(self, observation: Any, *, deterministic: bool) -> tuple[Any, Any]:
+        """Return an action (A,), and a memory that the next call receives as `state` unless it is None."""
+        ...
+
+
+Agent: TypeAlias = Predictor | Callable[[Observation], Any]
+"""An agent to evaluate: a `Predictor`, or a function of an observation that returns an action (A,)."""
+
+
+def acts_on_batches(agent: Agent, instruction: InstructionFormat) -> bool:
+    """Return whether an agent is known to act on batches: one of Stable-Baselines3, which read tokens."""
+    module = sys.modules.get("stable_baselines3.common.base_class")
+    return module is not None and instruction == "tokens" and isinstance(agent, module.BaseAlgorithm)
+
+
+@dataclass
+class _Lane:
+    """One running episode."""
+
+    number: int
+    """Number of its lane."""
+    trial: Trial
+    instruction: Any
+    """The instruction as the agent observes it."""
+    state: NDArray[np.float32]
+    memory: Any = None
+    """What the agent returned to receive it with the next observation."""
+    total_reward: float = 0.0
+    length: int = 0
+    success: bool = False
+
+    @property
+    def ended(self) -> bool:
+        """Whether the episode is over."""
+        return self.success or self.length == self.trial[0].horizon
+
+    @property
+    def episode(self) -> Episode:
+        """Outcome of the episode."""
+        task, split, number = self.trial
+        return Episode(task.name, split, number, self.success, self.total_reward, self.length)
+
+
+def play(
+    agent: Agent,
+    scenario: Scenario,
+    trials: Sequence[Trial],
+    seed: int,
+    instruction: InstructionFormat,
+    batched: bool,
+) -> list[Episode]:
+    """Return the outcome of each of `trials`, in their order.
+
+    Args:
+        agent: Agent that acts.
+        scenario: Scenario of the trials.
+        trials: Episodes by task, split and number.
+        seed: Seed of the run; it chooses the initial states.
+        instruction: Form of the instruction in observations.
+        batched: Whether the agent acts on `LANES` observations at once, always as many: another number of
+            rows may round differently. It may have no memory then. Otherwise it plays one episode after
+            another.
+
+    Raises:
+        InputError: An action has the wrong shape, or an agent that acts on batches returned a memory.
+    """
+    count = LANES if batched else 1
+    queue, idle = list(reversed(trials)), list(range(count))
+    live: list[_Lane] = []
+    ended: dict[tuple[str, str, int], Episode] = {}
+    with closing(Lanes(count, threads=os.cpu_count() or 1 if batched else 1)) as lanes:
+        while queue or live:
+            while queue and idle:
+                number, trial = idle.pop(), queue.pop()
+                world_seed, words = start_of(trial, seed)
+                (state,) = lanes.reset([number], [world_seed], [trial[0]])
+                shown = observed(words, instruction, scenario)
+                live.append(_Lane(number, trial, shown, state))
+            actions = (_act_on_batch if batched else _act)(agent, lanes, live)
+            outcomes = lanes.step([lane.number for lane in live], actions)
+            for lane, state, reward, success in zip(list(live), *outcomes, strict=True):
+                lane.state, lane.length, lane.success = state, lane.length + 1, bool(success)
+                lane.total_reward += float(reward)
+                if lane.ended:
+                    one = lane.episode
+                    ended[one.task, one.split, one.number] = one
+                    live.remove(lane)
+                    idle.append(lane.number)
+    return [ended[task.name, split, number] for task, split, number in trials]
+
+
+def _observations(lanes: Lanes, live: Sequence[_Lane]) -> Iterator[Observation]:
+    """Yield what the agent observes in each lane."""
+    tasks = [lane.trial[0] for lane in live]
+    states = np.stack([lane.state for lane in live])
+    numbers, images = lanes.observe([lane.number for lane in live], tasks, states)
+    for row, lane in enumerate(live):
+        picture = {} if lane.trial[0].camera is None else {"image": images[row]}
+        yield {"state": numbers[row], **picture, "instruction": lane.instruction}
+
+
+def _act(agent: Agent, lanes: Lanes, live: Sequence[_Lane]) -> NDArray[np.float32]:
+    """Return the actions (1, A) of an agent in the only lane, and let it keep its memory."""
+    (lane,), (observation,) = live, _observations(lanes, live)
+    predict = getattr(agent, "predict", None)
+    if predict is None:
+        action = agent(observation)  # type: ignore[operator]
+    else:
+        reminder = {} if lane.memory is None else {"state": lane.memory}
+        action, lane.memory = _predicted(predict(observation, deterministic=True, **reminder))
+    return _checked(action, lanes, live, ())
+
+
+def _act_on_batch(agent: Agent, lanes: Lanes, live: Sequence[_Lane]) -> NDArray[np.float32]:
+    """Return the actions (lanes, A) of an agent in all lanes; unused rows repeat the first one."""
+    rows = list(_observations(lanes, live))
+    rows += [rows[0]] * (LANES - len(rows))
+    batch = {name: np.stack([row[name] for row in rows]) for name in rows[0]}
+    predict = getattr(agent, "predict", None)
+    if predict is None:
+        actions, memory = agent(batch), None  # type: ignore[operator]
+    else:
+        actions, memory = _predicted(predict(batch, deterministic=True))
+    if memory is not None:
+        raise InputError("The agent has a memory, and cannot act on batches: pass batched=False.")
+    return _checked(actions, lanes, live, (LANES,))[: len(live)]
+
+
+def _predicted(found: Any) -> tuple[Any, Any]:
+    if not (isinstance(found, tuple) and len(found) == 2):
+        raise InputError("predict() must return (action, state), as in Stable-Baselines3.")
+    return found
+
+
+def _checked(action: Any, lanes: Lanes, live: Sequence[_Lane], rows: tuple[int, ...]) -> NDArray[np.float32]:
+    """Return actions (N, A) within the space of the first lane; all tasks of a scenario share it."""
+    space: spaces.Box = lanes.world(live[0].trial[0]).single_action_space
+    shape = (*rows, *space.shape)
+    try:
+        numbers = np.asarray(action, np.float64)
+    except (TypeError, ValueError) as error:
+        raise InputError(
+            f"The agent's action must be {space.shape[0]} numbers, not a {type(action).__name__}."
+        ) from error
+    if numbers.shape != shape:
+        raise InputError(f"The agent's action has the shape {numbers.shape}, not {shape}.")
+    # a diverged agent acts with zeros and fails, like a diverged policy
+    return np.nan_to_num(numbers.reshape(-1, *space.shape)).clip(space.low, space.high).astype(np.float32)
