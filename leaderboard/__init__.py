@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     import pandas
 
+    from .board.summary import Summary
     from .views.page.plot import Plot
 
 __all__ = ["load", "plot"]
@@ -32,11 +33,18 @@ def load(records: Path | str = Path("leaderboard/records")) -> pandas.DataFrame:
     Raises:
         FileNotFoundError: The folder does not exist.
     """
+    from .board.rows import read_table
+
+    return frame_of(read_table(Path(records)))
+
+
+def frame_of(board: Summary) -> pandas.DataFrame:
+    """Return a board as a table, with the columns of `load`."""
     import pandas
 
-    from .board.rows import column_names, read_table, values_of
+    from .board.summary import column_names, values_of
 
-    rows = [values_of(row) for row in read_table(Path(records)).rows]
+    rows = [values_of(row) for row in board.rows]
     frame = pandas.DataFrame(rows, columns=column_names(), dtype=object)
     kinds = {"seeds": "int64", **dict.fromkeys(("scenario", "method", "division", "groups", "tier"), "str")}
     return frame.astype({name: kinds.get(name, "float64") for name in column_names()})

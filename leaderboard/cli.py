@@ -20,19 +20,19 @@ from clbench.cli.arguments import (
     MethodName,
     ScenarioId,
     add_cwd_to_path,
-    check_folders,
     check_names,
     checked_input,
-    data_folders,
     print_json,
     whole_number,
 )
+from clbench.jobs.folders import check_folders
 from clbench.records.paths import RECORDS, record_path
 
 from .board.places import CONTROLS, SCENARIO
 
 if TYPE_CHECKING:
     from .board.rows import Table
+    from .board.summary import Summary
 
 # Whatever imports PyTorch, SciPy or the charts is imported where it is needed: `--help` does not wait for it.
 
@@ -57,41 +57,57 @@ def show(
         records: Folder of the records.
         as_json: Print JSON, one object for each row with every metric and cost, and write no files.
     """
-    from .board.rows import column_names, read_table, values_of
+    from .board.summary import column_names, values_of
+    from .publishing import inputs_of, read_unchanged, site_of, write_site
     from .views.terminal import terminal
 
     if not any(records.rglob("*.json")):
         message = f"There are no records in {records}. Make some first: clbench run {SCENARIO} sft"
         Console(stderr=True, soft_wrap=True).print(Text(message))
         raise SystemExit(2)
-    table = read_table(records)
+    inputs = inputs_of(records)
+    board = read_unchanged(records, inputs)
+    table = None
+    if board is None:
+        board = table = _computed(records)
     with checked_input():
-        shown = _chosen(table, scenario, sort)
+        shown = _chosen(board, scenario, sort)
     if as_json:
         print_json([dict(zip(column_names(), values_of(row), strict=True)) for row in shown.rows])
         return
-    written = _write_table(table, records)
+    written = [] if table is None else write_site(table, records, inputs)
     console = Console()
     console.print(terminal(shown, console.width, sort))
-    _print_written(written)
+    if written:
+        _print_written(written)
+    else:
+        console.print(Text(f"Unchanged: {site_of(records)}"), soft_wrap=True)
 
 
-def _chosen(table: Table, scenario: str | None, sort: str | None) -> Table:
-    """Return the part of the table that is asked for, if there is such a scenario and such a metric.
+def _computed(records: Path) -> Table:
+    """Return the table of the records; a spinner shows that it takes time."""
+    from .board.rows import read_table
+
+    with Console(stderr=True).status("Computing the board and its intervals"):
+        return read_table(records)
+
+
+def _chosen(board: Summary, scenario: str | None, sort: str | None) -> Summary:
+    """Return the part of the board that is asked for, if there is such a scenario and such a metric.
 
     Raises:
-        UnknownNameError: The table has no rows of the scenario, or no metric has the name of `sort`.
+        UnknownNameError: The board has no rows of the scenario, or no metric has the name of `sort`.
     """
     from clbench.scoring.metrics import load_metric
 
     if sort is not None:
         load_metric(sort)
     if scenario is None:
-        return table
-    if scenario not in table.scenarios:
-        raise unknown("scenario with records", scenario, table.scenarios)
-    rows = tuple(row for row in table.rows if row.scenario == scenario)
-    return replace(table, rows=rows, not_shown=())
+        return board
+    rows = tuple(row for row in board.rows if row.scenario == scenario)
+    if not rows:
+        raise unknown("scenario with records", scenario, board.starts)
+    return replace(board, rows=rows, not_shown=())
 
 
 def submit(
@@ -130,6 +146,7 @@ def submit(
     from clbench.runs.spec import RunSpec, check_device
 
     from .board.rows import read_table
+    from .publishing import inputs_of, write_site
     from .submission.submit import placement, run_submission
 
     add_cwd_to_path()
@@ -137,11 +154,12 @@ def submit(
         check_device(device)
         first = RunSpec(scenario, method, first_seed, device=device, order=order)
         runs = [replace(first, seed=first_seed + number).resolve() for number in range(seeds)]
-        check_folders(records=records, checkpoints=checkpoints, **data_folders())
+        check_folders({"--records": records, "--checkpoints": checkpoints})
         went_well = run_submission(runs, records, workers, checkpoints)
     if records.is_dir():
+        inputs = inputs_of(records)
         table = read_table(records)
-        _print_written(_write_table(table, records))
+        _print_written(write_site(table, records, inputs))
         lines = placement(table, runs[0], records)
         Console().print(Text("\n".join(lines)), soft_wrap=True)
     if not went_well:
@@ -352,24 +370,7 @@ def _table(records: Path) -> Table:
     """Return the table of the records, an empty one if there is no folder."""
     from .board.rows import Table, read_table
 
-    return read_table(records) if records.is_dir() else Table({}, (), ())
-
-
-def _write_table(table: Table, records: Path) -> list[Path]:
-    """Write every form of the table to the folder `site` next to the records, and return the paths."""
-    from .views import page as web_page
-    from .views.csv import csv_text
-    from .views.format import write_all
-    from .views.markdown import markdown
-
-    folder = Path(os.path.normpath(records / "../site"))
-    texts = {
-        "LEADERBOARD.md": markdown(table),
-        "leaderboard.csv": csv_text(table),
-        "index.html": web_page.page(table),
-        **web_page.pictures(table),
-    }
-    return write_all({folder / name: text for name, text in texts.items()})
+    return read_table(records) if records.is_dir() else Table()
 
 
 def _write(path: Path, text: str) -> None:

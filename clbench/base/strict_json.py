@@ -46,7 +46,7 @@ def read_json(path: Path) -> Any:
             one object; or a value is nested too deep, too long, too large or not finite.
     """
     try:
-        content = _read(path)
+        content = read_regular(path)
     except OSError as error:
         raise StrictJSONError(f"cannot be read ({error.strerror}).") from error
     try:
@@ -57,7 +57,13 @@ def read_json(path: Path) -> Any:
     return value
 
 
-def _read(path: Path) -> bytes:
+def read_regular(path: Path) -> bytes:
+    """Return the content of the regular file at `path`.
+
+    Raises:
+        StrictJSONError: It is a link, no regular file or too large.
+        OSError: The file system refuses to read it.
+    """
     if path.is_symlink():
         raise StrictJSONError("is a symbolic link, which is not followed.")
     with open(path, "rb", opener=lambda name, flags: os.open(name, flags | _PLAINLY)) as file:

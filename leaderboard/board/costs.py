@@ -9,15 +9,7 @@ from typing import Any
 from clbench.spec.references import BASELINE
 
 from .runs import Run, is_number
-
-COSTS = {
-    "steps": "optimiser_steps",
-    "bytes_kept": "bytes_kept",
-    "parameters": "parameters",
-    "parameters_added": "parameters_added",
-    "environment_steps": "environment_steps",
-}
-"""Fields of `Record.costs` by column of the table."""
+from .summary import COSTS
 
 
 def step_ratio(run: Run) -> float | None:

@@ -14,7 +14,8 @@ from clbench.scoring.intervals import Estimate, estimate, row_generator
 from clbench.spec.references import BASELINE
 
 from .places import LADDER
-from .runs import ALIKE, DIVISIONS, NotShown, Run, Sifted, is_number, no_row, read_run, read_runs
+from .runs import ALIKE, Run, Sifted, is_number, no_row, read_run, read_runs
+from .summary import DIVISIONS, NotShown
 
 FACTOR = "step_factor"
 """Hyper-parameter that the ladder changes."""

@@ -9,8 +9,7 @@ from dataclasses import dataclass
 from clbench.scoring.intervals import Estimate
 from clbench.scoring.metrics import METRICS
 
-from .rows import RANKED_BY, Row
-from .runs import DIVISIONS
+from .summary import DIVISIONS, RANKED_BY, RowSummary
 
 
 @dataclass(frozen=True)
@@ -29,12 +28,12 @@ class OverallRow:
     """Whether the stages of all scenarios end when the target is learned."""
 
 
-def overall(rows: Iterable[Row]) -> tuple[OverallRow, ...]:
+def overall(rows: Iterable[RowSummary]) -> tuple[OverallRow, ...]:
     """Return a row for each method that has one in every scenario, by division and falling final average.
 
     There is none if there is only one scenario.
     """
-    by_method: dict[tuple[str, str], dict[str, Row]] = {}
+    by_method: dict[tuple[str, str], dict[str, RowSummary]] = {}
     for row in rows:
         by_method.setdefault((row.division, row.method), {})[row.scenario] = row
     scenarios = {scenario for found in by_method.values() for scenario in found}
@@ -49,7 +48,7 @@ def _place(row: OverallRow) -> tuple[int, float, str]:
     return DIVISIONS.index(row.division), math.inf if value is None else -value, row.method
 
 
-def _overall_row(found: Mapping[str, Row]) -> OverallRow:
+def _overall_row(found: Mapping[str, RowSummary]) -> OverallRow:
     rows = list(found.values())
     estimates = {name: mean_estimate([row.estimates[name] for row in rows]) for name in METRICS}
     return OverallRow(

@@ -13,7 +13,7 @@ from clbench.spec.references import BASELINE
 
 from .agreement import REPLICATES, Array, kendall_tau
 from .rows import Row
-from .runs import METHODS
+from .summary import METHODS
 
 LEAST_SEEDS, LEAST_ROWS = 2, 6
 """Fewest seeds and rows: the interval draws seeds, and five rows have few orders."""

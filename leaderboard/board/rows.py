@@ -6,7 +6,7 @@ They are made from the records alone, but for `relative_cost`: see `costs`.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import chain, groupby
 from pathlib import Path
@@ -21,52 +21,23 @@ from clbench.scoring.metrics import METRICS, measure
 from clbench.spec.references import BASELINE
 
 from .agreement import Agreement, agreement_of
-from .costs import COSTS, costs_of
+from .costs import costs_of
 from .frontier import Curve, ladder_of, read_frontiers
 from .orders import Orders, orders_of
-from .runs import ALIKE, DIVISIONS, METHODS, NotShown, Run, Sifted, no_row, read_run, read_runs
+from .runs import ALIKE, Run, Sifted, no_row, read_run, read_runs
+from .summary import DIVISIONS, METHODS, RANKED_BY, RowSummary, Summary
 from .tiers import TIERS
 
-RANKED_BY = "final_average"
-"""Metric that rows are sorted and compared by."""
 
+@dataclass(frozen=True, kw_only=True)
+class Row(RowSummary):
+    """One method on one scenario, with its records."""
 
-@dataclass(frozen=True)
-class Row:
-    """One method on one scenario."""
-
-    scenario: str
-    """Gymnasium id."""
-    method: str
-    """Name or "module:Class"."""
-    division: str
-    """One of `DIVISIONS`."""
-    groups: str | None
-    """Letters of its groups. Two rows of a scenario and division share a letter if they are not told apart.
-    None for a reference, which does not compete, and for a row without a final average."""
     runs: tuple[Run, ...]
     """Its runs with the targets in the published order, by rising seed. All but `orders` is made from
     them."""
-    tier: str
-    """The lowest of `TIERS` among its runs: how far others than the submitter have checked them."""
-    estimates: Mapping[str, Estimate]
-    """Value and interval of every metric."""
-    costs: Mapping[str, float | None]
-    """Mean over seeds by column of the table."""
     orders: Orders
     """Its results with the targets in this and in other orders."""
-    tried: int | None = None
-    """Number of settings that tuning tried on the scenario; None for a method that was not tuned."""
-
-    @property
-    def to_criterion(self) -> bool:
-        """Whether its stages end when the target is learned."""
-        return self.runs[0].published.budget.get("criterion") is not None
-
-    @property
-    def seeds(self) -> tuple[int, ...]:
-        """Seeds of its runs."""
-        return tuple(run.seed for run in self.runs)
 
     @property
     def scores(self) -> Runs:
@@ -74,37 +45,41 @@ class Row:
         return _scores(self.runs)
 
 
-@dataclass(frozen=True)
-class Table:
+@dataclass(frozen=True, kw_only=True)
+class Table(Summary):
     """Everything that the leaderboard shows."""
 
-    scenarios: Mapping[str, ScenarioInfo]
+    scenarios: Mapping[str, ScenarioInfo] = field(default_factory=dict)
     """`Record.scenario`, which the rows of a scenario share, by its id."""
-    rows: tuple[Row, ...]
-    """Rows by scenario, division and falling final average; scenarios with a criterion come first."""
-    not_shown: tuple[NotShown, ...]
-    """Files that make no row, by path."""
+    rows: tuple[Row, ...] = ()
     frontiers: Mapping[str, tuple[Curve, ...]] = field(default_factory=dict)
     """Methods at the step sizes of the ladder, by scenario; those with records only."""
 
 
-def read_table(records: Path) -> Table:
+def read_table(records: Path, only: Container[str] | None = None) -> Table:
     """Return the table of the records anywhere below the folder `records`.
+
+    Args:
+        records: Folder of the records.
+        only: Paths of the records that count, from the folder; None for all.
 
     Raises:
         FileNotFoundError: The folder does not exist.
     """
     if not records.is_dir():
         raise FileNotFoundError(f"There is no folder of records at {records}.")
-    runs, not_shown = read_runs(records, read_run, ALIKE)
+    runs, not_shown = read_runs(records, read_run, ALIKE, only)
     runs, alone = _beside_rows(runs)
     by_scenario = groupby(sorted(runs, key=lambda run: run.scenario), key=lambda run: run.scenario)
     found = [_scenario_rows(list(members)) for _, members in by_scenario]
     found.sort(key=lambda rows: not rows[0].to_criterion)  # they have tuned methods, and judge the claims
-    frontiers, without = read_frontiers(ladder_of(records))
+    by_name = {rows[0].scenario: rows for rows in found}
+    frontiers, without = read_frontiers(ladder_of(records)) if only is None else ({}, [])
     return Table(
         scenarios={run.scenario: run.published for run in runs},
         rows=tuple(chain.from_iterable(found)),
+        starts={name: pretrained_success(rows) for name, rows in by_name.items()},
+        agreements={name: agreement(rows) for name, rows in by_name.items()},
         not_shown=tuple(sorted([*not_shown, *alone, *without], key=lambda entry: entry.path)),
         frontiers=frontiers,
     )
@@ -132,24 +107,39 @@ def _scenario_rows(runs: list[Run]) -> list[Row]:
         competing = {method: _scores(runs) for method, runs in members.items() if division != "reference"}
         letters = groups(RANKED_BY, competing)
         order = sorted(members, key=lambda method: (_falling(estimates[method][RANKED_BY]), method))
-        for method in order:
-            costs = costs_of(members[method], by_method.get(BASELINE, []))
-            scenario = members[method][0].scenario
-            rows.append(
-                Row(
-                    scenario,
-                    method,
-                    division,
-                    letters.get(method),
-                    tuple(members[method]),
-                    min((run.tier for run in members[method]), key=TIERS.index),
-                    estimates[method],
-                    costs,
-                    orders_of(run for run in runs if run.method == method),
-                    _tried(scenario, method),
-                )
-            )
+        rows += [
+            _row(method, estimates[method], letters.get(method), members[method], by_method, runs)
+            for method in order
+        ]
     return rows
+
+
+def _row(
+    method: str,
+    estimates: Mapping[str, Estimate],
+    letters: str | None,
+    members: Sequence[Run],
+    by_method: Mapping[str, list[Run]],
+    runs: Iterable[Run],
+) -> Row:
+    """Return the row of the runs `members` of a method; `runs` are all of the scenario, in any order."""
+    first = members[0]
+    orders = orders_of(run for run in runs if run.method == method)
+    return Row(
+        scenario=first.scenario,
+        method=method,
+        division=first.division,
+        groups=letters,
+        tier=min((run.tier for run in members), key=TIERS.index),
+        seeds=tuple(run.seed for run in members),
+        to_criterion=first.published.budget.get("criterion") is not None,
+        estimates=estimates,
+        costs=costs_of(members, by_method.get(BASELINE, [])),
+        order_sensitivity=orders.sensitivity,
+        tried=_tried(first.scenario, method),
+        runs=tuple(members),
+        orders=orders,
+    )
 
 
 def _tried(scenario: str, method: str) -> int | None:
@@ -232,30 +222,3 @@ def agreement(rows: Iterable[Row]) -> Agreement | None:
     ]
     known = [line for line in values if None not in line]
     return agreement_of(np.array(known, dtype=float)) if seeds and known else None
-
-
-def column_names() -> list[str]:
-    """Return the columns of the CSV file and of the data frame."""
-    ends = ("", "_low", "_high")
-    metrics = (name + end for name in METRICS for end in ends)
-    return [
-        "scenario",
-        "method",
-        "division",
-        "groups",
-        "tier",
-        "seeds",
-        *metrics,
-        "relative_cost",
-        *COSTS,
-        "order_sensitivity",
-        "settings_tried",
-    ]
-
-
-def values_of(row: Row) -> list[str | float | None]:
-    """Return the values of `row` in the order of `column_names`."""
-    estimates = (row.estimates[name] for name in METRICS)
-    numbers = [number for one in estimates for number in (one.value, one.low, one.high)]
-    place = [row.scenario, row.method, row.division, row.groups, row.tier, len(row.seeds)]
-    return [*place, *numbers, *row.costs.values(), row.orders.sensitivity, row.tried]

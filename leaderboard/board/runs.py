@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
-from collections.abc import Callable, Hashable, Iterable, Iterator
+from collections.abc import Callable, Container, Hashable, Iterable, Iterator
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -23,31 +23,14 @@ from clbench.spec.identifiers import built_in_methods
 from clbench.spec.protocol import Split
 from clbench.spec.scenario import balanced_order, target_order
 
+from .summary import NotShown
 from .tiers import tier_of
-
-DIVISIONS = ("prior-data-free", "prior questions", "prior demonstrations", "online", "reference")
-"""Divisions in the order of the table: the first three by the prior data that a method may use; "online" for
-agents that learned by trial instead of from demonstrations, with which no method is compared; "reference" for
-references, which do not compete."""
-
-METHODS = DIVISIONS[:3]
-"""Divisions of methods, which start from the same policy and learn from the same demonstrations."""
 
 ACCESS = ("never", "prepare", "throughout")
 """Values of `Record.run.uses`: when a method may use prior data."""
 
 LONGEST_REASON = 300
 """Characters of a reason that are shown; an error's message may be a page long."""
-
-
-@dataclass(frozen=True)
-class NotShown:
-    """A file that makes no row."""
-
-    path: str
-    """Path from the folder of records."""
-    reason: str
-    """Reason, in words."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,15 +66,29 @@ Sift = Callable[[list[Run]], Sifted]
 """Function that keeps the runs that may be compared with each other."""
 
 
-def read_runs(folder: Path, read: Callable[[Path, Path], Run], sifts: Iterable[Sift]) -> Sifted:
-    """Return the runs of the records below `folder` that pass all sifts, and the files that are refused."""
+def read_runs(
+    folder: Path,
+    read: Callable[[Path, Path], Run],
+    sifts: Iterable[Sift],
+    only: Container[str] | None = None,
+) -> Sifted:
+    """Return the runs of the records below `folder` that pass all sifts, and the files that are refused.
+
+    Args:
+        folder: Folder of the records.
+        read: Reads one record below a folder.
+        sifts: What is asked of the runs together.
+        only: Paths of the files that are read, from the folder; None for all.
+    """
     runs: list[Run] = []
     refused: list[NotShown] = []
     for path in sorted(_files(folder), key=lambda path: path.relative_to(folder).as_posix()):
+        name = path.relative_to(folder).as_posix()
+        if only is not None and name not in only:
+            continue
         try:
             runs.append(read(folder, path))
         except RecordError as error:
-            name = path.relative_to(folder).as_posix()
             refused.append(no_row(name, str(error).removeprefix(f"{path}: ")))
     for sift in sifts:
         runs, others = sift(runs)

@@ -21,7 +21,6 @@ from ..board.costs import step_ratio
 from ..board.frontier import FACTOR, ladder_of
 from ..board.runs import (
     ALIKE,
-    NotShown,
     Run,
     Sift,
     Sifted,
@@ -31,6 +30,7 @@ from ..board.runs import (
     read_run,
     read_runs,
 )
+from ..board.summary import NotShown
 
 LEAST_SEEDS = 2
 """An interval of one seed does not cover other seeds: it is shown but decides nothing."""

@@ -15,7 +15,8 @@ from clbench.spec.identifiers import folder_name
 
 from ..board.commands import run_command
 from ..board.rows import Row, Table
-from ..board.runs import DIVISIONS, is_number
+from ..board.runs import is_number
+from ..board.summary import DIVISIONS
 from ..claims.claim import BOARDS
 from ..claims.evidence import Evidence
 from ..claims.judges import Judged

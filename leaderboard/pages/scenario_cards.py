@@ -28,8 +28,9 @@ from clbench.spec.protocol import check_steps
 from clbench.spec.scenario import Scenario
 
 from ..board.commands import run_command
-from ..board.rows import RANKED_BY, Row, Table
-from ..board.runs import METHODS, differences
+from ..board.rows import Row, Table
+from ..board.runs import differences
+from ..board.summary import METHODS, RANKED_BY
 from ..views.descriptions import field_docstrings
 from ..views.format import MISSING
 from ..views.markdown import templates

@@ -5,12 +5,11 @@ from __future__ import annotations
 import csv
 import io
 
-from ..board.costs import COSTS
-from ..board.rows import Table, column_names, values_of
+from ..board.summary import COSTS, Summary, column_names, values_of
 from .format import number_text
 
 
-def csv_text(table: Table) -> str:
+def csv_text(table: Summary) -> str:
     """Return the table with every metric as CSV; missing values are empty."""
     stream = io.StringIO()
     writer = csv.writer(stream, lineterminator="\n")

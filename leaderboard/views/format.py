@@ -16,10 +16,11 @@ from clbench.scoring.metric import Metric
 from clbench.scoring.metrics import METRICS
 from clbench.scoring.scores import WEAK, WEAK_WARNING
 
+from ..board.agreement import Agreement
 from ..board.overall import OverallRow
 from ..board.predictors import predictions
-from ..board.rows import Row, agreement, pretrained_success, standing_of
-from ..board.runs import DIVISIONS
+from ..board.rows import Row, standing_of
+from ..board.summary import DIVISIONS, RowSummary
 
 FIXED = (
     "final_average",
@@ -63,7 +64,7 @@ TITLES_TO_CRITERION = {"adaptation": "learned", "retention": "kept skills"}
 MISSING = "-"
 """Text for a value that could not be computed."""
 
-Rows: TypeAlias = Sequence[Row] | Sequence[OverallRow]
+Rows: TypeAlias = Sequence[RowSummary] | Sequence[OverallRow]
 
 
 @dataclass(frozen=True)
@@ -109,21 +110,21 @@ def _to_criterion(rows: Rows) -> bool:
     return bool(rows) and all(row.to_criterion for row in rows)
 
 
-def start_text(rows: Sequence[Row]) -> str:
+def start_text(rate: float | None) -> str:
     """Return a sentence on what the pretrained policy can do, with a warning if it has little to forget.
 
-    It is empty if no row begins with the pretrained policy, or if no skill is retained.
+    Args:
+        rate: Its mean success on its skills. The sentence is empty without one: no row begins with the
+            pretrained policy, or no skill is retained.
     """
-    rate = pretrained_success(rows)
     if rate is None:
         return ""
     sentence = f"The pretrained policy succeeds in {number_text(rate, '.2f')} of the episodes of its skills."
     return sentence if rate >= WEAK else f"{sentence} {WEAK_WARNING}"
 
 
-def agreement_text(rows: Iterable[Row]) -> str:
+def agreement_text(found: Agreement | None) -> str:
     """Return a sentence on how alike two halves of the seeds order the methods; empty if it is not known."""
-    found = agreement(rows)
     if found is None:
         return ""
     how = "order" if found.low > 0 else "do not surely order"
@@ -169,7 +170,7 @@ def format_interval(estimate: Estimate, form: str = ".2f") -> str:
     return value if estimate.low is None else f"{value} [{low}, {high}]"
 
 
-def aligned(groups: str | None, rows: Iterable[Row]) -> str:
+def aligned(groups: str | None, rows: Iterable[RowSummary]) -> str:
     """Return the letters of a row, each in the column of its group: "a", "ab" and " b" below each other.
 
     Args:

@@ -17,7 +17,7 @@ from clbench.scoring.intervals import Estimate
 from clbench.scoring.metrics import METRICS
 
 from ..board.overall import OverallRow, overall
-from ..board.rows import Row, Table
+from ..board.summary import RowSummary, Summary
 from ..board.tiers import TIERS
 from .format import MISSING, Column, Rows, agreement_text, aligned, fitting, number_text, scaled, start_text
 
@@ -67,7 +67,7 @@ class _Head:
     higher_is_better: bool | None = None
 
 
-def terminal(table: Table, width: int = 108, sort: str | None = None) -> RenderableType:
+def terminal(table: Summary, width: int = 108, sort: str | None = None) -> RenderableType:
     """Return the table for a terminal.
 
     Args:
@@ -83,7 +83,8 @@ def terminal(table: Table, width: int = 108, sort: str | None = None) -> Rendera
         rows = list(members)
         tables.append(rows)
         parts += _fitted(scenario, _sorted(rows, sort), _heads(rows), width)
-        parts += [Text(sentence) for sentence in (start_text(rows), agreement_text(rows)) if sentence]
+        sentences = (start_text(table.starts.get(scenario)), agreement_text(table.agreements.get(scenario)))
+        parts += [Text(sentence) for sentence in sentences if sentence]
         parts.append(Text())
     over_scenarios = overall(table.rows)
     if over_scenarios:
@@ -101,13 +102,13 @@ def terminal(table: Table, width: int = 108, sort: str | None = None) -> Rendera
     return Group(*parts)
 
 
-def _sorted(rows: list[Row], metric: str | None) -> list[Row]:
+def _sorted(rows: list[RowSummary], metric: str | None) -> list[RowSummary]:
     """Return the rows with those of each division from the best to the worst; rows without a value last."""
     if metric is None:
         return rows
     sign = -1 if METRICS[metric].higher_is_better is False else 1
 
-    def place(row: Row) -> tuple[bool, float]:
+    def place(row: RowSummary) -> tuple[bool, float]:
         value = row.estimates[metric].value
         return value is None, 0.0 if value is None else -sign * value
 
@@ -116,7 +117,7 @@ def _sorted(rows: list[Row], metric: str | None) -> list[Row]:
 
 
 def _fitted(
-    title: str, rows: Sequence[Row | OverallRow], heads: Sequence[_Head], width: int
+    title: str, rows: Sequence[RowSummary | OverallRow], heads: Sequence[_Head], width: int
 ) -> list[RenderableType]:
     """Return a table without the columns that do not fit, and a line that names them."""
     kept, dropped = list(heads), []
@@ -135,7 +136,10 @@ def _width(table: TextTable) -> int:
 
 
 def _table(
-    title: str, rows: Sequence[Row | OverallRow], heads: Sequence[_Head], widest_name: int | None = None
+    title: str,
+    rows: Sequence[RowSummary | OverallRow],
+    heads: Sequence[_Head],
+    widest_name: int | None = None,
 ) -> TextTable:
     """Return a table with a section for each division."""
     table = TextTable(
@@ -168,11 +172,11 @@ def _best(head: _Head, rows: Sequence[Any]) -> float | None:
     return max(values) if head.higher_is_better else min(values)
 
 
-def _letters(row: Row | OverallRow, rows: Sequence[Any]) -> str:
-    return aligned(row.groups, rows) if isinstance(row, Row) else ""
+def _letters(row: RowSummary | OverallRow, rows: Sequence[Any]) -> str:
+    return aligned(row.groups, rows) if isinstance(row, RowSummary) else ""
 
 
-def _heads(rows: list[Row]) -> list[_Head]:
+def _heads(rows: list[RowSummary]) -> list[_Head]:
     """Return the columns of the table of one scenario."""
     tried = [_Head("tried", lambda row: number_text(row.tried, "d"))] if rows[0].to_criterion else []
     return [
@@ -204,7 +208,7 @@ def _metric_heads(rows: Rows) -> list[_Head]:
     return [head(column) for column in fitting(rows)]
 
 
-def _size(row: Row) -> str:
+def _size(row: RowSummary) -> str:
     kept = row.costs["bytes_kept"]
     return MISSING if kept is None else "".join(scaled(kept))
 

@@ -17,12 +17,12 @@ def test_showing_twice_changes_no_byte_and_writes_no_file_again(
     four_methods: Path, shown_with_page: Callable[[], tuple[str, str]]
 ) -> None:
     (four_methods / "torn.json").write_text("{", encoding="utf-8")
-    first = shown_with_page()
+    _, first = shown_with_page()
     files = [four_methods.parent / "site" / name for name in ("LEADERBOARD.md", "leaderboard.csv")]
     stamps = [(path.read_bytes(), path.stat().st_mtime_ns, path.stat().st_ino) for path in files]
-    assert shown_with_page() == first
+    assert shown_with_page()[1] == first
     assert [(path.read_bytes(), path.stat().st_mtime_ns, path.stat().st_ino) for path in files] == stamps
-    made = ["LEADERBOARD.md", "index.html", "leaderboard.csv", "pareto-dark.svg", "pareto.svg"]
+    made = ["LEADERBOARD.md", "board.json", "index.html", "leaderboard.csv", "pareto-dark.svg", "pareto.svg"]
     assert sorted(os.listdir(four_methods.parent)) == ["records", "site"]
     assert sorted(os.listdir(four_methods.parent / "site")) == made
 
@@ -40,6 +40,51 @@ def test_the_files_do_not_depend_on_where_the_records_lie(
     assert (moved.parent / "site" / "LEADERBOARD.md").read_text(encoding="utf-8") == here
     assert (moved.parent / "site" / "leaderboard.csv").read_bytes() == table
     assert str(tmp_path) not in here
+
+
+def test_unchanged_records_show_the_same_board_without_being_read(
+    four_methods: Path, shown: Callable[[], tuple[str, str]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (four_methods / "torn.json").write_text("{", encoding="utf-8")
+    table, _, written = shown()[0].partition("Written: ")
+    assert "board.json" in written
+
+    def fail(_: Path) -> None:
+        raise AssertionError("the records were read")
+
+    monkeypatch.setattr("clbench.leaderboard.board.rows.read_table", fail)
+    again, _, unchanged = shown()[0].partition("Unchanged: ")
+    assert again == table
+    assert "torn.json: cannot be read as JSON" in again
+    assert Path("".join(unchanged.split())) == four_methods.parent / "site"
+
+
+@pytest.mark.parametrize("what", ["record", "verification", "table", "numbers", "code"])
+def test_a_board_is_computed_again_when_something_changed_that_it_was_made_from(
+    what: str, four_methods: Path, shown: Callable[[], tuple[str, str]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first, _ = shown()
+    site = four_methods.parent / "site"
+    before = {path.name: path.read_bytes() for path in site.iterdir()}
+    if what == "record":
+        next(four_methods.rglob("replay/seed-1.json")).unlink()
+    elif what == "verification":
+        next(four_methods.rglob("seed-1.json")).with_suffix(".verified").write_text("{}", encoding="utf-8")
+    elif what == "table":
+        (site / "LEADERBOARD.md").write_text("forged", encoding="utf-8")
+    elif what == "numbers":
+        (site / "board.json").write_bytes(before["board.json"][:-100])
+    else:
+        monkeypatch.setattr("clbench.leaderboard.publishing.source_hash", lambda *_: "other")
+    printed, _ = shown()
+    assert "Written: " in printed
+    assert ("not shown" in printed.lower()) == ("not shown" in first.lower())
+    after = {path.name: path.read_bytes() for path in site.iterdir()}
+    if what in ("table", "numbers"):
+        assert after == before
+    else:
+        assert after["board.json"] != before["board.json"]
+    assert (after["leaderboard.csv"] != before["leaderboard.csv"]) == (what == "record")
 
 
 def test_a_folder_without_rows_lists_why(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -36,8 +36,8 @@ def test_every_method_has_the_same_seeds_and_the_same_pretrained_policies() -> N
     for record in records:
         seeds.setdefault((record.run.scenario, record.run.method), set()).add(record.run.seed)
     for (scenario, method), found in seeds.items():
-        # of balanced orders, a Latin square has four rows
-        assert found == set(range(4 if scenario == "clbench/Fetch-v1" else 3)), f"{scenario}, {method}"
+        # two Latin squares of balanced orders, which have four rows each
+        assert found == set(range(8 if scenario == "clbench/Fetch-v1" else 3)), f"{scenario}, {method}"
     assert not any(record.run.changes for record in records)
     assert not any(record.fingerprint["commit"]["dirty"] for record in records)
 
@@ -99,8 +99,11 @@ def test_aegis_sheds_little_energy_at_every_stage() -> None:
         assert len(trained) >= 3  # carry_back needs no training after lift
         assert set(record.diagnostics) == trained
         for reported in record.diagnostics.values():
-            assert 0 < reported["energy_shed_mean"] <= reported["energy_shed_highest"] < 1
-            assert 0 < reported["layers_projected_mean"] <= 1
+            assert 0 <= reported["energy_shed_mean"] <= reported["energy_shed_highest"] < 1
+        # no step of a short stage need conflict with the skills: press of seed 5 has none
+        shares = [reported["layers_projected_mean"] for reported in record.diagnostics.values()]
+        assert sum(share > 0 for share in shares) >= 3
+        assert max(shares) <= 1
 
 
 @pytest.mark.slow
@@ -123,8 +126,17 @@ def test_the_committed_pages_show_the_committed_records(
         )
     shutil.copytree(RECORDS, tmp_path / "board" / "records")
     shutil.copytree(checkout / "benchmarks" / "results", tmp_path / "benchmarks" / "results")
+    if (RECORDS.parent / "ladder").exists():
+        shutil.copytree(RECORDS.parent / "ladder", tmp_path / "board" / "ladder")
     cli.show(records=tmp_path / "board" / "records")
-    for name in ("LEADERBOARD.md", "leaderboard.csv", "index.html", "pareto.svg", "pareto-dark.svg"):
+    for name in (
+        "LEADERBOARD.md",
+        "leaderboard.csv",
+        "board.json",
+        "index.html",
+        "pareto.svg",
+        "pareto-dark.svg",
+    ):
         made = tmp_path / "board" / "site" / name
         assert made.read_bytes() == (RECORDS.parent / "site" / name).read_bytes(), (
             f"{name}: run `clbench leaderboard`"

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from ...board.rows import Row
-from ...board.runs import DIVISIONS
+from ...board.summary import DIVISIONS
 from ..format import format_interval
 from .labels import LONGEST, Mark, place
 

@@ -20,7 +20,7 @@ from clbench.spec.identifiers import built_in_methods
 
 from ...board.frontier import Curve
 from ...board.rows import Row, Table, standing_of
-from ...board.runs import DIVISIONS, METHODS
+from ...board.summary import DIVISIONS, METHODS
 from ..descriptions import Description, describe
 from ..format import (
     Column,
@@ -236,6 +236,10 @@ class ScenarioView:
     families: tuple[Family, ...]
     frontier: tuple[Curve, ...]
     """Methods along the ladder of step sizes."""
+    start: str
+    """Sentence on what the pretrained policy can do, empty if there is none."""
+    agreement: str
+    """Sentence on how alike two halves of the seeds order the methods, empty if it is not known."""
 
     @property
     def table(self) -> list[Row]:
@@ -246,16 +250,6 @@ class ScenarioView:
     def to_criterion(self) -> bool:
         """Whether its stages end when the target is learned."""
         return self.rows[0].row.to_criterion
-
-    @property
-    def start(self) -> str:
-        """Sentence on what the pretrained policy can do, empty if there is none."""
-        return start_text(self.table)
-
-    @property
-    def agreement(self) -> str:
-        """Sentence on how alike two halves of the seeds order the methods, empty if it is not known."""
-        return agreement_text(self.table)
 
     @property
     def prediction(self) -> str:
@@ -308,6 +302,8 @@ def scenarios(table: Table) -> list[ScenarioView]:
                 tuple(views),
                 tuple(families(competing)),
                 table.frontiers.get(scenario, ()),
+                start_text(table.starts.get(scenario)),
+                agreement_text(table.agreements.get(scenario)),
             )
         )
     return found

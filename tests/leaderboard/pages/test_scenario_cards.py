@@ -159,7 +159,7 @@ def test_where_nothing_is_retained_fine_tuning_must_forget_the_earlier_targets(
     bench: Bench, tmp_path: Path
 ) -> None:
     bare = dataclasses.replace(TOY, retained=(), held_out=TOY.retained, scenes=TOY.retained)
-    table = resolve("clbench.leaderboard.board.rows:Table")({}, (), ())
+    table = resolve("clbench.leaderboard.board.rows:Table")()
     experts = resolve("clbench.leaderboard.pages.scenario_tasks:Experts")(10, dict.fromkeys(NAMES, 9))
     card = resolve("clbench.leaderboard.pages.scenario_cards:Card")(bare, table, experts, frozenset()).page()
     assert list(bars(card))[:2] == ["adaptation of sft", "forgetting of earlier targets by sft"]

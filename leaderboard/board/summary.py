@@ -1,0 +1,153 @@
+"""The numbers of the board without its records: all that the terminal and `--json` show."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+from clbench.scoring.intervals import Estimate
+from clbench.scoring.metrics import METRICS
+
+from .agreement import Agreement
+
+DIVISIONS = ("prior-data-free", "prior questions", "prior demonstrations", "online", "reference")
+"""Divisions in the order of the table: the first three by the prior data that a method may use; "online" for
+agents that learned by trial instead of from demonstrations, with which no method is compared; "reference" for
+references, which do not compete."""
+
+METHODS = DIVISIONS[:3]
+"""Divisions of methods, which start from the same policy and learn from the same demonstrations."""
+
+COSTS = {
+    "steps": "optimiser_steps",
+    "bytes_kept": "bytes_kept",
+    "parameters": "parameters",
+    "parameters_added": "parameters_added",
+    "environment_steps": "environment_steps",
+}
+"""Fields of `Record.costs` by column of the table."""
+
+RANKED_BY = "final_average"
+"""Metric that rows are sorted and compared by."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RowSummary:
+    """The numbers of one method on one scenario."""
+
+    scenario: str
+    """Gymnasium id."""
+    method: str
+    """Name or "module:Class"."""
+    division: str
+    """One of `DIVISIONS`."""
+    groups: str | None
+    """Letters of its groups. Two rows of a scenario and division share a letter if they are not told apart.
+    None for a reference, which does not compete, and for a row without a final average."""
+    tier: str
+    """The lowest of `TIERS` among its runs: how far others than the submitter have checked them."""
+    seeds: tuple[int, ...]
+    """Seeds of its runs."""
+    to_criterion: bool
+    """Whether its stages end when the target is learned."""
+    estimates: Mapping[str, Estimate]
+    """Value and interval of every metric."""
+    costs: Mapping[str, float | None]
+    """Mean over seeds by column of the table."""
+    order_sensitivity: float | None
+    """Range of the final average over the orders of the targets, see `Orders.sensitivity`."""
+    tried: int | None = None
+    """Number of settings that tuning tried on the scenario; None for a method that was not tuned."""
+
+
+@dataclass(frozen=True)
+class NotShown:
+    """A file that makes no row."""
+
+    path: str
+    """Path from the folder of records."""
+    reason: str
+    """Reason, in words."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Summary:
+    """The numbers of the board."""
+
+    rows: tuple[RowSummary, ...] = ()
+    """Rows by scenario, division and falling final average; scenarios with a criterion come first."""
+    starts: Mapping[str, float | None] = field(default_factory=dict)
+    """Mean success of the pretrained policy on its skills, by scenario."""
+    agreements: Mapping[str, Agreement | None] = field(default_factory=dict)
+    """How alike two halves of the seeds order the rows, by scenario."""
+    not_shown: tuple[NotShown, ...] = ()
+    """Files that make no row, by path."""
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the summary as JSON; further fields of a subclass are left out."""
+        return {
+            "rows": [_row_to_json(row) for row in self.rows],
+            "starts": dict(self.starts),
+            "agreements": {name: found and asdict(found) for name, found in self.agreements.items()},
+            "not_shown": [asdict(entry) for entry in self.not_shown],
+        }
+
+    @classmethod
+    def from_json(cls, values: Mapping[str, Any]) -> Summary:
+        """Return the summary that `to_json` wrote.
+
+        Raises:
+            KeyError, TypeError: It has other fields.
+        """
+        return Summary(
+            rows=tuple(_row_from_json(row) for row in values["rows"]),
+            starts=values["starts"],
+            agreements={name: found and Agreement(**found) for name, found in values["agreements"].items()},
+            not_shown=tuple(NotShown(**entry) for entry in values["not_shown"]),
+        )
+
+
+_PLAIN = ("scenario", "method", "division", "groups", "tier", "to_criterion", "order_sensitivity", "tried")
+"""Fields of a row that are JSON as they are."""
+
+
+def _row_to_json(row: RowSummary) -> dict[str, Any]:
+    return {
+        **{name: getattr(row, name) for name in _PLAIN},
+        "seeds": list(row.seeds),
+        "estimates": {name: [one.value, one.low, one.high] for name, one in row.estimates.items()},
+        "costs": dict(row.costs),
+    }
+
+
+def _row_from_json(values: Mapping[str, Any]) -> RowSummary:
+    estimates = {name: Estimate(*ends) for name, ends in values["estimates"].items()}
+    return RowSummary(**{**values, "seeds": tuple(values["seeds"]), "estimates": estimates})
+
+
+def column_names() -> list[str]:
+    """Return the columns of the CSV file and of the data frame."""
+    ends = ("", "_low", "_high")
+    metrics = (name + end for name in METRICS for end in ends)
+    return [
+        "scenario",
+        "method",
+        "division",
+        "groups",
+        "tier",
+        "seeds",
+        *metrics,
+        "relative_cost",
+        *COSTS,
+        "order_sensitivity",
+        "settings_tried",
+    ]
+
+
+def values_of(row: RowSummary) -> list[str | float | None]:
+    """Return the values of `row` in the order of `column_names`."""
+    estimates = (row.estimates[name] for name in METRICS)
+    numbers = [number for one in estimates for number in (one.value, one.low, one.high)]
+    place = [row.scenario, row.method, row.division, row.groups, row.tier, len(row.seeds)]
+    return [*place, *numbers, *row.costs.values(), row.order_sensitivity, row.tried]

@@ -1,0 +1,73 @@
+"""`clbench.compare`: several methods on one scenario, run where needed, in one table."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from clbench.base.errors import InputError
+from clbench.jobs.grid import name_of, run_specs
+from clbench.records.paths import RECORDS, record_name
+from clbench.runs.spec import RunSpec, check_device
+from clbench.spec.references import BASELINE
+
+from .board.rows import read_table
+
+if TYPE_CHECKING:
+    import pandas
+
+    from clbench.learning.method import Method
+
+
+def compare(
+    scenario: str,
+    methods: Iterable[str | type[Method]],
+    *,
+    seeds: int = 2,
+    first_seed: int = 0,
+    records: Path | str = RECORDS,
+    workers: int | None = None,
+    device: str = "cpu",
+) -> pandas.DataFrame:
+    """Compare methods on a scenario: do the runs that have no record, and return their rows of the board.
+
+    Plain fine-tuning, "sft", always runs as well: without it a row says nothing. All methods meet the same
+    seeds, and rows count these seeds alone, even where the folder has more.
+
+    Args:
+        scenario: Gymnasium id of the scenario; "module:id" imports the module first.
+        methods: Classes of methods, their installed names, or "module:Class". Classes of a notebook run one
+            after the other, see `clbench.run`.
+        seeds: Number of seeds.
+        first_seed: The first seed.
+        records: Folder of the records. Those of other methods are not read.
+        workers: Number of runs at once, each a process with one thread; all cores if None.
+        device: Device on which policies are computed, for example "cpu" or "cuda".
+
+    Returns:
+        One row for each method, the best final average first, with the columns of `clbench.leaderboard.load`:
+        each metric with its interval, the costs, and in `groups` which methods are not told apart.
+
+    Raises:
+        UnknownNameError: There is no such scenario or method.
+        InputError: A value cannot be used, or a record makes no row; the message says why.
+        RunsFailedError: A run failed.
+    """
+    from . import frame_of
+
+    check_device(device)
+    names = dict.fromkeys([BASELINE, *map(name_of, methods)])
+    firsts = [RunSpec(scenario, name, first_seed, device=device) for name in names]
+    run_specs(firsts, seeds, Path(records), workers)
+    places = {
+        record_name(scenario.rpartition(":")[2], name, first_seed + number, 0).as_posix()
+        for name in names
+        for number in range(seeds)
+    }
+    table = read_table(Path(records), places)
+    absent = set(names) - {row.method for row in table.rows}
+    if absent:
+        reasons = " ".join(f"{one.path}: {one.reason}" for one in table.not_shown)
+        raise InputError(f"No row for {', '.join(sorted(absent))}. {reasons}")
+    return frame_of(table)

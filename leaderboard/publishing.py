@@ -1,0 +1,101 @@
+"""The folder `site` next to the records: every form of the board, and what it was made from.
+
+Computing the board takes 10 s, most of it for intervals. Therefore the folder keeps the numbers in
+`board.json`, with hashes of what they were computed from. They are read back while nothing of it changes.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from clbench.base.cache import hash_of
+from clbench.base.source import package_of, source_hash
+from clbench.base.strict_json import StrictJSONError, read_regular
+from clbench.spec.identifiers import installed_methods
+
+from .board.frontier import ladder_of
+from .board.summary import Summary
+from .views.csv import csv_text
+from .views.format import write_all
+
+if TYPE_CHECKING:
+    from .board.rows import Table
+
+NUMBERS = "board.json"
+"""Name of the file with the numbers of the board."""
+
+_CODE = (
+    *("clbench.base", "clbench.spec", "clbench.records", "clbench.runs", "clbench.scoring"),
+    *("clbench.learning", "clbench.leaderboard.board", "clbench.leaderboard.views"),
+)
+"""Code that the board and its pages depend on, besides the packages of the installed methods."""
+
+
+def site_of(records: Path) -> Path:
+    """Return the folder of the board for a folder of records."""
+    return Path(os.path.normpath(records / "../site"))
+
+
+def inputs_of(records: Path) -> dict[str, str]:
+    """Return the hashes of all that the board of a folder of records is made from.
+
+    Ask before the records are read: a record that arrives in between then changes the hash.
+    """
+    packages = {package_of(entry.value) for entry in installed_methods().values()}
+    return {
+        "records": _folder_hash(records),
+        "ladder": _folder_hash(ladder_of(records)),
+        "code": source_hash(*_CODE, *packages),
+    }
+
+
+def _folder_hash(folder: Path) -> str:
+    """Return the hash of the names and contents of everything below `folder`; links are not followed."""
+    found: dict[str, str] = {}
+    for parent, folders, names in os.walk(folder):
+        for path in (Path(parent, name) for name in (*folders, *names)):
+            try:
+                content = hashlib.sha256(read_regular(path)).hexdigest()
+            except StrictJSONError as error:  # the reader of records refuses it with the same message
+                content = str(error)
+            except OSError as error:
+                content = str(error.strerror)  # without the path: a copy of the folder has the same hash
+            found[path.relative_to(folder).as_posix()] = content
+    return hash_of(found)
+
+
+def read_unchanged(records: Path, inputs: dict[str, str]) -> Summary | None:
+    """Return the numbers of the board, None unless every file of the site was made from `inputs`."""
+    site = site_of(records)
+    try:
+        kept: dict[str, Any] = json.loads((site / NUMBERS).read_text(encoding="utf-8"))
+        whole = kept["files"] == {name: _text_hash((site / name).read_bytes()) for name in kept["files"]}
+        return Summary.from_json(kept["board"]) if whole and kept["made_from"] == inputs else None
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):  # none yet, or damaged
+        return None
+
+
+def write_site(table: Table, records: Path, inputs: dict[str, str]) -> list[Path]:
+    """Write every form of the table to the folder of the board, and return the paths."""
+    # They load the charts, SciPy and PyTorch: 3 s.
+    from .views import page as web_page
+    from .views.markdown import markdown
+
+    texts = {
+        "LEADERBOARD.md": markdown(table),
+        "leaderboard.csv": csv_text(table),
+        "index.html": web_page.page(table),
+        **web_page.pictures(table),
+    }
+    files = {name: _text_hash(text.encode()) for name, text in texts.items()}
+    kept = {"made_from": inputs, "files": files, "board": table.to_json()}
+    texts[NUMBERS] = json.dumps(kept, indent=1) + "\n"
+    return write_all({site_of(records) / name: text for name, text in texts.items()})
+
+
+def _text_hash(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()

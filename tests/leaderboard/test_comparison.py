@@ -1,0 +1,39 @@
+"""`clbench.compare`: runs that are missing, and the rows of the methods that were asked for."""
+
+from pathlib import Path
+
+import pytest
+
+import clbench
+from clbench.base.errors import InputError, UnknownNameError
+from clbench.records.writer import write_record
+
+TOY = "clbench.testing:clbench/Toy-v0"
+
+
+def test_methods_are_compared_over_the_seeds_that_were_asked_for(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    clbench.run(TOY, "frozen", seeds=3, records=tmp_path)
+    clbench.run(TOY, "joint", seeds=1, records=tmp_path)
+    capsys.readouterr()
+    table = clbench.compare(TOY, ["frozen"], seeds=2, records=tmp_path).set_index("method")
+    assert "2 of 4 runs have a record already." in capsys.readouterr().err
+    assert sorted(table.index) == ["frozen", "sft"]  # sft by itself; joint was not asked for
+    assert list(table["seeds"]) == [2, 2]
+    assert table.loc["frozen", "retention"] > table.loc["sft", "retention"]
+
+
+def test_a_method_whose_record_makes_no_row_is_named_with_the_reason(tmp_path: Path) -> None:
+    clbench.run(TOY, "sft", seeds=1, records=tmp_path)
+    (record,) = clbench.run(TOY, "frozen", seeds=1, records=tmp_path)
+    record.fingerprint["rollouts"] = dict.fromkeys(record.fingerprint["rollouts"], "0" * 16)
+    write_record(record, tmp_path / "Toy-v0" / "frozen" / "seed-0.json")
+    with pytest.raises(InputError, match=r"No row for sft\. .*sft/seed-0\.json: its simulator does not"):
+        clbench.compare(TOY, ["frozen"], seeds=1, records=tmp_path)
+
+
+def test_an_unknown_method_is_named_before_anything_runs(tmp_path: Path) -> None:
+    with pytest.raises(UnknownNameError, match="Did you mean 'frozen'"):
+        clbench.compare(TOY, ["frosen"], records=tmp_path)
+    assert not list(tmp_path.iterdir())
