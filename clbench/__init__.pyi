@@ -1,6 +1,9 @@
 from .data.questions import QuestionKind as QuestionKind
 from .evaluation.rollouts import Episode as Episode
 from .evaluation.rollouts import Evaluator as Evaluator
+from .jobs.grid import RunsFailedError as RunsFailedError
+from .jobs.grid import run as run
+from .leaderboard.comparison import compare as compare  # type: ignore[import-not-found]  # in a checkout it is elsewhere
 from .learning.method import Metadata as Metadata
 from .learning.method import Method as Method
 from .learning.method import Progress as Progress

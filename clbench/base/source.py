@@ -12,6 +12,7 @@ import hashlib
 import importlib.util
 import sys
 from pathlib import Path
+from types import CodeType
 
 DATA_SOURCES = ("clbench.base", "clbench.spec", "clbench.policy", "clbench.worlds", "clbench.data")
 """Code that demonstrations and questions depend on, besides the suite of their tasks."""
@@ -69,6 +70,39 @@ def _origin(module: str) -> Path | None:
             f"There is no module {module!r}, whose source is part of a key.", name=module
         )
     return Path(file) if file is not None else None
+
+
+def class_hash(cls: type) -> str:
+    """Return the hash of the code and the plain values of a class that was typed at a prompt.
+
+    What its methods call outside of the class does not count.
+    """
+    digest = hashlib.sha256()
+    for name, value in sorted(vars(cls).items()):
+        function = getattr(value, "__func__", getattr(value, "fget", value))  # of a class method, a property
+        code = getattr(function, "__code__", None)
+        if code is not None:
+            digest.update(f"{name} {_code_text(code)}".encode())
+        elif not name.startswith("__") and isinstance(value, str | int | float | tuple | None):
+            digest.update(f"{name} {value!r}".encode())
+    return digest.hexdigest()[:16]
+
+
+def _code_text(code: CodeType) -> str:
+    """Return what a function does as text, without the numbers of its lines."""
+
+    def text(constant: object) -> str:
+        if isinstance(constant, CodeType):
+            return _code_text(constant)
+        # sets have another order in each process
+        return repr(sorted(map(repr, constant))) if isinstance(constant, frozenset) else repr(constant)
+
+    return f"{code.co_code.hex()} {code.co_names} {list(map(text, code.co_consts))}"
+
+
+def has_source(module: str) -> bool:
+    """Return whether a module has a file; the module of a prompt has none."""
+    return _origin(module) is not None
 
 
 def package_of(entry_point: str) -> str:

@@ -7,7 +7,6 @@ import os
 import sys
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from pathlib import Path
 from typing import Annotated
 
 from cyclopts import CycloptsError, Parameter, Token, UnknownCommandError
@@ -15,10 +14,8 @@ from cyclopts.validators import Number
 from rich.console import Console
 from rich.text import Text
 
-from clbench.base.cache import cache_folder
 from clbench.base.entry_points import unknown
-from clbench.base.errors import ClbenchError, InputError
-from clbench.base.leftovers import unfinished
+from clbench.base.errors import ClbenchError
 from clbench.base.text import printable
 
 
@@ -99,38 +96,6 @@ def checked_input() -> Iterator[None]:
             error_line(error.args[0] if error.args else type(error).__name__)
         )
         sys.exit(2)
-
-
-def check_folders(**options: Path | None) -> None:
-    """Refuse folders that cannot be made or written to, before work begins; nothing is left behind.
-
-    Args:
-        options: Folders by the name of their option, or in capitals of their environment variable.
-
-    Raises:
-        InputError: A part of a path is no folder, or no file can be written there.
-    """
-    for name, folder in options.items():
-        if folder is None:
-            continue
-        there = next(one for one in (folder, *folder.absolute().parents) if os.path.lexists(one))
-        probe = unfinished(there / "probe")
-        try:
-            probe.touch()
-            probe.unlink()
-        except OSError as error:
-            option = name if name.isupper() else f"--{name}"
-            raise InputError(f"{option} {folder} cannot be written to: {error.strerror}.") from error
-
-
-def data_folders() -> dict[str, Path]:
-    """Return the folders of the cache and of all Minari datasets, by the variables that move them."""
-    return {"CLBENCH_CACHE": cache_folder(), "MINARI_DATASETS_PATH": minari_folder()}
-
-
-def minari_folder() -> Path:
-    """Return the folder of all Minari datasets."""
-    return Path(os.environ.get("MINARI_DATASETS_PATH") or "~/.minari/datasets").expanduser()
 
 
 def add_cwd_to_path() -> None:

@@ -23,7 +23,8 @@ from safetensors import SafetensorError, safe_open
 from clbench.base.cache import cache_folder, hash_of
 from clbench.base.errors import InputError
 from clbench.base.leftovers import finished_name, is_left_behind, is_unfinished, unfinished
-from clbench.cli.arguments import checked_input, minari_folder, whole_number
+from clbench.cli.arguments import checked_input, whole_number
+from clbench.jobs.folders import minari_folder
 from clbench.records.reader import RecordError, read_record
 
 DEMONSTRATIONS = "demonstrations"
@@ -41,6 +42,7 @@ KINDS = {
     "ray": "records of runs on a Ray cluster",
     "experts": "checkpoints of expert training",
     "vectors": "capability vectors of fast_dvla",
+    "watched": "what methods kept of the pretraining that they watched",
 }
 """Kinds of entries and their contents. All kinds but the first are folders of the cache."""
 

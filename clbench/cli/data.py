@@ -15,11 +15,10 @@ from clbench.base.errors import InputError
 from clbench.cli.arguments import (
     ScenarioId,
     add_cwd_to_path,
-    check_folders,
     checked_input,
-    data_folders,
     whole_number,
 )
+from clbench.jobs.folders import check_folders
 
 if TYPE_CHECKING:
     from clbench.data.expert_rates import Measurement
@@ -46,7 +45,7 @@ def demonstrations(
     add_cwd_to_path()
     with checked_input():
         loaded = load_scenario(scenario)
-        check_folders(**data_folders())
+        check_folders({})
     plan = Plan()
     plan.add_demonstrations(scenario, loaded, loaded.tasks)
     if run_with_bars(plan.jobs, Processes(workers)):

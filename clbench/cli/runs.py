@@ -4,35 +4,28 @@ from __future__ import annotations
 
 import shlex
 import sys
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, NamedTuple
+from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 from rich.console import Console
 
-from clbench.base.cache import cache_folder
 from clbench.base.errors import InputError
-from clbench.base.leftovers import sweep
-from clbench.base.text import counted, printable, printable_lines
+from clbench.base.text import counted, printable_lines
 from clbench.cli.arguments import (
     MethodName,
     ScenarioId,
     add_cwd_to_path,
-    check_folders,
     check_names,
     checked_input,
-    data_folders,
-    minari_folder,
     whole_number,
 )
 from clbench.records.paths import RECORDS
 
 if TYPE_CHECKING:
     from clbench.jobs.job import Workers
-    from clbench.jobs.plan import Plan
     from clbench.runs.spec import ResolvedRun, RunSpec
 
 # Modules with PyTorch or SciPy are imported where they are needed: `--help` does not wait for them.
@@ -173,47 +166,18 @@ def _workers(count: int | None, ray: str | None) -> Workers:
         return RayWorkers(ray, count)
 
 
-class _ToDo(NamedTuple):
-    """What a command still has to do."""
-
-    missing: list[ResolvedRun]
-    """Runs without a record."""
-    bare: list[ResolvedRun]
-    """Runs with a record whose policies are to be kept, and are not."""
-
-    def plan(self, records: Path, checkpoints: Path | None, tensorboard: Path | None = None) -> Plan:
-        """Return the plan of the jobs."""
-        from clbench.jobs.plan import Plan
-
-        plan = Plan()
-        for one in self.missing:
-            plan.add_run(one, records, checkpoints=checkpoints, tensorboard=tensorboard)
-        for one in self.bare:
-            plan.add_stages(one, checkpoints)
-        return plan
-
-
-def _to_do(runs: Sequence[ResolvedRun], records: Path, checkpoints: Path | None) -> _ToDo:
-    """Return what has to be done until all runs have a record and, with `checkpoints`, policies there."""
-    from clbench.jobs.recorded import has_record
-    from clbench.runs.checkpoints import has_stages
-
-    missing = [run for run in runs if not has_record(run, records)]
-    recorded = [run for run in runs if run not in missing]
-    return _ToDo(missing, [run for run in recorded if checkpoints and not has_stages(run, checkpoints)])
-
-
 def _print_forecast(
     runs: Sequence[ResolvedRun], records: Path, workers: int | None, checkpoints: Path | None
 ) -> None:
     """Print what the runs without a record would take."""
     from clbench.jobs.forecast import forecast
+    from clbench.jobs.grid import missing
 
     with checked_input():
-        to_do = _to_do(runs, records, checkpoints)
+        to_do = missing(runs, records, checkpoints)
         plan = to_do.plan(records, checkpoints)
-    lines = [f"{len(runs) - len(to_do.missing)} of {counted(len(runs), 'run')} done already."]
-    lines += forecast(plan, [*to_do.missing, *to_do.bare], workers, checkpoints) if plan.jobs else []
+    lines = [f"{len(runs) - len(to_do.runs)} of {counted(len(runs), 'run')} done already."]
+    lines += forecast(plan, [*to_do.runs, *to_do.stages], workers, checkpoints) if plan.jobs else []
     Console(soft_wrap=True).print("\n".join(lines), highlight=False, markup=False)
 
 
@@ -225,46 +189,12 @@ def run_missing(
     tensorboard: Path | None = None,
     quiet: bool = False,
 ) -> bool:
-    """Do the runs that have no record yet, and return whether all of them succeeded.
-
-    Args:
-        runs: The runs.
-        records: Folder of the records.
-        workers: Returns the workers, once there is something to do.
-        checkpoints: Folder below which the policies of all stages are kept; None keeps none.
-        tensorboard: Folder below which the runs are logged; None logs nothing.
-        quiet: Whether to print failures alone.
-    """
-    from clbench.jobs.recorded import has_record, set_damaged_aside
-    from clbench.jobs.scheduler import run_with_bars
+    """Do the runs that have no record yet, print failures, and return whether all runs succeeded."""
+    from clbench.jobs import grid
 
     console = Console(stderr=True, quiet=quiet)
-    sweep(records, cache_folder(), minari_folder() / "clbench")
     with checked_input():
-        missing, bare = to_do = _to_do(runs, records, checkpoints)
-    if len(missing) < len(runs):
-        have = "has" if len(runs) - len(missing) == 1 else "have"
-        console.print(f"{len(runs) - len(missing)} of {counted(len(runs), 'run')} {have} a record already.")
-    if not missing and not bare:
-        return True
-    begin = time.monotonic()
-    with checked_input():  # refuses a scenario with a camera on a machine that cannot render
-        check_folders(records=records, checkpoints=checkpoints, tensorboard=tensorboard, **data_folders())
-        for one in missing:
-            damage = set_damaged_aside(one, records)
-            if damage is not None:
-                console.print(printable(damage), highlight=False, markup=False, soft_wrap=True)
-        plan = to_do.plan(records, checkpoints, tensorboard)
-    failed = run_with_bars(plan.jobs, workers(), console)
-    seconds = time.monotonic() - begin
-    with checked_input():
-        good = sum(has_record(run, records) for run in missing)
-    done = f"{good} of " if good < len(missing) else ""
-    done += counted(len(missing), "run")
-    done += f" and the policies of {len(bare)}" if bare else ""
-    console.print(
-        f"{done} in {seconds / 60:.1f} minutes; records in {records}.", highlight=False, markup=False
-    )
+        failed = grid.run_missing(runs, records, workers, console, checkpoints, tensorboard)
     if failed and quiet:
         alarm = Console(stderr=True, soft_wrap=True)
         for job, reason in failed.items():

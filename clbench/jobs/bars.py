@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Hashable
+from importlib.util import find_spec
 from types import TracebackType
 from typing import Self
 
@@ -30,7 +31,7 @@ class Bars:
     def __init__(
         self, total: float, console: Console | None = None, clock: Callable[[], float] = time.monotonic
     ) -> None:
-        self.console = console or Console(stderr=True)
+        self.console = console or lines_console()
         self._clock = clock
         self._total, self._done = max(total, 1e-9), 0.0
         self._started = self._last_line = clock()
@@ -45,10 +46,14 @@ class Bars:
             TimeElapsedColumn(),
             TimeLeftColumn(),
             TextColumn("left"),
-            console=self.console,
-            disable=not self.console.is_terminal,
+            console=Console() if self._in_notebook() else self.console,
+            disable=not (self.console.is_terminal or self._in_notebook()),
         )
         self._all = self._progress.add_task("all", total=self._total)
+
+    def _in_notebook(self) -> bool:
+        """Return whether a notebook shows bars: rich needs ipywidgets for them."""
+        return self.console.stderr and Console().is_jupyter and find_spec("ipywidgets") is not None
 
     def __enter__(self) -> Self:
         self._progress.start()
@@ -81,7 +86,7 @@ class Bars:
         self._progress.advance(self._all, amount)
         self._done += amount
         now = self._clock()
-        if not self.console.is_terminal and now - self._last_line >= LINE_SECONDS:
+        if self._progress.disable and now - self._last_line >= LINE_SECONDS:
             self._last_line = now
             share = min(1.0, self._done / self._total)
             # the time left is unknown before any work is done
@@ -103,6 +108,11 @@ class Bars:
     def say(self, line: str) -> None:
         """Print a text without markup, wrapping or characters that control the terminal."""
         self.console.print(printable_lines(line), highlight=False, markup=False, soft_wrap=True)
+
+
+def lines_console() -> Console:
+    """Return a console for standard error; in a notebook its lines are text, and no pieces of HTML."""
+    return Console(stderr=True, force_jupyter=False)
 
 
 def _minutes(seconds: float) -> str:

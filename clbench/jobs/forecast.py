@@ -62,10 +62,10 @@ def forecast(
 
 def _time(jobs: Sequence[Job], scenarios: Sequence[Scenario], at_once: int) -> str:
     slowest = max(map(step_seconds, scenarios))
-    seconds = slowest * sum(job.length * job.pace for job in jobs) / min(at_once, len(jobs))
+    seconds = slowest * sum(job.duration for job in jobs) / min(at_once, len(jobs))
     early = any(scenario.budget.criterion for scenario in scenarios)
     return (
-        f"Time: {'up to about' if early else 'about'} {_duration(seconds)} with {at_once} at once, at "
+        f"Time: about {_duration(seconds)} with {at_once} at once, at "
         f"{1000 * slowest:.0f} ms for an optimiser step here"
         f"{'; a stage ends as soon as its target is learned' if early else ''}."
     )
@@ -98,7 +98,7 @@ def step_seconds(scenario: Scenario) -> float:
         chunk = (size, config.chunk, config.action_size)
         batch = Batch(
             state=torch.randn(size, config.state_size),
-            words=torch.as_tensor(encode(scenario.target[0].instructions[:1] * size)),
+            words=torch.as_tensor(encode(scenario.target[0].instructions[:1] * size, scenario.text_length)),
             action=torch.randn(chunk),
             valid=torch.ones(chunk[:2]),
             draw=torch.rand(size),

@@ -26,7 +26,7 @@ class Job:
     arguments: dict[str, Any]
     """Arguments by name; they travel to another process."""
     length: float
-    """Length in optimiser steps, to estimate the time left."""
+    """Length in optimiser steps: what `progress` is told adds up to it."""
     needs: tuple[Job, ...] = ()
     """Jobs that must succeed first."""
     limits: Limits | None = None
@@ -34,7 +34,7 @@ class Job:
     device: str = "cpu"
     """Device on which the job computes."""
     pace: float = 1.0
-    """Time of a unit of length, relative to other jobs."""
+    """Expected time of a unit of length, relative to an optimiser step."""
     makes: Path | None = None
     """File that the job makes, which one command at a time may do: others wait, and do other jobs
     meanwhile. None lets several do the job."""
@@ -43,6 +43,11 @@ class Job:
 
     def __str__(self) -> str:
         return self.title
+
+    @property
+    def duration(self) -> float:
+        """Expected time of the job, relative to an optimiser step."""
+        return self.length * self.pace
 
     def new_lease(self) -> Lease | None:
         """Return the lease that a command needs to do the job, None if it needs none."""

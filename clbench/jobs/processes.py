@@ -1,19 +1,21 @@
-"""Workers on this machine: processes that each do one job with one thread."""
+"""Workers on this machine: processes that each do one job with one thread, or this process."""
 
 from __future__ import annotations
 
 import multiprocessing
 import os
+import queue
 import signal
 import sys
 import threading
 import time
 import traceback
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
+from types import ModuleType
 from typing import Any, Literal
 
 from clbench.base.lease import LeaseLostError
@@ -98,6 +100,62 @@ class Processes:
                 end(worker.process.pid)
 
 
+class Here:
+    """This process as a worker: one job at a time, for methods that no other process can import.
+
+    Args:
+        count: Ignored; other workers have a number of jobs at once.
+    """
+
+    def __init__(self, count: int | None = None) -> None:
+        self._job: Job | None = None
+        self._thread = threading.Thread()
+        self._events: queue.Queue[Event] = queue.Queue()
+        self._stopped = threading.Event()
+
+    def free(self) -> int:
+        """Return the number of jobs that can start now."""
+        return 0 if self._job else 1
+
+    def start(self, job: Job) -> None:
+        """Start a job in a thread, so that this one can show its progress."""
+        self._job = job
+        self._thread = threading.Thread(target=self._work, args=(job,), daemon=True)
+        self._thread.start()
+
+    def _work(self, job: Job) -> None:
+        def send(amount: float) -> None:
+            if self._stopped.is_set():
+                raise SystemExit  # it ends the thread alone
+            self._events.put(Event(job, "progress", amount))
+
+        listen(lambda place, remark: self._events.put(Event(job, "at", f"{place} {remark}".strip())))
+        try:
+            kind, value = _do_job(job.function, job.arguments, send)
+        except SystemExit:
+            return
+        finally:
+            listen(None)
+        self._events.put(Event(job, kind, value))
+
+    def events(self) -> Iterator[Event]:
+        """Yield the events since the last call; wait at most a second for one."""
+        with suppress(queue.Empty):
+            event = self._events.get(timeout=1.0)
+            while True:
+                if event.kind not in ("progress", "at"):
+                    self._thread.join()
+                    self._job = None
+                yield event
+                event = self._events.get_nowait()
+
+    def close(self) -> None:
+        """End the running job at its next sign of progress."""
+        self._stopped.set()
+        if self._thread.is_alive():
+            self._thread.join()
+
+
 def _leave(process: BaseProcess) -> None:
     """Wait until a process that has sent its outcome is gone; kill it if one of its threads keeps running."""
     process.join(_LEAVE_SECONDS)
@@ -125,6 +183,16 @@ def _signals_held_back() -> Iterator[None]:
             signal.raise_signal(number)
 
 
+@contextmanager
+def _script_hidden() -> Iterator[None]:
+    """Keep new processes from importing the user's script: no job needs it, and it would run twice."""
+    script, sys.modules["__main__"] = sys.modules["__main__"], ModuleType("__main__")
+    try:
+        yield
+    finally:
+        sys.modules["__main__"] = script
+
+
 def _context() -> Any:
     """Return how processes start: forked from one that has imported everything (50 ms), or new (2 s)."""
     if "forkserver" not in multiprocessing.get_all_start_methods():
@@ -140,7 +208,8 @@ def _context() -> Any:
     # its imports: until then the mask protects it. A Ctrl-C that comes meanwhile waits here, and is not lost.
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
-        forkserver.ensure_running()
+        with _script_hidden():
+            forkserver.ensure_running()
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
     return context
@@ -152,7 +221,8 @@ def _start(job: Job) -> _Worker:
     process = context.Process(
         target=_work, args=(theirs, job.function, job.arguments, dict(os.environ)), daemon=True
     )
-    process.start()
+    with _script_hidden():
+        process.start()
     theirs.close()  # so that the end of the process is the end of the stream
     return _Worker(job, process, ours)
 

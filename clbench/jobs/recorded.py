@@ -19,8 +19,8 @@ from clbench.spec.scenario import Scenario
 def has_record(run: ResolvedRun, records: Path) -> bool:
     """Return whether exactly this run has completed, or the same run with perturbed episodes.
 
-    A record does not count if its run failed, if it cannot be read or contradicts itself, or if its budget,
-    device or settings differ.
+    A record does not count if its run failed, if it cannot be read or contradicts itself, if its budget,
+    device or settings differ, or if the code of a method "module:Class" has changed since.
 
     Raises:
         InputError: The record was made with another definition of the scenario.
@@ -34,15 +34,17 @@ def has_record(run: ResolvedRun, records: Path) -> bool:
     found = record.run if run.spec.perturb else dataclasses.replace(record.run, perturb=False)
     if record.status != "success" or (found, record.scenario) != (run.info, run.scenario_info):
         return False
+    if not _same_code(record, run):
+        return False
     _check_definition(record, run.published, path)
     return True
 
 
-def set_damaged_aside(run: ResolvedRun, records: Path) -> str | None:
-    """Rename the record of a run if it is damaged, so that the run can be done again.
+def set_aside(run: ResolvedRun, records: Path) -> str | None:
+    """Rename the record of a run if it is damaged, or of older code of its method, to do the run again.
 
     Returns:
-        A sentence that says what was damaged and where it is now; None if there is no damaged record.
+        A sentence that says what was wrong and where the record is now; None if there is no such record.
     """
     path = run.path(records)
     if not os.path.lexists(path):
@@ -52,12 +54,28 @@ def set_damaged_aside(run: ResolvedRun, records: Path) -> str | None:
         if record.status == "success":
             Scores.from_record(record)
     except RecordError as error:
-        aside = path.with_name(f"{path.name}.damaged")
-        with contextlib.suppress(FileNotFoundError):  # another command was faster
-            path.replace(aside)
-        fault = str(error).removeprefix(f"{path}: ").rstrip(".")
-        return f"{path}: {fault}. It is set aside as {aside.name}, and the run is done again."
-    return None
+        fault, ending = str(error).removeprefix(f"{path}: ").rstrip("."), "damaged"
+    else:
+        if record.status != "success" or _same_code(record, run):
+            return None
+        fault, ending = f"the code of {run.spec.method} has changed since", "old"
+    aside = path.with_name(f"{path.name}.{ending}")
+    with contextlib.suppress(FileNotFoundError):  # another command was faster
+        path.replace(aside)
+    return f"{path}: {fault}. It is set aside as {aside.name}, and the run is done again."
+
+
+def _same_code(record: Record, run: ResolvedRun) -> bool:
+    """Return whether a record is of the code that its method has now.
+
+    Methods with a name of their own have versions; those of a module are work in progress.
+    """
+    if ":" not in run.spec.method:
+        return True
+    from clbench.learning.registry import describe_method
+
+    recorded = record.fingerprint.get("method")
+    return isinstance(recorded, dict) and recorded.get("source") == describe_method(run.method)["source"]
 
 
 def _check_definition(record: Record, published: Scenario, path: Path) -> None:

@@ -41,16 +41,16 @@ def run_jobs(jobs: Sequence[Job], workers: Workers, bars: Bars) -> dict[Job, str
                 if job.is_done is not None and job.is_done():
                     succeeded.add(job)
                     leases.release(job)
-                    bars.skip(job, job.length, "done by another command")
+                    bars.skip(job, job.duration, "done by another command")
                     continue
                 workers.start(job)
                 started[job] = time.monotonic()
-                bars.start(job, job.length)
+                bars.start(job, job.duration)
             if not started and waiting:
                 leases.wait(waiting, bars)
             for job, kind, value in workers.events() if started else ():
                 if kind == "progress":
-                    bars.advance(job, value)
+                    bars.advance(job, value * job.pace)
                     leases.report(job, bars.share(job))
                     continue
                 if kind == "at":
@@ -115,7 +115,7 @@ class _Leases:
 
 def run_with_bars(jobs: Sequence[Job], workers: Workers, console: Console | None = None) -> dict[Job, str]:
     """Do all jobs as `run_jobs` does, with a bar for each."""
-    with Bars(sum(job.length for job in jobs), console) as bars:
+    with Bars(sum(job.duration for job in jobs), console) as bars:
         return run_jobs(jobs, workers, bars)
 
 
@@ -131,7 +131,7 @@ def _by_urgency(jobs: Sequence[Job]) -> list[Job]:
 
     @cache
     def time_of_chain(job: Job) -> float:
-        return max(map(time_of_chain, dependents[job]), default=0.0) + job.length * job.pace
+        return max(map(time_of_chain, dependents[job]), default=0.0) + job.duration
 
     return sorted(jobs, key=lambda job: -time_of_chain(job))
 

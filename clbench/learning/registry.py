@@ -10,8 +10,9 @@ from collections.abc import Callable, Mapping
 from types import NoneType, UnionType
 from typing import Any, Union, get_args, get_origin, get_type_hints
 
+from clbench.base.cache import hash_of
 from clbench.base.errors import InputError, UnknownNameError, WrongTypeError
-from clbench.base.source import package_of, source_hash
+from clbench.base.source import class_hash, has_source, package_of, source_hash
 from clbench.base.text import did_you_mean
 from clbench.learning.method import Method
 from clbench.spec.identifiers import built_in_methods, installed_methods, unknown_method
@@ -43,14 +44,25 @@ def load_method(spec: str) -> type[Method]:
 
 
 def describe_method(cls: type[Method]) -> dict[str, Any]:
-    """Return a method's metadata, and as `source` the hash of its package or of its module."""
-    return {**dataclasses.asdict(cls.metadata), "source": source_hash(*method_packages(cls))}
+    """Return a method's metadata, and as `source` the hash of its package or of its module.
+
+    For a class that was typed at a prompt, `source` is the hash of the class.
+    """
+    source = source_hash(*method_packages(cls))
+    typed = [class_hash(base) for base in _method_classes(cls) if not has_source(base.__module__)]
+    if typed:
+        source = hash_of([source, *typed])
+    return {**dataclasses.asdict(cls.metadata), "source": source}
 
 
 def method_packages(cls: type[Method]) -> list[str]:
     """Return the packages, or modules, of a method and of the methods that it derives from."""
-    classes = (base for base in cls.__mro__ if issubclass(base, Method) and base is not Method)
-    return sorted({package_of(base.__module__) for base in classes})
+    return sorted({package_of(base.__module__) for base in _method_classes(cls)})
+
+
+def _method_classes(cls: type[Method]) -> list[type[Method]]:
+    """Return a method and the methods that it derives from."""
+    return [base for base in cls.__mro__ if issubclass(base, Method) and base is not Method]
 
 
 def _guarded(spec: str, load: Callable[[], Any]) -> Any:

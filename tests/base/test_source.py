@@ -1,12 +1,13 @@
 """Hashes of source code: a cache key covers all code of its stage, and every module it names exists."""
 
+import os
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
-from clbench.base.source import DATA_SOURCES, RUN_SOURCES, TRAINING_SOURCES, source_hash
+from clbench.base.source import DATA_SOURCES, RUN_SOURCES, TRAINING_SOURCES, class_hash, source_hash
 
 STAGES = {
     "demonstrations": (
@@ -81,3 +82,41 @@ def test_a_class_typed_at_a_prompt_has_a_hash() -> None:
     code = "from clbench.base.source import source_hash; print(len(source_hash('__main__')))"
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert result.stdout.strip() == "16"
+
+
+CLASS = """
+class Some:
+    number = {number}
+
+    def ask(self, name):
+        return name in {{"one", "two", "{name}"}}
+
+    @property
+    def size(self):
+        return {size}
+"""
+
+
+def test_the_hash_of_a_typed_class_follows_its_code_and_values_and_not_its_place() -> None:
+    def hashed(text: str) -> str:
+        space: dict[str, type] = {}
+        exec(text, space)
+        return class_hash(space["Some"])
+
+    usual = {"number": 1, "name": "three", "size": 4}
+    before = hashed(CLASS.format(**usual))
+    assert hashed("# a remark\n\n" + CLASS.format(**usual)) == before
+    for change in ({"number": 2}, {"name": "four"}, {"size": 5}):
+        assert hashed(CLASS.format(**usual | change)) != before
+
+
+def test_the_hash_of_a_typed_class_is_the_same_in_every_process() -> None:
+    text = CLASS.format(number=1, name="three", size=4)
+    code = f"from clbench.base.source import class_hash\n{text}\nprint(class_hash(Some))"
+    command = [sys.executable, "-c", code]
+    environments = [{**os.environ, "PYTHONHASHSEED": seed} for seed in ("1", "2")]
+    first, second = (
+        subprocess.run(command, capture_output=True, text=True, check=True, env=one).stdout
+        for one in environments
+    )
+    assert first == second

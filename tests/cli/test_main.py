@@ -169,7 +169,7 @@ def test_the_shards_of_a_command_do_each_of_its_runs_once(
         done.extend(job.title for job in jobs if job.function is do_run)
         return {}
 
-    monkeypatch.setattr("clbench.jobs.scheduler.run_with_bars", note)
+    monkeypatch.setattr("clbench.jobs.grid.run_with_bars", note)
     runs = ["run", f"{TOY},clbench/Fetch-v1", "sft", "frozen", "lora", "--seeds", "3"]
     app(runs, result_action="return_value")
     whole, parts = sorted(done), []
@@ -187,7 +187,7 @@ def test_a_folder_that_cannot_be_written_to_is_named_before_work_begins(
     option: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("clbench.jobs.scheduler.run_with_bars", lambda *_: pytest.fail("work began"))
+    monkeypatch.setattr("clbench.jobs.grid.run_with_bars", lambda *_: pytest.fail("work began"))
     file = tmp_path / "a file"
     file.write_text("precious")
     before = sorted(tmp_path.iterdir())
@@ -209,7 +209,7 @@ def test_a_folder_with_markup_in_its_name_is_shown_as_it_is(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setenv("COLUMNS", "200")
-    monkeypatch.setattr("clbench.jobs.scheduler.run_with_bars", lambda *_: {})
+    monkeypatch.setattr("clbench.jobs.grid.run_with_bars", lambda *_: {})
     records = tmp_path / "[" / "red]x"
     app(["run", TOY, "sft", "--seeds", "1", "--records", str(records)], result_action="return_value")
     assert f"records in {records}." in capsys.readouterr().err.replace("\n", "")

@@ -17,7 +17,7 @@ from helpers import resealed
 
 from clbench.base.cache import fault_of
 from clbench.base.errors import InputError
-from clbench.jobs.recorded import has_record, set_damaged_aside
+from clbench.jobs.recorded import has_record, set_aside
 from clbench.records.reader import RecordError
 from clbench.runs.run import execute
 from clbench.runs.spec import ResolvedRun, RunSpec
@@ -188,7 +188,7 @@ def test_a_damaged_record_is_refused_by_all_commands_or_shows_the_same_numbers(
             came["refused as of another definition"] += 1
             continue
         assert shown or not counts
-        aside = set_damaged_aside(run, records)
+        aside = set_aside(run, records)
         assert (aside is None) == (path.exists())
         if aside is not None:
             assert not shown

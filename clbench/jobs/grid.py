@@ -1,0 +1,191 @@
+"""Runs of methods on scenarios for several seeds: which of them are missing, and doing these."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from rich.console import Console
+
+from clbench.base.cache import cache_folder
+from clbench.base.errors import ClbenchError, WrongTypeError
+from clbench.base.leftovers import sweep
+from clbench.base.text import counted, printable
+from clbench.jobs.bars import lines_console
+from clbench.jobs.folders import check_folders, minari_folder
+from clbench.jobs.job import Job, Workers
+from clbench.jobs.plan import Plan
+from clbench.jobs.processes import Here, Processes
+from clbench.jobs.recorded import has_record, set_aside
+from clbench.jobs.scheduler import run_with_bars
+from clbench.records.paths import RECORDS
+from clbench.records.reader import read_record
+from clbench.runs.checkpoints import has_stages
+from clbench.runs.spec import ResolvedRun, RunSpec, check_device
+from clbench.spec.identifiers import installed_methods
+
+if TYPE_CHECKING:
+    from clbench.learning.method import Method
+    from clbench.records.record import Record
+
+
+class RunsFailedError(ClbenchError, RuntimeError):
+    """Runs failed, each for the reason that the message gives."""
+
+
+class Missing(NamedTuple):
+    """What is still missing of a grid."""
+
+    runs: list[ResolvedRun]
+    """Runs without a record."""
+    stages: list[ResolvedRun]
+    """Runs with a record whose policies are to be kept, and are not."""
+
+    def plan(self, records: Path, checkpoints: Path | None, tensorboard: Path | None = None) -> Plan:
+        """Return the plan of the jobs."""
+        plan = Plan()
+        for one in self.runs:
+            plan.add_run(one, records, checkpoints=checkpoints, tensorboard=tensorboard)
+        for one in self.stages:
+            plan.add_stages(one, checkpoints)
+        return plan
+
+
+def missing(runs: Sequence[ResolvedRun], records: Path, checkpoints: Path | None) -> Missing:
+    """Return what has to be done until all runs have a record and, with `checkpoints`, policies there."""
+    without = [run for run in runs if not has_record(run, records)]
+    recorded = [run for run in runs if run not in without]
+    return Missing(without, [run for run in recorded if checkpoints and not has_stages(run, checkpoints)])
+
+
+def run_missing(
+    runs: Sequence[ResolvedRun],
+    records: Path,
+    workers: Callable[[], Workers],
+    console: Console,
+    checkpoints: Path | None = None,
+    tensorboard: Path | None = None,
+) -> dict[Job, str]:
+    """Do the runs that have no record yet, and return the reason of each failure by job.
+
+    Args:
+        runs: The runs.
+        records: Folder of the records.
+        workers: Returns the workers, once there is something to do.
+        console: Console that shows the progress.
+        checkpoints: Folder below which the policies of all stages are kept; None keeps none.
+        tensorboard: Folder below which the runs are logged; None logs nothing.
+
+    Raises:
+        InputError: A folder cannot be written to, a record is of another definition of its scenario, or this
+            machine cannot render what a scenario needs.
+    """
+    sweep(records, cache_folder(), minari_folder() / "clbench")
+    to_do = missing(runs, records, checkpoints)
+    there = len(runs) - len(to_do.runs)
+    if there:
+        console.print(
+            f"{there} of {counted(len(runs), 'run')} {'has' if there == 1 else 'have'} a record already."
+        )
+    if not any(to_do):
+        return {}
+    begin = time.monotonic()
+    check_folders({"--records": records, "--checkpoints": checkpoints, "--tensorboard": tensorboard})
+    for one in to_do.runs:
+        fault = set_aside(one, records)
+        if fault is not None:
+            console.print(printable(fault), highlight=False, markup=False, soft_wrap=True)
+    jobs = to_do.plan(records, checkpoints, tensorboard).jobs  # refuses a camera where nothing can render
+    failed = run_with_bars(jobs, workers(), console)
+    seconds = time.monotonic() - begin
+    good = sum(has_record(run, records) for run in to_do.runs)
+    done = f"{good} of " if good < len(to_do.runs) else ""
+    done += counted(len(to_do.runs), "run")
+    done += f" and the policies of {len(to_do.stages)}" if to_do.stages else ""
+    line = f"{done} in {seconds / 60:.1f} minutes; records in {records}."
+    console.print(line, highlight=False, markup=False, soft_wrap=True)
+    return failed
+
+
+def run(
+    scenario: str,
+    method: str | type[Method],
+    *,
+    seeds: int = 2,
+    first_seed: int = 0,
+    settings: Mapping[str, Any] | None = None,
+    perturb: bool = False,
+    records: Path | str = RECORDS,
+    workers: int | None = None,
+    device: str = "cpu",
+) -> list[Record]:
+    """Run a method on a scenario, once per seed, and return the records by seed.
+
+    Missing inputs are made first, as `clbench run` does. A run that has a record in the folder is not done
+    again, unless the code of a method of your own has changed: the old record is then set aside. Progress
+    shows on standard error, in notebooks below the cell.
+
+    A class from a notebook, or from the script itself, cannot be imported by other processes: its runs are
+    done here, one after the other. Put it into a module to use all cores.
+
+    Args:
+        scenario: Gymnasium id of the scenario; "module:id" imports the module first.
+        method: Class of the method, its installed name, or "module:Class".
+        seeds: Number of seeds.
+        first_seed: The first seed.
+        settings: Hyper-parameters that differ from the method's own, or from those tuned for the scenario.
+        perturb: Whether the skills and each new target are also evaluated in perturbed worlds.
+        records: Folder of the records.
+        workers: Number of runs at once, each a process with one thread; all cores if None.
+        device: Device on which policies are computed, for example "cpu" or "cuda".
+
+    Raises:
+        UnknownNameError: There is no such scenario, method or hyper-parameter.
+        InputError: A value cannot be used; the message says which.
+        RunsFailedError: A run failed.
+    """
+    check_device(device)
+    spec = RunSpec(scenario, name_of(method), first_seed, settings or {}, device, perturb=perturb)
+    return run_specs([spec], seeds, Path(records), workers)
+
+
+def run_specs(firsts: Sequence[RunSpec], seeds: int, records: Path, workers: int | None) -> list[Record]:
+    """Do the runs that `firsts` name, each with several seeds from its own on, and return their records.
+
+    Raises:
+        RunsFailedError: A run failed.
+    """
+    specs = [replace(one, seed=one.seed + number) for one in firsts for number in range(seeds)]
+    runs = [spec.resolve() for spec in specs]
+    console = lines_console()
+    typed = [run for run in runs if run.spec.method.startswith("__main__:")]
+    others = [run for run in runs if run not in typed]
+    # other processes cannot import the class, but can make what its runs need
+    needed = [
+        job for job in missing(typed, records, None).plan(records, None).jobs if "spec" not in job.arguments
+    ]
+    failed = run_with_bars(needed, Processes(workers), console) if needed else {}
+    failed |= run_missing(others, records, lambda: Processes(workers), console) if others else {}
+    failed |= run_missing(typed, records, Here, console) if typed else {}
+    if failed:
+        raise RunsFailedError("\n".join(f"{job}: {reason}" for job, reason in failed.items()))
+    return [read_record(run.path(records)) for run in runs]
+
+
+def name_of(method: str | type[Method]) -> str:
+    """Return the name of a method: the installed one, or "module:Class".
+
+    Raises:
+        WrongTypeError: The class is inside a function or another class, where no name can reach it.
+    """
+    if isinstance(method, str):
+        return method
+    place = f"{method.__module__}:{method.__qualname__}"
+    if not method.__qualname__.isidentifier():
+        raise WrongTypeError(
+            f"{method.__qualname__} cannot be found by its name: define it outside of functions."
+        )
+    return next((name for name, entry in installed_methods().items() if entry.value == place), place)

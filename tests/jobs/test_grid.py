@@ -1,0 +1,119 @@
+"""`clbench.run`: a method from Python, also one that no other process can import."""
+
+import importlib
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import clbench
+from clbench.base.progress import ProgressCallback
+from clbench.jobs.job import Job
+from clbench.jobs.processes import Here
+
+TOY = "clbench.testing:clbench/Toy-v0"
+
+METHOD = """
+from dataclasses import dataclass
+
+import clbench
+
+
+@dataclass
+class Slow(clbench.Method):
+    step_factor: float = 0.5
+"""
+
+SCRIPT = f"""{METHOD}
+
+first, second = clbench.run("{TOY}", Slow, seeds=2, records="records")
+print(first.run.method, first.status, second.run.seed, first.run.settings["step_factor"])
+"""
+
+
+def run_script(text: str, folder: Path) -> subprocess.CompletedProcess[str]:
+    (folder / "script.py").write_text(text, encoding="utf-8")
+    command = [sys.executable, "script.py"]
+    return subprocess.run(command, cwd=folder, capture_output=True, text=True, check=True)
+
+
+def test_a_class_of_the_script_itself_runs_and_its_change_is_noticed(tmp_path: Path) -> None:
+    result = run_script(SCRIPT, tmp_path)
+    assert result.stdout == "__main__:Slow success 1 0.5\n"  # once: no process did the script again
+    again = run_script(SCRIPT, tmp_path)
+    assert "2 of 2 runs have a record already." in again.stderr
+    changed = run_script(SCRIPT.replace("0.5", "0.25", 1), tmp_path)
+    assert changed.stdout == "__main__:Slow success 1 0.25\n"
+    assert "the code of __main__:Slow has changed since. It is set aside as seed-0.json.old" in changed.stderr
+    kept = sorted(path.name for path in (tmp_path / "records").rglob("*.json*"))
+    assert kept == ["seed-0.json", "seed-0.json.old", "seed-1.json", "seed-1.json.old"]
+
+
+def test_a_class_of_a_module_runs_in_processes_and_its_change_is_noticed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / "slow.py").write_text(METHOD, encoding="utf-8")
+    module = importlib.import_module("slow")
+    (record,) = clbench.run(TOY, module.Slow, seeds=1, records=tmp_path / "records")
+    assert (record.run.method, record.run.seed) == ("slow:Slow", 0)
+    assert clbench.run(TOY, module.Slow, seeds=1, records=tmp_path / "records") == [record]
+    (tmp_path / "slow.py").write_text(f"{METHOD}    # a remark\n", encoding="utf-8")
+    capsys.readouterr()
+    (again,) = clbench.run(TOY, importlib.reload(module).Slow, seeds=1, records=tmp_path / "records")
+    assert "the code of slow:Slow has changed since" in capsys.readouterr().err
+    assert again.fingerprint["method"] != record.fingerprint["method"]
+    assert again.episodes == record.episodes
+
+
+def test_an_installed_method_is_named_by_its_class(tmp_path: Path) -> None:
+    settings = {"step_factor": 0.5}
+    records = clbench.run(
+        TOY, clbench.load_method("frozen"), seeds=1, first_seed=3, settings=settings, records=tmp_path
+    )
+    assert [(one.run.method, one.run.seed, one.run.changes) for one in records] == [("frozen", 3, settings)]
+
+
+def test_a_failed_run_raises_with_its_reason(tmp_path: Path) -> None:
+    script = f"""{METHOD}
+    def loss(self, policy, batch, progress):
+        raise ArithmeticError("no loss today")
+
+
+try:
+    clbench.run("{TOY}", Slow, seeds=1, records="records")
+except clbench.RunsFailedError as error:
+    print(error)
+"""
+    result = run_script(script, tmp_path)
+    assert "Slow seed 0: " in result.stdout
+    assert "ArithmeticError" in result.stdout
+    assert "no loss today" in result.stdout
+
+
+def test_a_class_inside_a_function_is_refused(tmp_path: Path) -> None:
+    class Hidden(clbench.Method):
+        pass
+
+    with pytest.raises(TypeError, match="cannot be found by its name: define it outside of functions"):
+        clbench.run(TOY, Hidden, records=tmp_path)
+
+
+def test_a_job_of_this_process_ends_when_its_worker_is_closed() -> None:
+    reached = []
+
+    def endless(progress: ProgressCallback) -> str:
+        while True:
+            progress(1.0)
+            reached.append(1)
+
+    worker = Here()
+    worker.start(Job("endless", endless, {}, 1.0))
+    assert worker.free() == 0
+    next(worker.events())
+    worker.close()
+    count = len(reached)
+    assert count > 0
+    assert len(reached) == count
