@@ -1,8 +1,9 @@
-"""The worked example of `docs/guide/your_method.md`, run unchanged, as a stranger would."""
+"""The worked examples of `docs/guide/your_method.md`, run unchanged, as a stranger would."""
 
 import importlib
 import re
 import sys
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 
+import clbench
 from clbench.learning.method import Progress, Stage
 from clbench.learning.prior import Nothing, Prior, Source
 from clbench.policy.policy import Policy
@@ -23,11 +25,12 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 @pytest.fixture
 def blocks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """Return the Python of the page; its first block can be imported as `der`."""
+    """Return the Python of the page; its methods can be imported as `der` and `si`."""
     found = re.findall(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), flags=re.DOTALL)
-    (tmp_path / "der.py").write_text(found[0], encoding="utf-8")
     monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.delitem(sys.modules, "der", raising=False)
+    for name, text in (("der", found[0]), ("si", found[2])):
+        (tmp_path / f"{name}.py").write_text(text, encoding="utf-8")
+        monkeypatch.delitem(sys.modules, name, raising=False)
     return found
 
 
@@ -37,8 +40,9 @@ def der(blocks: list[str]) -> Any:
     return importlib.import_module("der").DER(kept=8)
 
 
-def test_its_method_keeps_the_contract(blocks: list[str]) -> None:
-    exec(blocks[1], {})
+@pytest.mark.parametrize("block", [1, 3])
+def test_its_methods_keep_the_contract(block: int, blocks: list[str]) -> None:
+    exec(blocks[block], {})
 
 
 def test_its_loss_is_that_of_der_plus_plus(der: Any) -> None:
@@ -73,3 +77,43 @@ def test_its_method_begins_without_skills_and_remembers_from_the_first_target_on
     assert loss.item() == policy.action_loss(new).mean().item()
     der.end_task(policy, Stage(1, TOY.task("right"), 0, 10, source, Prior({})))
     assert len(der.memory) == len(der.velocity) == 8
+
+
+def flat(tensors: Iterable[torch.Tensor]) -> Any:
+    return np.concatenate([one.detach().double().numpy().ravel() for one in tensors])
+
+
+def test_the_importance_of_the_skills_is_that_of_synaptic_intelligence(blocks: list[str]) -> None:
+    si = importlib.import_module("si").SI()
+    policy = Policy(SMALL)
+    parameters = list(policy.parameters())
+    source = toy_source("left", "up")
+    optimiser = torch.optim.SGD(parameters, lr=0.1)
+    weights, gradients = [flat(parameters)], []
+    si.watch_pretraining(policy, Progress(0, 3))
+    for step in range(3):
+        optimiser.zero_grad(set_to_none=False)
+        torch.autograd.backward(policy.action_loss(source.sample(8)).mean())
+        optimiser.step()
+        si.watch_pretraining(policy, Progress(step + 1, 3))
+        weights.append(flat(parameters))
+        gradients.append(flat([torch.zeros_like(p) if p.grad is None else p.grad for p in parameters]))
+    steps = zip(gradients, weights[:-1], weights[1:], strict=True)
+    path = -sum(gradient * (after - before) for gradient, before, after in steps)
+    expected = np.maximum(path, 0) / ((weights[-1] - weights[0]) ** 2 + 1e-3)
+    assert np.any(expected > 1e-6)
+    np.testing.assert_allclose(si.state()["importance"].numpy(), expected, rtol=1e-3, atol=1e-9)
+    np.testing.assert_allclose(si.state()["anchor"].numpy(), weights[-1], rtol=1e-6)
+
+
+def test_synaptic_intelligence_watches_the_pretraining_and_keeps_more_skills_than_fine_tuning(
+    blocks: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    toy, strong = "clbench.testing:clbench/Toy-v0", {"strength": 1e4}
+    (plain,) = clbench.run(toy, "sft", seeds=1, records=tmp_path / "records")
+    (held,) = clbench.run(toy, "si:SI", seeds=1, settings=strong, records=tmp_path / "records")
+    assert held.costs.preparation_steps == TOY.budget.pretraining_steps
+    assert held.costs.bytes_kept == 2 * 4 * (held.costs.parameters or 0)
+    retained = [one.matrix()["retained"].iloc[-1].mean() for one in (plain, held)]
+    assert retained[1] > retained[0] + 0.5

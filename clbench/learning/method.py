@@ -107,6 +107,14 @@ class Method:
     """Whether the policy is ready only at the end of a stage, for example because `end_task` merges it. Such
     a policy is not evaluated within a stage."""
 
+    def watch_pretraining(self, policy: Policy, progress: Progress) -> None:
+        """Look at the pretraining: before its first step, as step 0, and after each step.
+
+        For a method that overrides it, the pretraining is repeated before `prepare`, and its steps count as
+        the method's. `parameter.grad` holds the clipped gradients of the step just taken. Change nothing, and
+        return from `state` what later hooks need. `uses` must declare prior demonstrations.
+        """
+
     def prepare(self, policy: Policy, prior: Prior) -> int | None:
         """Prepare for the sequence, once, before stage 1: anchors, vectors, adapters, frozen copies.
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import dataclasses
-import json
 import os
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
@@ -13,12 +12,10 @@ from typing import Any
 
 import torch
 from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
 
-from clbench.base.progress import announce
+from clbench.base.progress import ProgressCallback, announce, no_progress
 from clbench.base.seeding import derive_seed, seeded, torch_generator
 from clbench.base.source import RUN_SOURCES, source_hash
-from clbench.base.strict_json import check_json, read_json
 from clbench.data.access import check_policy, hooks, outside
 from clbench.data.demonstrations import Demonstrations
 from clbench.data.training_data import TrainingData
@@ -27,6 +24,7 @@ from clbench.learning.method import Method, MethodState, Stage
 from clbench.learning.optimise import deterministic
 from clbench.learning.pretraining import pretrained_policy, pretraining_inputs
 from clbench.learning.prior import Access, Nothing, Prior, Source
+from clbench.learning.watching import read_state, watch, watches, write_state
 from clbench.policy.checkpoint import CheckpointError, load_policy, save_policy
 from clbench.policy.policy import Policy
 from clbench.spec.scenario import Scenario
@@ -48,6 +46,7 @@ class Trainer:
         pretrained: The pretrained policy, on the device where the run computes; it is not changed.
         new_method: Returns a new object of the method.
         seed: Seed of the run.
+        pretraining_seed: Seed of the pretrained policy, if it is another one.
     """
 
     def __init__(
@@ -57,8 +56,10 @@ class Trainer:
         pretrained: Policy,
         new_method: Callable[[], Method],
         seed: int,
+        pretraining_seed: int | None = None,
     ) -> None:
         self.scenario, self.data, self.seed = scenario, data, seed
+        self._pretraining_seed = seed if pretraining_seed is None else pretraining_seed
         self.pretrained, self.new_method = pretrained, new_method
         self.policy, self.method = copy.deepcopy(pretrained), new_method()
         self.where = "start"
@@ -92,15 +93,43 @@ class Trainer:
         """Device on which the policy is computed."""
         return self.pretrained.state_mean.device
 
-    def prepare(self) -> int:
-        """Let the method prepare for the sequence, and return the number of optimiser steps that it took."""
+    def prepare(self, progress: ProgressCallback = no_progress) -> int:
+        """Let the method prepare for the sequence, and return the number of optimiser steps that it took.
+
+        Args:
+            progress: Called with the number of steps of the pretraining that the method has watched.
+        """
+        watched = self._watch(progress) if watches(type(self.method)) else 0
         self.where = "prepare"
         prior = self.prior(0, ("prepare", "throughout"))
         with seeded("method", self.seed, 0), self._hooks(0):
             steps = self.method.prepare(self.policy, prior) or 0
         prior.close()
         check_policy(self.policy, self.pretrained)
-        return steps
+        return watched + steps
+
+    def _watch(self, progress: ProgressCallback) -> int:
+        """Let the method watch the pretraining, and return its number of steps."""
+        self.where = "watch_pretraining"
+        with seeded("method", self.seed, 0):
+            state = watch(
+                self.method,
+                self.pretrained,
+                self.scenario,
+                self._pretraining_seed,
+                lambda: self._hooks(0),
+                progress,
+            )
+        self.method = self.new_method()
+        self.where = "load_state() after watch_pretraining"
+        self.method.load_state(
+            self.policy,
+            {
+                name: value.to(self.device) if isinstance(value, torch.Tensor) else value
+                for name, value in state.items()
+            },
+        )
+        return self.scenario.budget.pretraining_steps
 
     def learn(self, number: int, after: Callable[[Step], bool | None]) -> int:
         """Adapt to a target, and return the number of optimiser steps done.
@@ -160,13 +189,7 @@ class Trainer:
     def save(self, folder: Path, state: MethodState) -> None:
         """Write the policy and the state of the method to the `STAGE_FILES` of `folder`."""
         save_policy(self.policy, folder)
-        tensors = {name: value for name, value in state.items() if isinstance(value, torch.Tensor)}
-        copies = {name: value.detach().clone().contiguous() for name, value in tensors.items()}
-        save_file(copies, folder / "method.safetensors")
-        values = {name: value for name, value in state.items() if name not in tensors}
-        text = json.dumps(values)
-        check_json(json.loads(text))  # refuse here, with a name, what reading the file would refuse
-        (folder / "method.json").write_text(text, encoding="utf-8")
+        write_state(folder, state)
 
     def load(self, folder: Path, number: int) -> None:
         """Load the policy and the method that stage `number` left in `folder`."""
@@ -183,8 +206,7 @@ def load_stage(folder: Path, method: Method, device: torch.device | str) -> Poli
         CheckpointError: A file is missing or torn, or is not a file of a stage.
     """
     try:
-        state: MethodState = {**read_json(folder / "method.json")}
-        state.update(load_file(folder / "method.safetensors", device=str(device)))
+        state = read_state(folder, device)
     except (OSError, ValueError, TypeError, SafetensorError) as error:
         raise CheckpointError(f"{folder}: cannot be read as the state of a method ({error}).") from error
     return load_policy(folder, lambda policy: method.load_state(policy, state)).to(device)

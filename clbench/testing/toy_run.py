@@ -22,6 +22,7 @@ from clbench.learning.optimise import MethodError
 from clbench.learning.pretraining import pretrained_policy
 from clbench.learning.prior import Prior, Source, UndeclaredAccessError
 from clbench.learning.trainer import Trainer, repeatable
+from clbench.learning.watching import watches
 from clbench.policy.checkpoint import CheckpointError
 from clbench.policy.policy import Policy
 from clbench.testing.error import ContractError
@@ -29,6 +30,7 @@ from clbench.testing.global_state import GENERATORS, read, watched
 from clbench.testing.toy import TOY
 
 HOOKS = (
+    "watch_pretraining",
     "prepare",
     "start_task",
     "batch",
@@ -101,7 +103,7 @@ class ToyRun:
         data, pretrained = toy_data()
         # no two runs begin with the same global generators: results that depend on them differ
         with repeatable("cpu"), seeded("toy run", next(_numbers)), tempfile.TemporaryDirectory() as folder:
-            self.trainer = Trainer(scenario, data, pretrained, self._watched_method, seed)
+            self.trainer = Trainer(scenario, data, pretrained, self._watched_method, seed, 0)
             self._go(Path(folder), resumed)
 
     def _go(self, folder: Path, resumed: bool) -> None:
@@ -151,6 +153,8 @@ class ToyRun:
     def _watched_method(self) -> Method:
         method = self._build()
         self.uses = method.uses
+        if watches(type(method)):  # in the cache after the first run
+            self.draws.add(("demonstrations", "prepare"))
         for hook in HOOKS:
             # an attribute of the object takes precedence over the hook of its class, even if it is frozen
             object.__setattr__(method, hook, functools.partial(self._call, hook, getattr(method, hook)))
@@ -226,7 +230,8 @@ class ToyRun:
                 raise _bad_state("names that are text", repr(name))
             if not (value is None or isinstance(value, Tensor | str | float | int)):
                 raise _bad_state("tensors and plain values", f"a {type(value).__name__}, {name!r}")
-            self._keep(self.trainer.where, f"state {name!r}", value)
+            if self.trainer.where != "watch_pretraining":  # a later run has it from the cache
+                self._keep(self.trainer.where, f"state {name!r}", value)
         return state
 
     def _checked_diagnostics(self, diagnostics: Any) -> Any:

@@ -1,0 +1,94 @@
+"""Pretraining, repeated for a method that watches it: some need to know how the skills were learned."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from pathlib import Path
+
+import torch
+from safetensors.torch import load_file, save_file
+
+from clbench.base.cache import cache_folder, cached, hash_of
+from clbench.base.progress import ProgressCallback
+from clbench.base.strict_json import check_json, read_json
+from clbench.learning.method import Method, MethodState, Progress
+from clbench.learning.optimise import MethodError
+from clbench.learning.pretraining import pretrain, pretraining_inputs
+from clbench.learning.registry import describe_method
+from clbench.policy.policy import Policy
+from clbench.spec.scenario import Scenario
+
+
+def watches(method: type[Method]) -> bool:
+    """Return whether a method watches the pretraining."""
+    return method.watch_pretraining is not Method.watch_pretraining
+
+
+def watch(
+    method: Method,
+    pretrained: Policy,
+    scenario: Scenario,
+    seed: int,
+    hooks: Callable[[], AbstractContextManager[None]],
+    progress: ProgressCallback,
+) -> MethodState:
+    """Let a method watch the pretraining, unless the cache has what it kept, and return its state after it.
+
+    Args:
+        method: The method.
+        pretrained: The policy that was pretrained; the same must come out again.
+        scenario: Its scenario.
+        seed: Its seed.
+        hooks: Returns the context in which hooks run.
+        progress: Called with the number of steps done since its last call.
+
+    Raises:
+        MethodError: The method does not declare prior demonstrations, or changed the pretraining.
+    """
+    if method.uses.demonstrations == "never":
+        raise MethodError(
+            "watch_pretraining() learns from the demonstrations of the skills: "
+            'declare `uses = Uses(demonstrations="prepare")`.'
+        )
+    inputs = {
+        **pretraining_inputs(scenario, seed),
+        "method": describe_method(type(method))["source"],
+        "class": f"{type(method).__module__}:{type(method).__qualname__}",
+        "settings": {name: repr(value) for name, value in dataclasses.asdict(method).items()},
+    }
+
+    def make(partial: Path) -> None:
+        steps = scenario.budget.pretraining_steps
+
+        def look(policy: Policy, step: int) -> None:
+            with hooks():
+                method.watch_pretraining(policy, Progress(step, steps))
+
+        again = pretrain(scenario, seed, progress, look)
+        for name, value in pretrained.state_dict().items():
+            if not torch.equal(value.cpu(), again.state_dict()[name]):
+                raise MethodError(f"watch_pretraining() changed the pretraining: {name} is another.")
+        write_state(partial, method.state())
+
+    return read_state(cached(cache_folder() / "watched" / hash_of(inputs), inputs, make))
+
+
+def write_state(folder: Path, state: MethodState) -> None:
+    """Write the state of a method to `method.safetensors` and `method.json` in `folder`."""
+    tensors = {name: value for name, value in state.items() if isinstance(value, torch.Tensor)}
+    copies = {name: value.detach().clone().contiguous() for name, value in tensors.items()}
+    save_file(copies, folder / "method.safetensors")
+    values = {name: value for name, value in state.items() if name not in tensors}
+    text = json.dumps(values)
+    check_json(json.loads(text))  # refuse here, with a name, what reading the file would refuse
+    (folder / "method.json").write_text(text, encoding="utf-8")
+
+
+def read_state(folder: Path, device: torch.device | str = "cpu") -> MethodState:
+    """Return the state of a method that `write_state` wrote to `folder`."""
+    state: MethodState = {**read_json(folder / "method.json")}
+    state.update(load_file(folder / "method.safetensors", device=str(device)))
+    return state

@@ -1,0 +1,115 @@
+"""Methods that watch the pretraining: what they see, what they may not do, and what it costs."""
+
+import importlib
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import clbench
+from clbench.base.cache import cache_folder
+from clbench.learning.watching import watches
+from clbench.testing import TOY, ContractError, check_method
+
+ID = "clbench.testing:clbench/Toy-v0"
+
+METHOD = """
+from dataclasses import dataclass
+
+from clbench import Method, Uses
+
+
+@dataclass
+class Watching(Method):
+    uses = Uses(demonstrations="prepare")
+
+    def __post_init__(self):
+        self.seen = {}
+
+    def watch_pretraining(self, policy, progress):
+        gradients = [one.grad for one in policy.parameters()]
+        with_one = sum(one is not None for one in gradients)
+        self.seen = {"step": progress.step, "steps": progress.steps, "calls": self.seen.get("calls", 0) + 1}
+        self.seen["gradients"] = with_one / len(gradients)
+
+    def state(self):
+        return self.seen
+
+    def load_state(self, policy, state):
+        self.seen = state
+"""
+
+
+@dataclass
+class Careful(clbench.Method):
+    """Looks at the weights after the pretraining."""
+
+    uses = clbench.Uses(demonstrations="prepare")
+
+    def watch_pretraining(self, policy: clbench.Policy, progress: clbench.Progress) -> None:
+        self.largest = max(float(one.detach().abs().max()) for one in policy.parameters())
+
+    def state(self) -> dict[str, Any]:
+        return {"largest": self.largest}
+
+    def load_state(self, policy: clbench.Policy, state: dict[str, Any]) -> None:
+        self.largest = state["largest"]
+
+
+@dataclass
+class Meddling(Careful):
+    """Changes a weight on the way."""
+
+    def watch_pretraining(self, policy: clbench.Policy, progress: clbench.Progress) -> None:
+        super().watch_pretraining(policy, progress)
+        if progress.step == 2:
+            next(policy.head.parameters()).data.mul_(1.5)
+
+
+@dataclass
+class Undeclared(Careful):
+    """Declares no demonstrations."""
+
+    uses = clbench.Uses()
+
+
+def test_a_method_sees_every_step_and_pays_for_it(
+    tmp_path: Path, empty_caches: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / "watching_method.py").write_text(METHOD, encoding="utf-8")
+    method = importlib.import_module("watching_method").Watching
+    (first,) = clbench.run(ID, method, seeds=1, records=tmp_path / "one")
+    (second,) = clbench.run(ID, method, seeds=1, records=tmp_path / "two")
+    steps = TOY.budget.pretraining_steps
+    assert first.costs.preparation_steps == second.costs.preparation_steps == steps
+    assert first.episodes == second.episodes  # the second one had it from the cache
+    (state,) = (cache_folder() / "watched").glob("*/method.json")
+    seen = {"step": steps, "steps": steps, "calls": steps + 1, "gradients": 1.0}
+    assert json.loads(state.read_text(encoding="utf-8")) == seen
+
+
+def test_only_a_method_that_overrides_the_hook_watches() -> None:
+    assert watches(Careful)
+    assert not watches(clbench.load_method("sft"))
+
+
+def test_a_method_that_only_looks_keeps_the_contract() -> None:
+    check_method(Careful)
+
+
+@pytest.mark.parametrize(
+    ("method", "message"),
+    [
+        (Meddling, r"watch_pretraining\(\) changed the pretraining: .* is another"),
+        (Undeclared, r"declare `uses = Uses\(demonstrations=\"prepare\"\)`"),
+    ],
+)
+def test_a_method_that_meddles_or_does_not_declare_its_data_is_refused(
+    method: type[clbench.Method], message: str
+) -> None:
+    with pytest.raises(ContractError, match=message):
+        check_method(method)
