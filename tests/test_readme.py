@@ -7,6 +7,10 @@ from pathlib import Path
 
 import pytest
 
+from clbench.records.reader import read_record
+from clbench.scoring.metrics import measure
+from clbench.scoring.scores import Scores
+
 README = Path(__file__).parents[1] / "README.md"
 
 
@@ -75,7 +79,10 @@ def test_three_commands_lead_from_nothing_to_a_row_on_the_board(tmp_path: Path) 
         [*command, *words], cwd=tmp_path, check=True, capture_output=True, text=True
     ).stdout
     assert "Division prior-data-free: place 1 of 1." in printed
-    assert (tmp_path / "try/records/FetchToy-v0/gentle_tuning.GentleTuning/seed-0.json").is_file()
+    record = read_record(tmp_path / "try/records/FetchToy-v0/gentle_tuning.GentleTuning/seed-0.json")
+    rates = Scores.from_record(record).rates()
+    assert rates.retained[0].mean() >= 0.7  # a newcomer's first numbers are no zeros
+    assert (measure("adaptation", Scores.from_record(record)) or 0.0) >= 0.5
     assert "gentle" in (tmp_path / "try/site/LEADERBOARD.md").read_text(encoding="utf-8")
 
 

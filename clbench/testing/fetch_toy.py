@@ -1,7 +1,7 @@
-"""A Fetch scenario that takes a minute: real worlds, experts and runs with a budget too small to learn.
+"""A Fetch scenario that takes half a minute: real worlds and experts, easy tasks and a small budget.
 
-It covers the whole path from a method class to a table row; its scores mean nothing. Its name in a command is
-"clbench.testing.fetch_toy:clbench/FetchToy-v0".
+Plain fine-tuning learns its target and forgets its skills. Ten episodes of each task are too few to conclude
+anything. Its name in a command is "clbench.testing.fetch_toy:clbench/FetchToy-v0".
 """
 
 import dataclasses
@@ -21,24 +21,27 @@ def _apart(tasks: tuple[Task, ...]) -> tuple[Task, ...]:
 FETCH_TOY = dataclasses.replace(
     _FETCH,
     id="clbench/FetchToy-v0",
-    description="Fetch with one target and a budget of seconds; for tests and for a first try.",
-    retained=_apart(_FETCH.retained),
-    target=_apart(_FETCH.target[:1]),
-    held_out=_apart(_FETCH.held_out[:1]),
+    description="Fetch with two skills, one target and a budget of seconds; for a first try.",
+    retained=_apart(_FETCH.retained[:2]),
+    target=_apart(_FETCH.held_out[1:]),
+    held_out=_apart(_FETCH.retained[2:]),
     background=(),
+    scenes=_apart(_FETCH.retained + _FETCH.target[:1] + _FETCH.held_out),
     balanced=False,
     budget=Budget(
-        demonstrations=4,
-        question_episodes=36,
+        demonstrations=80,
+        question_episodes=150,
         test_questions=60,
-        pretraining_steps=40,
-        adaptation_steps=16,
-        batch_size=16,
-        policy_width=32,
+        pretraining_steps=500,
+        pretraining_learning_rate=3e-3,
+        adaptation_steps=60,
+        learning_rate=5e-4,
+        batch_size=48,
+        policy_width=48,
         policy_layers=2,
         evaluation_points=2,
-        validation_episodes=2,
-        test_episodes=3,
+        validation_episodes=5,
+        test_episodes=10,
         curve_episodes=2,
     ),
 )
