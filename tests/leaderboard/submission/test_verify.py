@@ -4,13 +4,13 @@ import importlib
 import json
 import math
 import shutil
-from collections.abc import Callable
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
 import pytest
 from helpers import sealed
+from verification import TOY, edit, failures, flip, verify
 
 from clbench.evaluation.rollouts import Evaluator
 from clbench.learning.pretraining import pretrained_policy
@@ -20,59 +20,7 @@ from clbench.runs.run import execute
 from clbench.runs.spec import RunSpec
 from clbench.testing import ToyWorld
 
-verification = importlib.import_module("clbench.leaderboard.submission.verify")
 tiers = importlib.import_module("clbench.leaderboard.board.tiers")
-
-TOY = "clbench.testing:clbench/Toy-v0"
-ALL = 10**6
-"""More episodes than a toy run has."""
-
-Edit = Callable[[dict[str, Any]], None]
-
-
-@pytest.fixture(scope="module")
-def honest(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a folder with the record of one run, and the policies that it kept."""
-    folder = tmp_path_factory.mktemp("honest")
-    execute(RunSpec(TOY, "sft", 0), folder / "records", checkpoints=folder / "checkpoints")
-    return folder
-
-
-@pytest.fixture
-def mine(honest: Path, tmp_path: Path) -> Path:
-    """Return the path of a copy of that record in a folder of its own."""
-    shutil.copytree(honest / "records", tmp_path / "records")
-    (path,) = (tmp_path / "records").rglob("*.json")
-    return path
-
-
-def verify(path: Path, tier: str, honest: Path | None = None, **rest: Any) -> list[Any]:
-    """Return the checks of a verification, with the kept policies if their folder is given."""
-    checkpoints = honest / "checkpoints" if honest else None
-    request = importlib.import_module("clbench.leaderboard.submission.subject").Request(
-        **{
-            "tier": tier,
-            "episodes": ALL,
-            "seed": 0,
-            "method": None,
-            "scenario": TOY,
-            "checkpoints": checkpoints,
-            **rest,
-        }
-    )
-    records = next(folder for folder in path.parents if folder.name == "records")
-    checks: list[Any] = verification.verify(path, records, request)
-    return checks
-
-
-def failures(checks: list[Any]) -> str:
-    return "\n".join(f"{check.name}: {check.found}" for check in checks if not check.passed)
-
-
-def edit(path: Path, change: Edit) -> None:
-    values = json.loads(path.read_text(encoding="utf-8"))
-    change(values)
-    path.write_text(json.dumps(sealed(values)), encoding="utf-8")
 
 
 @pytest.mark.parametrize("tier", ["recomputed", "replayed", "retrained"])
@@ -162,99 +110,6 @@ def test_the_table_shows_the_least_tier_of_a_row(mine: Path, honest: Path) -> No
     shutil.copy(mine, other)
     edit(other, lambda values: values["run"].update(seed=1))
     assert list(load(records).tier) == ["self-reported"]
-
-
-def flip(values: dict[str, Any], success: int, step: int | None = None, split: str = "test") -> None:
-    """Turn the first episode with this outcome into its opposite, at this step of a stage if one is given."""
-    episodes = values["episodes"]
-    rows = [
-        row
-        for row, outcome in enumerate(episodes["success"])
-        if outcome == success and episodes["split"][row] == split and step in (None, episodes["step"][row])
-    ]
-    episodes["success"][rows[0]] = 1 - success
-
-
-def shorten(values: dict[str, Any], split: str, step: int) -> None:
-    """Let the first success of a split at a step of a stage come a step earlier."""
-    episodes = values["episodes"]
-    rows = zip(episodes["split"], episodes["step"], episodes["success"], strict=True)
-    episodes["length"][list(rows).index((split, step, 1))] -= 1
-
-
-def drop_failures(values: dict[str, Any]) -> None:
-    """Leave out all failures."""
-    episodes = values["episodes"]
-    kept = [row for row, outcome in enumerate(episodes["success"]) if outcome]
-    values["episodes"] = {name: [column[row] for row in kept] for name, column in episodes.items()}
-
-
-def more_right_answers(values: dict[str, Any]) -> None:
-    answers = values["answers"]
-    last = len(answers["correct"]) - 1
-    answers["correct"][last] = (answers["correct"][last] + 1) % (answers["asked"][last] + 1)
-
-
-FORGERIES = [
-    ("recomputed", "ends of episodes: failed before the horizon", lambda values: flip(values, 1)),
-    (
-        "recomputed",
-        "simulator: the rollouts of",
-        lambda values: values["fingerprint"]["rollouts"].update({"clbench.testing:ToyWorld": "0"}),
-    ),
-    (
-        "recomputed",
-        "definition: task left, questions differ from the installed code",
-        lambda values: values["fingerprint"]["definition"].update({"task left": "0", "questions": "1"}),
-    ),
-    (
-        "recomputed",
-        "what was run: scenario.budget",
-        lambda values: values["scenario"]["budget"].update(adaptation_steps=61),
-    ),
-    (
-        "recomputed",
-        "record: run: uses do not match ",
-        lambda values: values["run"]["uses"].update(demonstrations="throughout"),
-    ),
-    (
-        "recomputed",
-        "record: run: settings do not match ",
-        lambda values: values["run"]["settings"].update(strength=1.0),
-    ),
-    ("recomputed", "and must be there", lambda values: values["run"].update(seed=7)),
-    ("recomputed", "record: ", lambda values: values["episodes"]["success"].pop()),
-    ("replayed", "episodes: 1 of ", lambda values: flip(values, 0, 60)),
-    ("replayed", "episodes: 1 of ", lambda values: shorten(values, "validation", 60)),
-    ("replayed", "answers: different counts", more_right_answers),
-    ("recomputed", "episodes: there are none at stage 1", lambda values: drop_failures(values)),
-    *(
-        ("retrained", f"origin: the record states what is not so here: {what}", change)
-        for what, change in (
-            ("versions torch 1.0 is ", lambda values: values["fingerprint"]["versions"].update(torch="1.0")),
-            (
-                "hardware instructions NEON is ",
-                lambda values: values["fingerprint"]["hardware"].update(instructions="NEON"),
-            ),
-            (
-                "method authors somebody is None here",
-                lambda values: values["fingerprint"]["method"].update(authors="somebody"),
-            ),
-            ("hardware instructions None", lambda values: values["fingerprint"].update(hardware=[])),
-        )
-    ),
-]
-
-
-@pytest.mark.parametrize(("tier", "reason", "change"), FORGERIES)
-def test_a_forged_record_is_denied_the_tier_and_its_fault_is_named(
-    tier: str, reason: str, change: Edit, mine: Path, honest: Path
-) -> None:
-    edit(mine, change)
-    checks = verify(mine, tier, honest)
-    assert reason in failures(checks)
-    below = tiers.TIERS[tiers.TIERS.index(tier) - 1]
-    assert tiers.tier_of(mine) == below
 
 
 def test_the_pretraining_is_repeated_on_request_and_its_policy_compared(mine: Path, honest: Path) -> None:
