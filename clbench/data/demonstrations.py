@@ -28,7 +28,7 @@ from clbench.data.access import check_demonstrations
 from clbench.policy.batch import Batch
 from clbench.policy.policy import PolicyConfig
 from clbench.spec.budget import Budget
-from clbench.spec.language import encode
+from clbench.spec.language import TEXT_LENGTH, encode
 from clbench.spec.scenario import Scenario
 from clbench.spec.task import Task, packages_of
 from clbench.worlds.observation import observed
@@ -272,7 +272,9 @@ class Demonstrations:
     """First row of each task and the number of its rows, (tasks, 2): the rows of a task are consecutive."""
 
     @classmethod
-    def of_task(cls, task: Task, episodes: Sequence[Demonstration], chunk: int) -> Demonstrations:
+    def of_task(
+        cls, task: Task, episodes: Sequence[Demonstration], chunk: int, text_length: int = TEXT_LENGTH
+    ) -> Demonstrations:
         """Return the episodes of one task, cut into chunks of `chunk` actions.
 
         Raises:
@@ -284,7 +286,13 @@ class Demonstrations:
         state, image = map(torch.from_numpy, observed(task, scenes))
         rows = torch.tensor([[0, len(state)]])
         return cls(
-            torch.from_numpy(scenes), state, image, action, valid, encode(task.instructions)[None], rows
+            torch.from_numpy(scenes),
+            state,
+            image,
+            action,
+            valid,
+            encode(task.instructions, text_length)[None],
+            rows,
         )
 
     @classmethod
@@ -343,4 +351,4 @@ def load_demonstrations(task: Task, scenario: Scenario, config: PolicyConfig) ->
     """Return the demonstrations of `task` in chunks that fit a policy; they are collected on first use."""
     check_demonstrations(task.name)
     episodes = read_dataset(dataset_folder(task, scenario.budget))
-    return Demonstrations.of_task(task, episodes, config.chunk)
+    return Demonstrations.of_task(task, episodes, config.chunk, config.text_length)

@@ -26,7 +26,7 @@ from clbench.base.source import DATA_SOURCES, source_hash
 from clbench.data.access import check_questions
 from clbench.data.demonstrations import demonstrate, simulator_versions
 from clbench.policy.batch import QuestionBatch
-from clbench.spec.language import encode, word_id
+from clbench.spec.language import TEXT_LENGTH, encode, word_id
 from clbench.spec.scenario import Scenario
 from clbench.spec.task import packages_of
 from clbench.worlds.camera import Images, States
@@ -115,13 +115,18 @@ class Questions:
         kinds: Kinds of questions to ask.
         scenes: States (N, S) to ask about.
         shown: Numbers (N, P) and pictures that a policy sees of the states; None shows the states.
+        text_length: Length of the questions in tokens.
 
     Raises:
         ValueError: A kind has an answer that no state gives.
     """
 
     def __init__(
-        self, kinds: tuple[QuestionKind, ...], scenes: Tensor, shown: tuple[States, Images] | None = None
+        self,
+        kinds: tuple[QuestionKind, ...],
+        scenes: Tensor,
+        shown: tuple[States, Images] | None = None,
+        text_length: int = TEXT_LENGTH,
     ) -> None:
         self.kinds = kinds
         self.scenes = scenes
@@ -130,7 +135,10 @@ class Questions:
             self.state, self.image = map(torch.from_numpy, shown)
         wordings = max(len(kind.wordings) for kind in kinds)
         self._words = torch.stack(
-            [encode([kind.wordings[i % len(kind.wordings)] for i in range(wordings)]) for kind in kinds]
+            [
+                encode([kind.wordings[i % len(kind.wordings)] for i in range(wordings)], text_length)
+                for kind in kinds
+            ]
         )
         cells = [self._cells(kind) for kind in kinds]
         self._answers = torch.tensor([len(kind.answers) for kind in kinds])
@@ -183,7 +191,8 @@ def load_questions(scenario: Scenario) -> tuple[Questions, Questions]:
     scenes = load_file(scenes_folder(scenario) / "scenes.safetensors")
     first = scenario.scene_tasks[0]
     train, test = (
-        Questions(kinds, scenes[split], observed(first, scenes[split].numpy())) for split in ("train", "test")
+        Questions(kinds, scenes[split], observed(first, scenes[split].numpy()), scenario.text_length)
+        for split in ("train", "test")
     )
     return train, test
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -57,6 +57,7 @@ def pretraining_inputs(scenario: Scenario, seed: int) -> dict[str, Any]:
         "scenes": [dataclasses.asdict(task) for task in scenario.scenes],
         "budget": {name: value for name, value in budget.items() if name not in AFTER_PRETRAINING},
         "seed": seed,
+        "text_length": scenario.text_length,
         "frame": frame_hash(scenario.scene_tasks[0]),
         "source": source_hash(*TRAINING_SOURCES, *suites),
         # a label such as torch's +cpu names other abilities of a build; pretraining does not use them
@@ -128,6 +129,7 @@ def policy_config(scenario: Scenario) -> PolicyConfig:
     config = PolicyConfig(
         state_size=observer.spaces(world.observation_space)["state"].shape[0],
         action_size=world.action_space.shape[0],
+        text_length=scenario.text_length,
         image_size=observer.image_size,
         width=scenario.budget.policy_width,
         layers=scenario.budget.policy_layers,
@@ -136,8 +138,20 @@ def policy_config(scenario: Scenario) -> PolicyConfig:
     return config
 
 
-def pretrain(scenario: Scenario, seed: int, progress: ProgressCallback = no_progress) -> Policy:
-    """Return the policy of `pretrained_policy`, trained now even if it is in the cache or ships."""
+def pretrain(
+    scenario: Scenario,
+    seed: int,
+    progress: ProgressCallback = no_progress,
+    watch: Callable[[Policy, int], None] = lambda _, __: None,
+) -> Policy:
+    """Return the policy of `pretrained_policy`, trained now even if it is in the cache or ships.
+
+    Args:
+        scenario: Scenario of the retained tasks and the questions.
+        seed: Seed of the weights and of every draw.
+        progress: Called with the number of steps done since its last call.
+        watch: Called with the policy and the number of steps done, before the first step and after each.
+    """
     config, budget = policy_config(scenario), scenario.budget
     questions, _ = load_questions(scenario)
     policy = Policy(config, seed=derive_seed("weights", seed))
@@ -164,13 +178,18 @@ def pretrain(scenario: Scenario, seed: int, progress: ProgressCallback = no_prog
         asked = questions.sample(budget.batch_size // 2, generator)
         return policy.action_loss(batch).mean() + policy.answer_loss(asked).mean()
 
+    def after(step: int) -> None:
+        watch(policy, step)
+        progress(1)
+
     with deterministic():
+        watch(policy, 0)
         optimise(
             policy.parameters(),
             budget.pretraining_learning_rate,
             budget.pretraining_steps,
             loss_at,
-            after=lambda _: progress(1),
+            after=after,
         )
     return policy
 

@@ -38,6 +38,8 @@ class PolicyConfig:
     """Euler steps that integrate the flow."""
     vocabulary_size: int = VOCABULARY_SIZE
     """Number of words that it can read and answer."""
+    text_length: int = TEXT_LENGTH
+    """Words, or pieces of words, that it can read at once."""
     image_size: int = 0
     """Width and height of the image that it sees, in pixels; 0 without images."""
 
@@ -65,7 +67,7 @@ class Policy(nn.Module):
             self.backbone = Backbone(
                 config.state_size,
                 config.vocabulary_size,
-                TEXT_LENGTH,
+                config.text_length,
                 config.width,
                 config.layers,
                 config.heads,

@@ -1,9 +1,13 @@
-"""Words to ids: one tokenizer over a vocabulary that is fixed before any scenario is known."""
+"""Words to ids: one tokenizer over a vocabulary that is fixed before any scenario is known.
+
+A word of the vocabulary is one token. Any other word is spelled with pieces of words, longest first
+(WordPiece, Wu et al. 2016, arXiv 1609.08144), so that instructions and questions may hold any English word.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from functools import cache
+from collections.abc import Iterable, Sequence
+from functools import cache, lru_cache
 from importlib.resources import files
 from typing import TYPE_CHECKING
 
@@ -15,18 +19,22 @@ from clbench.base.text import did_you_mean
 if TYPE_CHECKING:  # PyTorch takes seconds to import, and environments do not need it
     from torch import Tensor
 
-TEXT_LENGTH = 12
-"""Words that the policy reads at most; shorter texts are padded, so that every forward has one shape."""
+LENGTHS = (12, 24, 48)
+"""Lengths of texts in tokens. A scenario has the shortest that all its texts fit, so that every forward has
+one shape."""
+
+TEXT_LENGTH = LENGTHS[0]
+"""Length of the texts of the built-in scenarios."""
 
 VOCABULARY_SIZE = 1024
-"""Rows of the embedding and of the answers, more than there are words. A new suite appends its words to the
-vocabulary, which changes neither the shapes nor the initial weights of a policy."""
+"""Rows of the embedding and of the answers, more than there are words and pieces. A new suite appends its
+words to the vocabulary, which changes neither the shapes nor the initial weights of a policy."""
 
 PADDING = "[padding]"
 
 
 class UnknownWordError(InputError):
-    """A text holds a word that is not in the vocabulary."""
+    """A word cannot be spelled, a text has too many tokens, or an answer is not in the vocabulary."""
 
 
 @cache
@@ -37,48 +45,92 @@ def vocabulary() -> tuple[str, ...]:
 
 
 @cache
-def _tokenizer() -> Tokenizer:
+def pieces() -> tuple[str, ...]:
+    """Return the pieces of words; those that continue a word begin with "##". The first has the last id."""
+    return tuple(files("clbench.spec").joinpath("pieces.txt").read_text(encoding="utf-8").split())
+
+
+@cache
+def _tokenizer(length: int) -> Tokenizer:
     ids = {word: number for number, word in enumerate(vocabulary())}
-    tokenizer = Tokenizer(models.WordLevel(ids, unk_token=PADDING))
-    tokenizer.normalizer = normalizers.Sequence([normalizers.NFKC(), normalizers.Lowercase()])
-    tokenizer.pre_tokenizer = pre_tokenizers.Sequence(
-        [pre_tokenizers.WhitespaceSplit(), pre_tokenizers.Punctuation(behavior="removed")]
+    # counted from the end: new words do not move them
+    ids |= {piece: VOCABULARY_SIZE - 1 - number for number, piece in enumerate(pieces())}
+    tokenizer = Tokenizer(models.WordPiece(ids, unk_token=PADDING))
+    tokenizer.normalizer = normalizers.Sequence(
+        [normalizers.NFKD(), normalizers.StripAccents(), normalizers.Lowercase()]
     )
-    tokenizer.enable_padding(length=TEXT_LENGTH, pad_id=0, pad_token=PADDING)
+    tokenizer.pre_tokenizer = _splitter()
+    tokenizer.enable_padding(length=length, pad_id=0, pad_token=PADDING)
     return tokenizer
 
 
-def encode(texts: Sequence[str]) -> Tensor:
-    """Return the word ids (len(texts), TEXT_LENGTH), int64, of `texts`. Case and punctuation do not count.
+def encode(texts: Sequence[str], length: int = TEXT_LENGTH) -> Tensor:
+    """Return the ids (len(texts), length), int64, of `texts`. Case, accents and punctuation do not count.
 
     Raises:
-        UnknownWordError: A word is not in the vocabulary, or there are more than `TEXT_LENGTH` words.
+        UnknownWordError: A word cannot be spelled, or there are more than `length` tokens.
     """
     import torch
 
-    return torch.tensor(word_ids(texts), dtype=torch.int64)
+    return torch.tensor(word_ids(texts, length), dtype=torch.int64)
 
 
-def word_ids(texts: Sequence[str]) -> list[list[int]]:
+def word_ids(texts: Sequence[str], length: int = TEXT_LENGTH) -> list[list[int]]:
     """Return the result of `encode` as lists.
 
     Raises:
-        UnknownWordError: A word is not in the vocabulary, or there are more than `TEXT_LENGTH` words.
+        UnknownWordError: A word cannot be spelled, or there are more than `length` tokens.
     """
-    tokenizer = _tokenizer()
     rows = []
-    for text, encoding in zip(texts, tokenizer.encode_batch(list(texts)), strict=True):
-        words = [text[start:end] for start, end in encoding.offsets if end > start]
-        for word, number in zip(words, encoding.ids, strict=False):
+    for text, encoding in zip(texts, _tokenizer(length).encode_batch(list(texts)), strict=True):
+        tokens = [
+            (text[start:end], number)
+            for (start, end), number in zip(encoding.offsets, encoding.ids, strict=True)
+            if end > start
+        ]
+        for word, number in tokens:
             if number == 0:
-                hint = did_you_mean(word.lower(), vocabulary())
-                raise UnknownWordError(f"The word {word!r} in {text!r} is not in the vocabulary.{hint}")
-        if not 0 < len(words) <= TEXT_LENGTH:
-            raise UnknownWordError(f"{text!r} has {len(words)} words; the policy reads 1 to {TEXT_LENGTH}.")
+                raise UnknownWordError(f"{word!r} in {text!r} cannot be spelled with English letters.")
+        if not 0 < len(tokens) <= length:
+            raise UnknownWordError(
+                f"{text!r} has {len(tokens)} words or pieces of words; the policy reads 1 to {length}."
+            )
         rows.append(encoding.ids)
     return rows
 
 
+@lru_cache(maxsize=64)
+def fitting_length(texts: tuple[str, ...]) -> int:
+    """Return the shortest of `LENGTHS` that all texts fit.
+
+    Raises:
+        UnknownWordError: A word cannot be spelled, or a text has more tokens than the greatest length.
+    """
+    longest = max((sum(number > 0 for number in row) for row in word_ids(texts, LENGTHS[-1])), default=0)
+    return next(length for length in LENGTHS if longest <= length)
+
+
+def spelled_words(texts: Iterable[str]) -> list[str]:
+    """Return the words of texts that are not in the vocabulary, each once."""
+    words = (word for text in texts for word, _ in _splitter().pre_tokenize_str(text.lower()))
+    return [word for word in dict.fromkeys(words) if word not in vocabulary()]
+
+
+@cache
+def _splitter() -> pre_tokenizers.PreTokenizer:
+    return pre_tokenizers.Sequence(
+        [pre_tokenizers.WhitespaceSplit(), pre_tokenizers.Punctuation(behavior="removed")]
+    )
+
+
 def word_id(word: str) -> int:
-    """Return the id of a single word of the vocabulary."""
-    return word_ids([word])[0][0]
+    """Return the id of a single word of the vocabulary.
+
+    Raises:
+        UnknownWordError: The vocabulary does not have it.
+    """
+    known = word.lower()
+    if known not in vocabulary()[1:]:
+        hint = did_you_mean(known, vocabulary())
+        raise UnknownWordError(f"The word {word!r} is not in the vocabulary.{hint}")
+    return vocabulary().index(known)

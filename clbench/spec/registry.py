@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import logging
+
 import gymnasium
 from gymnasium.envs import registration
 
 from clbench.base.entry_points import import_module, is_entry_point, resolve, unknown
 from clbench.base.errors import InputError, UnknownNameError
+from clbench.base.text import did_you_mean
 from clbench.spec.identifiers import check_scenario_id, scenario_ids
 from clbench.spec.scenario import Scenario
+
+LOG = logging.getLogger("clbench")
 
 
 def register(scenario_id: str, entry_point: str) -> None:
@@ -82,7 +87,7 @@ def opened_scenario(scenario: Scenario | str, order: int = 0) -> Scenario:
 
     Raises:
         LookupError: The entry point leads to no scenario, or a package that the tasks need is not installed.
-        ValueError: There is no such order, or a word of the instructions is not in the vocabulary.
+        ValueError: There is no such order, or an instruction is too long or cannot be spelled.
     """
     published = _scenario_at(scenario) if isinstance(scenario, str) else scenario
     published.require_packages()
@@ -90,11 +95,19 @@ def opened_scenario(scenario: Scenario | str, order: int = 0) -> Scenario:
 
 
 def _scenario_at(entry_point: str) -> Scenario:
-    from clbench.spec.language import word_ids  # imports the tokenizer, which registration does without
+    # they import the tokenizer, which registration does without
+    from clbench.spec.language import fitting_length, spelled_words, vocabulary
 
     scenario = resolve(entry_point)
     if not isinstance(scenario, Scenario):
         raise UnknownNameError(f"{entry_point!r} is no Scenario but a {type(scenario).__name__}.")
-    for task in scenario.tasks:
-        word_ids(task.instructions + task.test_instructions)
+    instructions = tuple(
+        text for task in scenario.tasks for text in task.instructions + task.test_instructions
+    )
+    fitting_length(instructions)
+    for word in spelled_words(instructions):
+        if hint := did_you_mean(word, vocabulary()):
+            LOG.warning(
+                "%s: the word %r is not in the vocabulary, and is spelled.%s", scenario.id, word, hint
+            )
     return scenario

@@ -9,7 +9,7 @@ from functools import cached_property
 from typing import Literal, get_args
 
 from clbench.base.dependencies import require_packages
-from clbench.base.entry_points import unknown
+from clbench.base.entry_points import resolve, unknown
 from clbench.base.errors import InputError
 from clbench.base.text import html_table
 from clbench.spec.budget import Budget
@@ -99,6 +99,17 @@ class Scenario:
     def scene_tasks(self) -> tuple[Task, ...]:
         """Tasks whose expert episodes give the states for the questions."""
         return self.scenes or self.retained
+
+    @property
+    def text_length(self) -> int:
+        """Length in tokens of every text that its policy reads: the shortest that all its texts fit."""
+        # imports the tokenizer and the questions, which a scenario that is only named does without
+        from clbench.spec.language import fitting_length
+
+        tasks = self.tasks + self.background
+        instructions = [text for task in tasks for text in task.instructions + task.test_instructions]
+        questions = [text for kind in resolve(self.questions) for text in kind.wordings]
+        return fitting_length((*instructions, *questions))
 
     def require_packages(self) -> None:
         """Check that the packages of its tasks are installed.

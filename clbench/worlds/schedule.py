@@ -11,7 +11,7 @@ import numpy as np
 from gymnasium import spaces
 
 from clbench.base.errors import InputError
-from clbench.spec.language import TEXT_LENGTH, VOCABULARY_SIZE, word_ids
+from clbench.spec.language import VOCABULARY_SIZE, word_ids
 from clbench.spec.scenario import Scenario
 from clbench.spec.task import Task
 
@@ -73,9 +73,10 @@ class Schedule:
     def instruction_space(self) -> spaces.Space[Any]:
         """Space of the instruction in observations."""
         if self._format == "tokens":
-            return spaces.Box(0, VOCABULARY_SIZE - 1, (TEXT_LENGTH,), np.int64)
-        longest = max(len(words) for task in self._scenario.tasks for words in task.instructions)
-        return spaces.Text(max_length=longest, charset=string.ascii_lowercase + " ")
+            return spaces.Box(0, VOCABULARY_SIZE - 1, (self._scenario.text_length,), np.int64)
+        texts = [words for task in self._scenario.tasks for words in task.instructions]
+        characters = {*string.ascii_lowercase, " ", *"".join(texts)}
+        return spaces.Text(max_length=max(map(len, texts)), charset="".join(sorted(characters)))
 
     def begin(self) -> None:
         """Go back to the first episode."""
@@ -92,7 +93,8 @@ class Schedule:
             raise InputError(f'Options of reset are "task" and "stage", not {sorted(options)}.')
         task, stage = self._choose(options)
         words = task.instructions[int(generator.integers(len(task.instructions)))]
-        return Start(task, stage, words, observed(words, self._format), int(generator.integers(2**31)))
+        shown = observed(words, self._format, self._scenario)
+        return Start(task, stage, words, shown, int(generator.integers(2**31)))
 
     def _choose(self, options: Mapping[str, Any]) -> tuple[Task, int]:
         """Return task and stage of the next episode."""
@@ -121,6 +123,6 @@ class Schedule:
             )
 
 
-def observed(words: str, form: InstructionFormat) -> Any:
-    """Return an instruction in the form of observations: text, or word ids (L,)."""
-    return np.array(word_ids([words])[0]) if form == "tokens" else words
+def observed(words: str, form: InstructionFormat, scenario: Scenario) -> Any:
+    """Return an instruction in the form of observations: text, or the ids (L,) of its tokens."""
+    return np.array(word_ids([words], scenario.text_length)[0]) if form == "tokens" else words

@@ -122,7 +122,7 @@ NO_QUESTIONS: tuple[QuestionKind, ...] = ()
 TWICE = TOY_QUESTIONS[:1] * 2
 ONE_ANSWER = (dataclasses.replace(TOY_QUESTIONS[0], answers=("left",)),)
 LONG_ANSWER = (dataclasses.replace(TOY_QUESTIONS[0], answers=("left", "to the right")),)
-STRANGE_WORD = (dataclasses.replace(TOY_QUESTIONS[0], wordings=("wherefore is it",)),)
+STRANGE_WORD = (dataclasses.replace(TOY_QUESTIONS[0], wordings=("где is it",)),)
 THIRD_ANSWER = (dataclasses.replace(TOY_QUESTIONS[0], answers=("left", "right", "up")),)
 TOO_HIGH = (dataclasses.replace(TOY_QUESTIONS[0], answer=lambda states: np.full(len(states), 2)),)
 FLOATS = (dataclasses.replace(TOY_QUESTIONS[0], answer=fractions),)
@@ -181,9 +181,9 @@ def test_an_expert_that_cannot_do_its_task_is_named(expert: str, message: str) -
     [
         ("NO_QUESTIONS", "there must be questions"),
         ("TWICE", "each kind with its own name"),
-        ("ONE_ANSWER", "answers must be two words or more"),
-        ("LONG_ANSWER", "answers must be two words or more"),
-        ("STRANGE_WORD", "'wherefore' in 'wherefore is it' is not in the vocabulary"),
+        ("ONE_ANSWER", "must have two answers or more"),
+        ("LONG_ANSWER", "The word 'to the right' is not in the vocabulary"),
+        ("STRANGE_WORD", "'где' in 'где is it' cannot be spelled with English letters"),
         ("THIRD_ANSWER", "'up' is never the answer"),
         ("TOO_HIGH", "answers must be from -1 to 1"),
         ("FLOATS", "must be whole numbers"),
