@@ -15,6 +15,7 @@ from rich.text import Text
 
 from clbench.base.entry_points import unknown
 from clbench.base.errors import InputError
+from clbench.base.text import counted
 from clbench.cli.arguments import (
     AsJson,
     MethodName,
@@ -43,6 +44,7 @@ def show(
     *,
     sort: str | None = None,
     records: Path = RECORDS,
+    published: bool = False,
     as_json: AsJson = False,
 ) -> None:
     """Show the leaderboard, and write it to the folder `site` next to the records.
@@ -55,15 +57,21 @@ def show(
         scenario: Show this scenario alone.
         sort: Name of the metric that orders the rows of each division, for example kept.
         records: Folder of the records.
+        published: First copy the records that come with clbench to the folder, where it lacks them: your rows
+            then stand beside the published ones.
         as_json: Print JSON, one object for each row with every metric and cost, and write no files.
     """
     from .board.summary import column_names, values_of
-    from .publishing import inputs_of, read_unchanged, site_of, write_site
+    from .publishing import add_published, inputs_of, read_unchanged, site_of, write_site
     from .views.terminal import terminal
 
+    messages = Console(stderr=True, soft_wrap=True)
+    if published:
+        messages.print(Text(f"{counted(add_published(records), 'published record')} added to {records}."))
     if not any(records.rglob("*.json")):
-        message = f"There are no records in {records}. Make some first: clbench run {SCENARIO} sft"
-        Console(stderr=True, soft_wrap=True).print(Text(message))
+        message = f"There are no records in {records}. Make some first: clbench run {SCENARIO} sft\n"
+        message += "Or look at the published ones: clbench leaderboard --published"
+        messages.print(Text(message))
         raise SystemExit(2)
     inputs = inputs_of(records)
     board = read_unchanged(records, inputs)

@@ -25,6 +25,9 @@ from .views.format import write_all
 if TYPE_CHECKING:
     from .board.rows import Table
 
+PUBLISHED = Path(__file__).parent / "records"
+"""Folder of the records that come with clbench."""
+
 NUMBERS = "board.json"
 """Name of the file with the numbers of the board."""
 
@@ -38,6 +41,21 @@ _CODE = (
 def site_of(records: Path) -> Path:
     """Return the folder of the board for a folder of records."""
     return Path(os.path.normpath(records / "../site"))
+
+
+def add_published(records: Path) -> int:
+    """Copy the published records, with their verifications, to a folder of records; what is there stays.
+
+    Returns:
+        The number of records that were missing.
+    """
+    texts = {
+        path: source.read_text(encoding="utf-8")
+        for source in sorted(PUBLISHED.rglob("seed-*"))
+        if source.suffix in (".json", ".verified")
+        and not (path := records / source.relative_to(PUBLISHED)).exists()
+    }
+    return sum(path.suffix == ".json" for path in write_all(texts))
 
 
 def inputs_of(records: Path) -> dict[str, str]:

@@ -1,9 +1,13 @@
 """The package as a whole: its front door, the effects of its import, and its files."""
 
+import dataclasses
+import pydoc
+import re
 import subprocess
 import sys
 
 import clbench
+from clbench.base.entry_points import resolve
 
 
 def _run(code: str) -> str:
@@ -15,6 +19,16 @@ def test_every_public_name_can_be_imported() -> None:
     assert len(clbench.__all__) == 33
     for name in clbench.__all__:
         assert getattr(clbench, name).__name__ == name
+
+
+def test_help_shows_every_field_of_a_public_class_with_its_docstring() -> None:
+    classes = [value for name in clbench.__all__ if dataclasses.is_dataclass(value := getattr(clbench, name))]
+    assert len(classes) >= 15
+    for cls in classes:
+        shown = pydoc.plain(pydoc.render_doc(cls))
+        for field in dataclasses.fields(cls):
+            assert re.search(rf"^ \|      {field.name}: [A-Z0-9]", shown, re.MULTILINE), (cls, field.name)
+        assert shown.count("Attributes:") == 1
 
 
 def test_an_unknown_name_is_an_attribute_error() -> None:
@@ -36,3 +50,8 @@ def test_nothing_leaks_to_the_top_level() -> None:
     code = "import clbench.cli.main, clbench.methods.sft, clbench.envs.fetch, clbench.leaderboard, sys;"
     code += "print({'envs', 'methods', 'leaderboard'} & set(sys.modules))"
     assert _run(code) == "set()"
+
+
+def test_the_records_of_the_board_come_with_clbench() -> None:
+    published = resolve("clbench.leaderboard.publishing:PUBLISHED")
+    assert len(list((published / "Fetch-v1").rglob("seed-*.json"))) >= 88

@@ -27,6 +27,26 @@ def test_showing_twice_changes_no_byte_and_writes_no_file_again(
     assert sorted(os.listdir(four_methods.parent / "site")) == made
 
 
+def test_the_published_rows_stand_beside_ones_own(
+    four_methods: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    mine, show = tmp_path / "mine/records", resolve("clbench.leaderboard.cli:show")
+    own = mine / "Toy-v0/sft/seed-0.json"
+    own.parent.mkdir(parents=True)
+    text = (four_methods / "Toy-v0/sft/seed-0.json").read_text(encoding="utf-8") + " "
+    own.write_text(text, encoding="utf-8")
+    published = sorted(path.relative_to(four_methods) for path in four_methods.rglob("seed-*.json"))
+    monkeypatch.setattr("clbench.leaderboard.publishing.PUBLISHED", four_methods)
+    show(records=mine, published=True)
+    said = capsys.readouterr()
+    assert f"{len(published) - 1} published records added to {mine}." in " ".join(said.err.split())
+    assert all(name in said.out for name in ("sft", "replay", "from_scratch"))
+    assert sorted(path.relative_to(mine) for path in mine.rglob("seed-*.json")) == published
+    assert own.read_text(encoding="utf-8") == text
+    show(records=mine, published=True)
+    assert "0 published records added" in capsys.readouterr().err
+
+
 def test_the_files_do_not_depend_on_where_the_records_lie(
     four_methods: Path, shown: Callable[[], tuple[str, str]], tmp_path: Path
 ) -> None:
