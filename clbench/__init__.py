@@ -18,7 +18,7 @@ def __getattr__(name: str) -> Any:
     value = _load(name)
     if not isinstance(value, type):
         return value
-    from clbench.base.documentation import with_fields
+    from clbench.base.text import with_fields
 
     return with_fields(value)
 

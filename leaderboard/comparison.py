@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from clbench.base.errors import InputError
 from clbench.jobs.grid import name_of, run_specs
-from clbench.records.paths import RECORDS, record_name
+from clbench.records.paths import RECORDS
 from clbench.runs.spec import RunSpec, check_device
+from clbench.spec.policies import DEFAULT_POLICY
 from clbench.spec.references import BASELINE
 
 from .board.rows import read_table
@@ -26,6 +28,7 @@ def compare(
     *,
     seeds: int = 2,
     first_seed: int = 0,
+    policy: str = DEFAULT_POLICY,
     records: Path | str = RECORDS,
     workers: int | None = None,
     device: str = "cpu",
@@ -41,6 +44,7 @@ def compare(
             after the other, see `clbench.run`.
         seeds: Number of seeds.
         first_seed: The first seed.
+        policy: Kind of the policy: "flow" or "discrete_diffusion".
         records: Folder of the records. Those of other methods are not read.
         workers: Number of runs at once, each a process with one thread; all cores if None.
         device: Device on which policies are computed, for example "cpu" or "cuda".
@@ -58,11 +62,11 @@ def compare(
 
     check_device(device)
     names = dict.fromkeys([BASELINE, *map(name_of, methods)])
-    firsts = [RunSpec(scenario, name, first_seed, device=device) for name in names]
+    firsts = [RunSpec(scenario, name, first_seed, device=device, policy=policy) for name in names]
     run_specs(firsts, seeds, Path(records), workers)
     places = {
-        record_name(scenario.rpartition(":")[2], name, first_seed + number, 0).as_posix()
-        for name in names
+        replace(one, seed=first_seed + number).path(Path()).as_posix()
+        for one in firsts
         for number in range(seeds)
     }
     table = read_table(Path(records), places)

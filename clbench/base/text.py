@@ -1,10 +1,17 @@
-"""Texts for people: names of strangers, counts, the nearest right name, and tables for notebooks."""
+"""Texts for people: names of strangers, counts, the nearest right name, tables for notebooks, and `help`."""
 
 from __future__ import annotations
 
 import difflib
 import html
+import inspect
+import textwrap
 from collections.abc import Iterable
+from typing import TypeVar
+
+T = TypeVar("T")
+
+_HEADING = "Attributes:"
 
 
 def quoted(text: str) -> str:
@@ -44,3 +51,24 @@ def html_table(title: str, columns: Iterable[str], rows: Iterable[Iterable[objec
     head = "".join(f"<th>{html.escape(name)}</th>" for name in columns)
     body = "".join(f"<tr>{''.join(map(cell, row))}</tr>" for row in rows)
     return f"<p>{html.escape(title)}</p><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
+
+
+def field_docstrings(cls: type) -> dict[str, str]:
+    """Return the docstrings under the fields of a class, by field; Python itself drops them."""
+    from docstring_parser import parse_from_object  # 20 ms, and it reads the source
+
+    own = inspect.get_annotations(cls)
+    documented = parse_from_object(cls).params
+    return {
+        one.arg_name: " ".join((one.description or "").split()) for one in documented if one.arg_name in own
+    }
+
+
+def with_fields(cls: type[T]) -> type[T]:
+    """Return a class after its fields, with their docstrings, were added to its docstring, for `help`."""
+    own = cls.__dict__.get("__doc__") or ""
+    if _HEADING not in own and (fields := field_docstrings(cls)):
+        lines = [f"    {name}: {text}" for name, text in fields.items()]
+        wrapped = [textwrap.fill(line, 100, subsequent_indent=" " * 8) for line in lines]
+        cls.__doc__ = "\n".join([inspect.cleandoc(own), "", _HEADING, *wrapped])
+    return cls

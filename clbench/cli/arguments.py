@@ -17,6 +17,7 @@ from rich.text import Text
 from clbench.base.entry_points import unknown
 from clbench.base.errors import ClbenchError
 from clbench.base.text import printable
+from clbench.spec.policies import POLICIES
 
 
 def whole_number(least: int) -> Parameter:
@@ -49,11 +50,18 @@ def _known_methods(_: object) -> tuple[str, ...]:
     return tuple(sorted(installed_methods()))
 
 
+def _known_policies(_: object) -> tuple[str, ...]:
+    """Return the kinds of policies."""
+    return tuple(POLICIES)
+
+
 ScenarioId = Annotated[str, Parameter(completer=_known_scenarios)]
 """Gymnasium id of a scenario on the command line."""
 MethodName = Annotated[str, Parameter(completer=_known_methods)]
 """Name of a method on the command line."""
 
+PolicyKind = Annotated[str, Parameter(completer=_known_policies)]
+"""Kind of a policy on the command line."""
 
 AsJson = Annotated[bool, Parameter(name="--json", negative="")]
 """Switch of a command that can print JSON instead of tables."""

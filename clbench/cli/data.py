@@ -13,12 +13,14 @@ from rich.table import Table
 
 from clbench.base.errors import InputError
 from clbench.cli.arguments import (
+    PolicyKind,
     ScenarioId,
     add_cwd_to_path,
     checked_input,
     whole_number,
 )
 from clbench.jobs.folders import check_folders
+from clbench.spec.policies import DEFAULT_POLICY
 
 if TYPE_CHECKING:
     from clbench.data.expert_rates import Measurement
@@ -71,6 +73,7 @@ def pretrain(
     scenario: ScenarioId,
     /,
     *,
+    policy: PolicyKind = DEFAULT_POLICY,
     seed: Annotated[int, whole_number(0)] = 0,
     ship: Annotated[bool, Parameter(negative="")] = False,
 ) -> None:
@@ -80,6 +83,7 @@ def pretrain(
 
     Args:
         scenario: Gymnasium id of the scenario.
+        policy: Kind of the policy: flow or discrete_diffusion.
         seed: Seed of the policy.
         ship: Copy the policy to clbench/pretrained/, so that it ships with the package. Needs a checkout.
     """
@@ -89,7 +93,7 @@ def pretrain(
 
     add_cwd_to_path()
     with checked_input():
-        loaded = load_scenario(scenario)
+        loaded = load_scenario(scenario).with_policy(policy)
         if ship and not (SHIPPED.parents[1] / "pyproject.toml").is_file():
             raise InputError("--ship needs a checkout of clbench: it does not change an installed package.")
     length = loaded.budget.pretraining_steps + vision_steps(loaded)

@@ -17,6 +17,7 @@ from clbench.base.text import printable
 from clbench.cli.arguments import (
     AsJson,
     MethodName,
+    PolicyKind,
     ScenarioId,
     add_cwd_to_path,
     checked_input,
@@ -26,6 +27,7 @@ from clbench.cli.arguments import (
 from clbench.cli.runs import requested
 from clbench.records.paths import RECORDS
 from clbench.records.status import RunState, State, found_runs, run_state, seconds_left
+from clbench.spec.policies import DEFAULT_POLICY
 
 STATES: tuple[State, ...] = ("done", "running", "failed", "damaged", "to do")
 
@@ -38,6 +40,7 @@ def status(
     seeds: Annotated[int, whole_number(1)] = 3,
     first_seed: Annotated[int, whole_number(0)] = 0,
     order: Annotated[int, whole_number(0)] = 0,
+    policy: PolicyKind = DEFAULT_POLICY,
     records: Path = RECORDS,
     changes: Annotated[dict[str, str] | None, Parameter(name="--set")] = None,
     as_json: AsJson = False,
@@ -55,6 +58,7 @@ def status(
         seeds: Number of seeds.
         first_seed: The first seed.
         order: Order in which the targets are learned.
+        policy: Kind of the policy.
         records: Folder of the records.
         changes: Hyper-parameters that differ from the defaults of the methods, as --set.name value.
         as_json: Print one JSON object for each run, and no table.
@@ -68,7 +72,7 @@ def status(
         else:
             from clbench.runs.spec import RunSpec
 
-            spec = RunSpec("", "", first_seed, changes or {}, order=order)
+            spec = RunSpec("", "", first_seed, changes or {}, order=order, policy=policy)
             paths = [one.path(records) for one in requested(scenarios, methods, every, seeds, spec, records)]
         states = [run_state(path) for path in paths]
     if as_json:

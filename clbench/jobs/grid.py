@@ -26,6 +26,7 @@ from clbench.records.reader import read_record
 from clbench.runs.checkpoints import has_stages
 from clbench.runs.spec import ResolvedRun, RunSpec, check_device
 from clbench.spec.identifiers import installed_methods
+from clbench.spec.policies import DEFAULT_POLICY
 
 if TYPE_CHECKING:
     from clbench.learning.method import Method
@@ -117,6 +118,7 @@ def run(
     seeds: int = 2,
     first_seed: int = 0,
     settings: Mapping[str, Any] | None = None,
+    policy: str = DEFAULT_POLICY,
     perturb: bool = False,
     records: Path | str = RECORDS,
     workers: int | None = None,
@@ -137,6 +139,7 @@ def run(
         seeds: Number of seeds.
         first_seed: The first seed.
         settings: Hyper-parameters that differ from the method's own, or from those tuned for the scenario.
+        policy: Kind of the policy: "flow" or "discrete_diffusion".
         perturb: Whether the skills and each new target are also evaluated in perturbed worlds.
         records: Folder of the records.
         workers: Number of runs at once, each a process with one thread; all cores if None.
@@ -148,7 +151,9 @@ def run(
         RunsFailedError: A run failed.
     """
     check_device(device)
-    spec = RunSpec(scenario, name_of(method), first_seed, settings or {}, device, perturb=perturb)
+    spec = RunSpec(
+        scenario, name_of(method), first_seed, settings or {}, device, perturb=perturb, policy=policy
+    )
     return run_specs([spec], seeds, Path(records), workers)
 
 

@@ -11,6 +11,7 @@ from clbench.jobs import work
 from clbench.jobs.job import Job
 from clbench.jobs.recorded import has_record
 from clbench.learning.pretraining import is_pretrained, vision_steps
+from clbench.records.paths import place_of
 from clbench.runs.length import point_length, run_length, training_length, watching_length
 from clbench.runs.spec import ResolvedRun
 from clbench.runs.start import is_evaluated
@@ -44,7 +45,7 @@ class Plan:
         self._target_data: dict[tuple[str, str], Job] = {}
         self._questions: dict[str, Job] = {}
         self._retained_data: dict[tuple[str, str], Job] = {}
-        self._policies: dict[tuple[str, int], Job | None] = {}
+        self._policies: dict[tuple[str, str, int], Job | None] = {}
         self._starts: dict[tuple[object, ...], Job | None] = {}
         self._runs: list[Job] = []
 
@@ -121,7 +122,7 @@ class Plan:
         limits: Limits | None = None,
         records: Path | None = None,
     ) -> Job:
-        title = _title(run.spec.scenario, title)
+        title = _title(_place(run), title)
         job = Job(title, function, {**arguments}, length, needs, limits, run.spec.device, _pace(run))
         if records is not None:
             job = replace(job, makes=run.path(records), is_done=lambda: has_record(run, records))
@@ -141,7 +142,7 @@ class Plan:
 
     def _policy(self, name: str, scenario: Scenario, seed: int) -> Job | None:
         """Return the job that pretrains the policy of a seed, None if the policy ships or is in the cache."""
-        key = name, seed
+        key = name, scenario.policy, seed
         if key not in self._policies:
             self._policies[key] = (
                 None if is_pretrained(scenario, seed) else self._pretraining(name, scenario, seed)
@@ -154,20 +155,24 @@ class Plan:
             self._question_job(name, scenario),
             *self.add_demonstrations(name, scenario, scenario.pretrained),
         )
-        title = _title(name, f"pretraining seed {seed}")
-        return Job(title, work.pretrain, {"scenario": name, "seed": seed}, steps, needs)
+        title = _title(place_of(name, scenario.policy), f"pretraining seed {seed}")
+        arguments = {"scenario": name, "policy": scenario.policy, "seed": seed}
+        return Job(title, work.pretrain, arguments, steps, needs)
 
     def _start(self, run: ResolvedRun) -> Job | None:
         """Return the job that evaluates the start of a run, None if the cache has the evaluation."""
         spec = run.spec
-        key = spec.scenario, spec.seed, spec.order, spec.targets, spec.split, spec.perturb, spec.device
+        key = (
+            *(spec.scenario, spec.policy, spec.seed, spec.order, spec.targets),
+            *(spec.split, spec.perturb, spec.device),
+        )
         if key not in self._starts:
             policy = self._policy(spec.scenario, run.scenario, spec.seed)
             if policy is None and is_evaluated(run):
                 self._starts[key] = None
             else:
                 needs = (*((policy,) if policy else ()), self._question_job(spec.scenario, run.scenario))
-                title = _title(spec.scenario, f"evaluation of the pretrained policy {_seed(run)}")
+                title = _title(_place(run), f"evaluation of the pretrained policy {_seed(run)}")
                 length = point_length(run.protocol, run.protocol.end(0))
                 self._starts[key] = Job(
                     title, work.evaluate_policy, {"spec": spec}, length, needs, device=spec.device
@@ -202,6 +207,10 @@ def _pace(run: ResolvedRun) -> float:
     if run.scenario.budget.criterion is not None:
         return EARLY_REPLAY_PACE if replays else EARLY_PACE
     return REPLAY_PACE if replays else 1.0
+
+
+def _place(run: ResolvedRun) -> str:
+    return place_of(run.spec.scenario, run.spec.policy)
 
 
 def _title(name: str, text: str) -> str:

@@ -51,13 +51,13 @@ def collect_scenes(scenario: str, progress: ProgressCallback) -> str:
     return f"{len(train.kinds)} kinds about {states}{noticed.source}"
 
 
-def pretrain(scenario: str, seed: int, progress: ProgressCallback) -> str:
-    """Pretrain the policy of a seed, unless it is in the cache."""
+def pretrain(scenario: str, policy: str, seed: int, progress: ProgressCallback) -> str:
+    """Pretrain the policy of a kind and a seed, unless it is in the cache."""
     from clbench.learning.pretraining import pretrained_policy
 
     noticed = _Noticed(progress)
-    policy, _ = pretrained_policy(load_scenario(scenario), seed, noticed)
-    return f"{sum(parameter.numel() for parameter in policy.parameters()):,} parameters{noticed.source}"
+    pretrained, _ = pretrained_policy(load_scenario(scenario).with_policy(policy), seed, noticed)
+    return f"{sum(parameter.numel() for parameter in pretrained.parameters()):,} parameters{noticed.source}"
 
 
 def evaluate_policy(spec: RunSpec, progress: ProgressCallback) -> str:

@@ -23,6 +23,7 @@ from clbench.learning.vision_pretraining import STEPS_SHARE, pictures_of, pretra
 from clbench.policy.checkpoint import load_policy, save_policy
 from clbench.policy.policy import Policy, PolicyConfig
 from clbench.policy.vision import Vision
+from clbench.spec.policies import DEFAULT_POLICY
 from clbench.spec.scenario import Scenario
 from clbench.spec.task import packages_of
 from clbench.worlds.camera import load_camera
@@ -58,6 +59,7 @@ def pretraining_inputs(scenario: Scenario, seed: int) -> dict[str, Any]:
         "budget": {name: value for name, value in budget.items() if name not in AFTER_PRETRAINING},
         "seed": seed,
         "text_length": scenario.text_length,
+        "policy": scenario.policy,
         "frame": frame_hash(scenario.scene_tasks[0]),
         "source": source_hash(*TRAINING_SOURCES, *suites),
         # a label such as torch's +cpu names other abilities of a build; pretraining does not use them
@@ -67,7 +69,8 @@ def pretraining_inputs(scenario: Scenario, seed: int) -> dict[str, Any]:
 
 def shipped_folder(scenario: Scenario, seed: int) -> Path:
     """Return the folder of the pretrained policy if it ships."""
-    return SHIPPED / f"{scenario.id.replace('/', '--')}-seed-{seed}"
+    kind = "" if scenario.policy == DEFAULT_POLICY else f"-{scenario.policy}"
+    return SHIPPED / f"{scenario.id.replace('/', '--')}{kind}-seed-{seed}"
 
 
 def pretrained_folder(scenario: Scenario, seed: int) -> Path:
@@ -133,6 +136,7 @@ def policy_config(scenario: Scenario) -> PolicyConfig:
         image_size=observer.image_size,
         width=scenario.budget.policy_width,
         layers=scenario.budget.policy_layers,
+        kind=scenario.policy,
     )
     world.close()
     return config

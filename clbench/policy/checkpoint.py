@@ -16,6 +16,7 @@ from torch import Tensor
 from clbench.base.errors import ClbenchError
 from clbench.base.strict_json import read_json
 from clbench.policy.policy import Policy, PolicyConfig
+from clbench.spec.policies import POLICIES
 
 LARGEST = 65_536
 """Upper limit of every size in a `PolicyConfig`."""
@@ -74,7 +75,10 @@ def _kinds(tensors: Mapping[str, Tensor]) -> dict[str, tuple[Any, ...]]:
 
 def _fault(config: PolicyConfig, tensors: Mapping[str, Tensor]) -> str | None:
     """Return why a policy of these sizes must not be built, None if it may: it could exceed the memory."""
-    for name, size in dataclasses.asdict(config).items():
+    sizes = dataclasses.asdict(config)
+    if sizes.pop("kind") not in POLICIES:
+        return f"its kind must be one of {', '.join(POLICIES)}, not {config.kind!r}"
+    for name, size in sizes.items():
         least = 0 if name == "image_size" else 1
         if type(size) is not int or not least <= size <= LARGEST:
             return f"{name} must be a whole number from {least} to {LARGEST:,}, not {size!r}"

@@ -1,16 +1,19 @@
 """The discrete-diffusion action head: it fills in masked action tokens, the surest first.
 
-Discrete Diffusion VLA (Liang et al., arXiv 2508.20072): each action dimension is cut into bins, a share of the
-tokens of a chunk is masked, and the network restores them (eq. 5). Decoding starts with all tokens masked and
-keeps the surest predictions of each step.
+Discrete Diffusion VLA (Liang et al., arXiv 2508.20072): each action dimension is cut into bins, a share of
+the tokens of a chunk is masked, and the network restores them (eq. 5). Decoding starts with all tokens masked
+and keeps the surest predictions of each step.
 
 Deviations from the paper:
 
 1. Tokens of actions that do not count, after the end of an episode and after action noise, are always masked
    and have no loss. The share of masked tokens is that of the others.
-2. Decoding takes the likeliest bin at every step, and the order has no Gumbel noise (the paper's ablation: 96.2
+2. Decoding takes the likeliest bin at every step, and the order has no Gumbel noise (the ablation: 96.2
    instead of 96.8 on LIBERO-Goal). An action is then a function of the observation alone.
 3. Keys and values of the observation come from the backbone's layers, as in the flow-matching head.
+4. Bins reach as far to both sides of 0 as the 1st and the 99th percentile of the skills' actions, whichever
+   is further, and to -1 and 1 in a dimension that no skill uses. Between the percentiles alone, a target that
+   needs the other direction could not be learned.
 """
 
 from __future__ import annotations
@@ -23,13 +26,17 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from clbench.policy.backbone import Layer
+from clbench.policy.head import ActionHead
 
 DECODING_STEPS = 12
 """Forwards of the head that decode a chunk; the paper's number."""
 
+LEAST_REACH = 0.01
+"""Actions that stay below it, a hundredth of the greatest, do not use their dimension."""
 
-class DiscreteDiffusionHead(nn.Module):
-    """Tokens of a chunk, one for each action dimension of each step, that attend to the backbone and each other.
+
+class DiscreteDiffusionHead(ActionHead):
+    """Tokens of a chunk, one for each action dimension of each step, that attend to each other.
 
     Token i of a chunk is dimension i % A of step i // A.
 
@@ -45,7 +52,9 @@ class DiscreteDiffusionHead(nn.Module):
     low: Tensor
     high: Tensor
 
-    def __init__(self, action_size: int, chunk: int, width: int, layers: int, heads: int, bins: int = 256) -> None:
+    def __init__(
+        self, action_size: int, chunk: int, width: int, layers: int, heads: int, bins: int = 256
+    ) -> None:
         super().__init__()
         self.bins, self.chunk, self.action_size = bins, chunk, action_size
         self.embed = nn.Embedding(bins + 1, width)
@@ -57,12 +66,13 @@ class DiscreteDiffusionHead(nn.Module):
         self.register_buffer("high", torch.full((action_size,), 1.0))
         nn.init.normal_(self.embed.weight, std=0.5)
 
-    def fit(self, action: Tensor) -> None:
-        """Set the range of the bins to the 1st to 99th percentile of normalised actions (N, A)."""
+    def fit(self, action: Tensor, mean: Tensor, std: Tensor) -> None:
+        """Set the range of the bins; `ActionHead.fit` documents the arguments."""
         at = action.new_tensor([0.01, 0.99])
-        low, high = torch.stack([torch.quantile(column, at) for column in action.T], dim=1)
-        self.low.copy_(low)
-        self.high.copy_(torch.maximum(high, low + 1e-2))
+        reach = torch.stack([torch.quantile(column, at).abs().max() for column in action.T])
+        reach = torch.where(reach < LEAST_REACH, 1.0, reach)
+        self.low.copy_((-reach - mean) / std)
+        self.high.copy_((reach - mean) / std)
 
     def tokens(self, action: Tensor) -> Tensor:
         """Return the bins (B, H * A), int64, of normalised chunks (B, H, A)."""
@@ -85,7 +95,7 @@ class DiscreteDiffusionHead(nn.Module):
     def masked(self, valid: Tensor, draw: Tensor, noise: Tensor) -> Tensor:
         """Return which tokens are masked, bool (B, H * A); `loss` documents the arguments."""
         counts = valid.bool()[:, :, None].expand_as(noise).flatten(1)
-        rank = noise.flatten(1).masked_fill(~counts, math.inf).argsort(1).argsort(1)
+        rank = noise.flatten(1).masked_fill(~counts, math.inf).argsort(dim=1, stable=True).argsort(dim=1)
         number = (counts.sum(1) * torch.cos(draw * (math.pi / 2))).round().clamp(min=1)
         return (rank < number[:, None]) | ~counts
 
@@ -95,7 +105,8 @@ class DiscreteDiffusionHead(nn.Module):
         """Return the expected normalised action (B, H, A) at partly masked chunks."""
         tokens = self.tokens(action).masked_fill(self.masked(valid, draw, noise), self.bins)
         share = self.logits(tokens, hidden, mask).softmax(dim=2)
-        return torch.einsum("bhak,ak->bha", share.unflatten(1, (self.chunk, self.action_size)), self.centres())
+        share = share.view(len(tokens), self.chunk, self.action_size, self.bins)
+        return (share * self.centres()).sum(dim=3)
 
     def loss(
         self, action: Tensor, valid: Tensor, draw: Tensor, noise: Tensor, hidden: list[Tensor], mask: Tensor
@@ -124,7 +135,11 @@ class DiscreteDiffusionHead(nn.Module):
             confidence, best = self.logits(tokens, hidden, mask).softmax(dim=2).max(dim=2)
             hides = tokens == self.bins
             keep = math.floor(length * math.cos(math.pi / 2 * step / DECODING_STEPS))
-            rank = confidence.masked_fill(~hides, math.inf).argsort(dim=1, descending=True).argsort(dim=1)
+            rank = (
+                confidence.masked_fill(~hides, math.inf)
+                .argsort(dim=1, descending=True, stable=True)
+                .argsort(dim=1)
+            )
             tokens = torch.where(hides & (rank < length - keep), best, tokens)
         chosen = tokens.view(batch, self.chunk, self.action_size)
         return self.centres().expand(batch, self.chunk, -1, -1).gather(3, chosen[..., None]).squeeze(3)

@@ -14,9 +14,10 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from clbench.policy.backbone import Layer
+from clbench.policy.head import ActionHead
 
 
-class FlowHead(nn.Module):
+class FlowHead(ActionHead):
     """Action tokens that attend, layer by layer, to the hidden states of the backbone and to each other."""
 
     time_features = 32
@@ -45,8 +46,11 @@ class FlowHead(nn.Module):
             tokens = layer(tokens, mask, prefix)
         return cast(Tensor, self.velocity_out(tokens))
 
+    def fit(self, action: Tensor, mean: Tensor, std: Tensor) -> None:
+        """Do nothing: velocities have no range."""
+
     def predict(
-        self, action: Tensor, draw: Tensor, noise: Tensor, hidden: list[Tensor], mask: Tensor
+        self, action: Tensor, valid: Tensor, draw: Tensor, noise: Tensor, hidden: list[Tensor], mask: Tensor
     ) -> Tensor:
         """Return the velocity (B, H, A) at chunks with added noise; `loss` documents the arguments."""
         time = draw ** (1 / 1.5)  # the inverse of Beta(1.5, 1)'s distribution function t ** 1.5
@@ -66,7 +70,7 @@ class FlowHead(nn.Module):
             hidden: Hidden states of the backbone, one (B, P, W) per layer.
             mask: Mask of the prefix tokens that are read, (B, 1, 1, P).
         """
-        predicted = self.predict(action, draw, noise, hidden, mask)
+        predicted = self.predict(action, valid, draw, noise, hidden, mask)
         return mean_over_valid((predicted - (noise - action)).square(), valid)
 
     def sample(self, noise: Tensor, hidden: list[Tensor], mask: Tensor) -> Tensor:

@@ -11,9 +11,12 @@ from torch import Tensor, nn
 
 from clbench.policy.backbone import Backbone
 from clbench.policy.batch import Batch, QuestionBatch
+from clbench.policy.discrete import DiscreteDiffusionHead
 from clbench.policy.flow import FlowHead
+from clbench.policy.head import ActionHead
 from clbench.spec.budget import HEADS
 from clbench.spec.language import TEXT_LENGTH, VOCABULARY_SIZE
+from clbench.spec.policies import DEFAULT_POLICY
 
 
 @dataclass(frozen=True)
@@ -42,6 +45,16 @@ class PolicyConfig:
     """Words, or pieces of words, that it can read at once."""
     image_size: int = 0
     """Width and height of the image that it sees, in pixels; 0 without images."""
+    kind: str = DEFAULT_POLICY
+    """Kind of its action head, one of `POLICIES`."""
+
+
+def new_head(config: PolicyConfig) -> ActionHead:
+    """Return the action head of the policy's kind, with initial weights."""
+    sizes = (config.action_size, config.chunk, config.width, config.layers, config.heads)
+    if config.kind == "discrete_diffusion":
+        return DiscreteDiffusionHead(*sizes)
+    return FlowHead(*sizes, config.euler_steps)
 
 
 class Policy(nn.Module):
@@ -73,14 +86,7 @@ class Policy(nn.Module):
                 config.heads,
                 config.image_size,
             )
-            self.head = FlowHead(
-                config.action_size,
-                config.chunk,
-                config.width,
-                config.layers,
-                config.heads,
-                config.euler_steps,
-            )
+            self.head = new_head(config)
         for name, size in (("state", config.state_size), ("action", config.action_size)):
             self.register_buffer(f"{name}_mean", torch.zeros(size))
             self.register_buffer(f"{name}_std", torch.ones(size))
@@ -93,6 +99,8 @@ class Policy(nn.Module):
             getattr(self, f"{name}_mean").copy_(values.mean(dim=0))
             # at least 1e-2, a centimetre or a hundredth of the actions: nearly constant values stay small
             getattr(self, f"{name}_std").copy_(values.std(dim=0, correction=0).clamp(min=1e-2))
+        if action is not None:
+            self.head.fit(action, self.action_mean, self.action_std)
 
     def hidden_states(self, state: Tensor, words: Tensor, image: Tensor | None = None) -> list[Tensor]:
         """Return the hidden state (B, P, W) of every backbone layer for states (B, S) and words (B, L)."""
@@ -113,11 +121,11 @@ class Policy(nn.Module):
         return self.head.loss(action, batch.valid, batch.draw, batch.noise, hidden, mask)
 
     def predict(self, batch: Batch) -> Tensor:
-        """Return the velocities (B, H, A) that the head predicts at the noisy chunks, to compare policies."""
+        """Return what the head predicts at the noisy chunks, (B, H, A), to compare policies of one kind."""
         hidden = self.hidden_states(batch.state, batch.words, batch.image)
         action = (batch.action - self.action_mean) / self.action_std
         mask = self.backbone.mask(batch.words)
-        return self.head.predict(action, batch.draw, batch.noise, hidden, mask)
+        return self.head.predict(action, batch.valid, batch.draw, batch.noise, hidden, mask)
 
     def answer_logits(self, state: Tensor, words: Tensor, image: Tensor | None = None) -> Tensor:
         """Return the logits (B, V) of the word that answers the question `words` about `state`."""

@@ -1,5 +1,7 @@
 """Records of older schemas, converted to the present one while they are read. Their files stay as they are.
 
+Schema 4 knew one kind of policy.
+
 Schema 3 did not measure how often the latest target captures the instructions of other skills.
 
 Schema 2 wrote "report" for the split "test" and "selection" for "validation", named four fields of the budget
@@ -146,7 +148,16 @@ def _from_3(values: _Values) -> _Values:
     return _with(values, {"policy": policy})
 
 
-_STEPS: tuple[Callable[[_Values], _Values], ...] = (_from_1, _from_2, _from_3)
+def _from_4(values: _Values) -> _Values:
+    """Convert schema 4 to schema 5."""
+    run = _part(values, "run")
+    if run is not None:
+        _refuse_later("run", run, ("policy",), 4)
+        run["policy"] = "flow"
+    return _with(values, {"run": run})
+
+
+_STEPS: tuple[Callable[[_Values], _Values], ...] = (_from_1, _from_2, _from_3, _from_4)
 """Functions that convert each schema, from 1, to the next one."""
 
 

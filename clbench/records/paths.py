@@ -8,6 +8,7 @@ from typing import Any
 
 from clbench.base.errors import InputError
 from clbench.spec.identifiers import check_label, check_scenario_id, folder_name
+from clbench.spec.policies import DEFAULT_POLICY, check_policy
 
 RECORDS = Path("leaderboard/records")
 """Folder of the leaderboard's records, from the working directory."""
@@ -21,7 +22,25 @@ def label_of(method: str, changes: Mapping[str, Any]) -> str:
     return "+".join([method, *(f"{name}={value}" for name, value in sorted(changes.items()))])
 
 
-def record_name(scenario: str, label: str, seed: int, order: int = 0) -> Path:
+def place_of(scenario: str, policy: str) -> str:
+    """Return the name of a run's table: the scenario, with the kind of policy if it is not the usual one.
+
+    Example: "clbench/Fetch-v1+discrete_diffusion". Policies of different kinds never share a table.
+
+    Args:
+        scenario: Gymnasium id.
+        policy: Kind of the policy.
+    """
+    return scenario if policy == DEFAULT_POLICY else f"{scenario}+{policy}"
+
+
+def parts_of(place: str) -> tuple[str, str]:
+    """Return the scenario and the kind of policy of a table's name, see `place_of`."""
+    scenario, _, policy = place.partition("+")
+    return scenario, policy or DEFAULT_POLICY
+
+
+def record_name(scenario: str, label: str, seed: int, order: int = 0, policy: str = DEFAULT_POLICY) -> Path:
     """Return the path of a run's record from the folder of records. No other run has the same.
 
     Args:
@@ -29,23 +48,27 @@ def record_name(scenario: str, label: str, seed: int, order: int = 0) -> Path:
         label: The method with its changed hyper-parameters, see `label_of`.
         seed: Seed of the run.
         order: Order in which the targets were learned; 0 is the published one.
+        policy: Kind of the policy.
 
     Raises:
         InputError: A name is refused.
     """
     check_scenario_id(scenario)
+    check_policy(policy)
     check_label(label)
     name = f"seed-{seed}-order-{order}.json" if order else f"seed-{seed}.json"
-    return Path(folder_name(scenario), folder_name(label), name)
+    return Path(folder_name(place_of(scenario, policy)), folder_name(label), name)
 
 
-def record_path(records: Path, scenario: str, label: str, seed: int, order: int = 0) -> Path:
+def record_path(
+    records: Path, scenario: str, label: str, seed: int, order: int = 0, policy: str = DEFAULT_POLICY
+) -> Path:
     """Return the path of a run's record below the folder `records`, see `record_name`.
 
     Raises:
         InputError: A name is refused, or a symbolic link leads out of the folder.
     """
-    path = records / record_name(scenario, label, seed, order)
+    path = records / record_name(scenario, label, seed, order, policy)
     if not path.parent.resolve().is_relative_to(records.resolve()):
         raise InputError(f"{path.parent}: a symbolic link leads out of {records}.")
     return path

@@ -10,12 +10,13 @@ import html
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
+from clbench.spec.policies import DEFAULT_POLICY
 from clbench.spec.protocol import Point, Protocol, ScoredSplit, Split
 
 if TYPE_CHECKING:
     import pandas
 
-SCHEMA = 4
+SCHEMA = 5
 """Version of the file format. A reader refuses a newer one, and converts older ones
 (`clbench.records.history`)."""
 
@@ -132,6 +133,8 @@ class RunInfo:
     `clbench.spec.scenario.target_order`."""
     perturb: bool = False
     """Whether the retained skills also met perturbed episodes."""
+    policy: str = DEFAULT_POLICY
+    """Kind of the policy."""
 
 
 @dataclass

@@ -14,6 +14,7 @@ from clbench.base.errors import InputError
 from clbench.records.paths import label_of, record_path
 from clbench.records.record import RunInfo, ScenarioInfo
 from clbench.runs.tuning import tuned_settings
+from clbench.spec.policies import DEFAULT_POLICY
 from clbench.spec.protocol import Protocol, ScoredSplit
 from clbench.spec.registry import load_scenario
 from clbench.spec.scenario import Scenario
@@ -49,6 +50,8 @@ class RunSpec:
     """Order of the targets, see `Scenario.in_order`; 0 is the published one."""
     perturb: bool = False
     """Whether the retained skills and each stage's target also meet perturbed episodes."""
+    policy: str = DEFAULT_POLICY
+    """Kind of the policy, one of `clbench.spec.policies.POLICIES`."""
 
     @property
     def label(self) -> str:
@@ -57,7 +60,8 @@ class RunSpec:
 
     def path(self, records: Path) -> Path:
         """Return the path of the record below the folder `records`."""
-        return record_path(records, self.scenario.rpartition(":")[2], self.label, self.seed, self.order)
+        scenario = self.scenario.rpartition(":")[2]
+        return record_path(records, scenario, self.label, self.seed, self.order, self.policy)
 
     def resolve(self) -> ResolvedRun:
         """Return the run with its scenario and its method looked up.
@@ -76,10 +80,10 @@ class RunSpec:
         """Return the scenario with the targets that are learned, and the same in the published order.
 
         Raises:
-            UnknownNameError: There is no such scenario.
+            UnknownNameError: There is no such scenario or policy.
             InputError: There is no such order, or nothing can be perturbed.
         """
-        published = load_scenario(self.scenario)
+        published = load_scenario(self.scenario).with_policy(self.policy)
         scenario = published.in_order(self.order).for_seed(self.seed)
         if self.perturb:
             check_perturbable(scenario.retained + scenario.target)
@@ -133,6 +137,7 @@ class ResolvedRun:
             uses=dataclasses.asdict(method.uses),
             order=spec.order,
             perturb=spec.perturb,
+            policy=spec.policy,
         )
 
     @cached_property
@@ -147,7 +152,8 @@ class ResolvedRun:
 
     def path(self, records: Path) -> Path:
         """Return the path of the record below the folder `records`."""
-        return record_path(records, self.scenario.id, self.label, self.spec.seed, self.spec.order)
+        spec = self.spec
+        return record_path(records, self.scenario.id, self.label, spec.seed, spec.order, spec.policy)
 
 
 def describe_scenario(scenario: Scenario) -> ScenarioInfo:

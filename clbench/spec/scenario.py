@@ -15,6 +15,7 @@ from clbench.base.text import html_table
 from clbench.spec.budget import Budget
 from clbench.spec.fields import check_entry_point
 from clbench.spec.limits import Limits
+from clbench.spec.policies import DEFAULT_POLICY, check_policy
 from clbench.spec.task import Task
 
 Group = Literal["retained", "target", "held_out"]
@@ -52,6 +53,8 @@ class Scenario:
     """Data, steps and evaluation episodes that every method gets."""
     limits: Limits = field(default_factory=Limits)
     """Limits of the process of a submitted run."""
+    policy: str = DEFAULT_POLICY
+    """Kind of the policy that is pretrained and fine-tuned, one of `POLICIES`."""
 
     def __post_init__(self) -> None:
         names = [task.name for task in self.tasks + self.background]
@@ -59,6 +62,7 @@ class Scenario:
             if names.count(name) > 1:
                 raise InputError(f"{self.id}: two tasks are called {name!r}.")
         check_entry_point(self, "questions")
+        check_policy(self.policy)
         if not self.scene_tasks:
             raise InputError(
                 f"{self.id}: without retained tasks it needs scenes, tasks whose states are asked about, "
@@ -137,6 +141,14 @@ class Scenario:
         except ValueError as error:
             raise InputError(f"{self.id}: {error}") from error
         return replace(self, target=tuple(self.target[place] for place in places)) if order else self
+
+    def with_policy(self, kind: str) -> Scenario:
+        """Return the scenario with another kind of policy; all else stays the same.
+
+        Raises:
+            UnknownNameError: There is no such kind.
+        """
+        return self if kind == self.policy else replace(self, policy=kind)
 
     def for_seed(self, seed: int) -> Scenario:
         """Return the scenario with its targets in the order in which runs of `seed` learn them."""

@@ -66,10 +66,8 @@ def read_frontiers(folder: Path) -> tuple[dict[str, tuple[Curve, ...]], list[Not
     Their paths begin with the folder's name. A missing folder counts as empty.
     """
     runs, refused = read_runs(folder, partial(read_run, changed=True), (*ALIKE, _on_the_ladder))
-    runs.sort(key=lambda run: run.scenario)
-    found = {
-        scenario: _curves(list(members)) for scenario, members in groupby(runs, lambda run: run.scenario)
-    }
+    runs.sort(key=lambda run: run.place)
+    found = {place: _curves(list(members)) for place, members in groupby(runs, lambda run: run.place)}
     return found, [dataclasses.replace(one, path=f"{folder.name}/{one.path}") for one in refused]
 
 
@@ -109,6 +107,6 @@ def _rungs(runs: Sequence[Run]) -> tuple[Rung, ...]:
 
 
 def _rung(factor: float, runs: Sequence[Run]) -> Rung:
-    generator = row_generator(runs[0].scenario, runs[0].method)
+    generator = row_generator(runs[0].place, runs[0].method)
     found = estimate((LEARNED, KEPT), {run.seed: run.scores for run in runs}, generator)
     return Rung(factor, found[LEARNED], found[KEPT], tuple(run.seed for run in runs))

@@ -6,8 +6,10 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
+from clbench.records.paths import parts_of
 from clbench.scoring.intervals import Estimate
 from clbench.scoring.metrics import METRICS
+from clbench.spec.policies import DEFAULT_POLICY
 
 from .summary import DIVISIONS, RANKED_BY, RowSummary
 
@@ -31,10 +33,12 @@ class OverallRow:
 def overall(rows: Iterable[RowSummary]) -> tuple[OverallRow, ...]:
     """Return a row for each method that has one in every scenario, by division and falling final average.
 
-    There is none if there is only one scenario.
+    There is none if there is only one scenario. Rows of other policies than the usual one do not count.
     """
     by_method: dict[tuple[str, str], dict[str, RowSummary]] = {}
     for row in rows:
+        if parts_of(row.scenario)[1] != DEFAULT_POLICY:
+            continue
         by_method.setdefault((row.division, row.method), {})[row.scenario] = row
     scenarios = {scenario for found in by_method.values() for scenario in found}
     if len(scenarios) < 2:

@@ -70,13 +70,13 @@ def read_table(records: Path, only: Container[str] | None = None) -> Table:
         raise FileNotFoundError(f"There is no folder of records at {records}.")
     runs, not_shown = read_runs(records, read_run, ALIKE, only)
     runs, alone = _beside_rows(runs)
-    by_scenario = groupby(sorted(runs, key=lambda run: run.scenario), key=lambda run: run.scenario)
-    found = [_scenario_rows(list(members)) for _, members in by_scenario]
+    by_place = groupby(sorted(runs, key=lambda run: run.place), key=lambda run: run.place)
+    found = [_scenario_rows(list(members)) for _, members in by_place]
     found.sort(key=lambda rows: not rows[0].to_criterion)  # they have tuned methods, and judge the claims
     by_name = {rows[0].scenario: rows for rows in found}
     frontiers, without = read_frontiers(ladder_of(records)) if only is None else ({}, [])
     return Table(
-        scenarios={run.scenario: run.published for run in runs},
+        scenarios={run.place: run.published for run in runs},
         rows=tuple(chain.from_iterable(found)),
         starts={name: pretrained_success(rows) for name, rows in by_name.items()},
         agreements={name: agreement(rows) for name, rows in by_name.items()},
@@ -87,9 +87,9 @@ def read_table(records: Path, only: Container[str] | None = None) -> Table:
 
 def _beside_rows(runs: list[Run]) -> Sifted:
     """Keep the runs of methods that have a row: one with the targets in the published order."""
-    with_row = {(run.scenario, run.method) for run in runs if not run.order}
-    kept = [run for run in runs if (run.scenario, run.method) in with_row]
-    alone = [run for run in runs if (run.scenario, run.method) not in with_row]
+    with_row = {(run.place, run.method) for run in runs if not run.order}
+    kept = [run for run in runs if (run.place, run.method) in with_row]
+    alone = [run for run in runs if (run.place, run.method) not in with_row]
     reason = "its method has no run with the targets in the published order, of which rows are made."
     return kept, [no_row(run.path, reason) for run in alone]
 
@@ -126,7 +126,7 @@ def _row(
     first = members[0]
     orders = orders_of(run for run in runs if run.method == method)
     return Row(
-        scenario=first.scenario,
+        scenario=first.place,
         method=method,
         division=first.division,
         groups=letters,
@@ -136,7 +136,7 @@ def _row(
         estimates=estimates,
         costs=costs_of(members, by_method.get(BASELINE, [])),
         order_sensitivity=orders.sensitivity,
-        tried=_tried(first.scenario, method),
+        tried=_tried(first.place, method),
         runs=tuple(members),
         orders=orders,
     )
@@ -175,7 +175,7 @@ def _estimates(method: str, by_method: Mapping[str, list[Run]]) -> dict[str, Est
         name: _scores(runs) for name, runs in by_method.items() if name != method or name not in never_itself
     }
     runs = by_method[method]
-    generator = row_generator(runs[0].scenario, method)
+    generator = row_generator(runs[0].place, method)
     return estimate(METRICS, _scores(runs), generator, references=references)
 
 

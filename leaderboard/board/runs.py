@@ -11,8 +11,9 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+from clbench.base.errors import ClbenchError
 from clbench.base.text import printable
-from clbench.records.paths import label_of, record_name
+from clbench.records.paths import label_of, place_of, record_name
 from clbench.records.pinned import other_parts, pinned
 from clbench.records.reader import RecordError, read_record
 from clbench.records.record import Record, RunInfo, ScenarioInfo
@@ -43,8 +44,8 @@ class Run:
     """The record."""
     scores: Scores
     """Scores of the record."""
-    scenario: str
-    """Gymnasium id."""
+    place: str
+    """Table that it belongs to: the scenario, and the kind of policy if it is another; see `place_of`."""
     method: str
     """The method with its changed hyper-parameters, see `label_of`."""
     seed: int
@@ -135,7 +136,16 @@ def read_run(folder: Path, path: Path, split: Split = "test", changed: bool | No
         raise RecordError(f"it is the record of {home}, and must be there.")
     scores, published = Scores.from_record(record), _published(record)
     return Run(
-        name, record, scores, run.scenario, label, run.seed, division, tier_of(path), run.order, published
+        name,
+        record,
+        scores,
+        place_of(run.scenario, run.policy),
+        label,
+        run.seed,
+        division,
+        tier_of(path),
+        run.order,
+        published,
     )
 
 
@@ -158,8 +168,8 @@ def _home(run: RunInfo, label: str) -> str:
     if run.seed < 0:
         raise RecordError(f"run: {run.seed} cannot be a seed.")
     try:
-        return record_name(run.scenario, label, run.seed, run.order).as_posix()
-    except ValueError as error:
+        return record_name(run.scenario, label, run.seed, run.order, run.policy).as_posix()
+    except ClbenchError as error:
         raise RecordError(f"run: {error}") from error
 
 
@@ -244,7 +254,7 @@ def same_scenario(runs: list[Run]) -> Sifted:
             fields = [f"budget ({', '.join(differences(ours, theirs))})"]
         return f"its scenario does not match most records: {', '.join(fields)} differ."
 
-    return _most(runs, lambda run: run.scenario, lambda run: _text(vars(run.published)), reason)
+    return _most(runs, lambda run: run.place, lambda run: _text(vars(run.published)), reason)
 
 
 def same_simulator(runs: list[Run]) -> Sifted:
@@ -257,7 +267,7 @@ def same_simulator(runs: list[Run]) -> Sifted:
         worlds = ", ".join(differences(rollouts(run), rollouts(other)))
         return f"its simulator does not match most records: the rollouts of {worlds or 'all worlds'} differ."
 
-    return _most(runs, lambda run: run.scenario, lambda run: _text(rollouts(run)), reason)
+    return _most(runs, lambda run: run.place, lambda run: _text(rollouts(run)), reason)
 
 
 def same_definition(runs: list[Run]) -> Sifted:
@@ -274,18 +284,18 @@ def same_definition(runs: list[Run]) -> Sifted:
         return f"its scenario is not that of most records: {parts} differ."
 
     kept, refused = _most(
-        [run for run in runs if run.scenario not in pinned() and defined(run) is not None],
-        lambda run: run.scenario,
+        [run for run in runs if run.record.run.scenario not in pinned() and defined(run) is not None],
+        lambda run: run.place,
         lambda run: _text(defined(run)),
         reason,
     )
-    kept += [run for run in runs if run.scenario not in pinned() and defined(run) is None]
+    kept += [run for run in runs if run.record.run.scenario not in pinned() and defined(run) is None]
     for run in runs:
-        if run.scenario in pinned():
-            if other := other_parts(defined(run), pinned()[run.scenario]):
-                refused.append(
-                    no_row(run.path, f"it was made with another {run.scenario}: {', '.join(other)} differ.")
-                )
+        scenario = run.record.run.scenario
+        if scenario in pinned():
+            if other := other_parts(defined(run), pinned()[scenario]):
+                words = f"it was made with another {scenario}: {', '.join(other)} differ."
+                refused.append(no_row(run.path, words))
             else:
                 kept.append(run)
     return kept, refused
@@ -301,7 +311,7 @@ def same_layout(runs: list[Run]) -> Sifted:
         fields = differences(vars(layout(run)), vars(layout(other)))
         return f"it was not evaluated like most records: {', '.join(fields)} differ."
 
-    return _most(runs, lambda run: run.scenario, layout, reason)
+    return _most(runs, lambda run: run.place, layout, reason)
 
 
 def same_settings(runs: list[Run]) -> Sifted:
@@ -318,7 +328,7 @@ def same_settings(runs: list[Run]) -> Sifted:
         fields = [name for one, another in both for name in differences(one, another)]
         return f"its settings do not match most seeds: {', '.join(fields)} differ."
 
-    return _most(runs, lambda run: (run.scenario, run.method), lambda run: _text(parts(run)), reason)
+    return _most(runs, lambda run: (run.place, run.method), lambda run: _text(parts(run)), reason)
 
 
 ALIKE: tuple[Sift, ...] = (same_scenario, same_definition, same_simulator, same_layout, same_settings)

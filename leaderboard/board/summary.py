@@ -37,7 +37,7 @@ class RowSummary:
     """The numbers of one method on one scenario."""
 
     scenario: str
-    """Gymnasium id."""
+    """Name of its table: the Gymnasium id, with the kind of policy if it is not the usual one."""
     method: str
     """Name or "module:Class"."""
     division: str

@@ -252,7 +252,7 @@ def read_evidence(scenario: str, records: Path, controls: Path) -> Evidence:
         *((run.method, run) for run in (*scored, *changed)),
         *((rung(run.record.run.method, run.record.run.changes.get(FACTOR)), run) for run in rungs),
     ):
-        if run.scenario == scenario and run.scores.layout.target and not run.order:
+        if run.place == scenario and run.scores.layout.target and not run.order:
             runs.setdefault(label, {})[run.seed] = run
     not_used = [
         NotShown(f"{name}/{entry.path}", entry.reason)
@@ -273,7 +273,7 @@ def rung(method: str, factor: Any) -> str:
 
 def _like(scored: Sequence[Run]) -> Sift:
     """Return the sift that keeps runs that were made and evaluated like the board's."""
-    examples = {run.scenario: run for run in scored}
+    examples = {run.place: run for run in scored}
 
     def traits(run: Run) -> dict[str, Any]:
         return {
@@ -285,7 +285,7 @@ def _like(scored: Sequence[Run]) -> Sift:
     def sift(runs: list[Run]) -> Sifted:
         kept, refused = [], []
         for run in runs:
-            example = examples.get(run.scenario, run)
+            example = examples.get(run.place, run)
             fields = differences(traits(run), traits(example))
             if fields:
                 reason = f"it cannot be compared with the board: {', '.join(fields)} differ."

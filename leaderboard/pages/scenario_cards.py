@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from clbench.base.entry_points import resolve
-from clbench.base.text import printable
+from clbench.base.text import field_docstrings, printable
 from clbench.records.paths import RECORDS
 from clbench.scoring.groups import deviation_of_differences
 from clbench.scoring.intervals import Estimate, bootstrap, paired_difference, row_generator, student_quantile
@@ -31,7 +31,6 @@ from ..board.commands import run_command
 from ..board.rows import Row, Table
 from ..board.runs import differences
 from ..board.summary import METHODS, RANKED_BY
-from ..views.descriptions import field_docstrings
 from ..views.format import MISSING
 from ..views.markdown import templates
 from .scenario_tasks import Experts, picture_path

@@ -74,6 +74,7 @@ class Subject:
             values.device,
             order=values.order,
             perturb=values.perturb,
+            policy=values.policy,
         )
 
     @property

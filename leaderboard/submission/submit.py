@@ -15,7 +15,7 @@ from clbench.jobs.processes import Processes
 from clbench.jobs.recorded import has_record
 from clbench.jobs.scheduler import run_with_bars
 from clbench.learning.registry import load_method
-from clbench.records.paths import label_of, record_path
+from clbench.records.paths import place_of
 from clbench.runs.spec import ResolvedRun
 from clbench.scoring.metrics import METRICS
 from clbench.testing import ContractError, check_method
@@ -73,10 +73,10 @@ def check_job(method: str, progress: Callable[[float], None]) -> str:
 
 def placement(table: Table, run: ResolvedRun, records: Path) -> list[str]:
     """Return lines with the place of the method of `run` on the board, or why it has no row."""
-    scenario, method = run.scenario.id, run.spec.method
+    scenario, method = place_of(run.scenario.id, run.spec.policy), run.spec.method
     rows = [row for row in table.rows if row.scenario == scenario]
     mine = [row for row in rows if row.method == method]
-    folder = record_path(Path(), scenario, label_of(method, {}), 0).parent.as_posix()
+    folder = run.path(Path()).parent.as_posix()
     refused = [entry for entry in table.not_shown if entry.path.startswith(f"{folder}/")]
     lines = [line for row in mine for line in _row_lines(row, rows, run.spec.scenario, records)]
     if not mine:

@@ -11,8 +11,7 @@ from dataclasses import dataclass
 from itertools import groupby
 from typing import Any
 
-from docstring_parser import parse_from_object
-
+from clbench.base.text import field_docstrings
 from clbench.learning.method import Method
 from clbench.learning.registry import load_method, method_names
 
@@ -137,15 +136,6 @@ def _hyper_parameters(cls: type[Method]) -> list[HyperParameter]:
         for field in dataclasses.fields(cls)
         if field.default != COMMON.get(field.name, dataclasses.MISSING)
     ]
-
-
-def field_docstrings(cls: type) -> dict[str, str]:
-    """Return the docstrings under the fields of a class, by field; Python itself drops them."""
-    own = inspect.get_annotations(cls)
-    documented = parse_from_object(cls).params
-    return {
-        one.arg_name: " ".join((one.description or "").split()) for one in documented if one.arg_name in own
-    }
 
 
 def _default(field: dataclasses.Field[Any]) -> str:

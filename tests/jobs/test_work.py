@@ -44,4 +44,4 @@ def test_what_is_in_the_cache_is_not_said_to_be_made(empty_caches: Path) -> None
     for end in ("for the test", "for the test, from the cache"):
         assert collect_scenes(SPEC.scenario, nothing).endswith(end)
     for end in ("parameters", "parameters, from the cache"):
-        assert pretrain(SPEC.scenario, 0, nothing).endswith(end)
+        assert pretrain(SPEC.scenario, "flow", 0, nothing).endswith(end)

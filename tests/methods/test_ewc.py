@@ -72,7 +72,9 @@ def test_importance_is_the_mean_squared_gradient_of_single_samples() -> None:
     _check_close(method.importance, _fisher(policy, toy_source("left"), 12))
     # not the square of the mean gradient, which is near 0 where training has ended
     batch = Batch.cat([source.sample(1) for source in [toy_source("left")] for _ in range(12)])
-    (mean,) = torch.autograd.grad(policy.action_loss(batch).mean(), [policy.head.embed.weight])
+    (mean,) = torch.autograd.grad(
+        policy.action_loss(batch).mean(), [policy.get_parameter("head.embed.weight")]
+    )
     assert (method.importance["head.embed.weight"] > 1.2 * mean.square()).float().mean() > 0.5
     assert all(method.anchor[name].equal(weight) for name, weight in before.items())
     assert all(weight.grad is None for weight in policy.parameters())

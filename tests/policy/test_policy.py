@@ -14,6 +14,7 @@ from torch import Tensor
 from clbench.learning.optimise import deterministic
 from clbench.policy.batch import Batch, QuestionBatch
 from clbench.policy.checkpoint import CheckpointError, load_policy, save_policy
+from clbench.policy.flow import FlowHead
 from clbench.policy.policy import Policy, PolicyConfig
 
 CONFIG = PolicyConfig(state_size=5, action_size=3, width=32, layers=2)
@@ -64,6 +65,7 @@ def test_the_flow_loss_is_the_squared_error_of_the_velocity_at_the_drawn_time() 
     noisy = time[:, None, None] * noise + (1 - time[:, None, None]) * action
     hidden = policy.hidden_states(batch.state, batch.words)
     mask = policy.backbone.mask(batch.words)
+    assert isinstance(policy.head, FlowHead)
     velocity = policy.head.velocity(torch.from_numpy(noisy), torch.from_numpy(time), hidden, mask)
     expected = ((velocity.detach().numpy() - (noise - action)) ** 2).mean(axis=(1, 2))
     np.testing.assert_allclose(loss, expected, rtol=1e-4)

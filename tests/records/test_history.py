@@ -37,6 +37,12 @@ VALUES: dict[str, dict[str, float | None]] = {
         "shift": 1.3276978582143784,
         "instruction_capture": None,
     },
+    "schema-4/Fetch-v1-sft-seed-0.json": {
+        "final_average": 0.4857142857142857,
+        "adaptation": 0.9,
+        "kept": 0.4,
+        "shift": 0.7951867654919624,
+    },
     "schema-2/MetaWorld-v0-sft-order-1.json": {
         "final_average": 0.5333333333333333,
         "retention": 0.41875,
@@ -64,6 +70,10 @@ def test_a_historic_record_can_be_written_in_the_present_schema(name: str, tmp_p
     write_record(record, tmp_path / "record.json")
     assert json.loads((tmp_path / "record.json").read_text(encoding="utf-8"))["schema"] == SCHEMA
     assert read_record(tmp_path / "record.json") == record
+
+
+def test_the_only_policy_of_schema_4_is_named() -> None:
+    assert read_record(HISTORIC / "schema-4" / "Fetch-v1-sft-seed-0.json").run.policy == "flow"
 
 
 def test_words_of_schema_2_are_translated() -> None:
@@ -102,6 +112,7 @@ def test_fields_that_follow_from_the_budget_of_schema_1_are_filled_in() -> None:
 
 
 OLD = {1: HISTORIC / "schema-1" / "Fetch-v0-sft-seed-0.json"}
+OLD[4] = HISTORIC / "schema-4" / "Fetch-v1-sft-seed-0.json"
 OLD[3] = HISTORIC / "schema-3" / "Fetch-v1-sft-tuning.json"
 OLD[2] = HISTORIC / "schema-2" / "DMControl-v0-sac-online.json"
 
@@ -128,6 +139,7 @@ def put(values: dict[str, Any], place: str, value: Any) -> None:
         (2, "relearning", None, "a record: schema 2 has no relearning"),
         (2, "policy.shift", [], "policy: schema 2 has no shift"),
         (3, "policy.captured", [], "policy: schema 3 has no captured"),
+        (4, "run.policy", "flow", "run: schema 4 has no policy"),
         (3, "content", None, "its content does not match its hash"),
         (2, "content", "0123", "a record of schema 2 has no content"),
         (2, "scenario", [], "scenario must be an object"),

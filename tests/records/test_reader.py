@@ -70,9 +70,9 @@ def test_a_path_that_is_no_file_is_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("fields", "words"),
     [
-        ({"schema": 5}, "is of schema 5, newer than 4: update clbench"),
-        ({"schema": 0}, "is no record of schema 4"),
-        ({"schema": True}, "is no record of schema 4"),
+        ({"schema": 6}, "is of schema 6, newer than 5: update clbench"),
+        ({"schema": 0}, "is no record of schema 5"),
+        ({"schema": True}, "is no record of schema 5"),
         ({"score": 0.99}, "score"),
         ({"status": "great"}, "great"),
         ({"run": None}, "run"),
@@ -81,7 +81,7 @@ def test_a_path_that_is_no_file_is_refused(tmp_path: Path) -> None:
         ({"status": "failed"}, "error must be an object"),
         (
             {"run": {}},
-            "run: scenario, method, seed, device, split, settings, changes, uses, order, perturb are missing",
+            "run: scenario, method, seed, device, split, settings, changes, uses, order, perturb, policy",
         ),
         (
             {"scenario": {"id": "x"}},
@@ -193,7 +193,7 @@ def test_a_record_without_its_hash_is_refused(record: Record, tmp_path: Path) ->
     values = json.loads(path.read_text(encoding="utf-8"))
     del values["content"]
     path.write_text(json.dumps(values), encoding="utf-8")
-    with pytest.raises(RecordError, match="a record of schema 4: content is missing"):
+    with pytest.raises(RecordError, match="a record of schema 5: content is missing"):
         read_record(path)
 
 

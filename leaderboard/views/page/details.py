@@ -16,6 +16,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from clbench.base.text import printable
+from clbench.records.paths import parts_of
+from clbench.spec.policies import DEFAULT_POLICY
 
 from ...board.rows import Row
 from ...board.runs import Run, is_number
@@ -110,7 +112,9 @@ def commands(row: Row) -> list[str]:
             continue
         for (device, perturb), members in groupby(runs, key=_how):
             for first, count in _in_a_row([run.seed for run in members]):
-                words = ["clbench", "run", row.scenario, row.method, "--seeds", str(count)]
+                scenario, policy = parts_of(row.scenario)
+                words = ["clbench", "run", scenario, row.method, "--seeds", str(count)]
+                words += [] if policy == DEFAULT_POLICY else ["--policy", policy]
                 words += ["--first-seed", str(first)] if first else []
                 words += [] if device == "cpu" else ["--device", printable(device)]
                 words += ["--perturb"] if perturb else []
