@@ -22,13 +22,21 @@ class Attention(nn.Module):
         self.out = nn.Linear(width, width)
 
     def forward(self, tokens: Tensor, memory: Tensor, mask: Tensor) -> Tensor:
-        """Map tokens (B, Q, W), memory (B, P, W) and mask (B, 1, 1, P), True where read, to (B, Q, W)."""
+        """Map tokens (B, Q, W), memory (B, P, W) and mask (B, 1, Q, P), True where read, to (B, Q, W)."""
+        return self.attend(tokens, self.keys_and_values(memory), mask)
+
+    def keys_and_values(self, memory: Tensor) -> Tensor:
+        """Return what the memory (B, P, W) offers to queries, (2, B, heads, P, W / heads)."""
+        batch, length, _ = memory.shape
+        both = self.key_value(memory).view(batch, length, 2, self.heads, -1)
+        return cast(Tensor, both.permute(2, 0, 3, 1, 4))
+
+    def attend(self, tokens: Tensor, keys_and_values: Tensor, mask: Tensor) -> Tensor:
+        """Map tokens (B, Q, W) to (B, Q, W) by what they read of the keys and values."""
         batch, length, width = tokens.shape
         query = self.query(tokens).view(batch, length, self.heads, -1).transpose(1, 2)
-        key, value = self.key_value(memory).view(batch, memory.shape[1], 2, self.heads, -1).unbind(2)
-        mixed = F.scaled_dot_product_attention(
-            query, key.transpose(1, 2), value.transpose(1, 2), attn_mask=mask
-        )
+        key, value = keys_and_values
+        mixed = F.scaled_dot_product_attention(query, key, value, attn_mask=mask)
         return cast(Tensor, self.out(mixed.transpose(1, 2).reshape(batch, length, width)))
 
 
@@ -49,6 +57,26 @@ class Layer(nn.Module):
         memory = own if prefix is None else torch.cat([self.attention_norm(prefix), own], dim=1)
         tokens = tokens + self.attention(own, memory, mask)
         return tokens + cast(Tensor, self.feed_forward(tokens))
+
+    def keys_and_values(self, tokens: Tensor) -> Tensor:
+        """Return what the tokens (B, Q, W) offer to others, (2, B, heads, Q, W / heads)."""
+        return self.attention.keys_and_values(self.attention_norm(tokens))
+
+    def go_on(self, tokens: Tensor, mask: Tensor, before: Tensor) -> tuple[Tensor, Tensor]:
+        """Map tokens (B, Q, W) to (B, Q, W) like `forward`, with what earlier tokens offer in place of them.
+
+        Args:
+            tokens: Tokens that follow the earlier ones.
+            mask: Mask, (B, 1, Q, P + Q), True where read.
+            before: Keys and values of P earlier tokens, (2, B, heads, P, W / heads).
+
+        Returns:
+            The tokens, and the keys and values of the earlier and of these tokens.
+        """
+        own = self.attention_norm(tokens)
+        known = torch.cat([before, self.attention.keys_and_values(own)], dim=3)
+        tokens = tokens + self.attention.attend(own, known, mask)
+        return tokens + cast(Tensor, self.feed_forward(tokens)), known
 
 
 class Backbone(nn.Module):

@@ -79,11 +79,13 @@ def _fault(config: PolicyConfig, tensors: Mapping[str, Tensor]) -> str | None:
     if sizes.pop("kind") not in POLICIES:
         return f"its kind must be one of {', '.join(POLICIES)}, not {config.kind!r}"
     for name, size in sizes.items():
-        least = 0 if name == "image_size" else 1
+        least = 0 if name in ("image_size", "block") else 1
         if type(size) is not int or not least <= size <= LARGEST:
             return f"{name} must be a whole number from {least} to {LARGEST:,}, not {size!r}"
     if config.width % config.heads:
         return f"width {config.width} cannot be shared among {config.heads} heads"
+    if config.block and config.chunk % config.block:
+        return f"a chunk of {config.chunk} steps cannot be cut into blocks of {config.block}"
     if config.layers > len(tensors):
         return f"{config.layers:,} layers cannot have {len(tensors):,} tensors"
     held = sum(value.numel() for value in tensors.values())

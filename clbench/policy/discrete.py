@@ -25,11 +25,10 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from clbench.base.errors import InputError
 from clbench.policy.backbone import Layer
+from clbench.policy.decoding import Decoder, easy_first, pipelined
 from clbench.policy.head import ActionHead
-
-DECODING_STEPS = 12
-"""Forwards of the head that decode a chunk; the paper's number."""
 
 LEAST_REACH = 0.01
 """Actions that stay below it, a hundredth of the greatest, do not use their dimension."""
@@ -47,16 +46,35 @@ class DiscreteDiffusionHead(ActionHead):
         layers: Number of layers, as many as the backbone has.
         heads: Attention heads.
         bins: Number of bins of an action dimension, K; the id K is the mask.
+        block: Steps in a block of block-causal attention (Fast-dVLA, arXiv 2603.25661, section 3.2): a token
+            reads its own block and earlier ones. With 0 every token reads all.
+
+    Raises:
+        InputError: A chunk cannot be cut into such blocks.
     """
 
     low: Tensor
     high: Tensor
 
     def __init__(
-        self, action_size: int, chunk: int, width: int, layers: int, heads: int, bins: int = 256
+        self,
+        action_size: int,
+        chunk: int,
+        width: int,
+        layers: int,
+        heads: int,
+        bins: int = 256,
+        block: int = 0,
     ) -> None:
         super().__init__()
         self.bins, self.chunk, self.action_size = bins, chunk, action_size
+        self.length = chunk * action_size
+        """Tokens of a chunk."""
+        if block and chunk % block:
+            raise InputError(f"A chunk of {chunk} steps cannot be cut into blocks of {block}.")
+        self.block = block
+        self.decoder: Decoder = pipelined if block else easy_first
+        """Function that decodes a chunk when the policy acts."""
         self.embed = nn.Embedding(bins + 1, width)
         self.step = nn.Parameter(0.02 * torch.randn(1, chunk, 1, width))
         self.dimension = nn.Parameter(0.02 * torch.randn(1, 1, action_size, width))
@@ -84,12 +102,31 @@ class DiscreteDiffusionHead(ActionHead):
         share = (torch.arange(self.bins, device=self.low.device) + 0.5) / self.bins
         return self.low[:, None] + share * (self.high - self.low)[:, None]
 
+    def embedded(self, tokens: Tensor, first: int = 0) -> Tensor:
+        """Return tokens (B, n) with their places in the chunk, from place `first` on, (B, n, W)."""
+        places = (self.step + self.dimension).flatten(1, 2)
+        return cast(Tensor, self.embed(tokens) + places[:, first : first + tokens.shape[1]])
+
+    def readable(self, mask: Tensor, first: int = 0, end: int | None = None) -> Tensor:
+        """Return what the tokens `first` to `end` of a chunk read: (B, 1, end - first or 1, P + end).
+
+        Args:
+            mask: Mask of the prefix tokens that are read, (B, 1, 1, P).
+            first: Place of the first token.
+            end: Place after the last token; the chunk's end if None.
+        """
+        end = self.length if end is None else end
+        if not self.block:
+            return F.pad(mask, (0, end), value=True)
+        block = torch.arange(end, device=mask.device) // (self.block * self.action_size)
+        causal = (block[first:, None] >= block).expand(len(mask), 1, -1, -1)
+        return torch.cat([mask.expand(-1, -1, end - first, -1), causal], dim=3)
+
     def logits(self, tokens: Tensor, hidden: list[Tensor], mask: Tensor) -> Tensor:
         """Return the logits (B, H * A, K) of each token's bin, from tokens (B, H * A), some of them masks."""
-        embedded = self.embed(tokens) + (self.step + self.dimension).flatten(1, 2)
-        mask = F.pad(mask, (0, embedded.shape[1]), value=True)
+        embedded, readable = self.embedded(tokens), self.readable(mask)
         for layer, prefix in zip(self.layers, hidden, strict=True):
-            embedded = layer(embedded, mask, prefix)
+            embedded = layer(embedded, readable, prefix)
         return cast(Tensor, self.bin_out(embedded))
 
     def masked(self, valid: Tensor, draw: Tensor, noise: Tensor) -> Tensor:
@@ -127,19 +164,33 @@ class DiscreteDiffusionHead(ActionHead):
         judged = hides & valid.bool()[:, :, None].expand_as(action).flatten(1)
         return (errors * judged).sum(dim=1) / judged.sum(dim=1)
 
+    def begin(self, hidden: list[Tensor]) -> list[Tensor]:
+        """Return the keys and values of the observation, one (2, B, heads, P, W / heads) per layer."""
+        return [
+            cast(Layer, layer).keys_and_values(prefix)
+            for layer, prefix in zip(self.layers, hidden, strict=True)
+        ]
+
+    def go_on(
+        self, tokens: Tensor, first: int, keys: list[Tensor], mask: Tensor
+    ) -> tuple[Tensor, list[Tensor]]:
+        """Return the logits (B, n, K) of the tokens (B, n) from place `first` on, and all keys and values.
+
+        Args:
+            tokens: Tokens, some of them masks.
+            first: Place of the first of them in the chunk.
+            keys: Keys and values of the observation and of the tokens before `first`, by layer.
+            mask: Mask of the prefix tokens that are read, (B, 1, 1, P).
+        """
+        embedded = self.embedded(tokens, first)
+        readable = self.readable(mask, first, first + tokens.shape[1])
+        after = []
+        for layer, before in zip(self.layers, keys, strict=True):
+            embedded, known = cast(Layer, layer).go_on(embedded, readable, before)
+            after.append(known)
+        return cast(Tensor, self.bin_out(embedded)), after
+
     def sample(self, noise: Tensor, hidden: list[Tensor], mask: Tensor) -> Tensor:
-        """Return the normalised action chunk (B, H, A) that is decoded; the noise gives its shape alone."""
-        batch, length = len(noise), self.chunk * self.action_size
-        tokens = torch.full((batch, length), self.bins, device=noise.device)
-        for step in range(1, DECODING_STEPS + 1):
-            confidence, best = self.logits(tokens, hidden, mask).softmax(dim=2).max(dim=2)
-            hides = tokens == self.bins
-            keep = math.floor(length * math.cos(math.pi / 2 * step / DECODING_STEPS))
-            rank = (
-                confidence.masked_fill(~hides, math.inf)
-                .argsort(dim=1, descending=True, stable=True)
-                .argsort(dim=1)
-            )
-            tokens = torch.where(hides & (rank < length - keep), best, tokens)
-        chosen = tokens.view(batch, self.chunk, self.action_size)
-        return self.centres().expand(batch, self.chunk, -1, -1).gather(3, chosen[..., None]).squeeze(3)
+        """Return the normalised action chunk (B, H, A) that is decoded; the noise is ignored."""
+        tokens = self.decoder(self, hidden, mask).view(-1, self.chunk, self.action_size, 1)
+        return self.centres().expand(len(tokens), self.chunk, -1, -1).gather(3, tokens).squeeze(3)

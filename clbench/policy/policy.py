@@ -47,13 +47,15 @@ class PolicyConfig:
     """Width and height of the image that it sees, in pixels; 0 without images."""
     kind: str = DEFAULT_POLICY
     """Kind of its action head, one of `POLICIES`."""
+    block: int = 0
+    """Steps in a block of block-causal attention in a discrete-diffusion head; 0 without blocks."""
 
 
 def new_head(config: PolicyConfig) -> ActionHead:
     """Return the action head of the policy's kind, with initial weights."""
     sizes = (config.action_size, config.chunk, config.width, config.layers, config.heads)
     if config.kind == "discrete_diffusion":
-        return DiscreteDiffusionHead(*sizes)
+        return DiscreteDiffusionHead(*sizes, block=config.block)
     return FlowHead(*sizes, config.euler_steps)
 
 

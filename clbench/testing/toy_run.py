@@ -25,6 +25,7 @@ from clbench.learning.trainer import Trainer, repeatable
 from clbench.learning.watching import watches
 from clbench.policy.checkpoint import CheckpointError
 from clbench.policy.policy import Policy
+from clbench.spec.policies import DEFAULT_POLICY
 from clbench.testing.error import ContractError
 from clbench.testing.global_state import GENERATORS, read, watched
 from clbench.testing.toy import TOY
@@ -63,9 +64,9 @@ _numbers = itertools.count()
 
 
 @functools.cache
-def toy_data() -> tuple[TrainingData, Policy]:
-    """Return the data and the pretrained policy of the toy; reading them takes a second."""
-    pretrained, _ = pretrained_policy(TOY, 0)
+def toy_data(policy: str = DEFAULT_POLICY) -> tuple[TrainingData, Policy]:
+    """Return the data and a pretrained policy of the toy; reading them takes a second."""
+    pretrained, _ = pretrained_policy(TOY.with_policy(policy), 0)
     return TrainingData.open(TOY, pretrained.config), pretrained
 
 
@@ -79,13 +80,20 @@ class ToyRun:
         seed: Seed of every draw.
         resumed: Whether each stage begins with a new object that loads the state of the last one, as in every
             run, or continues with the old object.
+        policy: Kind of the policy.
 
     Raises:
         ContractError: A hook does something after which the loop cannot continue.
     """
 
     def __init__(
-        self, build: Callable[[], Method], targets: int, steps: int, seed: int = 0, resumed: bool = True
+        self,
+        build: Callable[[], Method],
+        targets: int,
+        steps: int,
+        seed: int = 0,
+        resumed: bool = True,
+        policy: str = DEFAULT_POLICY,
     ) -> None:
         self.draws: set[tuple[str, str]] = set()
         """Source and hook of all draws."""
@@ -99,8 +107,8 @@ class ToyRun:
         """Global random generators after the first call of each hook for which a run seeds them."""
         self._build, self._hook, self._running, self._step_rows = build, "prepare", False, 0
         budget = dataclasses.replace(TOY.budget, adaptation_steps=steps)
-        scenario = dataclasses.replace(TOY, target=TOY.target[:targets], budget=budget)
-        data, pretrained = toy_data()
+        scenario = dataclasses.replace(TOY.with_policy(policy), target=TOY.target[:targets], budget=budget)
+        data, pretrained = toy_data(policy)
         # no two runs begin with the same global generators: results that depend on them differ
         with repeatable("cpu"), seeded("toy run", next(_numbers)), tempfile.TemporaryDirectory() as folder:
             self.trainer = Trainer(scenario, data, pretrained, self._watched_method, seed, 0)

@@ -23,6 +23,7 @@ from clbench.runs.run import execute
 from clbench.runs.spec import RunSpec
 from clbench.scoring.metrics import METRICS, measure
 from clbench.scoring.scores import Scores
+from clbench.spec.policies import POLICIES
 from clbench.testing import check_method
 
 TOY = "clbench.testing:clbench/Toy-v0"
@@ -76,9 +77,10 @@ FEWER: dict[str, dict[str, Any]] = {
 """Settings that make the preparation short."""
 
 
+@pytest.mark.parametrize("policy", POLICIES)
 @pytest.mark.parametrize("name", method_names())
-def test_every_method_keeps_the_contract(name: str) -> None:
-    check_method(load_method(name), **FEWER.get(name, {}))
+def test_every_method_keeps_the_contract_with_every_policy(name: str, policy: str) -> None:
+    check_method(load_method(name), policy=policy, **FEWER.get(name, {}))
 
 
 @pytest.mark.parametrize("name", method_names())

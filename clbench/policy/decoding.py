@@ -1,0 +1,260 @@
+"""Decoders of a masked chunk: easy first, and the pipeline of blocks of Fast-dVLA.
+
+Fast-dVLA (Song et al., arXiv 2603.25661, section 3.4 and Algorithm 1): the chunk grows block by block. The
+next block begins before the last one is complete, all active blocks share each forward, and the keys and
+values of the observation and of complete blocks are kept.
+
+Details that the paper leaves open:
+
+1. A complete block takes at least one token of each forward. The paper's floor(R / n) is 0 for a last token.
+2. Keys of a complete block are kept by the forward after the one that completed it, which no longer reads its
+   masks (as in the code of D2F, arXiv 2508.09192, whose recipe the paper follows).
+3. Many chunks at a time are decoded without kept keys. No token reads a later block, so the tokens are equal.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from clbench.base.errors import InputError
+from clbench.spec.fields import check_share
+
+EASY_FIRST_STEPS = 12
+"""Forwards of easy-first decoding: the number of Discrete Diffusion VLA (arXiv 2508.20072)."""
+
+
+class MaskedHead(Protocol):
+    """What a decoder needs of a head whose chunks have H steps of A tokens."""
+
+    bins: int
+    """Number of ids of a token, K; the id K is the mask."""
+    chunk: int
+    action_size: int
+    length: int
+    """Tokens of a chunk, H * A."""
+    block: int
+    """Steps of a block of block-causal attention; 0 if every token reads all others."""
+
+    def logits(self, tokens: Tensor, hidden: list[Tensor], mask: Tensor) -> Tensor:
+        """Return the logits (B, H * A, K) of all tokens (B, H * A)."""
+
+    def begin(self, hidden: list[Tensor]) -> list[Tensor]:
+        """Return the keys and values of the observation, one (2, B, heads, P, W / heads) per layer."""
+
+    def go_on(
+        self, tokens: Tensor, first: int, keys: list[Tensor], mask: Tensor
+    ) -> tuple[Tensor, list[Tensor]]:
+        """Return the logits (B, n, K) of the tokens from place `first` on, and `keys` with theirs added."""
+
+
+Decoder = Callable[[MaskedHead, list[Tensor], Tensor], Tensor]
+"""Maps a head, hidden states of the backbone and the mask (B, 1, 1, P) to the tokens (B, H * A)."""
+
+
+@dataclass(frozen=True)
+class Thresholds:
+    """When the pipeline takes a token and begins a block; the defaults are the paper's.
+
+    Raises:
+        InputError: `add` or `activate` is not a share below 1, which a complete block exceeds.
+    """
+
+    confidence: float = 0.5
+    """Probability from which a token is taken (tau_conf)."""
+    add: float = 0.5
+    """Share of a block's tokens above which the next block begins (tau_add)."""
+    activate: float = 0.7
+    """Share of a block's tokens above which the next one takes a part of its tokens at each forward, however
+    sure they are (tau_act)."""
+    part: int = 2
+    """The least part of the masked tokens that such a block takes is one in `part` (n)."""
+
+    def __post_init__(self) -> None:
+        check_share(self, "add", "activate")
+        if max(self.add, self.activate) == 1:
+            raise InputError("add and activate must be below 1: a complete block must exceed them.")
+
+
+IN_SEQUENCE = Thresholds(add=0.999, activate=0.999)
+"""Thresholds with which a block begins when the one before it is complete (Block Diffusion)."""
+
+
+@dataclass
+class Work:
+    """The forwards of the head that a decoder made."""
+
+    spans: list[tuple[int, int]] = field(default_factory=list)
+    """First token of each forward, and the token after its last."""
+
+    @property
+    def tokens(self) -> int:
+        """Number of tokens in all forwards."""
+        return sum(end - first for first, end in self.spans)
+
+
+def easy_first(
+    head: MaskedHead,
+    hidden: list[Tensor],
+    mask: Tensor,
+    steps: int = EASY_FIRST_STEPS,
+    work: Work | None = None,
+) -> Tensor:
+    """Return the tokens (B, H * A) after `steps` forwards, each of which keeps the surest predictions.
+
+    After forward s, floor(L cos(pi / 2 * s / steps)) of the L tokens are still masked. One step takes the
+    likeliest token everywhere. `work` receives the forwards.
+    """
+    length = head.length
+    tokens = torch.full((len(mask), length), head.bins, device=mask.device)
+    for step in range(1, steps + 1):
+        confidence, best = head.logits(tokens, hidden, mask).softmax(dim=2).max(dim=2)
+        hides = tokens == head.bins
+        keep = math.floor(length * math.cos(math.pi / 2 * step / steps))
+        rank = confidence.masked_fill(~hides, math.inf).argsort(dim=1, descending=True, stable=True)
+        tokens = torch.where(hides & (rank.argsort(dim=1) < length - keep), best, tokens)
+        if work is not None:
+            work.spans.append((0, length))
+    return tokens
+
+
+def pipelined(
+    head: MaskedHead,
+    hidden: list[Tensor],
+    mask: Tensor,
+    thresholds: Thresholds = Thresholds(),
+    block: int | None = None,
+    cached: bool = False,
+    work: Work | None = None,
+) -> Tensor:
+    """Return the tokens (B, H * A) that the pipeline of blocks decodes.
+
+    Args:
+        head: Head of the policy.
+        hidden: Hidden states of the backbone, one (B, P, W) per layer.
+        mask: Mask of the prefix tokens that are read, (B, 1, 1, P).
+        thresholds: When tokens are taken and blocks begin.
+        block: Steps of a block: those of the head's attention if None, or the chunk if it has no blocks. A
+            head without blocks may be given some if `cached`: its kept keys are then stale.
+        cached: Whether the keys and values of complete blocks are kept; chunks are then decoded one by one.
+        work: Receives the forwards.
+    """
+    steps = (head.block or head.chunk) if block is None else block
+    if steps < 1 or head.chunk % steps:
+        raise InputError(f"A chunk of {head.chunk} steps cannot be cut into blocks of {steps}.")
+    if not cached and steps not in (head.block, head.chunk):
+        raise InputError(f"Blocks of {steps} steps need kept keys: those of the head have {head.block}.")
+    if cached and len(mask) > 1:
+        rows = range(len(mask))
+        parts = [[layer[row : row + 1] for layer in hidden] for row in rows]
+        one_by_one = [
+            pipelined(head, part, mask[row : row + 1], thresholds, block, True, work)
+            for row, part in zip(rows, parts, strict=True)
+        ]
+        return torch.cat(one_by_one)
+    blocks = Blocks(head, len(mask), steps, thresholds, mask.device)
+    forward = Kept(head, hidden, mask, steps) if cached else None
+    while blocks.any_masked:
+        blocks.add()
+        if forward is None:
+            first, end = 0, head.length
+            logits = head.logits(blocks.tokens, hidden, mask)
+        else:
+            first, end = forward.place, blocks.end
+            logits = forward(blocks.tokens[:, first:end], blocks.complete)
+        if work is not None:
+            work.spans.append((first, end))
+        blocks.take(logits, first)
+    return blocks.tokens
+
+
+class Kept:
+    """Forwards of one chunk that keep the keys and values of the observation and of complete blocks."""
+
+    def __init__(self, head: MaskedHead, hidden: list[Tensor], mask: Tensor, steps: int) -> None:
+        self.head, self.mask = head, mask
+        self.size = steps * head.action_size
+        """Tokens of a block."""
+        self.place = 0
+        """First token whose keys are not kept."""
+        self.keys = head.begin(hidden)
+
+    def __call__(self, tokens: Tensor, complete: int) -> Tensor:
+        """Return the logits (1, n, K) of the tokens (1, n) from `place` on.
+
+        The first `complete` blocks have no mask: their keys and values are kept.
+        """
+        logits, keys = self.head.go_on(tokens, self.place, self.keys, self.mask)
+        self.place = complete * self.size
+        self.keys = [layer[:, :, :, : self.mask.shape[3] + self.place] for layer in keys]
+        return logits
+
+
+class Blocks:
+    """The state of the pipeline for B chunks: their tokens, and which blocks have begun."""
+
+    def __init__(
+        self, head: MaskedHead, batch: int, steps: int, thresholds: Thresholds, device: torch.device
+    ) -> None:
+        self.bins, self.thresholds = head.bins, thresholds
+        count = head.chunk // steps
+        self.shape = (count, steps * head.action_size)
+        """Blocks, and tokens of a block."""
+        self.tokens = torch.full((batch, head.length), self.bins, device=device)
+        self.number = torch.arange(count, device=device)
+        self.begun = torch.ones(batch, 1, dtype=torch.int64, device=device)
+        """Number of blocks that have begun, (B, 1)."""
+        self.active = (self.number == 0).expand(batch, -1).clone()
+        """Whether a block takes tokens however sure they are, (B, N); the first one does from the start."""
+
+    @property
+    def masked(self) -> Tensor:
+        """Masked tokens by block, (B, N, size)."""
+        return (self.tokens == self.bins).view(-1, *self.shape)
+
+    @property
+    def share(self) -> Tensor:
+        """Share of each block's tokens that are decoded, (B, N)."""
+        return 1 - self.masked.float().mean(dim=2)
+
+    @property
+    def any_masked(self) -> bool:
+        """Whether a token of any chunk is masked."""
+        return bool((self.tokens == self.bins).any())
+
+    @property
+    def end(self) -> int:
+        """Place after the last token that has begun in any chunk."""
+        return int(self.begun.max()) * self.shape[1]
+
+    @property
+    def complete(self) -> int:
+        """Number of leading blocks without a mask in all chunks."""
+        return int((~self.masked.any(dim=2).any(dim=0)).int().cumprod(dim=0).sum())
+
+    def add(self) -> None:
+        """Begin the next block of each chunk whose last one is decoded far enough."""
+        last = self.share.gather(1, self.begun - 1)
+        self.begun += (last > self.thresholds.add) & (self.begun < self.shape[0])
+
+    def take(self, logits: Tensor, first: int) -> None:
+        """Take the sure tokens, given the logits (B, n, K) of the tokens from `first` on."""
+        confidence, best = logits.softmax(dim=2).max(dim=2)
+        rest = self.tokens.shape[1] - first - logits.shape[1]
+        sure = F.pad(confidence, (first, rest)).view(-1, *self.shape)
+        best = F.pad(best, (first, rest))
+        masked = self.masked & (self.number < self.begun)[:, :, None]
+        sure = sure.masked_fill(~masked, -math.inf)
+        least = (masked.sum(dim=2, keepdim=True) // self.thresholds.part).clamp(min=1)
+        bar = sure.sort(dim=2, descending=True).values.gather(2, least - 1)
+        bar = bar.clamp(max=self.thresholds.confidence)
+        bar = torch.where(self.active[:, :, None], bar, self.thresholds.confidence)
+        taken = (masked & (sure >= bar)).flatten(1)
+        self.tokens = torch.where(taken, best, self.tokens)
+        self.active[:, 1:] |= (self.share > self.thresholds.activate)[:, :-1] & (self.number[1:] < self.begun)
