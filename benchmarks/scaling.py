@@ -29,7 +29,7 @@ from clbench.data.demonstrations import Demonstrations, load_demonstrations
 from clbench.evaluation.rollouts import Evaluator
 from clbench.learning.optimise import deterministic, optimise
 from clbench.learning.pretraining import policy_config
-from clbench.policy.policy import Policy
+from clbench.policy.kinds import new_policy
 from clbench.spec.registry import load_scenario
 
 FETCH, META_WORLD = "clbench/Fetch-v1", "clbench/MetaWorld-v1"
@@ -40,7 +40,7 @@ def evaluation_of_tasks() -> Callable[[int], float]:
     scenario = load_scenario(META_WORLD)
     names = [name.removesuffix("-v3").replace("-", "_") for name in ALL_V3_ENVIRONMENTS]
     tasks = [dataclasses.replace(scenario.target[0], name=name, horizon=50) for name in names]
-    policy = Policy(policy_config(scenario), seed=0)
+    policy = new_policy(policy_config(scenario), seed=0)
     evaluator = Evaluator(scenario, seed=0)
 
     def seconds(count: int) -> float:
@@ -56,7 +56,7 @@ def evaluation_of_tasks() -> Callable[[int], float]:
 def evaluation_of_episodes() -> Callable[[int], float]:
     """Return a function that times a number of episodes of one task."""
     scenario = load_scenario(FETCH)
-    policy = Policy(policy_config(scenario), seed=0)
+    policy = new_policy(policy_config(scenario), seed=0)
     evaluator = Evaluator(scenario, seed=0)
 
     def seconds(count: int) -> float:
@@ -88,7 +88,7 @@ def steps_of_environments() -> Callable[[int], float]:
 def steps_on_demonstrations() -> Callable[[int], float]:
     """Return a function that times 10 optimiser steps on a number of demonstrations."""
     scenario = load_scenario(FETCH)
-    policy = Policy(policy_config(scenario), seed=0)
+    policy = new_policy(policy_config(scenario), seed=0)
     data = load_demonstrations(scenario.target[0], scenario, policy.config)
     copies: dict[int, Demonstrations] = {}
 

@@ -11,11 +11,10 @@ from torch import Tensor, nn
 
 from clbench.learning.method import Metadata, Method, Progress, Stage
 from clbench.learning.optimise import WARM_UP
-from clbench.learning.prior import Prior
 from clbench.policy.batch import Batch
 from clbench.policy.policy import Policy
 
-from ._requirements import in_range, require_loss_per_sample
+from ._requirements import in_range
 
 BINS = (0.0, 0.01, 0.1, 0.5, 0.9, 1.0)
 """Edges of the histogram of weights in the diagnostics."""
@@ -56,10 +55,6 @@ class WeightedSFT(Method, ABC):
         for name in ("tau_start", "tau_end", "kappa", "decay", "curvature", "loss_scale", "schedule"):
             in_range(name, getattr(self, name), 1e-9)
         in_range("omega_min", self.omega_min, 0.0, 1.0)
-
-    def prepare(self, policy: Policy, prior: Prior) -> None:
-        """Refuse a policy that has no loss per sample."""
-        require_loss_per_sample(policy, type(self).__name__)
 
     def start_task(self, policy: Policy, stage: Stage) -> Iterable[nn.Parameter]:
         """Return all parameters, and clear the histograms."""

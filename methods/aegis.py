@@ -37,7 +37,7 @@ from clbench.policy.batch import Batch
 from clbench.policy.policy import Policy
 
 from ._projection import inner, project_out, random_like
-from ._requirements import in_range, require_hidden_states
+from ._requirements import in_range
 
 
 @dataclass
@@ -50,6 +50,7 @@ class Aegis(Method):
     """Direction of the projection: "anchor", or "random" for the control."""
 
     uses = Uses(questions="prepare")
+    needs = ("hidden_states",)
     metadata = Metadata(link="https://arxiv.org/abs/2604.16067")
 
     def __post_init__(self) -> None:
@@ -60,10 +61,9 @@ class Aegis(Method):
     @torch.no_grad()
     def prepare(self, policy: Policy, prior: Prior) -> None:
         """Compute the anchor."""
-        require_hidden_states(policy, "AEGIS")
         questions = prior.questions.sample(self.samples)
         hidden = policy.hidden_states(questions.state, questions.words, questions.image)
-        self.anchor = Gaussian.of(hidden, policy.backbone.mask(questions.words))
+        self.anchor = Gaussian.of(hidden, policy.token_mask(questions.words))
 
     def start_task(self, policy: Policy, stage: Stage) -> Iterable[nn.Parameter]:
         """Return all parameters."""
@@ -75,13 +75,13 @@ class Aegis(Method):
     def loss(self, policy: Policy, batch: Batch, progress: Progress) -> Tensor:
         """Return the action loss, and keep the hidden states' distance to the anchor for `gradients`."""
         hidden = policy.hidden_states(batch.state, batch.words, batch.image)
-        now = Gaussian.of(hidden, policy.backbone.mask(batch.words))
+        now = Gaussian.of(hidden, policy.token_mask(batch.words))
         self.distances.append(now.distance(self.anchor).mean())
         return policy.action_loss(batch, hidden).mean()
 
     def gradients(self, policy: Policy, loss: Tensor) -> None:
         """Set the gradients of the loss, projected in the backbone's layers."""
-        blocks = [list(layer.parameters()) for layer in policy.backbone.layers]
+        blocks = [list(layer.parameters()) for layer in policy.backbone_layers]
         weights = [weight for block in blocks for weight in block]
         away = iter(
             torch.autograd.grad(self.distances[-1], weights, retain_graph=True, materialize_grads=True)

@@ -28,6 +28,7 @@ class CoTraining(Method):
     """Factor of the answer loss."""
 
     uses = Uses(questions="throughout")
+    needs = ("answers",)
     metadata = Metadata(link="https://arxiv.org/abs/2604.16067")
     tunes = ("auxiliary", (0.3, 3.0))
 

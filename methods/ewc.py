@@ -22,7 +22,7 @@ from clbench.learning.prior import Prior, Source, Uses
 from clbench.policy.batch import Batch
 from clbench.policy.policy import Policy
 
-from ._requirements import in_range, require_loss_per_sample
+from ._requirements import in_range
 from ._weights import Weights, copy_of, packed, pull_back, unpacked
 
 
@@ -45,7 +45,6 @@ class EWC(Method):
 
     def prepare(self, policy: Policy, prior: Prior) -> None:
         """Compute the importance of the weights for the retained skills."""
-        require_loss_per_sample(policy, "EWC")
         self.anchor = copy_of(policy)
         known = self.samples if len(prior.demonstrations) else 0
         self.importance = fisher_information(policy, prior.demonstrations, known)

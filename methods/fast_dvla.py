@@ -111,7 +111,7 @@ class FastDVLA(Method):
             save_file(vector, folder / "vector.safetensors")
 
         folder = cached(cache_folder() / "vectors" / hash_of(inputs), inputs, make)
-        return load_file(folder / "vector.safetensors", device=str(policy.state_mean.device))
+        return load_file(folder / "vector.safetensors", device=str(policy.device))
 
     def start_task(self, policy: Policy, stage: Stage) -> Iterable[nn.Parameter]:
         """Return all parameters, and compute the regulariser's weights."""

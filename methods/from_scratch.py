@@ -12,6 +12,7 @@ from torch import nn
 
 from clbench.learning.method import Method, Stage
 from clbench.learning.prior import Uses
+from clbench.policy.kinds import new_policy
 from clbench.policy.policy import Policy
 
 
@@ -24,7 +25,7 @@ class FromScratch(Method):
 
     def start_task(self, policy: Policy, stage: Stage) -> Iterable[nn.Parameter]:
         """Return all parameters, set to new random weights."""
-        fresh = Policy(policy.config, seed=stage.seed)
+        fresh = new_policy(policy.config, seed=stage.seed)
         with torch.no_grad():
             for parameter, value in zip(policy.parameters(), fresh.parameters(), strict=True):
                 parameter.copy_(value)

@@ -19,6 +19,7 @@ class Joint(Method):
     """Train on the target, all prior demonstrations and the questions together."""
 
     uses = Uses(demonstrations="throughout", questions="throughout", reference=True)
+    needs = ("answers",)
 
     def batch(self, target: Source[Batch], prior: Prior) -> tuple[Batch, QuestionBatch]:
         """Return target samples, as many prior samples if there are any, and half as many questions."""

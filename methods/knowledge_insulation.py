@@ -18,7 +18,7 @@ from clbench.policy.batch import Batch, QuestionBatch
 from clbench.policy.policy import Policy
 
 from ._questions import with_questions
-from ._requirements import in_range, require_hidden_states
+from ._requirements import in_range
 
 
 @dataclass
@@ -29,15 +29,12 @@ class KnowledgeInsulation(Method):
     """Factor of the action loss."""
 
     uses = Uses(questions="throughout")
+    needs = ("hidden_states", "answers")
     metadata = Metadata(link="https://arxiv.org/abs/2505.23705")
     tunes = ("alpha", (0.3, 3.0))
 
     def __post_init__(self) -> None:
         in_range("alpha", self.alpha, 0.0)
-
-    def prepare(self, policy: Policy, prior: Prior) -> None:
-        """Refuse a policy without hidden states."""
-        require_hidden_states(policy, "knowledge_insulation")
 
     def batch(self, target: Source[Batch], prior: Prior) -> tuple[Batch, QuestionBatch]:
         """Return a batch of the target, and half as many questions."""

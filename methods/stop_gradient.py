@@ -15,11 +15,8 @@ import torch
 from torch import Tensor, nn
 
 from clbench.learning.method import Metadata, Method, Progress, Stage
-from clbench.learning.prior import Prior
 from clbench.policy.batch import Batch
 from clbench.policy.policy import Policy
-
-from ._requirements import require_hidden_states
 
 
 @dataclass
@@ -27,10 +24,7 @@ class StopGradient(Method):
     """Train the action head alone, on the hidden states of a fixed backbone."""
 
     metadata = Metadata(link="https://arxiv.org/abs/2604.16067")
-
-    def prepare(self, policy: Policy, prior: Prior) -> None:
-        """Refuse a policy without hidden states."""
-        require_hidden_states(policy, "stop_gradient")
+    needs = ("hidden_states",)
 
     def start_task(self, policy: Policy, stage: Stage) -> Iterable[nn.Parameter]:
         """Return the head's parameters."""

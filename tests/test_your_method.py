@@ -14,7 +14,7 @@ import torch
 import clbench
 from clbench.learning.method import Progress, Stage
 from clbench.learning.prior import Nothing, Prior, Source
-from clbench.policy.policy import Policy
+from clbench.policy.transformer import TransformerPolicy
 from clbench.testing import TOY
 from clbench.testing.small import SMALL, toy_source
 
@@ -46,7 +46,7 @@ def test_its_methods_keep_the_contract(block: int, blocks: list[str]) -> None:
 
 
 def test_its_loss_is_that_of_der_plus_plus(der: Any) -> None:
-    policy, later = Policy(SMALL), Policy(SMALL, seed=1)
+    policy, later = TransformerPolicy(SMALL), TransformerPolicy(SMALL, seed=1)
     der.prepare(policy, Prior({"demonstrations": toy_source("left", "up")}))
     new, (old, velocity), replayed = der.batch(toy_source("right"), Prior({}))
     torch.manual_seed(3)
@@ -66,7 +66,7 @@ def test_its_loss_is_that_of_der_plus_plus(der: Any) -> None:
 
 def test_its_method_begins_without_skills_and_remembers_from_the_first_target_on(der: Any) -> None:
     nothing: Any = Nothing()
-    policy, generator = Policy(SMALL), torch.Generator()
+    policy, generator = TransformerPolicy(SMALL), torch.Generator()
     der.prepare(policy, Prior({"demonstrations": Source(nothing, generator, 8)}))
     assert der.state() == {}
     der.load_state(policy, {})
@@ -85,7 +85,7 @@ def flat(tensors: Iterable[torch.Tensor]) -> Any:
 
 def test_the_importance_of_the_skills_is_that_of_synaptic_intelligence(blocks: list[str]) -> None:
     si = importlib.import_module("si").SI()
-    policy = Policy(SMALL)
+    policy = TransformerPolicy(SMALL)
     parameters = list(policy.parameters())
     source = toy_source("left", "up")
     optimiser = torch.optim.SGD(parameters, lr=0.1)

@@ -25,7 +25,7 @@ def answer(
         questions: B questions.
     """
     right = []
-    device = policy.state_mean.device
+    device = policy.device
     for start in range(0, len(questions), LANES):
         rows = slice(start, start + LANES)
         padding = LANES - len(questions.state[rows])

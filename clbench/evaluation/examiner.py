@@ -144,7 +144,7 @@ class Examiner:
 
     @property
     def _device(self) -> torch.device:
-        return self._pretrained.state_mean.device
+        return self._pretrained.device
 
     def close(self) -> None:
         """Close all worlds."""

@@ -18,7 +18,7 @@ SPARSITY_THRESHOLD = 1e-3
 def activations(policy: Policy, questions: QuestionBatch) -> Gaussian:
     """Return a Gaussian of the policy's hidden states on `questions`, given on the policy's device."""
     hidden = policy.hidden_states(questions.state, questions.words, questions.image)
-    return Gaussian.of(hidden, policy.backbone.mask(questions.words))
+    return Gaussian.of(hidden, policy.token_mask(questions.words))
 
 
 @torch.no_grad()

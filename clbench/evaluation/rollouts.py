@@ -195,7 +195,7 @@ class Evaluator:
             np.stack([lane.state for lane in live]),
         )
         state[: len(live)], image[: len(live)] = map(torch.from_numpy, shown)
-        device = policy.state_mean.device
+        device = policy.device
         chunks = policy.act(state.to(device), words.to(device), noise.to(device), image.to(device))
         actions: NDArray[np.float32] = chunks[: len(live), : config.executed].cpu().numpy()
         # a diverged policy returns NaN: with zero actions it fails and does not stop the run

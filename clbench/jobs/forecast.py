@@ -17,7 +17,7 @@ from clbench.jobs.job import Job
 from clbench.jobs.plan import Plan
 from clbench.learning.pretraining import policy_config
 from clbench.policy.batch import Batch
-from clbench.policy.policy import Policy
+from clbench.policy.kinds import new_policy
 from clbench.runs.spec import ResolvedRun
 from clbench.spec.language import encode
 from clbench.spec.scenario import Scenario
@@ -94,7 +94,7 @@ def step_seconds(scenario: Scenario) -> float:
     torch.set_num_threads(1)
     try:
         config, size = policy_config(scenario), scenario.budget.batch_size
-        policy = Policy(config)
+        policy = new_policy(config)
         chunk = (size, config.chunk, config.action_size)
         batch = Batch(
             state=torch.randn(size, config.state_size),
@@ -119,7 +119,7 @@ def step_seconds(scenario: Scenario) -> float:
 
 
 def _policy_bytes(scenario: Scenario) -> int:
-    return 4 * sum(parameter.numel() for parameter in Policy(policy_config(scenario)).parameters())
+    return 4 * sum(parameter.numel() for parameter in new_policy(policy_config(scenario)).parameters())
 
 
 def _data_bytes(scenario: Scenario) -> int:

@@ -26,6 +26,7 @@ from clbench.data.demonstrations import Demonstrations
 from clbench.learning.optimise import deterministic, optimise
 from clbench.policy.batch import Batch
 from clbench.policy.discrete import DiscreteDiffusionHead
+from clbench.policy.kinds import new_policy
 from clbench.policy.policy import Policy
 from clbench.spec.budget import Budget
 
@@ -96,7 +97,7 @@ def distillation_loss(
     """
     with torch.no_grad():
         hidden = teacher.hidden_states(batch.state, batch.words, batch.image)
-        mask = teacher.backbone.mask(batch.words)
+        mask = teacher.token_mask(batch.words)
         counts = batch.valid.bool().repeat_interleave(head.action_size, dim=1)
         by_token = share.repeat_interleave(head.length // share.shape[1], dim=1)
         hides = (drawn < by_token) | ~counts
@@ -125,9 +126,9 @@ def with_blocks(policy: Policy, block: int) -> Policy:
         policy: The policy.
         block: Steps of the chunk in a block; 0 for none.
     """
-    other = Policy(dataclasses.replace(policy.config, block=block))
+    other = new_policy(dataclasses.replace(policy.config, block=block))
     other.load_state_dict(policy.state_dict())
-    return other.to(policy.state_mean.device)
+    return other.to(policy.device)
 
 
 def discrete_head(policy: Policy) -> DiscreteDiffusionHead:

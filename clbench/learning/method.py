@@ -103,6 +103,8 @@ class Method:
     tunes: ClassVar[tuple[str, tuple[Any, Any]] | None] = None
     """Hyper-parameter that sets how strongly the method protects what is known, and two values that tuning
     tries besides the default. None: tuning tries further step sizes instead."""
+    needs: ClassVar[tuple[str, ...]] = ()
+    """Abilities that the policy must have besides the protocol: "hidden_states", "answers"."""
     whole_stages: ClassVar[bool] = False
     """Whether the policy is ready only at the end of a stage, for example because `end_task` merges it. Such
     a policy is not evaluated within a stage."""

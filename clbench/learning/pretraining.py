@@ -21,9 +21,11 @@ from clbench.data.questions import Questions, load_questions
 from clbench.learning.optimise import deterministic, optimise
 from clbench.learning.vision_pretraining import STEPS_SHARE, pictures_of, pretrain_vision
 from clbench.policy.checkpoint import load_policy, save_policy
+from clbench.policy.kinds import new_policy
 from clbench.policy.policy import Policy, PolicyConfig
 from clbench.policy.vision import Vision
-from clbench.spec.policies import DEFAULT_POLICY
+from clbench.spec.identifiers import folder_name
+from clbench.spec.policies import DEFAULT_POLICY, policy_packages
 from clbench.spec.scenario import Scenario
 from clbench.spec.task import packages_of
 from clbench.worlds.camera import load_camera
@@ -50,7 +52,11 @@ AFTER_PRETRAINING = (
 def pretraining_inputs(scenario: Scenario, seed: int) -> dict[str, Any]:
     """Return everything that a pretrained policy depends on."""
     tasks = scenario.pretrained + scenario.scenes
-    suites = {*packages_of(tasks, "world", "expert", "camera"), package_of(scenario.questions)}
+    suites = {
+        *packages_of(tasks, "world", "expert", "camera"),
+        package_of(scenario.questions),
+        *policy_packages(scenario.policy),
+    }
     budget = dataclasses.asdict(scenario.budget)
     installed = {**simulator_versions(tasks), **versions(("torch", "tokenizers"))}
     return {
@@ -69,7 +75,7 @@ def pretraining_inputs(scenario: Scenario, seed: int) -> dict[str, Any]:
 
 def shipped_folder(scenario: Scenario, seed: int) -> Path:
     """Return the folder of the pretrained policy if it ships."""
-    kind = "" if scenario.policy == DEFAULT_POLICY else f"-{scenario.policy}"
+    kind = "" if scenario.policy == DEFAULT_POLICY else f"-{folder_name(scenario.policy)}"
     return SHIPPED / f"{scenario.id.replace('/', '--')}{kind}-seed-{seed}"
 
 
@@ -115,7 +121,7 @@ def pretrained_policy(
         save_policy(pretrain(scenario, seed, progress), partial)
 
     folder = cached(_folder(scenario, seed, inputs), inputs, make)
-    return load_policy(folder), folder
+    return load_policy(folder, kind=scenario.policy), folder
 
 
 def vision_steps(scenario: Scenario) -> int:
@@ -158,16 +164,17 @@ def pretrain(
     """
     config, budget = policy_config(scenario), scenario.budget
     questions, _ = load_questions(scenario)
-    policy = Policy(config, seed=derive_seed("weights", seed))
+    policy = new_policy(config, seed=derive_seed("weights", seed))
     parts = [load_demonstrations(task, scenario, config) for task in scenario.pretrained]
     demonstrations = Demonstrations.cat(parts) if parts else None
     if demonstrations is not None:
         policy.normalise_like(demonstrations.state, demonstrations.action[:, 0])
     else:
         policy.normalise_like(questions.state)
-    if policy.backbone.vision is not None:
+    vision = policy.vision_to_pretrain()
+    if vision is not None:
         _pretrain_vision(
-            policy.backbone.vision,
+            vision,
             scenario,
             seed,
             [questions, demonstrations] if demonstrations else [questions],

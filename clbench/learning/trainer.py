@@ -27,6 +27,7 @@ from clbench.learning.prior import Access, Nothing, Prior, Source
 from clbench.learning.watching import read_state, watch, watches, write_state
 from clbench.policy.checkpoint import CheckpointError, load_policy, save_policy
 from clbench.policy.policy import Policy
+from clbench.spec.policies import policy_packages
 from clbench.spec.scenario import Scenario
 from clbench.spec.task import packages_of
 
@@ -91,7 +92,7 @@ class Trainer:
     @property
     def device(self) -> torch.device:
         """Device on which the policy is computed."""
-        return self.pretrained.state_mean.device
+        return self.pretrained.device
 
     def prepare(self, progress: ProgressCallback = no_progress) -> int:
         """Let the method prepare for the sequence, and return the number of optimiser steps that it took.
@@ -196,11 +197,17 @@ class Trainer:
         self.where = f"load_state() after stage {number}"
         self.method = self.new_method()
         with seeded("method", self.seed, number):  # adapters are drawn before they are filled
-            self.policy = load_stage(folder, self.method, self.device)
+            self.policy = load_stage(folder, self.method, self.device, self.scenario.policy)
 
 
-def load_stage(folder: Path, method: Method, device: torch.device | str) -> Policy:
+def load_stage(folder: Path, method: Method, device: torch.device | str, kind: str) -> Policy:
     """Return the policy that a stage left in `folder`, and load the state in the same folder into `method`.
+
+    Args:
+        folder: Folder of the stage.
+        method: New object of the method.
+        device: Device on which the policy is computed.
+        kind: Kind of the policy.
 
     Raises:
         CheckpointError: A file is missing or torn, or is not a file of a stage.
@@ -209,12 +216,12 @@ def load_stage(folder: Path, method: Method, device: torch.device | str) -> Poli
         state = read_state(folder, device)
     except (OSError, ValueError, TypeError, SafetensorError) as error:
         raise CheckpointError(f"{folder}: cannot be read as the state of a method ({error}).") from error
-    return load_policy(folder, lambda policy: method.load_state(policy, state)).to(device)
+    return load_policy(folder, lambda policy: method.load_state(policy, state), kind).to(device)
 
 
 def sources(scenario: Scenario, seed: int, *modules: str) -> dict[str, Any]:
     """Return the code, with `modules`, and the data that any result of a run depends on, as JSON."""
-    suites = packages_of(scenario.tasks, "world", "expert", "camera")
+    suites = {*packages_of(scenario.tasks, "world", "expert", "camera"), *policy_packages(scenario.policy)}
     return {
         "pretraining": pretraining_inputs(scenario, seed),
         "tasks": [dataclasses.asdict(task) for task in scenario.tasks],

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from clbench.base.errors import ClbenchError
 from clbench.base.strict_json import read_json
+from clbench.policy.kinds import new_policy
 from clbench.policy.policy import Policy, PolicyConfig
 from clbench.spec.policies import POLICIES
 
@@ -38,12 +39,16 @@ def save_policy(policy: Policy, folder: Path) -> None:
     )
 
 
-def load_policy(folder: Path, extend: Callable[[Policy], None] = lambda _: None) -> Policy:
+def load_policy(
+    folder: Path, extend: Callable[[Policy], None] = lambda _: None, kind: str | None = None
+) -> Policy:
     """Read the policy that `save_policy` wrote to `folder`.
 
     Args:
         folder: Folder of the checkpoint.
         extend: Function that adds modules, such as adapters, to a plain policy before its tensors are loaded.
+        kind: Kind that the policy must have. None stands for any built-in one: a checkpoint never decides
+            which module is imported.
 
     Raises:
         CheckpointError: A file is missing or torn, a size is out of range, the tensors do not have the names,
@@ -54,10 +59,10 @@ def load_policy(folder: Path, extend: Callable[[Policy], None] = lambda _: None)
         tensors = load_file(folder / "policy.safetensors")
     except (OSError, ValueError, TypeError, SafetensorError) as error:
         raise CheckpointError(f"{folder}: cannot be read as a policy ({error}).") from error
-    fault = _fault(config, tensors)
+    fault = _fault(config, tensors, kind)
     if fault:
         raise CheckpointError(f"{folder}: {fault}.")
-    policy = Policy(config)
+    policy = new_policy(config)
     extend(policy)
     expected, found = _kinds(policy.state_dict()), _kinds(tensors)
     if expected != found:
@@ -73,11 +78,12 @@ def _kinds(tensors: Mapping[str, Tensor]) -> dict[str, tuple[Any, ...]]:
     return {name: (tuple(value.shape), value.dtype) for name, value in tensors.items()}
 
 
-def _fault(config: PolicyConfig, tensors: Mapping[str, Tensor]) -> str | None:
+def _fault(config: PolicyConfig, tensors: Mapping[str, Tensor], kind: str | None) -> str | None:
     """Return why a policy of these sizes must not be built, None if it may: it could exceed the memory."""
     sizes = dataclasses.asdict(config)
-    if sizes.pop("kind") not in POLICIES:
-        return f"its kind must be one of {', '.join(POLICIES)}, not {config.kind!r}"
+    allowed = list(POLICIES) if kind is None else [kind]
+    if sizes.pop("kind") not in allowed:
+        return f"its kind must be {' or '.join(allowed)}, not {config.kind!r}"
     for name, size in sizes.items():
         least = 0 if name in ("image_size", "block") else 1
         if type(size) is not int or not least <= size <= LARGEST:
@@ -86,6 +92,8 @@ def _fault(config: PolicyConfig, tensors: Mapping[str, Tensor]) -> str | None:
         return f"width {config.width} cannot be shared among {config.heads} heads"
     if config.block and config.chunk % config.block:
         return f"a chunk of {config.chunk} steps cannot be cut into blocks of {config.block}"
+    if config.kind not in POLICIES:  # its sizes mean what its class makes of them
+        return None
     if config.layers > len(tensors):
         return f"{config.layers:,} layers cannot have {len(tensors):,} tensors"
     held = sum(value.numel() for value in tensors.values())

@@ -1,22 +1,26 @@
-"""The policy: backbone, action head, and the normalisation from pretraining."""
+"""The policy protocol: what methods, evaluation and pretraining need of a policy."""
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import cast
+from typing import ClassVar
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from clbench.policy.backbone import Backbone
+from clbench.base.errors import ClbenchError
 from clbench.policy.batch import Batch, QuestionBatch
-from clbench.policy.discrete import DiscreteDiffusionHead
-from clbench.policy.flow import FlowHead
-from clbench.policy.head import ActionHead
+from clbench.policy.vision import Vision
 from clbench.spec.budget import HEADS
 from clbench.spec.language import TEXT_LENGTH, VOCABULARY_SIZE
 from clbench.spec.policies import DEFAULT_POLICY
+
+
+class MissingAbilityError(ClbenchError, TypeError):
+    """A policy does not offer what was asked of it."""
 
 
 @dataclass(frozen=True)
@@ -46,28 +50,34 @@ class PolicyConfig:
     image_size: int = 0
     """Width and height of the image that it sees, in pixels; 0 without images."""
     kind: str = DEFAULT_POLICY
-    """Kind of its action head, one of `POLICIES`."""
+    """Kind of the policy: one of `clbench.spec.policies.POLICIES`, or "module:Class"."""
     block: int = 0
     """Steps in a block of block-causal attention in a discrete-diffusion head; 0 without blocks."""
 
 
-def new_head(config: PolicyConfig) -> ActionHead:
-    """Return the action head of the policy's kind, with initial weights."""
-    sizes = (config.action_size, config.chunk, config.width, config.layers, config.heads)
-    if config.kind == "discrete_diffusion":
-        return DiscreteDiffusionHead(*sizes, block=config.block)
-    return FlowHead(*sizes, config.euler_steps)
+class Policy(nn.Module, ABC):
+    """A policy: state, image and words in, action chunks out, and answers if it has that ability.
 
+    A subclass takes `config` and `seed`, draws its initial weights from the seed alone, and has the abstract
+    methods. B samples have states (B, S), words (B, L) and chunks of H actions (B, H, A) in the units of the
+    world. All draws come with the samples: equal policies have equal losses on the same batch. If a policy
+    sees images, each function that takes states also takes images, uint8 (B, N, N, 3).
 
-class Policy(nn.Module):
-    """A small vision-language-action model: state, image and words in, action chunks and answers out.
+    Abilities are optional. A method names those that it needs in `needs`, and runs with no other policy.
 
-    If a policy sees images, each function that takes states also takes images, uint8 (B, N, N, 3).
+    - "hidden_states": `hidden_states`, `token_mask` and `backbone_layers` show a backbone. The action head
+      `head` reads its hidden states, and `action_loss` accepts them as `hidden`.
+    - "answers": `answer_logits` answers questions about the scene.
 
     Args:
         config: Sizes of the policy.
-        seed: Seed of the initial weights; the state of the global generator does not change.
+        seed: Seed of the initial weights; the state of the global generator must not change.
     """
+
+    abilities: ClassVar[frozenset[str]] = frozenset()
+    """Abilities that the policy has, of "hidden_states" and "answers"."""
+    head: nn.Module
+    """The action head, whose parameters belong to the policy; with the ability "hidden_states"."""
 
     state_mean: Tensor
     state_std: Tensor
@@ -77,21 +87,14 @@ class Policy(nn.Module):
     def __init__(self, config: PolicyConfig, seed: int = 0) -> None:
         super().__init__()
         self.config = config
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(seed)
-            self.backbone = Backbone(
-                config.state_size,
-                config.vocabulary_size,
-                config.text_length,
-                config.width,
-                config.layers,
-                config.heads,
-                config.image_size,
-            )
-            self.head = new_head(config)
         for name, size in (("state", config.state_size), ("action", config.action_size)):
             self.register_buffer(f"{name}_mean", torch.zeros(size))
             self.register_buffer(f"{name}_std", torch.ones(size))
+
+    @property
+    def device(self) -> torch.device:
+        """Device on which the policy is computed."""
+        return self.state_mean.device
 
     def normalise_like(self, state: Tensor, action: Tensor | None = None) -> None:
         """Set the normalisation to the mean and deviation of states (N, S) and, if given, actions (N, A)."""
@@ -101,46 +104,57 @@ class Policy(nn.Module):
             getattr(self, f"{name}_mean").copy_(values.mean(dim=0))
             # at least 1e-2, a centimetre or a hundredth of the actions: nearly constant values stay small
             getattr(self, f"{name}_std").copy_(values.std(dim=0, correction=0).clamp(min=1e-2))
-        if action is not None:
-            self.head.fit(action, self.action_mean, self.action_std)
 
-    def hidden_states(self, state: Tensor, words: Tensor, image: Tensor | None = None) -> list[Tensor]:
-        """Return the hidden state (B, P, W) of every backbone layer for states (B, S) and words (B, L)."""
-        normalised = ((state - self.state_mean) / self.state_std).clamp(-10, 10)
-        return cast(list[Tensor], self.backbone(normalised, words, image))
-
+    @abstractmethod
     def action_loss(self, batch: Batch, hidden: list[Tensor] | None = None) -> Tensor:
-        """Return the head's loss of each sample, (B,).
+        """Return the loss of each sample, (B,), on demonstrated action chunks.
 
         Args:
             batch: Demonstrated action chunks.
             hidden: Hidden states to use instead of `hidden_states(batch.state, batch.words, batch.image)`:
-                detached ones stop the gradient at the backbone.
+                detached ones stop the gradient at the backbone. Given only with the ability "hidden_states".
         """
-        hidden = self.hidden_states(batch.state, batch.words, batch.image) if hidden is None else hidden
-        action = (batch.action - self.action_mean) / self.action_std
-        mask = self.backbone.mask(batch.words)
-        return self.head.loss(action, batch.valid, batch.draw, batch.noise, hidden, mask)
 
+    @abstractmethod
     def predict(self, batch: Batch) -> Tensor:
-        """Return what the head predicts at the noisy chunks, (B, H, A), to compare policies of one kind."""
-        hidden = self.hidden_states(batch.state, batch.words, batch.image)
-        action = (batch.action - self.action_mean) / self.action_std
-        mask = self.backbone.mask(batch.words)
-        return self.head.predict(action, batch.valid, batch.draw, batch.noise, hidden, mask)
+        """Return what the policy predicts in its loss, (B, H, A), to compare policies of one kind."""
+
+    @abstractmethod
+    def act(self, state: Tensor, words: Tensor, noise: Tensor, image: Tensor | None = None) -> Tensor:
+        """Return the action chunk (B, H, A) for states (B, S) and words (B, L).
+
+        Args:
+            state: Observations.
+            words: Word ids of the instructions.
+            noise: Standard normal draws, (B, H, A): the only source of chance.
+            image: Images, if the policy sees them.
+        """
+
+    def hidden_states(self, state: Tensor, words: Tensor, image: Tensor | None = None) -> list[Tensor]:
+        """Return the hidden state (B, P, W) of every backbone layer for states (B, S) and words (B, L)."""
+        raise self._lacks("hidden_states")
+
+    def token_mask(self, words: Tensor) -> Tensor:
+        """Return which tokens of the hidden states are read, (B, 1, 1, P): all but the words' padding."""
+        raise self._lacks("hidden_states")
+
+    @property
+    def backbone_layers(self) -> Sequence[nn.Module]:
+        """Layers of the backbone, as many as there are hidden states."""
+        raise self._lacks("hidden_states")
 
     def answer_logits(self, state: Tensor, words: Tensor, image: Tensor | None = None) -> Tensor:
         """Return the logits (B, V) of the word that answers the question `words` about `state`."""
-        return self.backbone.answer_logits(self.hidden_states(state, words, image)[-1])
+        raise self._lacks("answers")
 
     def answer_loss(self, questions: QuestionBatch) -> Tensor:
         """Return the cross-entropy of each right answer, (B,)."""
         logits = self.answer_logits(questions.state, questions.words, questions.image)
         return F.cross_entropy(logits, questions.answer, reduction="none")
 
-    @torch.inference_mode()
-    def act(self, state: Tensor, words: Tensor, noise: Tensor, image: Tensor | None = None) -> Tensor:
-        """Return the action chunk (B, H, A) for states (B, S) and words (B, L), from noise (B, H, A)."""
-        hidden = self.hidden_states(state, words, image)
-        chunk = self.head.sample(noise, hidden, self.backbone.mask(words))
-        return chunk * self.action_std + self.action_mean
+    def vision_to_pretrain(self) -> Vision | None:
+        """Return the module that is pretrained on pictures before the policy is, None without one."""
+        return None
+
+    def _lacks(self, ability: str) -> MissingAbilityError:
+        return MissingAbilityError(f"{type(self).__name__} does not have the ability {ability!r}.")

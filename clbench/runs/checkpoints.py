@@ -133,7 +133,10 @@ def make_stages(run: ResolvedRun, progress: ProgressCallback = no_progress) -> P
 def load_stages(run: ResolvedRun, folder: Path) -> list[Policy]:
     """Return the policies of all stages of a run from a folder with "stage-0" and so on."""
     numbers = range(len(run.scenario.target) + 1)
-    return [load_stage(folder / f"stage-{number}", run.new_method(), run.spec.device) for number in numbers]
+    return [
+        load_stage(folder / f"stage-{number}", run.new_method(), run.spec.device, run.spec.policy)
+        for number in numbers
+    ]
 
 
 def keep_stages(run: ResolvedRun, checkpoints: Path, progress: ProgressCallback = no_progress) -> None:

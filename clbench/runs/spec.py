@@ -68,12 +68,15 @@ class RunSpec:
 
         Raises:
             UnknownNameError: There is no such scenario, method or hyper-parameter.
-            InputError: There is no such order, nothing can be perturbed, or the method refuses a value.
+            InputError: There is no such order, nothing can be perturbed, the method refuses a value, or it
+                needs an ability that the policy lacks.
         """
         from clbench.learning.registry import load_method, read_changes
+        from clbench.policy.kinds import check_abilities
 
         scenario, published = self.scenarios()
         method = load_method(self.method)
+        check_abilities(self.policy, method.needs, self.method)
         return ResolvedRun(self, scenario, published, method, read_changes(self.method, method, self.changes))
 
     def scenarios(self) -> tuple[Scenario, Scenario]:

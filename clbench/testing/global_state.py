@@ -18,6 +18,7 @@ from torch import Tensor
 
 from clbench.base.cache import cache_folder
 from clbench.policy.policy import Policy
+from clbench.policy.transformer import TransformerPolicy
 
 _Setting = tuple[Callable[[], Any], Callable[[Any], object]]
 
@@ -41,6 +42,10 @@ SETTINGS: Mapping[str, _Setting] = {
     # inside `warnings.catch_warnings`, which restores them
     "warnings.filters": (lambda: list(warnings.filters), lambda _: None),
     "the class clbench.Policy": (lambda: dict(vars(Policy)), lambda value: _set_attributes(Policy, value)),
+    "the class of the built-in policies": (
+        lambda: dict(vars(TransformerPolicy)),
+        lambda value: _set_attributes(TransformerPolicy, value),
+    ),
 }
 """Settings of the whole process, each with a function that reads and one that restores it."""
 

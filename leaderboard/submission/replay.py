@@ -155,7 +155,7 @@ def _go_on(subject: Subject, kept: Path) -> Check:
         trainer.load(kept / f"stage-{number - 1}", number - 1)
         before = copy.deepcopy(trainer.policy)
         trainer.learn(number, lambda step: step.done >= steps)
-        after = load_stage(kept / f"stage-{number}", run.new_method(), run.spec.device)
+        after = load_stage(kept / f"stage-{number}", run.new_method(), run.spec.device, run.spec.policy)
     moved, apart = _distance(before, after), _distance(trainer.policy, after)
     return Check(
         "from stage to stage",

@@ -12,6 +12,7 @@ from clbench.evaluation.rollouts import LANES, Episode, Evaluator, Trial, start_
 from clbench.learning.optimise import deterministic
 from clbench.learning.pretraining import policy_config, pretrained_policy
 from clbench.policy.policy import Policy
+from clbench.policy.transformer import TransformerPolicy
 from clbench.spec.language import encode
 from clbench.spec.registry import load_scenario
 from clbench.spec.scenario import Scenario
@@ -24,7 +25,7 @@ FETCH = load_scenario("clbench/Fetch-v1")
 @pytest.fixture(scope="module")
 def fetch_policy() -> Policy:
     """An untrained policy for Fetch: it waves the arm about."""
-    return Policy(policy_config(FETCH), seed=3).eval()
+    return TransformerPolicy(policy_config(FETCH), seed=3).eval()
 
 
 def _with_episodes(**numbers: int) -> Scenario:
@@ -152,7 +153,7 @@ def test_a_pretrained_toy_policy_masters_its_skills_and_not_the_targets() -> Non
 
 
 def test_a_policy_that_returns_nan_fails_its_episodes_and_stops_nothing(fetch_policy: Policy) -> None:
-    broken = Policy(fetch_policy.config)
+    broken = TransformerPolicy(fetch_policy.config)
     next(broken.head.parameters()).data.fill_(float("nan"))
     episodes = Evaluator(_with_episodes(validation_episodes=2), 0).evaluate(broken, [FETCH.task("press")])
     assert not any(episode.success for episode in episodes)

@@ -55,7 +55,7 @@ def test_the_loss_is_the_cross_entropy_to_the_teacher_over_the_share(
 
     total, number = 0.0, 0
     with torch.no_grad():
-        hidden, mask = teacher.hidden_states(batch.state, batch.words), teacher.backbone.mask(batch.words)
+        hidden, mask = teacher.hidden_states(batch.state, batch.words), teacher.token_mask(batch.words)
     normalised = (batch.action - teacher.action_mean) / teacher.action_std
     truth = head.tokens(normalised)
     for row in range(5):

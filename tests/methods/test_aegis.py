@@ -18,6 +18,7 @@ from clbench.learning.prior import Prior
 from clbench.policy.activations import Gaussian
 from clbench.policy.batch import Batch
 from clbench.policy.policy import Policy, PolicyConfig
+from clbench.policy.transformer import TransformerPolicy
 from clbench.spec.budget import Budget
 from clbench.testing import TOY
 from clbench.testing.small import SMALL, toy_questions, toy_source
@@ -33,7 +34,7 @@ def _stage(steps: int) -> Stage:
 
 def _moved(config: PolicyConfig = CONFIG, seed: int = 0, **changes: Any) -> tuple[Any, Policy]:
     """Return a method that has begun a stage, and its policy, which has moved away from the anchor."""
-    method, policy = build_method("aegis", {"samples": 64, **changes}), Policy(config, seed=1)
+    method, policy = build_method("aegis", {"samples": 64, **changes}), TransformerPolicy(config, seed=1)
     method.prepare(policy, Prior({"questions": toy_questions()}))
     generator = torch.Generator().manual_seed(seed)
     with torch.no_grad():
@@ -45,7 +46,7 @@ def _moved(config: PolicyConfig = CONFIG, seed: int = 0, **changes: Any) -> tupl
 
 def _distance(policy: Policy, batch: Batch, anchor: Gaussian) -> Tensor:
     """Return ||mean - mean*||^2 + ||deviation - deviation*||^2 over channels, its mean over layers."""
-    read = policy.backbone.mask(batch.words)[:, 0, 0]
+    read = policy.token_mask(batch.words)[:, 0, 0]
     parts = []
     for layer, states in enumerate(policy.hidden_states(batch.state, batch.words)):
         rows = states[read]
@@ -78,13 +79,13 @@ def _set(policy: Policy) -> dict[str, NDArray[np.float64]]:
 
 def test_the_anchor_is_the_gaussian_of_the_questions_that_prepare_draws() -> None:
     method: Any = build_method("aegis", {"samples": 50})
-    policy, source = Policy(CONFIG), toy_questions(3)
+    policy, source = TransformerPolicy(CONFIG), toy_questions(3)
     prior = Prior({"questions": source})
     method.prepare(policy, prior)
     questions = toy_questions(3).sample(50)
     with torch.no_grad():
         hidden = policy.hidden_states(questions.state, questions.words)
-    expected = Gaussian.of(hidden, policy.backbone.mask(questions.words))
+    expected = Gaussian.of(hidden, policy.token_mask(questions.words))
     assert method.anchor.mean.equal(expected.mean)
     assert method.anchor.deviation.equal(expected.deviation)
     assert not method.anchor.mean.requires_grad
@@ -92,7 +93,7 @@ def test_the_anchor_is_the_gaussian_of_the_questions_that_prepare_draws() -> Non
 
 def test_training_needs_no_question_and_does_not_move_the_anchor() -> None:
     method: Any = build_method("aegis", {"samples": 50})
-    policy, prior = Policy(CONFIG), Prior({"questions": toy_questions(3)})
+    policy, prior = TransformerPolicy(CONFIG), Prior({"questions": toy_questions(3)})
     method.prepare(policy, prior)
     prior.close()
     mean, deviation = method.anchor.mean.clone(), method.anchor.deviation.clone()
@@ -168,7 +169,7 @@ def test_parameters_outside_the_backbones_layers_keep_the_plain_gradient() -> No
     outside = [name for name in plain if not name.startswith("backbone.layers.")]
     assert {"backbone.words.weight", "backbone.position", "head.embed.weight"} <= set(outside)
     assert all(np.array_equal(plain[name], found[name]) for name in outside)
-    assert policy.backbone.answer[1].weight.grad is None
+    assert policy.get_parameter("backbone.answer.1.weight").grad is None
 
 
 def _by_hand(
@@ -183,7 +184,7 @@ def _by_hand(
         return torch.stack([(layer.weight[0] * torch.tensor(slope)).sum() for layer, slope in parts]).sum()
 
     method: Any = build_method("aegis", changes)
-    method.start_task(Policy(CONFIG), _stage(1))
+    method.start_task(TransformerPolicy(CONFIG), _stage(1))
     method.distances.append(linear(against))
     method.gradients(policy, linear(gradients))
     return method, [layer.weight.grad[0].tolist() for layer in layers if layer.weight.grad is not None]
@@ -237,7 +238,7 @@ def test_the_random_control_projects_against_directions_of_the_same_norm() -> No
             np.concatenate(
                 [torch.randn_like(weight).double().numpy().ravel() for weight in layer.parameters()]
             )
-            for layer in policy.backbone.layers
+            for layer in policy.backbone_layers
         ]
     found, plain = _set(policy), _gradients(policy, policy.action_loss(batch).mean())
     away, projected = _gradients(policy, _distance(policy, batch, method.anchor)), 0
@@ -264,7 +265,7 @@ def test_the_anchor_survives_its_state() -> None:
 
 
 def test_the_diagnostics_have_the_distance_at_eleven_steps_from_the_first_to_the_last() -> None:
-    method, policy = build_method("aegis", {"samples": 50}), Policy(CONFIG)
+    method, policy = build_method("aegis", {"samples": 50}), TransformerPolicy(CONFIG)
     method.prepare(policy, Prior({"questions": toy_questions(3)}))
     assert method.diagnostics() == {}
     adapt(policy, method, _stage(31), Budget(learning_rate=1e-3))

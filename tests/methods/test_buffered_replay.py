@@ -10,7 +10,7 @@ from torch import Tensor
 from clbench.learning.method import Stage
 from clbench.learning.prior import Prior
 from clbench.policy.batch import Batch
-from clbench.policy.policy import Policy
+from clbench.policy.transformer import TransformerPolicy
 from clbench.testing import TOY
 from clbench.testing.small import SMALL, toy_source
 
@@ -23,7 +23,7 @@ def _prepared(**changes: Any) -> tuple[Any, Prior]:
     prior = Prior({"demonstrations": toy_source("left", "up")})
     with torch.random.fork_rng():
         torch.manual_seed(0)
-        method.prepare(Policy(SMALL), prior)
+        method.prepare(TransformerPolicy(SMALL), prior)
     prior.close()
     return method, prior
 
@@ -95,7 +95,7 @@ def test_flow_time_and_noise_of_replayed_samples_are_drawn_anew() -> None:
 def test_after_a_target_the_same_share_of_it_is_added() -> None:
     method, prior = _prepared(share=0.1)
     before, count = _moments(method.buffer), round(0.1 * len(toy_source("right")))
-    method.end_task(Policy(SMALL), _stage(seed=3))
+    method.end_task(TransformerPolicy(SMALL), _stage(seed=3))
     assert _moments(method.buffer) == before + _moments(toy_source("right", seed=3).sample(count))
     replayed = set()
     for _ in range(20):
@@ -105,9 +105,9 @@ def test_after_a_target_the_same_share_of_it_is_added() -> None:
 
 def test_the_buffer_survives_its_state() -> None:
     method, _ = _prepared(share=0.1)
-    method.end_task(Policy(SMALL), _stage())
+    method.end_task(TransformerPolicy(SMALL), _stage())
     other: Any = build_method("buffered_replay", {"share": 0.1})
-    other.load_state(Policy(SMALL), method.state())
+    other.load_state(TransformerPolicy(SMALL), method.state())
     for name, value in vars(method.buffer).items():
         again = getattr(other.buffer, name)
         assert isinstance(again, Tensor)

@@ -17,6 +17,7 @@ from clbench.learning.optimise import MethodError, optimise
 from clbench.learning.prior import Prior
 from clbench.policy.batch import Batch
 from clbench.policy.policy import Policy
+from clbench.policy.transformer import TransformerPolicy
 from clbench.spec.budget import Budget
 from clbench.testing import TOY
 from clbench.testing.small import SMALL, toy_source
@@ -47,7 +48,7 @@ def _stage(steps: int) -> Stage:
 def _started(spec: str, **changes: Any) -> Any:
     """Return a method that has begun its first stage."""
     method = build_method(spec, changes)
-    method.start_task(Policy(SMALL), _stage(10))
+    method.start_task(TransformerPolicy(SMALL), _stage(10))
     return method
 
 
@@ -135,7 +136,7 @@ def test_a_perfect_sample_weighs_1_and_a_hopeless_one_the_floor() -> None:
 
 
 def test_an_infinite_loss_stops_the_run_although_its_weight_is_the_floor() -> None:
-    policy, batch = Policy(SMALL), toy_source("right").sample(2)
+    policy, batch = TransformerPolicy(SMALL), toy_source("right").sample(2)
     # at flow time 1 the head reads noise alone: its velocity is finite, its target action is not
     batch = dataclasses.replace(
         batch, action=torch.full_like(batch.action, 1e25), draw=torch.ones(2), valid=torch.ones(2, 8)
@@ -149,7 +150,7 @@ def test_an_infinite_loss_stops_the_run_although_its_weight_is_the_floor() -> No
 
 @pytest.mark.parametrize("step", [0, 60])
 def test_the_gradient_is_the_mean_of_the_weighted_gradients_of_the_samples(step: int) -> None:
-    policy, batch = Policy(SMALL), toy_source("right", seed=1).sample(8)
+    policy, batch = TransformerPolicy(SMALL), toy_source("right", seed=1).sample(8)
     method = _started("consft", **UNEVEN)
     found = _set_gradient(method, policy, batch, Progress(step, 100))
     rows = [Batch(**{name: value[row : row + 1] for name, value in vars(batch).items()}) for row in range(8)]
@@ -165,7 +166,7 @@ def test_the_gradient_is_the_mean_of_the_weighted_gradients_of_the_samples(step:
 
 
 def test_no_gradient_flows_through_the_weights() -> None:
-    policy, batch = Policy(SMALL), toy_source("right", seed=1).sample(8)
+    policy, batch = TransformerPolicy(SMALL), toy_source("right", seed=1).sample(8)
     method = _started("consft", **UNEVEN)
     assert not method.weights(policy.action_loss(batch), Progress(0, 100)).requires_grad
     found = _set_gradient(method, policy, batch, Progress(0, 100))
@@ -177,7 +178,7 @@ def test_no_gradient_flows_through_the_weights() -> None:
 @pytest.mark.parametrize("seed", range(3))
 def test_one_sample_disrupts_old_knowledge_by_the_square_of_its_weight(seed: int) -> None:
     """The paper's claim (Eq. 7): g'Fg of the weighted gradient is omega^2 times g'Fg of the plain one."""
-    policy, batch = Policy(SMALL, seed=seed), toy_source("right", seed=seed).sample(1)
+    policy, batch = TransformerPolicy(SMALL, seed=seed), toy_source("right", seed=seed).sample(1)
     method = _started("consft", kappa=1.0, tau_start=1.0)
     weighted = _set_gradient(method, policy, batch, Progress(0, 100)).double()
     loss = policy.action_loss(batch).sum()
@@ -192,7 +193,7 @@ def test_one_sample_disrupts_old_knowledge_by_the_square_of_its_weight(seed: int
 
 
 def test_the_histogram_counts_each_sample_of_each_step_in_its_part_of_the_schedule() -> None:
-    method, policy = build_method("consft", {}), Policy(SMALL)
+    method, policy = build_method("consft", {}), TransformerPolicy(SMALL)
     assert method.diagnostics() == {}
     adapt(policy, method, _stage(25), Budget(learning_rate=1e-3))
     diagnostics = method.diagnostics()
@@ -204,7 +205,7 @@ def test_the_histogram_counts_each_sample_of_each_step_in_its_part_of_the_schedu
 
 
 def test_the_last_part_of_the_histogram_also_counts_the_steps_after_the_schedule() -> None:
-    method, policy = build_method("consft", {}), Policy(SMALL)
+    method, policy = build_method("consft", {}), TransformerPolicy(SMALL)
     budget = Budget(learning_rate=1e-3, criterion=0.9)
     adapt(policy, method, _stage(30), budget, lambda step: step.done == 30)
     counts = [sum(part) for part in method.diagnostics()["omega_counts"]]
@@ -214,7 +215,7 @@ def test_the_last_part_of_the_histogram_also_counts_the_steps_after_the_schedule
 
 
 def test_the_histogram_counts_the_weights() -> None:
-    policy, batch = Policy(SMALL), toy_source("right", seed=1).sample(64)
+    policy, batch = TransformerPolicy(SMALL), toy_source("right", seed=1).sample(64)
     method = _started("consft", kappa=2.0, tau_start=1.0)
     method.loss(policy, batch, Progress(7, 10))
     omegas = [_omega(loss, 0.7, kappa=2.0, tau_start=1.0) for loss in policy.action_loss(batch).tolist()]
@@ -245,7 +246,7 @@ def test_the_calibrated_variant_and_the_controls_change_only_the_unit_of_the_los
 
 
 def test_a_constant_weight_is_the_mean_weight_of_consft_for_every_sample() -> None:
-    losses = Policy(SMALL).action_loss(toy_source("right", seed=2).sample(16))
+    losses = TransformerPolicy(SMALL).action_loss(toy_source("right", seed=2).sample(16))
     consft: Any = build_method("consft", UNEVEN)
     constant: Any = build_method("constant_weight", {**UNEVEN, "loss_scale": 1.0})
     for step in (0, 60, 99):
@@ -255,7 +256,7 @@ def test_a_constant_weight_is_the_mean_weight_of_consft_for_every_sample() -> No
 
 
 def test_the_gradient_of_a_constant_weight_is_a_multiple_of_sfts() -> None:
-    policy, batch = Policy(SMALL), toy_source("right", seed=2).sample(16)
+    policy, batch = TransformerPolicy(SMALL), toy_source("right", seed=2).sample(16)
     found = _set_gradient(
         _started("constant_weight", **UNEVEN, loss_scale=1.0), policy, batch, Progress(0, 100)
     )
@@ -265,7 +266,7 @@ def test_the_gradient_of_a_constant_weight_is_a_multiple_of_sfts() -> None:
 
 
 def test_shuffled_weights_are_consfts_in_another_order() -> None:
-    losses = Policy(SMALL).action_loss(toy_source("right", seed=2).sample(64))
+    losses = TransformerPolicy(SMALL).action_loss(toy_source("right", seed=2).sample(64))
     consft: Any = build_method("consft", UNEVEN)
     shuffled: Any = build_method("shuffled_weights", {**UNEVEN, "loss_scale": 1.0})
     with seeded("shuffle"):
@@ -273,20 +274,3 @@ def test_shuffled_weights_are_consfts_in_another_order() -> None:
     ours = consft.weights(losses, Progress(0, 100))
     assert theirs.tolist() != ours.tolist()
     assert theirs.sort().values.tolist() == ours.sort().values.tolist()
-
-
-class _Reduced(Policy):
-    """A policy with one loss for all samples together."""
-
-    def action_loss(self, batch: Batch, hidden: list[Tensor] | None = None) -> Tensor:
-        return super().action_loss(batch, hidden).mean()
-
-
-@pytest.mark.parametrize(
-    ("spec", "name"),
-    [("consft", "ConSFT"), ("consft_calibrated", "ConSFTCalibrated"), ("constant_weight", "ConstantWeight")],
-)
-def test_a_policy_without_a_loss_for_each_sample_is_refused_by_name(spec: str, name: str) -> None:
-    with pytest.raises(TypeError, match=rf"{name} .* action_loss of _Reduced must .* its shape is \(\)"):
-        build_method(spec, {}).prepare(_Reduced(SMALL), Prior({}))
-    build_method(spec, {}).prepare(Policy(SMALL), Prior({}))

@@ -17,6 +17,7 @@ from clbench.learning.method import Method, Progress, Stage
 from clbench.learning.prior import Prior
 from clbench.policy.batch import Batch
 from clbench.policy.policy import Policy
+from clbench.policy.transformer import TransformerPolicy
 from clbench.spec.budget import Budget
 from clbench.testing import TOY
 from clbench.testing.small import SMALL, toy_questions, toy_source
@@ -76,7 +77,7 @@ def _distilled(policy: Policy, teacher: Policy, batch: Batch) -> float:
 
 
 def test_lwf_distils_the_policy_that_the_target_began_with() -> None:
-    method, policy = build_method("lwf", {"strength": 0.7}), Policy(SMALL)
+    method, policy = build_method("lwf", {"strength": 0.7}), TransformerPolicy(SMALL)
     method.prepare(policy, Prior({}))
     method.start_task(policy, _stage())  # of the target before
     _adapt(policy, build_method("sft", {}))
@@ -92,7 +93,7 @@ def test_lwf_distils_the_policy_that_the_target_began_with() -> None:
 
 
 def test_at_the_first_step_of_lwf_there_is_nothing_to_distil() -> None:
-    method, policy, batch = build_method("lwf", {}), Policy(SMALL), toy_source("right").sample(16)
+    method, policy, batch = build_method("lwf", {}), TransformerPolicy(SMALL), toy_source("right").sample(16)
     method.start_task(policy, _stage())
     plain = policy.action_loss(batch).mean()
     assert method.loss(policy, batch, NOW).item() == plain.item()
@@ -101,7 +102,7 @@ def test_at_the_first_step_of_lwf_there_is_nothing_to_distil() -> None:
 
 def test_the_teacher_of_lwf_does_not_learn() -> None:
     method: Any = build_method("lwf", {})
-    policy = Policy(SMALL)
+    policy = TransformerPolicy(SMALL)
     before = _weights(policy)
     _adapt(policy, method)
     assert not policy.get_parameter("head.embed.weight").equal(before["head.embed.weight"])
@@ -111,7 +112,7 @@ def test_the_teacher_of_lwf_does_not_learn() -> None:
 def test_the_gradient_of_lwf_sums_both_terms() -> None:
     method, policy, batch = (
         build_method("lwf", {"strength": 0.7}),
-        Policy(SMALL),
+        TransformerPolicy(SMALL),
         toy_source("up").sample(8),
     )
     method.start_task(policy, _stage())
@@ -131,7 +132,7 @@ def _vector(gradients: dict[str, Tensor]) -> NDArray[np.float64]:
 
 
 def test_a_gem_projects_the_gradient_off_directions_that_raise_the_prior_loss() -> None:
-    policy, method = Policy(SMALL), build_method("a_gem", {})
+    policy, method = TransformerPolicy(SMALL), build_method("a_gem", {})
     # at flow time 1 the head reads the noise alone; its prediction there is too low for one, too high for
     # the other
     batch = dataclasses.replace(toy_source("right").sample(16), draw=torch.ones(16))
@@ -151,7 +152,7 @@ def test_a_gem_projects_the_gradient_off_directions_that_raise_the_prior_loss() 
 
 
 def test_a_gem_leaves_every_bit_of_a_gradient_that_does_not_raise_the_prior_loss() -> None:
-    policy, batch = Policy(SMALL), toy_source("right").sample(16)
+    policy, batch = TransformerPolicy(SMALL), toy_source("right").sample(16)
     found = _set_by(build_method("a_gem", {}), policy, (batch, batch))
     plain = _set_by(build_method("sft", {}), policy, batch)
     assert all(value.equal(plain[name]) for name, value in found.items())
@@ -170,7 +171,7 @@ def test_a_gem_draws_a_full_batch_of_the_target_and_one_of_prior_demonstrations(
 @pytest.mark.parametrize("coefficient", [0.0, 0.25, 0.5, 1.0])
 def test_weight_interpolation_goes_its_share_of_the_way(coefficient: float) -> None:
     method = build_method("weight_interpolation", {"coefficient": coefficient})
-    policy, plain = Policy(SMALL), Policy(SMALL)
+    policy, plain = TransformerPolicy(SMALL), TransformerPolicy(SMALL)
     before = _weights(policy)
     _adapt(policy, method)
     _adapt(plain, build_method("sft", {}))
@@ -184,7 +185,7 @@ def test_weight_interpolation_goes_its_share_of_the_way(coefficient: float) -> N
 
 
 def test_weight_interpolation_goes_back_to_where_the_stage_began() -> None:
-    policy, method = Policy(SMALL), build_method("weight_interpolation", {"coefficient": 0.0})
+    policy, method = TransformerPolicy(SMALL), build_method("weight_interpolation", {"coefficient": 0.0})
     _adapt(policy, build_method("sft", {}))
     before = _weights(policy)
     _adapt(policy, method)
@@ -195,7 +196,11 @@ def test_weight_interpolation_goes_back_to_where_the_stage_began() -> None:
 
 
 def test_the_step_sizes_of_finch_follow_the_average_of_the_losses() -> None:
-    method, policy, source = build_method("finch", {"kappa": 0.9}), Policy(SMALL), toy_source("right")
+    method, policy, source = (
+        build_method("finch", {"kappa": 0.9}),
+        TransformerPolicy(SMALL),
+        toy_source("right"),
+    )
     method.start_task(policy, _stage())
     average, found, expected = 0.0, [], []
     for step in range(20):
@@ -210,7 +215,7 @@ def test_the_step_sizes_of_finch_follow_the_average_of_the_losses() -> None:
 
 
 def test_finch_never_exceeds_the_schedule_and_reaches_it_where_the_loss_is_low() -> None:
-    policy, batch = Policy(SMALL), toy_source("right").sample(16)
+    policy, batch = TransformerPolicy(SMALL), toy_source("right").sample(16)
     rates = []
     for kappa in (1e-3, 1e-2, 1e3):
         method = build_method("finch", {"kappa": kappa})
@@ -221,7 +226,7 @@ def test_finch_never_exceeds_the_schedule_and_reaches_it_where_the_loss_is_low()
 
 
 def test_finch_forgets_the_losses_of_the_last_target() -> None:
-    method, policy, rates = build_method("finch", {}), Policy(SMALL), []
+    method, policy, rates = build_method("finch", {}), TransformerPolicy(SMALL), []
     for batches in (0, 3):
         method.start_task(policy, _stage())
         for seed in range(batches):
@@ -234,10 +239,10 @@ def test_finch_forgets_the_losses_of_the_last_target() -> None:
 
 @pytest.mark.parametrize("factor", [0.2, 0.5])
 def test_the_step_factor_moves_every_weight_by_its_share_of_a_step(factor: float) -> None:
-    start = _weights(Policy(SMALL))
+    start = _weights(TransformerPolicy(SMALL))
     moves = []
     for changes in ({}, {"step_factor": factor}):
-        policy = Policy(SMALL)
+        policy = TransformerPolicy(SMALL)
         _adapt(policy, build_method("sft", changes), steps=1)
         moves.append({name: weight - start[name] for name, weight in _weights(policy).items()})
     plain, slow = moves
@@ -251,7 +256,7 @@ def test_the_step_factor_moves_every_weight_by_its_share_of_a_step(factor: float
 
 
 def test_stop_gradient_keeps_the_backbone_and_its_answers_to_the_last_bit() -> None:
-    policy, questions = Policy(SMALL), toy_questions(3).sample(32)
+    policy, questions = TransformerPolicy(SMALL), toy_questions(3).sample(32)
     before = _weights(policy)
     answers = policy.answer_logits(questions.state, questions.words)
     _adapt(policy, build_method("stop_gradient", {}), steps=10)
@@ -261,13 +266,17 @@ def test_stop_gradient_keeps_the_backbone_and_its_answers_to_the_last_bit() -> N
 
 
 def test_stop_gradient_gives_the_optimiser_the_head_alone() -> None:
-    policy = Policy(SMALL)
+    policy = TransformerPolicy(SMALL)
     given: Any = build_method("stop_gradient", {}).start_task(policy, _stage())
     assert {id(weight) for weight in given} == {id(weight) for weight in policy.head.parameters()}
 
 
 def test_the_head_of_stop_gradient_learns_from_the_plain_action_loss() -> None:
-    policy, batch, method = Policy(SMALL), toy_source("right").sample(16), build_method("stop_gradient", {})
+    policy, batch, method = (
+        TransformerPolicy(SMALL),
+        toy_source("right").sample(16),
+        build_method("stop_gradient", {}),
+    )
     plain = policy.action_loss(batch).mean()
     assert method.loss(policy, batch, NOW).item() == pytest.approx(plain.item(), rel=1e-6)
     gradients = _gradients(policy, plain)
@@ -278,7 +287,7 @@ def test_the_head_of_stop_gradient_learns_from_the_plain_action_loss() -> None:
 
 
 def test_knowledge_insulation_trains_the_backbone_on_questions_and_the_head_on_actions() -> None:
-    policy, method = Policy(SMALL), build_method("knowledge_insulation", {"alpha": 0.5})
+    policy, method = TransformerPolicy(SMALL), build_method("knowledge_insulation", {"alpha": 0.5})
     batch, questions = toy_source("right").sample(16), toy_questions().sample(8)
     acting = _gradients(policy, 0.5 * policy.action_loss(batch).mean())
     answering = _gradients(policy, policy.answer_loss(questions).mean())
@@ -295,7 +304,7 @@ def test_knowledge_insulation_trains_the_backbone_on_questions_and_the_head_on_a
 
 
 def test_co_training_descends_the_sum_of_both_losses() -> None:
-    policy, method = Policy(SMALL), build_method("co_training", {"auxiliary": 0.3})
+    policy, method = TransformerPolicy(SMALL), build_method("co_training", {"auxiliary": 0.3})
     batch, questions = toy_source("right").sample(16), toy_questions().sample(8)
     loss = policy.action_loss(batch).mean() + 0.3 * policy.answer_loss(questions).mean()
     assert method.loss(policy, (batch, questions), NOW).item() == pytest.approx(loss.item(), rel=1e-6)

@@ -12,6 +12,7 @@ from clbench.learning.method import Progress, Stage
 from clbench.learning.prior import Prior, Source
 from clbench.policy.batch import Batch
 from clbench.policy.policy import Policy
+from clbench.policy.transformer import TransformerPolicy
 from clbench.spec.budget import Budget
 from clbench.testing import TOY
 from clbench.testing.small import SMALL, toy_source
@@ -66,7 +67,7 @@ def _set(method: Any, policy: Policy, batch: Batch) -> list[Tensor | None]:
 
 
 def test_importance_is_the_mean_squared_gradient_of_single_samples() -> None:
-    policy = Policy(SMALL)
+    policy = TransformerPolicy(SMALL)
     before = _weights(policy)
     method = _prepared("ewc", policy, samples=12)
     _check_close(method.importance, _fisher(policy, toy_source("left"), 12))
@@ -84,7 +85,7 @@ def test_importance_is_the_mean_squared_gradient_of_single_samples() -> None:
     ("spec", "changes"), [("ewc", {"samples": 4, "strength": 50.0}), ("l2_sp", {"strength": 0.7})]
 )
 def test_the_pull_is_the_gradient_of_the_penalty(spec: str, changes: dict[str, Any]) -> None:
-    policy, batch = Policy(SMALL), toy_source("right", seed=1).sample(8)
+    policy, batch = TransformerPolicy(SMALL), toy_source("right", seed=1).sample(8)
     method = _prepared(spec, policy, **changes)
     _moved(policy)
     found = _set(method, policy, batch)
@@ -109,7 +110,7 @@ def test_the_pull_is_the_gradient_of_the_penalty(spec: str, changes: dict[str, A
 
 @pytest.mark.parametrize(("spec", "changes"), [("ewc", {"samples": 4}), ("l2_sp", {})])
 def test_at_the_anchor_nothing_pulls(spec: str, changes: dict[str, Any]) -> None:
-    policy, batch = Policy(SMALL), toy_source("right", seed=1).sample(8)
+    policy, batch = TransformerPolicy(SMALL), toy_source("right", seed=1).sample(8)
     found = _set(_prepared(spec, policy, **changes), policy, batch)
     plain = torch.autograd.grad(
         policy.action_loss(batch).mean(), list(policy.parameters()), allow_unused=True
@@ -120,7 +121,7 @@ def test_at_the_anchor_nothing_pulls(spec: str, changes: dict[str, Any]) -> None
 
 
 def test_after_a_target_its_importance_is_added_and_the_anchor_moves_there() -> None:
-    policy = Policy(SMALL)
+    policy = TransformerPolicy(SMALL)
     method = _prepared("ewc", policy, samples=6)
     retained = {name: value.clone() for name, value in method.importance.items()}
     _moved(policy)
@@ -131,7 +132,7 @@ def test_after_a_target_its_importance_is_added_and_the_anchor_moves_there() -> 
 
 
 def test_the_anchor_of_l2_sp_stays_where_pretraining_left_it() -> None:
-    policy = Policy(SMALL)
+    policy = TransformerPolicy(SMALL)
     before = _weights(policy)
     method = _prepared("l2_sp", policy)
     adapt(policy, method, _stage(), Budget(learning_rate=1e-3))
@@ -141,7 +142,7 @@ def test_the_anchor_of_l2_sp_stays_where_pretraining_left_it() -> None:
 
 @pytest.mark.parametrize(("spec", "changes"), [("ewc", {"samples": 4}), ("l2_sp", {})])
 def test_anchor_and_importance_survive_the_state(spec: str, changes: dict[str, Any]) -> None:
-    policy, batch = Policy(SMALL), toy_source("right", seed=1).sample(8)
+    policy, batch = TransformerPolicy(SMALL), toy_source("right", seed=1).sample(8)
     method, other = _prepared(spec, policy, **changes), build_method(spec, changes)
     other.load_state(policy, method.state())
     _moved(policy)
@@ -154,22 +155,10 @@ def test_anchor_and_importance_survive_the_state(spec: str, changes: dict[str, A
 def test_a_stronger_penalty_leaves_the_weights_nearer_to_where_they_were() -> None:
     distances = []
     for strength in (0.0, 100.0):
-        policy = Policy(SMALL)
+        policy = TransformerPolicy(SMALL)
         before = _weights(policy)
         stage = Stage(1, TOY.task("right"), 0, 30, toy_source("right"), Prior({}))
         adapt(policy, _prepared("l2_sp", policy, strength=strength), stage, Budget(learning_rate=1e-3))
         moved = [(weight - before[name]).square().sum() for name, weight in _weights(policy).items()]
         distances.append(float(torch.stack(moved).sum()))
     assert distances[1] < 0.5 * distances[0]
-
-
-class _Reduced(Policy):
-    """A policy with one loss for all samples together."""
-
-    def action_loss(self, batch: Batch, hidden: list[Tensor] | None = None) -> Tensor:
-        return super().action_loss(batch, hidden).mean()
-
-
-def test_ewc_refuses_a_policy_without_a_loss_for_each_sample_by_name() -> None:
-    with pytest.raises(TypeError, match=r"EWC looks at samples one by one: action_loss of _Reduced"):
-        _prepared("ewc", _Reduced(SMALL))

@@ -15,6 +15,7 @@ from clbench.learning.optimise import optimise
 from clbench.learning.prior import Prior
 from clbench.learning.registry import load_method
 from clbench.policy.policy import Policy
+from clbench.policy.transformer import TransformerPolicy
 from clbench.testing import TOY
 from clbench.testing.small import SMALL, toy_questions, toy_source
 
@@ -66,7 +67,7 @@ def _fine_tuned(policy: Policy, auxiliary: bool) -> dict[str, Tensor]:
 
 
 def test_the_vector_is_the_difference_of_two_fine_tunings_and_alpha_of_it_is_merged() -> None:
-    policy = Policy(SMALL, seed=3)
+    policy = TransformerPolicy(SMALL, seed=3)
     before = _weights(policy)
     plain, with_auxiliary = _fine_tuned(policy, False), _fine_tuned(policy, True)
     method = _prepared(policy, auxiliary=0.5, alpha=0.7)
@@ -81,12 +82,12 @@ def test_the_vector_is_the_difference_of_two_fine_tunings_and_alpha_of_it_is_mer
 
 
 def test_without_an_auxiliary_objective_there_is_no_vector() -> None:
-    method = _prepared(Policy(SMALL), auxiliary=0.0)
+    method = _prepared(TransformerPolicy(SMALL), auxiliary=0.0)
     assert not any(value.any() for value in method.vector.values())
 
 
 def test_with_alpha_0_the_policy_stays_as_it_was_bit_for_bit() -> None:
-    policy = Policy(SMALL)
+    policy = TransformerPolicy(SMALL)
     before = _weights(policy)
     method = _prepared(policy, alpha=0.0)
     assert any(value.any() for value in method.vector.values())
@@ -94,7 +95,7 @@ def test_with_alpha_0_the_policy_stays_as_it_was_bit_for_bit() -> None:
 
 
 def test_the_regularisers_gradient_is_that_of_its_formula() -> None:
-    policy = Policy(SMALL)
+    policy = TransformerPolicy(SMALL)
     method = _prepared(policy, orthogonal=0.3)
     assert not any(value.any() for value in _regulariser_gradient(method, policy).values())  # sign(0) = 0
     _moved(policy)
@@ -111,7 +112,7 @@ def test_the_regularisers_gradient_is_that_of_its_formula() -> None:
 
 
 def test_the_regularisers_gradient_agrees_with_finite_differences() -> None:
-    policy = Policy(SMALL)
+    policy = TransformerPolicy(SMALL)
     method = _prepared(policy, orthogonal=0.3)
     _moved(policy)
     found = _regulariser_gradient(method, policy)
@@ -134,7 +135,7 @@ def test_the_regularisers_gradient_agrees_with_finite_differences() -> None:
 
 
 def test_the_regulariser_is_added_to_the_gradient_of_the_loss() -> None:
-    policy, batch = Policy(SMALL), toy_source("left", "up", seed=4).sample(8)
+    policy, batch = TransformerPolicy(SMALL), toy_source("left", "up", seed=4).sample(8)
     method = _prepared(policy, orthogonal=0.3)
     _moved(policy)
     penalty = _regulariser_gradient(method, policy)
@@ -151,7 +152,7 @@ def test_the_regulariser_is_added_to_the_gradient_of_the_loss() -> None:
 
 
 def test_the_random_control_has_the_norm_of_the_vector_in_each_matrix() -> None:
-    first, second = Policy(SMALL), Policy(SMALL)
+    first, second = TransformerPolicy(SMALL), TransformerPolicy(SMALL)
     vector, random = (_prepared(first).vector, _prepared(second, direction="random").vector)
     for name, value in vector.items():
         assert float(random[name].norm()) == pytest.approx(float(value.norm()), rel=1e-4), name
@@ -162,13 +163,13 @@ def test_the_random_control_has_the_norm_of_the_vector_in_each_matrix() -> None:
     ]
     assert max(np.abs(cosines)) < 0.2
     for name, weight in second.named_parameters():
-        start = dict(Policy(SMALL).named_parameters())[name]
+        start = dict(TransformerPolicy(SMALL).named_parameters())[name]
         torch.testing.assert_close(weight, start + 1.1 * random[name], rtol=0, atol=1e-6)
 
 
 @pytest.mark.usefixtures("empty_caches")
 def test_the_vector_is_made_once_and_its_steps_count_every_time(monkeypatch: pytest.MonkeyPatch) -> None:
-    policies = [Policy(SMALL, seed=5) for _ in range(3)]
+    policies = [TransformerPolicy(SMALL, seed=5) for _ in range(3)]
     first = _prepared(policies[0])
 
     def explode(*_: Any) -> NoReturn:
@@ -179,7 +180,10 @@ def test_the_vector_is_made_once_and_its_steps_count_every_time(monkeypatch: pyt
     assert all(second.vector[name].equal(value) for name, value in first.vector.items())
     # merging and regularising need no other vector; another objective, or another policy, does
     _prepared(policies[2], alpha=0.5, orthogonal=1.0, direction="random")
-    for policy, changes in ((Policy(SMALL, seed=5), {"auxiliary": 0.5}), (Policy(SMALL, seed=6), {})):
+    for policy, changes in (
+        (TransformerPolicy(SMALL, seed=5), {"auxiliary": 0.5}),
+        (TransformerPolicy(SMALL, seed=6), {}),
+    ):
         with pytest.raises(AssertionError, match="made a second time"):
             _prepared(policy, **changes)
 
@@ -188,13 +192,13 @@ def test_other_demonstrations_make_another_vector() -> None:
     vectors = []
     for seed in (0, 1):
         method: Any = build_method("fast_dvla", FEW)
-        method.prepare(Policy(SMALL), _prior(seed))
+        method.prepare(TransformerPolicy(SMALL), _prior(seed))
         vectors.append(method.vector)
     assert not any(vectors[0][name].equal(vectors[1][name]) for name in vectors[0])
 
 
 def test_vector_and_merged_weights_survive_the_state() -> None:
-    policy = Policy(SMALL)
+    policy = TransformerPolicy(SMALL)
     method = _prepared(policy, orthogonal=0.3)
     other: Any = build_method("fast_dvla", {"orthogonal": 0.3})
     other.load_state(policy, method.state())

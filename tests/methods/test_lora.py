@@ -16,6 +16,7 @@ from clbench.learning.method import Progress, Stage
 from clbench.learning.prior import Prior
 from clbench.policy.checkpoint import load_policy, save_policy
 from clbench.policy.policy import Policy
+from clbench.policy.transformer import TransformerPolicy
 from clbench.spec.budget import Budget
 from clbench.testing import TOY
 from clbench.testing.small import SMALL, toy_source
@@ -42,7 +43,10 @@ def _adapters(policy: Policy) -> dict[str, Tensor]:
 
 def _adapted(variant: str, **changes: Any) -> tuple[Any, Policy]:
     """Return a method and the policy after a short stage of it."""
-    method, policy = build_method("lora", {"variant": variant, "rank": 4, **changes}), Policy(SMALL, seed=1)
+    method, policy = (
+        build_method("lora", {"variant": variant, "rank": 4, **changes}),
+        TransformerPolicy(SMALL, seed=1),
+    )
     with torch.random.fork_rng():
         torch.manual_seed(0)
         method.prepare(policy, Prior({}))
@@ -52,7 +56,7 @@ def _adapted(variant: str, **changes: Any) -> tuple[Any, Policy]:
 
 @VARIANTS
 def test_adapters_begin_as_no_change_and_sit_on_every_linear_map_of_the_layers(variant: str) -> None:
-    policy, batch = Policy(SMALL), toy_source("right", seed=1).sample(8)
+    policy, batch = TransformerPolicy(SMALL), toy_source("right", seed=1).sample(8)
     before = policy.action_loss(batch).detach()
     build_method("lora", {"variant": variant}).prepare(policy, Prior({}))
     torch.testing.assert_close(policy.action_loss(batch).detach(), before, rtol=1e-5, atol=1e-6)
@@ -69,7 +73,7 @@ def test_adapters_begin_as_no_change_and_sit_on_every_linear_map_of_the_layers(v
 
 @VARIANTS
 def test_the_weights_under_the_adapters_never_change_and_all_adapters_train(variant: str) -> None:
-    method, policy = build_method("lora", {"variant": variant}), Policy(SMALL, seed=1)
+    method, policy = build_method("lora", {"variant": variant}), TransformerPolicy(SMALL, seed=1)
     before = _weights(policy)
     method.prepare(policy, Prior({}))
     adapters = _adapters(policy)
@@ -90,7 +94,7 @@ def test_merged_adapters_act_as_they_did(variant: str) -> None:
 
     _, policy = _adapted(variant)
     batch = toy_source("right", seed=1).sample(8)
-    start = Policy(SMALL, seed=1).act(batch.state, batch.words, batch.noise)
+    start = TransformerPolicy(SMALL, seed=1).act(batch.state, batch.words, batch.noise)
     loss, actions = policy.action_loss(batch).detach(), policy.act(batch.state, batch.words, batch.noise)
     assert (actions - start).abs().max() > 1e-3
     layers = [module for module in policy.modules() if isinstance(module, LoraLayer)]

@@ -6,7 +6,8 @@ import torch
 from scipy import linalg
 
 from clbench.policy.activations import VARIANCE_FLOOR, Gaussian
-from clbench.policy.policy import Policy, PolicyConfig
+from clbench.policy.policy import PolicyConfig
+from clbench.policy.transformer import TransformerPolicy
 from clbench.spec.language import encode
 
 CONFIG = PolicyConfig(state_size=4, action_size=2, width=32, layers=2)
@@ -41,11 +42,11 @@ def test_a_distance_is_symmetric_and_zero_only_to_the_same_place() -> None:
 
 
 def test_mean_and_deviation_cover_all_tokens_that_are_read() -> None:
-    policy, words = Policy(CONFIG, seed=1), encode(TEXTS)
+    policy, words = TransformerPolicy(CONFIG, seed=1), encode(TEXTS)
     state = torch.randn(len(TEXTS), 4, generator=torch.Generator().manual_seed(0))
     with torch.no_grad():
         hidden = policy.hidden_states(state, words)
-    found = Gaussian.of(hidden, policy.backbone.mask(words))
+    found = Gaussian.of(hidden, policy.token_mask(words))
     assert found.mean.shape == found.deviation.shape == (2, 32)
     for layer, states in enumerate(hidden):
         # four observation tokens and the readout, then as many words as there are
@@ -59,8 +60,8 @@ def test_mean_and_deviation_cover_all_tokens_that_are_read() -> None:
 
 
 def test_padding_tokens_do_not_count() -> None:
-    policy, words = Policy(CONFIG), encode(TEXTS)
-    mask = policy.backbone.mask(words)
+    policy, words = TransformerPolicy(CONFIG), encode(TEXTS)
+    mask = policy.token_mask(words)
     hidden = [torch.randn(3, mask.shape[-1], 32, generator=torch.Generator().manual_seed(0))]
     changed = [torch.where(mask[:, 0, 0, :, None], states, 1e3) for states in hidden]
     before, after = Gaussian.of(hidden, mask), Gaussian.of(changed, mask)

@@ -11,6 +11,7 @@ from clbench.policy.batch import Batch
 from clbench.policy.checkpoint import CheckpointError, load_policy, save_policy
 from clbench.policy.discrete import DiscreteDiffusionHead
 from clbench.policy.policy import Policy, PolicyConfig
+from clbench.policy.transformer import TransformerPolicy
 
 CONFIG = PolicyConfig(state_size=5, action_size=3, width=32, layers=2, kind="discrete_diffusion")
 LENGTH = CONFIG.chunk * CONFIG.action_size
@@ -36,7 +37,7 @@ def head_of(policy: Policy) -> DiscreteDiffusionHead:
 
 
 def test_bins_reach_from_the_first_to_the_99th_percentile_and_as_far_to_the_other_side() -> None:
-    policy = Policy(CONFIG)
+    policy = TransformerPolicy(CONFIG)
     generator = np.random.default_rng(0)
     action = generator.uniform(-0.2, 0.8, (5000, 3)).astype(np.float32)
     action[:, 2] = 0.0  # a dimension that no skill uses
@@ -49,7 +50,7 @@ def test_bins_reach_from_the_first_to_the_99th_percentile_and_as_far_to_the_othe
 
 
 def test_an_action_comes_back_from_its_bin_to_within_half_a_bin() -> None:
-    head = head_of(Policy(CONFIG))
+    head = head_of(TransformerPolicy(CONFIG))
     action = batch_of(50).action
     tokens = head.tokens(action)
     assert tokens.shape == (50, LENGTH)
@@ -60,7 +61,7 @@ def test_an_action_comes_back_from_its_bin_to_within_half_a_bin() -> None:
 
 
 def test_the_share_of_masked_tokens_follows_the_cosine_and_the_noise_chooses_them() -> None:
-    head, batch = head_of(Policy(CONFIG)), batch_of(64)
+    head, batch = head_of(TransformerPolicy(CONFIG)), batch_of(64)
     masked = head.masked(batch.valid, batch.draw, batch.noise).numpy()
     for row in range(64):
         counts = np.repeat(batch.valid[row].numpy() > 0, 3)
@@ -71,9 +72,9 @@ def test_the_share_of_masked_tokens_follows_the_cosine_and_the_noise_chooses_the
 
 
 def test_the_loss_is_the_mean_cross_entropy_of_the_masked_tokens_that_count() -> None:
-    policy, batch = Policy(CONFIG, seed=1), batch_of(6)
+    policy, batch = TransformerPolicy(CONFIG, seed=1), batch_of(6)
     head, hidden = head_of(policy), policy.hidden_states(batch.state, batch.words)
-    mask = policy.backbone.mask(batch.words)
+    mask = policy.token_mask(batch.words)
     truth, masked = head.tokens(batch.action), head.masked(batch.valid, batch.draw, batch.noise)
     logits = head.logits(torch.where(masked, 256, truth), hidden, mask).detach().double().numpy()
     chances = np.exp(logits) / np.exp(logits).sum(axis=2, keepdims=True)
@@ -85,14 +86,14 @@ def test_the_loss_is_the_mean_cross_entropy_of_the_masked_tokens_that_count() ->
 
 
 def test_the_loss_does_not_see_tokens_that_are_masked_or_do_not_count() -> None:
-    policy, batch = Policy(CONFIG), batch_of(4)
+    policy, batch = TransformerPolicy(CONFIG), batch_of(4)
     other = batch.action.clone()
     other[0, 3:] = 0.7
     assert policy.action_loss(dataclasses.replace(batch, action=other)).equal(policy.action_loss(batch))
 
 
 def test_an_action_is_a_function_of_the_observation_alone() -> None:
-    policy, batch = Policy(CONFIG), batch_of(4)
+    policy, batch = TransformerPolicy(CONFIG), batch_of(4)
     first = policy.act(batch.state, batch.words, batch.noise)
     assert first.shape == batch.action.shape
     assert first.equal(policy.act(batch.state, batch.words, torch.zeros_like(batch.noise)))
@@ -100,14 +101,14 @@ def test_an_action_is_a_function_of_the_observation_alone() -> None:
 
 def test_sizes_of_both_policies_are_within_ten_percent() -> None:
     sizes = [
-        sum(parameter.numel() for parameter in Policy(PolicyConfig(25, 4, kind=kind)).parameters())
+        sum(parameter.numel() for parameter in TransformerPolicy(PolicyConfig(25, 4, kind=kind)).parameters())
         for kind in ("flow", "discrete_diffusion")
     ]
     assert max(sizes) / min(sizes) < 1.1
 
 
 def test_a_policy_with_blocks_comes_back_from_its_checkpoint(tmp_path: Path) -> None:
-    policy = Policy(dataclasses.replace(CONFIG, block=2), seed=2)
+    policy = TransformerPolicy(dataclasses.replace(CONFIG, block=2), seed=2)
     save_policy(policy, tmp_path)
     loaded, batch = load_policy(tmp_path), batch_of(3)
     assert head_of(loaded).block == 2
@@ -117,7 +118,7 @@ def test_a_policy_with_blocks_comes_back_from_its_checkpoint(tmp_path: Path) -> 
 
 
 def test_a_checkpoint_with_blocks_that_do_not_fit_is_refused(tmp_path: Path) -> None:
-    save_policy(Policy(CONFIG), tmp_path)
+    save_policy(TransformerPolicy(CONFIG), tmp_path)
     text = (tmp_path / "policy.json").read_text().replace('"block": 0', '"block": 3')
     (tmp_path / "policy.json").write_text(text)
     with pytest.raises(CheckpointError, match="8 steps cannot be cut into blocks of 3"):
@@ -125,9 +126,9 @@ def test_a_checkpoint_with_blocks_that_do_not_fit_is_refused(tmp_path: Path) -> 
 
 
 def test_a_checkpoint_of_the_other_kind_is_refused(tmp_path: Path) -> None:
-    save_policy(Policy(CONFIG), tmp_path)
+    save_policy(TransformerPolicy(CONFIG), tmp_path)
     tensors = load_file(tmp_path / "policy.safetensors")
-    save_policy(Policy(dataclasses.replace(CONFIG, kind="flow")), tmp_path)
+    save_policy(TransformerPolicy(dataclasses.replace(CONFIG, kind="flow")), tmp_path)
     save_file(tensors, tmp_path / "policy.safetensors")
     with pytest.raises(CheckpointError, match=r"tensors that do not fit the policy: head\."):
         load_policy(tmp_path)

@@ -15,7 +15,8 @@ from clbench.learning.optimise import deterministic
 from clbench.policy.batch import Batch, QuestionBatch
 from clbench.policy.checkpoint import CheckpointError, load_policy, save_policy
 from clbench.policy.flow import FlowHead
-from clbench.policy.policy import Policy, PolicyConfig
+from clbench.policy.policy import PolicyConfig
+from clbench.policy.transformer import TransformerPolicy
 
 CONFIG = PolicyConfig(state_size=5, action_size=3, width=32, layers=2)
 
@@ -36,7 +37,7 @@ def _batch(count: int, seed: int = 0) -> Batch:
 
 
 def test_losses_come_per_sample() -> None:
-    policy, batch = Policy(CONFIG), _batch(7)
+    policy, batch = TransformerPolicy(CONFIG), _batch(7)
     assert policy.action_loss(batch).shape == (7,)
     questions = QuestionBatch(batch.state, batch.words, torch.full((7,), 3))
     assert policy.answer_loss(questions).shape == (7,)
@@ -45,26 +46,26 @@ def test_losses_come_per_sample() -> None:
 
 def test_the_same_batch_gives_the_same_loss_and_the_same_seed_the_same_weights() -> None:
     batch = _batch(4)
-    first, second, other = (Policy(CONFIG, seed=seed).action_loss(batch) for seed in (1, 1, 2))
+    first, second, other = (TransformerPolicy(CONFIG, seed=seed).action_loss(batch) for seed in (1, 1, 2))
     assert first.equal(second)
     assert not first.equal(other)
 
 
 def test_making_a_policy_leaves_the_global_generator_alone() -> None:
     before = torch.get_rng_state()
-    Policy(CONFIG, seed=3)
+    TransformerPolicy(CONFIG, seed=3)
     assert torch.get_rng_state().equal(before)
 
 
 def test_the_flow_loss_is_the_squared_error_of_the_velocity_at_the_drawn_time() -> None:
-    policy, batch = Policy(CONFIG), _batch(6)
+    policy, batch = TransformerPolicy(CONFIG), _batch(6)
     loss = policy.action_loss(batch).detach().numpy()
     # by hand, in NumPy: x_t = t * noise + (1 - t) * action, u = noise - action, t = quantile of Beta(1.5, 1)
     time = stats.beta(1.5, 1).ppf(batch.draw.numpy()).astype(np.float32)
     noise, action = batch.noise.numpy(), batch.action.numpy()
     noisy = time[:, None, None] * noise + (1 - time[:, None, None]) * action
     hidden = policy.hidden_states(batch.state, batch.words)
-    mask = policy.backbone.mask(batch.words)
+    mask = policy.token_mask(batch.words)
     assert isinstance(policy.head, FlowHead)
     velocity = policy.head.velocity(torch.from_numpy(noisy), torch.from_numpy(time), hidden, mask)
     expected = ((velocity.detach().numpy() - (noise - action)) ** 2).mean(axis=(1, 2))
@@ -73,7 +74,7 @@ def test_the_flow_loss_is_the_squared_error_of_the_velocity_at_the_drawn_time() 
 
 def test_the_loss_is_the_mean_over_the_steps_that_count() -> None:
     """The other steps still read a step that does not count, as in a rollout; only its error is left out."""
-    policy, batch = Policy(CONFIG), _batch(3)
+    policy, batch = TransformerPolicy(CONFIG), _batch(3)
     parts = []
     for step in range(CONFIG.chunk):
         valid = torch.zeros(3, CONFIG.chunk)
@@ -89,7 +90,7 @@ def test_the_loss_is_the_mean_over_the_steps_that_count() -> None:
 
 
 def test_detached_hidden_states_stop_the_gradient_at_the_backbone() -> None:
-    policy, batch = Policy(CONFIG), _batch(3)
+    policy, batch = TransformerPolicy(CONFIG), _batch(3)
     hidden = [state.detach() for state in policy.hidden_states(batch.state, batch.words)]
     policy.action_loss(batch, hidden).mean().backward()  # type: ignore[no-untyped-call]
     assert all(parameter.grad is None for parameter in policy.backbone.parameters())
@@ -97,7 +98,7 @@ def test_detached_hidden_states_stop_the_gradient_at_the_backbone() -> None:
 
 
 def test_padding_words_do_not_change_the_actions_of_the_policy() -> None:
-    policy, batch = Policy(CONFIG), _batch(16)
+    policy, batch = TransformerPolicy(CONFIG), _batch(16)
     changed = policy.backbone.words.weight.data.clone()
     before = policy.act(batch.state, batch.words, batch.noise)
     changed[0] += 1.0
@@ -106,7 +107,7 @@ def test_padding_words_do_not_change_the_actions_of_the_policy() -> None:
 
 
 def test_normalisation_follows_the_data_it_is_given() -> None:
-    policy = Policy(CONFIG)
+    policy = TransformerPolicy(CONFIG)
     state = torch.randn(100, 5) * torch.tensor([1.0, 2.0, 3.0, 4.0, 0.0]) + 7
     policy.normalise_like(state, torch.randn(100, 3))
     np.testing.assert_allclose(policy.state_mean, state.numpy().mean(axis=0), rtol=1e-5)
@@ -115,7 +116,7 @@ def test_normalisation_follows_the_data_it_is_given() -> None:
 
 
 def test_a_policy_survives_saving(tmp_path: Path) -> None:
-    policy, batch = Policy(CONFIG, seed=5), _batch(3)
+    policy, batch = TransformerPolicy(CONFIG, seed=5), _batch(3)
     policy.normalise_like(batch.state, batch.action[:, 0])
     save_policy(policy, tmp_path)
     assert load_policy(tmp_path).action_loss(batch).equal(policy.action_loss(batch))
@@ -148,7 +149,7 @@ def _edit(change: Callable[[dict[str, Tensor]], Any]) -> Callable[[Path], None]:
 
 
 def _pickle(folder: Path) -> None:
-    torch.save(Policy(CONFIG).state_dict(), folder / "policy.safetensors")
+    torch.save(TransformerPolicy(CONFIG).state_dict(), folder / "policy.safetensors")
 
 
 def _poison(folder: Path) -> None:
@@ -181,7 +182,7 @@ def _poison(folder: Path) -> None:
 def test_a_damaged_checkpoint_is_refused_by_name(
     tmp_path: Path, damage: Callable[[Path], None], message: str
 ) -> None:
-    save_policy(Policy(CONFIG), tmp_path)
+    save_policy(TransformerPolicy(CONFIG), tmp_path)
     damage(tmp_path)
     with pytest.raises(CheckpointError, match=message) as error:
         load_policy(tmp_path)
@@ -204,14 +205,14 @@ def test_a_batch_without_images_has_a_row_of_no_pixels_for_each_sample() -> None
     batch = _batch(3)
     assert batch.image.shape == (3, 0, 0, 3)
     assert Batch.cat([batch, batch]).image.shape == (6, 0, 0, 3)
-    assert not any("vision" in name for name in Policy(CONFIG).state_dict())
+    assert not any("vision" in name for name in TransformerPolicy(CONFIG).state_dict())
 
 
 def test_a_policy_reads_an_image_in_four_tokens() -> None:
-    policy, batch = Policy(SEEING), _seen(3)
+    policy, batch = TransformerPolicy(SEEING), _seen(3)
     hidden = policy.hidden_states(batch.state, batch.words, batch.image)
     assert hidden[0].shape == (3, 4 + 4 + 1 + 12, 32)
-    assert policy.backbone.mask(batch.words).shape == (3, 1, 1, 21)
+    assert policy.token_mask(batch.words).shape == (3, 1, 1, 21)
     questions = QuestionBatch(batch.state, batch.words, torch.full((3,), 3), batch.image)
     dark = dataclasses.replace(batch, image=torch.zeros_like(batch.image))
     assert policy.action_loss(batch).shape == policy.answer_loss(questions).shape == (3,)
@@ -224,15 +225,15 @@ def test_a_policy_reads_an_image_in_four_tokens() -> None:
 def test_a_policy_with_eyes_refuses_to_act_without_an_image() -> None:
     batch = _batch(2)
     with pytest.raises(ValueError, match=r"image of \(32, 32, 3\), not none: hand over `batch.image`"):
-        Policy(SEEING).hidden_states(batch.state, batch.words)
+        TransformerPolicy(SEEING).hidden_states(batch.state, batch.words)
     with pytest.raises(ValueError, match=r"not \(0, 0, 3\)"):
-        Policy(SEEING).action_loss(batch)
+        TransformerPolicy(SEEING).action_loss(batch)
     with pytest.raises(ValueError, match="image_size must be a multiple of 16, not 30"):
-        Policy(dataclasses.replace(CONFIG, image_size=30))
+        TransformerPolicy(dataclasses.replace(CONFIG, image_size=30))
 
 
 def test_rows_of_a_forward_with_images_do_not_depend_on_their_place() -> None:
-    policy, batch = Policy(SEEING), _seen(40)
+    policy, batch = TransformerPolicy(SEEING), _seen(40)
     order = torch.randperm(40, generator=torch.Generator().manual_seed(1))
     with deterministic():
         chunks = policy.act(batch.state, batch.words, batch.noise, batch.image)
@@ -241,7 +242,7 @@ def test_rows_of_a_forward_with_images_do_not_depend_on_their_place() -> None:
 
 
 def test_a_checkpoint_keeps_the_eyes(tmp_path: Path) -> None:
-    policy, batch = Policy(SEEING, seed=2), _seen(4)
+    policy, batch = TransformerPolicy(SEEING, seed=2), _seen(4)
     save_policy(policy, tmp_path)
     loaded = load_policy(tmp_path)
     assert loaded.config == SEEING

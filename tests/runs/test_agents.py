@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from agents import ID, LEARNED, TOY, Knowing, stage_env, trained
 
+from clbench.policy.transformer import TransformerPolicy
 from clbench.records.reader import read_record
 from clbench.records.record import Costs
 from clbench.runs.agents import evaluate_agent, next_stage
@@ -85,7 +86,6 @@ def test_an_agent_has_the_same_initial_states_as_every_method(
 ) -> None:
     from clbench.evaluation.rollouts import Evaluator
     from clbench.learning.pretraining import policy_config
-    from clbench.policy.policy import Policy
     from clbench.worlds.lanes import Lanes
 
     seen: list[tuple[list[int], list[str]]] = []
@@ -100,7 +100,7 @@ def test_an_agent_has_the_same_initial_states_as_every_method(
     starts = {(name, seed) for seeds, names in seen for seed, name in zip(seeds, names, strict=True)}
     assert len(starts) == len(record.episodes["task"]) == 5 * TOY.budget.test_episodes
     seen.clear()
-    policy = Policy(policy_config(TOY), seed=0).eval()
+    policy = TransformerPolicy(policy_config(TOY), seed=0).eval()
     Evaluator(TOY, 5).evaluate(policy, TOY.tasks, "test")
     assert {(name, seed) for seeds, names in seen for seed, name in zip(seeds, names, strict=True)} == starts
 

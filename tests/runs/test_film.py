@@ -243,12 +243,12 @@ FETCH = """
 import sys
 from pathlib import Path
 from clbench.runs.film import shoot
-from clbench.policy.policy import Policy
+from clbench.policy.transformer import TransformerPolicy
 from clbench.learning.pretraining import policy_config
 from clbench.spec.registry import load_scenario
 
 scenario = load_scenario("clbench/Fetch-v1")
-policy = Policy(policy_config(scenario), seed=3)
+policy = TransformerPolicy(policy_config(scenario), seed=3)
 ((take,),) = shoot(scenario, 0, [policy], [(scenario.task("push"), "validation", 0)], 96)
 print(take.episode.length, len({picture.tobytes() for picture in take.pictures}), *take.pictures[0].size)
 """

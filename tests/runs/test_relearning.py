@@ -15,6 +15,7 @@ from clbench.evaluation.rollouts import Evaluator
 from clbench.learning.method import Method
 from clbench.policy.batch import Batch
 from clbench.policy.policy import Policy
+from clbench.policy.transformer import TransformerPolicy
 from clbench.records.record import Record, Relearning
 from clbench.runs.checkpoints import stage_policies
 from clbench.runs.length import run_length
@@ -141,7 +142,7 @@ def test_adapters_are_relearned_with_all_that_they_adapt(tmp_path: Path) -> None
         assert ("lora_" in name) or torch.equal(before, after), name
 
 
-class Broken(Policy):
+class Broken(TransformerPolicy):
     """A policy that cannot be fine-tuned: its loss is not finite."""
 
     def action_loss(self, batch: Batch, hidden: list[torch.Tensor] | None = None) -> torch.Tensor:
@@ -153,7 +154,8 @@ class Breaking(Method):
     """A method that learns targets and leaves such a policy."""
 
     def loss(self, policy: Policy, batch: Batch, progress: object) -> torch.Tensor:
-        return Policy.action_loss(policy, batch).mean()
+        assert isinstance(policy, TransformerPolicy)
+        return TransformerPolicy.action_loss(policy, batch).mean()
 
     def load_state(self, policy: Policy, state: object) -> None:
         policy.__class__ = Broken

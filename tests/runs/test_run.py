@@ -73,7 +73,7 @@ class Adapting(Method):
         policy.register_parameter("scale", torch.nn.Parameter(torch.zeros(3)))
 
     def start_task(self, policy: Policy, stage: Stage) -> Any:
-        policy.backbone.words.weight.requires_grad_(False)
+        policy.get_parameter("backbone.words.weight").requires_grad_(False)
         return [parameter for parameter in policy.parameters() if parameter.requires_grad]
 
     def loss(self, policy: Policy, batch: Any, progress: Any) -> Tensor:

@@ -22,7 +22,7 @@ from clbench.learning.optimise import deterministic, optimise
 from clbench.learning.pretraining import policy_config, pretrained_policy, pretraining_inputs
 from clbench.learning.registry import method_names
 from clbench.learning.trainer import Trainer
-from clbench.policy.policy import Policy
+from clbench.policy.transformer import TransformerPolicy
 from clbench.spec.registry import load_scenario
 from clbench.testing.seen_toy import SEEN_TOY
 from clbench.testing.toy_camera import ToyCamera
@@ -201,7 +201,7 @@ def test_an_agent_of_the_scenario_sees_the_picture_and_no_more() -> None:
 
 
 def test_a_policy_learns_facts_that_only_the_picture_shows() -> None:
-    policy = Policy(policy_config(SEEN_TOY), seed=0)
+    policy = TransformerPolicy(policy_config(SEEN_TOY), seed=0)
     assert (policy.config.state_size, policy.config.image_size) == (1, 16)
     asked = load_questions(SEEN_TOY)[0].sample(32, torch.Generator().manual_seed(0))
     asked = dataclasses.replace(asked, state=torch.zeros_like(asked.state))

@@ -1,0 +1,52 @@
+"""The kinds of policies: from a name to a class."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+from clbench.base.entry_points import resolve
+from clbench.base.errors import InputError, WrongTypeError
+from clbench.policy.policy import Policy, PolicyConfig
+from clbench.policy.transformer import TransformerPolicy
+from clbench.spec.policies import POLICIES, check_policy
+
+
+def policy_class(kind: str) -> type[Policy]:
+    """Return the class of a kind of policy: a built-in name, or "module:Class", which is imported.
+
+    Raises:
+        UnknownNameError: There is no such kind.
+        WrongTypeError: The object of this name is not a policy.
+    """
+    check_policy(kind)
+    if kind in POLICIES:
+        return TransformerPolicy
+    cls = resolve(kind)
+    if not (isinstance(cls, type) and issubclass(cls, Policy)):
+        raise WrongTypeError(f"{kind!r} is not a subclass of clbench.Policy.")
+    return cls
+
+
+def new_policy(config: PolicyConfig, seed: int = 0) -> Policy:
+    """Return a policy of the configured kind, with initial weights that depend on the seed alone."""
+    return policy_class(config.kind)(config, seed)
+
+
+def check_abilities(kind: str, needs: Iterable[str], method: str) -> None:
+    """Refuse a policy that lacks what a method needs.
+
+    Args:
+        kind: Kind of the policy.
+        needs: Abilities that the method needs.
+        method: Name of the method, for the message.
+
+    Raises:
+        InputError: The policy lacks some of them.
+    """
+    offered = policy_class(kind).abilities
+    missing = sorted(set(needs) - offered)
+    if missing:
+        raise InputError(
+            f"{method} needs a policy with the abilities {', '.join(sorted(needs))}; {kind} lacks "
+            f"{', '.join(missing)}."
+        )

@@ -1,0 +1,296 @@
+"""The contract of a policy, checked on the toy in seconds; `docs/guide/your_policy.md` describes it.
+
+    def test_my_policy() -> None:
+        check_policy("my_policy:MyPolicy")
+
+`clbench.testing.policy_checks` returns a check for each clause, as `method_checks` does for methods.
+"""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+import tempfile
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from clbench.learning.optimise import deterministic, optimise
+from clbench.policy.batch import Batch
+from clbench.policy.checkpoint import load_policy, save_policy
+from clbench.policy.kinds import new_policy, policy_class
+from clbench.policy.policy import Policy, PolicyConfig
+from clbench.testing.error import ContractError
+from clbench.testing.global_state import GENERATORS, read, same
+from clbench.testing.small import SMALL, toy_questions, toy_source
+
+SAMPLES = 6
+"""Samples in a batch that the checks look at."""
+
+LEARNING_STEPS = 80
+"""Optimiser steps within which the loss on the toy's demonstrations must fall by `LEAST_FALL`."""
+
+LEAST_FALL = 0.25
+"""Least share by which the loss falls. The built-in policies lose 94 and 90 % of it in these steps."""
+
+PAGE = "docs/guide/your_policy.md"
+
+
+def check_policy(kind: str) -> None:
+    """Check on the toy's data that a policy keeps the protocol of `clbench.Policy`.
+
+    Args:
+        kind: Kind of the policy: a built-in name, or "module:Class".
+
+    Raises:
+        UnknownNameError: There is no such kind.
+        WrongTypeError: The class is not a subclass of `clbench.Policy`.
+        ContractError: The policy breaks a clause; the message shows the expected and the actual behaviour,
+            and the place to look at.
+    """
+    for check in policy_checks(kind):
+        check()
+
+
+def policy_checks(kind: str) -> list[PolicyCheck]:
+    """Return a check for each clause of the contract, for `pytest.mark.parametrize(..., ids=str)`."""
+    subject = Subject(kind)
+    return [PolicyCheck(clause, subject) for clause in CLAUSES]
+
+
+@dataclass(frozen=True, eq=False)
+class PolicyCheck:
+    """One clause of the contract for one policy; call it to check."""
+
+    clause: Callable[[Subject], None]
+    """Clause, one of `CLAUSES`."""
+    subject: Subject
+    """Policy to check."""
+
+    def __call__(self) -> None:
+        """Check the clause.
+
+        Raises:
+            ContractError: The policy breaks the clause.
+        """
+        with deterministic():
+            self.clause(self.subject)
+
+    def __str__(self) -> str:
+        return self.clause.__name__
+
+
+class Subject:
+    """A policy, and samples to look at it with.
+
+    Args:
+        kind: Kind of the policy.
+    """
+
+    def __init__(self, kind: str) -> None:
+        self.cls = policy_class(kind)
+        self.config: PolicyConfig = dataclasses.replace(SMALL, kind=kind)
+
+    def build(self, seed: int = 0) -> Policy:
+        """Return a new policy, normalised like the toy's demonstrations."""
+        policy, (state, action) = new_policy(self.config, seed), self.known
+        policy.normalise_like(state, action)
+        return policy
+
+    @cached_property
+    def known(self) -> tuple[Tensor, Tensor]:
+        """States (N, S) and actions (N, A) of the toy's demonstrations."""
+        drawn = toy_source("left", "up").sample(500)
+        return drawn.state, drawn.action[:, 0]
+
+    @cached_property
+    def batch(self) -> Batch:
+        """Some samples; in the first one, the last actions do not count."""
+        drawn = toy_source("left", "up").sample(SAMPLES)
+        valid = drawn.valid.clone()
+        valid[0, self.config.chunk // 2 :] = 0
+        return dataclasses.replace(drawn, valid=valid)
+
+
+# ---- the clauses -------------------------------------------------------------------------------------------
+
+
+def initial_weights(subject: Subject) -> None:
+    """The initial weights depend on the seed alone, and leave the global generators as they are."""
+    before = read(GENERATORS)
+    first = new_policy(subject.config, 1).state_dict()
+    for name, value in read(GENERATORS).items():
+        if not same(value, before[name]):
+            raise _breach(
+                initial_weights, "the global generators to stay as they are", f"{name} changed", "__init__()"
+            )
+    torch.rand(1)
+    second, other = (new_policy(subject.config, seed).state_dict() for seed in (1, 2))
+    if not _equal(first, second):
+        found = "two policies with seed 1 have different weights"
+        raise _breach(initial_weights, "weights that depend on the seed alone", found, "__init__()")
+    if _equal(first, other):
+        found = "the seeds 1 and 2 give the same weights"
+        raise _breach(initial_weights, "weights that depend on the seed", found, "__init__()")
+
+
+def losses(subject: Subject) -> None:
+    """`action_loss` returns one loss per sample, a function of that sample and of the weights alone."""
+    policy, batch = subject.build(), subject.batch
+    loss = policy.action_loss(batch)
+    _check_shape(losses, loss, (SAMPLES,), "action_loss()")
+    if not bool(torch.isfinite(loss).all()):
+        raise _breach(losses, "finite losses", str(loss.tolist()), "action_loss()")
+    if not loss.equal(policy.action_loss(batch)):
+        expected = "equal losses on the same batch: all draws come with it, in `draw` and `noise`"
+        raise _breach(losses, expected, "other losses at the second call", "action_loss()")
+    for row in range(SAMPLES):
+        alone = policy.action_loss(batch[row : row + 1])
+        if not torch.allclose(alone, loss[row : row + 1], rtol=1e-3, atol=1e-5):
+            found = f"sample {row} has {loss[row].item():.4g} in the batch, {alone.item():.4g} alone"
+            raise _breach(losses, "losses that do not depend on the other samples", found, "action_loss()")
+    whole = policy.action_loss(dataclasses.replace(batch, valid=torch.ones_like(batch.valid)))
+    if whole[0].equal(loss[0]):
+        expected = "the mean over the steps where `valid` is 1"
+        raise _breach(losses, expected, "a loss that does not depend on `valid`", "action_loss()")
+
+
+def gradients(subject: Subject) -> None:
+    """The mean of the losses has a finite gradient."""
+    policy = subject.build()
+    torch.autograd.backward(policy.action_loss(subject.batch).mean())
+    found = [parameter.grad for parameter in policy.parameters() if parameter.grad is not None]
+    if not any(bool(gradient.abs().sum() > 0) for gradient in found):
+        raise _breach(gradients, "a gradient in the parameters", "none that is not 0", "action_loss()")
+    if not all(bool(torch.isfinite(gradient).all()) for gradient in found):
+        raise _breach(gradients, "finite gradients", "some that are not", "action_loss()")
+
+
+def actions(subject: Subject) -> None:
+    """`act` and `predict` return chunks that depend on their arguments and on the weights alone."""
+    policy, batch = subject.build().eval(), subject.batch
+    size = (SAMPLES, subject.config.chunk, subject.config.action_size)
+    before = read(GENERATORS)
+    chunk = policy.act(batch.state, batch.words, batch.noise)
+    _check_shape(actions, chunk, size, "act()")
+    _check_shape(actions, policy.predict(batch), size, "predict()")
+    again = policy.act(batch.state, batch.words, batch.noise)
+    untouched = all(same(value, before[name]) for name, value in read(GENERATORS).items())
+    if not (chunk.equal(again) and untouched):
+        expected = "the same actions for the same arguments: `noise` is the only source of chance"
+        raise _breach(actions, expected, "other actions, or draws from a global generator", "act()")
+    if chunk.requires_grad:
+        raise _breach(actions, "no gradient: use @torch.inference_mode()", "a tensor with one", "act()")
+    for row in range(SAMPLES):
+        alone = policy.act(batch.state[row : row + 1], batch.words[row : row + 1], batch.noise[row : row + 1])
+        if not torch.allclose(alone, chunk[row : row + 1], rtol=1e-3, atol=1e-3):
+            found = f"sample {row} gets other actions alone"
+            raise _breach(actions, "actions that do not depend on the other samples", found, "act()")
+
+
+def learning(subject: Subject) -> None:
+    """The policy learns the toy's demonstrations, and then reads the state and the words."""
+    policy, source = subject.build(), toy_source("left", "up", seed=1)
+    batch = toy_source("left", "up", seed=2).sample(200)
+    before = float(policy.action_loss(batch).detach().mean())
+    policy.train()
+    optimise(
+        policy.parameters(),
+        2e-3,
+        LEARNING_STEPS,
+        lambda _: policy.action_loss(source.sample(source.batch_size)).mean(),
+    )
+    policy.eval()
+    after = float(policy.action_loss(batch).detach().mean())
+    if not after <= (1 - LEAST_FALL) * before:
+        expected = f"a loss of at most {(1 - LEAST_FALL) * before:.3g} after {LEARNING_STEPS} steps"
+        raise _breach(learning, expected, f"{after:.3g}, with {before:.3g} before", "action_loss()")
+    words = toy_source("left").sample(SAMPLES).words, toy_source("up").sample(SAMPLES).words
+    seen = batch[:SAMPLES]
+    left, up = (policy.act(seen.state, told, seen.noise).mean(dim=(0, 1)) for told in words)
+    if not (left[0] < up[0] and left[1] < up[1]):
+        found = f"mean actions {left.tolist()} for `go left` and {up.tolist()} for `go up`"
+        raise _breach(learning, "actions that follow the instruction", found, "act()")
+
+
+def checkpoints(subject: Subject) -> None:
+    """Weights and normalisation are all that a checkpoint must hold."""
+    policy, batch = subject.build(3).eval(), subject.batch
+    with tempfile.TemporaryDirectory() as folder:
+        save_policy(policy, Path(folder))
+        loaded = load_policy(Path(folder), kind=subject.config.kind).eval()
+    for name, other in (("loaded", loaded), ("copied", copy.deepcopy(policy))):
+        if not other.act(batch.state, batch.words, batch.noise).equal(
+            policy.act(batch.state, batch.words, batch.noise)
+        ):
+            expected = "all that `act` needs in parameters and buffers"
+            raise _breach(checkpoints, expected, f"a {name} policy acts otherwise", "register_buffer()")
+
+
+def abilities(subject: Subject) -> None:
+    """The policy has the abilities that it declares, and no others."""
+    policy, batch = subject.build(), subject.batch
+    unknown = sorted(subject.cls.abilities - ABILITIES.keys())
+    if unknown:
+        expected = f"abilities among {', '.join(ABILITIES)}"
+        raise _breach(abilities, expected, ", ".join(unknown), "abilities")
+    for name, check in ABILITIES.items():
+        if name in subject.cls.abilities:
+            check(policy, batch)
+
+
+def hidden_states(policy: Policy, batch: Batch) -> None:
+    """The hidden states are what the head reads."""
+    hidden, mask = policy.hidden_states(batch.state, batch.words), policy.token_mask(batch.words)
+    _check_shape(abilities, mask, (SAMPLES, 1, 1, hidden[0].shape[1]), "token_mask()")
+    if len(hidden) != len(policy.backbone_layers):
+        found = f"{len(hidden)} hidden states, {len(policy.backbone_layers)} layers"
+        raise _breach(abilities, "one hidden state per layer of the backbone", found, "backbone_layers")
+    if not torch.allclose(policy.action_loss(batch, hidden), policy.action_loss(batch), rtol=1e-4):
+        expected = "the same loss with the hidden states handed over"
+        raise _breach(abilities, expected, "another loss", "action_loss(batch, hidden)")
+    ours = {id(parameter) for parameter in policy.head.parameters()}
+    if not ours or not ours <= {id(parameter) for parameter in policy.parameters()}:
+        raise _breach(abilities, "an action head with parameters of the policy", "none", "head")
+    torch.autograd.backward(policy.action_loss(batch, [state.detach() for state in hidden]).mean())
+    others = [parameter for parameter in policy.parameters() if id(parameter) not in ours]
+    if any(parameter.grad is not None and parameter.grad.abs().sum() > 0 for parameter in others):
+        found = "detached hidden states leave a gradient outside of it"
+        raise _breach(abilities, "a gradient in the head alone", found, "action_loss(batch, hidden)")
+
+
+def answers(policy: Policy, batch: Batch) -> None:
+    """The policy answers questions with a word of its vocabulary."""
+    questions = toy_questions().sample(SAMPLES)
+    logits = policy.answer_logits(questions.state, questions.words)
+    _check_shape(abilities, logits, (SAMPLES, policy.config.vocabulary_size), "answer_logits()")
+    loss = policy.answer_loss(questions)
+    if not torch.allclose(loss, F.cross_entropy(logits, questions.answer, reduction="none"), rtol=1e-4):
+        raise _breach(abilities, "the cross-entropy of each right answer", "another loss", "answer_loss()")
+
+
+ABILITIES: dict[str, Callable[[Policy, Batch], None]] = {"hidden_states": hidden_states, "answers": answers}
+"""The check of each ability."""
+
+CLAUSES = (initial_weights, losses, gradients, actions, learning, checkpoints, abilities)
+"""The clauses of the contract, in the order of the checks."""
+
+
+def _breach(clause: Callable[[Subject], None], expected: str, found: str, look: str) -> ContractError:
+    name = clause.__name__.replace("_", " ")
+    return ContractError(name, expected, found, look, subject="policy", page=PAGE)
+
+
+def _check_shape(clause: Callable[[Subject], None], value: object, shape: tuple[int, ...], look: str) -> None:
+    found = tuple(value.shape) if isinstance(value, Tensor) else type(value).__name__
+    if found != shape:
+        raise _breach(clause, f"a tensor of shape {shape}", str(found), look)
+
+
+def _equal(one: dict[str, Tensor], other: dict[str, Tensor]) -> bool:
+    return one.keys() == other.keys() and all(value.equal(other[name]) for name, value in one.items())
