@@ -65,6 +65,7 @@ class FastDVLA(Method):
     """Vector to merge: "capability", or "random" for the control."""
 
     uses = Uses(demonstrations="prepare", questions="prepare")
+    needs = ("answers",)
     metadata = Metadata(link="https://arxiv.org/abs/2603.25661")
     tunes = ("orthogonal", (1e-2, 1.0))
 

@@ -29,8 +29,9 @@ COMMANDS = {
         "metrics": "clbench.cli.catalogue:metrics",
         "film": "clbench.cli.film:film",
     },
-    "Add a method": {
-        "new-method": "clbench.cli.new_method:new_method",
+    "Add a method or a policy": {
+        "new-method": "clbench.cli.scaffold:new_method",
+        "new-policy": "clbench.cli.scaffold:new_policy",
         "submit": "clbench.leaderboard.cli:submit",
         "tune": "clbench.cli.tune:tune",
         "verify": "clbench.leaderboard.cli:verify",

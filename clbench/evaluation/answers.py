@@ -18,12 +18,16 @@ def answer(
 ) -> list[tuple[str, int, int]]:
     """Return the name of each kind of question, the number of its questions, and of correct answers.
 
+    A policy that cannot answer is asked nothing.
+
     Args:
         policy: Policy that answers with the most likely word of the whole vocabulary.
         kinds: All kinds of questions.
         kind: Index of each question's kind, (B,).
         questions: B questions.
     """
+    if "answers" not in policy.abilities:
+        return [(entry.name, 0, 0) for entry in kinds]
     right = []
     device = policy.device
     for start in range(0, len(questions), LANES):

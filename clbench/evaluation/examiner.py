@@ -61,7 +61,7 @@ class Examiner:
         return scored_questions(questions, self._scenario.budget.test_questions)
 
     @cached_property
-    def _anchor(self) -> Gaussian:
+    def _anchor(self) -> Gaussian | None:
         """Hidden states of the pretrained policy on the scored questions."""
         return self._activations(self._pretrained)
 
@@ -83,13 +83,12 @@ class Examiner:
             record.add_episode(episode_row(point, episode))
         for kind, asked, correct in answer(policy, self._data.questions.kinds, *self._asked):
             record.add_answers(AnswerRow(*point, kind, asked, correct))
-        drift = float(self._activations(policy).distance(self._anchor).mean())
         moved = captured = None
         if velocities_before is not None:
             moved = self._shift(policy, point.stage, velocities_before)
             captured = self._captured(policy, point.stage)
         sparsity = update_sparsity(policy, self._pretrained)
-        record.add_policy(PolicyRow(*point, sparsity, drift, moved, captured))
+        record.add_policy(PolicyRow(*point, sparsity, self._drift(policy), moved, captured))
 
     def velocities(self, policy: Policy, stage: int) -> Tensor:
         """Return the velocities (B, H, A) that `policy` predicts on a fixed batch of a stage's target."""
@@ -110,7 +109,14 @@ class Examiner:
         policy.train()
         return episodes
 
-    def _activations(self, policy: Policy) -> Gaussian:
+    def _drift(self, policy: Policy) -> float | None:
+        """Return how far the hidden states are from the pretrained ones, None for a policy without any."""
+        now, anchor = self._activations(policy), self._anchor
+        return None if now is None or anchor is None else float(now.distance(anchor).mean())
+
+    def _activations(self, policy: Policy) -> Gaussian | None:
+        if "hidden_states" not in policy.abilities:
+            return None
         return activations(policy, self._asked[1].to(self._device))
 
     def _shift(self, policy: Policy, stage: int, before: Tensor) -> float | None:

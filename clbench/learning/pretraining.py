@@ -156,6 +156,8 @@ def pretrain(
 ) -> Policy:
     """Return the policy of `pretrained_policy`, trained now even if it is in the cache or ships.
 
+    A class of policies with pretrained weights of its own is not trained.
+
     Args:
         scenario: Scenario of the retained tasks and the questions.
         seed: Seed of the weights and of every draw.
@@ -165,6 +167,9 @@ def pretrain(
     config, budget = policy_config(scenario), scenario.budget
     questions, _ = load_questions(scenario)
     policy = new_policy(config, seed=derive_seed("weights", seed))
+    if policy.pretrained:
+        progress(budget.pretraining_steps)
+        return policy
     parts = [load_demonstrations(task, scenario, config) for task in scenario.pretrained]
     demonstrations = Demonstrations.cat(parts) if parts else None
     if demonstrations is not None:
@@ -185,9 +190,10 @@ def pretrain(
     def loss_at(step: int) -> Tensor:
         if demonstrations is None:
             return policy.answer_loss(questions.sample(budget.batch_size // 2, generator)).mean()
-        batch = demonstrations.sample(budget.batch_size, generator)
-        asked = questions.sample(budget.batch_size // 2, generator)
-        return policy.action_loss(batch).mean() + policy.answer_loss(asked).mean()
+        loss = policy.action_loss(demonstrations.sample(budget.batch_size, generator)).mean()
+        if "answers" not in policy.abilities:
+            return loss
+        return loss + policy.answer_loss(questions.sample(budget.batch_size // 2, generator)).mean()
 
     def after(step: int) -> None:
         watch(policy, step)

@@ -76,6 +76,8 @@ class Policy(nn.Module, ABC):
 
     abilities: ClassVar[frozenset[str]] = frozenset()
     """Abilities that the policy has, of "hidden_states" and "answers"."""
+    pretrained: ClassVar[bool] = False
+    """Whether a new policy has pretrained weights of its own, which clbench then uses as they are."""
     head: nn.Module
     """The action head, whose parameters belong to the policy; with the ability "hidden_states"."""
 

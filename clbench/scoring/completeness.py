@@ -8,6 +8,7 @@ from collections.abc import Iterable, Sequence
 from clbench.records.reader import RecordError
 from clbench.records.record import Record
 from clbench.scoring.reading import Row
+from clbench.spec.policies import POLICIES
 from clbench.spec.protocol import EpisodeKey, Point, Protocol
 
 
@@ -15,7 +16,7 @@ def check_complete(record: Record, rows: Iterable[Row], protocol: Protocol) -> N
     """Refuse a record that is not what its budget demands: results that are left out change the scores.
 
     A method of whole stages, and an agent that learned online, is evaluated at the ends of stages alone. An
-    agent has no answers and no changes of the policy.
+    agent has no answers and no changes of the policy, and a policy that is not built in may have no answers.
 
     Args:
         record: The record; its values have been checked one by one.
@@ -27,7 +28,10 @@ def check_complete(record: Record, rows: Iterable[Row], protocol: Protocol) -> N
     """
     points = _check_episodes(rows, protocol)
     online = bool(record.run.uses.get("online"))
-    _check_answers(record, points, 0 if online else record.scenario.budget.get("test_questions", 0))
+    demanded = 0 if online else record.scenario.budget.get("test_questions", 0)
+    if record.run.policy not in POLICIES and not sum(record.answers["asked"]):
+        demanded = 0
+    _check_answers(record, points, demanded)
     moved = [Point(*place) for place in zip(record.policy["stage"], record.policy["step"], strict=True)]
     _check_points("policy", moved, () if online else points)
 

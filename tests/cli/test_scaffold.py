@@ -1,4 +1,4 @@
-"""`clbench new-method`: two files that work as they are, and names that are refused with the reason."""
+"""`clbench new-method` and `new-policy`: files that work as they are, and names that are refused."""
 
 import re
 import subprocess
@@ -8,11 +8,15 @@ from pathlib import Path
 
 import pytest
 
-from clbench.cli.new_method import class_name, write_method
+from clbench.base.errors import InputError
+from clbench.cli.scaffold import class_name, write_method, write_policy
 from clbench.learning.registry import load_method
+from clbench.records.reader import read_record
 from clbench.runs.run import execute
 from clbench.runs.spec import RunSpec
-from clbench.testing import check_method
+from clbench.scoring.metrics import measure
+from clbench.scoring.scores import Scores
+from clbench.testing import check_method, check_policy
 
 
 def _python(*arguments: str, folder: Path) -> subprocess.CompletedProcess[str]:
@@ -43,6 +47,69 @@ def test_a_fresh_template_is_linted_and_formatted_by_ruffs_own_settings(
 ) -> None:
     result = _python("ruff", command[0], "--isolated", "freshly_written.py", *command[1:], folder=tmp_path)
     assert result.returncode == 0, result.stdout + result.stderr
+
+
+@pytest.fixture
+def fresh_policy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
+    """Write a new policy and return its kind."""
+    write_policy("fresh_policy", tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    yield "fresh_policy:FreshPolicy"
+    sys.modules.pop("fresh_policy", None)
+
+
+def test_a_fresh_policy_keeps_the_contract(fresh_policy: str) -> None:
+    check_policy(fresh_policy)
+
+
+@pytest.mark.usefixtures("fresh_policy")
+@pytest.mark.parametrize("command", [("check", "--select=A,B,E,F,I,N,RUF,UP,W"), ("format", "--check")])
+def test_a_fresh_policy_is_linted_and_formatted_by_ruffs_own_settings(
+    command: tuple[str, ...], tmp_path: Path
+) -> None:
+    result = _python("ruff", command[0], "--isolated", "fresh_policy.py", *command[1:], folder=tmp_path)
+    assert result.returncode == 0, result.stdout + result.stderr
+
+
+@pytest.mark.parametrize("method", ["sft", "experience_replay", "lora", "consft"])
+def test_methods_fine_tune_a_fresh_policy(method: str, fresh_policy: str, tmp_path: Path) -> None:
+    spec = RunSpec("clbench.testing:clbench/Toy-v0", method, 0, policy=fresh_policy)
+    record = execute(spec, tmp_path / "records")
+    assert (record.status, record.run.policy) == ("success", fresh_policy)
+    path = tmp_path / "records" / "Toy-v0+fresh_policy.FreshPolicy" / method / "seed-0.json"
+    scores = Scores.from_record(read_record(path))
+    # it cannot answer, and shows no hidden states
+    assert measure("question_retention", scores) is None
+    assert measure("activation_drift", scores) is None
+    learned = measure("adaptation", scores)
+    assert learned is not None
+    assert learned > 0.5
+
+
+def test_a_method_whose_need_a_fresh_policy_lacks_is_refused_by_name(fresh_policy: str) -> None:
+    for method, lacks in (
+        ("aegis", "hidden_states"),
+        ("stop_gradient", "hidden_states"),
+        ("joint", "answers"),
+    ):
+        with pytest.raises(InputError, match=f"{method} needs .*; fresh_policy:FreshPolicy lacks {lacks}"):
+            RunSpec("clbench.testing:clbench/Toy-v0", method, 0, policy=fresh_policy).resolve()
+
+
+def test_new_policy_prints_the_next_steps(tmp_path: Path) -> None:
+    result = _python("clbench", "new-policy", "diffusion", folder=tmp_path)
+    assert result.stdout.splitlines() == [
+        "Wrote diffusion.py and test_diffusion.py. Make the policy yours, then:",
+        "  python -m pytest test_diffusion.py",
+        "  clbench run clbench/Fetch-v1 sft --policy diffusion:Diffusion",
+    ]
+    tested = _python("pytest", "--collect-only", "-q", "test_diffusion.py", folder=tmp_path)
+    assert "test_diffusion_keeps_the_contract" in tested.stdout
+
+
+def test_a_policy_cannot_be_named_like_a_built_in_one(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"'flow' is a built-in policy\. Did you mean 'my_flow'"):
+        write_policy("flow", tmp_path)
 
 
 def test_the_command_prints_the_next_steps(tmp_path: Path) -> None:
