@@ -56,8 +56,13 @@ class LoRA(Method):
         linear = [
             name
             for name, module in policy.named_modules()
-            if isinstance(module, nn.Linear) and ".layers." in name
+            if isinstance(module, nn.Linear) and "layers" in name.split(".")
         ]
+        if not linear:
+            raise TypeError(
+                f"lora adapts linear maps inside modules that are called `layers`: {type(policy).__name__} "
+                "has none."
+            )
         config = LoraConfig(
             r=self.rank,
             lora_alpha=self.alpha,  # type: ignore[arg-type]
