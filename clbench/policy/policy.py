@@ -62,6 +62,8 @@ def new_head(config: PolicyConfig) -> ActionHead:
 class Policy(nn.Module):
     """A small vision-language-action model: state, image and words in, action chunks and answers out.
 
+    Its parameters are in two modules: `backbone`, which also answers questions, and `head`, the action head.
+
     If a policy sees images, each function that takes states also takes images, uint8 (B, N, N, 3).
 
     Args:
@@ -112,6 +114,10 @@ class Policy(nn.Module):
     def action_loss(self, batch: Batch, hidden: list[Tensor] | None = None) -> Tensor:
         """Return the head's loss of each sample, (B,).
 
+        A flow head has the mean squared error of its velocities, `(predict(batch) - (noise - action)) ** 2`
+        with normalised actions, over the dimensions of the valid actions. A discrete-diffusion head has the
+        mean cross-entropy of the masked tokens of the valid actions.
+
         Args:
             batch: Demonstrated action chunks.
             hidden: Hidden states to use instead of `hidden_states(batch.state, batch.words, batch.image)`:
@@ -123,7 +129,12 @@ class Policy(nn.Module):
         return self.head.loss(action, batch.valid, batch.draw, batch.noise, hidden, mask)
 
     def predict(self, batch: Batch) -> Tensor:
-        """Return what the head predicts at the noisy chunks, (B, H, A), to compare policies of one kind."""
+        """Return what the head predicts at the noisy chunks, (B, H, A), to compare policies of one kind.
+
+        A flow head predicts the velocity from the normalised action to the noise, `noise - action`; a
+        discrete-diffusion head predicts the normalised action. Actions that are not valid have predictions
+        too: leave them out with `batch.valid`.
+        """
         hidden = self.hidden_states(batch.state, batch.words, batch.image)
         action = (batch.action - self.action_mean) / self.action_std
         mask = self.backbone.mask(batch.words)
