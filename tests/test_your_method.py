@@ -117,3 +117,18 @@ def test_synaptic_intelligence_watches_the_pretraining_and_keeps_more_skills_tha
     assert held.costs.bytes_kept == 2 * 4 * (held.costs.parameters or 0)
     retained = [one.matrix()["retained"].iloc[-1].mean() for one in (plain, held)]
     assert retained[1] > retained[0] + 0.5
+
+
+@pytest.mark.slow
+def test_the_default_of_synaptic_intelligence_protects_skills_and_learns(
+    blocks: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    toy = "clbench.testing.fetch_toy:clbench/FetchToy-v0"
+    plain, held = (
+        clbench.run(toy, method, seeds=1, records=tmp_path / "records")[0].matrix().iloc[-1]
+        for method in ("sft", "si:SI")
+    )
+    assert plain["retained"].mean() <= 0.2
+    assert held["retained"].mean() >= 0.5
+    assert held["target"].mean() >= 0.3

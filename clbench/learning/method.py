@@ -76,14 +76,14 @@ class Stage:
 
 @dataclass(frozen=True)
 class Progress:
-    """Progress of the adaptation to a target."""
+    """Progress of a stage, or of the pretraining in `watch_pretraining`."""
 
     step: int
-    """Number of optimiser steps done in this stage."""
+    """Number of optimiser steps done."""
     steps: int
-    """Number of optimiser steps in the whole stage, at most."""
+    """Number of optimiser steps of the whole stage, at most, or of the whole pretraining."""
     to_criterion: bool = False
-    """Whether the stage ends as soon as the target is learned."""
+    """Whether the stage ends as soon as the target is learned; False in the pretraining."""
 
 
 @dataclass(kw_only=True, eq=False)
@@ -112,9 +112,12 @@ class Method:
     def watch_pretraining(self, policy: Policy, progress: Progress) -> None:
         """Look at the pretraining: before its first step, as step 0, and after each step.
 
-        For a method that overrides it, the pretraining is repeated before `prepare`, and its steps count as
-        the method's. `parameter.grad` holds the clipped gradients of the step just taken. Change nothing, and
-        return from `state` what later hooks need. `uses` must declare prior demonstrations.
+        If a method overrides this hook, the pretraining is repeated before `prepare`, in every scenario, and
+        its steps count as the method's. The loss of the pretraining is the mean action loss on the skills
+        (and the background, if there is one) plus the mean answer loss on questions; without skills, it is
+        the answer loss alone. `parameter.grad` holds the clipped gradient of the step just taken. Change
+        nothing. Another object runs `prepare`: it gets what `state` returns after the last step. `uses` must
+        declare prior demonstrations, and need not declare questions.
         """
 
     def prepare(self, policy: Policy, prior: Prior) -> int | None:
@@ -148,15 +151,24 @@ class Method:
         """Merge or consolidate after a target."""
 
     def state(self) -> MethodState:
-        """Return everything that later hooks need, tensors and plain values by name; its bytes count as kept.
+        """Return everything that later hooks need; the bytes of its tensors count as kept.
 
         Every stage begins with a new object of the method that receives only this state, whether or not the
         run was interrupted.
+
+        Returns:
+            A flat dictionary of tensors, texts, numbers, truth values and None. `**vars(batch)` stores the
+            tensors of a `Batch`, and `Batch(**state)` makes it again.
         """
         return {}
 
     def load_state(self, policy: Policy, state: MethodState) -> None:
-        """Restore what `state` returned, and add to a plain policy what `prepare` added, such as adapters."""
+        """Restore what `state` returned, and add to a plain policy what `prepare` added, such as adapters.
+
+        Args:
+            policy: Plain policy. It may get its weights, and its device, only afterwards: use neither here.
+            state: What `state` returned, with its tensors on the run's device.
+        """
         if state:
             raise WrongTypeError(f"{type(self).__name__} returns a state() but has no load_state().")
 

@@ -21,7 +21,8 @@ class Uses:
     """Prior data that a method may use, and when. The trainer provides nothing else."""
 
     demonstrations: Access = "never"
-    """Access to demonstrations of the retained skills and of earlier targets; the source may be empty."""
+    """Access to demonstrations of the retained skills and, with "throughout", of earlier targets; the source
+    may be empty."""
     questions: Access = "never"
     """Access to the training questions."""
     reference: bool = False
@@ -71,14 +72,22 @@ class Nothing:
 
 
 class Source(Generic[Rows]):
-    """Data with its own random stream. It closes when the hooks that received it have ended.
+    """Data to draw from with replacement, with its own random stream.
+
+    Every draw first chooses a task, all equally likely, then one of its moments and one of its wordings. For
+    questions it chooses a kind, one of its answers, and then a state with this answer.
+
+    The source of `prepare` closes after `prepare`, the sources of a stage after `end_task`.
 
     Args:
         data: Data to draw from.
         generator: Random generator of the draws.
-        batch_size: Number of samples per step in the budget.
+        batch_size: Number of samples of the target in a step.
         device: Device of the samples.
     """
+
+    batch_size: int
+    """Largest number of samples of the target in a step: the budget of all methods."""
 
     def __init__(
         self,
@@ -93,6 +102,7 @@ class Source(Generic[Rows]):
         self._device = device
 
     def __len__(self) -> int:
+        """Return the number of different moments, or of states for questions; 0 if there is no data."""
         return len(self._open)
 
     @property
@@ -101,9 +111,13 @@ class Source(Generic[Rows]):
         return self._open.bytes
 
     def sample(self, count: int) -> Rows:
-        """Return `count` samples.
+        """Return `count` samples, each with new random draws for the loss.
+
+        Args:
+            count: Number of samples; it may exceed `len(source)`.
 
         Raises:
+            MissingDataError: There is no data.
             UndeclaredAccessError: The hooks that received the source have ended.
         """
         rows: Rows = self._open.sample(count, self._generator).to(self._device)

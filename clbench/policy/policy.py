@@ -69,6 +69,9 @@ class Policy(nn.Module, ABC):
       `head` reads its hidden states, and `action_loss` accepts them as `hidden`.
     - "answers": `answer_logits` answers questions about the scene.
 
+    The built-in policies have both. Their parameters are in two modules: `backbone`, which also answers
+    questions, and `head`, the action head.
+
     Args:
         config: Sizes of the policy.
         seed: Seed of the initial weights; the state of the global generator must not change.
@@ -111,6 +114,10 @@ class Policy(nn.Module, ABC):
     def action_loss(self, batch: Batch, hidden: list[Tensor] | None = None) -> Tensor:
         """Return the loss of each sample, (B,), on demonstrated action chunks.
 
+        A flow head has the mean squared error of its velocities, `(predict(batch) - (noise - action)) ** 2`
+        with normalised actions, over the dimensions of the valid actions. A discrete-diffusion head has the
+        mean cross-entropy of the masked tokens of the valid actions.
+
         Args:
             batch: Demonstrated action chunks.
             hidden: Hidden states to use instead of `hidden_states(batch.state, batch.words, batch.image)`:
@@ -119,7 +126,12 @@ class Policy(nn.Module, ABC):
 
     @abstractmethod
     def predict(self, batch: Batch) -> Tensor:
-        """Return what the policy predicts in its loss, (B, H, A), to compare policies of one kind."""
+        """Return what the policy predicts in its loss, (B, H, A), to compare policies of one kind.
+
+        A flow head predicts the velocity from the normalised action to the noise, `noise - action`; a
+        discrete-diffusion head predicts the normalised action. Actions that are not valid have predictions
+        too: leave them out with `batch.valid`.
+        """
 
     @abstractmethod
     def act(self, state: Tensor, words: Tensor, noise: Tensor, image: Tensor | None = None) -> Tensor:

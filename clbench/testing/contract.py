@@ -50,8 +50,13 @@ method that moves least, `finch`, gains 2.1."""
 PRIOR = ("demonstrations", "questions")
 """Kinds of prior data, by the fields of `Uses`."""
 
-_KINDS = {"uses": Uses, "metadata": Metadata, "whole_stages": bool}
-"""Types of the declarations of a class besides its hyper-parameters."""
+_KINDS: dict[str, tuple[Any, str]] = {
+    "uses": (Uses, "a Uses"),
+    "metadata": (Metadata, "a Metadata"),
+    "tunes": (tuple | None, "a tuple, the name of a hyper-parameter and two values of it, or None"),
+    "whole_stages": (bool, "a bool"),
+}
+"""Types of the declarations of a class besides its hyper-parameters, with their descriptions."""
 
 
 def check_method(cls: type[Method], *, policy: str = DEFAULT_POLICY, **settings: Any) -> None:
@@ -164,10 +169,10 @@ def declaration(subject: Subject) -> None:
 def _check_declared(cls: type[Method]) -> None:
     """Check the declarations of the class besides its hyper-parameters."""
     fields = {field.name for field in dataclasses.fields(cls)}
-    for name, kind in _KINDS.items():
+    for name, (kind, words) in _KINDS.items():
         value = getattr(cls, name)
         if not isinstance(value, kind):
-            raise _breach(declaration, f"{name} to be a {kind.__name__}", repr(value), name)
+            raise _breach(declaration, f"{name} to be {words}", repr(value), name)
         if name in fields:
             expected = f"`{name} = ...` without an annotation, which would make it a hyper-parameter"
             raise _breach(declaration, expected, f"{name} is a field of the dataclass", name)

@@ -23,6 +23,7 @@ from clbench.learning.pretraining import pretrained_policy
 from clbench.learning.prior import Prior, Source, UndeclaredAccessError
 from clbench.learning.trainer import Trainer, repeatable
 from clbench.learning.watching import watches
+from clbench.policy.batch import Batch, QuestionBatch
 from clbench.policy.checkpoint import CheckpointError
 from clbench.policy.policy import Policy
 from clbench.spec.policies import DEFAULT_POLICY
@@ -52,6 +53,7 @@ UNSEEDED = ("state", "diagnostics")
 """Hooks that may not draw at random."""
 
 SOUND = {
+    "watch_pretraining": "watch_pretraining() to change nothing",
     "start_task": "an iterable of the policy's parameters, or of optimiser groups of them",
     "loss": "a finite scalar tensor that has a gradient",
     "gradients": "finite gradients of the trained parameters",
@@ -162,6 +164,11 @@ class ToyRun:
         method = self._build()
         self.uses = method.uses
         if watches(type(method)):  # in the cache after the first run
+            if method.uses.demonstrations == "never":
+                expected = (
+                    'a method with watch_pretraining() to declare `uses = Uses(demonstrations="prepare")`'
+                )
+                raise ContractError("declared data", expected, 'demonstrations="never"', "uses")
             self.draws.add(("demonstrations", "prepare"))
         for hook in HOOKS:
             # an attribute of the object takes precedence over the hook of its class, even if it is frozen
@@ -237,7 +244,10 @@ class ToyRun:
             if not isinstance(name, str):
                 raise _bad_state("names that are text", repr(name))
             if not (value is None or isinstance(value, Tensor | str | float | int)):
-                raise _bad_state("tensors and plain values", f"a {type(value).__name__}, {name!r}")
+                found = f"a {type(value).__name__}, {name!r}"
+                if isinstance(value, Batch | QuestionBatch):
+                    found += "; store its tensors, {**vars(batch)}, and restore them, Batch(**state)"
+                raise _bad_state("a flat dictionary of tensors, texts, numbers, truth values and None", found)
             if self.trainer.where != "watch_pretraining":  # a later run has it from the cache
                 self._keep(self.trainer.where, f"state {name!r}", value)
         return state

@@ -102,14 +102,15 @@ def test_a_method_that_only_looks_keeps_the_contract() -> None:
 
 
 @pytest.mark.parametrize(
-    ("method", "message"),
+    ("method", "message", "look"),
     [
-        (Meddling, r"watch_pretraining\(\) changed the pretraining: .* is another"),
-        (Undeclared, r"declare `uses = Uses\(demonstrations=\"prepare\"\)`"),
+        (Meddling, r"watch_pretraining\(\) changed the pretraining: .* is another", "watch_pretraining()"),
+        (Undeclared, r"declare `uses = Uses\(demonstrations=\"prepare\"\)`", "uses"),
     ],
 )
 def test_a_method_that_meddles_or_does_not_declare_its_data_is_refused(
-    method: type[clbench.Method], message: str
+    method: type[clbench.Method], message: str, look: str
 ) -> None:
-    with pytest.raises(ContractError, match=message):
+    with pytest.raises(ContractError, match=message) as caught:
         check_method(method)
+    assert caught.value.look == look

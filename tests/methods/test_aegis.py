@@ -177,7 +177,7 @@ def _by_hand(
 ) -> tuple[Any, list[list[float]]]:
     """Return a method, and the gradients that it sets if loss and distance have these, layer by layer."""
     layers = [nn.Linear(len(values), 1, bias=False) for values in gradients]
-    policy: Any = SimpleNamespace(backbone=SimpleNamespace(layers=layers))
+    policy: Any = SimpleNamespace(backbone_layers=layers)
 
     def linear(slopes: list[list[float]]) -> Tensor:
         parts = zip(layers, slopes, strict=True)
@@ -276,20 +276,3 @@ def test_the_diagnostics_have_the_distance_at_eleven_steps_from_the_first_to_the
     again = method.diagnostics()["anchor_distance"]
     assert len(set(again)) == 2
     assert not set(again) & {float(distance) for distance in distances}  # of this stage alone
-
-
-@pytest.mark.parametrize(
-    ("spec", "name"),
-    [
-        ("aegis", "AEGIS"),
-        ("stop_gradient", "stop_gradient"),
-        ("knowledge_insulation", "knowledge_insulation"),
-    ],
-)
-def test_a_policy_without_hidden_states_is_refused_by_name(spec: str, name: str) -> None:
-    class Opaque(nn.Module):
-        pass
-
-    policy: Any = Opaque()
-    with pytest.raises(TypeError, match=f"{name} needs the hidden states .*; Opaque has no hidden_states"):
-        build_method(spec, {}).prepare(policy, Prior({"questions": toy_questions()}))

@@ -21,6 +21,14 @@ from clbench.policy.policy import Policy
 
 
 @dataclasses.dataclass
+class AnnotatedStrength(Method):
+    """Makes the name of its strength a hyper-parameter."""
+
+    strength: float = 1.0
+    tunes: tuple[str, tuple[float, float]] = ("strength", (0.1, 10.0))  # type: ignore[misc] # the fault
+
+
+@dataclasses.dataclass
 class Demanding(Method):
     """Has a hyper-parameter without a default."""
 
@@ -142,6 +150,17 @@ class Structured(Method):
 
     def state(self) -> MethodState:
         return {"losses": [0.5]}  # type: ignore[dict-item] # the fault
+
+
+@dataclasses.dataclass
+class Bundles(Method):
+    """Has a batch as state."""
+
+    def end_task(self, policy: Policy, stage: Stage) -> None:
+        self.buffer = stage.target.sample(4)
+
+    def state(self) -> MethodState:
+        return {"buffer": self.buffer} if hasattr(self, "buffer") else {}  # type: ignore[dict-item] # the fault
 
 
 @dataclasses.dataclass
@@ -272,6 +291,7 @@ class Backwards(Method):
 
 
 FAULTS_OF_STATE: list[tuple[Any, str, str, str]] = [
+    (AnnotatedStrength, "declaration", "without an annotation", "tunes is a field of the dataclass"),
     (Demanding, "constructor", "a default for every hyper-parameter", "rate has none"),
     (Prepared, "constructor", "only hyper-parameters to be stored", "it sets buffer"),
     (Rounding, "constructor", "to be kept unchanged", "rate=0.5 becomes 0"),
@@ -290,7 +310,13 @@ FAULTS_OF_STATE: list[tuple[Any, str, str, str]] = [
     (Reseeds, "seeding", "draw, but do not seed", "after batch() numpy.random is in the same state"),
     (Anchored, "state", "a new object that has only what load_state() sets", "no attribute 'anchor'"),
     (Restarts, "state", "state() to return everything that later stages need", "differs in stage 2 (down)"),
-    (Structured, "state", "tensors and plain values", "a list, 'losses'"),
+    (Structured, "state", "a flat dictionary of tensors, texts, numbers", "a list, 'losses'"),
+    (
+        Bundles,
+        "state",
+        "a flat dictionary of tensors",
+        "a Batch, 'buffer'; store its tensors, {**vars(batch)}",
+    ),
     (OneWay, "state", "load_state() to run without an error", "returns a state() but has no load_state()"),
     (Grows, "state", "load_state() to add to a plain policy what prepare() added", "scale"),
     (Draws, "global state", "as it was", "after diagnostics() Python's random generator was moved"),

@@ -387,6 +387,27 @@ def test_prior_data_may_be_drawn_at_few_steps() -> None:
     check_method(Seldom)
 
 
+@dataclasses.dataclass
+class Generous(Method):
+    """Draws more than there is, but of the target no more than a batch in a step."""
+
+    uses = Uses(demonstrations="throughout")
+
+    def start_task(self, policy: Policy, stage: Stage) -> Iterable[nn.Parameter]:
+        self.batches = [one.sample(2 * len(one)) for one in (stage.target, stage.prior.demonstrations)]
+        return policy.parameters()
+
+    def batch(self, target: Source[Batch], prior: Prior) -> Batch:
+        return Batch.cat([target.sample(target.batch_size), prior.demonstrations.sample(99), *self.batches])
+
+    def end_task(self, policy: Policy, stage: Stage) -> None:
+        stage.target.sample(2 * len(stage.target))
+
+
+def test_only_the_draws_of_the_target_in_a_step_are_limited() -> None:
+    check_method(Generous)
+
+
 CHECKS = method_checks(Sound)
 
 

@@ -36,8 +36,9 @@ class MethodTemplate(Method):
             raise ValueError(f"share must be above 0 and at most 1, not {self.share}.")
 
     # Override what differs from plain fine-tuning; this hook is an example. The others
-    # are prepare, start_task, batch, gradients, learning_rate, end_task, diagnostics,
-    # and state with load_state: every stage begins with a new object of the class.
+    # are watch_pretraining, prepare, start_task, batch, gradients, learning_rate,
+    # end_task, diagnostics, and state with load_state: every stage begins with a new
+    # object of the class, which has only what load_state sets.
     # help(clbench.Method) describes their arguments and results.
     def loss(self, policy: Policy, batch: Batch, progress: Progress) -> Tensor:
         """Return the mean of the lowest losses."""
