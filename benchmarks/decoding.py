@@ -1,8 +1,9 @@
 """Decoders of a discrete-diffusion policy: success, forwards and time, `python benchmarks/decoding.py`.
 
 The teacher is the policy pretrained on Fetch-v1; students with blocks of 1, 2 and 4 steps learn from it in a
-tenth of its steps. Success counts on the skills' validation episodes. For time, decoders take turns on chunks
-of one observation each, from the demonstrations; a ratio compares two decoders in one round.
+tenth of its steps. Success counts on the skills' validation episodes, with one teacher for each seed. For
+time, decoders of the first seed take turns on chunks of one observation each, from the demonstrations; a ratio
+compares two decoders in one round. The board and claim F6 read the results, leaderboard/decoding.json.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -35,6 +37,7 @@ from clbench.policy.policy import Policy, PolicyConfig
 from clbench.spec.registry import load_scenario
 
 SCENARIO = "clbench/Fetch-v1"
+BOARD = Path(__file__).parents[1] / "leaderboard"
 PEER = f"easy first, {EASY_FIRST_STEPS} forwards"
 PIPELINE = "pipeline, blocks of 1 step"
 WIDTHS = (96, 192, 384, 768, 1536)
@@ -82,8 +85,8 @@ def decoding(entry: Entry, decode: Callable[..., Tensor] | None = None) -> Itera
         head.decoder = own
 
 
-def success(entry: Entry, episodes: int, seed: int) -> float:
-    """Return the success on validation episodes of the skills."""
+def successes(entry: Entry, episodes: int, seed: int) -> list[bool]:
+    """Return the outcomes of the skills' validation episodes, in the same order for every entry."""
     scenario = load_scenario(SCENARIO)
     each = -(-episodes // len(scenario.retained))
     budget = dataclasses.replace(scenario.budget, validation_episodes=each)
@@ -91,7 +94,14 @@ def success(entry: Entry, episodes: int, seed: int) -> float:
     with decoding(entry, entry.decode_many) as policy, repeatable("cpu"):
         outcomes = evaluator.evaluate(policy, scenario.retained, "validation")
     evaluator.close()
-    return sum(one.success for one in outcomes) / len(outcomes)
+    return [one.success for one in outcomes]
+
+
+def difference(ours: list[bool], theirs: list[bool], generator: np.random.Generator) -> list[float]:
+    """Return the difference of success in paired episodes, and its 95 % bootstrap interval."""
+    apart = np.subtract(ours, theirs, dtype=np.float64)
+    drawn = generator.choice(apart, size=(2000, len(apart))).mean(axis=1)
+    return [round(float(value), 4) for value in (apart.mean(), *np.percentile(drawn, [2.5, 97.5]))]
 
 
 def seconds(entry: Entry, batch: Batch) -> float:
@@ -115,24 +125,46 @@ def work_of(entry: Entry, batch: Batch) -> list[Work]:
 
 
 def by_width(spans: list[tuple[int, int]], rounds: int, generator: np.random.Generator) -> dict[str, Any]:
-    """Return the time of easy-first decoding as a ratio to that of the spans, by width of the policy."""
-    found = {}
-    for width in WIDTHS:
-        config = PolicyConfig(25, 4, width=width)
-        sizes = (config.action_size, config.chunk, width, config.layers, config.heads)
-        whole, in_blocks = DiscreteDiffusionHead(*sizes), DiscreteDiffusionHead(*sizes, block=1)
-        hidden = [torch.randn(1, 17, width) for _ in range(config.layers)]
-        mask = torch.ones(1, 1, 1, 17, dtype=torch.bool)
-        ratios = []
-        with torch.inference_mode():
-            for _ in range(rounds + 1):
-                begin = time.perf_counter()
-                easy_first(whole, hidden, mask)
-                middle = time.perf_counter()
-                _repeat(in_blocks, hidden, mask, spans)
-                ratios.append((middle - begin) / (time.perf_counter() - middle))
-        found[str(width)] = median_ratio(ratios[1:], generator)
-    return found
+    """Return times of the head as ratios, by width of the policy.
+
+    `chunk`: easy-first decoding to the given forwards with kept keys. `forward`: a forward of all tokens to
+    one of a block.
+    """
+    return {
+        str(width): {
+            name: median_ratio(ratios, generator) for name, ratios in _at(width, spans, rounds).items()
+        }
+        for width in WIDTHS
+    }
+
+
+@torch.inference_mode()
+def _at(width: int, spans: list[tuple[int, int]], rounds: int) -> dict[str, list[float]]:
+    """Return the ratios of `by_width` in each round, at one width."""
+    config = PolicyConfig(25, 4, width=width)
+    sizes = (config.action_size, config.chunk, width, config.layers, config.heads)
+    whole, in_blocks = DiscreteDiffusionHead(*sizes), DiscreteDiffusionHead(*sizes, block=1)
+    hidden = [torch.randn(1, 17, width) for _ in range(config.layers)]
+    mask = torch.ones(1, 1, 1, 17, dtype=torch.bool)
+    tokens = torch.full((1, whole.length), whole.bins)
+    block, keys = tokens[:, : config.action_size], in_blocks.begin(hidden)
+    works: dict[str, tuple[Callable[[], object], Callable[[], object]]] = {
+        "chunk": (lambda: easy_first(whole, hidden, mask), lambda: _repeat(in_blocks, hidden, mask, spans)),
+        "forward": (
+            lambda: [whole.logits(tokens, hidden, mask) for _ in range(EASY_FIRST_STEPS)],
+            lambda: [in_blocks.go_on(block, 0, keys, mask) for _ in range(EASY_FIRST_STEPS)],
+        ),
+    }
+    return {
+        name: [_time(peer) / _time(ours) for _ in range(rounds + 1)][1:]
+        for name, (peer, ours) in works.items()
+    }
+
+
+def _time(work: Callable[[], object]) -> float:
+    begin = time.perf_counter()
+    work()
+    return time.perf_counter() - begin
 
 
 def _repeat(
@@ -146,11 +178,33 @@ def _repeat(
         forward(tokens[:, first:end], after).softmax(dim=2).max(dim=2)
 
 
+def entries_of(seed: int) -> tuple[dict[str, Entry], Demonstrations]:
+    """Return the decoders of the policy pretrained with `seed`, and the demonstrations of its skills."""
+    scenario = load_scenario(SCENARIO).with_policy("discrete_diffusion")
+    teacher, _ = pretrained_policy(scenario, seed)
+    data = {task.name: load_demonstrations(task, scenario, teacher.config) for task in scenario.pretrained}
+    every = Demonstrations.cat(list(data.values()))
+    students = {
+        block: distilled(teacher, every, scenario.budget, torch_generator("distillation", seed), block)
+        for block in track((1, 2, 4), description=f"distillation, seed {seed}")
+    }
+    return entries(teacher, students), Demonstrations.cat([data[task.name] for task in scenario.retained])
+
+
+def timed(found: dict[str, Entry], batch: Batch, rounds: int) -> dict[str, list[float]]:
+    """Return the seconds per chunk of each decoder in each round; a first round warms up."""
+    times: dict[str, list[float]] = {name: [] for name in found}
+    for number in track(range(rounds + 1), description="time"):
+        for name in sorted(found, key=lambda name: derive_seed("order", f"{name} {number}")):
+            times[name].append(seconds(found[name], batch) / len(batch))
+    return {name: one[1:] for name, one in times.items()}
+
+
 def parse() -> argparse.Namespace:
     """Return the options."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--seed", type=int, default=0, help="seed of the pretrained policy")
-    parser.add_argument("--episodes", type=int, default=200, help="episodes on the skills for each decoder")
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("--seeds", type=int, default=3, help="number of pretrained policies")
+    parser.add_argument("--episodes", type=int, default=200, help="episodes of each decoder and seed")
     parser.add_argument("--rounds", type=int, default=15, help="rounds in which decoders take turns")
     parser.add_argument("--chunks", type=int, default=40, help="chunks of each decoder in a round")
     return parser.parse_args()
@@ -160,46 +214,36 @@ def main() -> None:
     """Measure, and write the results."""
     options = parse()
     torch.set_num_threads(1)
-    scenario = load_scenario(SCENARIO).with_policy("discrete_diffusion")
-    teacher, _ = pretrained_policy(scenario, options.seed)
-    data = {task.name: load_demonstrations(task, scenario, teacher.config) for task in scenario.pretrained}
-    every = Demonstrations.cat(list(data.values()))
-    skills = Demonstrations.cat([data[task.name] for task in scenario.retained])
-    students = {
-        block: distilled(
-            teacher, every, scenario.budget, torch_generator("distillation", options.seed), block
-        )
-        for block in track((1, 2, 4), description="distillation")
-    }
-    batch = skills.sample(options.chunks, torch_generator("benchmark", "decoding"))
-    found = entries(teacher, students)
-    works = {name: work_of(entry, batch) for name, entry in found.items()}
-    times: dict[str, list[float]] = {name: [] for name in found}
-    for number in track(range(options.rounds + 1), description="time"):  # the first round warms up
-        for name in sorted(found, key=lambda name: derive_seed("order", f"{name} {number}")):
-            times[name].append(seconds(found[name], batch) / len(batch))
     generator = np.random.default_rng(0)
-    rows = {}
-    for name in track(found, description="success"):
-        pairs = zip(times[PEER][1:], times[name][1:], strict=True)
-        rows[name] = {
-            "success": round(success(found[name], options.episodes, options.seed), 4),
-            "forwards": float(np.mean([len(work.spans) for work in works[name]])),
-            "tokens": float(np.mean([work.tokens for work in works[name]])),
-            "milliseconds": round(1000 * float(np.median(times[name][1:])), 2),
-            "speed_up": median_ratio([peer / own for peer, own in pairs], generator),
+    outcomes: dict[str, list[bool]] = {}
+    for seed in reversed(range(options.seeds)):
+        found, skills = entries_of(seed)
+        for name in track(found, description=f"success, seed {seed}"):
+            outcomes[name] = outcomes.get(name, []) + successes(found[name], options.episodes, seed)
+    batch = skills.sample(options.chunks, torch_generator("benchmark", "decoding"))
+    works = {name: work_of(entry, batch) for name, entry in found.items()}
+    times = timed(found, batch, options.rounds)
+    rows = {
+        name: {
+            "success": round(float(np.mean(outcomes[name])), 4),
+            "success_difference": difference(outcomes[name], outcomes[PEER], generator),
+            "forwards": round(float(np.mean([len(work.spans) for work in works[name]])), 2),
+            "tokens": round(float(np.mean([work.tokens for work in works[name]])), 2),
+            "milliseconds": round(1000 * float(np.median(times[name])), 2),
+            "speed_up": median_ratio(np.divide(times[PEER], times[name]).tolist(), generator),
         }
+        for name in found
+    }
     typical = sorted(works[PIPELINE], key=lambda work: work.tokens)[len(batch) // 2].spans
-    write_results(
-        "decoding",
-        SCENARIO,
-        {
-            "episodes": options.episodes,
-            "rounds": options.rounds,
-            "decoders": rows,
-            "speed_up_of_the_head_by_width": by_width(typical, options.rounds, generator),
-        },
-    )
+    values = {
+        "scenario": SCENARIO,
+        "seeds": options.seeds,
+        "episodes": len(outcomes[PEER]),
+        "rounds": options.rounds,
+        "decoders": rows,
+        "by_width": by_width(typical, options.rounds, generator),
+    }
+    write_results("decoding", SCENARIO, values, BOARD)
 
 
 if __name__ == "__main__":

@@ -14,18 +14,19 @@ from clbench.spec.registry import load_scenario
 FOLDER = Path(__file__).parent / "results"
 
 
-def write_results(name: str, scenario: str, values: Mapping[str, Any]) -> None:
-    """Write results/`name`.json.
+def write_results(name: str, scenario: str, values: Mapping[str, Any], folder: Path = FOLDER) -> None:
+    """Write `name`.json.
 
     Args:
         name: Name of the benchmark.
         scenario: Id of the scenario whose fingerprint names the hardware.
         values: Measured values by name.
+        folder: Folder of the file: results/, unless the board reads it too.
     """
     hardware = fingerprint(load_scenario(scenario))["hardware"]
     result = {"clbench": clbench.__version__, "hardware": hardware, **values}
-    FOLDER.mkdir(exist_ok=True)
-    (FOLDER / f"{name}.json").write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+    folder.mkdir(exist_ok=True)
+    (folder / f"{name}.json").write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
 
 
 def read_results(name: str) -> Any:

@@ -15,7 +15,6 @@ from rich.text import Text
 from ..board.commands import run_command
 from ..claims.claim import Verdict
 from ..claims.evidence import LEAST_SEEDS, Figure
-from ..claims.fast_dvla import LATER
 from ..claims.judges import Judged
 from ..views.format import MISSING, format_interval
 from ..views.markdown import templates
@@ -44,7 +43,6 @@ def page(judged: Sequence[Judged]) -> str:
         tally=_tally(judged),
         judged=judged,
         papers=groupby(by_claim, key=lambda pair: pair[0].paper),
-        later=LATER,
         not_used=list(refused.values()),
         missing=_missing,
     )

@@ -16,10 +16,13 @@ from typing import Any
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 from clbench.base.text import printable
+from clbench.records.paths import parts_of
 from clbench.scoring.intervals import Estimate
 from clbench.scoring.metric import Metric
 
+from ..board.decoders import read_decoding
 from ..board.overall import overall
+from ..board.policies import by_table
 from ..board.rows import Row, Table
 from .format import (
     MISSING,
@@ -54,6 +57,9 @@ def markdown(table: Table) -> str:
         shown=shown,
         all_shown=_all_shown(by_scenario.values()),
         agreement_text=agreement_text,
+        comparisons=by_table(table.rows),
+        decoding=read_decoding(),
+        policy_of=lambda place: parts_of(place)[1],
         start_text=start_text,
         prediction_text=prediction_text,
         direction=_direction,

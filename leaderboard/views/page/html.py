@@ -15,6 +15,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
 from clbench.base.text import counted
+from clbench.records.paths import parts_of
 from clbench.spec.identifiers import folder_name
 
 from ...board.overall import overall
@@ -116,6 +117,7 @@ def _templates() -> Environment:
         tiers=TIERS,
         tier_rules=TIER_RULES,
         title_of=title_of,
+        policy_of=lambda place: parts_of(place)[1],
         counted=counted,
         format_interval=format_interval,
         number_text=number_text,

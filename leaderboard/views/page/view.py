@@ -18,7 +18,9 @@ from clbench.scoring.metrics import METRICS
 from clbench.scoring.scores import rates_of
 from clbench.spec.identifiers import built_in_methods
 
+from ...board.decoders import Decoding, read_decoding
 from ...board.frontier import Curve
+from ...board.policies import Comparison, by_table
 from ...board.rows import Row, Table, standing_of
 from ...board.summary import DIVISIONS, METHODS
 from ..descriptions import Description, describe
@@ -240,6 +242,10 @@ class ScenarioView:
     """Sentence on what the pretrained policy can do, empty if there is none."""
     agreement: str
     """Sentence on how alike two halves of the seeds order the methods, empty if it is not known."""
+    comparisons: tuple[Comparison, ...]
+    """The same methods with the default policy; none for a table of that policy."""
+    decoding: Decoding | None
+    """Decoders of the policy; None where there are none to choose among."""
 
     @property
     def table(self) -> list[Row]:
@@ -285,6 +291,7 @@ class ScenarioView:
 def scenarios(table: Table) -> list[ScenarioView]:
     """Return the view of each scenario."""
     found = []
+    comparisons, decoding = by_table(table.rows), read_decoding()
     for scenario, members in groupby(table.rows, key=lambda row: row.scenario):
         rows = list(members)
         layout, published = rows[0].runs[0].scores.layout, rows[0].runs[0].published
@@ -304,6 +311,8 @@ def scenarios(table: Table) -> list[ScenarioView]:
                 table.frontiers.get(scenario, ()),
                 start_text(table.starts.get(scenario)),
                 agreement_text(table.agreements.get(scenario)),
+                comparisons.get(scenario, ()),
+                decoding if decoding and scenario == decoding.place else None,
             )
         )
     return found
