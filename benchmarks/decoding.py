@@ -2,8 +2,8 @@
 
 The teacher is the policy pretrained on Fetch-v1; students with blocks of 1, 2 and 4 steps learn from it in a
 tenth of its steps. Success counts on the skills' validation episodes, with one teacher for each seed. For
-time, decoders of the first seed take turns on chunks of one observation each, from the demonstrations; a ratio
-compares two decoders in one round. The board and claim F6 read the results, leaderboard/decoding.json.
+time, decoders of the first seed take turns on chunks of one observation each, from the demonstrations; a
+ratio compares two decoders in one round. The board and claim F6 read leaderboard/decoding.json.
 """
 
 from __future__ import annotations

@@ -174,8 +174,8 @@ def vector_transfers(evidence: Evidence) -> Finding:
     "F6",
     FAST_DVLA,
     reported="2.65 to 4.1 times the speed of decoding without it, at equal success; 30 Hz on a robot",
-    rule="One chunk at a time, the fastest pipeline of a distilled student against easy-first decoding in 12 "
-    "forwards. Holds if the lower end of the speed-up is at least 2.65 and the lower end of the difference in "
+    rule="One chunk at a time, the fastest pipeline of a distilled student against easy-first decoding in "
+    "12 forwards. Holds if the lower end of the speed-up is at least 2.65 and that of the difference in "
     "success at least -0.03; does not hold if one of the upper ends is below. Cannot be shown here if it "
     "would not hold, success is equal, and a forward of all tokens takes less than 1.5 times as long as one "
     "of a block: the time is then that of forwards, whatever their tokens.",
