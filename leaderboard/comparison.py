@@ -44,7 +44,7 @@ def compare(
             after the other, see `clbench.run`.
         seeds: Number of seeds.
         first_seed: The first seed.
-        policy: Kind of the policy: "flow" or "discrete_diffusion".
+        policy: Name of the policy, such as "discrete_diffusion", "flow-base" or "module:Class".
         records: Folder of the records. Those of other methods are not read.
         workers: Number of runs at once, each a process with one thread; all cores if None.
         device: Device on which policies are computed, for example "cpu" or "cuda".

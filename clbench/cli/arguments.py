@@ -17,7 +17,7 @@ from rich.text import Text
 from clbench.base.entry_points import unknown
 from clbench.base.errors import ClbenchError
 from clbench.base.text import printable
-from clbench.spec.policies import POLICIES
+from clbench.spec.policies import SIZES, policy_names
 
 
 def whole_number(least: int) -> Parameter:
@@ -51,8 +51,12 @@ def _known_methods(_: object) -> tuple[str, ...]:
 
 
 def _known_policies(_: object) -> tuple[str, ...]:
-    """Return the kinds of policies."""
-    return tuple(POLICIES)
+    """Return the names of the built-in policies."""
+    return tuple(policy_names())
+
+
+def _known_sizes(_: object) -> tuple[str, ...]:
+    return tuple(SIZES)
 
 
 ScenarioId = Annotated[str, Parameter(completer=_known_scenarios)]
@@ -60,8 +64,11 @@ ScenarioId = Annotated[str, Parameter(completer=_known_scenarios)]
 MethodName = Annotated[str, Parameter(completer=_known_methods)]
 """Name of a method on the command line."""
 
-PolicyKind = Annotated[str, Parameter(completer=_known_policies)]
-"""Kind of a policy on the command line."""
+PolicyName = Annotated[str, Parameter(completer=_known_policies)]
+"""Name of a policy on the command line."""
+
+PolicySize = Annotated[str, Parameter(completer=_known_sizes)]
+"""Size of a policy on the command line."""
 
 AsJson = Annotated[bool, Parameter(name="--json", negative="")]
 """Switch of a command that can print JSON instead of tables."""

@@ -13,14 +13,15 @@ from rich.table import Table
 
 from clbench.base.errors import InputError
 from clbench.cli.arguments import (
-    PolicyKind,
+    PolicyName,
+    PolicySize,
     ScenarioId,
     add_cwd_to_path,
     checked_input,
     whole_number,
 )
 from clbench.jobs.folders import check_folders
-from clbench.spec.policies import DEFAULT_POLICY
+from clbench.spec.policies import DEFAULT_POLICY, SMALL, policy_name
 
 if TYPE_CHECKING:
     from clbench.data.expert_rates import Measurement
@@ -73,7 +74,8 @@ def pretrain(
     scenario: ScenarioId,
     /,
     *,
-    policy: PolicyKind = DEFAULT_POLICY,
+    policy: PolicyName = DEFAULT_POLICY,
+    policy_size: PolicySize = SMALL,
     seed: Annotated[int, whole_number(0)] = 0,
     ship: Annotated[bool, Parameter(negative="")] = False,
 ) -> None:
@@ -83,7 +85,8 @@ def pretrain(
 
     Args:
         scenario: Gymnasium id of the scenario.
-        policy: Kind of the policy: flow or discrete_diffusion.
+        policy: flow, discrete_diffusion, or a class of your own as module:Class.
+        policy_size: small, base (5 million parameters) or large (40 million) for the built-in ones.
         seed: Seed of the policy.
         ship: Copy the policy to clbench/pretrained/, so that it ships with the package. Needs a checkout.
     """
@@ -93,7 +96,7 @@ def pretrain(
 
     add_cwd_to_path()
     with checked_input():
-        loaded = load_scenario(scenario).with_policy(policy)
+        loaded = load_scenario(scenario).with_policy(policy_name(policy, policy_size))
         if ship and not (SHIPPED.parents[1] / "pyproject.toml").is_file():
             raise InputError("--ship needs a checkout of clbench: it does not change an installed package.")
     length = loaded.budget.pretraining_steps + vision_steps(loaded)

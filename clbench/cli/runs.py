@@ -16,7 +16,8 @@ from clbench.base.errors import InputError
 from clbench.base.text import counted, printable_lines
 from clbench.cli.arguments import (
     MethodName,
-    PolicyKind,
+    PolicyName,
+    PolicySize,
     ScenarioId,
     add_cwd_to_path,
     check_names,
@@ -24,7 +25,7 @@ from clbench.cli.arguments import (
     whole_number,
 )
 from clbench.records.paths import RECORDS
-from clbench.spec.policies import DEFAULT_POLICY
+from clbench.spec.policies import DEFAULT_POLICY, SMALL, policy_name
 
 if TYPE_CHECKING:
     from clbench.jobs.job import Workers
@@ -41,7 +42,8 @@ def run(
     seeds: Annotated[int, whole_number(1)] = 3,
     first_seed: Annotated[int, whole_number(0)] = 0,
     order: Annotated[int, whole_number(0)] = 0,
-    policy: PolicyKind = DEFAULT_POLICY,
+    policy: PolicyName = DEFAULT_POLICY,
+    policy_size: PolicySize = SMALL,
     perturb: Annotated[bool, Parameter(negative="")] = False,
     workers: Annotated[int | None, whole_number(1)] = None,
     shard: str = "1/1",
@@ -69,7 +71,8 @@ def run(
         order: Order in which the targets are learned. 0 is the published order, which the rows of the
             leaderboard use. Other numbers are permutations: from them the leaderboard reports how much scores
             depend on the order.
-        policy: Kind of the policy: flow or discrete_diffusion. Each kind has rows of its own.
+        policy: flow, discrete_diffusion, or a class of your own as module:Class. Each has rows of its own.
+        policy_size: small, base (5 million parameters) or large (40 million) for the built-in ones.
         perturb: Also evaluate the skills and each new target in perturbed worlds: other start poses, heavier
             or lighter objects and, in pictures, another camera and light. Such a record replaces a record
             without perturbed episodes, as it holds the same episodes and more.
@@ -97,7 +100,8 @@ def run(
         check_device(device)
         if tensorboard:
             require_tensorboard()
-        spec = RunSpec("", "", first_seed, changes or {}, device, order=order, perturb=perturb, policy=policy)
+        name = policy_name(policy, policy_size)
+        spec = RunSpec("", "", first_seed, changes or {}, device, order=order, perturb=perturb, policy=name)
         runs = requested(scenarios, methods, every, seeds, spec, records)
         chosen = _part(shard, runs)
     console = Console(stderr=True, quiet=quiet)

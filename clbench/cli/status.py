@@ -17,7 +17,8 @@ from clbench.base.text import printable
 from clbench.cli.arguments import (
     AsJson,
     MethodName,
-    PolicyKind,
+    PolicyName,
+    PolicySize,
     ScenarioId,
     add_cwd_to_path,
     checked_input,
@@ -27,7 +28,7 @@ from clbench.cli.arguments import (
 from clbench.cli.runs import requested
 from clbench.records.paths import RECORDS
 from clbench.records.status import RunState, State, found_runs, run_state, seconds_left
-from clbench.spec.policies import DEFAULT_POLICY
+from clbench.spec.policies import DEFAULT_POLICY, SMALL, policy_name
 
 STATES: tuple[State, ...] = ("done", "running", "failed", "damaged", "to do")
 
@@ -40,7 +41,8 @@ def status(
     seeds: Annotated[int, whole_number(1)] = 3,
     first_seed: Annotated[int, whole_number(0)] = 0,
     order: Annotated[int, whole_number(0)] = 0,
-    policy: PolicyKind = DEFAULT_POLICY,
+    policy: PolicyName = DEFAULT_POLICY,
+    policy_size: PolicySize = SMALL,
     records: Path = RECORDS,
     changes: Annotated[dict[str, str] | None, Parameter(name="--set")] = None,
     as_json: AsJson = False,
@@ -58,7 +60,8 @@ def status(
         seeds: Number of seeds.
         first_seed: The first seed.
         order: Order in which the targets are learned.
-        policy: Kind of the policy.
+        policy: flow, discrete_diffusion, or a class of your own as module:Class.
+        policy_size: small, base or large.
         records: Folder of the records.
         changes: Hyper-parameters that differ from the defaults of the methods, as --set.name value.
         as_json: Print one JSON object for each run, and no table.
@@ -72,7 +75,8 @@ def status(
         else:
             from clbench.runs.spec import RunSpec
 
-            spec = RunSpec("", "", first_seed, changes or {}, order=order, policy=policy)
+            name = policy_name(policy, policy_size)
+            spec = RunSpec("", "", first_seed, changes or {}, order=order, policy=name)
             paths = [one.path(records) for one in requested(scenarios, methods, every, seeds, spec, records)]
         states = [run_state(path) for path in paths]
     if as_json:

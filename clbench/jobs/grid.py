@@ -139,7 +139,7 @@ def run(
         seeds: Number of seeds.
         first_seed: The first seed.
         settings: Hyper-parameters that differ from the method's own, or from those tuned for the scenario.
-        policy: Kind of the policy: "flow" or "discrete_diffusion".
+        policy: Name of the policy, such as "discrete_diffusion", "flow-base" or "module:Class".
         perturb: Whether the skills and each new target are also evaluated in perturbed worlds.
         records: Folder of the records.
         workers: Number of runs at once, each a process with one thread; all cores if None.

@@ -25,7 +25,7 @@ from clbench.policy.kinds import new_policy
 from clbench.policy.policy import Policy, PolicyConfig
 from clbench.policy.vision import Vision
 from clbench.spec.identifiers import folder_name
-from clbench.spec.policies import DEFAULT_POLICY, policy_packages
+from clbench.spec.policies import DEFAULT_POLICY, kind_of, policy_packages, size_of
 from clbench.spec.scenario import Scenario
 from clbench.spec.task import packages_of
 from clbench.worlds.camera import load_camera
@@ -121,7 +121,7 @@ def pretrained_policy(
         save_policy(pretrain(scenario, seed, progress), partial)
 
     folder = cached(_folder(scenario, seed, inputs), inputs, make)
-    return load_policy(folder, kind=scenario.policy), folder
+    return load_policy(folder, name=scenario.policy), folder
 
 
 def vision_steps(scenario: Scenario) -> int:
@@ -135,14 +135,15 @@ def policy_config(scenario: Scenario) -> PolicyConfig:
     first = scenario.tasks[0]
     world = resolve(first.world)()
     observer = Observer(first.world, first.camera)
+    width, layers = size_of(scenario.policy) or (scenario.budget.policy_width, scenario.budget.policy_layers)
     config = PolicyConfig(
         state_size=observer.spaces(world.observation_space)["state"].shape[0],
         action_size=world.action_space.shape[0],
         text_length=scenario.text_length,
         image_size=observer.image_size,
-        width=scenario.budget.policy_width,
-        layers=scenario.budget.policy_layers,
-        kind=scenario.policy,
+        width=width,
+        layers=layers,
+        kind=kind_of(scenario.policy),
     )
     world.close()
     return config

@@ -200,14 +200,14 @@ class Trainer:
             self.policy = load_stage(folder, self.method, self.device, self.scenario.policy)
 
 
-def load_stage(folder: Path, method: Method, device: torch.device | str, kind: str) -> Policy:
+def load_stage(folder: Path, method: Method, device: torch.device | str, policy: str) -> Policy:
     """Return the policy that a stage left in `folder`, and load the state in the same folder into `method`.
 
     Args:
         folder: Folder of the stage.
         method: New object of the method.
         device: Device on which the policy is computed.
-        kind: Kind of the policy.
+        policy: Name of the policy.
 
     Raises:
         CheckpointError: A file is missing or torn, or is not a file of a stage.
@@ -216,7 +216,7 @@ def load_stage(folder: Path, method: Method, device: torch.device | str, kind: s
         state = read_state(folder, device)
     except (OSError, ValueError, TypeError, SafetensorError) as error:
         raise CheckpointError(f"{folder}: cannot be read as the state of a method ({error}).") from error
-    return load_policy(folder, lambda policy: method.load_state(policy, state), kind).to(device)
+    return load_policy(folder, lambda made: method.load_state(made, state), policy).to(device)
 
 
 def sources(scenario: Scenario, seed: int, *modules: str) -> dict[str, Any]:

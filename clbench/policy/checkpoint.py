@@ -17,7 +17,7 @@ from clbench.base.errors import ClbenchError
 from clbench.base.strict_json import read_json
 from clbench.policy.kinds import new_policy
 from clbench.policy.policy import Policy, PolicyConfig
-from clbench.spec.policies import POLICIES
+from clbench.spec.policies import POLICIES, kind_of
 
 LARGEST = 65_536
 """Upper limit of every size in a `PolicyConfig`."""
@@ -40,15 +40,15 @@ def save_policy(policy: Policy, folder: Path) -> None:
 
 
 def load_policy(
-    folder: Path, extend: Callable[[Policy], None] = lambda _: None, kind: str | None = None
+    folder: Path, extend: Callable[[Policy], None] = lambda _: None, name: str | None = None
 ) -> Policy:
     """Read the policy that `save_policy` wrote to `folder`.
 
     Args:
         folder: Folder of the checkpoint.
         extend: Function that adds modules, such as adapters, to a plain policy before its tensors are loaded.
-        kind: Kind that the policy must have. None stands for any built-in one: a checkpoint never decides
-            which module is imported.
+        name: Name of the policy, whose kind the checkpoint must have. None stands for any built-in one: a
+            checkpoint never decides which module is imported.
 
     Raises:
         CheckpointError: A file is missing or torn, a size is out of range, the tensors do not have the names,
@@ -59,7 +59,7 @@ def load_policy(
         tensors = load_file(folder / "policy.safetensors")
     except (OSError, ValueError, TypeError, SafetensorError) as error:
         raise CheckpointError(f"{folder}: cannot be read as a policy ({error}).") from error
-    fault = _fault(config, tensors, kind)
+    fault = _fault(config, tensors, None if name is None else kind_of(name))
     if fault:
         raise CheckpointError(f"{folder}: {fault}.")
     policy = new_policy(config)

@@ -18,9 +18,9 @@ def policy_class(kind: str) -> type[Policy]:
         UnknownNameError: There is no such kind.
         WrongTypeError: The object of this name is not a policy.
     """
-    check_policy(kind)
     if kind in POLICIES:
         return TransformerPolicy
+    check_policy(kind)
     cls = resolve(kind)
     if not (isinstance(cls, type) and issubclass(cls, Policy)):
         raise WrongTypeError(f"{kind!r} is not a subclass of clbench.Policy.")

@@ -50,7 +50,7 @@ class PolicyConfig:
     image_size: int = 0
     """Width and height of the image that it sees, in pixels; 0 without images."""
     kind: str = DEFAULT_POLICY
-    """Kind of the policy: one of `clbench.spec.policies.POLICIES`, or "module:Class"."""
+    """Kind of the policy: a key of `clbench.spec.policies.POLICIES`, or "module:Class"."""
     block: int = 0
     """Steps in a block of block-causal attention in a discrete-diffusion head; 0 without blocks."""
 

@@ -14,7 +14,7 @@ from clbench.base.errors import InputError
 from clbench.records.paths import label_of, record_path
 from clbench.records.record import RunInfo, ScenarioInfo
 from clbench.runs.tuning import tuned_settings
-from clbench.spec.policies import DEFAULT_POLICY
+from clbench.spec.policies import DEFAULT_POLICY, kind_of
 from clbench.spec.protocol import Protocol, ScoredSplit
 from clbench.spec.registry import load_scenario
 from clbench.spec.scenario import Scenario
@@ -51,7 +51,7 @@ class RunSpec:
     perturb: bool = False
     """Whether the retained skills and each stage's target also meet perturbed episodes."""
     policy: str = DEFAULT_POLICY
-    """Kind of the policy, one of `clbench.spec.policies.POLICIES`."""
+    """Name of the policy, see `clbench.spec.policies`."""
 
     @property
     def label(self) -> str:
@@ -76,7 +76,7 @@ class RunSpec:
 
         scenario, published = self.scenarios()
         method = load_method(self.method)
-        check_abilities(self.policy, method.needs, self.method)
+        check_abilities(kind_of(self.policy), method.needs, self.method)
         return ResolvedRun(self, scenario, published, method, read_changes(self.method, method, self.changes))
 
     def scenarios(self) -> tuple[Scenario, Scenario]:

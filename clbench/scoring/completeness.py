@@ -8,7 +8,7 @@ from collections.abc import Iterable, Sequence
 from clbench.records.reader import RecordError
 from clbench.records.record import Record
 from clbench.scoring.reading import Row
-from clbench.spec.policies import POLICIES
+from clbench.spec.policies import is_built_in
 from clbench.spec.protocol import EpisodeKey, Point, Protocol
 
 
@@ -29,7 +29,7 @@ def check_complete(record: Record, rows: Iterable[Row], protocol: Protocol) -> N
     points = _check_episodes(rows, protocol)
     online = bool(record.run.uses.get("online"))
     demanded = 0 if online else record.scenario.budget.get("test_questions", 0)
-    if record.run.policy not in POLICIES and not sum(record.answers["asked"]):
+    if not is_built_in(record.run.policy) and not sum(record.answers["asked"]):
         demanded = 0
     _check_answers(record, points, demanded)
     moved = [Point(*place) for place in zip(record.policy["stage"], record.policy["step"], strict=True)]

@@ -1,4 +1,8 @@
-"""The kinds of policies, by name."""
+"""The policies by name: kinds and sizes.
+
+A name is a built-in kind, such as "flow", with a size other than the smallest after a dash, such as
+"flow-base"; or "module:Class", a class of one's own.
+"""
 
 from __future__ import annotations
 
@@ -15,20 +19,57 @@ POLICIES = {
 
 DEFAULT_POLICY = "flow"
 
+SIZES: dict[str, tuple[int, int] | None] = {"small": None, "base": (256, 4), "large": (512, 9)}
+"""Channels of a token, and layers of backbone and head, by size. The small one has the budget's: 0.7 million
+parameters on Fetch-v1, where base has 5 and large 40 million."""
+
+SMALL = "small"
+
 _CLASS = re.compile(r"(?:[A-Za-z_]\w*\.)*[A-Za-z_]\w*:[A-Za-z_]\w*", re.ASCII)
 _LONGEST = 100
 
 
+def policy_names() -> list[str]:
+    """Return the names of all built-in policies."""
+    return [policy_name(kind, size) for kind in POLICIES for size in SIZES]
+
+
+def policy_name(kind: str, size: str = SMALL) -> str:
+    """Return the name of a policy of some kind and size, for example "flow-base".
+
+    Raises:
+        UnknownNameError: There is no such size; the message has the nearest one.
+    """
+    if size not in SIZES:
+        raise unknown("size of a policy", size, SIZES)
+    return kind if size == SMALL else f"{kind}-{size}"
+
+
+def kind_of(policy: str) -> str:
+    """Return the kind of a policy: a key of `POLICIES`, or "module:Class"."""
+    return policy if ":" in policy else policy.partition("-")[0]
+
+
+def size_of(policy: str) -> tuple[int, int] | None:
+    """Return the channels and layers of a policy, None for those of the budget."""
+    return None if ":" in policy else SIZES[policy.partition("-")[2] or SMALL]
+
+
+def is_built_in(policy: str) -> bool:
+    """Return whether a policy is one of ours."""
+    return kind_of(policy) in POLICIES
+
+
 def check_policy(name: str) -> None:
-    """Refuse a text that is neither a built-in kind of policy nor of the form "module:Class".
+    """Refuse a text that is neither the name of a built-in policy nor of the form "module:Class".
 
     Raises:
         UnknownNameError: The message has the nearest name.
     """
-    if name not in POLICIES and not (len(name) <= _LONGEST and _CLASS.fullmatch(name)):
-        raise unknown("policy", name, [*POLICIES, "module:Class"])
+    if name not in policy_names() and not (len(name) <= _LONGEST and _CLASS.fullmatch(name)):
+        raise unknown("policy", name, [*policy_names(), "module:Class"])
 
 
-def policy_packages(kind: str) -> list[str]:
+def policy_packages(policy: str) -> list[str]:
     """Return the package, or module, of a policy that is not built in."""
-    return [] if kind in POLICIES else [package_of(kind)]
+    return [] if is_built_in(policy) else [package_of(policy)]

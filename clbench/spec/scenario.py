@@ -54,7 +54,7 @@ class Scenario:
     limits: Limits = field(default_factory=Limits)
     """Limits of the process of a submitted run."""
     policy: str = DEFAULT_POLICY
-    """Kind of the policy that is pretrained and fine-tuned, one of `POLICIES`."""
+    """Name of the policy that is pretrained and fine-tuned, see `clbench.spec.policies`."""
 
     def __post_init__(self) -> None:
         names = [task.name for task in self.tasks + self.background]
@@ -142,13 +142,13 @@ class Scenario:
             raise InputError(f"{self.id}: {error}") from error
         return replace(self, target=tuple(self.target[place] for place in places)) if order else self
 
-    def with_policy(self, kind: str) -> Scenario:
-        """Return the scenario with another kind of policy; all else stays the same.
+    def with_policy(self, name: str) -> Scenario:
+        """Return the scenario with another policy; all else stays the same.
 
         Raises:
-            UnknownNameError: There is no such kind.
+            UnknownNameError: There is no such policy.
         """
-        return self if kind == self.policy else replace(self, policy=kind)
+        return self if name == self.policy else replace(self, policy=name)
 
     def for_seed(self, seed: int) -> Scenario:
         """Return the scenario with its targets in the order in which runs of `seed` learn them."""

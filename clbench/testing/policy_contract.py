@@ -223,7 +223,7 @@ def checkpoints(subject: Subject) -> None:
     policy, batch = subject.build(3).eval(), subject.batch
     with tempfile.TemporaryDirectory() as folder:
         save_policy(policy, Path(folder))
-        loaded = load_policy(Path(folder), kind=subject.config.kind).eval()
+        loaded = load_policy(Path(folder), name=subject.config.kind).eval()
     for name, other in (("loaded", loaded), ("copied", copy.deepcopy(policy))):
         if not other.act(batch.state, batch.words, batch.noise).equal(
             policy.act(batch.state, batch.words, batch.noise)

@@ -16,7 +16,7 @@ from clbench.records.writer import write_record
 
 SCENARIO = "clbench/Toy-v0"
 IDS = [*(f"C{number}" for number in range(1, 9)), *(f"A{number}" for number in range(1, 8))]
-IDS += [f"F{number}" for number in range(1, 6)]
+IDS += [f"F{number}" for number in range(1, 7)]
 
 
 class Bench:

@@ -10,5 +10,6 @@ from clbench.records.record import Record
 
 
 @pytest.fixture
-def bench(tmp_path: Path, make_record: Callable[..., Record]) -> Bench:
+def bench(tmp_path: Path, make_record: Callable[..., Record], monkeypatch: pytest.MonkeyPatch) -> Bench:
+    monkeypatch.setattr("clbench.leaderboard.claims.fast_dvla.read_decoding", lambda: None)
     return Bench(tmp_path, make_record)

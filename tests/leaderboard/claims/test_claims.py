@@ -41,14 +41,14 @@ def test_without_any_record_every_claim_says_which_command_is_missing(bench: Ben
     others = {"C5": "holds"}
     assert verdicts(page) == {identifier: others.get(identifier, "undecided") for identifier in IDS}
     for identifier in IDS:
-        assert "clbench run" in section(page, identifier)
+        command = "python benchmarks/decoding.py" if identifier == "F6" else "clbench run"
+        assert command in section(page, identifier)
     sft_on_the_ladder = f"`clbench run {SCENARIO} sft --set.step_factor 1 --records leaderboard/ladder`"
     assert sft_on_the_ladder in section(page, "C2")
     assert f"`clbench run {SCENARIO} aegis frozen sft`" in section(page, "A4")
     assert f"`clbench run {SCENARIO} aegis --set.direction random --records leaderboard/controls`" in section(
         page, "A4"
     )
-    assert "Later work." in section(page, "F6")
 
 
 def test_every_claim_has_its_paper_rule_and_the_papers_figure(bench: Bench) -> None:
