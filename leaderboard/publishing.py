@@ -19,6 +19,7 @@ from clbench.spec.identifiers import installed_methods
 
 from .board.frontier import ladder_of
 from .board.summary import Summary
+from .policies.decoders import RESULTS
 from .views.csv import csv_text
 from .views.format import write_all
 
@@ -33,7 +34,8 @@ NUMBERS = "board.json"
 
 _CODE = (
     *("clbench.base", "clbench.spec", "clbench.records", "clbench.runs", "clbench.scoring"),
-    *("clbench.learning", "clbench.leaderboard.board", "clbench.leaderboard.views"),
+    *("clbench.learning", "clbench.leaderboard.board", "clbench.leaderboard.policies"),
+    "clbench.leaderboard.views",
 )
 """Code that the board and its pages depend on, besides the packages of the installed methods."""
 
@@ -67,6 +69,7 @@ def inputs_of(records: Path) -> dict[str, str]:
     return {
         "records": _folder_hash(records),
         "ladder": _folder_hash(ladder_of(records)),
+        "decoding": _text_hash(RESULTS.read_bytes()) if RESULTS.is_file() else "",
         "code": source_hash(*_CODE, *packages),
     }
 

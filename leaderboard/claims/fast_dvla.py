@@ -10,7 +10,7 @@ import math
 
 from clbench.scoring.intervals import Estimate
 
-from ..board.decoders import Decoding, read_decoding
+from ..policies.decoders import Decoding, read_decoding
 from .claim import ANYWHERE, Finding, Paper, claim, decided, what_would_change
 from .evidence import NO_ESTIMATE, Evidence, Figure, rung
 from .figures import PUBLISHED, share_of_steps

@@ -20,10 +20,10 @@ from clbench.records.paths import parts_of
 from clbench.scoring.intervals import Estimate
 from clbench.scoring.metric import Metric
 
-from ..board.decoders import read_decoding
 from ..board.overall import overall
-from ..board.policies import by_table
 from ..board.rows import Row, Table
+from ..policies.compared import by_table
+from ..policies.decoders import read_decoding
 from .format import (
     MISSING,
     Column,

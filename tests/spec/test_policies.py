@@ -58,7 +58,7 @@ def test_another_name_is_refused_with_the_nearest_one(name: str, hint: str) -> N
 
 
 def test_an_unknown_size_is_refused_with_the_nearest_one() -> None:
-    with pytest.raises(UnknownNameError, match="No size of a policy is called 'bas'. Did you mean 'base'"):
+    with pytest.raises(UnknownNameError, match=r"No size of a policy is called 'bas'\. Did you mean 'base'"):
         policy_name("flow", "bas")
 
 

@@ -18,11 +18,11 @@ from clbench.scoring.metrics import METRICS
 from clbench.scoring.scores import rates_of
 from clbench.spec.identifiers import built_in_methods
 
-from ...board.decoders import Decoding, read_decoding
 from ...board.frontier import Curve
-from ...board.policies import Comparison, by_table
 from ...board.rows import Row, Table, standing_of
 from ...board.summary import DIVISIONS, METHODS
+from ...policies.compared import Comparison, by_table
+from ...policies.decoders import Decoding, read_decoding
 from ..descriptions import Description, describe
 from ..format import (
     Column,

@@ -9,7 +9,7 @@ from claims_bench import Bench, section, verdicts
 
 from clbench.base.entry_points import resolve
 
-read_decoding = resolve("clbench.leaderboard.board.decoders:read_decoding")
+read_decoding = resolve("clbench.leaderboard.policies.decoders:read_decoding")
 
 
 def ratio(value: float, half: float = 0.05) -> dict[str, float]:

@@ -16,7 +16,7 @@ from clbench.scoring.rates import Rates
 from clbench.scoring.scores import Scores
 from clbench.spec.policies import DEFAULT_POLICY
 
-from .rows import Row
+from ..board.rows import Row
 
 COMPARED = ("final_average", "adaptation", "retention", "kept_targets", "kept_share")
 """Metrics that are compared."""

@@ -11,7 +11,7 @@ from clbench.base.entry_points import resolve
 from clbench.records.record import Record
 
 read_table = resolve("clbench.leaderboard.board.rows:read_table")
-by_table = resolve("clbench.leaderboard.board.policies:by_table")
+by_table = resolve("clbench.leaderboard.policies.compared:by_table")
 markdown = resolve("clbench.leaderboard.views.markdown:markdown")
 PLACE = "clbench/Toy-v0+discrete_diffusion"
 
