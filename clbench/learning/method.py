@@ -104,7 +104,8 @@ class Method:
     """Hyper-parameter that sets how strongly the method protects what is known, and two values that tuning
     tries besides the default. None: tuning tries further step sizes instead."""
     needs: ClassVar[tuple[str, ...]] = ()
-    """Abilities that the policy must have besides the protocol: "hidden_states", "answers"."""
+    """Abilities that the policy must have besides the protocol: "hidden_states", "answers". A policy without
+    them is refused by name."""
     whole_stages: ClassVar[bool] = False
     """Whether the policy is ready only at the end of a stage, for example because `end_task` merges it. Such
     a policy is not evaluated within a stage."""

@@ -18,6 +18,9 @@ from clbench.spec.budget import HEADS
 from clbench.spec.language import TEXT_LENGTH, VOCABULARY_SIZE
 from clbench.spec.policies import DEFAULT_POLICY
 
+ABILITIES = ("hidden_states", "answers")
+"""Abilities that a policy may have besides the protocol."""
+
 
 class MissingAbilityError(ClbenchError, TypeError):
     """A policy does not offer what was asked of it."""
@@ -78,7 +81,7 @@ class Policy(nn.Module, ABC):
     """
 
     abilities: ClassVar[frozenset[str]] = frozenset()
-    """Abilities that the policy has, of "hidden_states" and "answers"."""
+    """Abilities that the policy has, of `ABILITIES`."""
     pretrained: ClassVar[bool] = False
     """Whether a new policy has pretrained weights of its own, which clbench then uses as they are."""
     head: nn.Module

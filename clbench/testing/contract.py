@@ -29,7 +29,7 @@ from clbench.evaluation.rollouts import Evaluator
 from clbench.learning.method import Metadata, Method
 from clbench.learning.prior import Access, Uses
 from clbench.learning.trainer import repeatable
-from clbench.policy.policy import Policy
+from clbench.policy.policy import ABILITIES, Policy
 from clbench.spec.policies import DEFAULT_POLICY
 from clbench.testing.error import ContractError
 from clbench.testing.global_state import GENERATORS, same, watched
@@ -54,6 +54,7 @@ _KINDS: dict[str, tuple[Any, str]] = {
     "uses": (Uses, "a Uses"),
     "metadata": (Metadata, "a Metadata"),
     "tunes": (tuple | None, "a tuple, the name of a hyper-parameter and two values of it, or None"),
+    "needs": (tuple, "a tuple of abilities of a policy"),
     "whole_stages": (bool, "a bool"),
 }
 """Types of the declarations of a class besides its hyper-parameters, with their descriptions."""
@@ -176,6 +177,9 @@ def _check_declared(cls: type[Method]) -> None:
         if name in fields:
             expected = f"`{name} = ...` without an annotation, which would make it a hyper-parameter"
             raise _breach(declaration, expected, f"{name} is a field of the dataclass", name)
+    unknown = sorted(set(cls.needs) - set(ABILITIES))
+    if unknown:
+        raise _breach(declaration, f"needs among {', '.join(ABILITIES)}", ", ".join(unknown), "needs")
     for name in PRIOR:
         access = getattr(cls.uses, name)
         if access not in get_args(Access):

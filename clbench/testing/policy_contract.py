@@ -24,7 +24,7 @@ from clbench.learning.optimise import deterministic, optimise
 from clbench.policy.batch import Batch
 from clbench.policy.checkpoint import load_policy, save_policy
 from clbench.policy.kinds import new_policy, policy_class
-from clbench.policy.policy import Policy, PolicyConfig
+from clbench.policy.policy import ABILITIES, Policy, PolicyConfig
 from clbench.testing.error import ContractError
 from clbench.testing.global_state import GENERATORS, read, same
 from clbench.testing.small import SMALL, toy_questions, toy_source
@@ -235,16 +235,17 @@ def checkpoints(subject: Subject) -> None:
 def abilities(subject: Subject) -> None:
     """The policy has the abilities that it declares, and no others."""
     policy, batch = subject.build(), subject.batch
-    unknown = sorted(subject.cls.abilities - ABILITIES.keys())
+    unknown = sorted(subject.cls.abilities - set(ABILITIES))
     if unknown:
         expected = f"abilities among {', '.join(ABILITIES)}"
         raise _breach(abilities, expected, ", ".join(unknown), "abilities")
-    for name, check in ABILITIES.items():
-        if name in subject.cls.abilities:
-            check(policy, batch)
+    if "hidden_states" in subject.cls.abilities:
+        _check_hidden_states(policy, batch)
+    if "answers" in subject.cls.abilities:
+        _check_answers(policy)
 
 
-def hidden_states(policy: Policy, batch: Batch) -> None:
+def _check_hidden_states(policy: Policy, batch: Batch) -> None:
     """The hidden states are what the head reads."""
     hidden, mask = policy.hidden_states(batch.state, batch.words), policy.token_mask(batch.words)
     _check_shape(abilities, mask, (SAMPLES, 1, 1, hidden[0].shape[1]), "token_mask()")
@@ -264,7 +265,7 @@ def hidden_states(policy: Policy, batch: Batch) -> None:
         raise _breach(abilities, "a gradient in the head alone", found, "action_loss(batch, hidden)")
 
 
-def answers(policy: Policy, batch: Batch) -> None:
+def _check_answers(policy: Policy) -> None:
     """The policy answers questions with a word of its vocabulary."""
     questions = toy_questions().sample(SAMPLES)
     logits = policy.answer_logits(questions.state, questions.words)
@@ -273,9 +274,6 @@ def answers(policy: Policy, batch: Batch) -> None:
     if not torch.allclose(loss, F.cross_entropy(logits, questions.answer, reduction="none"), rtol=1e-4):
         raise _breach(abilities, "the cross-entropy of each right answer", "another loss", "answer_loss()")
 
-
-ABILITIES: dict[str, Callable[[Policy, Batch], None]] = {"hidden_states": hidden_states, "answers": answers}
-"""The check of each ability."""
 
 CLAUSES = (initial_weights, losses, gradients, actions, learning, checkpoints, abilities)
 """The clauses of the contract, in the order of the checks."""

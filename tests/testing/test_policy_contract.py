@@ -1,18 +1,21 @@
 """Each broken policy breaks one clause of the contract, and the check names it."""
 
+from dataclasses import dataclass
+
 import pytest
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
 from clbench.base.errors import InputError, UnknownNameError, WrongTypeError
+from clbench.learning.method import Method
 from clbench.learning.registry import load_method
 from clbench.policy.batch import Batch, QuestionBatch
 from clbench.policy.kinds import check_abilities
 from clbench.policy.policy import MissingAbilityError, Policy, PolicyConfig
 from clbench.policy.transformer import TransformerPolicy
 from clbench.spec.policies import POLICIES
-from clbench.testing import ContractError, check_policy, policy_checks
+from clbench.testing import ContractError, check_method, check_policy, policy_checks
 from clbench.testing.policy_contract import CLAUSES
 
 
@@ -243,6 +246,18 @@ def test_what_is_no_policy_is_refused_by_name(kind: str, error: type[Exception],
 def test_every_broken_policy_is_one_by_its_clause_alone() -> None:
     """The class that they derive from keeps the contract: what the checks find is the change."""
     check_policy(f"{__name__}:Base")
+
+
+@dataclass
+class Demanding(Method):
+    """Needs what no policy has."""
+
+    needs = ("telepathy",)
+
+
+def test_a_method_must_not_need_what_no_policy_has() -> None:
+    with pytest.raises(ContractError, match=r"needs among hidden_states, answers\n  found:    telepathy"):
+        check_method(Demanding)
 
 
 def test_abilities_decide_which_methods_run() -> None:
