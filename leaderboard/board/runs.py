@@ -25,7 +25,7 @@ from clbench.spec.protocol import Split
 from clbench.spec.scenario import balanced_order, target_order
 
 from .summary import NotShown
-from .tiers import tier_of
+from .tiers import findings_of, tier_of
 
 ACCESS = ("never", "prepare", "throughout")
 """Values of `Record.run.uses`: when a method may use prior data."""
@@ -54,6 +54,8 @@ class Run:
     """One of `DIVISIONS`."""
     tier: str
     """One of `TIERS`."""
+    findings: tuple[tuple[str, str], ...]
+    """What its verification found, as names with texts; see `findings_of`."""
     order: int
     """Order in which the targets were learned; 0 is the published one."""
     published: ScenarioInfo
@@ -144,6 +146,7 @@ def read_run(folder: Path, path: Path, split: Split = "test", changed: bool | No
         run.seed,
         division,
         tier_of(path),
+        tuple(findings_of(path)),
         run.order,
         published,
     )
