@@ -1,9 +1,10 @@
-"""The definition of a scenario: a hash of each task and of the questions, by their words and what they do.
+"""The definition of a scenario: a hash of each task, of the questions and of the camera, by what they do.
 
 A hash covers what a score depends on besides the budget: instructions, horizon and seeds of a task, resets,
 rewards and successes of its world, plain and perturbed, the actions of its expert, and the answers to
 questions. It is a hash of behaviour in fixed episodes, so an edit that moves nothing keeps it. A change that
-no fixed episode meets keeps it too: a threshold must move far enough to move a success.
+no fixed episode meets keeps it too: a threshold must move far enough to move a success. Pictures differ
+between renderers: of a camera the hash has the code of its module, besides the numbers that it passes on.
 
 `python -m clbench.evaluation.definition` pins the definitions of the project's scenarios in
 `envs/definitions.json`. A changed scenario gets a new version instead, once records of it are public.
@@ -11,7 +12,10 @@ no fixed episode meets keeps it too: a threshold must move far enough to move a 
 
 from __future__ import annotations
 
+import ast
 import hashlib
+import importlib
+import inspect
 import json
 from collections.abc import Iterator
 from pathlib import Path
@@ -30,6 +34,7 @@ from clbench.spec.identifiers import scenario_ids
 from clbench.spec.registry import load_scenario
 from clbench.spec.scenario import Scenario
 from clbench.spec.task import Task, packages_of
+from clbench.worlds.camera import load_camera
 from clbench.worlds.lanes import vector_world
 
 CODE = (*DATA_SOURCES, "clbench.evaluation.definition")
@@ -47,11 +52,11 @@ RANDOM = 5
 
 
 def definition(scenario: Scenario) -> dict[str, str]:
-    """Return the hashes of a scenario by part: "task NAME" for each task, and "questions"."""
+    """Return the hashes of a scenario by part: "task NAME" for each task, "questions", "camera" if any."""
     tasks = (*scenario.tasks, *scenario.background, *scenario.scenes)
     suites = packages_of(tasks, "world", "expert", "camera")
     inputs = {
-        "tasks": [_words(task) for task in tasks],
+        "tasks": [[*_words(task), task.world, task.expert, task.camera] for task in tasks],
         "scenes": [task.name for task in scenario.scene_tasks],
         "questions": scenario.questions,
         "source": source_hash(*CODE, package_of(scenario.questions), *suites),
@@ -77,7 +82,39 @@ def _hashes(scenario: Scenario) -> dict[str, str]:
         digest.update(json.dumps([kind.name, kind.wordings, kind.answers]).encode())
         digest.update(kind.answer(shown).astype(np.int8).tobytes())
     hashes = {name: found[name] for name in (f"task {task.name}" for task in scored)}
-    return {**hashes, "questions": digest.hexdigest()[:16]}
+    hashes["questions"] = digest.hexdigest()[:16]
+    camera = scored[0].camera  # that of all tasks
+    if camera is not None:
+        hashes["camera"] = _hash_of_camera(camera, np.concatenate([states[task.name] for task in scored]))
+    return hashes
+
+
+def _hash_of_camera(entry_point: str, states: NDArray[np.float32]) -> str:
+    """Return the hash of a camera: its code, and what it passes on of some states."""
+    camera = load_camera(entry_point)
+    digest = hashlib.sha256(f"{camera.image_size} {_code(camera.__module__)}".encode())
+    for part in (camera.proprioception(states), camera.pictured(states)):
+        digest.update(np.asarray(part, np.float32).tobytes())
+    return digest.hexdigest()[:16]
+
+
+def _code(module: str) -> str:
+    """Return the code of a module without its comments, its docstrings and its layout."""
+    tree = ast.parse(inspect.getsource(importlib.import_module(module)))
+    for node in ast.walk(tree):
+        body = getattr(node, "body", None)
+        if isinstance(body, list):  # a lambda's is an expression
+            node.body = [one for one in body if not _is_text(one)] or [ast.Pass()]  # type: ignore[attr-defined]
+    return ast.unparse(tree)
+
+
+def _is_text(node: ast.stmt) -> bool:
+    """Return whether a statement is a text alone: a docstring."""
+    return (
+        isinstance(node, ast.Expr)
+        and isinstance(node.value, ast.Constant)
+        and isinstance(node.value.value, str)
+    )
 
 
 def _hash_of_task(task: Task) -> tuple[str, NDArray[np.float32]]:
