@@ -2,9 +2,9 @@
 
 A hash covers what a score depends on besides the budget: instructions, horizon and seeds of a task, resets,
 rewards and successes of its world, plain and perturbed, the actions of its expert, and the answers to
-questions. It is a hash of behaviour in fixed episodes, so an edit that moves nothing keeps it. A change that
-no fixed episode meets keeps it too: a threshold must move far enough to move a success. Pictures differ
-between renderers: of a camera the hash has the code of its module, besides the numbers that it passes on.
+questions. It is a hash of behaviour in fixed episodes, so an edit that moves nothing keeps it. Two parts are
+hashes of code, without comments, docstrings and layout: the rule of each task, as fixed episodes miss a
+threshold that moves a little, and the module of a camera, as pictures differ between renderers.
 
 `python -m clbench.evaluation.definition` pins the definitions of the project's scenarios in
 `envs/definitions.json`. A changed scenario gets a new version instead, once records of it are public.
@@ -12,10 +12,7 @@ between renderers: of a camera the hash has the code of its module, besides the 
 
 from __future__ import annotations
 
-import ast
 import hashlib
-import importlib
-import inspect
 import json
 from collections.abc import Iterator
 from pathlib import Path
@@ -29,6 +26,7 @@ from clbench.base.entry_points import resolve
 from clbench.base.source import DATA_SOURCES, package_of, source_hash
 from clbench.base.strict_json import read_json
 from clbench.data.demonstrations import simulator_versions
+from clbench.evaluation.rules import module_code, rule_code
 from clbench.records.pinned import pinned_file
 from clbench.spec.identifiers import scenario_ids
 from clbench.spec.registry import load_scenario
@@ -52,22 +50,29 @@ RANDOM = 5
 
 
 def definition(scenario: Scenario) -> dict[str, str]:
-    """Return the hashes of a scenario by part: "task NAME" for each task, "questions", "camera" if any."""
+    """Return the hashes of a scenario by part.
+
+    Parts are "task NAME" and "rule NAME" for each task, "questions", and "camera" if there is one.
+    """
     tasks = (*scenario.tasks, *scenario.background, *scenario.scenes)
     suites = packages_of(tasks, "world", "expert", "camera")
+    rules = {
+        f"rule {task.name}": hash_of(rule_code(task)) for task in (*scenario.tasks, *scenario.background)
+    }
     inputs = {
         "tasks": [[*_words(task), task.world, task.expert, task.camera] for task in tasks],
         "scenes": [task.name for task in scenario.scene_tasks],
         "questions": scenario.questions,
         "source": source_hash(*CODE, package_of(scenario.questions), *suites),
         "versions": simulator_versions(tasks),
+        "rules": rules,
     }
 
     def write(folder: Path) -> None:
         (folder / "definition.json").write_text(json.dumps(_hashes(scenario)), encoding="utf-8")
 
     folder = cached(cache_folder() / "definitions" / hash_of(inputs), inputs, write)
-    return {**read_json(folder / "definition.json")}
+    return {**read_json(folder / "definition.json"), **rules}
 
 
 def _hashes(scenario: Scenario) -> dict[str, str]:
@@ -92,29 +97,10 @@ def _hashes(scenario: Scenario) -> dict[str, str]:
 def _hash_of_camera(entry_point: str, states: NDArray[np.float32]) -> str:
     """Return the hash of a camera: its code, and what it passes on of some states."""
     camera = load_camera(entry_point)
-    digest = hashlib.sha256(f"{camera.image_size} {_code(camera.__module__)}".encode())
+    digest = hashlib.sha256(f"{camera.image_size} {module_code(camera.__module__)}".encode())
     for part in (camera.proprioception(states), camera.pictured(states)):
         digest.update(np.asarray(part, np.float32).tobytes())
     return digest.hexdigest()[:16]
-
-
-def _code(module: str) -> str:
-    """Return the code of a module without its comments, its docstrings and its layout."""
-    tree = ast.parse(inspect.getsource(importlib.import_module(module)))
-    for node in ast.walk(tree):
-        body = getattr(node, "body", None)
-        if isinstance(body, list):  # a lambda's is an expression
-            node.body = [one for one in body if not _is_text(one)] or [ast.Pass()]  # type: ignore[attr-defined]
-    return ast.unparse(tree)
-
-
-def _is_text(node: ast.stmt) -> bool:
-    """Return whether a statement is a text alone: a docstring."""
-    return (
-        isinstance(node, ast.Expr)
-        and isinstance(node.value, ast.Constant)
-        and isinstance(node.value.value, str)
-    )
 
 
 def _hash_of_task(task: Task) -> tuple[str, NDArray[np.float32]]:

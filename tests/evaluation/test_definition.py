@@ -52,8 +52,9 @@ def remade(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., dic
     return remade
 
 
-def test_it_has_a_part_for_each_task_and_the_questions(remade: Callable[..., dict[str, str]]) -> None:
-    assert set(remade()) == {*(f"task {task.name}" for task in TOY.tasks), "questions"}
+def test_it_has_parts_for_each_task_and_the_questions(remade: Callable[..., dict[str, str]]) -> None:
+    names = [task.name for task in TOY.tasks]
+    assert set(remade()) == {f"{part} {name}" for part in ("task", "rule") for name in names} | {"questions"}
     assert remade() == remade()
 
 
@@ -183,6 +184,8 @@ def test_a_definition_of_another_form_differs_as_a_whole() -> None:
     known = {"task left": "a", "questions": "b"}
     assert other_parts(None, known) == []  # an older record
     assert other_parts({"task left": "a"}, known) == ["questions"]
+    assert other_parts(known, {**known, "rule left": "c", "camera": "d"}) == []  # older than these parts
+    assert other_parts({**known, "rule left": "b"}, {**known, "rule left": "c"}) == ["rule left"]
     strangers: list[Any] = [[], "x", {"task left": "a", "questions": "b", "\x1b[2J": "c"}]
     for strange in strangers:
         assert other_parts(strange, known) == ["the tasks themselves"]
