@@ -21,7 +21,7 @@ import numpy as np
 from clbench.base.entry_points import resolve
 from clbench.spec.task import Task
 
-_PLAIN = (bool, int, float, str, bytes, slice, type(None), np.ndarray, np.generic)
+_PLAIN = (bool, int, float, str, bytes, slice, type(None))
 
 
 def rule_code(task: Task) -> str:
@@ -55,6 +55,7 @@ class _Reached:
 
     def __init__(self, modules: set[str]) -> None:
         self.modules, self.texts = modules, dict[str, str]()
+        self._objects: list[object] = []
 
     def add(self, name: str, value: Any) -> None:
         """Add a value, found under a name, with all that it reaches."""
@@ -64,15 +65,18 @@ class _Reached:
             self._add_class(value)
         elif isinstance(value, _PLAIN):
             self.texts[name] = repr(value)
+        elif isinstance(value, np.ndarray | np.generic):
+            self.texts[name] = repr(value.tolist())
         elif isinstance(value, functools.partial):
             self._add_all(name, {"function": value.func, "given": value.args, **value.keywords})
         elif isinstance(value, Mapping):
             self._add_all(name, {repr(key): one for key, one in value.items()})
         elif isinstance(value, tuple | list):
             self._add_all(name, dict(enumerate(value)))
-        elif type(value).__module__ in self.modules:
+        elif type(value).__module__ in self.modules and not any(value is one for one in self._objects):
+            self._objects.append(value)  # objects may name each other
             self._add_class(type(value))
-            self._add_all(name, vars(value))
+            self._add_all(name, getattr(value, "__dict__", {}))
 
     def _add_all(self, name: str, values: Mapping[Any, Any]) -> None:
         for key, one in values.items():

@@ -119,5 +119,24 @@ def test_of_the_rules_of_a_suite_the_entry_of_the_task_counts_alone(
     assert (codes[0] != codes[1]) == changed
 
 
+def test_objects_that_name_each_other_end(module: Callable[[str, str], str]) -> None:
+    source = (
+        NEAR
+        + """
+class Part:
+    __slots__ = ("other",)
+
+class Whole:
+    pass
+
+WHOLE, PART = Whole(), Part()
+WHOLE.part, PART.other, WHOLE.itself = PART, WHOLE, WHOLE
+World.whole = WHOLE
+"""
+    )
+    task = dataclasses.replace(TOY.retained[0], world=f"{module('whole_world', source)}:World")
+    assert "def is_near" in rule_code(task)
+
+
 def test_the_rule_of_a_press_has_its_distance() -> None:
     assert "math.hypot(x, y) < 0.015" in rule_code(load_scenario("clbench/Fetch-v1").task("press"))
