@@ -13,7 +13,7 @@ import importlib
 import importlib.util
 import inspect
 from collections.abc import Iterator, Mapping
-from types import FunctionType
+from types import FunctionType, ModuleType
 from typing import Any
 
 import numpy as np
@@ -108,26 +108,31 @@ class _Reached:
 def _function_code(function: FunctionType) -> str:
     """Return the code of a function; of a lambda, that of all lambdas on its line."""
     found = _functions(_source(function.__module__)).get(function.__code__.co_firstlineno, ())
-    return "; ".join(map(ast.unparse, found))
+    return "; ".join(found)
 
 
 def _source(module: str) -> str:
     """Return the source of a module, nothing for one that has no file, such as a prompt."""
     try:
-        return inspect.getsource(importlib.import_module(module))
+        return _text(importlib.import_module(module))
     except (ImportError, OSError, TypeError):
         return ""
 
 
+@functools.cache  # a rule asks for each of its functions
+def _text(module: ModuleType) -> str:
+    return inspect.getsource(module)
+
+
 @functools.cache
-def _functions(source: str) -> Mapping[int, list[ast.AST]]:
-    """Return the functions of a module by their first line, as code objects count them."""
-    found: dict[int, list[ast.AST]] = {}
+def _functions(source: str) -> Mapping[int, list[str]]:
+    """Return the code of the functions of a module by their first line, as code objects count them."""
+    found: dict[int, list[str]] = {}
     for node in ast.walk(_tree(source)):
         if isinstance(node, ast.FunctionDef | ast.Lambda):
             decorators = getattr(node, "decorator_list", [])
             first = min([node.lineno, *(one.lineno for one in decorators)])
-            found.setdefault(first, []).append(node)
+            found.setdefault(first, []).append(ast.unparse(node))
     return found
 
 
