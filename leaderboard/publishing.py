@@ -1,7 +1,8 @@
 """The folder `site` next to the records: every form of the board, and what it was made from.
 
 Computing the board takes 10 s, most of it for intervals. Therefore the folder keeps the numbers in
-`board.json`, with hashes of what they were computed from. They are read back while nothing of it changes.
+`board.json`, with hashes of what they were computed from, and of themselves. They are read back while nothing
+of it changes.
 """
 
 from __future__ import annotations
@@ -13,8 +14,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from clbench.base.cache import hash_of
+from clbench.base.leftovers import sweep
 from clbench.base.source import package_of, source_hash
 from clbench.base.strict_json import StrictJSONError, read_regular
+from clbench.records.content import content_hash
 from clbench.spec.identifiers import installed_methods
 
 from .board.frontier import ladder_of
@@ -90,11 +93,12 @@ def _folder_hash(folder: Path) -> str:
 
 
 def read_unchanged(records: Path, inputs: dict[str, str]) -> Summary | None:
-    """Return the numbers of the board, None unless every file of the site was made from `inputs`."""
+    """Return the numbers of the board, None unless every file of the site is whole and made from `inputs`."""
     site = site_of(records)
     try:
         kept: dict[str, Any] = json.loads((site / NUMBERS).read_text(encoding="utf-8"))
-        whole = kept["files"] == {name: _text_hash((site / name).read_bytes()) for name in kept["files"]}
+        files = {name: _text_hash((site / name).read_bytes()) for name in kept["files"]}
+        whole = kept["files"] == files and kept["content"] == content_hash(kept)
         return Summary.from_json(kept["board"]) if whole and kept["made_from"] == inputs else None
     except (OSError, ValueError, KeyError, TypeError, AttributeError):  # none yet, or damaged
         return None
@@ -114,8 +118,10 @@ def write_site(table: Table, records: Path, inputs: dict[str, str]) -> list[Path
     }
     files = {name: _text_hash(text.encode()) for name, text in texts.items()}
     kept = {"made_from": inputs, "files": files, "board": table.to_json()}
-    texts[NUMBERS] = json.dumps(kept, indent=1) + "\n"
-    return write_all({site_of(records) / name: text for name, text in texts.items()})
+    texts[NUMBERS] = json.dumps({**kept, "content": content_hash(kept)}, indent=1) + "\n"
+    site = site_of(records)
+    sweep(site)
+    return write_all({site / name: text for name, text in texts.items()})
 
 
 def _text_hash(content: bytes) -> str:

@@ -70,3 +70,14 @@ def test_the_architecture_page_has_a_row_for_every_package() -> None:
         for path in (ROOT / part).glob("*/__init__.py")
     }
     assert core | parts | {"methods"} == rows
+
+
+def test_every_guarantee_names_tests_that_exist() -> None:
+    rows = re.findall(
+        r"^\| (?!promise|---)(.+) \| (.+) \|$", _text("docs/guide/guarantees.md"), flags=re.MULTILINE
+    )
+    assert len(rows) > 10
+    for promise, tests in rows:
+        named = re.findall(r"`(tests/[^`]+)`", tests)
+        assert named, promise
+        assert [place for place in named if not (ROOT / place).exists()] == []

@@ -18,6 +18,7 @@ from clbench.cli.arguments import (
     checked_input,
     whole_number,
 )
+from clbench.jobs.folders import check_folders
 
 if TYPE_CHECKING:
     from clbench.runs.spec import ResolvedRun
@@ -78,6 +79,7 @@ def film(
         (episode,) = _numbers("--episode", str(episode), loaded.budget.validation_episodes - 1)
         path = output or run.path(FILMS).with_suffix(".gif")
         check_format(path)
+        check_folders({"--output": path.parent})
         choose_back_end(task.world for task in shown)
     console = Console(stderr=True)
     policies = load_stages(run, _stages_folder(run, checkpoints, console))

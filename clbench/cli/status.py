@@ -66,6 +66,8 @@ def status(
         changes: Hyper-parameters that differ from the defaults of the methods, as --set.name value.
         as_json: Print one JSON object for each run, and no table.
     """
+    from clbench.scoring.scores import Scores
+
     add_cwd_to_path()
     with checked_input():
         if scenarios is None:
@@ -78,7 +80,7 @@ def status(
             name = policy_name(policy, policy_size)
             spec = RunSpec("", "", first_seed, changes or {}, order=order, policy=name)
             paths = [one.path(records) for one in requested(scenarios, methods, every, seeds, spec, records)]
-        states = [run_state(path) for path in paths]
+        states = [run_state(path, Scores.from_record) for path in paths]
     if as_json:
         print_json([_values(state, records) for state in states])
         return

@@ -23,6 +23,7 @@ from clbench.cli.arguments import (
     whole_number,
 )
 from clbench.cli.runs import run_missing
+from clbench.jobs.folders import check_folders
 from clbench.records.paths import TUNING
 from clbench.spec.references import BASELINE
 
@@ -89,6 +90,7 @@ def tune(
         if not names:
             raise InputError("Name at least one method, or --all; `clbench list` shows them.")
         check_device(device)
+        check_folders({"--records": records, "--write": write and write.parent})
         classes = {name: load_method(name) for name in names}
     if values:
         combinations = _combinations(values)

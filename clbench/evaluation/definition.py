@@ -1,9 +1,10 @@
-"""The definition of a scenario: a hash of each task and of the questions, by their words and what they do.
+"""The definition of a scenario: a hash of each task, of the questions and of the camera, by what they do.
 
 A hash covers what a score depends on besides the budget: instructions, horizon and seeds of a task, resets,
 rewards and successes of its world, plain and perturbed, the actions of its expert, and the answers to
-questions. It is a hash of behaviour in fixed episodes, so an edit that moves nothing keeps it. A change that
-no fixed episode meets keeps it too: a threshold must move far enough to move a success.
+questions. It is a hash of behaviour in fixed episodes, so an edit that moves nothing keeps it. Two parts are
+hashes of code, without comments, docstrings and layout: the rule of each task, as fixed episodes miss a
+threshold that moves a little, and the module of a camera, as pictures differ between renderers.
 
 `python -m clbench.evaluation.definition` pins the definitions of the project's scenarios in
 `envs/definitions.json`. A changed scenario gets a new version instead, once records of it are public.
@@ -25,11 +26,13 @@ from clbench.base.entry_points import resolve
 from clbench.base.source import DATA_SOURCES, package_of, source_hash
 from clbench.base.strict_json import read_json
 from clbench.data.demonstrations import simulator_versions
+from clbench.evaluation.rules import module_code, rule_code
 from clbench.records.pinned import pinned_file
 from clbench.spec.identifiers import scenario_ids
 from clbench.spec.registry import load_scenario
 from clbench.spec.scenario import Scenario
 from clbench.spec.task import Task, packages_of
+from clbench.worlds.camera import load_camera
 from clbench.worlds.lanes import vector_world
 
 CODE = (*DATA_SOURCES, "clbench.evaluation.definition")
@@ -47,22 +50,29 @@ RANDOM = 5
 
 
 def definition(scenario: Scenario) -> dict[str, str]:
-    """Return the hashes of a scenario by part: "task NAME" for each task, and "questions"."""
+    """Return the hashes of a scenario by part.
+
+    Parts are "task NAME" and "rule NAME" for each task, "questions", and "camera" if there is one.
+    """
     tasks = (*scenario.tasks, *scenario.background, *scenario.scenes)
     suites = packages_of(tasks, "world", "expert", "camera")
+    rules = {
+        f"rule {task.name}": hash_of(rule_code(task)) for task in (*scenario.tasks, *scenario.background)
+    }
     inputs = {
-        "tasks": [_words(task) for task in tasks],
+        "tasks": [[*_words(task), task.world, task.expert, task.camera] for task in tasks],
         "scenes": [task.name for task in scenario.scene_tasks],
         "questions": scenario.questions,
         "source": source_hash(*CODE, package_of(scenario.questions), *suites),
         "versions": simulator_versions(tasks),
+        "rules": rules,
     }
 
     def write(folder: Path) -> None:
         (folder / "definition.json").write_text(json.dumps(_hashes(scenario)), encoding="utf-8")
 
     folder = cached(cache_folder() / "definitions" / hash_of(inputs), inputs, write)
-    return {**read_json(folder / "definition.json")}
+    return {**read_json(folder / "definition.json"), **rules}
 
 
 def _hashes(scenario: Scenario) -> dict[str, str]:
@@ -77,7 +87,20 @@ def _hashes(scenario: Scenario) -> dict[str, str]:
         digest.update(json.dumps([kind.name, kind.wordings, kind.answers]).encode())
         digest.update(kind.answer(shown).astype(np.int8).tobytes())
     hashes = {name: found[name] for name in (f"task {task.name}" for task in scored)}
-    return {**hashes, "questions": digest.hexdigest()[:16]}
+    hashes["questions"] = digest.hexdigest()[:16]
+    camera = scored[0].camera  # that of all tasks
+    if camera is not None:
+        hashes["camera"] = _hash_of_camera(camera, np.concatenate([states[task.name] for task in scored]))
+    return hashes
+
+
+def _hash_of_camera(entry_point: str, states: NDArray[np.float32]) -> str:
+    """Return the hash of a camera: its code, and what it passes on of some states."""
+    camera = load_camera(entry_point)
+    digest = hashlib.sha256(f"{camera.image_size} {module_code(camera.__module__)}".encode())
+    for part in (camera.proprioception(states), camera.pictured(states)):
+        digest.update(np.asarray(part, np.float32).tobytes())
+    return digest.hexdigest()[:16]
 
 
 def _hash_of_task(task: Task) -> tuple[str, NDArray[np.float32]]:

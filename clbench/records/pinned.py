@@ -19,6 +19,10 @@ def pinned_file() -> Path:
     return Path(envs.origin).with_name("definitions.json")
 
 
+LATER = ("rule ", "camera")
+"""Beginnings of the names of parts that the first definitions lacked."""
+
+
 @cache
 def pinned() -> Mapping[str, Mapping[str, str]]:
     """Return the definition of each scenario of the project, see `clbench.evaluation.definition`."""
@@ -31,10 +35,14 @@ def other_parts(recorded: Any, known: Mapping[str, str]) -> list[str]:
     Args:
         recorded: `fingerprint["definition"]` of a record, which a stranger may have written. None in a record
             that is older than definitions: it is not known to differ.
-        known: The definition to compare with. The names of all parts are from it.
+        known: The definition to compare with. The names of all parts are from it. Parts of `LATER` that one
+            of the two lacks are not known to differ.
     """
     if recorded is None:
         return []
-    if not isinstance(recorded, dict) or recorded.keys() - known.keys():
+    if not isinstance(recorded, dict):
         return ["the tasks themselves"]
-    return [name for name, value in known.items() if recorded.get(name) != value]
+    later = {name for name in recorded.keys() ^ known.keys() if name.startswith(LATER)}
+    if recorded.keys() - known.keys() - later:
+        return ["the tasks themselves"]
+    return [name for name in known if name not in later and recorded.get(name) != known[name]]

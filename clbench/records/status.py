@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Literal, NamedTuple
 
 from clbench.base.lease import Lease, Owner, Report, lease_path
 from clbench.records.reader import RecordError, read_record
+from clbench.records.record import Record
 
 State = Literal["done", "running", "failed", "damaged", "to do"]
 
@@ -18,7 +19,7 @@ class RunState(NamedTuple):
     path: Path
     """Path of its record."""
     state: State
-    """A run is damaged if its record cannot be read; `clbench run` does it again."""
+    """A run is damaged if its record cannot be read or contradicts itself; `clbench run` does it again."""
     owner: Owner | None = None
     """Process that does the run."""
     progress: Report | None = None
@@ -36,8 +37,14 @@ class RunState(NamedTuple):
         return self.progress.seconds * (1 / self.progress.share - 1)
 
 
-def run_state(path: Path) -> RunState:
-    """Return the state of the run whose record has the path."""
+def run_state(path: Path, check: Callable[[Record], object]) -> RunState:
+    """Return the state of the run whose record has the path.
+
+    Args:
+        path: Path of the record.
+        check: Refuses the record of a run that succeeded with a `RecordError` if it contradicts itself, such
+            as `Scores.from_record`.
+    """
     lease = Lease(path)
     owner = lease.owner
     if owner is not None:
@@ -46,6 +53,8 @@ def run_state(path: Path) -> RunState:
         return RunState(path, "to do")
     try:
         record = read_record(path)
+        if record.error is None:
+            check(record)
     except RecordError as error:
         return RunState(path, "damaged", reason=str(error))
     seconds = record.timing.get("seconds")

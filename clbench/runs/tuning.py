@@ -20,6 +20,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from clbench.base.leftovers import unfinished
 from clbench.base.strict_json import read_json
 from clbench.spec.identifiers import folder_name
 
@@ -100,7 +101,12 @@ def write_tuned(path: Path, scenario: str, seeds: Sequence[int], methods: Mappin
         known = {**read_json(path)["methods"], **known}
     content = {"scenario": scenario, "seeds": list(seeds), "methods": dict(sorted(known.items()))}
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+    partial = unfinished(path)
+    try:
+        partial.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+        partial.replace(path)  # a full disk leaves the settings of the others
+    finally:
+        partial.unlink(missing_ok=True)
 
 
 @cache

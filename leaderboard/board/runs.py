@@ -14,7 +14,7 @@ from typing import Any
 from clbench.base.errors import ClbenchError
 from clbench.base.text import printable
 from clbench.records.paths import label_of, place_of, record_name
-from clbench.records.pinned import other_parts, pinned
+from clbench.records.pinned import LATER, other_parts, pinned
 from clbench.records.reader import RecordError, read_record
 from clbench.records.record import Record, RunInfo, ScenarioInfo
 from clbench.runs.tuning import tuned_settings
@@ -25,7 +25,7 @@ from clbench.spec.protocol import Split
 from clbench.spec.scenario import balanced_order, target_order
 
 from .summary import NotShown
-from .tiers import tier_of
+from .tiers import findings_of, tier_of
 
 ACCESS = ("never", "prepare", "throughout")
 """Values of `Record.run.uses`: when a method may use prior data."""
@@ -54,6 +54,8 @@ class Run:
     """One of `DIVISIONS`."""
     tier: str
     """One of `TIERS`."""
+    findings: tuple[tuple[str, str], ...]
+    """What its verification found, as names with texts; see `findings_of`."""
     order: int
     """Order in which the targets were learned; 0 is the published one."""
     published: ScenarioInfo
@@ -144,6 +146,7 @@ def read_run(folder: Path, path: Path, split: Split = "test", changed: bool | No
         run.seed,
         division,
         tier_of(path),
+        tuple(findings_of(path)),
         run.order,
         published,
     )
@@ -273,32 +276,43 @@ def same_simulator(runs: list[Run]) -> Sifted:
 def same_definition(runs: list[Run]) -> Sifted:
     """Keep the runs whose scenario is defined as here, or, if it is not the project's, as in most records.
 
-    An older record has no definition, and is kept.
+    A record is kept if it is older than definitions, or than the parts of `LATER` in which it would differ.
     """
-
-    def defined(run: Run) -> Any:
-        return run.record.fingerprint.get("definition")
-
-    def reason(run: Run, other: Run) -> str:
-        parts = ", ".join(differences(defined(run), defined(other)))
-        return f"its scenario is not that of most records: {parts} differ."
-
-    kept, refused = _most(
-        [run for run in runs if run.record.run.scenario not in pinned() and defined(run) is not None],
-        lambda run: run.place,
-        lambda run: _text(defined(run)),
-        reason,
-    )
-    kept += [run for run in runs if run.record.run.scenario not in pinned() and defined(run) is None]
+    kept, refused = _same_parts([run for run in runs if run.record.run.scenario not in pinned()], later=False)
+    kept, others = _same_parts(kept, later=True)
+    refused += others
     for run in runs:
         scenario = run.record.run.scenario
         if scenario in pinned():
-            if other := other_parts(defined(run), pinned()[scenario]):
+            if other := other_parts(_definition(run), pinned()[scenario]):
                 words = f"it was made with another {scenario}: {', '.join(other)} differ."
                 refused.append(no_row(run.path, words))
             else:
                 kept.append(run)
     return kept, refused
+
+
+def _same_parts(runs: list[Run], later: bool) -> Sifted:
+    """Keep the runs whose definition has the usual parts, those of `LATER` or the others, or none of them."""
+
+    def parts(run: Run) -> Any:
+        found = _definition(run)
+        if not isinstance(found, dict):
+            return None if later else found
+        asked = {name: value for name, value in found.items() if name.startswith(LATER) == later}
+        return asked if asked or not later else None
+
+    def reason(run: Run, other: Run) -> str:
+        names = ", ".join(differences(parts(run), parts(other)))
+        return f"its scenario is not that of most records: {names} differ."
+
+    told = [run for run in runs if parts(run) is not None]
+    kept, refused = _most(told, lambda run: run.place, lambda run: _text(parts(run)), reason)
+    return [*kept, *(run for run in runs if parts(run) is None)], refused
+
+
+def _definition(run: Run) -> Any:
+    return run.record.fingerprint.get("definition")
 
 
 def same_layout(runs: list[Run]) -> Sifted:

@@ -1,16 +1,20 @@
 """Tiers: how far a record was checked, and by whom.
 
 The record itself is never touched. `clbench verify` writes its findings into a file next to the record. They
-hold for the bytes that it read: a record that is changed afterwards loses its tier.
+hold for the bytes that it read: a record that is changed afterwards loses its tier. So does one whose
+findings were changed or damaged.
 """
 
 from __future__ import annotations
 
 import hashlib
+import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from clbench.base.strict_json import read_json
+from clbench.records.content import content_hash
 
 TIERS = ("self-reported", "recomputed", "replayed", "retrained")
 """Checks of a record, from none: its metrics were computed again from its episodes; some of its episodes were
@@ -32,11 +36,27 @@ def checks_of(record: Path) -> list[Any]:
     return [*_verification(record).get("checks", ())]
 
 
+def findings_of(record: Path) -> list[tuple[str, str]]:
+    """Return who verified the record at `record`, when, and what each check found, as names with texts."""
+    values = _verification(record)
+    about = [(name, values.get(name)) for name in ("tier", "by", "time")]
+    checks = [(one.get("name"), one.get("found")) for one in checks_of(record) if isinstance(one, dict)]
+    return [
+        (name, text) for name, text in (*about, *checks) if isinstance(name, str) and isinstance(text, str)
+    ]
+
+
+def verification_text(values: Mapping[str, Any]) -> str:
+    """Return the text of the file of a verification; the hash in it reveals damage."""
+    return json.dumps({**values, "content": content_hash(values)}, indent=1) + "\n"
+
+
 def _verification(record: Path) -> dict[str, Any]:
-    """Return the verification of a record, empty if it does not hold for its bytes."""
+    """Return the verification of a record, empty if it is damaged or does not hold for its bytes."""
     try:
         values = read_json(verification_path(record))
-        if values["record"] == hashlib.sha256(record.read_bytes()).hexdigest() and values["tier"] in TIERS:
+        whole = values["content"] == content_hash(values) and values["tier"] in TIERS
+        if whole and values["record"] == hashlib.sha256(record.read_bytes()).hexdigest():
             return dict(values)
     except (OSError, ValueError, KeyError, TypeError):
         pass

@@ -8,7 +8,6 @@ time, and the fingerprint of the machine; the record is never changed.
 from __future__ import annotations
 
 import hashlib
-import json
 import tempfile
 from collections.abc import Sequence
 from dataclasses import asdict, is_dataclass
@@ -35,7 +34,7 @@ from clbench.scoring.metrics import measure
 from clbench.spec.scenario import Scenario
 
 from ..board.runs import differences, read_run
-from ..board.tiers import TIERS, tier_of, verification_path
+from ..board.tiers import TIERS, tier_of, verification_path, verification_text
 from ..views.format import write_if_changed
 from .replay import replay
 from .subject import Check, Request, Subject, some
@@ -101,7 +100,7 @@ def _write(path: Path, subject: Subject, tier: str, checks: Sequence[Check]) -> 
         "time": datetime.now(UTC).isoformat(timespec="seconds"),
         "verifier": subject.here,
     }
-    write_if_changed(verification_path(path), json.dumps(values, indent=1) + "\n")
+    write_if_changed(verification_path(path), verification_text(values))
 
 
 # ---- recomputed --------------------------------------------------------------------------------------------

@@ -5,12 +5,12 @@ The same rows give the same bytes: no date, no absolute path, fixed digits.
 
 from __future__ import annotations
 
-import uuid
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeAlias
 
+from clbench.base.leftovers import unfinished
 from clbench.scoring.intervals import Estimate
 from clbench.scoring.metric import Metric
 from clbench.scoring.metrics import METRICS
@@ -227,7 +227,7 @@ def write_all(texts: Mapping[Path, str]) -> list[Path]:
             if path.is_file() and path.read_bytes() == content:
                 continue
             path.parent.mkdir(parents=True, exist_ok=True)
-            partials[path] = path.with_name(f".{path.name}.{uuid.uuid4().hex}.partial")
+            partials[path] = unfinished(path)
             partials[path].write_bytes(content)
         for path, partial in partials.items():
             partial.replace(path)

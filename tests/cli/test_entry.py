@@ -122,6 +122,14 @@ def test_a_bug_shows_its_traceback() -> None:
     assert err.rstrip().endswith("KeyError: 'key'")
 
 
+def test_no_text_in_the_log_controls_the_terminal() -> None:
+    log = "logging.getLogger('clbench').warning('%s', '[red]x\\x1b[2J')"
+    program = f"import clbench.cli.main as m, logging; m.app = lambda: {log}; m.main()"
+    found = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert "[red]x\\x1b[2J" in found.stderr
+    assert "\x1b" not in found.stderr
+
+
 def test_a_terminal_without_a_sign_gets_another_and_no_traceback() -> None:
     program = f"import clbench.cli.main as m, sys; m.main = lambda: print('0.5 \\u00b1 0.1'); {RUN}"
     environment = {**os.environ, "PYTHONIOENCODING": "ascii"}

@@ -7,6 +7,9 @@ import pytest
 
 from clbench.base.entry_points import resolve
 from clbench.base.lease import Lease
+from clbench.jobs.recorded import has_record
+from clbench.records.reader import read_record
+from clbench.records.writer import write_record
 from clbench.runs.run import execute
 from clbench.runs.spec import RunSpec
 
@@ -43,6 +46,19 @@ def test_without_a_request_it_shows_what_is_in_the_folder(
     resolve("clbench.cli.status:status")(records=records, as_json=True)
     found = {entry["run"]: entry["state"] for entry in json.loads(capsys.readouterr().out)}
     assert found == {"Toy-v0/frozen/seed-0": "done", "Toy-v0/sft/seed-0": "damaged"}
+
+
+def test_a_record_that_run_would_do_again_is_not_done(
+    records: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = RunSpec(TOY, "frozen", seed=0).path(records)
+    record = read_record(path)
+    for column in record.episodes.values():
+        del column[-1]
+    write_record(record, path)
+    assert not has_record(RunSpec(TOY, "frozen", seed=0).resolve(), records)
+    resolve("clbench.cli.status:status")(records=records)
+    assert "Toy-v0/frozen/seed-0: damaged, " in capsys.readouterr().out
 
 
 def test_an_empty_folder_is_said_to_be_empty(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -1,6 +1,7 @@
 """The definition of a scenario: it changes with what a task is, and with nothing else."""
 
 import dataclasses
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -51,8 +52,9 @@ def remade(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., dic
     return remade
 
 
-def test_it_has_a_part_for_each_task_and_the_questions(remade: Callable[..., dict[str, str]]) -> None:
-    assert set(remade()) == {*(f"task {task.name}" for task in TOY.tasks), "questions"}
+def test_it_has_parts_for_each_task_and_the_questions(remade: Callable[..., dict[str, str]]) -> None:
+    names = [task.name for task in TOY.tasks]
+    assert set(remade()) == {f"{part} {name}" for part in ("task", "rule") for name in names} | {"questions"}
     assert remade() == remade()
 
 
@@ -80,24 +82,110 @@ def test_a_changed_task_changes_its_own_part(
     assert set(changed) <= {f"task {FIRST}", "questions"}  # its episodes give states for the questions
 
 
-def test_another_condition_of_success_changes_the_task(
-    remade: Callable[..., dict[str, str]], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    class Easier(ToyWorld):
-        def step(self, action: Any) -> Any:
-            state, reward, _, truncated, info = super().step(action)
-            return state, reward, reward > -0.4, truncated, info  # the toy: -0.3
+class Easier(ToyWorld):
+    """The toy with another condition of success."""
 
-    monkeypatch.setattr("clbench.testing.Easier", Easier, raising=False)
-    task = dataclasses.replace(TOY.retained[0], world="clbench.testing:Easier")
+    def step(self, action: Any) -> Any:
+        state, reward, _, truncated, info = super().step(action)
+        return state, reward, reward > -0.4, truncated, info  # the toy: -0.3
+
+
+class Generous(ToyWorld):
+    """The toy with other rewards."""
+
+    def step(self, action: Any) -> Any:
+        state, reward, *rest = super().step(action)
+        return state, reward + 0.01, *rest
+
+
+class Elsewhere(ToyWorld):
+    """The toy with other initial states."""
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        return super().reset(seed=None if seed is None else seed + 1, options=options)
+
+
+def test_a_task_that_names_another_expert_of_the_same_module_changes_though_it_was_defined_before(
+    empty_caches: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before = definition(TOY)
+    monkeypatch.setattr(
+        "clbench.testing.crooked_expert", lambda _: lambda state: np.ones(2, np.float32), raising=False
+    )
+    task = dataclasses.replace(TOY.retained[0], expert="clbench.testing:crooked_expert")
+    other = definition(dataclasses.replace(TOY, retained=(task, *TOY.retained[1:])))
+    assert f"task {FIRST}" in other_parts(other, before)
+
+
+@pytest.mark.parametrize("world", [Easier, Generous, Elsewhere])
+def test_another_success_reward_or_initial_state_changes_the_task(
+    world: type[ToyWorld], remade: Callable[..., dict[str, str]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("clbench.testing.Changed", world, raising=False)
+    task = dataclasses.replace(TOY.retained[0], world="clbench.testing:Changed")
     other = remade(dataclasses.replace(TOY, retained=(task, *TOY.retained[1:])))
     assert f"task {FIRST}" in other_parts(other, remade())
+
+
+CAMERA = """
+class Camera:
+    image_size, state_size = 64, 2
+    azimuth = 180.0
+
+    @staticmethod
+    def proprioception(states):
+        return states[:, :2]
+
+    @staticmethod
+    def pictured(states):
+        return states[:, :1]
+
+    def draw(self, states, views):
+        raise AssertionError("a definition needs no renderer")
+"""
+
+
+def _seen_by(camera: str) -> Scenario:
+    """Return the toy, seen by the camera of a module."""
+    seen: dict[str, Any] = {
+        name: tuple(dataclasses.replace(task, camera=f"{camera}:Camera") for task in getattr(TOY, name))
+        for name in ("retained", "target", "held_out")
+    }
+    return dataclasses.replace(TOY, **seen)
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "changed"),
+    [
+        ("class Camera:", "class Camera:  # a remark", []),
+        ("class Camera:", "class Camera:\n    'A view from above.'\n", []),
+        ("azimuth = 180.0", "azimuth = 175.0", ["camera"]),
+        ("image_size, state_size = 64, 2", "image_size, state_size = 32, 2", ["camera"]),
+        ("states[:, :2]", "states[:, 1:3]", ["camera"]),
+    ],
+)
+def test_another_camera_changes_the_part_of_the_camera_alone(
+    before: str,
+    after: str,
+    changed: list[str],
+    remade: Callable[..., dict[str, str]],
+    write_module: Callable[[str, str], None],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    for name, source in (("one_camera", CAMERA), ("other_camera", CAMERA.replace(before, after))):
+        write_module(name, source)
+        monkeypatch.delitem(sys.modules, name, raising=False)  # of another case
+    one, other = (remade(_seen_by(camera)) for camera in ("one_camera", "other_camera"))
+    assert set(one) == {*remade(), "camera"}
+    assert other_parts(other, one) == changed
 
 
 def test_a_definition_of_another_form_differs_as_a_whole() -> None:
     known = {"task left": "a", "questions": "b"}
     assert other_parts(None, known) == []  # an older record
     assert other_parts({"task left": "a"}, known) == ["questions"]
+    assert other_parts(known, {**known, "rule left": "c", "camera": "d"}) == []  # older than these parts
+    assert other_parts({**known, "rule left": "b"}, {**known, "rule left": "c"}) == ["rule left"]
     strangers: list[Any] = [[], "x", {"task left": "a", "questions": "b", "\x1b[2J": "c"}]
     for strange in strangers:
         assert other_parts(strange, known) == ["the tasks themselves"]

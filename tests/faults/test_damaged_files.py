@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from fault_server import Runs
 from helpers import resealed
+from verification import verify
 
 from clbench.base.cache import fault_of
 from clbench.base.errors import InputError
@@ -35,7 +36,13 @@ CACHED = {
 HALF_WAY = {"checkpoint": "cache/runs/*/*/*"}
 """Kinds of files that a killed run leaves, with their places."""
 
+BESIDE = {"numbers of the board": "site/board.json", "verification": "records/*/*/*.verified"}
+"""Kinds of files that commands make from records, with their places."""
+
 runs_of = importlib.import_module("clbench.leaderboard.board.runs")
+rows = importlib.import_module("clbench.leaderboard.board.rows")
+tiers = importlib.import_module("clbench.leaderboard.board.tiers")
+publishing = importlib.import_module("clbench.leaderboard.publishing")
 
 
 def damaged(content: bytes, chance: random.Random) -> bytes:
@@ -137,14 +144,19 @@ def test_a_run_with_a_damaged_file_gives_the_same_record(
         _check_run(runs, folder, finished, lasting_records)
 
 
-@pytest.mark.parametrize("kind", [kind for kind in CACHED if not kind.startswith("names")])
+@pytest.mark.parametrize("kind", [kind for kind in (*CACHED, *HALF_WAY) if not kind.startswith("names")])
 @pytest.mark.parametrize("count", [20, pytest.param(500, marks=pytest.mark.slow)])
 def test_a_damaged_file_of_a_cached_result_is_found(
-    kind: str, count: int, finished: Path, tmp_path: Path, record_property: Callable[[str, object], None]
+    kind: str,
+    count: int,
+    finished: Path,
+    half_way: Path,
+    tmp_path: Path,
+    record_property: Callable[[str, object], None],
 ) -> None:
-    _copy_caches(finished, tmp_path)
+    _copy_caches(half_way if kind in HALF_WAY else finished, tmp_path)
     chance = random.Random(kind)
-    files = _files(tmp_path, CACHED[kind])
+    files = _files(tmp_path, {**CACHED, **HALF_WAY}[kind])
     came: Counter[str] = Counter()
     for _ in range(count):
         path = chance.choice(files)
@@ -206,6 +218,44 @@ def test_a_damaged_record_is_refused_by_all_commands_or_shows_the_same_numbers(
             came["same numbers"] += 1
     record_property("counts", dict(came))
     assert came["set aside"] > 0.5 * count
+
+
+@pytest.fixture(scope="module")
+def board(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the folder of a board with a record that was verified."""
+    folder = tmp_path_factory.mktemp("board")
+    records, spec = folder / "records", RunSpec(fault_server.TOY, "frozen", 0)
+    execute(spec, records)
+    verify(spec.path(records), "recomputed", by="Ada")
+    publishing.write_site(rows.read_table(records), records, publishing.inputs_of(records))
+    return folder
+
+
+def _told(board: Path) -> tuple[Any, Any]:
+    """Return the kept numbers of a board and what the verification of its record found, None if refused."""
+    (record,) = (board / "records").glob("*/*/*.json")
+    kept = publishing.read_unchanged(board / "records", publishing.inputs_of(board / "records"))
+    return kept and kept.to_json(), tiers.findings_of(record) or None
+
+
+@pytest.mark.parametrize("kind", BESIDE)
+@pytest.mark.parametrize("count", [20, pytest.param(500, marks=pytest.mark.slow)])
+def test_a_damaged_file_beside_the_records_changes_no_number_of_the_board(
+    kind: str, count: int, board: Path, record_property: Callable[[str, object], None]
+) -> None:
+    chance, honest = random.Random(kind), _told(board)
+    assert None not in honest
+    (path,) = _files(board, BESIDE[kind])
+    content = path.read_bytes()
+    came: Counter[str] = Counter()
+    for _ in range(count):
+        path.write_bytes(damaged(content, chance))
+        told = _told(board)[list(BESIDE).index(kind)]
+        assert told in (None, honest[list(BESIDE).index(kind)])
+        came["refused" if told is None else "same numbers"] += 1
+    path.write_bytes(content)
+    record_property("counts", dict(came))
+    assert came["refused"] > 0.5 * count
 
 
 def _counts(run: ResolvedRun, records: Path) -> bool | None:

@@ -84,9 +84,11 @@ def test_a_run_that_dies_at_any_operation_is_completed_by_the_next_start(
     whole: tuple[Path, int],
     tmp_path: Path,
     lasting_records: Callable[[Path], dict[str, Any]],
+    record_property: Callable[[str, object], None],
 ) -> None:
     folder, count = whole
     _die(list(range(1, count + 1)), runs, tmp_path, folder, lasting_records)
+    record_property("counts", {"operations": count})
 
 
 @pytest.mark.slow
@@ -117,6 +119,7 @@ def test_a_full_disk_ends_a_run_without_a_record_and_the_next_start_completes_it
     tmp_path: Path,
     lasting_records: Callable[[Path], dict[str, Any]],
     share: float | None,
+    record_property: Callable[[str, object], None],
 ) -> None:
     folder, count = whole
     shares = [share] if share else [(number + 0.5) / FULL_DISKS for number in range(FULL_DISKS)]
@@ -127,6 +130,7 @@ def test_a_full_disk_ends_a_run_without_a_record_and_the_next_start_completes_it
         assert end.startswith("refused: ") or (end == "success" and place > 0.9), end
         assert len(list(mine.glob("records/*/*/*.json"))) == (end == "success")
         _check_next_start(runs, mine, folder, lasting_records)
+    record_property("counts", {"full disks": len(shares)})
 
 
 def test_sweeping_a_folder_of_finished_runs_removes_nothing(whole: tuple[Path, int]) -> None:

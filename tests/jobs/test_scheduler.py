@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from multiprocessing import forkserver
 from pathlib import Path
 from typing import Any
 
@@ -175,6 +176,27 @@ def test_stopping_the_scheduler_ends_its_processes(
         run_jobs([_job("slow", "slow", path=str(path))], Processes(1), bars)
     with pytest.raises(ProcessLookupError):
         os.kill(int(path.read_text()), 0)
+
+
+def test_a_ctrl_c_while_a_job_starts_is_not_lost(
+    tmp_path: Path, bars: Bars, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ensure_running, path = forkserver.ensure_running, tmp_path / "pid"
+
+    def interrupted() -> None:
+        signal.raise_signal(signal.SIGINT)
+        ensure_running()
+
+    monkeypatch.setattr(forkserver, "ensure_running", interrupted)
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # tests may run where it is ignored
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            run_jobs([_job("slow", "slow", path=str(path))], Processes(1), bars)
+    finally:
+        signal.signal(signal.SIGINT, before)
+    if path.exists() and path.read_text():
+        with pytest.raises(ProcessLookupError):
+            os.kill(int(path.read_text()), 0)
 
 
 def test_jobs_on_the_longest_chain_start_first(bars: Bars) -> None:

@@ -1,7 +1,10 @@
 """The command `clbench leaderboard`: the same records give the same files."""
 
 import errno
+import io
 import os
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -79,7 +82,7 @@ def test_unchanged_records_show_the_same_board_without_being_read(
     assert Path("".join(unchanged.split())) == four_methods.parent / "site"
 
 
-@pytest.mark.parametrize("what", ["record", "verification", "table", "numbers", "code"])
+@pytest.mark.parametrize("what", ["record", "verification", "table", "numbers", "one value", "code"])
 def test_a_board_is_computed_again_when_something_changed_that_it_was_made_from(
     what: str, four_methods: Path, shown: Callable[[], tuple[str, str]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -94,17 +97,57 @@ def test_a_board_is_computed_again_when_something_changed_that_it_was_made_from(
         (site / "LEADERBOARD.md").write_text("forged", encoding="utf-8")
     elif what == "numbers":
         (site / "board.json").write_bytes(before["board.json"][:-100])
+    elif what == "one value":
+        (site / "board.json").write_bytes(before["board.json"].replace(b"self-reported", b"retrained", 1))
     else:
         monkeypatch.setattr("clbench.leaderboard.publishing.source_hash", lambda *_: "other")
     printed, _ = shown()
     assert "Written: " in printed
     assert ("not shown" in printed.lower()) == ("not shown" in first.lower())
     after = {path.name: path.read_bytes() for path in site.iterdir()}
-    if what in ("table", "numbers"):
+    assert ("retrained" in printed) == ("retrained" in first)
+    if what in ("table", "numbers", "one value"):
         assert after == before
     else:
         assert after["board.json"] != before["board.json"]
     assert (after["leaderboard.csv"] != before["leaderboard.csv"]) == (what == "record")
+
+
+def test_a_board_whose_reader_leaves_is_written_whole(
+    four_methods: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("clbench.leaderboard.views.page.page", lambda _: "a page")
+    monkeypatch.setattr("clbench.leaderboard.views.page.pictures", lambda _: {})
+    with open(tmp_path / "out", "w", encoding="utf-8") as file:
+
+        class Closed(io.StringIO):
+            """Standard output in `clbench leaderboard | head -1`."""
+
+            def fileno(self) -> int:
+                return file.fileno()
+
+            def write(self, text: str) -> int:
+                raise BrokenPipeError(errno.EPIPE, "Broken pipe")
+
+        monkeypatch.setattr("sys.stdout", Closed())
+        with pytest.raises(SystemExit):
+            resolve("clbench.leaderboard.cli:show")(records=four_methods)
+    site = four_methods.parent / "site"
+    assert sorted(os.listdir(site)) == ["LEADERBOARD.md", "board.json", "index.html", "leaderboard.csv"]
+    assert "replay" in (site / "leaderboard.csv").read_text(encoding="utf-8")
+
+
+def test_what_a_killed_command_left_beside_the_board_is_removed(
+    four_methods: Path, shown: Callable[[], tuple[str, str]]
+) -> None:
+    site = four_methods.parent / "site"
+    site.mkdir()
+    code = "import sys; from pathlib import Path; from clbench.base.leftovers import unfinished; "
+    code += "unfinished(Path(sys.argv[1])).touch()"
+    subprocess.run([sys.executable, "-c", code, str(site / "index.html")], check=True)
+    assert list(site.glob(".*"))
+    shown()
+    assert not list(site.glob(".*"))
 
 
 def test_a_folder_without_rows_lists_why(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

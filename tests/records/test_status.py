@@ -12,6 +12,7 @@ from clbench.records.status import RunState, found_runs, run_state, seconds_left
 from clbench.records.writer import write_record
 from clbench.runs.run import execute
 from clbench.runs.spec import RunSpec
+from clbench.scoring.scores import Scores
 
 TOY = "clbench.testing:clbench/Toy-v0"
 
@@ -26,7 +27,7 @@ def test_every_state_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     lease = Lease(paths[3])
     assert lease.take()
     lease.report(0.25)
-    states = [run_state(path) for path in paths]
+    states = [run_state(path, Scores.from_record) for path in paths]
     assert [state.state for state in states] == ["done", "failed", "damaged", "running", "to do"]
     assert states[0].seconds == record.timing["seconds"]
     assert states[1].reason == "stage 1: ValueError: went wrong"

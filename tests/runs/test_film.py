@@ -220,6 +220,7 @@ def test_the_command_writes_the_requested_film(recorded: tuple[Record, Path], tm
         ({"fps": 60}, "--fps must be from 1 to 50, not 60."),
         ({"output": Path("toy.avi")}, "A film is a .gif or .mp4 file, not 'toy.avi'."),
         ({"changes": {"rate": "1"}}, "sft has no hyper-parameter 'rate'"),
+        ({"output": Path(__file__, "toy.gif")}, f"{Path(__file__)} cannot be written to: Not a directory."),
     ],
 )
 def test_bad_input_ends_with_exit_code_2_before_any_work(

@@ -5,14 +5,17 @@ import dataclasses
 import resource
 import subprocess
 import sys
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from clbench.base import lease as leases
 from clbench.base.cache import CacheError, cache_folder
 from clbench.base.entry_points import resolve
+from clbench.base.lease import LeaseLostError
 from clbench.learning.method import Method
 from clbench.policy.policy import Policy
 from clbench.records.reader import read_record
@@ -87,6 +90,30 @@ def test_an_error_of_the_file_system_inside_a_hook_is_a_failure_of_the_method(
     assert record.error is not None
     assert record.error["type"] == "FileNotFoundError"
     assert record.error["where"] == "prepare"
+
+
+@dataclasses.dataclass
+class _Waits(Method):
+    """A method during which another process takes its run over, as if this machine was suspended."""
+
+    def end_task(self, policy: Policy, stage: Any) -> None:
+        for lease in (cache_folder() / "runs").glob(".*.lease"):
+            lease.unlink()
+        time.sleep(1.0)
+
+
+def test_a_run_that_another_process_took_over_writes_nothing_more(
+    tmp_path: Path,
+    empty_caches: Path,
+    stranger: Callable[[type[Method]], str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(leases, "SECONDS", 0.3)
+    spec = RunSpec(TOY, stranger(_Waits), seed=0)
+    with pytest.raises(LeaseLostError, match="was lost to another process"):
+        execute(spec, tmp_path / "records")
+    assert not (tmp_path / "records").exists()
+    assert [path.name for path in cache_folder().glob("runs/*/stage-*")] == ["stage-0"]
 
 
 @dataclasses.dataclass

@@ -1,6 +1,9 @@
 """Tuning: the same number of settings for every method, and a choice on validation episodes."""
 
+import errno
+import os
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -74,6 +77,25 @@ def test_a_run_takes_the_tuned_settings_unless_it_changes_them(
     assert changed.label == "l2_sp+strength=5.0" or changed.label == "l2_sp+strength=5"
     assert RunSpec(TOY, "ewc", 0).resolve().info.settings["step_factor"] == 1.0
     tuned.cache_clear()
+
+
+def test_a_full_disk_leaves_the_tuned_settings_of_other_methods(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, one = tmp_path / "Toy-v0.json", Tuned({"step_factor": 0.1}, (_tried(0.6, 0.9, 0.1),))
+    write_tuned(path, "clbench/Toy-v0", [100], {"sft": one})
+    before = path.read_bytes()
+
+    def fill(path: Path, *_: Any, **__: Any) -> int:
+        path.touch()
+        os.truncate(path, 0)
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(Path, "write_text", fill)
+    with pytest.raises(OSError, match="No space left"):
+        write_tuned(path, "clbench/Toy-v0", [100], {"lwf": one})
+    assert path.read_bytes() == before
+    assert list(tmp_path.iterdir()) == [path]
 
 
 def test_tuned_settings_of_other_methods_stay_in_the_file(

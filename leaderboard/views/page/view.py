@@ -205,6 +205,15 @@ class RowView:
         return [*flat(run.settings), *flat(uses)]
 
     @property
+    def findings(self) -> list[Entry]:
+        """What others found who checked its runs."""
+        checked = [run for run in self.row.runs if run.findings]
+        if not checked:
+            return []
+        found = same_or_each([(run.seed, flat(dict(run.findings))) for run in checked])
+        return [Entry("seeds", ", ".join(str(run.seed) for run in checked)), *found]
+
+    @property
     def fingerprint(self) -> list[Entry]:
         """Machine and software of its runs."""
         return same_or_each([(run.seed, flat(run.record.fingerprint)) for run in self.row.runs])

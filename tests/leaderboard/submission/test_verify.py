@@ -254,6 +254,18 @@ def test_the_command_lists_its_checks(mine: Path, honest: Path, capsys: pytest.C
     assert "NOT ends of episodes" in capsys.readouterr().out
 
 
+def test_a_strangers_text_in_a_check_does_not_control_the_terminal(
+    mine: Path, honest: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = importlib.import_module("clbench.leaderboard.cli").verify
+    edit(mine, lambda values: values["fingerprint"]["rollouts"].update({"[red]\x1b[2Jworld": "0"}))
+    with pytest.raises(SystemExit):
+        command(mine, tier="recomputed", scenario=TOY, records=mine.parents[2], workers=1)
+    shown = capsys.readouterr().out
+    assert "the rollouts of [red]\\x1b[2Jworld differ" in shown
+    assert "\x1b" not in shown
+
+
 def test_the_command_prints_json_of_good_and_bad_records(
     mine: Path, honest: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -139,13 +139,23 @@ def test_a_record_that_cannot_be_a_row_is_listed_with_its_reason_and_hides_no_ot
 def test_a_record_of_another_definition_than_most_of_a_strangers_scenario_is_not_shown(
     four_methods: Path, add_full: Callable[..., Path], shown: Callable[[], tuple[str, str]]
 ) -> None:
-    for seed, of_task in ((0, "a"), (1, "a"), (2, "b")):
-        edit = set_in("fingerprint", "definition", {"task skill_0": of_task, "questions": "c"})
+    rules: list[dict[str, str]] = [
+        {},
+        {},
+        {},
+        {"rule skill_0": "r"},
+        {"rule skill_0": "r"},
+        {"rule skill_0": "s"},
+    ]
+    for seed, rule in enumerate(rules):
+        definition = {"task skill_0": "b" if seed == 2 else "a", "questions": "c", **rule}
+        edit = set_in("fingerprint", "definition", definition)
         add_full("lora", seed, edit=edit, place=f"Toy-v0/lora/seed-{seed}.json")
     for text in shown():
-        reason = "its scenario is not that of most records: task skill_0 differ."
-        assert f"Toy-v0/lora/seed-2.json: {reason}" in flat(text)
-        assert "Toy-v0/lora/seed-0.json" not in flat(text)
+        reason = "its scenario is not that of most records:"
+        assert f"Toy-v0/lora/seed-2.json: {reason} task skill_0 differ." in flat(text)
+        assert f"Toy-v0/lora/seed-5.json: {reason} rule skill_0 differ." in flat(text)
+        assert not any(f"Toy-v0/lora/seed-{seed}.json" in flat(text) for seed in (0, 1, 3, 4))
 
 
 def test_a_record_of_another_definition_of_a_scenario_of_the_project_is_not_shown(

@@ -1,6 +1,8 @@
 """The page: all that is behind the numbers, in one file, the same bytes from the same records."""
 
 import dataclasses
+import hashlib
+import importlib
 import os
 import re
 import subprocess
@@ -21,6 +23,7 @@ from clbench.records.writer import write_record
 
 page = resolve("clbench.leaderboard.views.page:page")
 pictures = resolve("clbench.leaderboard.views.page:pictures")
+tiers = importlib.import_module("clbench.leaderboard.board.tiers")
 read_table = resolve("clbench.leaderboard.board.rows:read_table")
 
 HOSTILE = "</script><img src=x onerror=alert(1)>'\"&{{ 1 }}"
@@ -99,6 +102,21 @@ def test_perturbed_retention_has_a_column_only_where_a_row_has_it(
     better = words(by_id(document, "clbench/Toy-v0/better"))
     assert "perturbed retention \N{EN DASH} The run has no perturbed episodes" in better
     assert "--seeds 2 --perturb" not in better
+
+
+def test_a_row_says_what_its_verification_looked_at_and_which_lie_it_could_have_missed(records: Path) -> None:
+    method = "clbench/Toy-v0/sft"
+    assert "Checked by others" not in words(by_id(parsed(page(read_table(records))), method))
+    record = record_path(records, "clbench/Toy-v0", "sft", 0)
+    found = "40 of 900 replayed, all ended as recorded; 64 made-up ones would have been found with 95 %"
+    checks = [{"name": "episodes", "found": found, "passed": True}, {"name": HOSTILE, "found": "\x1b[2J"}, 7]
+    text = record.read_bytes()
+    values = {"tier": "replayed", "record": hashlib.sha256(text).hexdigest(), "checks": checks, "by": "Ada"}
+    tiers.verification_path(record).write_text(tiers.verification_text(values), encoding="utf-8")
+    own = by_id(parsed(page(read_table(records))), method)
+    assert f"seeds 0 tier replayed by Ada episodes {found} " in words(own)
+    assert "\x1b" not in words(own)
+    assert not list(own.iter("img"))
 
 
 def test_a_missing_value_is_a_dash_that_says_why(add: Callable[..., Path], records: Path) -> None:

@@ -1,0 +1,158 @@
+"""The rule of a task as code: its condition of success and its reward, without comments, docstrings, layout.
+
+A few fixed episodes miss a threshold that moves a little; the code does not. It is that of the functions and
+classes that a rule reaches in its own modules, with the values that they use. A rule begins at the class of
+the world. A suite has a module `rules` with a table by task instead, of which the task's entry counts alone.
+"""
+
+from __future__ import annotations
+
+import ast
+import functools
+import importlib
+import importlib.util
+import inspect
+from collections.abc import Iterator, Mapping
+from types import FunctionType, ModuleType
+from typing import Any
+
+import numpy as np
+
+from clbench.base.entry_points import resolve
+from clbench.spec.task import Task
+
+_PLAIN = (bool, int, float, str, bytes, slice, type(None))
+
+
+def rule_code(task: Task) -> str:
+    """Return the code of a task's rule."""
+    world = resolve(task.world)
+    module = task.world.partition(":")[0]
+    beside = f"{module.rpartition('.')[0]}.rules"
+    suite = "." in module and importlib.util.find_spec(beside) is not None
+    modules = [importlib.import_module(name) for name in ([module, beside] if suite else [module])]
+    tables = {id(one): one for each in modules for one in vars(each).values() if isinstance(one, Mapping)}
+    entries = [table[task.name] for table in tables.values() if task.name in table]
+    roots = entries if suite and entries else [world, *entries]
+    homes = {getattr(root, "__module__", module) for root in roots}
+    reached = _Reached(homes | {each.__name__ for each in modules})
+    for number, root in enumerate(roots):
+        reached.add(f"{task.name} {number}", root)
+    return "\n".join(sorted(f"{name}: {text}" for name, text in reached.texts.items()))
+
+
+def module_code(module: str) -> str:
+    """Return the code of a module without its comments, its docstrings and its layout."""
+    return ast.unparse(_tree(_source(module)))
+
+
+class _Reached:
+    """The texts of functions and values, by names that say where they were found.
+
+    Args:
+        modules: Names of the modules whose functions and classes are read; of others, the name counts alone.
+    """
+
+    def __init__(self, modules: set[str]) -> None:
+        self.modules, self.texts = modules, dict[str, str]()
+        self._objects: list[object] = []
+
+    def add(self, name: str, value: Any) -> None:
+        """Add a value, found under a name, with all that it reaches."""
+        if isinstance(value, FunctionType):
+            self._add_function(name, value)
+        elif isinstance(value, type):
+            self._add_class(value)
+        elif isinstance(value, _PLAIN):
+            self.texts[name] = repr(value)
+        elif isinstance(value, np.ndarray | np.generic):
+            self.texts[name] = repr(value.tolist())
+        elif isinstance(value, functools.partial):
+            self._add_all(name, {"function": value.func, "given": value.args, **value.keywords})
+        elif isinstance(value, Mapping):
+            self._add_all(name, {repr(key): one for key, one in value.items()})
+        elif isinstance(value, tuple | list):
+            self._add_all(name, dict(enumerate(value)))
+        elif type(value).__module__ in self.modules and not any(value is one for one in self._objects):
+            self._objects.append(value)  # objects may name each other
+            self._add_class(type(value))
+            self._add_all(name, getattr(value, "__dict__", {}))
+
+    def _add_all(self, name: str, values: Mapping[Any, Any]) -> None:
+        for key, one in values.items():
+            self.add(f"{name}.{key}", one)
+
+    def _add_class(self, value: type) -> None:
+        if value.__module__ not in self.modules or value.__qualname__ in self.texts:
+            return
+        self.texts[value.__qualname__] = ", ".join(base.__qualname__ for base in value.__bases__)
+        for base in value.__bases__:
+            self._add_class(base)
+        for name, one in vars(value).items():
+            function = getattr(one, "__func__", getattr(one, "fget", one))
+            if isinstance(function, FunctionType) or not name.startswith("__"):
+                self.add(f"{value.__qualname__}.{name}", function)
+
+    def _add_function(self, name: str, value: FunctionType) -> None:
+        """Add the code of a function, and what it takes from its module and from the function around it."""
+        text = _function_code(value) if value.__module__ in self.modules else ""
+        if not text or self.texts.get(name) == text:  # of another module, or of no file; or here before
+            return
+        self.texts[name] = text
+        used = inspect.getclosurevars(value)
+        self._add_all(name, used.nonlocals)
+        for other, one in used.globals.items():
+            self.add(other, one)
+
+
+def _function_code(function: FunctionType) -> str:
+    """Return the code of a function; of a lambda, that of all lambdas on its line."""
+    found = _functions(_source(function.__module__)).get(function.__code__.co_firstlineno, ())
+    return "; ".join(found)
+
+
+def _source(module: str) -> str:
+    """Return the source of a module, nothing for one that has no file, such as a prompt."""
+    try:
+        return _text(importlib.import_module(module))
+    except (ImportError, OSError, TypeError):
+        return ""
+
+
+@functools.cache  # a rule asks for each of its functions
+def _text(module: ModuleType) -> str:
+    return inspect.getsource(module)
+
+
+@functools.cache
+def _functions(source: str) -> Mapping[int, list[str]]:
+    """Return the code of the functions of a module by their first line, as code objects count them."""
+    found: dict[int, list[str]] = {}
+    for node in ast.walk(_tree(source)):
+        if isinstance(node, ast.FunctionDef | ast.Lambda):
+            decorators = getattr(node, "decorator_list", [])
+            first = min([node.lineno, *(one.lineno for one in decorators)])
+            found.setdefault(first, []).append(ast.unparse(node))
+    return found
+
+
+def _tree(source: str) -> ast.Module:
+    """Return the syntax of a module without its docstrings."""
+    tree = ast.parse(source)
+    for node, body in _bodies(tree):
+        node.body = [one for one in body if not _is_text(one)] or [ast.Pass()]
+    return tree
+
+
+def _bodies(tree: ast.Module) -> Iterator[tuple[Any, list[ast.stmt]]]:
+    """Yield the parts of a module that have statements, with these."""
+    for node in ast.walk(tree):
+        body = getattr(node, "body", None)
+        if isinstance(body, list):  # a lambda's is an expression
+            yield node, body
+
+
+def _is_text(node: ast.stmt) -> bool:
+    """Return whether a statement is a text alone, as a docstring is."""
+    constant = node.value if isinstance(node, ast.Expr) else None
+    return isinstance(constant, ast.Constant) and isinstance(constant.value, str)

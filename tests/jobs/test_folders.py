@@ -1,0 +1,31 @@
+"""Folders that cannot be written to: named before work begins, and nothing is left in those that can."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+from clbench.base.errors import InputError
+from clbench.jobs.folders import check_folders
+from clbench.records.paths import record_path
+
+
+def test_folders_that_can_be_written_to_or_made_stay_as_they_are(empty_caches: Path) -> None:
+    (empty_caches / "there").mkdir()
+    check_folders(
+        {"--records": empty_caches / "there", "--output": empty_caches / "a" / "b", "--write": None}
+    )
+    assert [path.name for path in empty_caches.rglob("*")] == ["there"]
+
+
+@pytest.mark.parametrize("below", [".", "a/b"])
+def test_a_link_that_leads_to_itself_is_named(below: str, empty_caches: Path) -> None:
+    loop = empty_caches / "loop"
+    loop.symlink_to(loop)
+    folder = loop / below
+    record_path(folder, "clbench/Toy-v0", "sft", 0)  # looks at links, and leaves this one to the check
+    reason = "Too many levels of symbolic links"
+    with pytest.raises(
+        InputError, match=rf"--records {re.escape(str(folder))} cannot be written to: {reason}"
+    ):
+        check_folders({"--records": folder})
