@@ -15,6 +15,7 @@ from clbench.spec.policies import DEFAULT_POLICY
 from clbench.spec.references import BASELINE
 
 from .board.rows import read_table
+from .table import frame_of
 
 if TYPE_CHECKING:
     import pandas
@@ -50,7 +51,7 @@ def compare(
         device: Device on which policies are computed, for example "cpu" or "cuda".
 
     Returns:
-        One row for each method, the best final average first, with the columns of `clbench.leaderboard.load`:
+        One row for each method, the best final average first, with the columns of `clbench.load_board`:
         each metric with its interval, the costs, and in `groups` which methods are not told apart.
 
     Raises:
@@ -58,8 +59,6 @@ def compare(
         InputError: A value cannot be used, or a record makes no row; the message says why.
         RunsFailedError: A run failed.
     """
-    from . import frame_of
-
     check_device(device)
     names = dict.fromkeys([BASELINE, *map(name_of, methods)])
     firsts = [RunSpec(scenario, name, first_seed, device=device, policy=policy) for name in names]

@@ -12,6 +12,7 @@ import pytest
 from helpers import sealed
 from verification import TOY, edit, failures, flip, verify
 
+import clbench
 from clbench.evaluation.rollouts import Evaluator
 from clbench.learning.pretraining import pretrained_policy
 from clbench.records.paths import record_path
@@ -104,7 +105,7 @@ def test_a_record_can_be_replayed_from_policies_that_are_made_again(mine: Path) 
 def test_the_table_shows_the_least_tier_of_a_row(mine: Path, honest: Path) -> None:
     verify(mine, "replayed", honest)
     records = next(folder for folder in mine.parents if folder.name == "records")
-    load = importlib.import_module("clbench.leaderboard").load
+    load = clbench.load_board
     assert list(load(records).tier) == ["replayed"]
     other = mine.with_name("seed-1.json")
     shutil.copy(mine, other)
