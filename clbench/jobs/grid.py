@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from rich.console import Console
 
 from clbench.base.cache import cache_folder
-from clbench.base.errors import ClbenchError, WrongTypeError
+from clbench.base.errors import ClbenchError, InputError, WrongTypeError
 from clbench.base.leftovers import sweep
 from clbench.base.text import counted, printable
 from clbench.jobs.bars import lines_console
@@ -25,7 +25,7 @@ from clbench.records.paths import RECORDS
 from clbench.records.reader import read_record
 from clbench.runs.checkpoints import has_stages
 from clbench.runs.spec import ResolvedRun, RunSpec, check_device
-from clbench.spec.identifiers import installed_methods
+from clbench.spec.identifiers import check_known, installed_methods
 from clbench.spec.policies import DEFAULT_POLICY
 
 if TYPE_CHECKING:
@@ -150,7 +150,6 @@ def run(
         InputError: A value cannot be used; the message says which.
         RunsFailedError: A run failed.
     """
-    check_device(device)
     spec = RunSpec(
         scenario, name_of(method), first_seed, settings or {}, device, perturb=perturb, policy=policy
     )
@@ -161,8 +160,16 @@ def run_specs(firsts: Sequence[RunSpec], seeds: int, records: Path, workers: int
     """Do the runs that `firsts` name, each with several seeds from its own on, and return their records.
 
     Raises:
+        UnknownNameError: There is no such scenario, method or hyper-parameter.
+        InputError: A value cannot be used; the message says which.
         RunsFailedError: A run failed.
     """
+    for name, value in (("seeds", seeds), ("workers", workers)):
+        if value is not None and (type(value) is not int or value < 1):
+            raise InputError(f"{name} must be a whole number from 1, not {value!r}.")
+    check_known([one.scenario for one in firsts], [one.method for one in firsts])
+    for device in {one.device for one in firsts}:
+        check_device(device)
     specs = [replace(one, seed=one.seed + number) for one in firsts for number in range(seeds)]
     runs = [spec.resolve() for spec in specs]
     console = lines_console()
@@ -184,10 +191,12 @@ def name_of(method: str | type[Method]) -> str:
     """Return the name of a method: the installed one, or "module:Class".
 
     Raises:
-        WrongTypeError: The class is inside a function or another class, where no name can reach it.
+        WrongTypeError: It is no class, or one inside a function or another class, where no name can reach it.
     """
     if isinstance(method, str):
         return method
+    if not isinstance(method, type):
+        raise WrongTypeError(f"A method must be a class or its name, not {method!r}.")
     place = f"{method.__module__}:{method.__qualname__}"
     if not method.__qualname__.isidentifier():
         raise WrongTypeError(
