@@ -359,7 +359,11 @@ def test_a_quiet_run_prints_failures_alone(
 def test_demonstrations_are_collected_and_shown(empty_caches: Path) -> None:
     result = _clbench("demonstrations", TOY)
     assert result.returncode == 0, result.stderr
-    assert re.search(r"clbench/toy/[0-9a-f]{16}/left-v0 ", result.stdout)
+    assert re.search(
+        r"left: retained, 10 episodes, \d noisy, success 1.00, mean length [\d.]+\n"
+        r"    clbench/toy/[0-9a-f]{16}/left-v0\n",
+        result.stdout,
+    )
     assert "demonstrations left: 10 episodes" in result.stderr
 
 
