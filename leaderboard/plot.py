@@ -138,3 +138,7 @@ def _chosen(scenario: str | None, counts: Mapping[str, int], what: str, folder: 
     if chosen not in counts:
         raise unknown(f"scenario with a {what}", chosen, counts)
     return chosen
+
+
+def __dir__() -> list[str]:
+    return __all__

@@ -140,7 +140,9 @@ def measure(scenario: str, /, *tasks: str, episodes: Annotated[int, whole_number
 def _table(scenario: Scenario, rows: Sequence[Measurement], episodes: int) -> Table:
     """Return measurements of experts as a table for the terminal."""
     table = Table(
-        box=SIMPLE_HEAD, padding=(0, 1, 0, 0), title=f"Experts of {scenario.id}, {episodes} episodes each"
+        box=SIMPLE_HEAD,
+        padding=(0, 1, 0, 0),
+        title=f"Experts of {scenario.id}, {counted(episodes, 'episode')} each",
     )
     columns = ("task", "group", "success", "mean return", "lowest return", "mean steps")
     for number, column in enumerate(columns):

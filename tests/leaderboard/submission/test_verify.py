@@ -255,6 +255,22 @@ def test_the_command_lists_its_checks(mine: Path, honest: Path, capsys: pytest.C
     assert "NOT ends of episodes" in capsys.readouterr().out
 
 
+def test_a_record_elsewhere_is_refused_with_the_option_that_finds_it(
+    mine: Path, honest: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    command = importlib.import_module("clbench.leaderboard.cli").verify
+    records = next(folder for folder in mine.parents if folder.name == "records")
+    monkeypatch.chdir(records.parent)
+    beside = Path("records") / mine.relative_to(records)
+    with pytest.raises(SystemExit) as stopped:
+        command(beside, tier="recomputed", scenario=TOY, workers=1)
+    assert stopped.value.code == 2
+    assert f"{mine} is not below " in (error := capsys.readouterr().err)
+    assert "name its folder of records, in which it is SCENARIO/METHOD/seed-N.json, with --records" in error
+    command(beside, tier="recomputed", scenario=TOY, records=Path("records"), workers=1)
+    assert f"{beside}: recomputed" in capsys.readouterr().out
+
+
 def test_the_command_prints_json_of_good_and_bad_records(
     mine: Path, honest: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
