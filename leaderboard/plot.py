@@ -81,15 +81,16 @@ def plane(records: Path | str = RECORDS, scenario: str | None = None, *, dark: b
         InputError: No record makes a row.
         UnknownNameError: The scenario has no row.
     """
-    from .board.rows import read_table
-    from .views.page.charts import FONT, WIDE
+    from .publishing import read_board
+    from .views.page.charts import FONT, WIDE, heading
     from .views.page.charts import plane as chart
     from .views.page.plot import themed
 
-    rows = read_table(Path(records)).rows
+    rows = read_board(Path(records)).rows
     names = [row.scenario for row in rows]
     chosen = _chosen(scenario, {name: names.count(name) for name in names}, "row", records)
-    return themed(chart([row for row in rows if row.scenario == chosen], WIDE, font=FONT), dark)
+    drawn = chart([row for row in rows if row.scenario == chosen], WIDE, font=FONT)
+    return themed({**drawn, "title": heading(chosen)}, dark)
 
 
 def frontier(records: Path | str = RECORDS, scenario: str | None = None, *, dark: bool = False) -> Plot:
@@ -107,7 +108,7 @@ def frontier(records: Path | str = RECORDS, scenario: str | None = None, *, dark
         UnknownNameError: The scenario has none.
     """
     from .board.frontier import ladder_of, read_frontiers
-    from .views.page.charts import FONT
+    from .views.page.charts import FONT, heading
     from .views.page.frontier import WIDE
     from .views.page.frontier import frontier as chart
     from .views.page.plot import themed
@@ -115,7 +116,7 @@ def frontier(records: Path | str = RECORDS, scenario: str | None = None, *, dark
     folder = ladder_of(Path(records))
     found, _ = read_frontiers(folder)
     chosen = _chosen(scenario, {name: len(curves) for name, curves in found.items()}, "curve", folder)
-    return themed(chart(found[chosen], WIDE, FONT), dark)
+    return themed({**chart(found[chosen], WIDE, FONT), "title": heading(chosen)}, dark)
 
 
 def _records(runs: Record | Iterable[Record] | Path | str) -> list[Record]:

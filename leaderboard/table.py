@@ -31,9 +31,9 @@ def load_board(records: Path | str = RECORDS) -> pandas.DataFrame:
     Raises:
         FileNotFoundError: The folder does not exist.
     """
-    from .board.rows import read_table
+    from .publishing import read_board
 
-    return frame_of(read_table(Path(records)))
+    return frame_of(read_board(Path(records)))
 
 
 def frame_of(board: Summary) -> pandas.DataFrame:

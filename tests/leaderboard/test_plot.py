@@ -93,8 +93,8 @@ def test_a_plane_shows_every_method_in_the_colours_of_the_theme(four_methods: Pa
     light, dark = (
         plot.plane(four_methods, "clbench/Toy-v0", dark=dark)._repr_svg_() for dark in (False, True)
     )
-    for method in ("sft", "replay", "asks", "from_scratch"):
-        assert f">{method}</text>" in light
+    for text in ("clbench/Toy-v0", "sft", "replay", "asks", "from_scratch"):
+        assert f">{text}</text>" in light
     assert "var(--" not in light + dark
     assert light != dark
     assert plot.plane(str(four_methods)).svg() == light  # the scenario with most rows

@@ -11,8 +11,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from ...board.rows import Row
-from ...board.summary import DIVISIONS
+from ...board.summary import DIVISIONS, RowSummary
 from ..format import format_interval
 from .labels import LONGEST, Mark, place
 
@@ -147,7 +146,7 @@ LOW, HIGH = -0.02, 1.02
 
 
 def plane(
-    rows: Sequence[Row], size: Size, anchors: Mapping[str, str] | None = None, font: str = SYSTEM_FONT
+    rows: Sequence[RowSummary], size: Size, anchors: Mapping[str, str] | None = None, font: str = SYSTEM_FONT
 ) -> Spec:
     """Return the plane of retention and adaptation with the Pareto front of each division.
 
@@ -204,11 +203,11 @@ def layer(values: Sequence[Mapping[str, Any]], mark: Spec, **encoding: Any) -> S
     return {"data": {"values": list(values)}, "mark": mark, "encoding": encoding}
 
 
-def _is_in_plane(row: Row) -> bool:
+def _is_in_plane(row: RowSummary) -> bool:
     return row.estimates["adaptation"].value is not None and row.estimates["retention"].value is not None
 
 
-def _point(row: Row, anchor: str) -> dict[str, Any]:
+def _point(row: RowSummary, anchor: str) -> dict[str, Any]:
     point: dict[str, Any] = {"method": row.method, "division": row.division, "anchor": anchor}
     for side, name in (("x", "adaptation"), ("y", "retention")):
         one = row.estimates[name]
