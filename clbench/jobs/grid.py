@@ -17,20 +17,21 @@ from clbench.base.text import counted, printable
 from clbench.jobs.bars import lines_console
 from clbench.jobs.folders import check_folders, minari_folder
 from clbench.jobs.job import Job, Workers
-from clbench.jobs.plan import Plan
 from clbench.jobs.processes import Here, Processes
 from clbench.jobs.recorded import has_record, set_aside
 from clbench.jobs.scheduler import run_with_bars
 from clbench.records.paths import RECORDS
 from clbench.records.reader import read_record
-from clbench.runs.checkpoints import has_stages
 from clbench.runs.spec import ResolvedRun, RunSpec, check_device
 from clbench.spec.identifiers import check_known, installed_methods
 from clbench.spec.policies import DEFAULT_POLICY
 
 if TYPE_CHECKING:
+    from clbench.jobs.plan import Plan
     from clbench.learning.method import Method
     from clbench.records.record import Record
+
+# PyTorch is imported where it is needed, so that wrong names and values do not wait for it.
 
 
 class RunsFailedError(ClbenchError, RuntimeError):
@@ -47,6 +48,8 @@ class Missing(NamedTuple):
 
     def plan(self, records: Path, checkpoints: Path | None, tensorboard: Path | None = None) -> Plan:
         """Return the plan of the jobs."""
+        from clbench.jobs.plan import Plan
+
         plan = Plan()
         for one in self.runs:
             plan.add_run(one, records, checkpoints=checkpoints, tensorboard=tensorboard)
@@ -57,6 +60,8 @@ class Missing(NamedTuple):
 
 def missing(runs: Sequence[ResolvedRun], records: Path, checkpoints: Path | None) -> Missing:
     """Return what has to be done until all runs have a record and, with `checkpoints`, policies there."""
+    from clbench.runs.checkpoints import has_stages
+
     without = [run for run in runs if not has_record(run, records)]
     recorded = [run for run in runs if run not in without]
     return Missing(without, [run for run in recorded if checkpoints and not has_stages(run, checkpoints)])

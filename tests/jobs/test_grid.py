@@ -126,6 +126,14 @@ def test_wrong_values_are_named_before_anything_runs(
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize("call", ['run("clbench/Fetsh-v1", "sft")', f'compare("{TOY}", "frosen")'])
+def test_a_wrong_name_does_not_wait_for_pytorch(tmp_path: Path, call: str) -> None:
+    caught = f"try: clbench.{call}\nexcept LookupError as error: print(error, 'torch' in sys.modules)"
+    said = run_script(f"import sys, clbench\n{caught}", tmp_path).stdout
+    assert "Did you mean" in said
+    assert said.endswith(" False\n")
+
+
 def test_a_job_of_this_process_ends_when_its_worker_is_closed() -> None:
     reached = []
 
