@@ -3,7 +3,9 @@ from .evaluation.rollouts import Episode as Episode
 from .evaluation.rollouts import Evaluator as Evaluator
 from .jobs.grid import RunsFailedError as RunsFailedError
 from .jobs.grid import run as run
-from .leaderboard.comparison import compare as compare  # type: ignore[import-not-found]  # in a checkout it is elsewhere
+from .leaderboard import plot as plot  # type: ignore[import-not-found]  # in a checkout it is elsewhere
+from .leaderboard.comparison import compare as compare  # type: ignore[import-not-found]
+from .leaderboard.table import load_board as load_board  # type: ignore[import-not-found]
 from .learning.method import Metadata as Metadata
 from .learning.method import Method as Method
 from .learning.method import Progress as Progress

@@ -61,10 +61,15 @@ def show(
             then stand beside the published ones.
         as_json: Print JSON, one object for each row with every metric and cost, and write no files.
     """
+    from clbench.scoring.metrics import load_metric
+
     from .board.summary import column_names, values_of
     from .publishing import add_published, inputs_of, read_unchanged, site_of, write_site
     from .views.terminal import terminal
 
+    if sort is not None:
+        with checked_input():
+            load_metric(sort)
     messages = Console(stderr=True, soft_wrap=True)
     if published:
         messages.print(Text(f"{counted(add_published(records), 'published record')} added to {records}."))
@@ -79,7 +84,7 @@ def show(
     if board is None:
         board = table = _computed(records)
     with checked_input():
-        shown = _chosen(board, scenario, sort)
+        shown = _chosen(board, scenario)
     if as_json:
         print_json([dict(zip(column_names(), values_of(row), strict=True)) for row in shown.rows])
         return
@@ -100,16 +105,12 @@ def _computed(records: Path) -> Table:
         return read_table(records)
 
 
-def _chosen(board: Summary, scenario: str | None, sort: str | None) -> Summary:
-    """Return the part of the board that is asked for, if there is such a scenario and such a metric.
+def _chosen(board: Summary, scenario: str | None) -> Summary:
+    """Return the part of the board that is asked for.
 
     Raises:
-        UnknownNameError: The board has no rows of the scenario, or no metric has the name of `sort`.
+        UnknownNameError: The board has no rows of the scenario.
     """
-    from clbench.scoring.metrics import load_metric
-
-    if sort is not None:
-        load_metric(sort)
     if scenario is None:
         return board
     rows = tuple(row for row in board.rows if row.scenario == scenario)

@@ -10,11 +10,12 @@ from typing import TYPE_CHECKING
 from clbench.base.errors import InputError
 from clbench.jobs.grid import name_of, run_specs
 from clbench.records.paths import RECORDS
-from clbench.runs.spec import RunSpec, check_device
+from clbench.runs.spec import RunSpec
 from clbench.spec.policies import DEFAULT_POLICY
 from clbench.spec.references import BASELINE
 
 from .board.rows import read_table
+from .table import frame_of
 
 if TYPE_CHECKING:
     import pandas
@@ -24,7 +25,7 @@ if TYPE_CHECKING:
 
 def compare(
     scenario: str,
-    methods: Iterable[str | type[Method]],
+    methods: str | type[Method] | Iterable[str | type[Method]],
     *,
     seeds: int = 2,
     first_seed: int = 0,
@@ -40,8 +41,8 @@ def compare(
 
     Args:
         scenario: Gymnasium id of the scenario; "module:id" imports the module first.
-        methods: Classes of methods, their installed names, or "module:Class". Classes of a notebook run one
-            after the other, see `clbench.run`.
+        methods: One method or several: classes, installed names, or "module:Class". Classes of a notebook run
+            one after the other, see `clbench.run`.
         seeds: Number of seeds.
         first_seed: The first seed.
         policy: Name of the policy, such as "discrete_diffusion", "flow-base" or "module:Class".
@@ -50,7 +51,7 @@ def compare(
         device: Device on which policies are computed, for example "cpu" or "cuda".
 
     Returns:
-        One row for each method, the best final average first, with the columns of `clbench.leaderboard.load`:
+        One row for each method, the best final average first, with the columns of `clbench.load_board`:
         each metric with its interval, the costs, and in `groups` which methods are not told apart.
 
     Raises:
@@ -58,10 +59,8 @@ def compare(
         InputError: A value cannot be used, or a record makes no row; the message says why.
         RunsFailedError: A run failed.
     """
-    from . import frame_of
-
-    check_device(device)
-    names = dict.fromkeys([BASELINE, *map(name_of, methods)])
+    several = [methods] if isinstance(methods, str | type) else methods
+    names = dict.fromkeys([BASELINE, *map(name_of, several)])
     firsts = [RunSpec(scenario, name, first_seed, device=device, policy=policy) for name in names]
     run_specs(firsts, seeds, Path(records), workers)
     places = {

@@ -104,6 +104,17 @@ def read_unchanged(records: Path, inputs: dict[str, str]) -> Summary | None:
         return None
 
 
+def read_board(records: Path) -> Summary:
+    """Return the board of a folder of records: the numbers that it keeps, if they still hold.
+
+    Raises:
+        FileNotFoundError: The folder does not exist.
+    """
+    from .board.rows import read_table
+
+    return read_unchanged(records, inputs_of(records)) or read_table(records)
+
+
 def write_site(table: Table, records: Path, inputs: dict[str, str]) -> list[Path]:
     """Write every form of the table to the folder of the board, and return the paths."""
     # They load the charts, SciPy and PyTorch: 3 s.

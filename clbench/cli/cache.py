@@ -52,6 +52,9 @@ _NAME = re.compile(r"(?:.*-)?[0-9a-f]{16}(?:\.\w+)?")
 _READ_HERE = ("ray", "experts")
 """Kinds without manifests: this command itself reads their files. A run or a training writes them again."""
 _CODE = ("source", "versions", "torch")
+WIDE = 100
+"""Width of a terminal in characters from which on the table says what each kind contains."""
+
 _DAY = 24 * 60 * 60
 
 
@@ -78,7 +81,7 @@ def cache(
     found = list(entries())
     stale = find_stale(found, older_than, now)
     console = Console(highlight=False)
-    console.print(_table(found, stale, now))
+    console.print(_table(found, stale, now, console.width >= WIDE))
     lines = [
         f"Cache: {cache_folder()} (CLBENCH_CACHE moves it)",
         f"Demonstrations: {minari_folder()} (MINARI_DATASETS_PATH moves it)",
@@ -329,23 +332,25 @@ def find_stale(found: Iterable[Entry], days: int, now: float) -> dict[Entry, str
     return stale
 
 
-def _table(found: Sequence[Entry], stale: Mapping[Entry, str], now: float) -> Table:
-    """Return the kinds as a table."""
+def _table(found: Sequence[Entry], stale: Mapping[Entry, str], now: float, is_wide: bool) -> Table:
+    """Return the kinds as a table; a wide one says what they contain."""
     table = Table()
-    for column in ("kind", "contents", "entries", "size", "oldest", "stale"):
-        right = column in ("entries", "size", "oldest", "stale")
-        table.add_column(column, justify="right" if right else "left", no_wrap=column != "contents")
+    table.add_column("kind", no_wrap=True)
+    for column in ("entries", "size", "oldest", "stale"):
+        table.add_column(column, justify="right", no_wrap=True)
+    if is_wide:
+        table.add_column("contents")
     present = {entry.kind for entry in found}
     for kind in (*(kind for kind in KINDS if kind in present), *sorted(present - set(KINDS))):
         ours = [entry for entry in found if entry.kind == kind]
         unused = [entry.size for entry in ours if entry in stale]
         table.add_row(
             kind,
-            KINDS.get(kind, ""),
             str(len(ours)),
             _size(sum(entry.size for entry in ours)),
             _days(max(now - entry.made for entry in ours)),
             f"{len(unused)} ({_size(sum(unused))})" if unused else "-",
+            *([KINDS.get(kind, "")] if is_wide else []),
         )
     return table
 

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
+from rich.text import Text
 
 from clbench import __version__
 from clbench.base.errors import InputError
@@ -42,18 +43,35 @@ def list_(*, as_json: AsJson = False) -> None:
     if as_json:
         print_json({"scenarios": scenarios, "methods": methods})
         return
-    table = Table(title="Scenarios", show_lines=True)
-    for column in ("id", "retained", "target, in order", "held out"):
-        table.add_column(column, no_wrap=column == "id")
+    console = Console()
     for values in scenarios:
-        table.add_row(str(values["id"]), *(", ".join(values[group]) for group in groups))
-    Console().print(table)
-    table = Table(title="Methods")
-    for column in ("name", "prior demonstrations", "prior questions", "what it does"):
-        table.add_column(column, no_wrap=column == "name")
+        names = {group.replace("_", " "): ", ".join(values[group]) for group in groups if values[group]}
+        _print_entries(console, str(values["id"]), names)
+    by_data: dict[str, dict[str, str]] = {}
     for method in methods:
-        table.add_row(*(value or "?" for value in method.values()))
-    Console().print(table)
+        by_data.setdefault(_prior_data(method), {})[str(method["name"])] = str(method["summary"])
+    for data, entries in sorted(by_data.items(), key=lambda item: len(item[0])):
+        _print_entries(console, f"Methods that use {data}", entries)
+
+
+def _print_entries(console: Console, title: str, entries: Mapping[str, str]) -> None:
+    """Print names with their texts, which wrap between words alone."""
+    table = Table.grid(padding=(0, 2, 0, 0))
+    table.add_column(no_wrap=True)
+    table.add_column(overflow="fold")
+    for name, text in entries.items():
+        table.add_row(f"  {name}", Text(text))
+    console.print(Text(title, style="bold"), table, "")
+
+
+def _prior_data(method: Mapping[str, str | None]) -> str:
+    """Return the prior data of a method in words."""
+    kinds = {kind: method[kind] for kind in ("demonstrations", "questions")}
+    if None in kinds.values():
+        return "unknown prior data"
+    times = {"prepare": "before the first target", "throughout": "throughout"}
+    used = [f"prior {kind} {times[when]}" for kind, when in kinds.items() if when in times]
+    return " and ".join(used) or "no prior data"
 
 
 def _methods() -> list[dict[str, str | None]]:
@@ -74,7 +92,7 @@ def _methods() -> list[dict[str, str | None]]:
 
 
 def metrics(name: str | None = None, /, *, markdown: Path | None = None, as_json: AsJson = False) -> None:
-    """Show a table of all metrics, or everything about the metric NAME.
+    """Show all metrics, or everything about the metric NAME.
 
     Args:
         name: Name of a metric, for example forgetting.
@@ -100,8 +118,7 @@ def metrics(name: str | None = None, /, *, markdown: Path | None = None, as_json
     elif metric:
         console.print(metric_pages.text(metric), end="", soft_wrap=True, highlight=False, markup=False)
     else:
-        width = max(console.width, metric_pages.WIDTH)
-        Console(width=width).print(metric_pages.table())
+        console.print(metric_pages.listing(), highlight=False)
 
 
 def doctor(*, as_json: AsJson = False) -> None:

@@ -8,10 +8,13 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
+from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 
 from clbench.base.errors import InputError
+from clbench.base.text import counted
 from clbench.cli.arguments import (
     PolicyName,
     PolicySize,
@@ -33,7 +36,7 @@ if TYPE_CHECKING:
 def demonstrations(
     scenario: ScenarioId, /, *, workers: Annotated[int | None, whole_number(1)] = None
 ) -> None:
-    """Collect the expert demonstrations of SCENARIO as Minari datasets, and show a table of them.
+    """Collect the expert demonstrations of SCENARIO as Minari datasets, and list these.
 
     Args:
         scenario: Gymnasium id of the scenario.
@@ -53,21 +56,19 @@ def demonstrations(
     plan.add_demonstrations(scenario, loaded, loaded.tasks)
     if run_with_bars(plan.jobs, Processes(workers)):
         sys.exit(1)
-    table = Table(title=f"Demonstrations of {loaded.id}")
-    for column in ("dataset", "group", "episodes", "noisy", "success", "mean length"):
-        table.add_column(column, no_wrap=column == "dataset")
+    console = Console()
     for task in loaded.tasks:
         episodes = read_dataset(dataset_folder(task, loaded.budget))
-        lengths = [len(episode.executed) for episode in episodes]
-        table.add_row(
-            dataset_id(task, loaded.budget),
-            loaded.group(task.name),
-            str(len(episodes)),
-            str(sum(bool(episode.noisy.any()) for episode in episodes)),
-            f"{sum(episode.success for episode in episodes) / len(episodes):.2f}",
-            f"{sum(lengths) / len(lengths):.1f}",
+        count = len(episodes)
+        facts = (
+            loaded.group(task.name).replace("_", " "),
+            counted(count, "episode"),
+            f"{sum(bool(episode.noisy.any()) for episode in episodes)} noisy",
+            f"success {sum(episode.success for episode in episodes) / count:.2f}",
+            f"mean length {sum(len(episode.executed) for episode in episodes) / count:.1f}",
         )
-    Console().print(table)
+        console.print(Text.assemble((task.name, "bold"), f": {', '.join(facts)}"))
+        console.print(f"    {dataset_id(task, loaded.budget)}", highlight=False, markup=False, soft_wrap=True)
 
 
 def pretrain(
@@ -141,10 +142,14 @@ def measure(scenario: str, /, *tasks: str, episodes: Annotated[int, whole_number
 
 def _table(scenario: Scenario, rows: Sequence[Measurement], episodes: int) -> Table:
     """Return measurements of experts as a table for the terminal."""
-    table = Table(title=f"Experts of {scenario.id}, {episodes} episodes each")
+    table = Table(
+        box=SIMPLE_HEAD,
+        padding=(0, 1, 0, 0),
+        title=f"Experts of {scenario.id}, {counted(episodes, 'episode')} each",
+    )
     columns = ("task", "group", "success", "mean return", "lowest return", "mean steps")
     for number, column in enumerate(columns):
-        table.add_column(column, no_wrap=number == 0, justify="left" if number < 2 else "right")
+        table.add_column(column, no_wrap=number < 2, justify="left" if number < 2 else "right")
     for row in rows:
         table.add_row(
             row.task,

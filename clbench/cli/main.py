@@ -127,7 +127,7 @@ def _app(name: str, text: str, commands: dict[Group, dict[str, str]]) -> App:
     for group, members in commands.items():
         for number, (command, entry_point) in enumerate(members.items()):
             names = NAMES.get(command)
-            usage = f"Usage: {name} {command} [OPTIONS] {names}\n" if names else None
+            usage = f"Usage: {name} {command} [OPTIONS] {names}" if names else None
             made.command(entry_point, name=command, group=group, sort_key=number, usage=usage)
     return made
 

@@ -1,4 +1,4 @@
-"""The metrics as text: a table, everything about one metric, and the page docs/reference/metrics.md."""
+"""The metrics as text: a list, everything about one metric, and the page docs/reference/metrics.md."""
 
 from __future__ import annotations
 
@@ -6,13 +6,12 @@ import inspect
 from pathlib import Path
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
-from rich.table import Table
+from rich.console import Group, RenderableType
+from rich.padding import Padding
+from rich.text import Text
 
 from clbench.scoring.metric import Metric
 from clbench.scoring.metrics import METRICS
-
-WIDTH = 150
-"""Least width of the table in characters: a narrower table would break names, and a long line only wraps."""
 
 LEFT_OUT = {
     "Continual World's RT": "it needs a run for every pair of tasks",
@@ -81,21 +80,13 @@ def text(metric: Metric) -> str:
     return "\n".join([*lines, *(["", more] if more else [])]) + "\n"
 
 
-def table() -> Table:
-    """Return all metrics as a table for the terminal."""
-    grid = Table(title="Metrics")
-    for column in ("name", "version", "direction", "range", "source", "description"):
-        grid.add_column(column, overflow="fold", no_wrap=column in ("name", "direction", "range"))
+def listing() -> Group:
+    """Return all metrics for the terminal, in lines that fit any width."""
+    lines: list[RenderableType] = []
     for metric in METRICS.values():
-        grid.add_row(
-            metric.name,
-            str(metric.version),
-            direction(metric),
-            span(metric),
-            metric.source,
-            metric.description,
-        )
-    return grid
+        lines.append(Text.assemble((metric.name, "bold"), f": {direction(metric)}, {span(metric)}"))
+        lines.append(Padding(Text(f"{metric.description} Source: {metric.source}."), (0, 0, 0, 4)))
+    return Group(*lines)
 
 
 def page() -> str:

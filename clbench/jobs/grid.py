@@ -11,26 +11,27 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from rich.console import Console
 
 from clbench.base.cache import cache_folder
-from clbench.base.errors import ClbenchError, WrongTypeError
+from clbench.base.errors import ClbenchError, InputError, WrongTypeError
 from clbench.base.leftovers import sweep
 from clbench.base.text import counted, printable
 from clbench.jobs.bars import lines_console
 from clbench.jobs.folders import check_folders, minari_folder
 from clbench.jobs.job import Job, Workers
-from clbench.jobs.plan import Plan
 from clbench.jobs.processes import Here, Processes
 from clbench.jobs.recorded import has_record, set_aside
 from clbench.jobs.scheduler import run_with_bars
 from clbench.records.paths import RECORDS
 from clbench.records.reader import read_record
-from clbench.runs.checkpoints import has_stages
 from clbench.runs.spec import ResolvedRun, RunSpec, check_device
-from clbench.spec.identifiers import installed_methods
+from clbench.spec.identifiers import check_known, installed_methods
 from clbench.spec.policies import DEFAULT_POLICY
 
 if TYPE_CHECKING:
+    from clbench.jobs.plan import Plan
     from clbench.learning.method import Method
     from clbench.records.record import Record
+
+# PyTorch is imported where it is needed, so that wrong names and values do not wait for it.
 
 
 class RunsFailedError(ClbenchError, RuntimeError):
@@ -47,6 +48,8 @@ class Missing(NamedTuple):
 
     def plan(self, records: Path, checkpoints: Path | None, tensorboard: Path | None = None) -> Plan:
         """Return the plan of the jobs."""
+        from clbench.jobs.plan import Plan
+
         plan = Plan()
         for one in self.runs:
             plan.add_run(one, records, checkpoints=checkpoints, tensorboard=tensorboard)
@@ -57,6 +60,8 @@ class Missing(NamedTuple):
 
 def missing(runs: Sequence[ResolvedRun], records: Path, checkpoints: Path | None) -> Missing:
     """Return what has to be done until all runs have a record and, with `checkpoints`, policies there."""
+    from clbench.runs.checkpoints import has_stages
+
     without = [run for run in runs if not has_record(run, records)]
     recorded = [run for run in runs if run not in without]
     return Missing(without, [run for run in recorded if checkpoints and not has_stages(run, checkpoints)])
@@ -150,7 +155,6 @@ def run(
         InputError: A value cannot be used; the message says which.
         RunsFailedError: A run failed.
     """
-    check_device(device)
     spec = RunSpec(
         scenario, name_of(method), first_seed, settings or {}, device, perturb=perturb, policy=policy
     )
@@ -161,8 +165,16 @@ def run_specs(firsts: Sequence[RunSpec], seeds: int, records: Path, workers: int
     """Do the runs that `firsts` name, each with several seeds from its own on, and return their records.
 
     Raises:
+        UnknownNameError: There is no such scenario, method or hyper-parameter.
+        InputError: A value cannot be used; the message says which.
         RunsFailedError: A run failed.
     """
+    for name, value in (("seeds", seeds), ("workers", workers)):
+        if value is not None and (type(value) is not int or value < 1):
+            raise InputError(f"{name} must be a whole number from 1, not {value!r}.")
+    check_known([one.scenario for one in firsts], [one.method for one in firsts])
+    for device in {one.device for one in firsts}:
+        check_device(device)
     specs = [replace(one, seed=one.seed + number) for one in firsts for number in range(seeds)]
     runs = [spec.resolve() for spec in specs]
     console = lines_console()
@@ -184,10 +196,12 @@ def name_of(method: str | type[Method]) -> str:
     """Return the name of a method: the installed one, or "module:Class".
 
     Raises:
-        WrongTypeError: The class is inside a function or another class, where no name can reach it.
+        WrongTypeError: It is no class, or one inside a function or another class, where no name can reach it.
     """
     if isinstance(method, str):
         return method
+    if not isinstance(method, type):
+        raise WrongTypeError(f"A method must be a class or its name, not {method!r}.")
     place = f"{method.__module__}:{method.__qualname__}"
     if not method.__qualname__.isidentifier():
         raise WrongTypeError(

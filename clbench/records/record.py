@@ -127,7 +127,7 @@ class RunInfo:
     changes: dict[str, Any]
     """The hyper-parameters that differ from the method's defaults."""
     uses: dict[str, Any]
-    """The prior data that the method may touch; `online` is true for an agent that learned by trial."""
+    """The prior data that the method may touch; `online` is true for an agent of another program."""
     order: int = 0
     """Order in which the targets were learned; 0 is the published one. See
     `clbench.spec.scenario.target_order`."""

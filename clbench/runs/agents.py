@@ -50,7 +50,7 @@ from clbench.worlds.scenario_vector_env import ScenarioVectorEnv
 LOG = logging.getLogger("clbench")
 
 USES = {"demonstrations": "never", "questions": "never", "reference": False, "online": True}
-"""`RunInfo.uses` of an agent: it uses no prior data of clbench, and learns by trial and error."""
+"""`RunInfo.uses` of an agent: it uses no prior data of clbench, and another program trains it."""
 
 
 def evaluate_agent(

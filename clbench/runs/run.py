@@ -49,8 +49,8 @@ def execute(
     records: Path | str,
     progress: ProgressCallback = no_progress,
     *,
-    checkpoints: Path | None = None,
-    tensorboard: Path | None = None,
+    checkpoints: Path | str | None = None,
+    tensorboard: Path | str | None = None,
 ) -> Record:
     """Do a run, or continue an interrupted one, and write its record.
 
@@ -75,10 +75,11 @@ def execute(
         require_tensorboard()
     resolved = run.resolve() if isinstance(run, RunSpec) else run
     folder = _checkpoints(resolved, Path(records))
+    kept, log = (None if one is None else Path(one) for one in (checkpoints, tensorboard))
     lease = Lease(folder)
     with lease.held():
         with repeatable(resolved.spec.device):
-            under_way = _Run.start(resolved, folder, lease, progress, checkpoints, tensorboard)
+            under_way = _Run.start(resolved, folder, lease, progress, kept, log)
             record = under_way.go()
         lease.check()
         write_result(record, resolved.path(Path(records)))

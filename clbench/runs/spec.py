@@ -10,10 +10,11 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from clbench.base.errors import InputError
+from clbench.base.errors import InputError, WrongTypeError
 from clbench.records.paths import label_of, record_path
 from clbench.records.record import RunInfo, ScenarioInfo
 from clbench.runs.tuning import tuned_settings
+from clbench.spec.fields import check_whole
 from clbench.spec.policies import DEFAULT_POLICY, kind_of
 from clbench.spec.protocol import Protocol, ScoredSplit
 from clbench.spec.registry import load_scenario
@@ -52,6 +53,15 @@ class RunSpec:
     """Whether the retained skills and each stage's target also meet perturbed episodes."""
     policy: str = DEFAULT_POLICY
     """Name of the policy, see `clbench.spec.policies`."""
+
+    def __post_init__(self) -> None:
+        for name, hint in (("scenario", "its id"), ("method", "its name or 'module:Class'")):
+            value = getattr(self, name)
+            if not isinstance(value, str):
+                raise WrongTypeError(f"{name} of a run must be a text, {hint}, not {value!r}.")
+        check_whole(self, 0, "seed", "order")
+        if self.targets is not None:
+            check_whole(self, 1, "targets")
 
     @property
     def label(self) -> str:

@@ -13,7 +13,7 @@ from .agreement import Agreement
 
 DIVISIONS = ("prior-data-free", "prior questions", "prior demonstrations", "online", "reference")
 """Divisions in the order of the table: the first three by the prior data that a method may use; "online" for
-agents that learned by trial instead of from demonstrations, with which no method is compared; "reference" for
+agents of other programs, most of which learned by trial, with which no method is compared; "reference" for
 references, which do not compete."""
 
 METHODS = DIVISIONS[:3]

@@ -49,13 +49,18 @@ def _cache(capsys: pytest.CaptureFixture[str], *options: str) -> str:
 
 
 @pytest.mark.usefixtures("empty_caches")
-def test_every_kind_is_shown_with_its_number_size_and_age(capsys: pytest.CaptureFixture[str]) -> None:
+def test_every_kind_is_shown_with_its_number_size_and_age(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     _make("runs", 40)
     _make("runs", 3)
     _make("scenes", 1)
+    monkeypatch.setenv("COLUMNS", "60")
     out = _cache(capsys)
+    assert max(len(line) for line in out.splitlines() if line.startswith("│")) <= 60
+    assert "…" not in out
     (runs,) = (line for line in out.splitlines() if line.startswith("│ runs "))
-    assert [cell.strip() for cell in runs.strip("│").split("│")][2:] == [
+    assert [cell.strip() for cell in runs.strip("│").split("│")][1:] == [
         "2",
         "4.0 MB",
         "40 days",

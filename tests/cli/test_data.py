@@ -50,3 +50,15 @@ def test_a_policy_ships_from_a_checkout_alone(
     assert {path.name: path.read_bytes() for path in folder.iterdir()} == {
         path.name: path.read_bytes() for path in cached.iterdir()
     }
+
+
+def test_a_scenario_of_the_working_folder_is_found(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    lines = ("import clbench", f"clbench.load_scenario({TOY!r})")
+    (tmp_path / "toy_of_mine.py").write_text("\n".join(lines), encoding="utf-8")
+    monkeypatch.chdir(tmp_path)
+    _clbench("experts", "measure", "toy_of_mine:clbench/Toy-v0", "--episodes", "1")
+    assert "Experts of clbench/Toy-v0, 1 episode each" in capsys.readouterr().out
+    _clbench("demonstrations", "toy_of_mine:clbench/Toy-v0")
+    assert "left: retained, 10 episodes" in capsys.readouterr().out

@@ -4,10 +4,12 @@ import importlib
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 import clbench
+from clbench.base.errors import ClbenchError
 from clbench.base.progress import ProgressCallback
 from clbench.jobs.job import Job
 from clbench.jobs.processes import Here
@@ -99,6 +101,37 @@ def test_a_class_inside_a_function_is_refused(tmp_path: Path) -> None:
 
     with pytest.raises(TypeError, match="cannot be found by its name: define it outside of functions"):
         clbench.run(TOY, Hidden, records=tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"seeds": 1.5}, "seeds must be a whole number from 1, not 1.5"),
+        ({"seeds": 0}, "seeds must be a whole number from 1, not 0"),
+        ({"workers": True}, "workers must be a whole number from 1, not True"),
+        ({"first_seed": 0.7}, "seed must be a whole number, not 0.7"),
+        ({"first_seed": -1}, "seed must be at least 0, not -1"),
+        ({"scenario": "clbench/Fetsh-v1"}, "Did you mean 'clbench/Fetch-v1'"),
+        ({"method": "stf"}, "Did you mean 'sft'"),
+        ({"method": 3}, "A method must be a class or its name, not 3"),
+        ({"scenario": None}, "scenario of a run must be a text, its id, not None"),
+        ({"device": "mps"}, "The device 'mps' cannot be used"),
+    ],
+)
+def test_wrong_values_are_named_before_anything_runs(
+    tmp_path: Path, wrong: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(ClbenchError, match=message):
+        clbench.run(**{"scenario": TOY, "method": "sft", "records": tmp_path, **wrong})
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("call", ['run("clbench/Fetsh-v1", "sft")', f'compare("{TOY}", "frosen")'])
+def test_a_wrong_name_does_not_wait_for_pytorch(tmp_path: Path, call: str) -> None:
+    caught = f"try: clbench.{call}\nexcept LookupError as error: print(error, 'torch' in sys.modules)"
+    said = run_script(f"import sys, clbench\n{caught}", tmp_path).stdout
+    assert "Did you mean" in said
+    assert said.endswith(" False\n")
 
 
 def test_a_job_of_this_process_ends_when_its_worker_is_closed() -> None:

@@ -9,11 +9,13 @@ from collections.abc import Callable
 from pathlib import Path
 
 import cyclopts
+import pandas
 import pytest
 
+import clbench
 from clbench.base.entry_points import resolve
 
-load = resolve("clbench.leaderboard:load")
+load = resolve("clbench:load_board")
 
 
 def test_showing_twice_changes_no_byte_and_writes_no_file_again(
@@ -69,6 +71,7 @@ def test_unchanged_records_show_the_same_board_without_being_read(
     four_methods: Path, shown: Callable[[], tuple[str, str]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (four_methods / "torn.json").write_text("{", encoding="utf-8")
+    frame, plane = load(four_methods), clbench.plot.plane(four_methods).spec
     table, _, written = shown()[0].partition("Written: ")
     assert "board.json" in written
 
@@ -80,6 +83,8 @@ def test_unchanged_records_show_the_same_board_without_being_read(
     assert again == table
     assert "torn.json: cannot be read as JSON" in again
     assert Path("".join(unchanged.split())) == four_methods.parent / "site"
+    pandas.testing.assert_frame_equal(load(four_methods), frame)
+    assert clbench.plot.plane(four_methods).spec == plane
 
 
 @pytest.mark.parametrize("what", ["record", "verification", "table", "numbers", "one value", "code"])

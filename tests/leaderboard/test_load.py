@@ -13,7 +13,7 @@ from clbench.records.paths import record_path
 from clbench.records.record import Record
 from clbench.scoring.metrics import METRICS
 
-load = resolve("clbench.leaderboard:load")
+load = resolve("clbench:load_board")
 
 
 def test_there_is_one_row_for_each_method_sorted_by_division_and_final_average(

@@ -14,7 +14,7 @@ from clbench.runs.agents import evaluate_agent
 from clbench.runs.run import execute
 from clbench.runs.spec import RunSpec
 
-load = resolve("clbench.leaderboard:load")
+load = resolve("clbench:load_board")
 show = resolve("clbench.leaderboard.cli:show")
 read_table = resolve("clbench.leaderboard.board.rows:read_table")
 tier_of = resolve("clbench.leaderboard.board.tiers:tier_of")

@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 
+import clbench
 from clbench.learning.registry import load_method
 from clbench.records.reader import read_record
 from clbench.runs.tuning import tuned
@@ -21,7 +22,7 @@ pytestmark = pytest.mark.skipif(not RECORDS.exists(), reason="records are not pa
 @pytest.fixture(scope="module")
 def board() -> Any:
     """The board of Fetch-v1 by method."""
-    table = importlib.import_module("clbench.leaderboard").load(RECORDS)
+    table = clbench.load_board(RECORDS)
     return table[table["scenario"] == "clbench/Fetch-v1"].set_index("method")
 
 

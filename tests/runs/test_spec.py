@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from clbench.base.errors import InputError, UnknownNameError
+from clbench.base.errors import ClbenchError, InputError, UnknownNameError
 from clbench.runs.run import execute
 from clbench.runs.spec import RunSpec
 
@@ -23,7 +23,7 @@ def test_a_run_looks_up_one_scenario_and_one_method(tmp_path: Path, monkeypatch:
 
         return count
 
-    execute(RunSpec(TOY, "sft", 0, targets=1), tmp_path / "first")  # fills the cache
+    execute(RunSpec(TOY, "sft", 0, targets=1), str(tmp_path / "first"))  # fills the cache
     for module in [one for name, one in sys.modules.items() if name.startswith("clbench.")]:
         for name in counts:
             if name in vars(module):
@@ -57,3 +57,18 @@ def test_a_wrong_name_or_value_is_refused_before_any_work(
 ) -> None:
     with pytest.raises(error, match=message):
         spec.resolve()
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"scenario": 1}, "scenario of a run must be a text, its id, not 1"),
+        ({"method": int}, "method of a run must be a text, its name or 'module:Class', not <class 'int'>"),
+        ({"seed": 0.5}, "seed must be a whole number, not 0.5"),
+        ({"order": -1}, "order must be at least 0, not -1"),
+        ({"targets": 0}, "targets must be at least 1, not 0"),
+    ],
+)
+def test_an_impossible_run_is_refused_where_it_is_built(fields: dict[str, Any], message: str) -> None:
+    with pytest.raises(ClbenchError, match=message):
+        RunSpec(**{"scenario": TOY, "method": "sft", "seed": 0, **fields})

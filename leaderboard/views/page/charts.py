@@ -11,8 +11,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from ...board.rows import Row
-from ...board.summary import DIVISIONS
+from ...board.summary import DIVISIONS, RowSummary
 from ..format import format_interval
 from .labels import LONGEST, Mark, place
 
@@ -85,14 +84,15 @@ def _config(font: str) -> Spec:
     }
 
 
-def specification(layers: Sequence[Spec], font: str, **rest: Any) -> Spec:
-    """Return a chart of layers, the lowest first."""
-    return {
-        "$schema": "https://vega.github.io/schema/vega-lite/v6.json",
-        "config": _config(font),
-        "layer": list(layers),
-        **rest,
-    }
+def specification(font: str, **parts: Any) -> Spec:
+    """Return a chart of `parts`, for example of layers, the lowest first."""
+    schema = "https://vega.github.io/schema/vega-lite/v6.json"
+    return {"$schema": schema, "config": _config(font), **parts}
+
+
+def heading(text: str) -> Spec:
+    """Return the title of a chart."""
+    return {"text": text, "anchor": "start", "color": colour("ink"), "fontSize": 13}
 
 
 def axis(name: str, title: str, **rest: Any) -> Spec:
@@ -146,7 +146,7 @@ LOW, HIGH = -0.02, 1.02
 
 
 def plane(
-    rows: Sequence[Row], size: Size, anchors: Mapping[str, str] | None = None, font: str = SYSTEM_FONT
+    rows: Sequence[RowSummary], size: Size, anchors: Mapping[str, str] | None = None, font: str = SYSTEM_FONT
 ) -> Spec:
     """Return the plane of retention and adaptation with the Pareto front of each division.
 
@@ -195,7 +195,7 @@ def plane(
         *_labels(points, {y for corners in fronts.values() for _, y in corners}, size),
         layer(points, mark, x=x, y=y, color=hue, shape=shape, tooltip=tooltip),
     ]
-    return specification(layers, font, width=size.width, height=size.height)
+    return specification(font, layer=layers, width=size.width, height=size.height)
 
 
 def layer(values: Sequence[Mapping[str, Any]], mark: Spec, **encoding: Any) -> Spec:
@@ -203,11 +203,11 @@ def layer(values: Sequence[Mapping[str, Any]], mark: Spec, **encoding: Any) -> S
     return {"data": {"values": list(values)}, "mark": mark, "encoding": encoding}
 
 
-def _is_in_plane(row: Row) -> bool:
+def _is_in_plane(row: RowSummary) -> bool:
     return row.estimates["adaptation"].value is not None and row.estimates["retention"].value is not None
 
 
-def _point(row: Row, anchor: str) -> dict[str, Any]:
+def _point(row: RowSummary, anchor: str) -> dict[str, Any]:
     point: dict[str, Any] = {"method": row.method, "division": row.division, "anchor": anchor}
     for side, name in (("x", "adaptation"), ("y", "retention")):
         one = row.estimates[name]
@@ -281,8 +281,10 @@ SERIES = ("old skills", "target of the stage", "old skills under sft")
 """Lines in the chart of a run; the last one is for comparison."""
 
 
-def along_a_run(targets: Sequence[str], steps: int | None) -> Spec:
-    """Return the chart of a run without its points, which the page adds for each row.
+def along_a_run(
+    targets: Sequence[str], steps: int | None, width: int | str = "container", font: str = SYSTEM_FONT
+) -> Spec:
+    """Return the chart of a run without its points; `with_points` adds them, and the page for each row.
 
     The points are the named data `points`: `x` (steps since the first stage, or stages), `y` with `low` and
     `high`, one of `SERIES`, and the `stage`, which separates the curve of a target from the next; the
@@ -290,19 +292,21 @@ def along_a_run(targets: Sequence[str], steps: int | None) -> Spec:
 
     Args:
         targets: Titles of the stages.
-        steps: Optimiser steps of a stage; None if a stage ends when its target is learned, and is one wide.
+        steps: Optimiser steps of a stage; None if a stage ends when its target is learned, and is one long.
+        width: Width in pixels, or "container" for that of the place on the page.
+        font: Font of all texts.
     """
-    width = steps or 1
+    length = steps or 1
     stages = [
-        {"begin": number * width, "end": (number + 1) * width, "name": name}
+        {"begin": number * length, "end": (number + 1) * length, "name": name}
         for number, name in enumerate(targets)
     ]
     count = max(len(targets), 1)
     x = axis(
         "x",
         "optimiser steps, stage after stage" if steps else "stages, each until its target is learned",
-        scale={"domain": [0, count * width], "nice": False},
-        axis={"values": [number * width for number in range(count + 1)], "grid": False},
+        scale={"domain": [0, count * length], "nice": False},
+        axis={"values": [number * length for number in range(count + 1)], "grid": False},
     )
     y = axis("y", "success", scale={"domain": [0, 1]})
     hues = [colour(f"mark-{number}") for number in (0, 1, 4)]
@@ -323,7 +327,14 @@ def along_a_run(targets: Sequence[str], steps: int | None) -> Spec:
         _points({"type": "line", "strokeWidth": 2}, **lines, strokeDash=dashes),
         _points({"type": "point", "filled": True, "size": 30, "opacity": 1}, **lines, tooltip=tooltip),
     ]
-    return specification(layers, SYSTEM_FONT, width="container", height=230)
+    return specification(font, layer=layers, width=width, height=230)
+
+
+def with_points(chart: Spec, points: Sequence[Mapping[str, Any]]) -> Spec:
+    """Return the chart of a run with its points."""
+    present = {point["series"] for point in points}
+    shown = [series for series in SERIES if series in present]
+    return {**chart, "params": [{"name": "shown", "value": shown}], "datasets": {"points": list(points)}}
 
 
 def _points(mark: Spec, **encoding: Any) -> Spec:

@@ -74,7 +74,7 @@ def frontier(curves: Sequence[Curve], size: Size, font: str = SYSTEM_FONT) -> Sp
         layer(over, {"type": "line", "strokeWidth": 1.75}, **line),
         layer(points, mark, x=x, y=y, color=hue, shape=shape, tooltip=tooltip),
     ]
-    return specification(layers, font, width=size.width, height=size.height)
+    return specification(font, layer=layers, width=size.width, height=size.height)
 
 
 def _is_known(rung: Rung) -> bool:

@@ -60,7 +60,7 @@ RULES: Mapping[str, str] = dict(
             "may reuse no earlier data",
             "may reuse earlier questions, but no demonstrations",
             "may reuse earlier demonstrations",
-            "learn by trial and error, without pretrained policy and demonstrations: not comparable",
+            "are trained outside of clbench, by trial and error or from other data: not comparable",
             "do not compete: they show the best that is possible, and the result of doing nothing",
         ),
         strict=True,

@@ -15,6 +15,7 @@ from helpers import resealed
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+import clbench
 from clbench.records.paths import record_path
 from clbench.records.record import Record
 from clbench.records.writer import write_record
@@ -228,7 +229,7 @@ def check_board(board: Path, examples: int) -> Counter[str]:
     for place in PLACES.values():
         (board / place).unlink()
     before, _ = runs.read_runs(board, runs.read_run, runs.ALIKE)
-    rows = importlib.import_module("clbench.leaderboard").load(board)
+    rows = clbench.load_board(board)
     came: Counter[str] = Counter()
     whole: dict[bytes, str] = {}
 
@@ -270,7 +271,7 @@ def check_board(board: Path, examples: int) -> Counter[str]:
         path.write_bytes(resealed(content.replace(b"theirs/mine", f"theirs/mine{number}".encode())))
         came["in the table"] += 1
     importlib.import_module("clbench.leaderboard.cli").show(records=board)
-    table = importlib.import_module("clbench.leaderboard").load(board)
+    table = clbench.load_board(board)
     expected = rows.set_index(["scenario", "method"]).drop(columns="groups")
     after = table.set_index(["scenario", "method"]).drop(columns="groups")
     pandas.testing.assert_frame_equal(after.loc[expected.index], expected)

@@ -1,6 +1,5 @@
 """Orders of the targets: runs in other orders appear with the row, and show how much depends on the order."""
 
-import importlib
 import json
 import math
 from collections.abc import Callable
@@ -12,6 +11,7 @@ import pandas
 import pytest
 from helpers import complete_record, sealed
 
+import clbench
 from clbench.base.entry_points import resolve
 from clbench.records.paths import record_path
 from clbench.records.record import Record
@@ -47,7 +47,7 @@ def records(tmp_path: Path) -> Path:
 
 
 def load(records: Path) -> pandas.DataFrame:
-    frame = importlib.import_module("clbench.leaderboard").load(records)
+    frame = clbench.load_board(records)
     assert isinstance(frame, pandas.DataFrame)
     return frame
 

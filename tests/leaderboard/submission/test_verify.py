@@ -12,6 +12,7 @@ import pytest
 from helpers import sealed
 from verification import TOY, edit, failures, flip, verify
 
+import clbench
 from clbench.evaluation.rollouts import Evaluator
 from clbench.learning.pretraining import pretrained_policy
 from clbench.records.paths import record_path
@@ -104,7 +105,7 @@ def test_a_record_can_be_replayed_from_policies_that_are_made_again(mine: Path) 
 def test_the_table_shows_the_least_tier_of_a_row(mine: Path, honest: Path) -> None:
     verify(mine, "replayed", honest)
     records = next(folder for folder in mine.parents if folder.name == "records")
-    load = importlib.import_module("clbench.leaderboard").load
+    load = clbench.load_board
     assert list(load(records).tier) == ["replayed"]
     other = mine.with_name("seed-1.json")
     shutil.copy(mine, other)
@@ -264,6 +265,22 @@ def test_a_strangers_text_in_a_check_does_not_control_the_terminal(
     shown = capsys.readouterr().out
     assert "the rollouts of [red]\\x1b[2Jworld differ" in shown
     assert "\x1b" not in shown
+
+
+def test_a_record_elsewhere_is_refused_with_the_option_that_finds_it(
+    mine: Path, honest: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    command = importlib.import_module("clbench.leaderboard.cli").verify
+    records = next(folder for folder in mine.parents if folder.name == "records")
+    monkeypatch.chdir(records.parent)
+    beside = Path("records") / mine.relative_to(records)
+    with pytest.raises(SystemExit) as stopped:
+        command(beside, tier="recomputed", scenario=TOY, workers=1)
+    assert stopped.value.code == 2
+    assert f"{mine} is not below " in (error := capsys.readouterr().err)
+    assert "name its folder of records, in which it is SCENARIO/METHOD/seed-N.json, with --records" in error
+    command(beside, tier="recomputed", scenario=TOY, records=Path("records"), workers=1)
+    assert f"{beside}: recomputed" in capsys.readouterr().out
 
 
 def test_the_command_prints_json_of_good_and_bad_records(

@@ -7,7 +7,7 @@ import pandas
 
 from clbench.base.entry_points import resolve
 
-load = resolve("clbench.leaderboard:load")
+load = resolve("clbench:load_board")
 
 
 def test_the_csv_file_is_the_data_frame(four_methods: Path, shown: Callable[[], tuple[str, str]]) -> None:

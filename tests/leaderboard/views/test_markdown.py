@@ -14,7 +14,7 @@ from clbench.records.record import Record
 VALIDATION = [[0.3, 0.6, 0.9, 0.9], [0.1, 0.3, 0.8, 0.8]]
 ASKS = {"demonstrations": "never", "questions": "prepare", "reference": False}
 PERTURBED = [[0.9, 0.8], [0.5, 0.7], [0.4, 0.2]]
-load = resolve("clbench.leaderboard:load")
+load = resolve("clbench:load_board")
 
 
 def test_the_markdown_has_values_with_intervals_and_explains_them(

@@ -20,7 +20,7 @@ from clbench.records.record import Record
 from clbench.records.writer import write_record
 
 ASKS = {"demonstrations": "never", "questions": "prepare", "reference": False}
-load = resolve("clbench.leaderboard:load")
+load = resolve("clbench:load_board")
 
 
 def table_of_four_methods(records: Path, shown: Callable[[], Any]) -> bytes:

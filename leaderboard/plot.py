@@ -1,0 +1,145 @@
+"""Charts of records: `clbench.plot`. Notebooks show them, and `save` writes an SVG, PNG or PDF file.
+
+`matrix` and `curves` show the runs of one method, `plane` and `frontier` all methods on a scenario. They are
+the charts of the leaderboard's page.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from clbench.base.entry_points import unknown
+from clbench.base.errors import InputError
+from clbench.records.paths import RECORDS
+
+if TYPE_CHECKING:
+    from clbench.records.record import Record
+
+    from .views.page.plot import Plot
+
+__all__ = ["curves", "frontier", "matrix", "plane"]
+
+# The charts load SciPy and a converter of pictures: they are imported when they are drawn.
+
+
+def matrix(runs: Record | Iterable[Record] | Path | str, *, dark: bool = False) -> Plot:
+    """Return the success after each stage (rows) on each task (columns), the mean of runs of one method.
+
+    A frame marks the task that a stage learned. Targets have numbers if the runs learned them in different
+    orders.
+
+    Args:
+        runs: A record, several records, or the path of a record or of a folder of them.
+        dark: Whether to use the colours for a dark page.
+
+    Raises:
+        InputError: There is no record, or they are of several methods, or of different scenarios.
+        RecordError: A file is no record, or its run failed.
+    """
+    from .views.page.plot import themed
+    from .views.page.runs import Runs, matrix_of
+
+    return themed(matrix_of(Runs.of(_records(runs))), dark)
+
+
+def curves(
+    runs: Record | Iterable[Record] | Path | str,
+    sft: Record | Iterable[Record] | Path | str | None = None,
+    *,
+    dark: bool = False,
+) -> Plot:
+    """Return the success along the stages, on the old skills and on each stage's target, with intervals.
+
+    Args:
+        runs: A record, several records of one method, or the path of a record or of a folder of them.
+        sft: The same of plain fine-tuning, to compare the old skills with; None to leave it out.
+        dark: Whether to use the colours for a dark page.
+
+    Raises:
+        InputError: There is no record, or they are of several methods, or of different scenarios.
+        RecordError: A file is no record, or its run failed.
+    """
+    from .views.page.plot import themed
+    from .views.page.runs import Runs, curves_of
+
+    beside = None if sft is None else Runs.of(_records(sft))
+    return themed(curves_of(Runs.of(_records(runs)), beside), dark)
+
+
+def plane(records: Path | str = RECORDS, scenario: str | None = None, *, dark: bool = False) -> Plot:
+    """Return the methods of a scenario: kept skills against learned targets, with intervals.
+
+    Args:
+        records: Folder of the records.
+        scenario: Gymnasium id of the scenario (default: the one with most rows).
+        dark: Whether to use the colours for a dark page.
+
+    Raises:
+        FileNotFoundError: The folder does not exist.
+        InputError: No record makes a row.
+        UnknownNameError: The scenario has no row.
+    """
+    from .publishing import read_board
+    from .views.page.charts import FONT, WIDE, heading
+    from .views.page.charts import plane as chart
+    from .views.page.plot import themed
+
+    rows = read_board(Path(records)).rows
+    names = [row.scenario for row in rows]
+    chosen = _chosen(scenario, {name: names.count(name) for name in names}, "row", records)
+    drawn = chart([row for row in rows if row.scenario == chosen], WIDE, font=FONT)
+    return themed({**drawn, "title": heading(chosen)}, dark)
+
+
+def frontier(records: Path | str = RECORDS, scenario: str | None = None, *, dark: bool = False) -> Plot:
+    """Return what the methods of a scenario learn and keep at each step size of the ladder.
+
+    The records of the ladder are in the folder `ladder` next to the folder of the records.
+
+    Args:
+        records: Folder of the records.
+        scenario: Gymnasium id of the scenario (default: the one with most methods).
+        dark: Whether to use the colours for a dark page.
+
+    Raises:
+        InputError: There is no ladder.
+        UnknownNameError: The scenario has none.
+    """
+    from .board.frontier import ladder_of, read_frontiers
+    from .views.page.charts import FONT, heading
+    from .views.page.frontier import WIDE
+    from .views.page.frontier import frontier as chart
+    from .views.page.plot import themed
+
+    folder = ladder_of(Path(records))
+    found, _ = read_frontiers(folder)
+    chosen = _chosen(scenario, {name: len(curves) for name, curves in found.items()}, "curve", folder)
+    return themed({**chart(found[chosen], WIDE, FONT), "title": heading(chosen)}, dark)
+
+
+def _records(runs: Record | Iterable[Record] | Path | str) -> list[Record]:
+    from clbench.records.reader import read_record
+    from clbench.records.record import Record
+
+    if isinstance(runs, Record):
+        return [runs]
+    if not isinstance(runs, (str, Path)):
+        return list(runs)
+    path = Path(runs)
+    return [read_record(one) for one in (sorted(path.rglob("*.json")) if path.is_dir() else [path])]
+
+
+def _chosen(scenario: str | None, counts: Mapping[str, int], what: str, folder: Path | str) -> str:
+    """Return a scenario that was asked for, or the one that has most."""
+    if not counts:
+        raise InputError(f"No record in {folder} makes a {what}; `clbench leaderboard` says why.")
+    chosen = scenario or max(counts, key=counts.__getitem__)
+    if chosen not in counts:
+        raise unknown(f"scenario with a {what}", chosen, counts)
+    return chosen
+
+
+def __dir__() -> list[str]:
+    return __all__
