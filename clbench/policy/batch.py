@@ -52,12 +52,17 @@ class _Rows:
         columns = {field.name: getattr(self, field.name).to(device) for field in dataclasses.fields(self)}  # type: ignore[arg-type]
         return type(self)(**columns)
 
+    def __repr__(self) -> str:
+        columns = ((field.name, getattr(self, field.name)) for field in dataclasses.fields(self))  # type: ignore[arg-type]
+        shapes = ", ".join(f"{name} {tuple(value.shape)}" for name, value in columns if value.numel())
+        return f"<{type(self).__name__} of {len(self)} samples: {shapes}>"
+
     def __len__(self) -> int:
         first = dataclasses.fields(self)[0].name  # type: ignore[arg-type]
         return len(getattr(self, first))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Batch(_Rows):
     """Demonstrated action chunks, B samples of H actions."""
 
@@ -77,7 +82,7 @@ class Batch(_Rows):
     """Pictures of the camera, uint8 (B, N, N, 3); N is 0 where the policy sees none."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class QuestionBatch(_Rows):
     """Questions with their answers, B samples."""
 

@@ -64,6 +64,9 @@ class Task:
         check_share(self, "action_noise")
         check_entry_point(self, "world", "expert", *(("camera",) if self.camera is not None else ()))
 
+    def __repr__(self) -> str:
+        return f"<Task {self.suite}/{self.name}: {self.instructions[0]}>"
+
     def _repr_html_(self) -> str:
         """Return what defines the task as a table, for notebooks."""
         names = ("instructions", "test_instructions", "horizon", "world", "expert", "camera", "version")

@@ -272,3 +272,8 @@ def test_batches_can_be_indexed_and_joined_so_that_a_buffer_takes_few_lines(rows
     joined = Batch.cat([chosen, batch])
     assert len(joined) == len(chosen) + 4
     assert torch.equal(joined.words[len(chosen) :], batch.words)
+
+
+def test_a_batch_is_shown_in_one_line() -> None:
+    shapes = "state (2, 5), words (2, 12), action (2, 8, 3), valid (2, 8), draw (2,), noise (2, 8, 3)"
+    assert repr(_batch(4)[:2]) == f"<Batch of 2 samples: {shapes}>"

@@ -162,3 +162,7 @@ def test_in_another_order_nothing_but_the_targets_differs() -> None:
     assert [task.name for task in other.target] == [published.target[index].name for index in (3, 2, 1, 0)]
     assert dataclasses.replace(other, target=published.target) == published
     assert published.in_order(0) is published
+
+
+def test_a_task_is_shown_in_one_line() -> None:
+    assert repr(TOY.task("left")) == "<Task toy/left: go left>"
