@@ -31,7 +31,15 @@ from clbench.learning.distillation import discrete_head, distilled
 from clbench.learning.pretraining import pretrained_policy
 from clbench.learning.trainer import repeatable
 from clbench.policy.batch import Batch
-from clbench.policy.decoding import EASY_FIRST_STEPS, IN_SEQUENCE, Kept, Work, easy_first, pipelined
+from clbench.policy.decoding import (
+    EASY_FIRST_STEPS,
+    IN_SEQUENCE,
+    Kept,
+    Thresholds,
+    Work,
+    easy_first,
+    pipelined,
+)
 from clbench.policy.discrete import DiscreteDiffusionHead
 from clbench.policy.policy import Policy, PolicyConfig
 from clbench.spec.registry import load_scenario
@@ -40,7 +48,7 @@ SCENARIO = "clbench/Fetch-v1"
 BOARD = Path(__file__).parents[1] / "leaderboard"
 PEER = f"easy first, {EASY_FIRST_STEPS} forwards"
 PIPELINE = "pipeline, blocks of 1 step"
-WIDTHS = (96, 192, 384, 768, 1536)
+WIDTHS = (96, 192, 384, 768, 1536, 3072)
 """Widths of policies whose forwards are timed, with initial weights."""
 
 
@@ -69,6 +77,11 @@ def entries(teacher: Policy, students: dict[int, Policy]) -> dict[str, Entry]:
             f"pipeline, blocks of {block} step{'s' if block > 1 else ''}": Entry(student, kept, pipelined)
             for block, student in students.items()
         },
+        f"{PIPELINE}, tau_conf 0.25": Entry(
+            students[1],
+            partial(kept, thresholds=Thresholds(confidence=0.25)),
+            partial(pipelined, thresholds=Thresholds(confidence=0.25)),
+        ),
         f"{PIPELINE}, no kept keys": Entry(students[1], pipelined),
         f"{PIPELINE}, teacher with stale keys": Entry(teacher, partial(kept, block=1)),
     }

@@ -197,7 +197,7 @@ class Kept:
 
 
 class Blocks:
-    """The state of the pipeline for B chunks: their tokens, and which blocks have begun."""
+    """The state of the pipeline for B chunks of N blocks: their tokens, and which blocks have begun."""
 
     def __init__(
         self, head: MaskedHead, batch: int, steps: int, thresholds: Thresholds, device: torch.device
@@ -212,31 +212,26 @@ class Blocks:
         """Number of blocks that have begun, (B, 1)."""
         self.active = (self.number == 0).expand(batch, -1).clone()
         """Whether a block takes tokens however sure they are, (B, N); the first one does from the start."""
+        self._look()
 
-    @property
-    def masked(self) -> Tensor:
-        """Masked tokens by block, (B, N, size)."""
-        return (self.tokens == self.bins).view(-1, *self.shape)
-
-    @property
-    def share(self) -> Tensor:
+    def _look(self) -> None:
+        """Look at the tokens again after some were taken."""
+        self.masked = (self.tokens == self.bins).view(-1, *self.shape)
+        left = self.masked.sum(dim=2)
+        self.left = left
+        """Number of masked tokens by block, (B, N)."""
+        self.share = 1 - left / self.shape[1]
         """Share of each block's tokens that are decoded, (B, N)."""
-        return 1 - self.masked.float().mean(dim=2)
-
-    @property
-    def any_masked(self) -> bool:
+        by_block = left.amax(dim=0).tolist()
+        self.any_masked = any(by_block)
         """Whether a token of any chunk is masked."""
-        return bool((self.tokens == self.bins).any())
+        self.complete = next((number for number, count in enumerate(by_block) if count), len(by_block))
+        """Number of leading blocks without a mask in all chunks."""
 
     @property
     def end(self) -> int:
         """Place after the last token that has begun in any chunk."""
         return int(self.begun.max()) * self.shape[1]
-
-    @property
-    def complete(self) -> int:
-        """Number of leading blocks without a mask in all chunks."""
-        return int((~self.masked.any(dim=2).any(dim=0)).int().cumprod(dim=0).sum())
 
     def add(self) -> None:
         """Begin the next block of each chunk whose last one is decoded far enough."""
@@ -248,13 +243,14 @@ class Blocks:
         confidence, best = logits.softmax(dim=2).max(dim=2)
         rest = self.tokens.shape[1] - first - logits.shape[1]
         sure = F.pad(confidence, (first, rest)).view(-1, *self.shape)
-        best = F.pad(best, (first, rest))
-        masked = self.masked & (self.number < self.begun)[:, :, None]
+        has_begun = self.number < self.begun
+        masked = self.masked & has_begun[:, :, None]
         sure = sure.masked_fill(~masked, -math.inf)
-        least = (masked.sum(dim=2, keepdim=True) // self.thresholds.part).clamp(min=1)
+        least = (self.left // self.thresholds.part).clamp(min=1)[:, :, None]
         bar = sure.sort(dim=2, descending=True).values.gather(2, least - 1)
         bar = bar.clamp(max=self.thresholds.confidence)
         bar = torch.where(self.active[:, :, None], bar, self.thresholds.confidence)
         taken = (masked & (sure >= bar)).flatten(1)
-        self.tokens = torch.where(taken, best, self.tokens)
-        self.active[:, 1:] |= (self.share > self.thresholds.activate)[:, :-1] & (self.number[1:] < self.begun)
+        self.tokens = torch.where(taken, F.pad(best, (first, rest)), self.tokens)
+        self._look()
+        self.active[:, 1:] |= (self.share[:, :-1] > self.thresholds.activate) & has_begun[:, 1:]
