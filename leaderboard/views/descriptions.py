@@ -6,7 +6,7 @@ import dataclasses
 import inspect
 import re
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from itertools import groupby
 from typing import Any
@@ -16,12 +16,28 @@ from clbench.learning.method import Method
 from clbench.learning.registry import load_method, method_names
 
 from ..board.runs import division_of
+from ..board.summary import DIVISIONS
 
 _ITEM = re.compile(r"\d+\. +(.*)")
 
 
 COMMON: dict[str, Any] = {field.name: field.default for field in dataclasses.fields(Method)}
 """Hyper-parameters of every method with their defaults: pages of methods list only other defaults of them."""
+
+RULES: Mapping[str, str] = dict(
+    zip(
+        DIVISIONS,
+        (
+            "may reuse no earlier data",
+            "may reuse earlier questions, but no demonstrations",
+            "may reuse earlier demonstrations",
+            "are trained outside of clbench, by trial and error or from other data: not comparable",
+            "do not compete: they show the best that is possible, and the result of doing nothing",
+        ),
+        strict=True,
+    )
+)
+"""What the methods of each division may do."""
 
 
 @dataclass(frozen=True)

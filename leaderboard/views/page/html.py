@@ -22,7 +22,7 @@ from ...board.overall import overall
 from ...board.rows import Row, Table
 from ...board.tiers import TIERS
 from ..format import format_interval, number_text, title_of
-from .charts import FONT, NARROW, PALETTE, SERIES, SHAPES, WIDE, along_a_run, in_theme, plane
+from .charts import FONT, NARROW, PALETTE, SERIES, SHAPES, WIDE, along_a_run, decoders, in_theme, plane
 from .frontier import NARROW as NARROW_FRONTIER
 from .frontier import WIDE as WIDE_FRONTIER
 from .frontier import frontier
@@ -188,15 +188,18 @@ def _data(views: Sequence[ScenarioView]) -> dict[str, Any]:
 def _scenario_data(one: ScenarioView) -> dict[str, Any]:
     rows = [view.row for view in one.rows]
     anchors = {view.row.method: view.anchor for view in one.rows}
-    frontiers = {}
+    extra = {}
     if one.frontier:
-        frontiers["wide_frontier"] = frontier(one.frontier, WIDE_FRONTIER)
-        frontiers["narrow_frontier"] = frontier(one.frontier, NARROW_FRONTIER)
+        extra["wide_frontier"] = frontier(one.frontier, WIDE_FRONTIER)
+        extra["narrow_frontier"] = frontier(one.frontier, NARROW_FRONTIER)
+    if one.decoding:
+        extra["wide_decoders"] = decoders(one.decoding, 260)
+        extra["narrow_decoders"] = decoders(one.decoding, 90)
     names = one.tasks["target"]
     titles = names if one.balanced else [f"{number} {name}" for number, name in enumerate(names, 1)]
     steps = (1,) if one.to_criterion else one.steps
     return {
-        **frontiers,
+        **extra,
         "to_criterion": one.to_criterion,
         "metrics": [[title_of(metric.name), metric.description, metric.missing] for metric in one.others],
         "sft": anchors.get("sft"),

@@ -130,6 +130,11 @@
     draw(element, narrow() ? one.narrow_frontier : one.wide_frontier);
   }
 
+  function drawDecoders(element) {
+    const one = data.scenarios[element.dataset.decoders];
+    draw(element, narrow() ? one.narrow_decoders : one.wide_decoders);
+  }
+
   const words = ([value, low, high]) =>
     value === null ? "–" : value.toFixed(2) + (low === null ? "" : ` [${low.toFixed(2)}, ${high.toFixed(2)}]`);
 
@@ -225,12 +230,12 @@
   }, true);
 
   function drawInside(part) {
-    for (const element of part.querySelectorAll("[data-plane], [data-frontier], [data-run]")) {
+    for (const element of part.querySelectorAll("[data-plane], [data-frontier], [data-decoders], [data-run]")) {
       const hidden = element.closest("dialog:not([open])");
       if (hidden || element.dataset.drawn) continue;
       element.dataset.drawn = "yes";
-      const { plane, frontier } = element.dataset;
-      (plane ? drawPlane : frontier ? drawFrontier : drawRun)(element);
+      const { plane, frontier, decoders } = element.dataset;
+      (plane ? drawPlane : frontier ? drawFrontier : decoders ? drawDecoders : drawRun)(element);
     }
   }
 

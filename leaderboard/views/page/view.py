@@ -23,7 +23,7 @@ from ...board.rows import Row, Table, standing_of
 from ...board.summary import DIVISIONS, METHODS
 from ...policies.compared import Comparison, by_table
 from ...policies.decoders import Decoding, read_decoding
-from ..descriptions import Description, describe
+from ..descriptions import RULES, Description, describe
 from ..format import (
     Column,
     Rows,
@@ -52,21 +52,6 @@ NAMED = 3
 
 SHADES = 20
 """Number of shades between success 0 and success 1."""
-
-RULES: Mapping[str, str] = dict(
-    zip(
-        DIVISIONS,
-        (
-            "may reuse no earlier data",
-            "may reuse earlier questions, but no demonstrations",
-            "may reuse earlier demonstrations",
-            "are trained outside of clbench, by trial and error or from other data: not comparable",
-            "do not compete: they show the best that is possible, and the result of doing nothing",
-        ),
-        strict=True,
-    )
-)
-"""What the methods of each division may do."""
 
 
 Item = TypeVar("Item")
