@@ -14,6 +14,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 import torch
+from gymnasium.envs.registration import EnvSpec
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -228,9 +229,20 @@ def _write(folder: Path, name: str, task: Task, world: World, episodes: Sequence
             "minari_version": version("minari"),
             "algorithm_name": f"expert {task.expert}",
             "description": f"{task.instructions[0]} (horizon {task.horizon})",
+            "env_spec": _env_spec(task).to_json(),
         }
     )
     storage.update_episodes(buffers)
+
+
+def _env_spec(task: Task) -> EnvSpec:
+    """Return the environment of a task's dataset, which `recover_environment()` of the dataset makes."""
+    return EnvSpec(
+        f"clbench/{task.suite}.{task.name}-v{task.version}",
+        entry_point="clbench.worlds.world:one_task",
+        max_episode_steps=task.horizon,
+        kwargs={"world": task.world, "task": task.name},
+    )
 
 
 def read_dataset(folder: Path) -> list[Demonstration]:

@@ -12,6 +12,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from clbench.base.entry_points import resolve
 from clbench.base.errors import InputError
 
 if TYPE_CHECKING:
@@ -186,3 +187,28 @@ def rows_by_task(tasks: Iterable[str]) -> dict[str, list[int]]:
     for row, task in enumerate(tasks):
         rows[task].append(row)
     return rows
+
+
+class _OneTask(gymnasium.Wrapper[States, States, States, States]):
+    """A world whose episodes have one task unless `reset` is told another."""
+
+    def __init__(self, env: World, task: str) -> None:
+        super().__init__(env)
+        self.task = task
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[States, dict[str, Any]]:
+        """Start an episode."""
+        return self.env.reset(seed=seed, options={"task": self.task, **(options or {})})
+
+
+def one_task(world: str, task: str, **options: Any) -> gymnasium.Env[States, States]:
+    """Return a world whose episodes have one task: the environment that a Minari dataset recovers.
+
+    Args:
+        world: Entry point of the world.
+        task: Name of the task.
+        options: Arguments of the world, such as `render_mode`.
+    """
+    return _OneTask(resolve(world)(**options), task)

@@ -1,3 +1,4 @@
+import contextlib
 import dataclasses
 import logging
 import re
@@ -47,6 +48,27 @@ def test_others_read_them_with_minari(empty_caches: Path) -> None:
     episode = dataset[0]
     assert episode.observations.shape[0] == len(episode.actions) + 1 == len(episode.infos["expert_action"])
     assert episode.terminations[-1]
+
+
+def test_a_dataset_recovers_the_environment_that_made_it(empty_caches: Path) -> None:
+    dataset_folder(TASK, BUDGET)
+    dataset = minari.load_dataset(dataset_id(TASK, BUDGET))
+    with contextlib.closing(dataset.recover_environment()) as env:
+        _, info = env.reset(seed=0)
+        assert info["task"] == TASK.name
+        expert, ended = resolve(TASK.expert)(TASK.name), False
+        state, _ = env.reset(seed=1)
+        while not ended:
+            state, _, success, truncated, _ = env.step(expert(state))
+            ended = success or truncated
+        assert success
+        env.reset(seed=0)
+        steps = 0
+        while not truncated:
+            *_, truncated, _ = env.step(np.zeros(2, np.float32))
+            steps += 1
+        assert steps == TASK.horizon
+        assert env.reset(options={"task": "up"})[1]["task"] == "up"
 
 
 def test_two_budgets_or_versions_never_share_a_folder(empty_caches: Path) -> None:
