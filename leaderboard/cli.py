@@ -19,6 +19,7 @@ from clbench.base.text import counted
 from clbench.cli.arguments import (
     AsJson,
     MethodName,
+    PolicyName,
     ScenarioId,
     add_cwd_to_path,
     check_names,
@@ -181,6 +182,7 @@ def verify(
     episodes: Annotated[int, whole_number(1)] = 40,
     seed: Annotated[int | None, whole_number(0)] = None,
     method: MethodName | None = None,
+    policy: PolicyName | None = None,
     scenario: ScenarioId | None = None,
     checkpoints: Path | None = None,
     pretrain: Annotated[bool, Parameter(negative="")] = False,
@@ -202,6 +204,7 @@ def verify(
         episodes: Number of episodes to replay.
         seed: Random seed that selects the episodes (default: random; keep it secret from the submitter).
         method: module:Class of the method, if it is not installed: it is imported, and its code runs as you.
+        policy: module:Class of the policy, if it is not built in: it is imported, too.
         scenario: module:id of the scenario, if clbench does not register it.
         checkpoints: Folder of policies from `clbench run --checkpoints` (default: train them again).
         pretrain: At the tier retrained, also repeat the pretraining (default: use the cached policy).
@@ -224,7 +227,7 @@ def verify(
             )
         found, records = _placed(_found(paths, records), records)
     seed = secrets.randbits(48) if seed is None else seed
-    request = Request(tier, episodes, seed, method, scenario, checkpoints, pretrain, by)
+    request = Request(tier, episodes, seed, method, scenario, checkpoints, pretrain, by, policy)
     failures = run_verifications(found, records, request, workers, Console(stderr=as_json))
     if as_json:
         print_json(

@@ -45,8 +45,10 @@ def replay(subject: Subject, progress: ProgressCallback) -> list[Check]:
                 "policies", "an agent that learned online has none, so its highest tier is recomputed", False
             )
         ]
-    if not subject.may_import:
-        result = f"{run.method} is not installed: name it with --method to import and run its code"
+    if subject.strange:
+        options = " and ".join("--method" if name == run.method else "--policy" for name in subject.strange)
+        names = " and ".join(subject.strange)
+        result = f"{names} is not installed: name it with {options} to import and run its code"
         return [Check("policies", result, False)]
     try:
         check_device(spec.device)

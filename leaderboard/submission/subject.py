@@ -12,6 +12,7 @@ from clbench.learning.registry import method_names
 from clbench.runs.fingerprint import fingerprint
 from clbench.runs.spec import ResolvedRun, RunSpec
 from clbench.scoring.reading import read_protocol
+from clbench.spec.policies import is_built_in
 from clbench.spec.protocol import Protocol
 from clbench.spec.scenario import Scenario
 
@@ -53,6 +54,8 @@ class Request:
     """Whether the tier "retrained" repeats the pretraining, too, and reads no policy from the cache."""
     by: str | None = None
     """Name of the verifier, if he gives one."""
+    policy: str | None = None
+    """module:Class of a policy that is not built in; the name in a record alone is never imported."""
 
 
 @dataclass(frozen=True)
@@ -78,9 +81,12 @@ class Subject:
         )
 
     @property
-    def may_import(self) -> bool:
-        """Whether its method may be imported: it is installed, or the verifier named it."""
-        return self.run.record.run.method in (*method_names(), self.request.method)
+    def strange(self) -> list[str]:
+        """Names of its method and policy that may not be imported: not ours, nor named by the verifier."""
+        run = self.run.record.run
+        method = [] if run.method in (*method_names(), self.request.method) else [run.method]
+        policy = [] if is_built_in(run.policy) or run.policy == self.request.policy else [run.policy]
+        return method + policy
 
     @cached_property
     def resolved(self) -> ResolvedRun:

@@ -114,12 +114,13 @@ def _recompute(subject: Subject, _: ProgressCallback) -> list[Check]:
     checks = [Check("metrics from its episodes", result, values["final_average"] is not None)]
     try:
         scenario = subject.scenario
-        described = subject.resolved if subject.may_import else None
+        described = None if subject.strange else subject.resolved
     except ClbenchError as error:
         return [*checks, Check("what was run", str(error.args[0]), False)]
     checks.append(_check_horizons(run.record, scenario))
     if described is None:
-        result = f"{run.record.run.method} is not installed: its settings were not compared with its class"
+        names = " and ".join(subject.strange)
+        result = f"{names} is not installed: its settings were not compared with its class"
         checks.append(Check("what was run", result, True))
     else:
         ours = {"run": described.info, "scenario": described.scenario_info}

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from verification import failures, verify
 
 from clbench.base.errors import InputError
 from clbench.cli.scaffold import class_name, write_method, write_policy
@@ -84,6 +85,18 @@ def test_methods_fine_tune_a_fresh_policy(method: str, fresh_policy: str, tmp_pa
     learned = measure("adaptation", scores)
     assert learned is not None
     assert learned > 0.5
+
+
+def test_a_record_of_a_fresh_policy_is_replayed_only_if_the_verifier_names_it(
+    fresh_policy: str, tmp_path: Path
+) -> None:
+    spec = RunSpec("clbench.testing:clbench/Toy-v0", "sft", 0, policy=fresh_policy)
+    execute(spec, tmp_path / "records", checkpoints=tmp_path / "checkpoints")
+    path = spec.path(tmp_path / "records")
+    assert failures(verify(path, "recomputed")) == ""
+    words = failures(verify(path, "replayed", tmp_path))
+    assert f"{fresh_policy} is not installed: name it with --policy to import and run its code" in words
+    assert failures(verify(path, "replayed", tmp_path, policy=fresh_policy)) == ""
 
 
 def test_a_method_whose_need_a_fresh_policy_lacks_is_refused_by_name(fresh_policy: str) -> None:
