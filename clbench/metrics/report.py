@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from clbench.base.entry_points import unknown
 from clbench.base.text import counted, quoted
 from clbench.metrics.definitions import DEFINITIONS, FAMILIES
 from clbench.scoring.intervals import interval
@@ -102,9 +103,11 @@ class Report:
         """Return the value of a metric for a method; without a name, for the only or first one.
 
         Raises:
-            UnknownNameError: There is no such metric.
+            UnknownNameError: There is no such metric or method.
         """
         by_method = self.values[load_metric(metric).name]
+        if method is not None and method not in by_method:
+            raise unknown("method", method, by_method)
         return by_method[next(iter(by_method)) if method is None else method]
 
     def __getitem__(self, metric: str) -> Value:

@@ -152,7 +152,9 @@ def test_a_wrong_matrix_is_refused_with_what_was_expected(arguments: dict[str, o
         from_matrix(**arguments)  # type: ignore[arg-type]
 
 
-def test_an_unknown_task_or_metric_is_refused_with_the_nearest_name() -> None:
+def test_an_unknown_task_metric_or_method_is_refused_with_the_nearest_name() -> None:
+    with pytest.raises(UnknownNameError, match="Did you mean 'sft'"):
+        from_matrix({"sft": TRIANGLE}).of("adaptation", "stf")
     with pytest.raises(UnknownNameError, match="Did you mean 'task 1'"):
         from_matrix(TRIANGLE, retained=["task1"])
     with pytest.raises(UnknownNameError, match="Did you mean 'forgetting_mammoth'"):
