@@ -1,3 +1,4 @@
+from . import metrics as metrics
 from .data.questions import QuestionKind as QuestionKind
 from .evaluation.rollouts import Episode as Episode
 from .evaluation.rollouts import Evaluator as Evaluator

@@ -27,7 +27,7 @@ FLOORS = (
     ("spec",),
     ("records", "policy", "worlds"),
     ("scoring", "data"),
-    ("evaluation", "learning"),
+    ("evaluation", "learning", "metrics"),
     ("runs",),
     ("jobs", "testing"),
     ("cli",),
@@ -54,7 +54,7 @@ FORBIDDEN = {
 }
 """Modules that a package must not import, neither in a function nor by way of the modules that it imports."""
 
-LIGHT = ("clbench.scoring.metrics", "clbench.records.reader", "clbench.leaderboard")
+LIGHT = ("clbench.scoring.metrics", "clbench.metrics", "clbench.records.reader", "clbench.leaderboard")
 """Modules that read scores: they need neither PyTorch nor a simulator."""
 
 MOST_LINES = 450

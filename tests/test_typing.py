@@ -51,6 +51,7 @@ assert_type(clbench.execute(run, "records", checkpoints="policies"), clbench.Rec
 table = clbench.compare(scenario.id, [Mine, "sft"], records="records")
 print(table["gain"], clbench.load_board("records"))
 clbench.plot.matrix(records).save("matrix.png")
+assert_type(clbench.metrics.from_matrix([[0.5]])["adaptation"].value, float | None)
 
 
 def agent(observation: dict[str, Any]) -> Any:

@@ -8,8 +8,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, requires, version
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated, Literal
 
+from cyclopts import Parameter
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
@@ -22,6 +23,9 @@ from clbench.cli.arguments import AsJson, checked_input, print_json
 
 if TYPE_CHECKING:
     from packaging.requirements import Requirement
+
+TaskNames = Annotated[tuple[str, ...], Parameter(consume_multiple=True, negative="", show_default=False)]
+"""Names of tasks on the command line, one or more after one option."""
 
 
 def list_(*, as_json: AsJson = False) -> None:
@@ -91,23 +95,52 @@ def _methods() -> list[dict[str, str | None]]:
     return found
 
 
-def metrics(name: str | None = None, /, *, markdown: Path | None = None, as_json: AsJson = False) -> None:
-    """Show all metrics, or everything about the metric NAME.
+def metrics(
+    name: str | None = None,
+    /,
+    *,
+    retained: TaskNames = (),
+    target: TaskNames = (),
+    held_out: TaskNames = (),
+    unit: Literal["share", "percent"] | None = None,
+    markdown: Path | None = None,
+    as_json: AsJson = False,
+) -> None:
+    """Show all metrics, everything about the metric NAME, or all metrics of your success rates in a CSV file.
+
+    A file has the column stage and one column for each task, or the columns stage, task and success. The
+    columns method and seed are optional. robocasa365.csv is an example that comes with clbench.
 
     Args:
-        name: Name of a metric, for example forgetting.
+        name: Name of a metric, for example forgetting, or a CSV file.
+        retained: Tasks of the file that are known before stage 1 and never trained again.
+        target: Tasks of the file that are learned, in their order; without it, all others as in the file.
+        held_out: Tasks of the file that are never trained.
+        unit: Unit of the file's rates; without it, they are shares unless one is above 1.
         markdown: Write the page of all metrics to this file, for example docs/reference/metrics.md, and show
             nothing.
-        as_json: Print JSON: one object for each metric.
+        as_json: Print JSON: one object for each metric, or one for the file.
     """
     from clbench.cli import metric_pages
     from clbench.cli.metric_pages import facts
+    from clbench.metrics import view
+    from clbench.metrics.tables import find, from_csv, is_table, notes
     from clbench.scoring.metrics import METRICS, load_metric
 
     console = Console()
     with checked_input():
         if name and markdown:
             raise InputError("The page holds all metrics: give a name or --markdown, not both.")
+        if name and is_table(name):
+            path = find(name)
+            report = from_csv(path, retained=retained, target=target or None, held_out=held_out, unit=unit)
+            if as_json:
+                print_json(view.as_values(report))
+            else:
+                console.print(view.text(report, notes(path)), highlight=False)
+            return
+        if retained or target or held_out or unit:
+            raise InputError("--retained, --target, --held-out and --unit need a CSV file.")
         metric = load_metric(name) if name else None
     if markdown:
         markdown.parent.mkdir(parents=True, exist_ok=True)

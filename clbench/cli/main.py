@@ -54,7 +54,7 @@ NAMES = {
     "run": "SCENARIOS [METHODS...]",
     "status": "[SCENARIOS] [METHODS...]",
     "leaderboard": "[SCENARIO]",
-    "metrics": "[NAME]",
+    "metrics": "[NAME|FILE]",
     "tune": "SCENARIO [METHODS...]",
     "verify": "PATHS...",
     "scenario-card": "[SCENARIOS...]",

@@ -1,9 +1,13 @@
 """`clbench list` and `clbench metrics` in terminals of any width."""
 
+import json
+from pathlib import Path
+
 import pytest
 
 from clbench import load_scenario
 from clbench.cli.main import app
+from clbench.metrics.definitions import DEFINITIONS
 from clbench.scoring.metrics import METRICS
 from clbench.spec.identifiers import built_in_methods
 
@@ -37,3 +41,68 @@ def test_methods_are_listed_by_the_prior_data_that_they_use(capsys: pytest.Captu
 def test_everything_about_one_metric_is_shown(capsys: pytest.CaptureFixture[str]) -> None:
     app(["metrics", "worst_case_accuracy"], result_action="return_value")
     assert "Formula: R[K][K] / K + (1 - 1 / K) minimum_accuracy\n" in capsys.readouterr().out
+
+
+TABLE = """method,seed,stage,reach,push,lift
+experience_replay,0,1,90,60,10
+experience_replay,0,2,80,50,70
+experience_replay,1,1,80,50,0
+experience_replay,1,2,90,50,80
+sft,0,1,50,70,10
+sft,0,2,20,30,90
+sft,1,1,60,80,0
+sft,1,2,30,20,80
+"""
+
+
+@pytest.mark.parametrize("width", [60, 80, 120])
+def test_the_metrics_of_a_table_fit_the_terminal_and_cut_no_name(
+    width: int, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", str(width))
+    path = tmp_path / "table.csv"
+    path.write_text(TABLE, encoding="utf-8")
+    for words in ([str(path), "--retained", "reach"], ["robocasa365.csv"]):
+        app(["metrics", *words], result_action="return_value")
+        shown = capsys.readouterr().out
+        assert max(map(len, shown.splitlines())) <= width
+        assert METRICS.keys() <= {word.strip(",:") for word in shown.split()}
+    assert "read as per cent, since the greatest is 41.5" in " ".join(shown.split())
+
+
+def test_the_metrics_of_a_table_are_printed_as_json_with_reasons_and_flips(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "table.csv"
+    path.write_text(TABLE, encoding="utf-8")
+    app(["metrics", str(path), "--retained", "reach", "--json"], result_action="return_value")
+    printed = json.loads(capsys.readouterr().out)
+    assert (printed["unit"], printed["target"]) == ("percent", ["push", "lift"])
+    by_name = {one["name"]: one for one in printed["metrics"]}
+    assert by_name.keys() == METRICS.keys()
+    assert all(by_name[name]["assumption"] for name in DEFINITIONS)
+    assert by_name["retention"]["values"]["experience_replay"]["value"] == pytest.approx(0.85)
+    missing = by_name["zero_shot"]["values"]["sft"]
+    assert missing["value"] is None
+    assert missing["reason"].startswith("There are no held-out tasks")
+    assert {"family", "first", "second", "first_is_better", "second_is_better"} == printed["flips"][0].keys()
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["robocasa.csv"], "Did you mean 'robocasa365.csv'?"),
+        (["forgetting", "--unit", "share"], "need a CSV file"),
+        (["robocasa365.csv", "--retained", "atomics"], "Did you mean 'atomic'?"),
+        (["robocasa365.csv", "--markdown", "page.md"], "give a name or --markdown, not both"),
+    ],
+)
+def test_a_wrong_table_is_an_error_in_one_line(
+    words: list[str], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as ended:
+        app(["metrics", *words], result_action="return_value")
+    assert ended.value.code == 2
+    shown = capsys.readouterr().err
+    assert message in shown
+    assert shown.count("\n") == 1

@@ -1,0 +1,193 @@
+"""Success matrices: their cells, their units, the groups of their tasks, and `from_matrix`."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from clbench.base.entry_points import unknown
+from clbench.base.errors import InputError
+from clbench.base.text import counted, quoted
+from clbench.metrics.report import Matrices, Report, measure
+from clbench.scoring.layout import Array, Layout
+
+Unit = Literal["share", "percent"]
+"""Unit of success rates: from 0 to 1, or from 0 to 100."""
+MOST: dict[Unit, float] = {"share": 1.0, "percent": 100.0}
+"""The greatest success rate in each unit."""
+
+Names = Sequence[str]
+
+
+class Cell(NamedTuple):
+    """The place of one success rate."""
+
+    method: str
+    seed: str
+    stage: int
+    task: str
+
+    def __str__(self) -> str:
+        method = f"method {quoted(self.method)}, " if self.method else ""
+        seed = f"seed {quoted(self.seed)}, " if self.seed else ""
+        return f"{method}{seed}stage {self.stage}, task {quoted(self.task)}"
+
+
+@dataclass(frozen=True)
+class Groups:
+    """The tasks of each group, as the user names them; None stands for the tasks in no other group."""
+
+    retained: Names = ()
+    target: Names | None = None
+    held_out: Names = ()
+
+
+def from_matrix(
+    matrix: ArrayLike | Mapping[str, ArrayLike],
+    *,
+    tasks: Names | None = None,
+    retained: Names = (),
+    target: Names | None = None,
+    held_out: Names = (),
+    unit: Unit | None = None,
+) -> Report:
+    """Return every metric that a success matrix allows, and the reasons why the others have no value.
+
+    Args:
+        matrix: Success rates, (stages, tasks) or (seeds, stages, tasks), NaN where missing; or several of
+            them by the name of the method. Row k is the end of stage k, in which target k is learned. A row
+            more than there are targets is stage 0, before the first target. A method called sft, joint or
+            from_scratch is the reference of the metrics that need one.
+        tasks: Names of the columns. Without them, they are "task 1", "task 2" and so on.
+        retained: Names of the tasks that are known before the first target and never trained again.
+        target: Names of the tasks that are learned, in their order. Without them, they are all tasks that are
+            neither retained nor held out, in the order of the columns.
+        held_out: Names of the tasks that are never trained.
+        unit: "share" if the rates are from 0 to 1, "percent" if they are from 0 to 100. Without it, they are
+            shares unless one is above 1; `Report.unit` says what was assumed.
+
+    Raises:
+        InputError: The shape does not fit the tasks, or a rate is out of range.
+        UnknownNameError: There is no such task.
+    """
+    given = matrix if isinstance(matrix, Mapping) else {"": matrix}
+    arrays = {str(method): _array(values, str(method)) for method, values in given.items()}
+    if not arrays:
+        raise InputError("There is no matrix: expected at least one method.")
+    rows, columns = _shape(arrays)
+    names = tuple(tasks) if tasks is not None else tuple(f"task {n}" for n in range(1, columns + 1))
+    if len(names) != columns:
+        raise InputError(f"There are {counted(len(names), 'name')} for {counted(columns, 'task')}.")
+    groups = Groups(retained, target, held_out)
+    layout = layout_of(names, groups)
+    first = 1 + len(layout.target) - rows
+    if first not in (0, 1):
+        raise InputError(f"The matrix has {counted(rows, 'row')}. {_expected_stages(layout)}")
+    cells = {
+        Cell(method, str(seed) if len(array) > 1 else "", first + row, name): float(array[seed, row, column])
+        for method, array in arrays.items()
+        for seed in range(len(array))
+        for row in range(rows)
+        for column, name in enumerate(names)
+    }
+    return measure(matrices_of(cells, names, groups, unit))
+
+
+def _array(values: ArrayLike, method: str) -> Array:
+    """Return success rates as an array, (seeds, stages, tasks)."""
+    array = np.asarray(values, dtype=np.float64)
+    if array.ndim not in (2, 3) or not array.size:
+        name = f" of method {quoted(method)}" if method else ""
+        raise InputError(
+            f"The matrix{name} has the shape {array.shape}: expected (stages, tasks) or (seeds, stages, "
+            "tasks)."
+        )
+    return array if array.ndim == 3 else array[None]
+
+
+def _shape(arrays: Mapping[str, Array]) -> tuple[int, int]:
+    """Return the number of rows and columns, the same for all methods."""
+    shapes = {method: array.shape[1:] for method, array in arrays.items()}
+    (rows, columns), *others = set(shapes.values())
+    if others:
+        found = ", ".join(f"{quoted(method)} {shape}" for method, shape in shapes.items())
+        raise InputError(f"All methods need the same stages and tasks; their matrices have {found}.")
+    return rows, columns
+
+
+def matrices_of(
+    cells: Mapping[Cell, float], tasks: Names, groups: Groups, unit: Unit | None, where: str = ""
+) -> Matrices:
+    """Return the cells of a table as matrices.
+
+    Args:
+        cells: The success rates that are there, NaN where missing.
+        tasks: Names of all tasks, in the order of the table.
+        groups: The groups of the tasks.
+        unit: Unit of the rates; None to choose it by the greatest one.
+        where: Place of the table for messages, such as "table.csv: ".
+    """
+    layout = layout_of(tasks, groups)
+    stages = sorted({cell.stage for cell in cells})
+    if not stages or stages[-1] != len(layout.target) or stages[0] < 0:
+        found = f"The stages are {stages[0]} to {stages[-1]}." if stages else "The table has no rows."
+        raise InputError(f"{where}{found} {_expected_stages(layout)}")
+    known = {cell: rate for cell, rate in cells.items() if not math.isnan(rate)}
+    largest = max(known.values(), default=0.0)
+    chosen: Unit = unit or ("percent" if largest > 1 else "share")
+    _check_range(known, chosen, where)
+    places = {name: place for place, name in enumerate(layout.tasks)}
+    success: dict[str, dict[str, Array]] = {}
+    for cell, rate in cells.items():
+        of_method = success.setdefault(cell.method, {})
+        if cell.seed not in of_method:
+            of_method[cell.seed] = np.full((len(layout.target) + 1, len(tasks)), np.nan)
+        of_method[cell.seed][cell.stage, places[cell.task]] = rate / MOST[chosen]
+    return Matrices(layout, success, chosen, unit is not None, largest)
+
+
+def _check_range(known: Mapping[Cell, float], unit: Unit, where: str) -> None:
+    """Refuse a rate that is impossible in its unit."""
+    for cell, rate in known.items():
+        if not 0 <= rate <= MOST[unit]:
+            words = {"share": "a share from 0 to 1", "percent": "per cent from 0 to 100"}[unit]
+            raise InputError(f"{where}{cell}: expected {words}, found {rate:g}.")
+
+
+def layout_of(tasks: Names, groups: Groups) -> Layout:
+    """Return the layout of a matrix whose columns are `tasks`."""
+    for task in (*groups.retained, *(groups.target or ()), *groups.held_out):
+        if task not in tasks:
+            raise unknown("task", task, tasks)
+    others = {*groups.retained, *groups.held_out}
+    target = groups.target if groups.target is not None else [task for task in tasks if task not in others]
+    chosen = [*groups.retained, *target, *groups.held_out]
+    for task in tasks:
+        if chosen.count(task) != 1:
+            fault = "is in no group" if task not in chosen else "is named twice"
+            raise InputError(f"Task {quoted(task)} {fault}: it is retained, a target, or held out.")
+    return Layout(
+        tuple(groups.retained),
+        tuple(target),
+        tuple(groups.held_out),
+        episodes=(),
+        curve_episodes=(),
+        validation_episodes=(),
+        steps=(1,),
+        kinds=(),
+    )
+
+
+def _expected_stages(layout: Layout) -> str:
+    """Return which stages a table with these targets has, and what to do if there are more or fewer."""
+    count = len(layout.target)
+    return (
+        f"Expected stages 1 to {count}, one for each of {counted(count, 'target')}: stage k is the end of "
+        "the training on target k, and stage 0, which may be missing, is before the first. Name tasks that "
+        "are no targets as retained or held out."
+    )

@@ -1,0 +1,250 @@
+"""The metrics of success matrices: values, the reasons of missing ones, and where the order of methods flips.
+
+All values come from the functions of the registry (`clbench.scoring.metrics`). What a metric needs is found
+by trying: it is computed for a complete matrix without one cell, for each cell in turn. If it then has no
+value, it needs this cell.
+"""
+
+from __future__ import annotations
+
+import functools
+import itertools
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clbench.base.entry_points import unknown
+from clbench.base.text import counted, quoted
+from clbench.metrics.definitions import DEFINITIONS, FAMILIES
+from clbench.scoring.intervals import interval
+from clbench.scoring.layout import Array, Layout
+from clbench.scoring.metric import Metric
+from clbench.scoring.metrics import METRICS, load_metric
+from clbench.scoring.rates import Rates
+
+if TYPE_CHECKING:
+    import pandas
+
+TIE = 1e-9
+"""Greatest difference of two values that count as equal: they differ by rounding."""
+
+
+@dataclass(frozen=True, eq=False)
+class Matrices:
+    """Success matrices of one or more methods on the same tasks."""
+
+    layout: Layout
+    """Groups and order of the tasks."""
+    success: Mapping[str, Mapping[str, Array]]
+    """Success rates by method and seed, (stages + 1, tasks), NaN where missing. A method or seed without a
+    name is the empty text."""
+    unit: str
+    """Unit in which the rates were given: "share" or "percent"."""
+    unit_was_given: bool
+    """Whether the user named the unit; if not, it was chosen by the greatest rate."""
+    largest: float
+    """The greatest rate as it was given."""
+
+
+@dataclass(frozen=True)
+class Value:
+    """The value of a metric for one method."""
+
+    value: float | None
+    """The value, the mean over seeds; None if something is missing."""
+    low: float | None = None
+    """Lower end of the 95 % interval over seeds; None with one seed, or if all seeds agree."""
+    high: float | None = None
+    """Upper end of the interval."""
+    reason: str | None = None
+    """Why there is no value; None if there is one."""
+
+
+@dataclass(frozen=True)
+class Flip:
+    """Two methods that the definitions of one family put in different orders."""
+
+    family: str
+    """Family of the definitions."""
+    first: str
+    """Name of a method."""
+    second: str
+    """Name of another one."""
+    first_is_better: tuple[str, ...]
+    """Definitions by which the first is better."""
+    second_is_better: tuple[str, ...]
+    """Definitions by which the second is better."""
+
+
+@dataclass(frozen=True, eq=False)
+class Report:
+    """Every metric of one or more success matrices; `report["final_average"].value` is one of them."""
+
+    matrices: Matrices
+    """What was measured."""
+    values: Mapping[str, Mapping[str, Value]]
+    """The values of all metrics of the registry, by metric and method."""
+    flips: tuple[Flip, ...] = field(init=False)
+    """Where the order of two methods depends on the definition."""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "flips", tuple(_flips(self.values)))
+
+    @property
+    def unit(self) -> str:
+        """The unit in which the rates were given, or assumed to be: "share" or "percent"."""
+        return self.matrices.unit
+
+    def of(self, metric: str, method: str | None = None) -> Value:
+        """Return the value of a metric for a method; without a name, for the only or first one.
+
+        Raises:
+            UnknownNameError: There is no such metric or method.
+        """
+        by_method = self.values[load_metric(metric).name]
+        if method is not None and method not in by_method:
+            raise unknown("method", method, by_method)
+        return by_method[next(iter(by_method)) if method is None else method]
+
+    def __getitem__(self, metric: str) -> Value:
+        return self.of(metric)
+
+    def frame(self) -> pandas.DataFrame:
+        """Return one row for each metric and method, with value, interval, reason, assumption and source."""
+        import pandas
+
+        rows = [
+            {
+                "family": DEFINITIONS[name].family if name in DEFINITIONS else None,
+                "metric": name,
+                "method": method,
+                "value": value.value,
+                "low": value.low,
+                "high": value.high,
+                "reason": value.reason,
+                "assumption": DEFINITIONS[name].assumption if name in DEFINITIONS else None,
+                "source": METRICS[name].source,
+            }
+            for name, by_method in self.values.items()
+            for method, value in by_method.items()
+        ]
+        return pandas.DataFrame(rows)
+
+
+def measure(matrices: Matrices) -> Report:
+    """Return all metrics of the registry for all methods."""
+    values = {
+        metric.name: {method: _value(metric, method, matrices) for method in matrices.success}
+        for metric in METRICS.values()
+    }
+    return Report(matrices, values)
+
+
+def _value(metric: Metric, method: str, matrices: Matrices) -> Value:
+    """Return the value of a metric for a method, with its interval over seeds, or the reason."""
+    if method in metric.references and not metric.compares_itself:
+        return Value(None, reason=f"{method} is what the others are compared with.")
+    runs = matrices.success[method]
+    references = {
+        name: _rates(np.stack([matrices.success[name][seed] for seed in runs]), matrices.layout)
+        for name in metric.references
+        if set(runs) <= set(matrices.success.get(name, ()))
+    }
+    absent = [name for name in metric.references if name not in references]
+    rates = _rates(np.stack(list(runs.values())), matrices.layout)
+    rates = replace(rates, references=references)
+    value = float(metric.over_runs(rates))
+    if not math.isfinite(value):
+        return Value(None, reason=_reason(metric, matrices.layout, runs, absent))
+    # without one seed each: none of them with one seed
+    others = [
+        float(metric.over_runs(rates.each(functools.partial(np.delete, obj=place, axis=0))))
+        for place in range(len(runs) if len(runs) > 1 else 0)
+    ]
+    found = interval(value, np.array(others), span=(metric.low, metric.high))
+    return Value(value, found.low, found.high)
+
+
+def _rates(success: Array, layout: Layout) -> Rates:
+    """Return rates of success at the ends of stages, (..., stages + 1, tasks); all else is missing."""
+    batch, count, tasks = success.shape[:-2], len(layout.target), len(layout.tasks)
+
+    def missing(*shape: int) -> Array:
+        return np.full((*batch, *shape), np.nan)
+
+    points = len(layout.steps)
+    of_points = ("answer_curves", "update_sparsity", "activation_drift")
+    of_stages = ("shift", "captured", "steps", "met")
+    arrays: dict[str, Any] = {
+        **dict.fromkeys(of_points, missing(count, points)),
+        **dict.fromkeys(of_stages, missing(count)),
+        **dict.fromkeys(("asked", "correct"), missing(count + 1, len(layout.kinds))),
+    }
+    return Rates(
+        layout=layout,
+        success=success,
+        curves=missing(count, points, tasks),
+        perturbed=missing(count + 1, tasks),
+        relearning_steps=missing(),
+        **arrays,
+    )
+
+
+# ---- reasons -----------------------------------------------------------------------------------------------
+
+
+def needed_cells(metric: Metric, layout: Layout) -> NDArray[np.bool_] | None:
+    """Return which cells of a matrix a metric needs, (stages + 1, tasks); None if it needs other things."""
+    shape = len(layout.target) + 1, len(layout.tasks)
+    complete = np.full((1 + math.prod(shape), *shape), 0.5)
+    complete[1:].reshape(math.prod(shape), -1)[np.diag_indices(math.prod(shape))] = np.nan
+    references = {name: _rates(np.full(complete.shape, 0.5), layout) for name in metric.references}
+    found = metric.function(replace(_rates(complete, layout), references=references))
+    whole, without_one = found[0], found[1:]
+    return None if np.isnan(whole) else np.isnan(without_one).reshape(shape)
+
+
+def _reason(metric: Metric, layout: Layout, runs: Mapping[str, Array], absent: list[str]) -> str:
+    """Return why a metric has no value."""
+    needed = needed_cells(metric, layout)
+    if needed is None:
+        return metric.missing
+    if absent:
+        return f"No method is called {absent[0]}, or it lacks seeds."
+    places = [
+        f"{f'seed {quoted(seed)}, ' if len(runs) > 1 else ''}stage {stage}, {layout.tasks[task]}"
+        for seed, matrix in runs.items()
+        for stage, task in np.argwhere(needed & np.isnan(matrix))
+    ]
+    if not places:
+        return metric.missing
+    more = f" and {counted(len(places) - 1, 'other cell')}" if places[1:] else ""
+    return f"The table lacks {places[0]}{more}."
+
+
+# ---- the order of the methods ------------------------------------------------------------------------------
+
+
+def _flips(values: Mapping[str, Mapping[str, Value]]) -> Iterator[Flip]:
+    """Yield the pairs of methods whose order depends on the definition, family by family."""
+    methods = list(next(iter(values.values())))
+    for family, (first, second) in itertools.product(FAMILIES, itertools.combinations(methods, 2)):
+        better: dict[bool, list[str]] = {True: [], False: []}
+        for name in (name for name, one in DEFINITIONS.items() if one.family == family):
+            sides = values[name][first].value, values[name][second].value
+            ahead = _ahead(METRICS[name], *sides)
+            if ahead is not None:
+                better[ahead].append(name)
+        if better[True] and better[False]:
+            yield Flip(family, first, second, tuple(better[True]), tuple(better[False]))
+
+
+def _ahead(metric: Metric, first: float | None, second: float | None) -> bool | None:
+    """Return whether the first value is better than the second; None if neither is, or one is missing."""
+    if first is None or second is None or metric.higher_is_better is None or abs(first - second) <= TIE:
+        return None
+    return (first > second) == metric.higher_is_better

@@ -1,0 +1,187 @@
+"""CSV files of success rates, in a long or a wide layout; docs/guide/your_numbers.md describes both.
+
+    method,seed,stage,task,success      method,seed,stage,reach,push
+    sft,0,1,reach,0.9                   sft,0,1,0.9,
+    sft,0,2,reach,0.4                   sft,0,2,0.4,0.8
+    sft,0,2,push,0.8
+
+The columns method and seed may be missing. An empty cell or "-" is a missing rate. Lines that begin with #
+are notes. A table without a task column is wide.
+"""
+
+from __future__ import annotations
+
+import csv
+import difflib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from clbench.base.errors import InputError
+from clbench.base.text import did_you_mean, quoted
+from clbench.metrics.matrices import Cell, Groups, Names, Unit, matrices_of
+from clbench.metrics.report import Report, measure
+
+EXAMPLES = Path(__file__).parent / "examples"
+"""Folder of the tables that come with clbench."""
+
+KEYS = ("method", "seed", "stage")
+"""Columns that say where a row belongs; all but the last may be missing."""
+RATES = ("task", "success")
+"""The other columns of a long table."""
+MISSING = ("", "-", "nan")
+"""Texts of a cell without a rate, in small letters."""
+
+
+@dataclass(frozen=True)
+class _Line:
+    """A line of a table."""
+
+    number: int
+    """Its number in the file, from 1."""
+    fields: list[str]
+    """Its cells, without spaces around them."""
+
+
+def is_table(name: str) -> bool:
+    """Return whether a name is meant as a table: it ends in .csv, or a file has it."""
+    return name.lower().endswith(".csv") or Path(name).is_file()
+
+
+def find(name: Path | str) -> Path:
+    """Return the file of a table: the one at this path, or else the example of this name.
+
+    Raises:
+        InputError: There is neither; the message names the nearest file.
+    """
+    path = Path(name)
+    if path.is_file():
+        return path
+    if path.name == str(path) and (EXAMPLES / path).is_file():
+        return EXAMPLES / path
+    examples = sorted(one.name for one in EXAMPLES.glob("*.csv"))
+    folder = path.parent
+    near = sorted(one.name for one in folder.glob("*.csv")) if folder.is_dir() else []
+    guess = difflib.get_close_matches(path.name, near, n=1)
+    hint = f" Did you mean {str(folder / guess[0])!r}?" if guess else did_you_mean(str(path), examples)
+    raise InputError(f"There is no file {quoted(str(path))}.{hint}")
+
+
+def notes(path: Path) -> list[str]:
+    """Return the notes of a table, such as its source: its lines that begin with #."""
+    lines = _text(path).splitlines()
+    return [line.lstrip("# ").rstrip() for line in lines if line.startswith("#")]
+
+
+def from_csv(
+    path: Path | str,
+    *,
+    retained: Names = (),
+    target: Names | None = None,
+    held_out: Names = (),
+    unit: Unit | None = None,
+) -> Report:
+    """Return every metric that the success rates in a CSV file allow.
+
+    Args:
+        path: The file, or the name of an example that comes with clbench, such as "robocasa365.csv".
+        retained: As for `from_matrix`, like the arguments below.
+        target: Without it, the targets are in the order of the columns, in a long table in the order in which
+            they first appear.
+        held_out: Names of the tasks that are never trained.
+        unit: "share" or "percent".
+
+    Raises:
+        InputError: The file is missing or no such table; the message names the line and the cell.
+        UnknownNameError: There is no such task.
+    """
+    path = find(path)
+    cells, tasks = _read(path)
+    groups = Groups(retained, target, held_out)
+    return measure(matrices_of(cells, tasks, groups, unit, f"{path.name}: "))
+
+
+def _text(path: Path) -> str:
+    try:
+        return path.read_text(encoding="utf-8-sig")
+    except UnicodeDecodeError:
+        raise InputError(f"{path.name}: expected a text file in UTF-8.") from None
+
+
+def _read(path: Path) -> tuple[dict[Cell, float], list[str]]:
+    """Return the cells of a table, and its tasks in their order."""
+    content = enumerate(_text(path).splitlines(), 1)
+    numbered = [(number, line) for number, line in content if line.strip() and not line.startswith("#")]
+    rows = csv.reader([line for _, line in numbered], strict=True)
+    try:
+        lines = [
+            _Line(number, [field.strip() for field in row])
+            for (number, _), row in zip(numbered, rows, strict=True)
+        ]
+    except (csv.Error, ValueError) as error:
+        raise InputError(f"{path.name}: not a CSV file: {error}.") from None
+    if len(lines) < 2:
+        raise InputError(f"{path.name}: expected a line with the names of the columns, and rows below it.")
+    header, *body = lines
+    long = _check_header(header.fields, path.name)
+    cells: dict[Cell, float] = {}
+    seen: dict[Cell, int] = {}
+    for line in body:
+        where = f"{path.name}, line {line.number}"
+        if len(line.fields) != len(header.fields):
+            raise InputError(f"{where}: expected {len(header.fields)} cells, found {len(line.fields)}.")
+        for cell, text in _cells(dict(zip(header.fields, line.fields, strict=True)), long, where):
+            if cell in seen:
+                raise InputError(f"{where}: {cell} was given on line {seen[cell]} already.")
+            seen[cell], cells[cell] = line.number, _rate(text, f"{where}, {cell}")
+    tasks = list(dict.fromkeys(cell.task for cell in cells))
+    return cells, tasks
+
+
+def _check_header(header: Sequence[str], name: str) -> bool:
+    """Return whether a table is long; refuse columns that make it neither long nor wide."""
+    doubled = next((column for column in header if header.count(column) > 1), None)
+    if doubled is not None or "" in header:
+        fault = "a column has no name" if "" in header else f"there are two columns {quoted(doubled or '')}"
+        raise InputError(f"{name}: {fault}.")
+    long = any(column in header for column in RATES)
+    for column in ("stage", *(RATES if long else ())):
+        if column not in header:
+            layout = "stage, task and success" if long else "stage and one column for each task"
+            near = difflib.get_close_matches(
+                column, [one for one in header if one not in (*KEYS, *RATES)], n=1
+            )
+            hint = f" Rename {near[0]!r} to {column!r}." if near else ""
+            raise InputError(f"{name}: the column {column!r} is missing: expected {layout}.{hint}")
+    if long:
+        for column in header:
+            if column not in (*KEYS, *RATES):
+                known = (*KEYS, *RATES)
+                raise InputError(
+                    f"{name}: unknown column {quoted(column)}: a long table has {', '.join(known)}."
+                    f"{did_you_mean(column, known)}"
+                )
+    return long
+
+
+def _cells(row: dict[str, str], long: bool, where: str) -> list[tuple[Cell, str]]:
+    """Return the cells of a row with their texts."""
+    method, seed, stage = (row.pop(key, "") for key in KEYS)
+    if not stage.isascii() or not stage.isdigit():
+        raise InputError(
+            f"{where}: stage {quoted(stage)} is none: expected a whole number, the targets learned so far."
+        )
+    pairs = [(row["task"], row["success"])] if long else list(row.items())
+    return [(Cell(method, seed, int(stage), task), text) for task, text in pairs]
+
+
+def _rate(text: str, where: str) -> float:
+    """Return the success rate in a cell, NaN if it is missing."""
+    if text.lower() in MISSING:
+        return float("nan")
+    try:
+        return float(text)
+    except ValueError:
+        raise InputError(
+            f"{where}: expected a success rate such as 0.8 or 80, or an empty cell; found {quoted(text)}."
+        ) from None

@@ -1,0 +1,106 @@
+"""Tables as CSV files: two layouts with the same numbers, and errors that name the line and the cell."""
+
+from pathlib import Path
+
+import pytest
+
+from clbench.base.errors import InputError
+from clbench.metrics import from_csv, from_matrix
+from clbench.metrics.tables import EXAMPLES, notes
+from clbench.metrics.view import as_values
+
+WIDE = """# where it comes from
+method,seed,stage,reach,push,lift
+mine,0,0,1.0,0.1,-
+mine,0,1,0.8,0.6,
+mine,0,2,0.7,0.4,0.9
+sft,0,0,1.0,0.1,-
+sft,0,1,0.5,0.7,
+sft,0,2,0.2,0.3,0.9
+"""
+LONG = """stage, task, success, method, seed
+0, reach, 1.0, mine, 0
+0, push, 0.1, mine, 0
+
+1, reach, 0.8, mine, 0
+1, push, 0.6, mine, 0
+2, reach, 0.7, mine, 0
+2, push, 0.4, mine, 0
+2, lift, 0.9, mine, 0
+0, reach, 1.0, sft, 0
+0, push, 0.1, sft, 0
+1, reach, 0.5, sft, 0
+1, push, 0.7, sft, 0
+2, reach, 0.2, sft, 0
+2, push, 0.3, sft, 0
+2, lift, 0.9, sft, 0
+"""
+
+
+@pytest.fixture
+def table(tmp_path: Path) -> Path:
+    return tmp_path / "table.csv"
+
+
+def test_both_layouts_and_arrays_give_the_same_report(table: Path) -> None:
+    nan = float("nan")
+    mine = [[1.0, 0.1, nan], [0.8, 0.6, nan], [0.7, 0.4, 0.9]]
+    sft = [[1.0, 0.1, nan], [0.5, 0.7, nan], [0.2, 0.3, 0.9]]
+    reports = [from_matrix({"mine": mine, "sft": sft}, tasks=["reach", "push", "lift"], retained=["reach"])]
+    for text in (WIDE, LONG, WIDE.replace("\n", "\r\n"), "\N{ZERO WIDTH NO-BREAK SPACE}" + LONG):
+        table.write_bytes(text.encode())
+        reports.append(from_csv(table, retained=["reach"]))
+    first, *others = [{**as_values(report), "seeds": None} for report in reports]
+    assert others == [first] * 4
+
+
+def test_the_notes_of_a_table_are_its_lines_that_begin_with_a_hash(table: Path) -> None:
+    table.write_text(WIDE, encoding="utf-8")
+    assert notes(table) == ["where it comes from"]
+
+
+def test_every_example_names_its_source_and_can_be_read_by_its_name() -> None:
+    names = [path.name for path in EXAMPLES.glob("*.csv")]
+    assert "robocasa365.csv" in names
+    for name in names:
+        assert any(line.startswith("Source: ") for line in notes(EXAMPLES / name))
+        assert from_csv(name)["final_average"].value is not None
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("stage,reach\n1,0,5\n", "line 2: expected 2 cells, found 3"),
+        ("stage,reach\n1,half\n", "line 2, stage 1, task 'reach': expected a success rate such as 0.8 or 80"),
+        ("stage,reach\n1,0.5\n1,0.6\n", "line 3: stage 1, task 'reach' was given on line 2 already"),
+        ("stage,reach\nfirst,0.5\n", "line 2: stage 'first' is none: expected a whole number"),
+        ("stage,reach,push\n1,0.5,0.5\n", "The stages are 1 to 1. Expected stages 1 to 2"),
+        ("stage,reach\n1,500\n", "stage 1, task 'reach': expected per cent from 0 to 100, found 500"),
+        ("phase,reach\n1,0.5\n", "the column 'stage' is missing"),
+        ("stages,reach\n1,0.5\n", "Rename 'stages' to 'stage'"),
+        ("stage,task,sucess\n1,reach,0.5\n", "the column 'success' is missing.*Rename 'sucess' to 'success'"),
+        ("stage,task,success,sede\n1,reach,0.5,0\n", "unknown column 'sede'.*Did you mean 'seed'"),
+        ("stage,reach,reach\n1,0.5,0.5\n", "two columns 'reach'"),
+        ("stage,\n1,0.5\n", "a column has no name"),
+        ("stage,reach\n", "expected a line with the names of the columns, and rows below it"),
+        ('stage,reach\n1,"0.5\n', "not a CSV file"),
+    ],
+)
+def test_a_wrong_table_is_refused_with_its_line_and_cell(table: Path, text: str, message: str) -> None:
+    table.write_text(text, encoding="utf-8")
+    with pytest.raises(InputError, match=f"^table.csv.*{message}"):
+        from_csv(table)
+
+
+def test_a_file_that_is_no_text_is_refused(table: Path) -> None:
+    table.write_bytes(b"stage,reach\n1,\xff\n")
+    with pytest.raises(InputError, match="expected a text file in UTF-8"):
+        from_csv(table)
+
+
+def test_a_missing_file_is_refused_with_the_nearest_file_or_example(table: Path) -> None:
+    table.write_text(WIDE, encoding="utf-8")
+    with pytest.raises(InputError, match=r"There is no file .*Did you mean .*table\.csv"):
+        from_csv(table.with_name("tabel.csv"))
+    with pytest.raises(InputError, match=r"Did you mean 'robocasa365\.csv'"):
+        from_csv("robocasa.csv")

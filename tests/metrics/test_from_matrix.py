@@ -1,0 +1,165 @@
+"""Metrics of arrays: one implementation, honest gaps, and where the order of methods flips."""
+
+from collections.abc import Callable, Mapping
+
+import numpy as np
+import pytest
+from numpy.typing import ArrayLike
+
+import clbench
+from clbench.base.errors import InputError, UnknownNameError
+from clbench.metrics import Report, from_matrix
+from clbench.metrics.definitions import DEFINITIONS, FAMILIES
+from clbench.metrics.matrices import Groups, layout_of
+from clbench.metrics.report import needed_cells
+from clbench.scoring.metrics import METRICS, measure
+from clbench.scoring.scores import Scores
+
+# one skill, three targets, one task held out
+MATRIX = [
+    [1.0, 0.1, 0.0, 0.2, 0.3],
+    [0.8, 0.6, 0.2, 0.1, 0.2],
+    [0.7, 0.8, 0.9, 0.4, 0.4],
+    [0.6, 0.9, 0.3, 1.0, 0.1],
+]
+JOINT = [[1.0, 0.1, 0.0, 0.2, 0.3], [1, 0.9, 0, 0, 0], [1, 0.9, 0.8, 0, 0], [1, 0.9, 0.8, 1.0, 0]]
+TRIANGLE = [[0.8, np.nan, np.nan], [0.6, 0.9, np.nan], [0.5, 0.4, 0.7]]
+
+
+def _report(matrices: Mapping[str, ArrayLike]) -> Report:
+    return from_matrix(matrices, retained=["task 1"], held_out=["task 5"])
+
+
+def test_every_value_is_that_of_a_record_with_the_same_rates(scores: Callable[..., Scores]) -> None:
+    report = _report({"mine": MATRIX, "joint": JOINT, "sft": JOINT})
+    references = {"joint": scores(JOINT), "sft": scores(JOINT)}
+    for name in DEFINITIONS:
+        assert report.of(name, "mine").value == pytest.approx(measure(name, scores(MATRIX), references)), name
+
+
+def test_the_definitions_are_the_metrics_that_a_success_matrix_allows() -> None:
+    layout = layout_of(["a", "b", "c", "d", "e"], Groups(("a",), None, ("e",)))
+    allowed = {name for name, metric in METRICS.items() if needed_cells(metric, layout) is not None}
+    assert set(DEFINITIONS) == allowed
+    assert {one.family for one in DEFINITIONS.values()} == set(FAMILIES)
+
+
+def test_a_metric_has_no_value_exactly_if_a_cell_that_it_needs_is_missing() -> None:
+    layout = layout_of([f"task {n}" for n in range(1, 6)], Groups(("task 1",), None, ("task 5",)))
+    whole: dict[str, ArrayLike] = {"": MATRIX, "joint": JOINT, "sft": JOINT}
+    for stage, task in np.ndindex(4, 5):
+        holed = np.array(MATRIX)
+        holed[stage, task] = np.nan
+        report = _report({**whole, "": holed})
+        for name in DEFINITIONS:
+            needed = needed_cells(METRICS[name], layout)
+            assert needed is not None
+            value = report.of(name, "")
+            assert (value.value is None) == needed[stage, task] == (value.reason is not None)
+            if value.reason:
+                assert value.reason == f"The table lacks stage {stage}, task {task + 1}."
+
+
+def test_a_triangle_has_every_drop_but_those_that_need_targets_before_they_are_learned() -> None:
+    report = from_matrix(TRIANGLE)
+    assert report["forgetting_avalanche"].value == pytest.approx((0.3 + 0.5) / 2)
+    assert report["forgetting_chaudhry"].value is None
+    assert report["forgetting_chaudhry"].reason == "The table lacks stage 1, task 2."
+    assert report["isolated_forgetting_cora"].reason == "The table lacks stage 0, task 1 and 2 other cells."
+    assert report["question_retention"].reason == METRICS["question_retention"].missing
+
+
+def test_seeds_give_the_mean_of_their_values_and_an_interval() -> None:
+    other = np.array(TRIANGLE) - 0.2
+    report = from_matrix(np.array([TRIANGLE, other, TRIANGLE]))
+    value = report["performance_continual_world"]
+    assert value.value == pytest.approx((1.6 / 3 + 1.0 / 3 + 1.6 / 3) / 3)
+    assert value.low is not None
+    assert value.high is not None
+    assert 0 < value.low < 0.46 < value.high < 1
+    assert from_matrix(TRIANGLE)["performance_continual_world"].low is None
+
+
+def test_per_cent_are_recognised_and_can_be_declared() -> None:
+    whole = from_matrix(np.array(TRIANGLE) * 100)
+    assert whole.unit == "percent"
+    assert whole["adaptation"].value == pytest.approx(from_matrix(TRIANGLE)["adaptation"].value)
+    small = from_matrix([[0.5, 0.1], [0.2, 0.9]], unit="percent")
+    assert small["adaptation"].value == pytest.approx(0.007)
+    assert from_matrix([[0.5, 0.1], [0.2, 0.9]]).unit == "share"
+
+
+def test_the_order_of_two_methods_flips_between_definitions_and_both_sides_are_named() -> None:
+    # the first keeps a little more in the end, the second falls later
+    report = from_matrix(
+        {
+            "early": [[0.8, 0.0, 0.0], [0.2, 0.8, 0.0], [0.4, 0.6, 0.8]],
+            "late": [[0.8, 0.0, 0.0], [0.8, 0.8, 0.0], [0.3, 0.6, 0.8]],
+        }
+    )
+    (flip,) = (flip for flip in report.flips if flip.family == "forgetting")
+    assert (flip.first, flip.second) == ("early", "late")
+    assert "forgetting_avalanche" in flip.first_is_better
+    assert "negative_backward_transfer_libero" in flip.second_is_better
+
+
+def test_a_tie_is_no_flip() -> None:
+    assert from_matrix({"one": TRIANGLE, "other": TRIANGLE}).flips == ()
+
+
+def test_a_reference_needs_its_own_name_and_the_same_seeds() -> None:
+    assert from_matrix({"mine": TRIANGLE})["gain"].reason == "No method is called sft, or it lacks seeds."
+    report = from_matrix({"mine": [TRIANGLE, TRIANGLE], "sft": TRIANGLE, "joint": [TRIANGLE, TRIANGLE]})
+    assert report.of("gain", "mine").value is None
+    assert report.of("intransigence", "mine").value == pytest.approx(0)
+    assert report.of("intransigence", "joint").reason == "joint is what the others are compared with."
+
+
+def test_the_targets_can_be_put_in_the_order_in_which_they_were_learned() -> None:
+    swapped = np.array(TRIANGLE)[:, ::-1]
+    tasks = ["third", "second", "first"]
+    report = from_matrix(swapped, tasks=tasks, target=["first", "second", "third"])
+    assert report["adaptation"].value == pytest.approx(from_matrix(TRIANGLE)["adaptation"].value)
+
+
+def test_a_table_of_pandas_has_a_row_for_every_metric_and_method() -> None:
+    frame = from_matrix({"one": TRIANGLE, "other": TRIANGLE}).frame()
+    assert len(frame) == 2 * len(METRICS)
+    row = frame[(frame.metric == "forgetting_avalanche") & (frame.method == "other")].iloc[0]
+    assert (row.family, row.source) == ("forgetting", METRICS["forgetting_avalanche"].source)
+    assert row.value == pytest.approx(0.4)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"matrix": [0.5, 0.5]}, r"shape \(2,\): expected \(stages, tasks\) or \(seeds, stages, tasks\)"),
+        (
+            {"matrix": [[0.5, 0.5, 0.5]]},
+            r"The matrix has 1 row\. Expected stages 1 to 3.*retained or held out",
+        ),
+        ({"matrix": [[-0.5]]}, r"stage 1, task 'task 1': expected a share from 0 to 1, found -0\.5"),
+        ({"matrix": [[500]]}, r"stage 1, task 'task 1': expected per cent from 0 to 100, found 500"),
+        ({"matrix": [[0.5]], "tasks": ["a", "b"]}, "There are 2 names for 1 task"),
+        ({"matrix": {"a": [[0.5]], "b": TRIANGLE}}, r"'a' \(1, 1\), 'b' \(3, 3\)"),
+        ({"matrix": {}}, "expected at least one method"),
+        ({"matrix": TRIANGLE, "target": ["task 1"]}, "Task 'task 2' is in no group"),
+        ({"matrix": TRIANGLE, "target": ["task 1"] * 2}, "Task 'task 1' is named twice"),
+    ],
+)
+def test_a_wrong_matrix_is_refused_with_what_was_expected(arguments: dict[str, object], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        from_matrix(**arguments)  # type: ignore[arg-type]
+
+
+def test_an_unknown_task_metric_or_method_is_refused_with_the_nearest_name() -> None:
+    with pytest.raises(UnknownNameError, match="Did you mean 'sft'"):
+        from_matrix({"sft": TRIANGLE}).of("adaptation", "stf")
+    with pytest.raises(UnknownNameError, match="Did you mean 'task 1'"):
+        from_matrix(TRIANGLE, retained=["task1"])
+    with pytest.raises(UnknownNameError, match="Did you mean 'forgetting_mammoth'"):
+        from_matrix(TRIANGLE)["forgetting_mamoth"]
+
+
+def test_the_front_door_leads_here() -> None:
+    assert clbench.metrics.from_matrix is from_matrix
