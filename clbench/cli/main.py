@@ -24,6 +24,7 @@ COMMANDS = {
     "Measure": {
         "list": "clbench.cli.catalogue:list_",
         "run": "clbench.cli.runs:run",
+        "score": "clbench.cli.runs:score",
         "status": "clbench.cli.status:status",
         "leaderboard": "clbench.leaderboard.cli:show",
         "metrics": "clbench.cli.catalogue:metrics",
@@ -54,6 +55,7 @@ NAMES = {
     "run": "SCENARIOS [METHODS...]",
     "status": "[SCENARIOS] [METHODS...]",
     "leaderboard": "[SCENARIO]",
+    "score": "SCENARIO",
     "metrics": "[NAME|FILE]",
     "tune": "SCENARIO [METHODS...]",
     "verify": "PATHS...",

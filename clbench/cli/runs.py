@@ -1,4 +1,4 @@
-"""The command `clbench run`."""
+"""The commands `clbench run` and `clbench score`, which leave records."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 from rich.console import Console
 
+from clbench.base.dependencies import require
 from clbench.base.errors import InputError
 from clbench.base.text import counted, printable_lines
 from clbench.cli.arguments import (
@@ -24,11 +25,12 @@ from clbench.cli.arguments import (
     checked_input,
     whole_number,
 )
-from clbench.records.paths import RECORDS
+from clbench.records.paths import RECORDS, record_path
 from clbench.spec.policies import DEFAULT_POLICY, SMALL, policy_name
 
 if TYPE_CHECKING:
     from clbench.jobs.job import Workers
+    from clbench.records.record import Record
     from clbench.runs.spec import ResolvedRun, RunSpec
 
 # Modules with PyTorch or SciPy are imported where they are needed: `--help` does not wait for them.
@@ -112,10 +114,90 @@ def run(
         return
     went_well = run_missing(chosen, records, lambda: _workers(workers, ray), checkpoints, tensorboard, quiet)
     if not changes:  # the board shows no run with changed settings
-        option = "" if records == RECORDS else f" --records {shlex.quote(str(records))}"
-        console.print(f"Next: clbench leaderboard{option}", highlight=False, markup=False, soft_wrap=True)
+        console.print(_next(records), highlight=False, markup=False, soft_wrap=True)
     if not went_well:
         sys.exit(1)
+
+
+def score(
+    scenario: ScenarioId,
+    /,
+    *,
+    policy: str,
+    stage: Annotated[int, whole_number(0)],
+    method: str,
+    seed: Annotated[int, whole_number(0)] = 0,
+    execute: Annotated[int | None, whole_number(1)] = None,
+    data: str | None = None,
+    steps: Annotated[int | None, whole_number(0)] = None,
+    timeout: Annotated[int, whole_number(1)] = 300,
+    records: Path = RECORDS,
+) -> None:
+    """Score a policy that a server offers on SCENARIO, after each stage of its fine-tuning elsewhere.
+
+    Score each stage once and in order: 0 before the first target, k after fine-tuning on target k. A stage
+    that is done is skipped. The last stage writes the record.
+
+    Args:
+        scenario: Gymnasium id of the scenario.
+        policy: Address of the server, ws://host:port. docs/guide/external.md shows how to serve a policy.
+        stage: Stage after whose fine-tuning the policy is evaluated.
+        method: Name of the row on the leaderboard, for example me/lora.
+        seed: Seed of the run. It chooses the initial states, the same for all methods.
+        execute: Actions of each chunk that are executed before the policy acts again; all if not given. It is
+            the same in all stages.
+        data: What the policy was trained on in this stage, in words. The record keeps it.
+        steps: Optimiser steps of the stage. The record keeps them.
+        timeout: Seconds that a reply may take; a first one may include compilation.
+        records: Folder of the records.
+    """
+    check_names([scenario], [])
+    with checked_input():
+        require("websockets", "serve", "A policy of another program")
+        require("msgpack", "serve", "A policy of another program")
+    from clbench.jobs.bars import Bars
+    from clbench.serving.client import ServedPolicy
+    from clbench.serving.score import is_scored
+    from clbench.serving.score import score as evaluate
+
+    add_cwd_to_path()
+    console, piece = Console(stderr=True), f"stage {stage}"
+    with checked_input():
+        if is_scored(scenario, stage=stage, method=method, seed=seed, records=records):
+            console.print(f"Stage {stage} of {method}, seed {seed}, is done.", highlight=False, markup=False)
+            return
+        served = ServedPolicy(policy, timeout)
+        with Bars(1.0, console) as bars:
+            bars.start(piece, 1.0)
+            record = evaluate(
+                scenario,
+                served,
+                stage=stage,
+                method=method,
+                seed=seed,
+                executed=execute,
+                data=data,
+                steps=steps,
+                records=records,
+                progress=lambda share: bars.advance(piece, share),
+            )
+            bars.finish(piece, _rates(record))
+        served.close()
+    targets = record.scenario.target
+    if stage < len(targets):
+        then = (
+            f"Next: fine-tune on {targets[stage]}, serve the policy, and score it with --stage {stage + 1}."
+        )
+    else:
+        then = f"Record: {record_path(records, record.run.scenario, method, seed)}\n{_next(records)}"
+    console.print(then, highlight=False, markup=False, soft_wrap=True)
+
+
+def _rates(record: Record) -> str:
+    """Return the success rates of all tasks after the last stage so far."""
+    found = record.matrix()
+    pairs = zip(found.columns.get_level_values(-1), found.iloc[-1], strict=True)
+    return ", ".join(f"{task} {rate:.2f}" for task, rate in pairs)
 
 
 def requested(
@@ -147,6 +229,12 @@ def requested(
     ]
     # one scenario may be named twice, once with its module
     return list({run.path(records): run for run in runs}.values())
+
+
+def _next(records: Path) -> str:
+    """Return the line that names the next command."""
+    option = "" if records == RECORDS else f" --records {shlex.quote(str(records))}"
+    return f"Next: clbench leaderboard{option}"
 
 
 def _part(shard: str, runs: Sequence[ResolvedRun]) -> Sequence[ResolvedRun]:

@@ -1,4 +1,4 @@
-"""Episodes of an agent of any library: one after another, or in lock-step if it acts on batches."""
+"""Episodes of an agent or policy of any library: one after another, or in lock-step if it acts on batches."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, TypeAlias
 from typing import Protocol as Interface
 
@@ -15,6 +16,8 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from clbench.base.errors import InputError
+from clbench.base.progress import ProgressCallback, no_progress
+from clbench.base.seeding import derive_seed
 from clbench.evaluation.rollouts import LANES, Episode, Trial, start_of
 from clbench.spec.scenario import Scenario
 from clbench.worlds.lanes import Lanes
@@ -34,6 +37,11 @@ Agent: TypeAlias = Predictor | Callable[[Observation], Any]
 """An agent to evaluate: a `Predictor`, or a function of an observation that returns an action (A,)."""
 
 
+ChunkPolicy: TypeAlias = Callable[[dict[str, Any]], Any]
+"""A function from the observations of `LANES` episodes, arrays and lists by name, to chunks of actions
+(LANES, H, A)."""
+
+
 def acts_on_batches(agent: Agent, instruction: InstructionFormat) -> bool:
     """Return whether an agent is known to act on batches: one of Stable-Baselines3, which read tokens."""
     module = sys.modules.get("stable_baselines3.common.base_class")
@@ -50,6 +58,8 @@ class _Lane:
     instruction: Any
     """The instruction as the agent observes it."""
     state: NDArray[np.float32]
+    seed: int
+    """Seed of its initial state."""
     memory: Any = None
     """What the agent returned to receive it with the next observation."""
     total_reward: float = 0.0
@@ -91,29 +101,82 @@ def play(
     Raises:
         InputError: An action has the wrong shape, or an agent that acts on batches returned a memory.
     """
+    act = _act_on_batch if batched else _act
     count = LANES if batched else 1
+    single = lambda lanes, live: act(agent, lanes, live)[:, None]  # noqa: E731 - chunks of one action
+    return _play(single, scenario, trials, seed, instruction, count)
+
+
+def play_chunks(
+    policy: ChunkPolicy,
+    scenario: Scenario,
+    trials: Sequence[Trial],
+    seed: int,
+    executed: int | None = None,
+    progress: ProgressCallback = no_progress,
+) -> list[Episode]:
+    """Return the outcome of each of `trials`, in their order.
+
+    The policy observes `state`, float32 (LANES, S), `image`, uint8 (LANES, N, N, 3), where the tasks have a
+    camera, `instruction`, texts, and what noise may be drawn from: `seed`, int64 (LANES,), different for each
+    episode, and `step`, int64 (LANES,), the steps taken in it. Unused rows repeat the first one.
+
+    Args:
+        policy: Policy that acts.
+        scenario: Scenario of the trials.
+        trials: Episodes by task, split and number.
+        seed: Seed of the run; it chooses the initial states.
+        executed: Actions of a chunk that are executed before the policy acts again; all if None.
+        progress: Called with the number of episodes that have ended since its last call.
+
+    Raises:
+        InputError: The actions have the wrong shape, or a chunk has fewer than `executed`.
+    """
+    return _play(partial(_act_in_chunks, policy, executed), scenario, trials, seed, "text", LANES, progress)
+
+
+def _play(
+    act: Callable[[Lanes, Sequence[_Lane]], NDArray[np.float32]],
+    scenario: Scenario,
+    trials: Sequence[Trial],
+    seed: int,
+    instruction: InstructionFormat,
+    count: int,
+    progress: ProgressCallback = no_progress,
+) -> list[Episode]:
+    """Return the outcome of each of `trials` in `count` lanes; `act` returns the actions (lanes, H, A)."""
     queue, idle = list(reversed(trials)), list(range(count))
     live: list[_Lane] = []
     ended: dict[tuple[str, str, int], Episode] = {}
-    with closing(Lanes(count, threads=os.cpu_count() or 1 if batched else 1)) as lanes:
+    with closing(Lanes(count, threads=os.cpu_count() or 1 if count > 1 else 1)) as lanes:
         while queue or live:
             while queue and idle:
                 number, trial = idle.pop(), queue.pop()
                 world_seed, words = start_of(trial, seed)
                 (state,) = lanes.reset([number], [world_seed], [trial[0]])
                 shown = observed(words, instruction, scenario)
-                live.append(_Lane(number, trial, shown, state))
-            actions = (_act_on_batch if batched else _act)(agent, lanes, live)
-            outcomes = lanes.step([lane.number for lane in live], actions)
-            for lane, state, reward, success in zip(list(live), *outcomes, strict=True):
-                lane.state, lane.length, lane.success = state, lane.length + 1, bool(success)
-                lane.total_reward += float(reward)
-                if lane.ended:
-                    one = lane.episode
-                    ended[one.task, one.split, one.number] = one
-                    live.remove(lane)
-                    idle.append(lane.number)
+                live.append(_Lane(number, trial, shown, state, world_seed))
+            _execute(lanes, live, act(lanes, live))
+            for lane in [lane for lane in live if lane.ended]:
+                one = lane.episode
+                ended[one.task, one.split, one.number] = one
+                live.remove(lane)
+                idle.append(lane.number)
+                progress(1)
     return [ended[task.name, split, number] for task, split, number in trials]
+
+
+def _execute(lanes: Lanes, live: Sequence[_Lane], chunks: NDArray[np.float32]) -> None:
+    """Step the lanes through their chunks (lanes, H, A), each until its episode ends."""
+    for step in range(chunks.shape[1]):
+        rows = [row for row, lane in enumerate(live) if not lane.ended]
+        if not rows:
+            return
+        outcomes = lanes.step([live[row].number for row in rows], chunks[rows, step])
+        for row, state, reward, success in zip(rows, *outcomes, strict=True):
+            lane = live[row]
+            lane.state, lane.length, lane.success = state, lane.length + 1, bool(success)
+            lane.total_reward += float(reward)
 
 
 def _observations(lanes: Lanes, live: Sequence[_Lane]) -> Iterator[Observation]:
@@ -153,6 +216,29 @@ def _act_on_batch(agent: Agent, lanes: Lanes, live: Sequence[_Lane]) -> NDArray[
     return _checked(actions, lanes, live, (LANES,))[: len(live)]
 
 
+def _act_in_chunks(
+    policy: ChunkPolicy, executed: int | None, lanes: Lanes, live: Sequence[_Lane]
+) -> NDArray[np.float32]:
+    """Return the actions (lanes, H, A) to execute."""
+    rows = list(_observations(lanes, live))
+    rows = [
+        {**row, "seed": derive_seed("noise", lane.seed), "step": lane.length}
+        for row, lane in zip(rows, live, strict=True)
+    ]
+    rows += [rows[0]] * (LANES - len(rows))
+    columns = {name: [row[name] for row in rows] for name in rows[0]}
+    texts = {"instruction": columns.pop("instruction")}
+    chunks = policy({**{name: np.stack(values) for name, values in columns.items()}, **texts})
+    length = np.shape(chunks)[1] if np.ndim(chunks) == 3 else 0
+    if length < (executed or 1):
+        wanted = f"at least {executed}" if executed else "any number of"
+        raise InputError(
+            f"The policy's actions have the shape {np.shape(chunks)}, not ({LANES}, H, A): for each episode "
+            f"{wanted} actions."
+        )
+    return _checked(chunks, lanes, live, (LANES, length))[: len(live), :executed]
+
+
 def _predicted(found: Any) -> tuple[Any, Any]:
     if not (isinstance(found, tuple) and len(found) == 2):
         raise InputError("predict() must return (action, state), as in Stable-Baselines3.")
@@ -160,7 +246,14 @@ def _predicted(found: Any) -> tuple[Any, Any]:
 
 
 def _checked(action: Any, lanes: Lanes, live: Sequence[_Lane], rows: tuple[int, ...]) -> NDArray[np.float32]:
-    """Return actions (N, A) within the space of the first lane; all tasks of a scenario share it."""
+    """Return actions (N, ..., A) within the space of the first lane; all tasks of a scenario share it.
+
+    Args:
+        action: What the agent returned.
+        lanes: Running worlds.
+        live: Lanes in use.
+        rows: Shape of the actions without A; () for a single action, which becomes (1, A).
+    """
     space: spaces.Box = lanes.world(live[0].trial[0]).single_action_space
     shape = (*rows, *space.shape)
     try:
@@ -172,4 +265,5 @@ def _checked(action: Any, lanes: Lanes, live: Sequence[_Lane], rows: tuple[int, 
     if numbers.shape != shape:
         raise InputError(f"The agent's action has the shape {numbers.shape}, not {shape}.")
     # a diverged agent acts with zeros and fails, like a diverged policy
-    return np.nan_to_num(numbers.reshape(-1, *space.shape)).clip(space.low, space.high).astype(np.float32)
+    numbers = np.nan_to_num(numbers if rows else numbers[None])
+    return numbers.clip(space.low, space.high).astype(np.float32)

@@ -26,7 +26,7 @@ initial state inside its task and split. `clbench.spec.protocol.Protocol.episode
 point has."""
 
 ANSWER_COLUMNS = ("stage", "step", "kind", "asked", "correct")
-"""One row for each evaluation point and kind of question; an agent that learned online is asked 0."""
+"""One row for each evaluation point and kind of question; a policy that was trained elsewhere is asked 0."""
 
 POLICY_COLUMNS = ("stage", "step", "update_sparsity", "activation_drift", "shift", "captured")
 """One row for each evaluation point: how far the policy has moved.
@@ -127,7 +127,8 @@ class RunInfo:
     changes: dict[str, Any]
     """The hyper-parameters that differ from the method's defaults."""
     uses: dict[str, Any]
-    """The prior data that the method may touch; `online` is true for an agent of another program."""
+    """The prior data that the method may touch; `online` is true for an agent of another program, and
+    `external` for a policy that a server offered, of whose data nothing is known."""
     order: int = 0
     """Order in which the targets were learned; 0 is the published one. See
     `clbench.spec.scenario.target_order`."""
@@ -135,6 +136,11 @@ class RunInfo:
     """Whether the retained skills also met perturbed episodes."""
     policy: str = DEFAULT_POLICY
     """Kind of the policy."""
+
+    @property
+    def trained_elsewhere(self) -> bool:
+        """Whether another program trained the policy: an agent, or a policy that a server offered."""
+        return bool(self.uses.get("online") or self.uses.get("external"))
 
 
 @dataclass

@@ -108,10 +108,10 @@ def evaluate_agent(
         )
     if steps is not None and (type(steps) is not int or steps < 0):
         raise InputError(f"steps must be a whole number from 0, not {steps!r}.")
-    run = _OnlineRun(world.scenario, method, seed, Path(records))
+    run = StagedRun(world.scenario, method, seed, Path(records))
     begin = time.perf_counter()
     trained = begin - world.begun_at if steps is None and world.begun_at is not None else None
-    record = run.begin(world.stage, _plain(settings or {}), agent)
+    record = run.begin(world.stage, _plain(settings or {}), USES, agent)
     form = world.instruction
     if batched is None:
         batched = acts_on_batches(agent, form)
@@ -119,8 +119,8 @@ def evaluate_agent(
         run.report(
             record, world.stage, lambda trials: play(agent, world.scenario, trials, seed, form, batched)
         )
-    taken = steps if steps is not None else world.steps_taken or None
-    run.count(record, world.stage, taken, trained, time.perf_counter() - begin)
+    run.count(record, world.stage, steps if steps is not None else world.steps_taken or None)
+    run.time(record, trained, time.perf_counter() - begin)
     run.keep(record, world.stage)
     return record
 
@@ -137,21 +137,24 @@ def next_stage(scenario: str, *, method: str, seed: int = 0, records: Path | str
     Returns:
         0 if no stage has been evaluated, the last stage plus one if there is a record.
     """
-    run = _OnlineRun(load_scenario(scenario), method, seed, Path(records))
-    if run.path.exists():
-        return run.last + 1
-    done = run.done()
-    return 0 if done is None else done + 1
+    return StagedRun(load_scenario(scenario), method, seed, Path(records)).next
 
 
 @dataclass(frozen=True)
-class _OnlineRun:
-    """The run of an agent, and the location of its record."""
+class StagedRun:
+    """A run whose policy another program trains, an agent or a policy that is served.
+
+    It is evaluated stage by stage; its record is in the cache until the last one.
+    """
 
     scenario: Scenario
+    """Scenario of the run."""
     method: str
+    """Name of its row on the leaderboard."""
     seed: int
+    """Seed of the run."""
     records: Path
+    """Folder of the records."""
 
     def __post_init__(self) -> None:
         if not self.scenario.retained:
@@ -200,13 +203,30 @@ class _OnlineRun:
         stages = range(self.last, -1, -1)
         return next((k for k in stages if is_cached(self._stage_folder(k), self._inputs(k))), None)
 
-    def begin(self, stage: int, settings: dict[str, Any], agent: Agent) -> Record:
+    @property
+    def next(self) -> int:
+        """The stage that is evaluated next; the last one plus one if there is a record."""
+        if self.path.exists():
+            return self.last + 1
+        done = self.done()
+        return 0 if done is None else done + 1
+
+    def __str__(self) -> str:
+        return f"{self.method}, seed {self.seed}, on {self.scenario.id}"
+
+    def begin(self, stage: int, settings: dict[str, Any], uses: Mapping[str, Any], agent: Any) -> Record:
         """Return the record of the earlier stages.
 
+        Args:
+            stage: Stage that is evaluated.
+            settings: Settings that readers should know, the same in all stages.
+            uses: `RunInfo.uses`, the same in all stages.
+            agent: The agent or policy.
+
         Raises:
-            InputError: Another stage comes next, or the settings differ from the settings in stage 0.
+            InputError: Another stage comes next, or settings or uses differ from those in stage 0.
         """
-        name = f"{self.method}, seed {self.seed}, on {self.scenario.id}"
+        name = str(self)
         if self.path.exists():
             raise InputError(
                 f"{name} has a record already, {self.path}, which is never edited: "
@@ -217,7 +237,7 @@ class _OnlineRun:
             if done is not None:
                 LOG.warning("%s starts over: its evaluations up to stage %d are dropped.", name, done)
                 shutil.rmtree(self.folder, ignore_errors=True)
-            return self._new_record(settings, agent)
+            return self._new_record(settings, uses, agent)
         if done is None:
             raise InputError(
                 f"Stage 0 of {name} comes first, not {stage}: "
@@ -233,9 +253,14 @@ class _OnlineRun:
             raise InputError(
                 f"The settings of {name} are {settings}, but were {record.run.settings} in stage 0."
             )
+        if record.run.uses != uses:
+            raise InputError(
+                f"{name} was begun as another kind of run: evaluate all stages of agents that learn by trial "
+                "with evaluate_agent(), and all stages of served policies with `clbench score`."
+            )
         return record
 
-    def _new_record(self, settings: dict[str, Any], agent: Agent) -> Record:
+    def _new_record(self, settings: dict[str, Any], uses: Mapping[str, Any], agent: Any) -> Record:
         run = RunInfo(
             scenario=self.scenario.id,
             method=self.method,
@@ -244,7 +269,7 @@ class _OnlineRun:
             split="test",
             settings=settings,
             changes={},
-            uses=dict(USES),
+            uses=dict(uses),
         )
         record = Record("success", run, describe_scenario(self.scenario))
         record.fingerprint = {**fingerprint(self.scenario), "method": _describe(agent)}
@@ -264,13 +289,14 @@ class _OnlineRun:
         for kind in resolve(self.scenario.questions):
             record.add_answers(AnswerRow(*point, kind.name, 0, 0))
 
-    def count(
-        self, record: Record, stage: int, steps: int | None, trained: float | None, evaluated: float
-    ) -> None:
-        """Add the costs of a stage: environment steps, and seconds of training and of evaluation."""
+    def count(self, record: Record, stage: int, steps: int | None) -> None:
+        """Add the environment steps of a stage."""
         record.diagnostics[str(stage)] = {"environment_steps": steps}
         each = [found["environment_steps"] for found in record.diagnostics.values()]
         record.costs.environment_steps = None if None in each else sum(each)
+
+    def time(self, record: Record, trained: float | None, evaluated: float) -> None:
+        """Add the seconds of a stage: of training, None if they are not known, and of evaluation."""
         training = None if trained is None else round(trained, 2)
         record.timing["stages"].append({"training": training, "evaluation": round(evaluated, 2)})
         parts = [seconds for timing in record.timing["stages"] for seconds in timing.values()]
@@ -288,7 +314,7 @@ class _OnlineRun:
             shutil.rmtree(self._stage_folder(stage - 1), ignore_errors=True)
 
 
-def _describe(agent: Agent) -> dict[str, Any]:
+def _describe(agent: Any) -> dict[str, Any]:
     """Return the class of an agent and the version of its package, None without a package."""
     kind = type(agent)
     packages = packages_distributions().get(kind.__module__.partition(".")[0], [])

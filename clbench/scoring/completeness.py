@@ -15,8 +15,9 @@ from clbench.spec.protocol import EpisodeKey, Point, Protocol
 def check_complete(record: Record, rows: Iterable[Row], protocol: Protocol) -> None:
     """Refuse a record that is not what its budget demands: results that are left out change the scores.
 
-    A method of whole stages, and an agent that learned online, is evaluated at the ends of stages alone. An
-    agent has no answers and no changes of the policy, and a policy that is not built in may have no answers.
+    A method of whole stages, and a policy that was trained elsewhere, is evaluated at the ends of stages
+    alone. The latter has no answers and no changes of the policy, and a policy that is not built in may have
+    no answers.
 
     Args:
         record: The record; its values have been checked one by one.
@@ -27,13 +28,13 @@ def check_complete(record: Record, rows: Iterable[Row], protocol: Protocol) -> N
         RecordError: Something is missing, or must not be there.
     """
     points = _check_episodes(rows, protocol)
-    online = bool(record.run.uses.get("online"))
-    demanded = 0 if online else record.scenario.budget.get("test_questions", 0)
+    elsewhere = record.run.trained_elsewhere
+    demanded = 0 if elsewhere else record.scenario.budget.get("test_questions", 0)
     if not is_built_in(record.run.policy) and not sum(record.answers["asked"]):
         demanded = 0
     _check_answers(record, points, demanded)
     moved = [Point(*place) for place in zip(record.policy["stage"], record.policy["step"], strict=True)]
-    _check_points("policy", moved, () if online else points)
+    _check_points("policy", moved, () if elsewhere else points)
 
 
 def _check_answers(record: Record, points: Sequence[Point], demanded: int) -> None:

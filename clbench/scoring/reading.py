@@ -73,7 +73,7 @@ def read_protocol(record: Record) -> Protocol:
         return scenario.protocol(record.run)
     if not _is_number(criterion, 1) or len(scenario.evaluation_steps) != 1:
         raise RecordError("scenario: a criterion must be a success rate, with one evaluation step.")
-    if record.run.uses.get("online"):  # an agent's stages are budgets of interaction, and end with them
+    if record.run.trained_elsewhere:  # it chose its own steps; its stages count as full ones
         ends = tuple(scenario.evaluation_steps * len(scenario.target))
     else:
         ends = _read_ends(record)

@@ -223,6 +223,10 @@ def division_of(uses: dict[str, Any]) -> str:
         RecordError: `uses` is no valid declaration.
     """
     kinds = ("demonstrations", "questions")
+    if "external" in uses:
+        if uses != {"external": True}:
+            raise RecordError("run: uses of a policy that was fine-tuned elsewhere must say nothing else.")
+        return "external"
     if "online" in uses:
         if uses != {**dict.fromkeys(kinds, "never"), "reference": False, "online": True}:
             raise RecordError("run: uses of an agent that learned online must be of nothing else.")

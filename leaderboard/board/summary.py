@@ -11,10 +11,14 @@ from clbench.scoring.metrics import METRICS
 
 from .agreement import Agreement
 
-DIVISIONS = ("prior-data-free", "prior questions", "prior demonstrations", "online", "reference")
+DIVISIONS = ("prior-data-free", "prior questions", "prior demonstrations", "online", "external", "reference")
 """Divisions in the order of the table: the first three by the prior data that a method may use; "online" for
-agents of other programs, most of which learned by trial, with which no method is compared; "reference" for
-references, which do not compete."""
+agents of other programs, which learned by trial, and "external" for policies that were fine-tuned elsewhere,
+on what their authors declare: no method is compared with either; "reference" for references, which do not
+compete."""
+
+ELSEWHERE = ("online", "external")
+"""Divisions of policies that another program trained: there is nothing to run again."""
 
 METHODS = DIVISIONS[:3]
 """Divisions of methods, which start from the same policy and learn from the same demonstrations."""

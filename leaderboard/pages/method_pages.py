@@ -150,7 +150,7 @@ def _claims(method: Description, sources: Sources) -> list[Part]:
     for one in sources.judged:
         finding = one.finding
         about = {_base(label) for label in finding.about}
-        about |= {_base(figure.methods[0]) for figure in finding.figures}
+        about |= {_base(figure.methods[0]) for figure in finding.figures if figure.methods}
         compared = {
             _base(label) for figure in (*finding.figures, *finding.controls) for label in figure.methods
         }

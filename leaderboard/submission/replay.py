@@ -27,6 +27,7 @@ from clbench.runs.run import pretrained_hash
 from clbench.runs.spec import check_device
 from clbench.spec.protocol import Point
 
+from ..board.summary import ELSEWHERE
 from .subject import Check, Subject, some
 
 LARGEST_DRIFT = 0.05
@@ -39,12 +40,11 @@ MISSED = 0.05
 def replay(subject: Subject, progress: ProgressCallback) -> list[Check]:
     """Replay episodes of a record with the policies of its stages, and ask the questions again."""
     run, spec = subject.run, subject.spec
-    if run.division == "online":
-        return [
-            Check(
-                "policies", "an agent that learned online has none, so its highest tier is recomputed", False
-            )
-        ]
+    if run.division in ELSEWHERE:
+        which = (
+            "an agent that learned online" if run.division == "online" else "a policy served from elsewhere"
+        )
+        return [Check("policies", f"{which} has none, so its highest tier is recomputed", False)]
     if subject.strange:
         options = " and ".join("--method" if name == run.method else "--policy" for name in subject.strange)
         names = " and ".join(subject.strange)

@@ -47,7 +47,7 @@ def complete_record(record: Record) -> None:
         for key in protocol.episodes(point):
             if (point, *key) not in played:
                 record.add_episode(EpisodeRow(*point, key.task, key.split, key.number, 0, 0.0, 50))
-        if point not in moved and not record.run.uses.get("online"):
+        if point not in moved and not record.run.trained_elsewhere:
             record.add_policy(PolicyRow(*point, None, None, None, None))
         for row in answers:
             if row.stage == point.stage - 1 and not protocol.is_end(point):

@@ -28,12 +28,13 @@ PALETTE: Mapping[str, tuple[str, str]] = {
     "mark-1": ("#d55e00", "#e69f00"),
     "mark-2": ("#00805d", "#2bc49a"),
     "mark-3": ("#a0527f", "#cc79a7"),
-    "mark-4": ("#6b7480", "#9aa4b0"),
+    "mark-4": ("#8a6d00", "#d9b92e"),
+    "mark-5": ("#6b7480", "#9aa4b0"),
 }
 """Colours in the light and in the dark theme. Marks have the colours of Okabe and Ito, which colour-blind
 readers can distinguish, or similar ones where the contrast to the paper was below 3."""
 
-SHAPES = ("circle", "square", "triangle-up", "cross", "diamond")
+SHAPES = ("circle", "square", "triangle-up", "cross", "triangle-down", "diamond")
 """Shape of the marks of each of `DIVISIONS`: colour is never the only sign."""
 
 FONT = "Liberation Sans, Arial, Helvetica, sans-serif"
@@ -310,7 +311,7 @@ def along_a_run(
         axis={"values": [number * length for number in range(count + 1)], "grid": False},
     )
     y = axis("y", "success", scale={"domain": [0, 1]})
-    hues = [colour(f"mark-{number}") for number in (0, 1, 4)]
+    hues = [colour(f"mark-{number}") for number in (0, 1, 5)]
     series = {"field": "series", "type": "nominal", "scale": {"domain": list(SERIES), "range": hues}}
     series |= {"legend": {"columns": {"expr": "width < 400 ? 1 : 3"}, "values": {"expr": "shown"}}}
     beside = {"test": {"field": "series", "equal": SERIES[-1]}, "value": [3, 3]}

@@ -21,6 +21,7 @@ from clbench.spec.policies import DEFAULT_POLICY
 
 from ...board.rows import Row
 from ...board.runs import Run, is_number
+from ...board.summary import ELSEWHERE
 from ..format import number_text
 
 LONGEST = 160
@@ -107,8 +108,8 @@ def commands(row: Row) -> list[str]:
     lines = []
     for commit, runs in groupby(row.runs, key=_commit):
         lines += [f"git checkout {commit}", "pip install -c constraints.txt -e ."] if commit else []
-        if row.division == "online":
-            lines.append(f"# {printable(row.method)} is a separate program: docs/guide/online.md")
+        if row.division in ELSEWHERE:
+            lines.append(f"# {printable(row.method)} is a separate program: docs/guide/{row.division}.md")
             continue
         for (device, perturb), members in groupby(runs, key=_how):
             for first, count in _in_a_row([run.seed for run in members]):

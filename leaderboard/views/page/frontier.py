@@ -19,7 +19,7 @@ SHAPES = ("circle", "square", "triangle-up", "diamond", "cross", "triangle-down"
 HIGHEST_LOW = 0.8
 """Highest low end of an axis, so that differences of a few episodes do not look large."""
 
-BESIDE = "mark-4"
+BESIDE = "mark-5"
 """Colour of plain fine-tuning, which lies under all others."""
 
 

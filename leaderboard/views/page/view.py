@@ -186,7 +186,7 @@ class RowView:
     def settings(self) -> list[Entry]:
         """Hyper-parameters, and the prior data that its method may use."""
         run = self.row.runs[0].record.run
-        uses = {f"prior {kind}": run.uses[kind] for kind in ("demonstrations", "questions")}
+        uses = {f"prior {kind}": run.uses.get(kind, "not known") for kind in ("demonstrations", "questions")}
         return [*flat(run.settings), *flat(uses)]
 
     @property

@@ -1,0 +1,167 @@
+"""The client of a served policy: it connects again when the connection is lost, and limits the time."""
+
+from __future__ import annotations
+
+import logging
+import time
+from contextlib import ExitStack
+from typing import Any
+from urllib.parse import urlsplit
+
+import numpy as np
+from numpy.typing import NDArray
+from websockets.exceptions import ConnectionClosed, InvalidHandshake
+from websockets.sync.client import ClientConnection, connect
+
+from clbench.base.errors import InputError
+from clbench.base.text import printable
+from clbench.serving.server import LARGEST_MESSAGE, Observations, pack, unpack
+
+LOG = logging.getLogger("clbench")
+
+ATTEMPTS = 5
+"""Connections that one request may lose: a request that ends the server would do so forever."""
+
+_LOST = (ConnectionClosed, InvalidHandshake, OSError)
+"""Errors of a connection that another attempt may not have; a handshake out of time is an OSError."""
+
+
+class ServedPolicy:
+    """A policy that a server offers, as a function from observations to chunks of actions.
+
+    A request that is interrupted is sent again: its reply depends on nothing else.
+
+    Args:
+        address: Address of the server, for example "ws://localhost:8000".
+        timeout: Seconds that a reply may take; a first one may include compilation.
+        patience: Seconds to wait for a server that cannot be reached.
+
+    Raises:
+        InputError: The address is no address, no server answers in time, or it speaks another protocol.
+    """
+
+    def __init__(self, address: str, timeout: float = 300.0, patience: float = 30.0) -> None:
+        if not _is_address(address):
+            raise InputError(f"The address of a policy is ws://host:port, not {address!r}.")
+        self.address, self._timeout, self._patience = address, timeout, patience
+        self._connection: ClientConnection | None = None
+        self._opened = ExitStack()
+        self.metadata: dict[str, Any] = {}
+        """What the server says about itself."""
+        self._connected()
+
+    def __call__(self, observations: Observations) -> NDArray[Any]:
+        """Return chunks of actions (B, H, A) for the observations of B episodes.
+
+        Raises:
+            InputError: The policy failed, took too long, returned no actions, or cannot be reached any more.
+        """
+        request = pack(observations)
+        for _ in range(ATTEMPTS):
+            connection = self._connected()
+            try:
+                connection.send(request)
+                reply = self._receive(connection)
+            except _LOST as error:
+                LOG.warning("The connection to the policy at %s was lost: %s", self.address, _reason(error))
+                self.close()
+            else:
+                return self._actions(reply)
+        raise InputError(
+            f"The policy at {self.address} ended the connection {ATTEMPTS} times during one request: "
+            "see what its server prints."
+        )
+
+    def close(self) -> None:
+        """End the connection; the next request makes another."""
+        self._connection = None
+        self._opened.close()
+
+    def _connected(self) -> ClientConnection:
+        """Return the connection; if there is none, make one as soon as the server can be reached."""
+        begin, pause = time.monotonic(), 0.1
+        while self._connection is None:
+            try:
+                self._connection = self._connect()
+            except _LOST as error:
+                if time.monotonic() - begin + pause > self._patience:
+                    raise InputError(
+                        f"No policy answers at {self.address}: {_reason(error)}. Start its server, for "
+                        "example with serve() of clbench/serving/server.py."
+                    ) from error
+                if pause == 0.1:
+                    LOG.warning("Waiting for the policy at %s: %s", self.address, _reason(error))
+                time.sleep(pause)
+                pause = min(2 * pause, 2.0)
+        return self._connection
+
+    def _connect(self) -> ClientConnection:
+        """Return a new connection whose server has sent its metadata."""
+        opening = connect(
+            self.address,
+            compression=None,
+            max_size=LARGEST_MESSAGE,
+            ping_interval=None,  # openpi's server answers none while its policy computes, or compiles
+            close_timeout=1,
+            proxy=None,  # a policy is on this machine or a near one, which proxies seldom reach
+        )
+        with ExitStack() as opened:
+            connection = opened.enter_context(opening)
+            metadata = self._receive(connection)
+            if not isinstance(metadata, dict):
+                raise InputError(f"The server at {self.address} must first send a dictionary of metadata.")
+            self.metadata, self._opened = metadata, opened.pop_all()
+        return connection
+
+    def _receive(self, connection: ClientConnection) -> Any:
+        """Return the next message of the server.
+
+        Raises:
+            InputError: It is an error of the policy, cannot be read, or does not arrive in time.
+        """
+        try:
+            message = connection.recv(timeout=self._timeout)
+        except TimeoutError as error:
+            self.close()
+            raise InputError(
+                f"The policy at {self.address} did not answer within {self._timeout:g} seconds: a slower one "
+                "needs a larger --timeout."
+            ) from error
+        if isinstance(message, str):  # openpi's servers send their traceback, and end the connection
+            self.close()
+            raise InputError(f"The policy at {self.address} failed: {printable(_last_line(message))}")
+        try:
+            return unpack(message)
+        except ValueError as error:
+            raise InputError(
+                f"The server at {self.address} does not speak openpi's protocol: {error}"
+            ) from error
+
+    def _actions(self, reply: Any) -> NDArray[Any]:
+        """Return the actions of a reply."""
+        actions = reply.get("actions") if isinstance(reply, dict) else None
+        if not isinstance(actions, np.ndarray) or actions.dtype.kind not in "fiub":
+            found = ", ".join(map(str, reply)) if isinstance(reply, dict) else type(reply).__name__
+            raise InputError(
+                f"The policy at {self.address} must reply with a dictionary that has an array of numbers "
+                f"called actions; it sent: {printable(found)}."
+            )
+        return actions
+
+
+def _is_address(text: str) -> bool:
+    try:
+        parts = urlsplit(text)
+        return parts.scheme in ("ws", "wss") and bool(parts.hostname) and parts.port != 0
+    except ValueError:  # the port is no number
+        return False
+
+
+def _reason(error: BaseException) -> str:
+    return printable(str(error).rstrip(".")) or type(error).__name__
+
+
+def _last_line(text: str) -> str:
+    """Return the line of a traceback that names the error."""
+    lines = [line for line in text.splitlines() if line and not line.startswith(" ")]
+    return lines[-1] if lines else text.strip()

@@ -1,0 +1,243 @@
+"""Serve a policy over a websocket, so that `clbench score` can evaluate it from another environment.
+
+Copy this file next to your policy. It needs Python 3.10 or later, NumPy, websockets and msgpack, and nothing
+else: neither clbench nor a simulator.
+
+    from server import serve
+    serve(act)  # on ws://localhost:8000
+
+A policy is a function from the observations of B episodes to chunks of actions, (B, H, A): the next H actions
+of each episode. Its observations are a dictionary:
+
+- `state`: float32 (B, S), the numbers that the scenario's policies may see;
+- `image`: uint8 (B, N, N, 3), only where the task has a camera;
+- `instruction`: B texts;
+- `seed`: int64 (B,), a seed for each episode, and `step`: int64 (B,), the steps taken in it. Draw noise from
+  both alone, and the outcomes repeat themselves.
+
+Rows are independent: an episode has no fixed row, and unused rows repeat the first one.
+
+The protocol is openpi's. The first message is the metadata of the server. Then each request is a dictionary
+of observations, and each reply one with `actions`. All are msgpack, with arrays as in openpi's
+`msgpack_numpy`. An error is sent as text, and ends the connection. `GET /healthz` answers OK.
+"""
+
+from __future__ import annotations
+
+import sys
+import threading
+import traceback
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from http import HTTPStatus
+from typing import TYPE_CHECKING, Any
+
+import msgpack
+import numpy as np
+from websockets.exceptions import ConnectionClosed
+from websockets.sync.server import Server, ServerConnection
+from websockets.sync.server import serve as listen
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+    from websockets.http11 import Request, Response
+
+Observations = dict[str, Any]
+"""Observations of B episodes by name, see the module's docstring."""
+
+Policy = Callable[[Observations], Any]
+"""A function from observations to chunks of actions (B, H, A)."""
+
+LARGEST_MESSAGE = 256 * 2**20
+"""Bytes of the largest request that is read: 40 episodes with pictures of 1,400 x 1,400 pixels."""
+
+
+# ---- the policies of other libraries -----------------------------------------------------------------------
+
+
+def lerobot_policy(
+    policy: Any, preprocess: Callable[[Any], Any], postprocess: Callable[[Any], Any], camera: str = "image"
+) -> Policy:
+    """Return a policy of LeRobot as a function of observations.
+
+    The batch that `preprocess` receives has `observation.state`, float32 (B, S), `task`, a list of B texts,
+    and with a camera `observation.images.<camera>`, float32 (B, 3, N, N) from 0 to 1. `postprocess` receives
+    the actions (B, A) of one step after another, as in LeRobot's own server. Noise is drawn from PyTorch's
+    generator, which is seeded before each call.
+
+    Args:
+        policy: A `PreTrainedPolicy` whose `predict_action_chunk` needs no earlier observations: ACT, SmolVLA,
+            pi0 and others, but not the diffusion policy with its history.
+        preprocess: The preprocessor of `lerobot.policies.factory.make_pre_post_processors`.
+        postprocess: The postprocessor of the same function.
+        camera: Name of the camera in the policy's features.
+    """
+    import torch  # LeRobot brings it
+
+    def act(observations: Observations) -> NDArray[Any]:
+        batch = {
+            "observation.state": torch.from_numpy(observations["state"]),
+            "task": list(observations["instruction"]),
+        }
+        if "image" in observations:
+            pictures = torch.from_numpy(observations["image"]).permute(0, 3, 1, 2)
+            batch[f"observation.images.{camera}"] = pictures.contiguous().float() / 255
+        torch.manual_seed(int(observations["seed"].sum() + observations["step"].sum()))
+        with torch.no_grad():
+            chunks = policy.predict_action_chunk(preprocess(batch))
+            steps = [postprocess(chunks[:, step]) for step in range(chunks.shape[1])]
+            actions: NDArray[Any] = torch.stack(steps, dim=1).float().cpu().numpy()
+        return actions
+
+    return act
+
+
+def _openpi_observation(row: Observations) -> Observations:
+    """Return one observation with the names of openpi's LIBERO policies."""
+    image = {"observation/image": row["image"]} if "image" in row else {}
+    return {"observation/state": row["state"], **image, "prompt": row["instruction"]}
+
+
+def openpi_policy(
+    policy: Any,
+    observation: Callable[[Observations], Observations] = _openpi_observation,
+    noise: tuple[int, int] | None = None,
+) -> Policy:
+    """Return a policy of openpi as a function of observations; it infers one episode after another.
+
+    Args:
+        policy: A policy whose `infer(observation)` returns a dictionary with `actions`, (H, A).
+        observation: Function from one row of the observations to what the policy expects. By default
+            `observation/state`, `observation/image` and `prompt`, as openpi's LIBERO policies have them.
+        noise: Shape of the noise that `infer(observation, noise=...)` starts from: the horizon and the size
+            of an action inside the model. It is drawn from seed and step, so that outcomes repeat themselves.
+            None lets the policy draw its own.
+    """
+
+    def infer(row: Observations) -> Any:
+        drawn = {}
+        if noise is not None:
+            generator = np.random.default_rng([int(row["seed"]), int(row["step"])])
+            drawn["noise"] = generator.standard_normal(noise, np.float32)
+        return policy.infer(observation(row), **drawn)["actions"]
+
+    def act(observations: Observations) -> NDArray[Any]:
+        count = len(observations["state"])
+        rows = [{name: values[row] for name, values in observations.items()} for row in range(count)]
+        return np.stack([np.asarray(infer(row)) for row in rows])
+
+    return act
+
+
+# ---- the server --------------------------------------------------------------------------------------------
+
+
+def serve(
+    policy: Policy, host: str = "localhost", port: int = 8000, metadata: Mapping[str, Any] | None = None
+) -> None:
+    """Serve a policy until the program is interrupted.
+
+    Args:
+        policy: The policy. It is called by one request at a time.
+        host: Address to listen on. "0.0.0.0" lets any machine that reaches this one use the policy.
+        port: Port to listen on; 0 lets the system choose one, which is printed.
+        metadata: What clients receive first, for example the name of a checkpoint.
+    """
+    with open_server(policy, host, port, metadata) as server:
+        sys.stdout.write(f"Serving a policy on ws://{host}:{server.socket.getsockname()[1]}\n")
+        sys.stdout.flush()
+        with suppress(KeyboardInterrupt):
+            server.serve_forever()
+
+
+def open_server(
+    policy: Policy, host: str = "localhost", port: int = 8000, metadata: Mapping[str, Any] | None = None
+) -> Server:
+    """Return a server that listens, for a thread of your own: it has `serve_forever` and `shutdown`.
+
+    The arguments are those of `serve`.
+    """
+    greeting, lock = pack(dict(metadata or {})), threading.Lock()
+
+    def handle(connection: ServerConnection) -> None:
+        with suppress(ConnectionClosed):
+            connection.send(greeting)
+            for message in connection:
+                try:
+                    with lock:
+                        reply = _answer(policy, message)
+                except Exception:  # whatever the policy raises: the client shows it
+                    connection.send(traceback.format_exc())
+                    connection.close(1011, "The policy failed: the last message says why.")
+                    return
+                connection.send(reply)
+
+    return listen(
+        handle, host, port, compression=None, max_size=LARGEST_MESSAGE, process_request=_answer_health_check
+    )
+
+
+def _answer(policy: Policy, message: str | bytes) -> bytes:
+    """Return the reply to a request."""
+    observations = None if isinstance(message, str) else unpack(message)
+    if not isinstance(observations, dict):
+        raise ValueError("A request must be a dictionary of observations, packed by msgpack.")
+    return pack({"actions": np.asarray(policy(observations))})
+
+
+def _answer_health_check(connection: ServerConnection, request: Request) -> Response | None:
+    return connection.respond(HTTPStatus.OK, "OK\n") if request.path == "/healthz" else None
+
+
+# ---- messages ----------------------------------------------------------------------------------------------
+
+
+def pack(values: Any) -> bytes:
+    """Return a message: msgpack, with NumPy arrays and scalars as openpi encodes them.
+
+    Raises:
+        TypeError: It holds what msgpack cannot.
+        ValueError: It holds an array of objects, structures or complex numbers.
+    """
+    message: bytes = msgpack.packb(values, default=_encode)
+    return message
+
+
+def unpack(message: bytes) -> Any:
+    """Return what a message holds; its arrays are copies that may be written to.
+
+    Raises:
+        ValueError: The message is damaged, or holds an array of objects, structures or complex numbers.
+    """
+    try:
+        return msgpack.unpackb(message, object_hook=_decode)
+    except (ValueError, TypeError, KeyError, OverflowError, msgpack.exceptions.UnpackException) as error:
+        raise ValueError(f"This is no message of a policy: {error or type(error).__name__}") from error
+
+
+def _encode(value: Any) -> Any:
+    if isinstance(value, np.ndarray):
+        shape, data = value.shape, value.tobytes()
+        return {b"__ndarray__": True, b"data": data, b"dtype": _plain(value.dtype).str, b"shape": shape}
+    if isinstance(value, np.generic):
+        return {b"__npgeneric__": True, b"data": value.item(), b"dtype": _plain(value.dtype).str}
+    raise TypeError(f"A message cannot hold a {type(value).__name__}.")
+
+
+def _decode(values: dict[Any, Any]) -> Any:
+    if b"__ndarray__" in values:
+        dtype = _plain(np.dtype(values[b"dtype"]))
+        shape, data = values[b"shape"], values[b"data"]
+        if min(shape, default=0) < 0:  # NumPy would choose a size for it
+            raise ValueError(f"An array cannot have the shape {shape}.")
+        return (np.frombuffer(data, dtype) if data else np.empty(0, dtype)).reshape(shape).copy()
+    if b"__npgeneric__" in values:
+        return _plain(np.dtype(values[b"dtype"])).type(values[b"data"])
+    return values
+
+
+def _plain(dtype: np.dtype[Any]) -> np.dtype[Any]:
+    """Return a type, unless its values are objects, structures or complex numbers, as openpi does."""
+    if dtype.kind in "OVc":
+        raise ValueError(f"A message cannot hold values of the type {dtype}.")
+    return dtype

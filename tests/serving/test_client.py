@@ -1,0 +1,153 @@
+"""The client of a served policy: lost connections, time limits and errors."""
+
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from served import serving, write_policy
+from websockets.sync.server import ServerConnection, serve
+
+from clbench.base.errors import InputError
+from clbench.serving.client import ServedPolicy
+from clbench.serving.server import pack
+
+OBSERVATIONS = {
+    "state": np.zeros((2, 4), np.float32),
+    "instruction": ["go left", "go up"],
+    "seed": np.array([1, 2]),
+    "step": np.array([0, 0]),
+}
+
+
+@contextmanager
+def answering(handle: Callable[[ServerConnection], None]) -> Iterator[str]:
+    """Run a server of its own manners in a thread, and yield its address."""
+    with serve(handle, "localhost", 0) as server:
+        thread = threading.Thread(target=server.serve_forever)
+        thread.start()
+        try:
+            yield f"ws://localhost:{server.socket.getsockname()[1]}"
+        finally:
+            server.shutdown()
+            thread.join()
+
+
+def test_a_served_policy_acts_like_the_same_policy_here(tmp_path: Path) -> None:
+    here = write_policy(tmp_path)(0)
+    with serving(tmp_path, 0) as (address, _):
+        served = ServedPolicy(address)
+        assert served.metadata == {"stage": 0}
+        found, expected = served(OBSERVATIONS), here(OBSERVATIONS)
+        assert found.dtype == expected.dtype
+        assert np.array_equal(found, expected)
+        served.close()
+        assert np.array_equal(served(OBSERVATIONS), expected)
+        served.close()
+
+
+def test_a_server_that_is_killed_and_started_again_is_found_again(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    expected = write_policy(tmp_path)(0)(OBSERVATIONS)
+    with serving(tmp_path, 0) as (address, _):
+        served = ServedPolicy(address)
+        assert np.array_equal(served(OBSERVATIONS), expected)
+    port = int(address.rpartition(":")[2])
+    found: list[Any] = []
+    thread = threading.Thread(target=lambda: found.append(served(OBSERVATIONS)))
+    thread.start()
+    time.sleep(0.5)
+    with serving(tmp_path, 0, port):
+        thread.join()
+    assert np.array_equal(found[0], expected)
+    assert f"Waiting for the policy at {address}" in caplog.text
+
+
+def test_nobody_at_the_address_is_an_error_that_says_what_to_do() -> None:
+    with socket.create_server(("localhost", 0)) as free:
+        port = free.getsockname()[1]
+    with pytest.raises(
+        InputError, match=rf"No policy answers at ws://localhost:{port}: .*refused.*Start its"
+    ):
+        ServedPolicy(f"ws://localhost:{port}", patience=0.3)
+
+
+@pytest.mark.parametrize("address", ["localhost:8000", "http://localhost", "ws://", "ws://host:port"])
+def test_another_address_is_refused(address: str) -> None:
+    with pytest.raises(InputError, match=r"The address of a policy is ws://host:port, not "):
+        ServedPolicy(address, patience=0.1)
+
+
+def greet(connection: ServerConnection) -> None:
+    connection.send(pack({}))
+
+
+def sending(reply: Any) -> Callable[[ServerConnection], None]:
+    def handle(connection: ServerConnection) -> None:
+        greet(connection)
+        for _ in connection:
+            connection.send(reply)
+
+    return handle
+
+
+def silent(connection: ServerConnection) -> None:
+    greet(connection)
+    for _ in connection:
+        time.sleep(0.4)
+
+
+def ending(connection: ServerConnection) -> None:
+    greet(connection)
+    connection.recv()
+    connection.close(1001)
+
+
+@pytest.mark.parametrize(
+    ("handle", "message"),
+    [
+        (sending("Traceback:\n  File\nKeyError: 'st\x1bate'\n"), r"failed: KeyError: 'st\\x1bate'"),
+        (sending(pack({"action": np.zeros(2)})), r"array of numbers called actions; it sent: action"),
+        (sending(pack({"actions": "left"})), "array of numbers called actions"),
+        (sending(pack([1])), "array of numbers called actions; it sent: list"),
+        (sending(b"\xc1"), "does not speak openpi's protocol"),
+        (silent, r"did not answer within 0\.2 seconds: a slower one needs a larger --timeout"),
+        (ending, "ended the connection 5 times during one request"),
+    ],
+)
+def test_a_reply_that_is_no_reply_is_an_error(handle: Callable[..., None], message: str) -> None:
+    with answering(handle) as address:
+        served = ServedPolicy(address, timeout=0.2)
+        with pytest.raises(InputError, match=message):
+            served(OBSERVATIONS)
+        served.close()
+
+
+@pytest.mark.parametrize(
+    ("first", "message"),
+    [
+        (pack([1, 2]), "must first send a dictionary of metadata"),
+        (b"\xc1", "does not speak openpi's protocol"),
+        ("no model is loaded", "failed: no model is loaded"),
+    ],
+)
+def test_a_server_without_metadata_is_an_error(first: Any, message: str) -> None:
+    with (
+        answering(lambda connection: connection.send(first)) as address,
+        pytest.raises(InputError, match=message),
+    ):
+        ServedPolicy(address)
+
+
+def test_a_server_that_never_sends_metadata_is_an_error() -> None:
+    with (
+        answering(lambda connection: time.sleep(0.5)) as address,
+        pytest.raises(InputError, match=r"did not answer within 0\.1 seconds"),
+    ):
+        ServedPolicy(address, timeout=0.1)

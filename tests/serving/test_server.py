@@ -1,0 +1,259 @@
+"""The server of a policy: its messages, and its adapters for policies of other libraries."""
+
+import subprocess
+import sys
+import threading
+import urllib.request
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import msgpack
+import numpy as np
+import pytest
+import torch
+from served import SERVER
+from websockets.exceptions import ConnectionClosedError
+from websockets.sync.client import ClientConnection, connect
+
+from clbench.serving.server import lerobot_policy, open_server, openpi_policy, pack, unpack
+
+ARRAYS = [
+    np.array([[1.5, np.nan], [np.inf, -0.0]], np.float32),
+    np.arange(24, dtype=np.float64).reshape(2, 3, 4)[:, ::2],
+    np.asfortranarray(np.arange(6, dtype=np.int16).reshape(2, 3)),
+    np.arange(4, dtype=">i4"),
+    np.zeros((0, 3), np.uint8),
+    np.array(7, np.int64),
+    np.array([True, False]),
+    np.array(["left", "höher"]),
+    np.array([1, 2], np.float16),
+]
+
+
+@pytest.mark.parametrize("array", ARRAYS, ids=lambda one: f"{one.dtype.str}{one.shape}")
+def test_an_array_comes_back_with_its_type_its_shape_and_its_bytes(array: Any) -> None:
+    found = unpack(pack({"a": [array]}))["a"][0]
+    assert (found.dtype, found.shape, found.tobytes()) == (array.dtype, array.shape, array.tobytes())
+    assert found.flags.writeable
+
+
+@pytest.mark.parametrize("scalar", [np.float32(0.1), np.int64(-3), np.bool_(True), np.uint8(255)])
+def test_a_scalar_comes_back_with_its_type(scalar: Any) -> None:
+    found = unpack(pack(scalar))
+    assert (found, found.dtype) == (scalar, scalar.dtype)
+
+
+def test_plain_values_come_back_as_they_are() -> None:
+    values = {"text": "go left", "list": ["a", 1, 2.5, None, True], "bytes": b"\x00\xff", "none": {}}
+    assert unpack(pack(values)) == values
+
+
+def test_arrays_are_encoded_as_openpi_encodes_them() -> None:
+    array = np.array([[1, 2]], np.int16)
+    assert msgpack.unpackb(pack(array)) == {
+        b"__ndarray__": True,
+        b"data": array.tobytes(),
+        b"dtype": "<i2",
+        b"shape": [1, 2],
+    }
+    assert msgpack.unpackb(pack(np.float32(2))) == {b"__npgeneric__": True, b"data": 2.0, b"dtype": "<f4"}
+
+
+@pytest.mark.parametrize(
+    ("value", "error"),
+    [
+        (np.array([{}], object), "type object"),
+        (np.zeros(2, [("a", "f4")]), "cannot hold values of the type"),
+        (np.complex64(1), "type complex64"),
+        ({1, 2}, "cannot hold a set"),
+    ],
+)
+def test_what_a_message_cannot_hold_is_refused_before_it_is_sent(value: Any, error: str) -> None:
+    with pytest.raises((TypeError, ValueError), match=error):
+        pack({"a": value})
+
+
+@pytest.mark.parametrize(
+    "message",
+    [
+        b"",
+        b"\xc1",
+        pack({"a": np.zeros(4)})[:-3],
+        msgpack.packb({b"__ndarray__": True}),
+        msgpack.packb({b"__ndarray__": True, b"data": b"\0" * 8, b"dtype": "|O", b"shape": [1]}),
+        msgpack.packb({b"__ndarray__": True, b"data": b"\0" * 8, b"dtype": "<f8", b"shape": [1000]}),
+        msgpack.packb({b"__ndarray__": True, b"data": b"\0" * 8, b"dtype": "<f8", b"shape": [-1]}),
+        msgpack.packb({b"__ndarray__": True, b"data": b"", b"dtype": "<f8", b"shape": [0, 2**63]}),
+        msgpack.packb({b"__ndarray__": True, b"data": b"", b"dtype": "nonsense", b"shape": [0]}),
+        msgpack.packb({b"__npgeneric__": True, b"data": "x", b"dtype": "<f8"}),
+    ],
+)
+def test_a_damaged_message_is_refused(message: bytes) -> None:
+    with pytest.raises(ValueError, match="no message of a policy"):
+        unpack(message)
+
+
+def test_the_file_alone_imports_neither_clbench_nor_pytorch_nor_a_simulator() -> None:
+    code = f"""
+import runpy, sys
+runpy.run_path({str(SERVER)!r})
+print(sorted({{"clbench", "torch", "gymnasium", "mujoco"}} & set(sys.modules)))
+"""
+    done = subprocess.run(
+        [sys.executable, "-I", "-c", code], capture_output=True, text=True, check=True, cwd=Path("/")
+    )
+    assert done.stdout == "[]\n"
+
+
+@contextmanager
+def connected(policy: Callable[..., Any], **options: Any) -> Iterator[tuple[ClientConnection, int]]:
+    """Serve a policy from a thread, and yield a bare connection and the port."""
+    with open_server(policy, port=0, **options) as server:
+        thread = threading.Thread(target=server.serve_forever)
+        thread.start()
+        port = server.socket.getsockname()[1]
+        try:
+            with connect(f"ws://localhost:{port}", compression=None, proxy=None) as connection:
+                yield connection, port
+        finally:
+            server.shutdown()
+            thread.join()
+
+
+def received(connection: ClientConnection) -> Any:
+    message = connection.recv()
+    assert isinstance(message, bytes)
+    return unpack(message)
+
+
+def twice(observations: dict[str, Any]) -> Any:
+    return 2 * observations["state"][:, None]
+
+
+def test_the_metadata_come_first_and_each_request_has_a_reply() -> None:
+    with connected(twice, metadata={"checkpoint": "step-100"}) as (connection, port):
+        assert received(connection) == {"checkpoint": "step-100"}
+        for count in (1, 40):
+            state = np.random.default_rng(count).random((count, 3), np.float32)
+            connection.send(pack({"state": state}))
+            assert np.array_equal(received(connection)["actions"], 2 * state[:, None])
+        with urllib.request.urlopen(f"http://localhost:{port}/healthz") as answer:
+            assert answer.read() == b"OK\n"
+
+
+@pytest.mark.parametrize(
+    ("request_", "message"),
+    [
+        (pack({"velocity": 1}), "KeyError: 'state'"),
+        (pack([1, 2]), "must be a dictionary of observations"),
+        ("state", "must be a dictionary of observations"),
+        (b"\xc1", "no message of a policy"),
+    ],
+)
+def test_an_error_is_sent_as_text_and_ends_the_connection_alone(request_: Any, message: str) -> None:
+    with connected(twice) as (connection, port):
+        assert received(connection) == {}
+        connection.send(request_)
+        found = connection.recv()
+        assert isinstance(found, str)
+        assert "Traceback" in found
+        assert message in found
+        with pytest.raises(ConnectionClosedError, match="1011"):
+            connection.recv()
+        with connect(f"ws://localhost:{port}", proxy=None) as another:
+            assert received(another) == {}
+
+
+# ---- policies of other libraries ---------------------------------------------------------------------------
+
+OBSERVATIONS: dict[str, Any] = {
+    "state": np.arange(6, dtype=np.float32).reshape(2, 3),
+    "image": np.arange(2 * 4 * 4 * 3, dtype=np.uint8).reshape(2, 4, 4, 3),
+    "instruction": ["go left", "go up"],
+    "seed": np.array([5, 6]),
+    "step": np.array([0, 8]),
+}
+
+
+class LeRobotShaped:
+    """Has the documented interface of LeRobot's policies, with normalisation in the processors."""
+
+    def __init__(self, noise: float = 0.0) -> None:
+        self.batches: list[dict[str, Any]] = []
+        self.noise = noise
+
+    def preprocess(self, batch: dict[str, Any]) -> dict[str, Any]:
+        self.batches.append(batch)
+        return {**batch, "observation.state": batch["observation.state"] - 1}
+
+    def predict_action_chunk(self, batch: dict[str, Any]) -> torch.Tensor:
+        state = batch["observation.state"][:, None, :2]
+        chunks: torch.Tensor = state + torch.arange(5.0)[:, None] + self.noise * torch.randn(len(state), 5, 2)
+        return chunks
+
+    def postprocess(self, action: torch.Tensor) -> torch.Tensor:
+        assert action.shape == (2, 2)
+        return action * 10
+
+
+def test_a_policy_of_lerobot_receives_its_batch_and_its_actions_are_processed_step_by_step() -> None:
+    policy = LeRobotShaped()
+    act = lerobot_policy(policy, policy.preprocess, policy.postprocess, camera="front")
+    expected = (OBSERVATIONS["state"][:, None, :2] - 1 + np.arange(5, dtype=np.float32)[:, None]) * 10
+    found = act(OBSERVATIONS)
+    assert found.dtype == np.float32
+    assert np.array_equal(found, expected)
+    (batch,) = policy.batches
+    assert set(batch) == {"observation.state", "observation.images.front", "task"}
+    assert batch["task"] == ["go left", "go up"]
+    picture = batch["observation.images.front"]
+    assert (picture.shape, picture.dtype, picture.is_contiguous()) == ((2, 3, 4, 4), torch.float32, True)
+    assert np.allclose(picture.numpy().transpose(0, 2, 3, 1) * 255, OBSERVATIONS["image"])
+    act({name: values for name, values in OBSERVATIONS.items() if name != "image"})
+    assert set(policy.batches[1]) == {"observation.state", "task"}
+
+
+def test_a_policy_of_lerobot_draws_the_same_noise_for_the_same_request() -> None:
+    policy = LeRobotShaped(noise=1.0)
+    act = lerobot_policy(policy, policy.preprocess, policy.postprocess)
+    with torch.random.fork_rng():
+        first, again = act(OBSERVATIONS), act(OBSERVATIONS)
+        later = act({**OBSERVATIONS, "step": np.array([4, 8])})
+    assert np.array_equal(first, again)
+    assert not np.array_equal(first, later)
+
+
+class OpenpiShaped:
+    """Has the documented interface of openpi's policies."""
+
+    def __init__(self) -> None:
+        self.seen: list[tuple[dict[str, Any], Any]] = []
+
+    def infer(self, obs: dict[str, Any], *, noise: Any = None) -> dict[str, Any]:
+        self.seen.append((obs, noise))
+        actions = np.tile(next(iter(obs.values()))[:2], (4, 1))
+        return {"actions": actions, "policy_timing": {"infer_ms": 1.0}}
+
+
+def test_a_policy_of_openpi_infers_one_episode_after_another() -> None:
+    policy = OpenpiShaped()
+    found = openpi_policy(policy)(OBSERVATIONS)
+    assert np.array_equal(found, np.repeat(OBSERVATIONS["state"][:, None, :2], 4, axis=1))
+    (first, _), (second, noise) = policy.seen
+    assert set(first) == {"observation/state", "observation/image", "prompt"}
+    assert (first["prompt"], second["prompt"], noise) == ("go left", "go up", None)
+    assert np.array_equal(second["observation/image"], OBSERVATIONS["image"][1])
+
+
+def test_a_policy_of_openpi_may_have_other_names_and_noise_that_repeats_itself() -> None:
+    policy = OpenpiShaped()
+    act = openpi_policy(policy, lambda row: {"joints": row["state"]}, noise=(4, 8))
+    act(OBSERVATIONS)
+    act(OBSERVATIONS)
+    assert all(set(shown) == {"joints"} for shown, _ in policy.seen)
+    one, two, again, _ = (noise for _, noise in policy.seen)
+    assert (one.shape, one.dtype) == ((4, 8), np.float32)
+    assert np.array_equal(one, again)
+    assert not np.array_equal(one, two)
