@@ -30,6 +30,8 @@ records: .venv/installed
 	$(BIN)/clbench run clbench/Fetch-v1 sft consft consft_calibrated --seeds 8 --perturb
 	for id in $(BOARDS); do $(BIN)/clbench run $$id --all --seeds 8 || exit; done
 	$(BIN)/clbench run $(KNOWLEDGE) frozen sft stop_gradient aegis lora --seeds 4
+	$(BIN)/clbench run clbench/Fetch-v1 frozen sft consft aegis experience_replay lora stop_gradient --seeds 3 \
+		--policy discrete_diffusion
 	$(BIN)/clbench run $(FIXED),clbench/MetaWorldCW-v0 sft frozen joint from_scratch --seeds 3
 	$(BIN)/clbench run $(FIXED) experience_replay --seeds 3
 	$(BIN)/clbench leaderboard
@@ -64,6 +66,7 @@ docs: .venv/installed
 benchmark: .venv/installed-dev
 	$(BIN)/python benchmarks/rollouts.py
 	$(BIN)/python benchmarks/step_time.py
+	$(BIN)/python benchmarks/decoding.py
 	for id in Fetch-v1 MetaWorld-v1 PointMaze-v0 DMControl-v0 MetaWorldCW-v0; do \
 		$(BIN)/python benchmarks/whole_run.py clbench/$$id || exit; \
 	done
