@@ -15,7 +15,7 @@ from typing import Any
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
-from clbench.base.text import printable
+from clbench.base.text import counted, printable
 from clbench.records.paths import parts_of
 from clbench.scoring.intervals import Estimate
 from clbench.scoring.metric import Metric
@@ -59,6 +59,7 @@ def markdown(table: Table) -> str:
         agreement_text=agreement_text,
         comparisons=by_table(table.rows),
         decoding=read_decoding(),
+        counted=counted,
         policy_of=lambda place: parts_of(place)[1],
         start_text=start_text,
         prediction_text=prediction_text,
