@@ -8,7 +8,7 @@ from clbench.base.entry_points import resolve
 from clbench.base.errors import InputError, WrongTypeError
 from clbench.policy.policy import Policy, PolicyConfig
 from clbench.policy.transformer import TransformerPolicy
-from clbench.spec.policies import POLICIES, check_policy
+from clbench.spec.policies import POLICIES, check_policy_name
 
 
 def policy_class(kind: str) -> type[Policy]:
@@ -20,7 +20,7 @@ def policy_class(kind: str) -> type[Policy]:
     """
     if kind in POLICIES:
         return TransformerPolicy
-    check_policy(kind)
+    check_policy_name(kind)
     cls = resolve(kind)
     if not (isinstance(cls, type) and issubclass(cls, Policy)):
         raise WrongTypeError(f"{kind!r} is not a subclass of clbench.Policy.")

@@ -9,7 +9,7 @@ from typing import Any
 
 from clbench.base.errors import InputError
 from clbench.spec.identifiers import check_label, check_scenario_id, folder_name
-from clbench.spec.policies import DEFAULT_POLICY, check_policy
+from clbench.spec.policies import DEFAULT_POLICY, check_policy_name
 
 RECORDS = Path("leaderboard/records")
 """Folder of the leaderboard's records, from the working directory."""
@@ -55,7 +55,7 @@ def record_name(scenario: str, label: str, seed: int, order: int = 0, policy: st
         InputError: A name is refused.
     """
     check_scenario_id(scenario)
-    check_policy(policy)
+    check_policy_name(policy)
     check_label(label)
     name = f"seed-{seed}-order-{order}.json" if order else f"seed-{seed}.json"
     return Path(folder_name(place_of(scenario, policy)), folder_name(label), name)

@@ -60,7 +60,7 @@ def is_built_in(policy: str) -> bool:
     return kind_of(policy) in POLICIES
 
 
-def check_policy(name: str) -> None:
+def check_policy_name(name: str) -> None:
     """Refuse a text that is neither the name of a built-in policy nor of the form "module:Class".
 
     Raises:

@@ -15,7 +15,7 @@ from clbench.base.text import html_table
 from clbench.spec.budget import Budget
 from clbench.spec.fields import check_entry_point
 from clbench.spec.limits import Limits
-from clbench.spec.policies import DEFAULT_POLICY, check_policy
+from clbench.spec.policies import DEFAULT_POLICY, check_policy_name
 from clbench.spec.task import Task
 
 Group = Literal["retained", "target", "held_out"]
@@ -62,7 +62,7 @@ class Scenario:
             if names.count(name) > 1:
                 raise InputError(f"{self.id}: two tasks are called {name!r}.")
         check_entry_point(self, "questions")
-        check_policy(self.policy)
+        check_policy_name(self.policy)
         if not self.scene_tasks:
             raise InputError(
                 f"{self.id}: without retained tasks it needs scenes, tasks whose states are asked about, "

@@ -92,18 +92,18 @@ def method_checks(cls: type[Method], *, policy: str = DEFAULT_POLICY, **settings
 
 @dataclass(frozen=True, eq=False)
 class Check:
-    """One clause of the contract for one method; call it to check."""
+    """One clause of a contract for one subject; call it to check."""
 
-    clause: Callable[[Subject], None]
-    """Clause, one of `CLAUSES`."""
-    subject: Subject
-    """Method to check."""
+    clause: Callable[[Any], None]
+    """Clause, one of the contract's `CLAUSES`."""
+    subject: Any
+    """Method or policy to check."""
 
     def __call__(self) -> None:
         """Check the clause.
 
         Raises:
-            ContractError: The method breaks the clause.
+            ContractError: The subject breaks the clause.
         """
         self.clause(self.subject)
 

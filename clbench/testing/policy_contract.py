@@ -12,7 +12,6 @@ import copy
 import dataclasses
 import tempfile
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
@@ -25,6 +24,7 @@ from clbench.policy.batch import Batch
 from clbench.policy.checkpoint import load_policy, save_policy
 from clbench.policy.kinds import new_policy, policy_class
 from clbench.policy.policy import ABILITIES, Policy, PolicyConfig
+from clbench.testing.contract import Check
 from clbench.testing.error import ContractError
 from clbench.testing.global_state import GENERATORS, read, same
 from clbench.testing.small import SMALL, toy_questions, toy_source
@@ -57,32 +57,10 @@ def check_policy(kind: str) -> None:
         check()
 
 
-def policy_checks(kind: str) -> list[PolicyCheck]:
+def policy_checks(kind: str) -> list[Check]:
     """Return a check for each clause of the contract, for `pytest.mark.parametrize(..., ids=str)`."""
     subject = Subject(kind)
-    return [PolicyCheck(clause, subject) for clause in CLAUSES]
-
-
-@dataclass(frozen=True, eq=False)
-class PolicyCheck:
-    """One clause of the contract for one policy; call it to check."""
-
-    clause: Callable[[Subject], None]
-    """Clause, one of `CLAUSES`."""
-    subject: Subject
-    """Policy to check."""
-
-    def __call__(self) -> None:
-        """Check the clause.
-
-        Raises:
-            ContractError: The policy breaks the clause.
-        """
-        with deterministic():
-            self.clause(self.subject)
-
-    def __str__(self) -> str:
-        return self.clause.__name__
+    return [Check(deterministic()(clause), subject) for clause in CLAUSES]
 
 
 class Subject:

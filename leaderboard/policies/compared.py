@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -72,7 +71,6 @@ def _estimates(
 ) -> tuple[Estimate, Estimate, Estimate]:
     """Return a metric of runs with the default policy, of runs with another one, and the difference."""
     metric = load_metric(name)
-    high = metric.high if math.isfinite(metric.high) else math.inf
 
     def difference(of: Mapping[str, Rates]) -> Array:
         return metric.over_runs(of["theirs"]) - metric.over_runs(of["ours"])
@@ -82,9 +80,12 @@ def _estimates(
 
     def alone(what: str, runs: list[Scores]) -> Estimate:
         return bootstrap(
-            lambda of: metric.over_runs(of[what]), {what: runs}, generator(what), span=(metric.low, high)
+            lambda of: metric.over_runs(of[what]),
+            {what: runs},
+            generator(what),
+            span=(metric.low, metric.high),
         )
 
     both = {"ours": ours, "theirs": theirs}
-    apart = bootstrap(difference, both, generator("difference"), span=(-high, high))
+    apart = bootstrap(difference, both, generator("difference"), span=(-metric.high, metric.high))
     return alone("ours", ours), alone("theirs", theirs), apart

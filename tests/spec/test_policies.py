@@ -8,7 +8,7 @@ from clbench.policy.kinds import new_policy
 from clbench.records.paths import parts_of, place_of, record_name
 from clbench.spec.policies import (
     POLICIES,
-    check_policy,
+    check_policy_name,
     is_built_in,
     kind_of,
     policy_name,
@@ -24,7 +24,7 @@ def test_every_kind_has_three_sizes_and_the_small_one_has_the_plain_name() -> No
     assert policy_name("flow") == policy_name("flow", "small") == "flow"
     assert policy_name("discrete_diffusion", "large") == "discrete_diffusion-large"
     for name in policy_names():
-        check_policy(name)
+        check_policy_name(name)
         assert is_built_in(name)
         assert kind_of(name) in POLICIES
         assert policy_packages(name) == []
@@ -32,7 +32,7 @@ def test_every_kind_has_three_sizes_and_the_small_one_has_the_plain_name() -> No
 
 def test_a_class_has_no_size_of_ours() -> None:
     name = "clbench.testing.toy:ToyWorld"
-    check_policy(name)
+    check_policy_name(name)
     assert (kind_of(name), size_of(name), is_built_in(name)) == (name, None, False)
     assert policy_packages(name) == ["clbench.testing"]
 
@@ -52,7 +52,7 @@ def test_a_class_has_no_size_of_ours() -> None:
 )
 def test_another_name_is_refused_with_the_nearest_one(name: str, hint: str) -> None:
     with pytest.raises(UnknownNameError, match=hint):
-        check_policy(name)
+        check_policy_name(name)
     with pytest.raises(UnknownNameError, match=hint):
         TOY.with_policy(name)
 
