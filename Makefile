@@ -4,7 +4,7 @@ BIN := .venv/bin
 SCENARIO := clbench/Fetch-v1
 QUICK := build/quick
 
-.PHONY: leaderboard tuning records ladder controls docs benchmark test test-slow check wheel-test clean
+.PHONY: leaderboard tuning records ladder controls docs site benchmark test test-slow check wheel-test clean
 
 # The main job: from nothing to a table in minutes, with one seed. The full board takes `make records`.
 leaderboard:
@@ -62,6 +62,10 @@ docs: .venv/installed
 	$(BIN)/clbench method-pages
 	$(BIN)/clbench scenario-card
 
+# docs/ as a site, the reference of the Python names and the interactive leaderboard included: build/site/index.html.
+site: .venv/installed-docs
+	$(BIN)/python -m sphinx --fail-on-warning --keep-going --quiet --builder html docs build/site
+
 # Speed, as ratios: benchmarks/results/, and docs/reference/performance.md from them. It takes an hour of a quiet machine.
 benchmark: .venv/installed-dev
 	$(BIN)/python benchmarks/rollouts.py
@@ -113,4 +117,8 @@ clean:
 
 .venv/installed-dev: .venv/installed
 	$(BIN)/pip install -q -c constraints.txt -e ".[dev]"
+	@touch $@
+
+.venv/installed-docs: .venv/installed
+	$(BIN)/pip install -q -c constraints.txt -e ".[docs]"
 	@touch $@
