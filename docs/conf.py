@@ -49,7 +49,7 @@ _BOARD = DOCS.parent / "leaderboard" / "site" / "index.html"
 
 
 def lead_out(_app: Any, page: str, source: list[str]) -> None:
-    """Let links that leave docs/ lead to the repository, and those to the leaderboard to the site's own copy."""
+    """Let links that leave docs/ lead to the repository, and those to the leaderboard to its copy here."""
     folder = (DOCS / page).parent
 
     def link(found: re.Match[str]) -> str:
