@@ -61,6 +61,8 @@ class Entry:
     """Decoder of a chunk, which reports its work."""
     decode_many: Callable[..., Tensor] | None = None
     """Decoder of many chunks at a time that gives the same tokens; None for `decode`."""
+    is_pipeline: bool = False
+    """Whether it is what Fast-dVLA proposes: the pipeline of a distilled student with kept keys."""
 
 
 def entries(teacher: Policy, students: dict[int, Policy]) -> dict[str, Entry]:
@@ -74,7 +76,9 @@ def entries(teacher: Policy, students: dict[int, Policy]) -> dict[str, Entry]:
             students[1], partial(kept, thresholds=IN_SEQUENCE), partial(pipelined, thresholds=IN_SEQUENCE)
         ),
         **{
-            f"pipeline, blocks of {block} step{'s' if block > 1 else ''}": Entry(student, kept, pipelined)
+            f"pipeline, blocks of {block} step{'s' if block > 1 else ''}": Entry(
+                student, kept, pipelined, is_pipeline=True
+            )
             for block, student in students.items()
         },
         f"{PIPELINE}, tau_conf 0.25": Entry(
@@ -238,6 +242,7 @@ def main() -> None:
     times = timed(found, batch, options.rounds)
     rows = {
         name: {
+            "is_pipeline": found[name].is_pipeline,
             "success": round(float(np.mean(outcomes[name])), 4),
             "success_difference": difference(outcomes[name], outcomes[PEER], generator),
             "forwards": round(float(np.mean([len(work.spans) for work in works[name]])), 2),

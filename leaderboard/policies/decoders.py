@@ -20,6 +20,8 @@ class Decoder:
     """One decoder, compared with easy-first decoding in the same rounds and episodes."""
 
     name: str
+    is_pipeline: bool
+    """Whether it is the pipeline of a distilled student with kept keys: what Fast-dVLA proposes."""
     success: float
     """Share of the skills' validation episodes that succeed."""
     difference: Estimate
@@ -32,11 +34,6 @@ class Decoder:
     """Median time of a chunk, with the observation read."""
     speed_up: Estimate
     """Time of easy-first decoding divided by this one's, median of the rounds."""
-
-    @property
-    def is_pipeline(self) -> bool:
-        """Whether it is the pipeline of a distilled student with kept keys: what Fast-dVLA proposes."""
-        return self.name.startswith("pipeline") and "," not in self.name.removeprefix("pipeline, ")
 
 
 @dataclass(frozen=True)
@@ -78,6 +75,7 @@ def read_decoding(path: Path = RESULTS) -> Decoding | None:
         tuple(
             Decoder(
                 name,
+                one["is_pipeline"],
                 one["success"],
                 Estimate(*one["success_difference"]),
                 one["forwards"],

@@ -16,8 +16,11 @@ def ratio(value: float, half: float = 0.05) -> dict[str, float]:
     return {"median_ratio": value, "low": value - half, "high": value + half}
 
 
-def decoder(speed_up: float, difference: float = 0.0, tokens: float = 64.0) -> dict[str, Any]:
+def decoder(
+    speed_up: float, difference: float = 0.0, tokens: float = 64.0, *, is_pipeline: bool = False
+) -> dict[str, Any]:
     return {
+        "is_pipeline": is_pipeline,
         "success": 0.9 + difference,
         "success_difference": [difference, difference - 0.01, difference + 0.01],
         "forwards": 8.5,
@@ -36,8 +39,8 @@ def results(speed_up: float, difference: float = 0.0, forward: float = 1.1) -> d
         "decoders": {
             "easy first, 12 forwards": decoder(1.0, tokens=384.0),
             "one forward": decoder(9.0),
-            "pipeline, blocks of 1 step": decoder(speed_up - 0.4),
-            "pipeline, blocks of 4 steps": decoder(speed_up, difference),
+            "pipeline, blocks of 1 step": decoder(speed_up - 0.4, is_pipeline=True),
+            "pipeline, blocks of 4 steps": decoder(speed_up, difference, is_pipeline=True),
             "pipeline, blocks of 1 step, no kept keys": decoder(8.0),
         },
         "by_width": {
