@@ -22,6 +22,8 @@ class OverallRow:
     """Name or "module:Class"."""
     division: str
     """One of `DIVISIONS`."""
+    scenarios: tuple[str, ...]
+    """Names of the tables that it is the mean of, in the order of the board."""
     groups: tuple[str | None, ...]
     """Letters of its groups in the scenarios, in the order of the board."""
     estimates: Mapping[str, Estimate]
@@ -58,6 +60,7 @@ def _overall_row(found: Mapping[str, RowSummary]) -> OverallRow:
     return OverallRow(
         rows[0].method,
         rows[0].division,
+        tuple(found),
         tuple(row.groups for row in rows),
         estimates,
         all(row.to_criterion for row in rows),

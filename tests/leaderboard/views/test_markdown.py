@@ -79,6 +79,7 @@ def test_rows_in_every_scenario_are_averaged_over_them(
     printed, page = shown()
     assert "All scenarios" in printed
     section = page.partition("## All scenarios")[2].partition("\n## ")[0]
+    assert "Means over clbench/Other-v0, clbench/Toy-v0, for methods" in section
     rows = [line for line in section.splitlines() if line.startswith("| ") and "division" not in line]
     (row,) = [line for line in rows if "---" not in line]
     frame = load(four_methods)
