@@ -59,9 +59,10 @@ controls: .venv/installed
 	$(BIN)/clbench run $(KNOWLEDGE) lora --set.rank 4 $(CONTROLS)
 	$(BIN)/clbench run $(KNOWLEDGE) lora --set.rank 64 $(CONTROLS)
 
-# docs/reference/claims.md, docs/reference/methods/ and docs/reference/scenarios/ from the records; experts are measured once.
+# The pages of docs/reference that come from the records; experts are measured once.
 docs: .venv/installed
 	$(BIN)/clbench claims
+	$(BIN)/clbench findings
 	$(BIN)/clbench method-pages
 	$(BIN)/clbench scenario-card
 

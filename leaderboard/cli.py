@@ -1,4 +1,4 @@
-"""The commands `clbench leaderboard`, `submit`, `verify`, `claims`, `method-pages` and `scenario-card`."""
+"""The commands of the leaderboard: `leaderboard`, `submit`, `verify`, `claims`, `findings` and the pages."""
 
 from __future__ import annotations
 
@@ -298,6 +298,29 @@ def claims(
     console = Console()
     console.print(terminal(judged))
     _write(output, page(judged))
+
+
+def findings(
+    *,
+    records: Path = RECORDS,
+    controls: Path = CONTROLS,
+    output: Path = Path("docs/reference/findings.md"),
+) -> None:
+    """Say what the records show together, and write a page with every figure, its interval and pictures.
+
+    Args:
+        records: Folder of the records of the leaderboard.
+        controls: Folder of the records of changed settings.
+        output: Path of the page; pictures go to the folder `findings` beside it.
+    """
+    from .claims.evidence import read_evidence
+    from .claims.judges import judge_all
+    from .pages.findings import page, pictures, sections
+    from .views.format import write_all
+
+    found = sections(_table(records), judge_all(lambda name: read_evidence(name, records, controls)))
+    drawn = {output.parent / "findings" / name: svg for name, svg in pictures(_table(records)).items()}
+    _print_written(write_all({output: page(found), **drawn}))
 
 
 def method_pages(

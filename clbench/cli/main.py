@@ -45,6 +45,7 @@ COMMANDS = {
     },
     "Pages": {
         "claims": "clbench.leaderboard.cli:claims",
+        "findings": "clbench.leaderboard.cli:findings",
         "method-pages": "clbench.leaderboard.cli:method_pages",
         "scenario-card": "clbench.leaderboard.cli:scenario_card",
     },

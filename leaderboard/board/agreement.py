@@ -1,4 +1,4 @@
-"""Agreement of two halves of the seeds on the order of the rows: Kendall's tau with an interval."""
+"""Agreement of two boards, or of two halves of the seeds, on the order of the rows: Kendall's tau."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ LEAST_SEEDS, LEAST_ROWS = 4, 3
 
 @dataclass(frozen=True)
 class Agreement:
-    """Kendall's tau between the orders of rows by two halves of the seeds, with its 95 % interval."""
+    """Kendall's tau between the orders of rows by two boards, with its 95 % interval."""
 
     tau: float
     low: float
     high: float
     seeds: int
-    """Number of seeds in both halves together."""
+    """Number of seeds in both boards together."""
     rows: int
     """Number of rows."""
 
@@ -49,9 +49,6 @@ def _signs(differences: Array) -> Array:
 def agreement_of(values: Array, replicates: int = REPLICATES) -> Agreement | None:
     """Return the agreement of the first and the second half of the seeds on the order of the rows.
 
-    The interval holds the percentiles of `replicates` boards whose seeds are drawn with replacement, in each
-    half on its own; all rows share the draws, since seeds differ a lot.
-
     Args:
         values: Value of each row and seed, (rows, seeds).
         replicates: Number of draws.
@@ -62,14 +59,31 @@ def agreement_of(values: Array, replicates: int = REPLICATES) -> Agreement | Non
     rows, seeds = values.shape
     if rows < LEAST_ROWS or seeds < LEAST_SEEDS:
         return None
-    halves = np.split(values, [seeds // 2], axis=1)
-    tau = float(kendall_tau(*(half.mean(axis=1) for half in halves)))
-    if not np.isfinite(tau):
+    return agreement_between(values[:, : seeds // 2], values[:, seeds // 2 :], replicates)
+
+
+def agreement_between(one: Array, other: Array, replicates: int = REPLICATES) -> Agreement | None:
+    """Return the agreement of two boards on the order of the same rows.
+
+    The interval holds the percentiles of `replicates` pairs of boards whose seeds are drawn with replacement,
+    in each board on its own; all rows share the draws, since seeds differ a lot.
+
+    Args:
+        one: Value of each row and seed, (rows, seeds).
+        other: The same of the other board, (rows, other seeds).
+        replicates: Number of draws.
+
+    Returns:
+        None with too few rows, or if a board does not order the rows at all.
+    """
+    boards = (one, other)
+    tau = float(kendall_tau(*(board.mean(axis=1) for board in boards)))
+    if len(one) < LEAST_ROWS or not np.isfinite(tau):
         return None
     generator = np.random.default_rng(0)
     drawn = [
-        half[:, generator.integers(half.shape[1], size=(replicates, half.shape[1]))].mean(axis=2).T
-        for half in halves
+        board[:, generator.integers(board.shape[1], size=(replicates, board.shape[1]))].mean(axis=2).T
+        for board in boards
     ]
     low, high = np.nanpercentile(kendall_tau(*drawn), (2.5, 97.5))
-    return Agreement(tau, float(low), float(high), seeds, rows)
+    return Agreement(tau, float(low), float(high), sum(board.shape[1] for board in boards), len(one))

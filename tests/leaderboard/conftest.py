@@ -1,4 +1,4 @@
-"""A folder with the records of four methods, and the leaderboard that comes from it."""
+"""Folders of records: four methods with fixed stages, and any number of them at equal learning."""
 
 import functools
 from collections.abc import Callable
@@ -9,7 +9,12 @@ import numpy as np
 import pytest
 
 from clbench.base.entry_points import resolve
+from clbench.records.paths import label_of, record_path
+from clbench.records.record import Record
+from clbench.records.writer import record_text
+from clbench.spec.scenario import balanced_order
 
+EVEN = "clbench/Even-v1"
 ANSWERS = {(stage, kind): (50, 45 - 10 * stage) for stage in range(3) for kind in ("left", "above")}
 VALIDATION = [[0.3, 0.6, 0.9, 0.9], [0.1, 0.3, 0.8, 0.8]]
 REFERENCE = {"demonstrations": "never", "questions": "never", "reference": True}
@@ -55,3 +60,27 @@ def shown(
     monkeypatch.setattr("clbench.leaderboard.views.page.page", lambda _: "")
     monkeypatch.setattr("clbench.leaderboard.views.page.pictures", lambda _: {})
     return shown_with_page
+
+
+@pytest.fixture
+def even_board(make_record: Callable[..., Record], tmp_path: Path) -> Callable[..., Path]:
+    """Return a function that adds a record of a scenario at equal learning to a folder.
+
+    It returns the folder of records.
+    """
+
+    def add(method: str, seed: int, kept: float, folder: str = "records", **changes: Any) -> Path:
+        success = [[1, 1, 0, 0, 0], [kept, kept, 0.9, 0, 0], [kept, kept, kept, 0.9, 0]]
+        options = {"steps": (20,), "ends": (8, 20), "settings": changes, "changes": changes}
+        record = make_record(success, method=method, seed=seed, scenario=EVEN, **options)
+        names = record.scenario.target
+        record.scenario.balanced = True
+        record.scenario.target = [names[place] for place in balanced_order(2, seed)]
+        swapped = dict(zip(names, record.scenario.target, strict=True))
+        record.episodes["task"] = [swapped.get(task, task) for task in record.episodes["task"]]
+        path = record_path(tmp_path / folder, EVEN, label_of(method, changes), seed)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(record_text(record), encoding="utf-8")
+        return tmp_path / "records"
+
+    return add

@@ -119,6 +119,7 @@ def test_the_committed_pages_show_the_committed_records(
     cli = importlib.import_module("clbench.leaderboard.cli")
     monkeypatch.chdir(checkout)
     cli.claims(output=tmp_path / "claims.md")
+    cli.findings(output=tmp_path / "findings.md")
     cli.method_pages(output=tmp_path / "methods")
     shutil.copytree(
         checkout / "docs" / "reference" / "scenarios", tmp_path / "scenarios"

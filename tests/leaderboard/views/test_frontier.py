@@ -2,17 +2,15 @@
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 from xml.etree import ElementTree
 
 import html5lib
 import pytest
 
 from clbench.base.entry_points import resolve
-from clbench.records.paths import label_of, record_path
+from clbench.records.paths import record_path
 from clbench.records.record import Record
 from clbench.records.writer import record_text
-from clbench.spec.scenario import balanced_order
 
 SCENARIO = "clbench/Even-v1"
 page = resolve("clbench.leaderboard.views.page:page")
@@ -24,37 +22,16 @@ show = resolve("clbench.leaderboard.cli:show")
 
 
 @pytest.fixture
-def board(make_record: Callable[..., Record], tmp_path: Path) -> Callable[..., Path]:
-    """Return a function that adds a record to a folder and returns the folder of records."""
-
-    def board(method: str, seed: int, kept: float, folder: str = "records", **changes: Any) -> Path:
-        success = [[1, 1, 0, 0, 0], [kept, kept, 0.9, 0, 0], [kept, kept, kept, 0.9, 0]]
-        options = {"steps": (20,), "ends": (8, 20), "settings": changes, "changes": changes}
-        record = make_record(success, method=method, seed=seed, scenario=SCENARIO, **options)
-        names = record.scenario.target
-        record.scenario.balanced = True
-        record.scenario.target = [names[place] for place in balanced_order(2, seed)]
-        swapped = dict(zip(names, record.scenario.target, strict=True))
-        record.episodes["task"] = [swapped.get(task, task) for task in record.episodes["task"]]
-        path = record_path(tmp_path / folder, SCENARIO, label_of(method, changes), seed)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(record_text(record), encoding="utf-8")
-        return tmp_path / "records"
-
-    return board
-
-
-@pytest.fixture
-def records(board: Callable[..., Path]) -> Path:
+def records(even_board: Callable[..., Path]) -> Path:
     """Return a folder of records of three methods with four seeds, beside a ladder of two."""
     for seed in range(4):
         for method, kept in (("sft", 0.1), ("finch", 0.5), ("lora", 0.3)):
-            board(method, seed, kept)
+            even_board(method, seed, kept)
     for factor, kept in ((0.1, 0.4), (1.0, 0.2)):
         for seed in range(2):
-            board("finch", seed, kept + 0.3, "ladder", step_factor=factor)
-            board("sft", seed, kept, "ladder", step_factor=factor)
-    return board("lora", 0, 0.3)
+            even_board("finch", seed, kept + 0.3, "ladder", step_factor=factor)
+            even_board("sft", seed, kept, "ladder", step_factor=factor)
+    return even_board("lora", 0, 0.3)
 
 
 def words(element: ElementTree.Element) -> str:
@@ -143,16 +120,16 @@ def test_the_frontier_has_each_method_at_each_step_size(records: Path) -> None:
         assert "var(" not in picture
 
 
-def test_without_a_ladder_there_is_no_frontier(board: Callable[..., Path]) -> None:
-    table = read_table(board("sft", 0, 0.2))
+def test_without_a_ladder_there_is_no_frontier(even_board: Callable[..., Path]) -> None:
+    table = read_table(even_board("sft", 0, 0.2))
     assert not table.frontiers
     assert "frontier" not in markdown(table)
     assert set(pictures(table)) == {"pareto.svg", "pareto-dark.svg"}
 
 
-def test_a_ladder_record_without_a_step_size_is_refused(board: Callable[..., Path]) -> None:
-    board("finch", 0, 0.4, "ladder", kappa=0.5)
-    table = read_table(board("sft", 0, 0.2))
+def test_a_ladder_record_without_a_step_size_is_refused(even_board: Callable[..., Path]) -> None:
+    even_board("finch", 0, 0.4, "ladder", kappa=0.5)
+    table = read_table(even_board("sft", 0, 0.2))
     assert not table.frontiers
     (entry,) = table.not_shown
     assert entry.path.startswith("ladder/Even-v1/finch+kappa=0.5/")

@@ -1,0 +1,68 @@
+"""The picture of the findings: the gain of every method over tuned fine-tuning, with its interval."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+from ..board.rows import Row
+from ..board.summary import DIVISIONS
+from ..views.page.charts import FONT, Spec, axis, colour, rounded, specification
+
+WIDTH = 520
+"""Width of the plot in pixels."""
+
+ROW_HEIGHT = 18
+"""Height of a method's line in pixels."""
+
+
+def gains_chart(boards: Mapping[str, Sequence[Row]]) -> Spec:
+    """Return the chart: one panel for each scenario, one line for each method, the largest gain on top."""
+    return specification(FONT, vconcat=[_panel(name, rows) for name, rows in boards.items() if rows])
+
+
+def _panel(name: str, rows: Sequence[Row]) -> Spec:
+    values = [
+        {
+            "method": row.method,
+            "division": row.division,
+            **{end: rounded(getattr(row.estimates["gain"], end)) for end in ("low", "value", "high")},
+        }
+        for row in rows
+    ]
+    divisions = [division for division in DIVISIONS if any(row.division == division for row in rows)]
+    method = {
+        "field": "method",
+        "type": "nominal",
+        "sort": [row.method for row in rows],
+        "title": None,
+        "axis": {"labelColor": colour("ink")},
+    }
+    hue = {
+        "field": "division",
+        "type": "nominal",
+        "scale": {
+            "domain": divisions,
+            "range": [colour(f"mark-{DIVISIONS.index(division)}") for division in divisions],
+        },
+    }
+    gain = axis("value", "gain over tuned fine-tuning, with 95 % interval", axis={"format": ".2~f"})
+    ends = {"x": {"field": "low", "type": "quantitative"}, "x2": {"field": "high"}}
+    zero = {
+        "data": {"values": [{"zero": 0}]},
+        "mark": {"type": "rule", "color": colour("edge"), "strokeDash": [4, 3]},
+        "encoding": {"x": {"field": "zero", "type": "quantitative"}},
+    }
+    return {
+        "title": {"text": name, "anchor": "start", "color": colour("ink"), "fontSize": 13},
+        "width": WIDTH,
+        "height": ROW_HEIGHT * len(rows),
+        "data": {"values": values},
+        "layer": [
+            zero,
+            {"mark": {"type": "rule", "strokeWidth": 2}, "encoding": {"y": method, "color": hue, **ends}},
+            {
+                "mark": {"type": "point", "filled": True, "size": 70, "opacity": 1},
+                "encoding": {"y": method, "x": gain, "color": hue},
+            },
+        ],
+    }

@@ -1,0 +1,89 @@
+"""The findings say what the records show: every sentence follows from made-up records."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from clbench.base.entry_points import resolve
+
+findings = resolve("clbench.leaderboard.cli:findings")
+
+
+@pytest.fixture
+def page(even_board: Callable[..., Path], tmp_path: Path) -> Callable[[], str]:
+    """Return a function that makes the page, without the backslashes of Markdown."""
+
+    def make() -> str:
+        output = tmp_path / "docs" / "findings.md"
+        findings(records=tmp_path / "records", controls=tmp_path / "controls", output=output)
+        return output.read_text(encoding="utf-8").replace("\\", "")
+
+    return make
+
+
+def fill(even_board: Callable[..., Path], **kept: float) -> None:
+    for seed in range(4):
+        for method, share in kept.items():
+            even_board(method, seed, share)
+
+
+def test_a_method_that_is_certainly_better_is_named_with_its_gain(
+    even_board: Callable[..., Path], page: Callable[[], str]
+) -> None:
+    fill(even_board, sft=0.4, finch=0.8, lora=0.4, l2_sp=0.0)
+    text = page()
+    # kept counts two skills and one earlier target of four tasks in all: a gain of 3/4 of the difference
+    assert "On clbench/Even-v1, yes: `finch` by 0.300 [" in text
+    assert "Certainly worse: `l2_sp` by -0.300 [" in text
+    table = text.partition("| scenario | method | gain |")[2]
+    assert [line.split(" | ")[1] for line in table.splitlines()[2:5]] == ["finch", "lora", "l2_sp"]
+
+
+def test_without_one_the_page_says_so_and_names_the_largest_gain(
+    even_board: Callable[..., Path], page: Callable[[], str]
+) -> None:
+    fill(even_board, sft=0.4, finch=0.4, lora=0.4)
+    assert "not for certain: the largest gain of 2 methods is 0.000" in page()
+
+
+def test_the_ladder_tells_what_a_smaller_step_size_does(
+    even_board: Callable[..., Path], page: Callable[[], str]
+) -> None:
+    fill(even_board, sft=0.4)
+    assert "smaller step size" not in page()
+    for factor, kept in ((1.0, 0.2), (0.1, 0.5)):
+        for seed in range(2):
+            even_board("sft", seed, kept, "ladder", step_factor=factor)
+    assert "plain fine-tuning keeps 0.20" in page()
+    assert "at 1 of the published step size, and 0.50" in page()
+
+
+def test_definitions_that_order_the_methods_alike_have_a_tau_of_one(
+    even_board: Callable[..., Path], page: Callable[[], str]
+) -> None:
+    fill(even_board, sft=0.2, finch=0.6, lora=0.4, l2_sp=0.1)
+    assert (
+        "Final average and forgetting on clbench/Even-v1: alike, Kendall's tau 1.00 [1.00, 1.00]." in page()
+    )
+
+
+def test_a_second_call_changes_no_byte(
+    even_board: Callable[..., Path], page: Callable[[], str], tmp_path: Path
+) -> None:
+    fill(even_board, sft=0.2, finch=0.6)
+    page()
+    made = {path: path.read_bytes() for path in (tmp_path / "docs").rglob("*.*")}
+    assert {path.name for path in made} == {"findings.md", "gains.svg", "gains-dark.svg"}
+    page()
+    assert {path: path.read_bytes() for path in (tmp_path / "docs").rglob("*.*")} == made
+
+
+def test_without_records_at_equal_learning_there_is_nothing_to_say(
+    four_methods: Path, tmp_path: Path
+) -> None:
+    output = tmp_path / "findings.md"
+    findings(records=four_methods, controls=tmp_path / "controls", output=output)
+    text = output.read_text(encoding="utf-8")
+    assert "beat tuned fine-tuning" not in text
+    assert not (tmp_path / "findings").exists()
