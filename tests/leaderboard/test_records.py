@@ -125,7 +125,7 @@ def test_the_committed_pages_show_the_committed_records(
         checkout / "docs" / "reference" / "scenarios", tmp_path / "scenarios"
     )  # pictures and measured experts
     cli.scenario_card(output=tmp_path / "scenarios")
-    for made in sorted(tmp_path.rglob("*.md")):
+    for made in sorted([*tmp_path.rglob("*.md"), *tmp_path.rglob("*.svg")]):
         page = made.relative_to(tmp_path)
         assert made.read_text() == (checkout / "docs" / "reference" / page).read_text(), (
             f"{page}: run `make docs`"
