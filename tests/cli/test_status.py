@@ -1,6 +1,7 @@
 """`clbench status`: what is done, running, failed and to do."""
 
 import json
+import re
 from pathlib import Path
 
 import pytest
@@ -37,7 +38,7 @@ def test_it_counts_the_runs_of_a_request_by_their_states(
     shown = capsys.readouterr().out
     assert "Toy-v0/frozen/seed-1: 25% after 0:0" in shown
     assert "Toy-v0/sft/seed-0: damaged, " in shown
-    assert "6 runs: 1 done, 1 running, 1 damaged, 3 to do. About 0:0" in shown
+    assert re.search(r"6 runs: 1 done, 1 running, 1 damaged, 3 to do\. About \d+:\d\d left", shown)
 
 
 def test_without_a_request_it_shows_what_is_in_the_folder(
