@@ -204,7 +204,8 @@ def measure(scenario: str, /, *tasks: str, episodes: Annotated[int, whole_number
         chosen = [loaded.task(name) for name in tasks] or list(loaded.tasks)
     with Bars(len(chosen) * episodes) as bars:
         bars.start(loaded.id, len(chosen) * episodes)
-        rows = expert_rates.measure(loaded, chosen, episodes, lambda done: bars.advance(loaded.id, done))
+        with checked_input():  # a task may have no expert
+            rows = expert_rates.measure(loaded, chosen, episodes, lambda done: bars.advance(loaded.id, done))
     Console().print(_table(loaded, rows, episodes))
     found = [expert_rates.complaint(task, row) for task, row in zip(chosen, rows, strict=True)]
     complaints = [text for text in found if text is not None]

@@ -153,7 +153,9 @@ def _grouped(commands: dict[str, dict[str, str]]) -> dict[Group, dict[str, str]]
 GROUPS = _grouped(COMMANDS)
 app = _app("clbench", clbench.__doc__ or "", GROUPS)
 demonstrations = _app("demonstrations", None, _grouped({"Commands": DEMONSTRATIONS}))
-demonstrations.usage = "Usage: clbench demonstrations [OPTIONS] SCENARIO\n       clbench demonstrations COMMAND"
+demonstrations.usage = (
+    "Usage: clbench demonstrations [OPTIONS] SCENARIO\n       clbench demonstrations COMMAND"
+)
 demonstrations.default(collect)
 experts = _app(
     "experts",

@@ -69,7 +69,9 @@ def write_hdf5(path: Path, task: Task, episodes: Sequence[Demonstration]) -> Non
 
 def _dones(episode: Demonstration) -> NDArray[np.uint8]:
     """Return 1 for a last step that ended in success, else 0, (T,)."""
-    return (episode.success & (np.arange(len(episode.executed)) == len(episode.executed) - 1)).astype(np.uint8)
+    return (episode.success & (np.arange(len(episode.executed)) == len(episode.executed) - 1)).astype(
+        np.uint8
+    )
 
 
 def _attributes(task: Task, episodes: Sequence[Demonstration]) -> dict[str, Any]:
@@ -135,7 +137,7 @@ class _File:
     def _check_attributes(self, data: h5py.Group) -> None:
         """Check the instruction and the control rate, where the file gives them."""
         words = _json(data.attrs.get("problem_info")).get("language_instruction")
-        words = "".join(words) if isinstance(words, list) else words  # LIBERO has a list of letters in places
+        words = "".join(words) if isinstance(words, list) else words  # LIBERO joins it, too
         if isinstance(words, str) and words.strip('" \n') not in self._task.instructions:
             raise self._error(
                 f"its instruction is {quoted(words)}, which the task {self._task.name} does not have: add it to "
@@ -201,9 +203,7 @@ class _File:
         values = np.asarray(group[name])
         if values.ndim != axes or values.dtype.kind not in "biuf":
             shape = "(T,)" if axes == 1 else "(T, N)"
-            raise self._error(
-                f"{where}/{name} must be numbers {shape}, not {values.dtype} {values.shape}"
-            )
+            raise self._error(f"{where}/{name} must be numbers {shape}, not {values.dtype} {values.shape}")
         if steps is not None and len(values) != steps:
             raise self._error(f"{where}/{name} has {len(values)} rows, but there are {steps} actions")
         if not np.isfinite(values).all():

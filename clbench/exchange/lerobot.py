@@ -32,6 +32,10 @@ FILE = "chunk-000/file-000.parquet"
 IMAGE = "observation.images.image"
 """Name of the picture that a policy sees; the camera is called image, as in `clbench/serving/server.py`."""
 
+ENVIRONMENT_STATE = "observation.environment_state"
+"""Second name of the state where there is no picture: LeRobot's ACT and diffusion policies refuse to go
+without one of the two."""
+
 QUANTILES = (0.01, 0.1, 0.5, 0.9, 0.99)
 """Quantiles among the statistics, as in LeRobot: q01 to q99."""
 
@@ -54,7 +58,9 @@ def write_lerobot(folder: Path, tasks: Mapping[Task, Sequence[Demonstration]]) -
     """
     rates = {steps_per_second(task) for task in tasks}
     if len(rates) > 1:
-        raise InputError(f"A LeRobotDataset has one rate, but the tasks have {sorted(rates)} steps per second.")
+        raise InputError(
+            f"A LeRobotDataset has one rate, but the tasks have {sorted(rates)} steps per second."
+        )
     (rate,) = rates
     texts = [words for task in tasks for words in task.instructions]
     episodes = list(_episodes(tasks, texts, rate))
@@ -111,7 +117,7 @@ def _columns(one: Shown, number: int, first: int, text: int, rate: float) -> Col
     done = steps == len(steps) - 1
     return {
         "observation.state": one.state,
-        **({IMAGE: one.image} if one.image.size else {}),
+        **({IMAGE: one.image} if one.image.size else {ENVIRONMENT_STATE: one.state}),
         "action": episode.expert[:-1],
         "executed": episode.executed,
         "noisy": episode.noisy[:-1],
