@@ -52,8 +52,8 @@ RANDOM = 5
 def definition(scenario: Scenario) -> dict[str, str]:
     """Return the hashes of a scenario by part.
 
-    Parts are "task NAME" and "rule NAME" for each task, "questions", and "camera" if there is one. A task that
-    learns from a file has "demonstrations NAME", too.
+    Parts are "task NAME" and "rule NAME" for each task, "questions", and "camera" if there is one. A task
+    that learns from a file has "demonstrations NAME", too.
     """
     tasks = (*scenario.tasks, *scenario.background, *scenario.scenes)
     suites = packages_of(tasks, "world", "expert", "camera")
@@ -78,9 +78,9 @@ def definition(scenario: Scenario) -> dict[str, str]:
 
 
 def recording_of(task: Task) -> str | None:
-    """Return the hash of the demonstrations that a task names in the place of an expert, see `clbench.exchange`.
+    """Return the hash of the recorded demonstrations that a task names in the place of an expert, or None.
 
-    None stands for a task with an expert.
+    `clbench.exchange.recorded` has the object that such a task names as its expert.
     """
     recording: str | None = getattr(resolve(task.expert), "recording", None)
     return recording

@@ -123,8 +123,8 @@ def import_demonstrations(
 ) -> str:
     """Keep the demonstrations of an HDF5 file as the Minari dataset of a task, and return its id.
 
-    The task must name these demonstrations in the place of an expert; the error of a task that does not says
-    how. All results of the task then say that its demonstrations come from elsewhere, and which ones they are.
+    The task must name these demonstrations in the place of an expert; if it does not, the error says how. The
+    definition of the scenario, which is in all its records, then says which demonstrations the task has.
 
     Args:
         scenario: Scenario of your own, or its Gymnasium id.
@@ -174,6 +174,6 @@ def _check_owner(scenario: Scenario, task: Task, found: str, path: Path) -> None
             f"demonstrations of its expert. Give a task of your own scenario {how} to learn from this file."
         )
     raise InputError(
-        f"{path} holds the recording {found}, but the task {task.name} of {scenario.id} names {named}. To learn "
-        f"from this file, give it {how}."
+        f"{path} holds the recording {found}, but the task {task.name} of {scenario.id} names {named}. To "
+        f"learn from this file, give it {how}."
     )

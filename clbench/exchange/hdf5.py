@@ -140,8 +140,8 @@ class _File:
         words = "".join(words) if isinstance(words, list) else words  # LIBERO joins it, too
         if isinstance(words, str) and words.strip('" \n') not in self._task.instructions:
             raise self._error(
-                f"its instruction is {quoted(words)}, which the task {self._task.name} does not have: add it to "
-                f"the instructions of the task if it means the same. It has {self._task.instructions}"
+                f"its instruction is {quoted(words)}, which the task {self._task.name} does not have: add it "
+                f"to the instructions of the task if it means the same. It has {self._task.instructions}"
             )
         kwargs = _json(data.attrs.get("env_args")).get("env_kwargs")
         rate = kwargs.get("control_freq") if isinstance(kwargs, dict) else None
@@ -233,7 +233,8 @@ class _File:
             row, column = np.argwhere(outside)[0]
             raise self._error(
                 f"{what} hold {values[row, column]:g} in row {row}, column {column}: the world "
-                f"{self._task.world} takes float32 numbers from {space.low[column]:g} to {space.high[column]:g}"
+                f"{self._task.world} takes float32 numbers from {space.low[column]:g} to "
+                f"{space.high[column]:g}"
             )
 
     def _error(self, fault: str) -> InputError:

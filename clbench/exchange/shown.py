@@ -51,7 +51,7 @@ def steps_per_second(task: Task) -> float:
         rate = world.metadata.get("render_fps")
     if rate is None:
         raise InputError(
-            f"The world {task.world} of the task {task.name} does not give its steps per second, which a data "
-            'set holds: add them to its class, for example metadata = {"render_fps": 25}.'
+            f"The world {task.world} of the task {task.name} does not give its steps per second, which a "
+            'data set holds: add them to its class, for example metadata = {"render_fps": 25}.'
         )
     return float(rate)

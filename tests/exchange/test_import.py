@@ -40,7 +40,7 @@ def _recorded(path: Path, **changes: object) -> Scenario:
     """Return a toy whose first target learns from a file."""
     expert = expert_of(recording_hash(read_hdf5(path, TASK)))
     target = (dataclasses.replace(TASK, expert=expert), *TOY.target[1:])
-    return dataclasses.replace(TOY, id="me/Recorded-v0", target=target, **changes)
+    return dataclasses.replace(TOY, id="me/Taught-v0", target=target, **changes)
 
 
 def test_training_learns_from_the_file(path: Path, empty_caches: Path) -> None:
@@ -71,14 +71,15 @@ def test_a_task_with_an_expert_is_refused_with_what_to_write(path: Path, empty_c
 
 def test_a_task_that_names_other_demonstrations_is_refused(path: Path) -> None:
     scenario = _recorded(path)
+    other = dataclasses.replace(scenario.target[0], expert=expert_of("0123456789abcdef"))
+    changed = dataclasses.replace(scenario, target=(other,))
     with pytest.raises(InputError, match=r"holds the recording \w{16}, but the task right of me/\S+ names"):
-        other = dataclasses.replace(scenario.target[0], expert=expert_of("0123456789abcdef"))
-        clbench.import_demonstrations(dataclasses.replace(scenario, target=(other,)), "right", path)
+        clbench.import_demonstrations(changed, "right", path)
 
 
 def test_the_budget_must_have_as_many_demonstrations(path: Path) -> None:
     budget = dataclasses.replace(TOY.budget, demonstrations=50)
-    with pytest.raises(InputError, match="has 10 demonstrations, but the budget of me/Recorded-v0 has 50"):
+    with pytest.raises(InputError, match="has 10 demonstrations, but the budget of me/Taught-v0 has 50"):
         clbench.import_demonstrations(_recorded(path, budget=budget), "right", path)
 
 
@@ -118,29 +119,32 @@ from clbench.testing import TOY
 
 right, *others = TOY.target
 SCENARIO = dataclasses.replace(
-    TOY, id="me/Recorded-v0", target=(dataclasses.replace(right, expert={expert!r}),)
+    TOY, id="me/Taught-v0", target=(dataclasses.replace(right, expert={expert!r}),)
 )
-clbench.register("me/Recorded-v0", "recorded_toy:SCENARIO")
+clbench.register("me/Taught-v0", "recorded_toy:SCENARIO")
 """,
     )
-    name = "recorded_toy:me/Recorded-v0"
+    name = "recorded_toy:me/Taught-v0"
     clbench.import_demonstrations(name, "right", path)
     record = clbench.execute(clbench.RunSpec(name, "sft", 0), tmp_path / "records")
     assert record.fingerprint["definition"]["demonstrations right"] in expert
     assert record.status == "success"
 
 
-def test_the_check_of_a_scenario_plays_a_recorded_task_without_its_expert(path: Path) -> None:
+def test_the_check_of_a_scenario_plays_a_recorded_task_without_its_expert(
+    path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     scenario = _recorded(path)
     check_scenario(scenario, episodes=3)
-    late = dataclasses.replace(scenario.target[0], world="clbench.testing.toy:Late")
-    with pytest.MonkeyPatch.context() as patch, pytest.raises(ScenarioError, match="task right, step 1"):
-        patch.setattr(toy_module, "Late", _Late, raising=False)
-        check_scenario(dataclasses.replace(scenario, target=(late,)), episodes=3)
+    early = dataclasses.replace(scenario.target[0], world="clbench.testing.toy:Early")
+    changed = dataclasses.replace(scenario, target=(early,))
+    monkeypatch.setattr(toy_module, "Early", _Early, raising=False)
+    with pytest.raises(ScenarioError, match="task right, step 1"):
+        check_scenario(changed, episodes=3)
 
 
-class _Late(toy_module.ToyWorld):
-    """A toy whose info says success one step too early."""
+class _Early(toy_module.ToyWorld):
+    """A toy whose info says success too early."""
 
     def step(self, action: toy_module.Action) -> tuple:  # type: ignore[type-arg]
         state, reward, done, truncated, info = super().step(action)
