@@ -40,7 +40,7 @@ class Recording:
         raise InputError(
             f"The task {task} has no expert: it learns from the recording {self.recording}, which is not "
             "kept for this version of the task and of clbench. Import it with `clbench demonstrations "
-            f"import`. If questions need states, let the `scenes` of the scenario name other tasks than {task}."
+            "import`. If questions need states, let the `scenes` of the scenario name other tasks."
         )
 
 
