@@ -11,6 +11,7 @@ https://libero-project.github.io/datasets.
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Sequence
 from contextlib import closing
 from importlib.metadata import version
@@ -34,6 +35,9 @@ GYM = 2
 
 FARTHEST_RATE = 0.01
 """Largest relative difference between the control rates of a file and of a world: rates are often rounded."""
+
+
+_NAME = re.compile(r"demo_([0-9]+)")
 
 
 # ---- out ---------------------------------------------------------------------------------------------------
@@ -69,9 +73,9 @@ def write_hdf5(path: Path, task: Task, episodes: Sequence[Demonstration]) -> Non
 
 def _dones(episode: Demonstration) -> NDArray[np.uint8]:
     """Return 1 for a last step that ended in success, else 0, (T,)."""
-    return (episode.success & (np.arange(len(episode.executed)) == len(episode.executed) - 1)).astype(
-        np.uint8
-    )
+    dones = np.zeros(len(episode.executed), np.uint8)
+    dones[-1] = episode.success
+    return dones
 
 
 def _attributes(task: Task, episodes: Sequence[Demonstration]) -> dict[str, Any]:
@@ -124,11 +128,12 @@ class _File:
     def demonstrations(self) -> list[Demonstration]:
         """Return all demonstrations, in the order of their numbers."""
         data = self._file.get("data")
-        names = [name for name in data if _number(name) is not None] if isinstance(data, h5py.Group) else []
+        found = data if isinstance(data, h5py.Group) else ()
+        names = {int(one[1]): name for name in found if (one := _NAME.fullmatch(name)) is not None}
         if not names:
             raise self._error("it has no demonstrations: the layout of robomimic and LIBERO has data/demo_0")
         self._check_attributes(data)
-        episodes = [self._demonstration(data, name) for name in sorted(names, key=_number)]
+        episodes = [self._demonstration(data, names[number]) for number in sorted(names)]
         steps, total = sum(len(episode.executed) for episode in episodes), data.attrs.get("total")
         if total is not None and int(total) != steps:
             raise self._error(f"data has total {total}, but its demonstrations have {steps} steps")
@@ -239,12 +244,6 @@ class _File:
 
     def _error(self, fault: str) -> InputError:
         return InputError(f"{self._path}: {fault}.")
-
-
-def _number(name: str) -> int | None:
-    """Return the number of a demonstration, None for other names."""
-    begin, _, number = name.partition("demo_")
-    return int(number) if not begin and number.isdecimal() else None
 
 
 def _json(text: Any) -> dict[str, Any]:

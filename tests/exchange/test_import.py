@@ -5,6 +5,7 @@ import re
 from collections.abc import Callable
 from pathlib import Path
 
+import h5py
 import minari
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from clbench.evaluation.definition import definition
 from clbench.exchange.hdf5 import read_hdf5
 from clbench.exchange.recorded import expert_of, recording_hash
 from clbench.learning.pretraining import policy_config, pretraining_inputs
+from clbench.spec.budget import Budget
 from clbench.spec.scenario import Scenario
 from clbench.testing import TOY, ScenarioError, check_scenario
 from clbench.testing import toy as toy_module
@@ -27,8 +29,6 @@ TASK = TOY.task("right")
 @pytest.fixture
 def path(tmp_path: Path) -> Path:
     """A file with the demonstrations of one task, whose actions are the expert's at half speed."""
-    import h5py
-
     folder = clbench.export_demonstrations(TOY, tmp_path / "out", format="hdf5", tasks=["right"])
     with h5py.File(folder / "right_demo.hdf5", "r+") as file:
         for demo in file["data"].values():
@@ -36,11 +36,11 @@ def path(tmp_path: Path) -> Path:
     return folder / "right_demo.hdf5"
 
 
-def _recorded(path: Path, **changes: object) -> Scenario:
+def _recorded(path: Path, budget: Budget = TOY.budget) -> Scenario:
     """Return a toy whose first target learns from a file."""
     expert = expert_of(recording_hash(read_hdf5(path, TASK)))
     target = (dataclasses.replace(TASK, expert=expert), *TOY.target[1:])
-    return dataclasses.replace(TOY, id="me/Taught-v0", target=target, **changes)
+    return dataclasses.replace(TOY, id="me/Taught-v0", target=target, budget=budget)
 
 
 def test_training_learns_from_the_file(path: Path, empty_caches: Path) -> None:

@@ -77,7 +77,7 @@ def test_its_frames_are_those_of_the_demonstrations_bit_for_bit(
     folder: Path, episodes: list[Demonstration]
 ) -> None:
     rows = _rows(folder / "data" / "chunk-000" / "file-000.parquet")
-    expected = {
+    expected: dict[str, list[Any]] = {
         "observation.state": [episode.state[:-1] for episode in episodes],
         "observation.environment_state": [episode.state[:-1] for episode in episodes],
         "action": [episode.expert[:-1] for episode in episodes],
