@@ -36,7 +36,6 @@ GYM = 2
 FARTHEST_RATE = 0.01
 """Largest relative difference between the control rates of a file and of a world: rates are often rounded."""
 
-
 _NAME = re.compile(r"demo_([0-9]+)")
 
 

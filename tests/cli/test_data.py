@@ -1,4 +1,4 @@
-"""`clbench demonstrations` and `clbench pretrain`."""
+"""`clbench demonstrations` with its export, and `clbench pretrain`."""
 
 from pathlib import Path
 
@@ -62,3 +62,13 @@ def test_a_scenario_of_the_working_folder_is_found(
     assert "Experts of clbench/Toy-v0, 1 episode each" in capsys.readouterr().out
     _clbench("demonstrations", "toy_of_mine:clbench/Toy-v0")
     assert "left: retained, 10 episodes" in capsys.readouterr().out
+
+
+def test_demonstrations_are_exported_after_those_that_are_missing_are_collected(
+    empty_caches: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    output = empty_caches / "out"
+    _clbench("demonstrations", "export", TOY, "up", "left", "--format", "hdf5", "--output", str(output))
+    assert capsys.readouterr().out == f"2 tasks of clbench/Toy-v0 in {output}\n"
+    assert {path.name for path in output.iterdir()} == {"up_demo.hdf5", "left_demo.hdf5"}
+    assert len(list((empty_caches / "minari").rglob("main_data.hdf5"))) == 2
