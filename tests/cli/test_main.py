@@ -74,22 +74,6 @@ def _clbench(*arguments: str, folder: Path | None = None) -> subprocess.Complete
         (["run", "clbench/Fetch-v1", "sft", "--shard", "half"], "for example 2/8, not 'half'"),
         (["demonstrations", "clbench/Fetch"], "Did you mean 'clbench/Fetch-v"),
         (["demonstrations", "clbench/Fetch-v1", "--workers", "0"], "Must be >= 1."),
-        (
-            ["demonstrations", "export", "clbench/Fetch-v1", "pres", "--format", "hdf5", "--output", "x"],
-            "No task of clbench/Fetch-v1 is called 'pres'. Did you mean 'press'?",
-        ),
-        (
-            ["demonstrations", "export", "clbench/Fetch-v1", "--format", "hdf", "--output", "x"],
-            'Invalid value "hdf" for --format',
-        ),
-        (
-            ["demonstrations", "export", "clbench/Fetch-v1", "--format", "hdf5"],
-            "--output requires an argument",
-        ),
-        (
-            ["demonstrations", "import", "clbench/Fetch-v1", "press", "x.hdf5"],
-            "x.hdf5 cannot be read as HDF5",
-        ),
         (["pretrain", "clbench/Fetch"], "Did you mean 'clbench/Fetch-v"),
         (["pretrain", "clbench/Fetch-v1", "--seed", "-1"], "Must be >= 0."),
         (["submit", "sft", "--seeds", "0"], 'Invalid value "0" for --seeds. Must be >= 1.'),
