@@ -2,6 +2,8 @@ from . import metrics as metrics
 from .data.questions import QuestionKind as QuestionKind
 from .evaluation.rollouts import Episode as Episode
 from .evaluation.rollouts import Evaluator as Evaluator
+from .exchange.demonstrations import export_demonstrations as export_demonstrations
+from .exchange.demonstrations import import_demonstrations as import_demonstrations
 from .jobs.grid import RunsFailedError as RunsFailedError
 from .jobs.grid import run as run
 from .leaderboard import plot as plot  # type: ignore[import-not-found]  # in a checkout it is elsewhere

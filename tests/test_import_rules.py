@@ -29,7 +29,7 @@ FLOORS = (
     ("scoring", "data"),
     ("evaluation", "learning", "metrics"),
     ("runs",),
-    ("jobs", "serving", "testing"),
+    ("exchange", "jobs", "serving", "testing"),
     ("cli",),
 )
 """Packages of the core from the ground up. A package imports itself and those below it."""

@@ -1,11 +1,12 @@
-"""The commands that make what runs start from: `clbench demonstrations`, `pretrain` and `experts measure`."""
+"""The commands about what runs start from: `clbench demonstrations`, `pretrain` and `experts measure`."""
 
 from __future__ import annotations
 
 import shutil
 import sys
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Annotated
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter
 from rich.box import SIMPLE_HEAD
@@ -29,6 +30,7 @@ from clbench.spec.policies import DEFAULT_POLICY, SMALL, policy_name
 if TYPE_CHECKING:
     from clbench.data.expert_rates import Measurement
     from clbench.spec.scenario import Scenario
+    from clbench.spec.task import Task
 
 # PyTorch and the simulators are imported where they are needed: `--help` does not wait for them.
 
@@ -43,19 +45,13 @@ def demonstrations(
         workers: Number of tasks to collect at once; all cores if not given.
     """
     from clbench.data.demonstrations import dataset_folder, dataset_id, read_dataset
-    from clbench.jobs.plan import Plan
-    from clbench.jobs.processes import Processes
-    from clbench.jobs.scheduler import run_with_bars
     from clbench.spec.registry import load_scenario
 
     add_cwd_to_path()
     with checked_input():
         loaded = load_scenario(scenario)
         check_folders({})
-    plan = Plan()
-    plan.add_demonstrations(scenario, loaded, loaded.tasks)
-    if run_with_bars(plan.jobs, Processes(workers)):
-        sys.exit(1)
+    _collect(scenario, loaded, loaded.tasks, workers)
     console = Console()
     for task in loaded.tasks:
         episodes = read_dataset(dataset_folder(task, loaded.budget))
@@ -69,6 +65,84 @@ def demonstrations(
         )
         console.print(Text.assemble((task.name, "bold"), f": {', '.join(facts)}"))
         console.print(f"    {dataset_id(task, loaded.budget)}", highlight=False, markup=False, soft_wrap=True)
+
+
+def export(
+    scenario: ScenarioId,
+    /,
+    *tasks: str,
+    format: Literal["lerobot", "hdf5"],  # noqa: A002 - the word that everyone uses
+    output: Path,
+    workers: Annotated[int | None, whole_number(1)] = None,
+) -> None:
+    """Export the demonstrations of SCENARIO, or of TASKS alone, for other libraries.
+
+    They are collected first if they are missing. In both formats the actions are the expert's; where action
+    noise replaced one, `noisy` is true and `executed` holds the action that led to the next state.
+
+    Args:
+        scenario: Gymnasium id of the scenario.
+        tasks: Names of tasks; the retained skills and the targets if not given.
+        format: lerobot for one LeRobotDataset v3, with the instructions as its tasks, or hdf5 for a file
+            TASK_demo.hdf5 for each task, in the layout of robomimic and LIBERO.
+        output: New folder.
+        workers: Number of tasks to collect at once; all cores if not given.
+    """
+    from clbench.exchange.demonstrations import check_output, chosen_tasks, export_demonstrations
+
+    add_cwd_to_path()
+    with checked_input():
+        loaded, chosen = chosen_tasks(scenario, tasks)
+        check_output(output, format)
+        check_folders({"--output": output})
+    _collect(scenario, loaded, chosen, workers)
+    with checked_input():
+        folder = export_demonstrations(loaded, output, format=format, tasks=[task.name for task in chosen])
+    text = f"{counted(len(chosen), 'task')} of {loaded.id} in {folder}"
+    Console().print(text, highlight=False, markup=False, soft_wrap=True)
+
+
+def import_(
+    scenario: ScenarioId,
+    task: str,
+    path: Path,
+    /,
+    *,
+    state: Annotated[tuple[str, ...], Parameter(consume_multiple=True, negative="")] = ("states",),
+) -> None:
+    """Import recorded demonstrations: TASK of a SCENARIO of your own learns from the HDF5 file PATH.
+
+    The file has the layout of robomimic and LIBERO: one group data/demo_i for each demonstration, with
+    actions, states, rewards, dones and obs. It must fit the world, the horizon and the instructions of the
+    task, and have as many demonstrations as the budget. The task names the demonstrations in the place of an
+    expert; without that, the command checks the file and says what to write.
+
+    Args:
+        scenario: Gymnasium id of the scenario, as module:id.
+        task: Name of the task.
+        path: The HDF5 file.
+        state: Datasets of each demonstration that make, side by side, the state of the world, for example
+            obs/ee_states obs/gripper_states.
+    """
+    from clbench.exchange.demonstrations import import_demonstrations
+
+    add_cwd_to_path()
+    with checked_input():
+        check_folders({})
+        name = import_demonstrations(scenario, task, path, state=state)
+    Console().print(name, highlight=False, markup=False, soft_wrap=True)
+
+
+def _collect(name: str, scenario: Scenario, tasks: Sequence[Task], workers: int | None) -> None:
+    """Collect the demonstrations of tasks that are missing; end with exit code 1 if an expert fails."""
+    from clbench.jobs.plan import Plan
+    from clbench.jobs.processes import Processes
+    from clbench.jobs.scheduler import run_with_bars
+
+    plan = Plan()
+    plan.add_demonstrations(name, scenario, tasks)
+    if run_with_bars(plan.jobs, Processes(workers)):
+        sys.exit(1)
 
 
 def pretrain(
@@ -130,7 +204,8 @@ def measure(scenario: str, /, *tasks: str, episodes: Annotated[int, whole_number
         chosen = [loaded.task(name) for name in tasks] or list(loaded.tasks)
     with Bars(len(chosen) * episodes) as bars:
         bars.start(loaded.id, len(chosen) * episodes)
-        rows = expert_rates.measure(loaded, chosen, episodes, lambda done: bars.advance(loaded.id, done))
+        with checked_input():  # a task may have no expert
+            rows = expert_rates.measure(loaded, chosen, episodes, lambda done: bars.advance(loaded.id, done))
     Console().print(_table(loaded, rows, episodes))
     found = [expert_rates.complaint(task, row) for task, row in zip(chosen, rows, strict=True)]
     complaints = [text for text in found if text is not None]

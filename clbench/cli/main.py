@@ -14,6 +14,7 @@ from rich.logging import RichHandler
 import clbench
 from clbench.base.text import printable_lines
 from clbench.cli.arguments import parsing_error
+from clbench.cli.data import demonstrations as collect
 
 if TYPE_CHECKING:
     from cyclopts.help import HelpPanel
@@ -39,7 +40,6 @@ COMMANDS = {
     },
     "Inputs and machine": {
         "doctor": "clbench.cli.catalogue:doctor",
-        "demonstrations": "clbench.cli.data:demonstrations",
         "pretrain": "clbench.cli.data:pretrain",
         "cache": "clbench.cli.cache:cache",
     },
@@ -61,8 +61,15 @@ NAMES = {
     "tune": "SCENARIO [METHODS...]",
     "verify": "PATHS...",
     "scenario-card": "[SCENARIOS...]",
+    "export": "SCENARIO [TASKS...]",
 }
 """Arguments in the first line of a command's help, where Cyclopts would show [ARGS...]."""
+
+DEMONSTRATIONS = {
+    "export": "clbench.cli.data:export",
+    "import": "clbench.cli.data:import_",
+}
+"""Entry points of the commands of `clbench demonstrations`, which itself collects and lists them."""
 
 EXPERTS = {
     "measure": "clbench.cli.data:measure",
@@ -116,7 +123,7 @@ def _summary(entry_point: str) -> str:
     return (ast.get_docstring(next(found)) or "").partition("\n")[0]
 
 
-def _app(name: str, text: str, commands: dict[Group, dict[str, str]]) -> App:
+def _app(name: str, text: str | None, commands: dict[Group, dict[str, str]]) -> App:
     """Return the command `name` with lazy subcommands in groups."""
     made = App(
         name=name,
@@ -130,7 +137,8 @@ def _app(name: str, text: str, commands: dict[Group, dict[str, str]]) -> App:
     for group, members in commands.items():
         for number, (command, entry_point) in enumerate(members.items()):
             names = NAMES.get(command)
-            usage = f"Usage: {name} {command} [OPTIONS] {names}" if names else None
+            program = name if name == "clbench" else f"clbench {name}"
+            usage = f"Usage: {program} {command} [OPTIONS] {names}" if names else None
             made.command(entry_point, name=command, group=group, sort_key=number, usage=usage)
     return made
 
@@ -145,12 +153,18 @@ def _grouped(commands: dict[str, dict[str, str]]) -> dict[Group, dict[str, str]]
 
 GROUPS = _grouped(COMMANDS)
 app = _app("clbench", clbench.__doc__ or "", GROUPS)
+demonstrations = _app("demonstrations", None, _grouped({"Commands": DEMONSTRATIONS}))
+demonstrations.usage = (
+    "Usage: clbench demonstrations [OPTIONS] SCENARIO\n       clbench demonstrations COMMAND"
+)
+demonstrations.default(collect)
 experts = _app(
     "experts",
     "Measure the experts that demonstrate tasks, and train learned experts.",
     _grouped({"Commands": EXPERTS}),
 )
-experts.group = next(group for group in GROUPS if group.name == "Inputs and machine")
-experts.sort_key = len(COMMANDS["Inputs and machine"])
-app.command(experts)
+for place, nested in enumerate((demonstrations, experts)):
+    nested.group = next(group for group in GROUPS if group.name == "Inputs and machine")
+    nested.sort_key = len(COMMANDS["Inputs and machine"]) + place
+    app.command(nested)
 app.register_install_completion_command(help="Let TAB complete commands, options, methods and scenarios.")

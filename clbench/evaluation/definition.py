@@ -52,13 +52,14 @@ RANDOM = 5
 def definition(scenario: Scenario) -> dict[str, str]:
     """Return the hashes of a scenario by part.
 
-    Parts are "task NAME" and "rule NAME" for each task, "questions", and "camera" if there is one.
+    Parts are "task NAME" and "rule NAME" for each task, "questions", and "camera" if there is one. A task
+    that learns from a file has "demonstrations NAME", too.
     """
     tasks = (*scenario.tasks, *scenario.background, *scenario.scenes)
     suites = packages_of(tasks, "world", "expert", "camera")
-    rules = {
-        f"rule {task.name}": hash_of(rule_code(task)) for task in (*scenario.tasks, *scenario.background)
-    }
+    scored = (*scenario.tasks, *scenario.background)
+    rules = {f"rule {task.name}": hash_of(rule_code(task)) for task in scored}
+    recordings = {f"demonstrations {task.name}": recording_of(task) for task in scored}
     inputs = {
         "tasks": [[*_words(task), task.world, task.expert, task.camera] for task in tasks],
         "scenes": [task.name for task in scenario.scene_tasks],
@@ -72,7 +73,17 @@ def definition(scenario: Scenario) -> dict[str, str]:
         (folder / "definition.json").write_text(json.dumps(_hashes(scenario)), encoding="utf-8")
 
     folder = cached(cache_folder() / "definitions" / hash_of(inputs), inputs, write)
-    return {**read_json(folder / "definition.json"), **rules}
+    named = {part: recording for part, recording in recordings.items() if recording is not None}
+    return {**read_json(folder / "definition.json"), **rules, **named}
+
+
+def recording_of(task: Task) -> str | None:
+    """Return the hash of the recorded demonstrations that a task names in the place of an expert, or None.
+
+    `clbench.exchange.recorded` has the object that such a task names as its expert.
+    """
+    recording: str | None = getattr(resolve(task.expert), "recording", None)
+    return recording
 
 
 def _hashes(scenario: Scenario) -> dict[str, str]:
@@ -126,17 +137,21 @@ def _is_perturbable(task: Task) -> bool:
 
 
 def _moments(task: Task, perturbed: bool) -> Iterator[tuple[NDArray[Any], ...]]:
-    """Yield the steps of the fixed episodes: state, action, reward and success, and the last state alone."""
-    expert = resolve(task.expert)(task.name)
+    """Yield the steps of the fixed episodes: state, action, reward and success, and the last state alone.
+
+    All actions are random if the task has no expert.
+    """
+    expert = resolve(task.expert)(task.name) if recording_of(task) is None else None
     world = vector_world(task.world, 1, 1, perturbed)
     space = world.single_action_space
     generator = np.random.default_rng(0)
     for seed in range(EPISODES):
         state = world.reset([0], [seed], [task.name])[0].copy()
         for step in range(task.horizon):
-            action = np.round(expert(state) * GRID) / GRID
-            if step % RANDOM == RANDOM - 1:
+            if expert is None or step % RANDOM == RANDOM - 1:
                 action = generator.uniform(space.low, space.high)
+            else:
+                action = np.round(expert(state) * GRID) / GRID
             after, rewards, successes = world.step([0], action[None].astype(np.float32))
             yield state, action, rewards, successes
             state = after[0].copy()

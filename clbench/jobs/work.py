@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
+from clbench.base.errors import InputError
 from clbench.base.progress import ProgressCallback
 from clbench.jobs.job import JobError
 from clbench.runs.spec import RunSpec
@@ -28,13 +31,23 @@ class _Noticed:
         return "" if self._made else ", from the cache"
 
 
+@contextmanager
+def _explained() -> Iterator[None]:
+    """Let a job fail with the message of a wrong input: a task may have no expert that demonstrates it."""
+    try:
+        yield
+    except InputError as error:
+        raise JobError(str(error)) from error
+
+
 def collect_demonstrations(scenario: str, task: str, progress: ProgressCallback) -> str:
     """Collect the demonstrations of a task, unless they are in the cache."""
     from clbench.data.demonstrations import dataset_folder, read_dataset
 
     loaded = load_scenario(scenario)
     noticed = _Noticed(progress)
-    episodes = read_dataset(dataset_folder(loaded.task(task), loaded.budget, noticed))
+    with _explained():
+        episodes = read_dataset(dataset_folder(loaded.task(task), loaded.budget, noticed))
     steps = sum(len(episode.executed) for episode in episodes)
     return f"{len(episodes)} episodes, {steps} steps{noticed.source}"
 
@@ -45,7 +58,8 @@ def collect_scenes(scenario: str, progress: ProgressCallback) -> str:
 
     loaded = load_scenario(scenario)
     noticed = _Noticed(progress)
-    scenes_folder(loaded, noticed)
+    with _explained():
+        scenes_folder(loaded, noticed)
     train, test = load_questions(loaded)
     states = f"{len(train.scenes)} states, and {len(test.scenes)} for the test"
     return f"{len(train.kinds)} kinds about {states}{noticed.source}"

@@ -61,7 +61,8 @@ def lerobot_policy(
     """Return a policy of LeRobot as a function of observations.
 
     The batch that `preprocess` receives has `observation.state`, float32 (B, S), `task`, a list of B texts,
-    and with a camera `observation.images.<camera>`, float32 (B, 3, N, N) from 0 to 1. `postprocess` receives
+    and with a camera `observation.images.<camera>`, float32 (B, 3, N, N) from 0 to 1. Without a camera it has
+    the state as `observation.environment_state`, too: ACT refuses to go without both. `postprocess` receives
     the actions (B, A) of one step after another, as in LeRobot's own server. Noise is drawn from PyTorch's
     generator, which is seeded before each call.
 
@@ -75,13 +76,13 @@ def lerobot_policy(
     import torch  # LeRobot brings it
 
     def act(observations: Observations) -> NDArray[Any]:
-        batch = {
-            "observation.state": torch.from_numpy(observations["state"]),
-            "task": list(observations["instruction"]),
-        }
+        state = torch.from_numpy(observations["state"])
+        batch = {"observation.state": state, "task": list(observations["instruction"])}
         if "image" in observations:
             pictures = torch.from_numpy(observations["image"]).permute(0, 3, 1, 2)
             batch[f"observation.images.{camera}"] = pictures.contiguous().float() / 255
+        else:
+            batch["observation.environment_state"] = state
         torch.manual_seed(int(observations["seed"].sum() + observations["step"].sum()))
         with torch.no_grad():
             chunks = policy.predict_action_chunk(preprocess(batch))

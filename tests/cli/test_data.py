@@ -1,4 +1,4 @@
-"""`clbench demonstrations` and `clbench pretrain`."""
+"""`clbench demonstrations` with its export, and `clbench pretrain`."""
 
 from pathlib import Path
 
@@ -62,3 +62,33 @@ def test_a_scenario_of_the_working_folder_is_found(
     assert "Experts of clbench/Toy-v0, 1 episode each" in capsys.readouterr().out
     _clbench("demonstrations", "toy_of_mine:clbench/Toy-v0")
     assert "left: retained, 10 episodes" in capsys.readouterr().out
+
+
+def test_demonstrations_are_exported_after_those_that_are_missing_are_collected(
+    empty_caches: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    output = empty_caches / "out"
+    _clbench("demonstrations", "export", TOY, "up", "left", "--format", "hdf5", "--output", str(output))
+    assert capsys.readouterr().out == f"2 tasks of clbench/Toy-v0 in {output}\n"
+    assert {path.name for path in output.iterdir()} == {"up_demo.hdf5", "left_demo.hdf5"}
+    assert len(list((empty_caches / "minari").rglob("main_data.hdf5"))) == 2
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["export", TOY, "lft", "--format", "hdf5", "--output", "x"], "Did you mean 'left'?"),
+        (["export", TOY, "--format", "hdf", "--output", "x"], 'Invalid value "hdf" for --format'),
+        (["export", TOY, "--format", "hdf5"], "--output requires an argument"),
+        (["import", TOY, "left", "x.hdf5"], "x.hdf5 cannot be read as HDF5"),
+    ],
+)
+def test_an_export_or_import_of_bad_input_ends_with_exit_code_2_and_one_line(
+    arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as ended:
+        app(["demonstrations", *arguments])
+    printed = "".join(capsys.readouterr())
+    assert ended.value.code == 2
+    assert message in printed
+    assert len(printed.splitlines()) == 1

@@ -212,7 +212,10 @@ def test_a_policy_of_lerobot_receives_its_batch_and_its_actions_are_processed_st
     assert (picture.shape, picture.dtype, picture.is_contiguous()) == ((2, 3, 4, 4), torch.float32, True)
     assert np.allclose(picture.numpy().transpose(0, 2, 3, 1) * 255, OBSERVATIONS["image"])
     act({name: values for name, values in OBSERVATIONS.items() if name != "image"})
-    assert set(policy.batches[1]) == {"observation.state", "task"}
+    assert set(policy.batches[1]) == {"observation.state", "observation.environment_state", "task"}
+    assert torch.equal(
+        policy.batches[1]["observation.environment_state"], policy.batches[1]["observation.state"]
+    )
 
 
 def test_a_policy_of_lerobot_draws_the_same_noise_for_the_same_request() -> None:

@@ -1,0 +1,179 @@
+"""Export of demonstrations to other libraries, and import of recorded ones."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import closing
+from pathlib import Path
+from typing import Literal, get_args
+
+from clbench.base.cache import cached
+from clbench.base.dependencies import require
+from clbench.base.entry_points import resolve, unknown
+from clbench.base.errors import InputError
+from clbench.base.leftovers import unfinished
+from clbench.base.text import counted
+
+# private names: under public ones every dataset and the policy that ships would have to be made again
+from clbench.data.demonstrations import (
+    Demonstration,
+    _declare_namespaces,
+    _inputs,
+    _write,
+    dataset_folder,
+    dataset_id,
+    read_dataset,
+)
+from clbench.evaluation.definition import recording_of
+from clbench.exchange.recorded import expert_of, recording_hash
+from clbench.spec.registry import load_scenario
+from clbench.spec.scenario import Scenario
+from clbench.spec.task import Task
+
+Format = Literal["lerobot", "hdf5"]
+"""Format of exported demonstrations: one LeRobotDataset, or one HDF5 file for each task."""
+
+
+def export_demonstrations(
+    scenario: Scenario | str,
+    output: Path | str,
+    *,
+    format: Format,  # noqa: A002 - the word that everyone uses
+    tasks: Iterable[str] = (),
+) -> Path:
+    """Export demonstrations, which are collected on first use, and return the folder that holds them.
+
+    Args:
+        scenario: Scenario, or its Gymnasium id.
+        output: New folder.
+        format: "lerobot" for one LeRobotDataset v3 of all tasks, or "hdf5" for one file of the layout of
+            robomimic and LIBERO for each task, `TASK_demo.hdf5`.
+        tasks: Names of tasks; the retained skills and the targets if there are none.
+
+    Raises:
+        InputError: The folder exists, the format is unknown, or a world does not give its steps per second.
+        LookupError: A name is unknown, or a package is not installed.
+        RenderingError: The tasks have a camera, and no back end of this machine can draw.
+    """
+    loaded, chosen = chosen_tasks(scenario, tasks)
+    folder = check_output(output, format)
+    found = {task: read_dataset(dataset_folder(task, loaded.budget)) for task in chosen}
+    return _in_one_step(folder, lambda partial: _WRITERS[format](partial, found))
+
+
+def chosen_tasks(scenario: Scenario | str, tasks: Iterable[str]) -> tuple[Scenario, list[Task]]:
+    """Return a scenario, and those of its tasks that have some names.
+
+    Raises:
+        LookupError: A name is unknown; the nearest one is named.
+    """
+    loaded = load_scenario(scenario) if isinstance(scenario, str) else scenario
+    names = dict.fromkeys(tasks)
+    return loaded, [loaded.task(name) for name in names] or [*loaded.retained, *loaded.target]
+
+
+def check_output(output: Path | str, kind: str) -> Path:
+    """Return the folder of an export, before any work starts.
+
+    Raises:
+        InputError: The folder exists.
+        LookupError: There is no such format, or a package that it needs is not installed.
+    """
+    if kind not in get_args(Format):
+        raise unknown("format", kind, get_args(Format))
+    if kind == "lerobot":
+        require("pyarrow", "exchange", "A LeRobotDataset")
+    if os.path.lexists(output):
+        raise InputError(f"{output} exists: an export makes a new folder.")
+    return Path(output)
+
+
+def _write_files(folder: Path, tasks: Mapping[Task, Sequence[Demonstration]]) -> None:
+    from clbench.exchange.hdf5 import write_hdf5
+
+    for task, episodes in tasks.items():
+        write_hdf5(folder / f"{task.name}_demo.hdf5", task, episodes)
+
+
+def _write_dataset(folder: Path, tasks: Mapping[Task, Sequence[Demonstration]]) -> None:
+    from clbench.exchange.lerobot import write_lerobot
+
+    write_lerobot(folder, tasks)
+
+
+_WRITERS = {"lerobot": _write_dataset, "hdf5": _write_files}
+
+
+def _in_one_step(folder: Path, fill: Callable[[Path], None]) -> Path:
+    """Return a folder that appears when it is complete."""
+    folder.absolute().parent.mkdir(parents=True, exist_ok=True)
+    partial = unfinished(folder)
+    partial.mkdir()
+    try:
+        fill(partial)
+        return partial.rename(folder)
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+
+
+def import_demonstrations(
+    scenario: Scenario | str, task: str, path: Path | str, *, state: Sequence[str] = ("states",)
+) -> str:
+    """Keep the demonstrations of an HDF5 file as the Minari dataset of a task, and return its id.
+
+    The task must name these demonstrations in the place of an expert; if it does not, the error says how. The
+    definition of the scenario, which is in all its records, then says which demonstrations the task has.
+
+    Args:
+        scenario: Scenario of your own, or its Gymnasium id.
+        task: Name of the task.
+        path: File of the layout of robomimic and LIBERO, with one group `data/demo_i` for each demonstration.
+        state: Datasets of each demonstration that make, side by side, the state of the task's world, for
+            example ("obs/ee_states", "obs/gripper_states").
+
+    Raises:
+        InputError: The file cannot be read or does not fit the task, the task has an expert or names other
+            demonstrations, or the budget of the scenario has another number of them.
+        LookupError: There is no such scenario or task.
+    """
+    from minari.storage.datasets_root_dir import get_dataset_path
+
+    from clbench.exchange.hdf5 import read_hdf5
+
+    loaded, (chosen,) = chosen_tasks(scenario, [task])
+    episodes = read_hdf5(Path(path), chosen, state)
+    _check_owner(loaded, chosen, recording_hash(episodes), Path(path))
+    if len(episodes) != loaded.budget.demonstrations:
+        raise InputError(
+            f"{path} has {counted(len(episodes), 'demonstration')}, but the budget of {loaded.id} has "
+            f"{loaded.budget.demonstrations}: both must agree, because records show the budget."
+        )
+    name = dataset_id(chosen, loaded.budget)
+    folder = get_dataset_path(name)
+    _declare_namespaces(folder, name)
+
+    def make(partial: Path) -> None:
+        with closing(resolve(chosen.world)()) as world:
+            _write(partial / "data", name, chosen, world, episodes)
+
+    cached(folder, _inputs(chosen, loaded.budget), make)
+    return name
+
+
+def _check_owner(scenario: Scenario, task: Task, found: str, path: Path) -> None:
+    """Check that a task names the demonstrations that were found in a file."""
+    named = recording_of(task)
+    if named == found:
+        return
+    how = f'expert="{expert_of(found)}"'
+    if named is None:
+        raise InputError(
+            f"{path} fits the task {task.name} of {scenario.id}, but results of this task stand for the "
+            f"demonstrations of its expert. Give a task of your own scenario {how} to learn from this file."
+        )
+    raise InputError(
+        f"{path} holds the recording {found}, but the task {task.name} of {scenario.id} names {named}. To "
+        f"learn from this file, give it {how}."
+    )

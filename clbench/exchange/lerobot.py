@@ -1,0 +1,216 @@
+"""Demonstrations as a LeRobotDataset v3: Parquet files and their statistics, written without LeRobot.
+
+`action` is the expert's action in each state, which the policies of clbench learn. Where action noise
+replaced it, `noisy` is true and `executed` holds the action that led to the next state.
+
+Source: `lerobot.datasets` 0.6.1, https://huggingface.co/docs/lerobot/lerobot-dataset-v3.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pyarrow as pa
+import pyarrow.parquet as parquet
+from numpy.typing import NDArray
+
+from clbench.base.dependencies import require
+from clbench.base.errors import InputError
+from clbench.data.demonstrations import Demonstration
+from clbench.exchange.shown import Shown, shown, steps_per_second
+from clbench.spec.task import Task
+
+FILE = "chunk-000/file-000.parquet"
+"""Only file of the data, and of the facts about episodes: the largest scenario of the project has 200 MB."""
+
+IMAGE = "observation.images.image"
+"""Name of the picture that a policy sees; the camera is called image, as in `clbench/serving/server.py`."""
+
+ENVIRONMENT_STATE = "observation.environment_state"
+"""Second name of the state where there is no picture: LeRobot's ACT and diffusion policies refuse to go
+without one of the two."""
+
+QUANTILES = (0.01, 0.1, 0.5, 0.9, 0.99)
+"""Quantiles among the statistics, as in LeRobot: q01 to q99."""
+
+Columns = dict[str, NDArray[Any]]
+"""Values of an episode by feature, (T,), (T, N), or pictures (T, N, N, 3)."""
+
+
+def write_lerobot(folder: Path, tasks: Mapping[Task, Sequence[Demonstration]]) -> None:
+    """Write the demonstrations of tasks as one LeRobotDataset.
+
+    The episodes of a task have its wordings in turn as their task.
+
+    Args:
+        folder: Folder to fill.
+        tasks: Demonstrations by task.
+
+    Raises:
+        InputError: A world does not give its steps per second, or two worlds have different rates.
+        RenderingError: The tasks have a camera, and no back end of this machine can draw.
+    """
+    rates = {steps_per_second(task) for task in tasks}
+    if len(rates) > 1:
+        raise InputError(
+            f"A LeRobotDataset has one rate, but the tasks have {sorted(rates)} steps per second."
+        )
+    (rate,) = rates
+    texts = [words for task in tasks for words in task.instructions]
+    episodes = list(_episodes(tasks, texts, rate))
+    features = {name: _feature(values) for name, values in episodes[0].items()}
+    _write_table(folder / "data" / FILE, pa.concat_tables(_table(episode, features) for episode in episodes))
+    meta = folder / "meta"
+    _write_table(meta / "episodes" / FILE, _facts(episodes, texts))
+    indices = pd.DataFrame({"task_index": range(len(texts))}, index=pd.Index(texts, name="task"))
+    _write_table(meta / "tasks.parquet", pa.Table.from_pandas(indices))
+    every = {name: np.concatenate([episode[name] for episode in episodes]) for name in features}
+    info = {
+        "codebase_version": "v3.0",
+        "robot_type": next(iter(tasks)).suite,
+        "total_episodes": len(episodes),
+        "total_frames": len(every["index"]),
+        "total_tasks": len(texts),
+        "chunks_size": 1000,
+        "data_files_size_in_mb": 100,
+        "video_files_size_in_mb": 200,
+        "fps": int(rate) if rate.is_integer() else rate,
+        "splits": {"train": f"0:{len(episodes)}"},
+        "data_path": "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet",
+        "video_path": None,
+        "features": features,
+    }
+    stats = {name: _as_lists(_statistics(values)) for name, values in every.items()}
+    for name, content in (("info.json", info), ("stats.json", stats)):
+        (meta / name).write_text(json.dumps(content, indent=4), encoding="utf-8")
+
+
+def _episodes(
+    tasks: Mapping[Task, Sequence[Demonstration]], texts: Sequence[str], rate: float
+) -> Iterator[Columns]:
+    """Yield the columns of each episode."""
+    frames = number = 0
+    for task, episodes in tasks.items():
+        for place, one in enumerate(shown(task, episodes)):
+            words = task.instructions[place % len(task.instructions)]
+            yield _columns(one, number, frames, texts.index(words), rate)
+            number, frames = number + 1, frames + len(one.state)
+
+
+def _columns(one: Shown, number: int, first: int, text: int, rate: float) -> Columns:
+    """Return the columns of an episode.
+
+    Args:
+        one: The episode.
+        number: Number of the episode.
+        first: Number of its first frame among all frames.
+        text: Number of its instruction.
+        rate: Steps per second.
+    """
+    episode, steps = one.episode, np.arange(len(one.state))
+    done = steps == len(steps) - 1
+    return {
+        "observation.state": one.state,
+        **({IMAGE: one.image} if one.image.size else {ENVIRONMENT_STATE: one.state}),
+        "action": episode.expert[:-1],
+        "executed": episode.executed,
+        "noisy": episode.noisy[:-1],
+        "next.reward": episode.reward,
+        "next.done": done,
+        "next.success": done & episode.success,
+        "timestamp": (steps / rate).astype(np.float32),
+        "frame_index": steps,
+        "episode_index": np.full(len(steps), number),
+        "index": steps + first,
+        "task_index": np.full(len(steps), text),
+    }
+
+
+def _feature(values: NDArray[Any]) -> dict[str, Any]:
+    """Return the entry of a column in info.json."""
+    if values.ndim == 4:
+        names = ["height", "width", "channels"]
+        return {"dtype": "image", "shape": list(values.shape[1:]), "names": names}
+    return {"dtype": str(values.dtype), "shape": list(values.shape[1:]) or [1], "names": None}
+
+
+def _table(episode: Columns, features: Mapping[str, Mapping[str, Any]]) -> pa.Table:
+    """Return the frames of an episode as a table of Arrow."""
+    return pa.table({name: _array(episode[name], features[name]["dtype"]) for name in features})
+
+
+def _array(values: NDArray[Any], kind: str) -> pa.Array:
+    if kind == "image":
+        pictures = [{"bytes": _png(picture), "path": None} for picture in values]
+        return pa.array(pictures, pa.struct({"bytes": pa.binary(), "path": pa.string()}))
+    flat = pa.array(np.ascontiguousarray(values).reshape(-1))
+    # LeRobot reads a feature of one number as a number, not as a list
+    width = values.shape[1] if values.ndim == 2 else 1
+    return flat if width == 1 else pa.FixedSizeListArray.from_arrays(flat, width)
+
+
+def _png(picture: NDArray[np.uint8]) -> bytes:
+    """Return a picture (N, N, 3) as a PNG file, which loses nothing."""
+    require("PIL", "exchange", "A LeRobotDataset with pictures")
+    from PIL import Image
+
+    file = io.BytesIO()
+    Image.fromarray(picture).save(file, "PNG")
+    return file.getvalue()
+
+
+def _facts(episodes: Sequence[Columns], texts: Sequence[str]) -> pa.Table:
+    """Return the facts about each episode: its place in the data, its task, and its statistics."""
+    rows = []
+    for episode in episodes:
+        first, length = int(episode["index"][0]), len(episode["index"])
+        stats = {name: _as_lists(_statistics(values)) for name, values in episode.items()}
+        rows.append(
+            {
+                "episode_index": int(episode["episode_index"][0]),
+                "tasks": [texts[int(episode["task_index"][0])]],
+                "length": length,
+                "data/chunk_index": 0,
+                "data/file_index": 0,
+                "dataset_from_index": first,
+                "dataset_to_index": first + length,
+                **{f"stats/{name}/{key}": value for name, one in stats.items() for key, value in one.items()},
+                "meta/episodes/chunk_index": 0,
+                "meta/episodes/file_index": 0,
+            }
+        )
+    return pa.Table.from_pylist(rows)
+
+
+def _statistics(values: NDArray[Any]) -> Columns:
+    """Return the statistics of a column: per number, or per colour (3, 1, 1) from 0 to 1 for pictures."""
+    pictures = values.ndim == 4
+    rows = values.reshape(-1, 3) / 255 if pictures else values.reshape(len(values), -1).astype(np.float64)
+    found = {
+        "min": rows.min(axis=0),
+        "max": rows.max(axis=0),
+        "mean": rows.mean(axis=0),
+        "std": rows.std(axis=0),
+        **{
+            f"q{100 * share:02.0f}": quantile
+            for share, quantile in zip(QUANTILES, np.quantile(rows, QUANTILES, axis=0), strict=True)
+        },
+    }
+    if pictures:
+        found = {name: value.reshape(3, 1, 1) for name, value in found.items()}
+    return {**found, "count": np.array([len(values)])}
+
+
+def _as_lists(stats: Columns) -> dict[str, list[Any]]:
+    return {name: values.tolist() for name, values in stats.items()}
+
+
+def _write_table(path: Path, table: pa.Table) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    parquet.write_table(table, path)

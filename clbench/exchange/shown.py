@@ -1,0 +1,57 @@
+"""What a data set for others holds of each demonstration: what a policy sees, and the actions to learn."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import closing
+from dataclasses import dataclass
+
+import numpy as np
+
+from clbench.base.entry_points import resolve
+from clbench.base.errors import InputError
+from clbench.data.demonstrations import Demonstration
+from clbench.spec.task import Task
+from clbench.worlds.camera import Images, States
+from clbench.worlds.observation import observed
+
+
+@dataclass(frozen=True)
+class Shown:
+    """An episode of T steps with the observations of a policy."""
+
+    episode: Demonstration
+    """The demonstration."""
+    state: States
+    """Numbers that a policy sees before each step, (T, P)."""
+    image: Images
+    """Pictures that a policy sees before each step, (T, N, N, 3); N is 0 without a camera."""
+
+
+def shown(task: Task, episodes: Sequence[Demonstration]) -> Iterator[Shown]:
+    """Yield the episodes of a task with the observations of a policy.
+
+    Raises:
+        RenderingError: The task has a camera, and no back end of this machine can draw.
+    """
+    state, image = observed(task, np.concatenate([episode.state[:-1] for episode in episodes]))
+    ends = np.cumsum([len(episode.executed) for episode in episodes])
+    starts = [0, *ends[:-1]]
+    for episode, start, end in zip(episodes, starts, ends, strict=True):
+        yield Shown(episode, state[start:end], image[start:end])
+
+
+def steps_per_second(task: Task) -> float:
+    """Return the control rate of a task's world.
+
+    Raises:
+        InputError: The world gives no rate.
+    """
+    with closing(resolve(task.world)()) as world:
+        rate = world.metadata.get("render_fps")
+    if rate is None:
+        raise InputError(
+            f"The world {task.world} of the task {task.name} does not give its steps per second, which a "
+            'data set holds: add them to its class, for example metadata = {"render_fps": 25}.'
+        )
+    return float(rate)

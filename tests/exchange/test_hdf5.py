@@ -1,0 +1,219 @@
+"""HDF5 files: our own come back bit for bit, those of others are checked against the task."""
+
+import dataclasses
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+from helpers import same_demonstrations
+
+from clbench import export_demonstrations
+from clbench.base.errors import InputError
+from clbench.data.demonstrations import Demonstrations, dataset_folder, read_dataset
+from clbench.exchange.hdf5 import read_hdf5
+from clbench.spec.task import Task
+from clbench.testing import TOY
+
+TASK = TOY.task("right")
+CAMERA = "clbench.testing.toy_camera:ToyCamera"
+
+
+@pytest.fixture
+def exported(tmp_path: Path) -> Path:
+    """The file of one task of the toy."""
+    return export_demonstrations(TOY, tmp_path / "out", format="hdf5", tasks=["right"]) / "right_demo.hdf5"
+
+
+@pytest.fixture
+def libero(tmp_path: Path) -> Path:
+    """A file as LIBERO's, for the toy: float64, states of another simulator, and no final state."""
+    path = tmp_path / "go_right_demo.hdf5"
+    generator = np.random.default_rng(0)
+    with h5py.File(path, "w") as file:
+        data = file.create_group("data")
+        data.attrs["env_args"] = json.dumps({"type": 1, "env_kwargs": {"control_freq": 10}})
+        data.attrs["problem_info"] = json.dumps({"language_instruction": '"go right"'})
+        data.attrs["num_demos"], data.attrs["total"] = 12, 12 * 5
+        for number in range(12):
+            demo = data.create_group(f"demo_{number}")
+            demo.attrs["num_samples"] = 5
+            demo["actions"] = np.full((5, 2), 0.01 * number)
+            demo["states"] = generator.normal(size=(5, 47))
+            demo["robot_states"] = generator.normal(size=(5, 9))
+            demo["rewards"] = demo["dones"] = np.array([0, 0, 0, 0, 1], np.uint8)
+            demo["obs/ee_pos"] = generator.normal(size=(5, 3))
+            demo["obs/gripper"] = generator.normal(size=(5, 1))
+            demo["obs/agentview_rgb"] = np.zeros((5, 8, 8, 3), np.uint8)
+    return path
+
+
+def test_an_exported_file_comes_back_bit_for_bit(exported: Path) -> None:
+    before = read_dataset(dataset_folder(TASK, TOY.budget))
+    after = read_hdf5(exported, TASK)
+    assert same_demonstrations(after, before)
+    for one, other in zip(after, before, strict=True):
+        for found, expected in zip(vars(one).values(), vars(other).values(), strict=True):
+            assert np.asarray(found).dtype == np.asarray(expected).dtype
+
+
+def test_a_file_has_the_layout_that_robomimic_reads(exported: Path) -> None:
+    (*_, episode) = read_dataset(dataset_folder(TASK, TOY.budget))
+    with h5py.File(exported) as file:
+        data = file["data"]
+        assert data.attrs["total"] == sum(data[name].attrs["num_samples"] for name in data)
+        assert json.loads(data.attrs["problem_info"]) == {"language_instruction": "go right"}
+        arguments = json.loads(data.attrs["env_args"])
+        assert arguments["env_name"] == "clbench/toy.right-v0"
+        assert arguments["env_kwargs"]["control_freq"] == 10
+        demo = data["demo_9"]
+        steps = demo.attrs["num_samples"]
+        for name in ("actions", "dones", "rewards", "states", "obs/state"):
+            assert len(demo[name]) == steps
+        assert np.array_equal(demo["actions"], episode.expert[:-1])
+        assert np.array_equal(demo["obs/state"], episode.state[:-1])
+        assert list(demo["dones"]) == [0] * (steps - 1) + [1]
+
+
+def test_a_file_of_a_task_with_a_camera_has_what_a_policy_sees(tmp_path: Path) -> None:
+    seen = dataclasses.replace(TASK, camera=CAMERA)
+    scenario = dataclasses.replace(TOY, retained=(), scenes=(seen,), target=(seen,), held_out=())
+    folder = export_demonstrations(scenario, tmp_path / "out", format="hdf5")
+    with h5py.File(folder / "right_demo.hdf5") as file:
+        demo = file["data/demo_0"]
+        assert demo["obs/image"].shape == (demo.attrs["num_samples"], 16, 16, 3)
+        assert demo["obs/image"].dtype == np.uint8
+        assert np.array_equal(demo["obs/state"], demo["states"][:, :1])
+    assert same_demonstrations(
+        read_hdf5(folder / "right_demo.hdf5", seen), read_dataset(dataset_folder(seen, TOY.budget))
+    )
+
+
+def test_a_file_of_liberos_layout_is_read_in_the_order_of_its_numbers(libero: Path) -> None:
+    episodes = read_hdf5(libero, TASK, ["obs/ee_pos", "obs/gripper"])
+    assert [episode.executed[0, 0] for episode in episodes] == [np.float32(0.01 * n) for n in range(12)]
+    with h5py.File(libero) as file:
+        demo = file["data/demo_3"]
+        expected = np.concatenate([demo["obs/ee_pos"], demo["obs/gripper"]], axis=1).astype(np.float32)
+    episode = episodes[3]
+    assert np.array_equal(episode.state[:-1], expected)
+    assert np.array_equal(episode.expert[:-1], episode.executed)
+    assert not episode.noisy.any()
+    assert episode.success
+    assert list(episode.reward) == [0, 0, 0, 0, 1]
+
+
+def test_what_a_file_does_not_say_is_missing_and_reaches_no_policy(libero: Path) -> None:
+    episodes = read_hdf5(libero, TASK, ["obs/ee_pos", "obs/gripper"])
+    assert np.isnan(episodes[0].state[-1]).all()
+    assert np.isnan(episodes[0].expert[-1]).all()
+    data = Demonstrations.of_task(TASK, episodes, chunk=3)
+    assert all(tensor.isfinite().all() for tensor in (data.state, data.action, data.scenes))
+
+
+def _set(name: str, value: Any) -> Callable[[h5py.Group], None]:
+    def edit(data: h5py.Group) -> None:
+        del data[name]
+        data[name] = value
+
+    return edit
+
+
+def _attribute(name: str, value: Any, group: str = "") -> Callable[[h5py.Group], None]:
+    def edit(data: h5py.Group) -> None:
+        (data[group] if group else data).attrs[name] = value
+
+    return edit
+
+
+def _longer(data: h5py.Group) -> None:
+    for name in ("actions", "executed", "states", "rewards", "dones", "noisy"):
+        rows = np.repeat(np.asarray(data["demo_0"][name]), 4, axis=0)[:13]
+        _set(f"demo_0/{name}", rows)(data)
+
+
+def _remove(name: str) -> Callable[[h5py.Group], None]:
+    return lambda data: data.__delitem__(name)
+
+
+def _all(data: h5py.Group) -> None:
+    for name in list(data):
+        del data[name]
+
+
+def _last(value: float) -> Callable[[h5py.Group], None]:
+    def edit(data: h5py.Group) -> None:
+        data["demo_1/actions"][1, 0] = value
+
+    return edit
+
+
+@pytest.mark.parametrize(
+    ("edit", "message"),
+    [
+        (_all, r"no demonstrations: the layout of robomimic and LIBERO has data/demo_0"),
+        (_remove("demo_1/actions"), r"data/demo_1 has no 'actions'\..* It has \['dones', 'executed', "),
+        (_remove("demo_1/dones"), r"data/demo_1 has no 'dones'"),
+        (_set("demo_1/actions", np.zeros((4, 3))), "actions have the width 3, but the world .* needs 2"),
+        (_set("demo_1/states", np.zeros((4, 47))), "states have the width 47, but the world .* needs 4"),
+        (_set("demo_1/actions", np.zeros(4)), r"demo_1/actions must be numbers \(T, N\), not float64 \(4,\)"),
+        (_set("demo_1/dones", ["no"] * 4), r"demo_1/dones must be numbers \(T,\), not object \(4,\)"),
+        (_set("demo_1/rewards", np.zeros(3)), "demo_1/rewards has 3 rows, but there are 4 actions"),
+        (_set("demo_1/final_state", np.zeros(3)), r"final_state has the shape \(3,\), not \(4,\)"),
+        (
+            _set("demo_1/dones", np.zeros(4)),
+            "data/demo_1 does not end in success: the last of its dones is 0",
+        ),
+        (_set("demo_1/states", np.full((4, 4), np.nan)), "demo_1/states holds numbers that are not finite"),
+        (_set("demo_1/states", np.full((4, 4), 1e300)), r"states hold 1e\+300 in row 0, column 0"),
+        (_last(1.5), r"demo_1: actions hold 1.5 in row 1, column 0: the world .* numbers from -1 to 1"),
+        (
+            _set("demo_1/actions", np.zeros((0, 2))),
+            "data/demo_1 has 0 steps, but the task right ends after 12",
+        ),
+        (_longer, "data/demo_0 has 13 steps, but the task right ends after 12"),
+        (_attribute("num_samples", 3, "demo_1"), "demo_1 has num_samples 3, but 4 rows of actions"),
+        (_attribute("total", 1), "data has total 1, but its demonstrations have 47 steps"),
+        (
+            _attribute("problem_info", '{"language_instruction": "go down"}'),
+            "its instruction is 'go down', which the task right does not have",
+        ),
+        (
+            _attribute("env_args", '{"env_kwargs": {"control_freq": 20}}'),
+            "recorded at 20 steps per second, but the world .* makes 10: an action would last another time",
+        ),
+    ],
+)
+def test_what_does_not_fit_is_named(edit: Callable[[h5py.Group], None], message: str, exported: Path) -> None:
+    with h5py.File(exported, "r+") as file:
+        edit(file["data"])
+    with pytest.raises(InputError, match=f"^{exported}: .*{message}"):
+        read_hdf5(exported, TASK)
+
+
+def test_the_datasets_of_the_state_are_named_with_the_nearest_one(libero: Path) -> None:
+    with pytest.raises(InputError, match=r"data/demo_0 has no 'obs/ee_ps'\. Did you mean 'obs/ee_pos'\?"):
+        read_hdf5(libero, TASK, ["obs/ee_ps"])
+    with pytest.raises(InputError, match="obs/ee_pos and robot_states have the width 12"):
+        read_hdf5(libero, TASK, ["obs/ee_pos", "robot_states"])
+
+
+@pytest.mark.parametrize("content", [None, b"no HDF5"])
+def test_a_file_that_is_missing_or_no_hdf5_is_named(content: bytes | None, tmp_path: Path) -> None:
+    path = tmp_path / "x.hdf5"
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(InputError, match=f"{path} cannot be read as HDF5"):
+        read_hdf5(path, TASK)
+
+
+def test_attributes_that_say_nothing_are_no_fault(exported: Path) -> None:
+    with h5py.File(exported, "r+") as file:
+        for name in list(file["data"].attrs):
+            del file["data"].attrs[name]
+        file["data"].attrs["env_args"] = "[1]"
+    task: Task = dataclasses.replace(TASK, instructions=("another",))
+    assert len(read_hdf5(exported, task)) == 10
