@@ -18,6 +18,10 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from clbench.base.dependencies import require
+
+require("libero", "libero", "The LIBERO world")
+
 _MACROS = "No private macro file", "It is recommended to use a private macro file", "To setup, run: python"
 
 

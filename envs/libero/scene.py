@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import functools
 from dataclasses import dataclass
-from typing import TypeAlias
+from typing import Any, TypeAlias
 from xml.etree import ElementTree
 
 import mujoco
@@ -61,6 +61,10 @@ class Scene:
     """Compiled places of the bodies; a problem moves the fixtures among them."""
     rest: Sensed
     """What the controller senses when the arm is at rest."""
+
+    def __deepcopy__(self, _: dict[int, Any]) -> Scene:
+        """Return the scene itself: a copied world shares it, too."""
+        return self
 
     @functools.cached_property
     def drawn(self) -> mujoco.MjModel:
