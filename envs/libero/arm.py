@@ -16,11 +16,10 @@ import math
 from typing import NamedTuple
 
 import mujoco
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from .original import nullspace_torques, opspace_matrices, orientation_error, set_goal_orientation
+from .original import njit, nullspace_torques, opspace_matrices, orientation_error, set_goal_orientation
 
 Vector = NDArray[np.float64]
 
@@ -57,7 +56,7 @@ class Sensed(NamedTuple):
     """Positions of the arm's joints (7,)."""
 
 
-@numba.njit(nogil=True, cache=True)  # type: ignore[untyped-decorator]
+@njit(nogil=True, cache=True)  # type: ignore[untyped-decorator]
 def _torques(sensed: Sensed, bias: Vector, goal: Vector, goal_axes: Vector, rest: Vector) -> Vector:
     """Return the torques of the joints (7,) before they are clipped.
 

