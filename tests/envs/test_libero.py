@@ -48,11 +48,11 @@ def trails(starts: Iterable[Start], steps: int = 15) -> dict[Start, str]:
     for task, seed in starts:
         problem = problem_of(task)
         episode = episodes.setdefault(id(problem.scene), Episode(problem))
-        trail = hashlib.sha256(episode.begin(problem, seed))
+        trail, data = hashlib.sha256(episode.begin(problem, seed)), episode.data
         for action in random_actions(seed, steps):
             episode.action = action
             episode.move()
-            trail.update(episode.data.qpos.tobytes() + episode.data.qvel.tobytes())
+            trail.update(b"".join(part.tobytes() for part in (data.qpos, data.qvel, data.xpos)))
         found[task, seed] = trail.hexdigest()
     return found
 
