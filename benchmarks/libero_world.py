@@ -4,9 +4,9 @@ Speed: blocks of random actions take turns, and the clock counts this process's 
 compares two blocks of one round; results are the median over rounds and its 95 % bootstrap interval.
 
 Resets: episodes of each task begin from initial states 0, 1, 2, ... and, in another world, from the same ones
-with the last one first. An episode repeats itself if both end with all bodies in the same places and all joints
-at the same speeds, to the last bit. LIBERO's environment is seeded once, as in its evaluation, or before each
-reset.
+with the last one first. An episode repeats itself if both end with all bodies in the same places and all
+joints at the same speeds, to the last bit. LIBERO's environment is seeded once, as in its evaluation, or before
+each reset.
 
     python benchmarks/libero_world.py
 """
