@@ -33,6 +33,8 @@ SCALE = np.array([0.05, 0.05, 0.05, 0.5, 0.5, 0.5])
 """Displacement of the hand's goal for an action of 1, in metres and radians (6,)."""
 STIFFNESS, DAMPING = 150.0, 2 * math.sqrt(150.0)
 """Gains on the errors of position and orientation, and on the velocities; the damping is critical."""
+FINGERS = (-1.0, 1.0)
+"""Directions in which the two fingers close."""
 FINGER_SPEED = 0.01
 """Change of a finger's control in a physics step, as a share of half its range."""
 SITE = "gripper0_grip_site"
@@ -57,10 +59,29 @@ class Sensed(NamedTuple):
 
 
 @njit(nogil=True, cache=True)  # type: ignore[untyped-decorator]
-def _torques(sensed: Sensed, bias: Vector, goal: Vector, goal_axes: Vector, rest: Vector) -> Vector:
-    """Return the torques of the joints (7,) before they are clipped.
+def _drive(
+    sensed: Sensed,
+    bias: Vector,
+    goal: Vector,
+    goal_axes: Vector,
+    closing: Vector,
+    direction: float,
+    limits: Vector,
+    controls: Vector,
+) -> None:
+    """Set the controls of a physics step: torques of the joints, and places of the fingers.
 
     Matrices have the layouts in memory that robosuite's have, column by column: others change the last bit.
+
+    Args:
+        sensed: What the controller senses.
+        bias: Bias forces of the joints (7,).
+        goal: Goal of the hand's position (3,).
+        goal_axes: Goal of its orientation (3, 3).
+        closing: Shares to which the fingers are closed (2,), which change.
+        direction: 1 to close them, -1 to open them, 0 to leave them.
+        limits: Lowest and highest controls (9, 2).
+        controls: The controls (9,), which are set.
     """
     jacobian, speeds = sensed.jacobian, sensed.speeds
     of_both = jacobian[:, :JOINTS].T.copy().T
@@ -71,8 +92,15 @@ def _torques(sensed: Sensed, bias: Vector, goal: Vector, goal_axes: Vector, rest
     turn = orientation_error(goal_axes, sensed.axes)
     torque = turn * STIFFNESS - np.dot(jacobian[3:], speeds) * DAMPING
     wrench = np.concatenate((np.dot(place_mass, force), np.dot(axes_mass, torque)))
-    to_rest = nullspace_torques(inertia, null_space, rest, sensed.joints, speeds[:JOINTS].copy())
-    return np.dot(of_both.T, wrench) + bias + to_rest
+    to_rest = nullspace_torques(inertia, null_space, REST, sensed.joints, speeds[:JOINTS].copy())
+    controls[:JOINTS] = np.dot(of_both.T, wrench) + bias + to_rest
+    for joint in range(JOINTS):
+        controls[joint] = min(max(controls[joint], limits[joint, 0]), limits[joint, 1])
+    for finger in range(2):
+        low, high = limits[JOINTS + finger]
+        moved = closing[finger] + FINGERS[finger] * FINGER_SPEED * direction
+        closing[finger] = min(max(moved, -1.0), 1.0)
+        controls[JOINTS + finger] = 0.5 * (high + low) + 0.5 * (high - low) * closing[finger]
 
 
 class Arm:
@@ -85,11 +113,7 @@ class Arm:
 
     def __init__(self, model: mujoco.MjModel, data: mujoco.MjData) -> None:
         site = int(model.site(SITE).id)
-        limits = model.actuator_ctrlrange.copy()
-        self._data, self._site = data, site
-        self._low, self._high = limits[:JOINTS].T.copy()
-        self._middle = 0.5 * (limits[JOINTS:, 1] + limits[JOINTS:, 0])
-        self._half = 0.5 * (limits[JOINTS:, 1] - limits[JOINTS:, 0])
+        self._data, self._site, self._limits = data, site, model.actuator_ctrlrange.copy()
         self._now = Sensed(
             data.site_xpos[site],
             data.site_xmat[site].reshape(3, 3),
@@ -98,11 +122,7 @@ class Arm:
             data.qvel,
             data.qpos[:JOINTS],
         )
-        self._bias, self._torque, self._finger = (
-            data.qfrc_bias[:JOINTS],
-            data.ctrl[:JOINTS],
-            data.ctrl[JOINTS:],
-        )
+        self._bias, self._controls = data.qfrc_bias[:JOINTS], data.ctrl
 
     def begin(self, rest: Sensed) -> None:
         """Begin an episode: the goal of the hand is its place at rest.
@@ -117,7 +137,7 @@ class Arm:
     def follow(self, other: Arm) -> None:
         """Take over the goals of another controller."""
         self._first, self._goal, self._goal_axes = other._first, other._goal, other._goal_axes
-        self._closing = other._closing
+        self._closing = other._closing.copy()
 
     def sense(self, model: mujoco.MjModel) -> Sensed:
         """Return what the controller reads now: views and buffers, which change with the physics."""
@@ -141,12 +161,14 @@ class Arm:
             self._goal = sensed.place + displacement[:3]
             if displacement[3:].any():  # robosuite keeps the goal of an earlier action otherwise
                 self._goal_axes = set_goal_orientation(displacement[3:], sensed.axes)
-        torques = _torques(sensed, self._bias, self._goal, self._goal_axes, REST)
-        self._torque[:] = np.minimum(np.maximum(torques, self._low), self._high)
-        closing = self._closing + _FINGERS * FINGER_SPEED * np.sign(action[6])
-        self._closing = np.minimum(np.maximum(closing, -1.0), 1.0)
-        self._finger[:] = self._middle + self._half * self._closing
-
-
-_FINGERS = np.array([-1.0, 1.0])
-"""Directions in which the two fingers close."""
+            self._direction = float(np.sign(action[6]))
+        _drive(
+            sensed,
+            self._bias,
+            self._goal,
+            self._goal_axes,
+            self._closing,
+            self._direction,
+            self._limits,
+            self._controls,
+        )
