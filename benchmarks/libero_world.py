@@ -5,8 +5,8 @@ compares two blocks of one round; results are the median over rounds and its 95 
 
 Resets: episodes of each task begin from initial states 0, 1, 2, ... and, in another world, from the same ones
 with the last one first. An episode repeats itself if both end with all bodies in the same places and all
-joints at the same speeds, to the last bit. LIBERO's environment is seeded once, as in its evaluation, or before
-each reset.
+joints at the same speeds, to the last bit. LIBERO's environment is seeded once, as in its evaluation, or
+before each reset.
 
     python benchmarks/libero_world.py
 """
@@ -15,10 +15,11 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import functools
 import io
 import statistics
 import time
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -133,10 +134,10 @@ def their_trails(task: str, states: Iterable[int], steps: int, seeded: bool) -> 
 
 def resets(tasks: int, states: int, steps: int) -> dict[str, Any]:
     """Return how many episodes differ when the same initial states come in another order."""
-    kinds = {
+    kinds: dict[str, Callable[[str, Iterable[int], int], Trails]] = {
         "clbench": our_trails,
-        "LIBERO, seeded once": lambda *run: their_trails(*run, seeded=False),
-        "LIBERO, seeded before each reset": lambda *run: their_trails(*run, seeded=True),
+        "LIBERO, seeded once": functools.partial(their_trails, seeded=False),
+        "LIBERO, seeded before each reset": functools.partial(their_trails, seeded=True),
     }
     different = dict.fromkeys(kinds, 0)
     for task in track(TASKS[:: len(TASKS) // tasks][:tasks], "resets"):

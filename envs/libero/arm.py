@@ -58,7 +58,7 @@ class Sensed(NamedTuple):
     """Positions of the arm's joints (7,)."""
 
 
-@njit(nogil=True, cache=True)  # type: ignore[untyped-decorator]
+@njit(nogil=True, cache=True)
 def _drive(
     sensed: Sensed,
     bias: Vector,

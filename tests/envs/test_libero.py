@@ -103,13 +103,12 @@ def test_lanes_and_threads_do_not_change_a_bit() -> None:
 
 
 def test_a_copy_of_a_world_goes_on_as_the_world_does_and_leaves_it_alone() -> None:
-    world, actions, trails_of_both = World(), random_actions(0, 20), []
+    world, actions = World(), random_actions(0, 20)
     world.reset(seed=2, options={"task": BOWL})
     for action in actions[:10]:
         world.step(action)
-    for one in (copy.deepcopy(world), world):
-        trails_of_both.append([one.step(action)[0] for action in actions[10:]])
-    np.testing.assert_array_equal(*trails_of_both)
+    copied, own = ([one.step(action)[0] for action in actions[10:]] for one in (copy.deepcopy(world), world))
+    np.testing.assert_array_equal(copied, own)
 
 
 def test_global_generators_have_no_part_in_it_and_are_left_alone() -> None:
