@@ -1,6 +1,6 @@
 """Coverage of the intervals, and false splits and power of the groups, simulated in minutes.
 
-Run `python benchmarks/coverage.py`.
+Run `python benchmarks/interval_coverage.py`.
 
 The model mimics a row of the benchmark. The success rates of a method's runs have a beta distribution. Its
 standard deviation is stated for a mean rate of one half; at a rate p it is 2 sqrt(p (1 - p)) times as large.

@@ -1,0 +1,174 @@
+"""The controller of the arm: robosuite's OSC_POSE with LIBERO's settings, and the gripper.
+
+The inputs of the physics follow from an action as in `controllers/osc.py`, `controllers/config/osc_pose.json`
+and `models/grippers/panda_gripper.py` of robosuite 1.4.0. Operations and layouts in memory are the same, so
+results are equal bit for bit. Two differences save time:
+
+1. robosuite computes the dynamics before the controller, again inside it, and a third time in the physics
+   step. Once is enough: `mj_step1` computes the positions, velocities, inertia and bias forces that the
+   controller needs, and `mj_step2` continues from there.
+2. The controller is compiled as a whole and releases the interpreter lock.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from .original import njit, nullspace_torques, opspace_matrices, orientation_error, set_goal_orientation
+
+Vector = NDArray[np.float64]
+
+SUBSTEPS = 25
+"""Physics steps of 2 ms per action: 20 actions per second."""
+JOINTS = 7
+"""Joints of the arm, the first of every model; those of the two fingers follow."""
+REST = np.array([0.0, -1.61037389e-01, 0.0, -2.44459747, 0.0, 2.2267522, np.pi / 4])
+"""Joint positions at which LIBERO's robots begin, and to which the redundant joint is drawn (7,)."""
+SCALE = np.array([0.05, 0.05, 0.05, 0.5, 0.5, 0.5])
+"""Displacement of the hand's goal for an action of 1, in metres and radians (6,)."""
+STIFFNESS, DAMPING = 150.0, 2 * math.sqrt(150.0)
+"""Gains on the errors of position and orientation, and on the velocities; the damping is critical."""
+FINGERS = (-1.0, 1.0)
+"""Directions in which the two fingers close."""
+FINGER_SPEED = 0.01
+"""Change of a finger's control in a physics step, as a share of half its range."""
+SITE = "gripper0_grip_site"
+"""The point between the finger tips that the controller moves."""
+
+
+class Sensed(NamedTuple):
+    """What the controller reads from the physics, apart from the bias forces."""
+
+    place: Vector
+    """Position of the hand (3,)."""
+    axes: Vector
+    """Orientation of the hand (3, 3)."""
+    jacobian: Vector
+    """Jacobian of the position, then of the orientation (6, nv)."""
+    inertia: Vector
+    """Inertia of all joints (nv, nv)."""
+    speeds: Vector
+    """Velocities of all joints (nv,)."""
+    joints: Vector
+    """Positions of the arm's joints (7,)."""
+
+
+@njit(nogil=True, cache=True)
+def _drive(
+    sensed: Sensed,
+    bias: Vector,
+    goal: Vector,
+    goal_axes: Vector,
+    closing: Vector,
+    direction: float,
+    limits: Vector,
+    controls: Vector,
+) -> None:
+    """Set the controls of a physics step: torques of the joints, and places of the fingers.
+
+    Matrices have the layouts in memory that robosuite's have, column by column: others change the last bit.
+
+    Args:
+        sensed: What the controller senses.
+        bias: Bias forces of the joints (7,).
+        goal: Goal of the hand's position (3,).
+        goal_axes: Goal of its orientation (3, 3).
+        closing: Shares to which the fingers are closed (2,), which change.
+        direction: 1 to close them, -1 to open them, 0 to leave them.
+        limits: Lowest and highest controls (9, 2).
+        controls: The controls (9,), which are set.
+    """
+    jacobian, speeds = sensed.jacobian, sensed.speeds
+    of_both = jacobian[:, :JOINTS].T.copy().T
+    of_place, of_axes = jacobian[:3, :JOINTS].T.copy().T, jacobian[3:, :JOINTS].T.copy().T
+    inertia = sensed.inertia[:JOINTS, :JOINTS].T.copy().T
+    _, place_mass, axes_mass, null_space = opspace_matrices(inertia, of_both, of_place, of_axes)
+    force = (goal - sensed.place) * STIFFNESS - np.dot(jacobian[:3], speeds) * DAMPING
+    turn = orientation_error(goal_axes, sensed.axes)
+    torque = turn * STIFFNESS - np.dot(jacobian[3:], speeds) * DAMPING
+    wrench = np.concatenate((np.dot(place_mass, force), np.dot(axes_mass, torque)))
+    to_rest = nullspace_torques(inertia, null_space, REST, sensed.joints, speeds[:JOINTS].copy())
+    controls[:JOINTS] = np.dot(of_both.T, wrench) + bias + to_rest
+    for joint in range(JOINTS):
+        controls[joint] = min(max(controls[joint], limits[joint, 0]), limits[joint, 1])
+    for finger in range(2):
+        low, high = limits[JOINTS + finger]
+        moved = closing[finger] + FINGERS[finger] * FINGER_SPEED * direction
+        closing[finger] = min(max(moved, -1.0), 1.0)
+        controls[JOINTS + finger] = 0.5 * (high + low) + 0.5 * (high - low) * closing[finger]
+
+
+class Arm:
+    """The controller in one episode.
+
+    Args:
+        model: Compiled scene.
+        data: Physics of the episode.
+    """
+
+    def __init__(self, model: mujoco.MjModel, data: mujoco.MjData) -> None:
+        site = int(model.site(SITE).id)
+        self._data, self._site, self._limits = data, site, model.actuator_ctrlrange.copy()
+        self._now = Sensed(
+            data.site_xpos[site],
+            data.site_xmat[site].reshape(3, 3),
+            np.zeros((6, model.nv)),
+            np.zeros((model.nv, model.nv)),
+            data.qvel,
+            data.qpos[:JOINTS],
+        )
+        self._bias, self._controls = data.qfrc_bias[:JOINTS], data.ctrl
+
+    def begin(self, rest: Sensed) -> None:
+        """Begin an episode: the goal of the hand is its place at rest.
+
+        The first physics step of an episode uses what was sensed at rest, wherever the episode puts the arm.
+        So does robosuite, whose controller senses the arm before LIBERO sets the initial state.
+        """
+        self._first: Sensed | None = rest
+        self._goal, self._goal_axes = rest.place, rest.axes
+        self._closing = np.zeros(2)
+
+    def follow(self, other: Arm) -> None:
+        """Take over the goals of another controller."""
+        self._first, self._goal, self._goal_axes = other._first, other._goal, other._goal_axes
+        self._closing = other._closing.copy()
+
+    def sense(self, model: mujoco.MjModel) -> Sensed:
+        """Return what the controller reads now: views and buffers, which change with the physics."""
+        now = self._now
+        mujoco.mj_jacSite(model, self._data, now.jacobian[:3], now.jacobian[3:], self._site)
+        mujoco.mj_fullM(model, self._data, now.inertia)
+        return now
+
+    def drive(self, model: mujoco.MjModel, action: NDArray[np.float32], is_new: bool) -> None:
+        """Set the controls of the next physics step, whose first half has been computed.
+
+        Args:
+            model: Scene of the episode, or its copy.
+            action: Displacement of the hand's goal and closing of the fingers (7,), in [-1, 1].
+            is_new: Whether this is the first physics step of the action.
+        """
+        sensed = self._first or self.sense(model)
+        self._first = None
+        if is_new:
+            displacement = action[:6] * SCALE
+            self._goal = sensed.place + displacement[:3]
+            if displacement[3:].any():  # robosuite keeps the goal of an earlier action otherwise
+                self._goal_axes = set_goal_orientation(displacement[3:], sensed.axes)
+            self._direction = float(np.sign(action[6]))
+        _drive(
+            sensed,
+            self._bias,
+            self._goal,
+            self._goal_axes,
+            self._closing,
+            self._direction,
+            self._limits,
+            self._controls,
+        )

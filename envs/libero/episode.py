@@ -1,0 +1,94 @@
+"""One episode of LIBERO: its physics, on a model that all episodes of a scene share."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from .arm import JOINTS as ARM_JOINTS
+from .arm import SUBSTEPS, Arm
+from .problem import Problem
+from .state import FINGERS, HAND, HAND_QUATERNION, JOINTS, PLACES, SIZE, State
+
+FINGER_JOINTS = slice(ARM_JOINTS, ARM_JOINTS + 2)
+HAND_BODY, HAND_SITE = "robot0_right_hand", "gripper0_grip_site"
+
+
+class Episode:
+    """An episode of any task in one scene, one after the other.
+
+    Args:
+        problem: Problem of the first task; `begin` takes others in the same scene.
+    """
+
+    def __init__(self, problem: Problem) -> None:
+        self.problem = problem
+        self.data = data = mujoco.MjData(problem.scene.model)
+        self.action = np.zeros(7, np.float32)
+        """The action of the next `move`, (7,)."""
+        self._arm = Arm(problem.scene.model, data)
+        self._places = problem.scene.places
+        self._hand = data.site(HAND_SITE).xpos, data.body(HAND_BODY).xquat, data.qpos[FINGER_JOINTS]
+
+    def begin(self, problem: Problem, seed: int) -> State:
+        """Begin an episode, and return its first state (62,).
+
+        Args:
+            problem: Problem in the same scene.
+            seed: Number of the initial state, modulo their count, and seed of the places of fixtures.
+        """
+        self.problem, self._places = problem, problem.places(seed)
+        model, data, start = problem.scene.model, self.data, problem.starts[seed % len(problem.starts)]
+        mujoco.mj_resetData(model, data)  # also clears controls and the warm start of the solver
+        data.time = start[0]
+        data.qpos[:], data.qvel[:] = np.split(start[1:], [model.nq])
+        self.forward()
+        self._arm.begin(problem.scene.rest)
+        return self.state()
+
+    def forward(self) -> None:
+        """Compute everything that follows from the joints; the next step does not depend on this call."""
+        models = self.problem.scene.models
+        model = models.take(self._places)
+        mujoco.mj_forward(model, self.data)
+        models.give_back(model)
+
+    def drawn(self) -> mujoco.MjModel:
+        """Return the scene with its textures and with the fixtures in place, for a picture of `data`."""
+        self.forward()
+        model = self.problem.scene.drawn
+        model.body_pos[:], model.body_quat[:] = self._places
+        return model
+
+    def move(self) -> None:
+        """Advance the physics by `action`; several threads may do so at once, each for another episode."""
+        models = self.problem.scene.models
+        model = models.take(self._places)
+        for substep in range(SUBSTEPS):
+            mujoco.mj_step1(model, self.data)
+            self._arm.drive(model, self.action, is_new=substep == 0)
+            mujoco.mj_step2(model, self.data)
+        models.give_back(model)
+
+    def state(self) -> State:
+        """Return the state (62,)."""
+        state, data, problem = np.zeros(SIZE, np.float32), self.data, self.problem
+        state[HAND], state[HAND_QUATERNION], state[FINGERS] = self._hand
+        places = np.concatenate((data.xpos[problem.things], data.xquat[problem.things]), axis=1).ravel()
+        state[PLACES][: places.size] = places
+        state[JOINTS][: problem.parts.size] = data.qpos[problem.parts]
+        return state
+
+    def is_solved(self) -> bool:
+        """Return whether the goal of the task holds."""
+        return self.problem.is_solved(self.data)
+
+    def __deepcopy__(self, _: dict[int, Any]) -> Episode:
+        """Return an episode with its own physics, in the same state."""
+        copied = Episode(self.problem)
+        mujoco.mj_copyData(copied.data, self.problem.scene.model, self.data)
+        copied._places = self._places
+        copied._arm.follow(self._arm)
+        return copied

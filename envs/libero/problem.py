@@ -1,0 +1,108 @@
+"""The problems of LIBERO: each is a task in its scene, with a goal, initial states and places of fixtures."""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from clbench.base.entry_points import unknown
+
+from .original import TASKS, RandomizationError, environment, initial_states
+from .rules import Predicate, goal_of
+from .scene import Places, Scene, Vector, scene_of
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """A task of LIBERO, shared by all its episodes in a process."""
+
+    scene: Scene
+    goal: Sequence[Predicate]
+    """Predicates that hold together when the task is done."""
+    starts: Vector
+    """LIBERO's initial states, (50, 1 + nq + nv): time, positions and velocities of the joints."""
+    things: NDArray[np.int64]
+    """Bodies of the objects and fixtures in the order of their names."""
+    parts: NDArray[np.int64]
+    """Addresses of the positions of drawers and knobs."""
+    fixtures: dict[str, int]
+    """Bodies of the fixtures by name. Their places are no joints, and therefore in no state of LIBERO."""
+    sampler: Any
+    """LIBERO's sampler of the places of fixtures and objects."""
+
+    def places(self, seed: int) -> Places:
+        """Return the places of all bodies, with fixtures where LIBERO's sampler puts them for a seed.
+
+        In LIBERO they depend on all resets before, and a state does not contain them.
+        """
+        positions, quaternions = (part.copy() for part in self.scene.places)
+        drawn = _drawn(self.sampler, seed)
+        for name, body in self.fixtures.items():
+            positions[body], quaternions[body], _ = drawn[name]
+        return positions, quaternions
+
+    def is_solved(self, data: mujoco.MjData) -> bool:
+        """Return whether the goal holds."""
+        return all(predicate(data) for predicate in self.goal)
+
+
+@functools.cache
+def problem_of(task: str) -> Problem:
+    """Return the problem of a task; the first one in a scene compiles it.
+
+    Raises:
+        UnknownNameError: LIBERO has no task of this name; the error names the nearest one.
+    """
+    if task not in TASKS:
+        raise unknown("task of the LIBERO world", task, TASKS)
+    scenes: list[Scene] = []
+
+    def compiled(xml: str) -> mujoco.MjModel:
+        scenes.append(scene_of(xml))
+        return scenes[-1].model
+
+    with _own_randomness(0):
+        env = environment(task, compiled)
+    scene, model = scenes[-1], scenes[-1].model
+    fixtures = {name: int(model.body(one.root_body).id) for name, one in env.fixtures_dict.items()}
+    objects = {name: int(model.body(one.root_body).id) for name, one in env.objects_dict.items()}
+    bodies = {**fixtures, **objects}
+    of_fixtures = np.isin(model.body_rootid[model.jnt_bodyid], list(fixtures.values()))
+    return Problem(
+        scene,
+        goal_of(env, model),
+        initial_states(task),
+        np.array([bodies[name] for name in sorted(bodies)]),
+        model.jnt_qposadr[of_fixtures].astype(np.int64),
+        fixtures,
+        env.placement_initializer,
+    )
+
+
+def _drawn(sampler: Any, seed: int) -> dict[str, Any]:
+    """Return the places that LIBERO's sampler draws, and draw all again if things overlap, as LIBERO does."""
+    with _own_randomness(seed):
+        while True:
+            try:
+                places: dict[str, Any] = sampler.sample()
+            except RandomizationError:
+                continue
+            return places
+
+
+@contextlib.contextmanager
+def _own_randomness(seed: int) -> Iterator[None]:
+    """Seed the global generator of numpy, from which LIBERO draws, and leave no trace in it."""
+    before = np.random.get_state()  # noqa: NPY002
+    np.random.seed(seed % 2**32)  # noqa: NPY002
+    try:
+        yield
+    finally:
+        np.random.set_state(before)  # noqa: NPY002

@@ -1,0 +1,35 @@
+"""Layout of the state of the LIBERO world: 62 numbers, lengths in metres.
+
+x grows away from the robot, y to its left, z up. Quaternions begin with their scalar. Every scene has seven
+objects and fixtures, in the order of their names. All tasks of libero_goal have the same, and so do those of
+libero_spatial; each task of libero_object has others. Joints of fixtures are 0 where a scene has none.
+"""
+
+from __future__ import annotations
+
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+State: TypeAlias = NDArray[np.float32]
+"""One state (62,), or many (N, 62)."""
+
+THINGS, PARTS = 7, 4
+"""Number of objects and fixtures, and largest number of joints of fixtures: three drawers and a knob."""
+
+SIZE = 9 + 7 * THINGS + PARTS
+HAND = slice(0, 3)
+"""Position of the point between the finger tips."""
+HAND_QUATERNION = slice(3, 7)
+FINGERS = slice(7, 9)
+"""Positions of the fingers: (0.04, -0.04) open, (0, 0) closed."""
+PLACES = slice(9, 9 + 7 * THINGS)
+"""Position and quaternion of each object and fixture, seven numbers each."""
+JOINTS = slice(9 + 7 * THINGS, SIZE)
+"""Positions of the joints of fixtures: drawers, then the knob of the stove."""
+
+
+def thing(number: int) -> slice:
+    """Return where position (3,) and quaternion (4,) of thing `number` are; things are numbered from 0."""
+    return slice(9 + 7 * number, 16 + 7 * number)

@@ -1,0 +1,15 @@
+"""The LIBERO world as one Gymnasium environment: a Panda arm, a table and the things on it."""
+
+from __future__ import annotations
+
+from clbench.worlds.world import MujocoWorld
+
+from .physics import LiberoVectorWorld
+
+
+class LiberoWorld(MujocoWorld):
+    """A `LiberoVectorWorld` with one lane; that class documents states, actions and rewards."""
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 20}  # noqa: RUF012
+    vector_world = LiberoVectorWorld
+    first_task = "open_the_middle_drawer_of_the_cabinet"

@@ -1,0 +1,191 @@
+"""The LIBERO world: episodes that their seeds alone determine, in any order and on any worker."""
+
+import copy
+import hashlib
+import os
+import subprocess
+import sys
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+pytest.importorskip("libero", reason="pip install 'clbench[libero]'")
+
+from clbench.base.entry_points import resolve
+from clbench.base.errors import InputError, UnknownNameError
+from clbench.worlds.lanes import vector_world
+
+WORLD = "clbench.envs.libero.world:LiberoWorld"
+World = resolve(WORLD)
+Episode = resolve("clbench.envs.libero.episode:Episode")
+problem_of = resolve("clbench.envs.libero.problem:problem_of")
+TASKS = list(resolve("clbench.envs.libero.original:TASKS"))
+OPEN, BOWL, PLATE, MILK = (
+    "open_the_middle_drawer_of_the_cabinet",
+    "put_the_bowl_on_the_stove",
+    "pick_up_the_black_bowl_on_the_stove_and_place_it_on_the_plate",
+    "pick_up_the_milk_and_place_it_in_the_basket",
+)
+
+Start = tuple[str, int]
+"""Task and seed of an episode."""
+
+
+def random_actions(seed: int, steps: int) -> NDArray[np.float32]:
+    actions = np.random.default_rng(seed).uniform(-1.0, 1.0, (steps, 7)).astype(np.float32)
+    actions[:, 2] = np.maximum(actions[:, 2] - 0.2, -1.0)
+    return actions
+
+
+def trails(starts: Iterable[Start], steps: int = 15) -> dict[Start, str]:
+    """Hash of the physics after each step of some episodes, which one object runs per scene."""
+    episodes: dict[int, Any] = {}
+    found = {}
+    for task, seed in starts:
+        problem = problem_of(task)
+        episode = episodes.setdefault(id(problem.scene), Episode(problem))
+        trail, data = hashlib.sha256(episode.begin(problem, seed)), episode.data
+        for action in random_actions(seed, steps):
+            episode.action = action
+            episode.move()
+            trail.update(b"".join(part.tobytes() for part in (data.qpos, data.qvel, data.xpos)))
+        found[task, seed] = trail.hexdigest()
+    return found
+
+
+def fresh_trails(start: Start, steps: int = 15) -> Mapping[Start, str]:
+    """Do the same in a fresh process."""
+    code = f"from test_libero import trails; print(trails([{start!r}], {steps}))"
+    path = os.pathsep.join(filter(None, (os.path.dirname(__file__), os.environ.get("PYTHONPATH"))))
+    command = [sys.executable, "-c", code]
+    done = subprocess.run(
+        command, env={**os.environ, "PYTHONPATH": path}, check=True, capture_output=True, text=True
+    )
+    found: Mapping[Start, str] = eval(done.stdout)
+    return found
+
+
+def test_an_episode_repeats_itself_bit_for_bit_after_any_others_and_in_a_fresh_process() -> None:
+    starts = [(task, seed) for task in (OPEN, BOWL, PLATE, MILK) for seed in (0, 7)]
+    expected = trails(starts)
+    assert len(set(expected.values())) == len(starts)
+    assert trails(starts[::-1]) == expected
+    assert fresh_trails(starts[-1]).items() <= expected.items()
+
+
+@pytest.mark.slow
+def test_a_hundred_episodes_of_twenty_tasks_do_so() -> None:
+    starts = [(task, seed) for task in TASKS[:20] for seed in range(5)]
+    expected = trails(starts, 40)
+    shuffled = np.random.default_rng(0).permutation(len(starts))
+    assert trails([starts[number] for number in shuffled], 40) == expected
+    for start in starts[::5]:
+        assert fresh_trails(start, 40).items() <= expected.items()
+
+
+def test_lanes_and_threads_do_not_change_a_bit() -> None:
+    tasks, seeds = [OPEN, MILK, BOWL, OPEN], [1, 2, 3, 4]
+    actions = np.stack([random_actions(seed, 10) for seed in seeds], axis=1)
+    for threads in (1, 3):
+        world = vector_world(WORLD, 5, threads)
+        states = [world.reset([4, 1, 2, 0], seeds, tasks)]
+        states += [world.step([4, 1, 2, 0], batch)[0] for batch in actions]
+        world.close()
+        for row, (task, seed) in enumerate(zip(tasks, seeds, strict=True)):
+            plain = World()
+            alone = [plain.reset(seed=seed, options={"task": task})[0]]
+            alone += [plain.step(action)[0] for action in actions[:, row]]
+            np.testing.assert_array_equal(np.stack(states)[:, row], alone)
+
+
+def test_a_copy_of_a_world_goes_on_as_the_world_does_and_leaves_it_alone() -> None:
+    world, actions = World(), random_actions(0, 20)
+    world.reset(seed=2, options={"task": BOWL})
+    for action in actions[:10]:
+        world.step(action)
+    copied, own = ([one.step(action)[0] for action in actions[10:]] for one in (copy.deepcopy(world), world))
+    np.testing.assert_array_equal(copied, own)
+
+
+def test_global_generators_have_no_part_in_it_and_are_left_alone() -> None:
+    expected = World().reset(seed=3, options={"task": OPEN})[0]
+    np.random.seed(5)  # noqa: NPY002
+    before = np.random.get_state()[1].copy()  # type: ignore[index]  # noqa: NPY002
+    np.testing.assert_array_equal(World().reset(seed=3, options={"task": OPEN})[0], expected)
+    np.testing.assert_array_equal(np.random.get_state()[1], before)  # type: ignore[index]  # noqa: NPY002
+
+
+def test_fixtures_have_places_of_their_own_for_each_seed_and_fifty_initial_states_take_turns() -> None:
+    problem = problem_of(OPEN)
+    first, again, other = (problem.places(seed) for seed in (1, 1, 51))
+    np.testing.assert_array_equal(first[0], again[0])
+    moved = np.flatnonzero((first[0] != other[0]).any(axis=1))
+    assert set(moved) == set(problem.fixtures.values())
+    episode = Episode(problem)
+    joints = []
+    for seed in (1, 51, 2):
+        episode.begin(problem, seed)
+        joints.append(episode.data.qpos.copy())
+    np.testing.assert_array_equal(joints[0], joints[1])
+    assert (joints[0] != joints[2]).any()
+
+
+@pytest.mark.parametrize("task", [OPEN, MILK])
+def test_the_world_keeps_gymnasiums_rules(task: str) -> None:
+    world = World(render_mode="rgb_array")
+    state, info = world.reset(seed=0, options={"task": task})
+    assert info == {"success": False, "task": task}
+    assert world.observation_space.contains(state)
+    state, reward, terminated, truncated, info = world.step(np.zeros(7, np.float32))
+    assert world.observation_space.contains(state)
+    assert (reward, terminated, truncated) == (0.0, False, False)
+
+
+def test_an_open_drawer_is_success_with_reward_one() -> None:
+    world, still = vector_world(WORLD, 1), np.zeros((1, 7), np.float32)
+    world.reset([0], [0], [OPEN])
+    _, rewards, successes = world.step([0], still)
+    assert (rewards[0], successes[0]) == (0.0, False)
+    drawn: Any = world
+    drawn.drawable(0).data.joint("wooden_cabinet_1_middle_level").qpos[:] = -0.15
+    states, rewards, successes = world.step([0], still)
+    assert (rewards[0], successes[0]) == (1.0, True)
+    assert -0.15 in states[0, -4:].round(2)
+
+
+def test_a_picture_shows_the_scene_with_its_textures_and_leaves_the_next_step_alone() -> None:
+    worlds: list[Any] = [vector_world(WORLD, 1), vector_world(WORLD, 1)]
+    for world in worlds:
+        world.reset([0], [4], [OPEN])
+    model, data, _ = worlds[0].drawable(0)
+    assert model.ntex > 10
+    places = problem_of(OPEN).places(4)
+    np.testing.assert_array_equal(model.body_pos, places[0])
+    assert data.body("wine_rack_1_main").xpos.any()
+    action = random_actions(0, 1)
+    np.testing.assert_array_equal(*(world.step([0], action)[0] for world in worlds))
+
+
+def test_wrong_tasks_and_actions_are_named() -> None:
+    world = World()
+    with pytest.raises(UnknownNameError, match=f"Did you mean '{OPEN}'"):
+        world.reset(options={"task": "open_the_middle_drawer_of_a_cabinet"})
+    with pytest.raises(gymnasium.error.ResetNeeded, match="LIBERO"):
+        World().step(np.zeros(7))
+    world.reset(seed=0)
+    with pytest.raises(InputError, match=r"shape \(7,\)"):
+        world.step(np.zeros(4))
+    with pytest.raises(InputError, match="finite"):
+        world.step(np.full(7, np.nan))
+
+
+def test_importing_the_world_leaves_the_process_as_it_was() -> None:
+    code = "import os; a = dict(os.environ); import clbench.envs.libero.world; assert dict(os.environ) == a"
+    done = subprocess.run(
+        [sys.executable, "-W", "error", "-c", code], capture_output=True, text=True, check=False
+    )
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
