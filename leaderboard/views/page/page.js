@@ -50,7 +50,11 @@
     document.addEventListener(begin, (event) => { if (noted(event)) showNote(noted(event)); });
     document.addEventListener(end, (event) => { if (noted(event)) hideTip(); });
   }
-  document.addEventListener("scroll", hideTip, { capture: true, passive: true });
+  document.addEventListener("scroll", () => {
+    const focused = document.activeElement.closest("[data-note]"); // the focus may have moved the page
+    if (focused?.matches(":focus-visible")) showNote(focused);
+    else hideTip();
+  }, { capture: true, passive: true });
 
   /* One number of a table is a stop of the Tab key; the arrow keys lead to the others. */
   function roam(table) {
@@ -165,13 +169,13 @@
   async function draw(element, spec) {
     // `ast` interprets expressions: the policy of the page forbids code made from text.
     const options = { actions: false, ast: true, renderer: "svg", defaultStyle: false, tooltip: showPoint };
-    // Vega sets its own class names on the element that it draws in.
-    const place = document.createElement("div");
+    // Vega sets its own class names on the element that it draws in, and asks for its width.
+    const place = element.latest = element.appendChild(document.createElement("div"));
     const { view } = await vegaEmbed(place, spec, options);
     view.addEventListener("click", (event, item) => {
       if (item?.datum?.anchor) location.hash = `#${item.datum.anchor}`;
     });
-    element.replaceChildren(place);
+    if (element.latest === place) element.replaceChildren(place); // the reader may have chosen again meanwhile
   }
 
   const sizeOfPlane = () => (narrow() ? "narrow" : window.innerWidth < 1340 ? "wide" : "full");

@@ -18,7 +18,7 @@ from clbench.scoring.scores import rates_of
 from clbench.spec.identifiers import built_in_methods
 
 from ...board.rows import Row, standing_of
-from ...board.summary import DIVISIONS, ELSEWHERE
+from ...board.summary import DIVISIONS, ELSEWHERE, RANKED_BY
 from ..descriptions import Description, describe
 from ..format import Column, Rows, aligned, format_interval, number_text, shown, standing_text, title_of
 from ..markdown import arxiv_ids
@@ -168,19 +168,28 @@ class RowView:
         return same_or_each([(run.seed, flat(run.record.fingerprint)) for run in self.row.runs])
 
 
-MAIN = ("final_average", "gain", "adaptation", "retention", "kept_targets", "kept", "forgetting")
-"""Metrics that a table shows at once; it shows its other columns when the reader asks for them."""
+MAIN = {
+    RANKED_BY: "final average",
+    "gain": "gain",
+    "adaptation": "learned",
+    "retention": "kept skills",
+    "kept_targets": "kept targets",
+    "kept": "kept",
+}
+"""Metrics that a table shows at once, with their titles; it shows its other columns when the reader asks for
+them. The page calls them the same in every scenario."""
 
 
 def columns(rows: Rows) -> tuple[Column, ...]:
-    """Return the columns of a table of `rows`, those of `MAIN` first; the section of a row has all metrics."""
-    found = [one for one in shown(rows) if one.metric.name != "zero_shot"]
-    return tuple(sorted(found, key=lambda one: one.metric.name not in MAIN))
+    """Return the columns of a table of `rows`, those of `MAIN` first."""
+    main = [Column(METRICS[name], title) for name, title in MAIN.items()]
+    known = [one for one in main if any(row.estimates[one.metric.name].value is not None for row in rows)]
+    return (*known, *(one for one in shown(rows) if one.metric.name not in MAIN))
 
 
 def others(rows: Rows) -> list[Metric]:
     """Return the metrics that a table of `rows` does not show; the section of a row lists them apart."""
-    there = {one.metric.name for one in shown(rows)}
+    there = {one.metric.name for one in columns(rows)}
     return [metric for metric in METRICS.values() if metric.name not in there]
 
 
@@ -200,7 +209,7 @@ def row_view(row: Row, rows: Sequence[Row]) -> RowView:
         standing.place if (standing := standing_of(row, rows)) else None,
         standing_text(row, rows, NAMED),
         tuple(number(row.estimates[one.metric.name], one) for one in columns(rows)),
-        tuple(_metric(one, row.estimates[one.metric.name], seeds[one.metric.name]) for one in shown(rows)),
+        tuple(_metric(one, row.estimates[one.metric.name], seeds[one.metric.name]) for one in columns(rows)),
         tuple(_stages(row)),
         _drawn(row, seeds, others(rows)),
         _description(row.method) if row.method in built_in_methods() else None,

@@ -13,7 +13,7 @@ from clbench.spec.identifiers import folder_name
 CARDS = Path(__file__).parents[3] / "docs/reference/scenarios"
 """Folder of the cards. An installed wheel has none, and the page then has no stills."""
 
-_NAMESPACE = "clbench/"
+_SCENARIO = re.compile(r"clbench/[A-Za-z0-9_]+-v\d+")
 _NAME = re.compile(r"[A-Za-z0-9_]+")
 
 
@@ -26,7 +26,7 @@ def stills(place: str, tasks: Iterable[str], cards: Path = CARDS) -> dict[str, s
         cards: Folder of the cards.
     """
     scenario = parts_of(place)[0]
-    if not scenario.startswith(_NAMESPACE):
+    if not _SCENARIO.fullmatch(scenario):
         return {}
     paths = {
         task: cards / folder_name(scenario) / f"{task}.webp" for task in tasks if _NAME.fullmatch(task)

@@ -62,8 +62,9 @@ def headline(rows: Sequence[Row]) -> str:
         methods = "The one other method is not" if len(others) == 1 else "No method is"
         return f"{methods} shown to end above plain fine-tuning."
     gain = max(row.estimates["gain"].value or 0.0 for row in ahead)
-    verb, most = ("ends", "") if len(ahead) == 1 else ("end", "up to ")
-    first = f"{_listed(ahead)} {verb} {most}{number_text(gain, '.2f')} above plain fine-tuning."
+    first = f"{_listed(ahead)} end above plain fine-tuning, by up to {number_text(gain, '.2f')}."
+    if len(ahead) == 1:
+        first = f"{_listed(ahead)} ends {number_text(gain, '.2f')} above plain fine-tuning."
     left = len(others) - len(ahead)
     if not left:
         return first

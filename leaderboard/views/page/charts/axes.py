@@ -86,6 +86,13 @@ class Axis:
         """Return whether a value is known and on the axis."""
         return one.value is not None and self.low - 1e-9 <= one.value <= self.high + 1e-9
 
+    def clipped(self, one: Estimate) -> tuple[float | None, float | None]:
+        """Return the part of an interval that is on the axis; the value twice if there is no interval."""
+        if one.low is None or one.high is None:
+            return one.value, one.value
+        low, high = self._domain
+        return max(one.low, low), min(one.high, high)
+
     def share(self, value: float) -> float:
         """Return where a value is, from 0 at the worse end of the axis to 1 at the better one."""
         low, high, here = (self._bent(one) for one in (self.low, self.high, value))
@@ -106,10 +113,10 @@ class Axis:
     @property
     def scale(self) -> Spec:
         """Its scale in Vega-Lite."""
-        kind: Spec = {"domain": self._domain, "nice": False, "zero": False}
+        kind: Spec = {"domain": self._domain, "nice": False}
         if self.quantity.source == "bytes_kept":
             return kind | {"type": "symlog", "constant": NOT_ZERO, "reverse": True}
-        return kind | ({"type": "log", "reverse": True} if self.quantity.is_cost else {})
+        return kind | ({"type": "log", "reverse": True} if self.quantity.is_cost else {"zero": False})
 
     @property
     def marks(self) -> Spec:

@@ -68,7 +68,7 @@ def template(size: Size, font: str = SYSTEM_FONT, named: Iterable[str] = ()) -> 
     upright = {"x": x, "y": y | {"field": "y_low"}, "y2": {"field": "y_high"}, "color": hue}
     mark = {"type": "point", "filled": True, "size": 95, "opacity": 1}
     mark |= {"stroke": colour("paper"), "strokeWidth": 1}
-    whisker = {"type": "rule", "opacity": 0.4, "clip": True}
+    whisker = {"type": "rule", "opacity": 0.4}
     front = {"type": "line", "strokeWidth": 1.5, "strokeDash": [4, 3], "opacity": 0.8}
     tooltip = [{"field": name} for name in ("method", "division", "across", "up")]
     # In pixels, since some labels are outside the plane.
@@ -167,9 +167,10 @@ class Plane:
         point: dict[str, Any] = {"method": row.method, "division": row.division, "anchor": anchor}
         for side, name, axis in (("x", "across", self.across), ("y", "up", self.up)):
             one = axis.quantity.of(row)
+            low, high = axis.clipped(one)
             point[side] = rounded(one.value)
-            point[f"{side}_low"] = rounded(one.value if one.low is None else one.low)
-            point[f"{side}_high"] = rounded(one.value if one.high is None else one.high)
+            point[f"{side}_low"] = rounded(low)
+            point[f"{side}_high"] = rounded(high)
             point[name] = f"{axis.quantity.name} {axis.quantity.text(one)}"
         return point
 
