@@ -84,8 +84,8 @@ def plane(records: Path | str = RECORDS, scenario: str | None = None, *, dark: b
     from .publishing import read_board
     from .views.page.charts.plane import WIDE
     from .views.page.charts.plane import plane as chart
-    from .views.page.charts.vega import heading
     from .views.page.charts.plot import themed
+    from .views.page.charts.vega import heading
 
     rows = read_board(Path(records)).rows
     names = [row.scenario for row in rows]
@@ -111,8 +111,8 @@ def frontier(records: Path | str = RECORDS, scenario: str | None = None, *, dark
     from .board.frontier import ladder_of, read_frontiers
     from .views.page.charts.frontier import WIDE
     from .views.page.charts.frontier import frontier as chart
-    from .views.page.charts.vega import FONT, heading
     from .views.page.charts.plot import themed
+    from .views.page.charts.vega import FONT, heading
 
     folder = ladder_of(Path(records))
     found, _ = read_frontiers(folder)

@@ -145,7 +145,9 @@ def _templates() -> Environment:
 
 def _method_page(method: str) -> str:
     """Return the address of a method's page, empty if the method is not built in."""
-    return f"{REPOSITORY}/blob/main/docs/reference/methods/{method}.md" if method in built_in_methods() else ""
+    return (
+        f"{REPOSITORY}/blob/main/docs/reference/methods/{method}.md" if method in built_in_methods() else ""
+    )
 
 
 def _shade_of_rank(rank: int, count: int) -> int:
@@ -213,7 +215,9 @@ def _data(views: Sequence[ScenarioView]) -> dict[str, Any]:
 
 def _section(one: ScenarioView, number: int) -> str:
     """Return the section of a row as HTML."""
-    before, after = (one.rows[place] if 0 <= place < len(one.rows) else None for place in (number - 1, number + 1))
+    before, after = (
+        one.rows[place] if 0 <= place < len(one.rows) else None for place in (number - 1, number + 1)
+    )
     section = _templates().get_template("row.html")
     return section.render(one=one, view=one.rows[number], previous=before, next=after)
 

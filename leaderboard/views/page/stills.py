@@ -1,4 +1,4 @@
-"""Stills of the tasks: the pictures of the scenario cards, where they are beside the code."""
+"""Stills of the tasks: the pictures of the scenario cards. Without cards, the page has no stills."""
 
 from __future__ import annotations
 
@@ -10,8 +10,7 @@ from pathlib import Path
 from clbench.records.paths import parts_of
 from clbench.spec.identifiers import folder_name
 
-CARDS = Path(__file__).parents[3] / "docs/reference/scenarios"
-"""Folder of the cards. An installed wheel has none, and the page then has no stills."""
+from ...board.places import CARDS
 
 _SCENARIO = re.compile(r"clbench/[A-Za-z0-9_]+-v\d+")
 _NAME = re.compile(r"[A-Za-z0-9_]+")
@@ -28,9 +27,7 @@ def stills(place: str, tasks: Iterable[str], cards: Path = CARDS) -> dict[str, s
     scenario = parts_of(place)[0]
     if not _SCENARIO.fullmatch(scenario):
         return {}
-    paths = {
-        task: cards / folder_name(scenario) / f"{task}.webp" for task in tasks if _NAME.fullmatch(task)
-    }
+    paths = {task: cards / folder_name(scenario) / f"{task}.webp" for task in tasks if _NAME.fullmatch(task)}
     return {
         task: f"data:image/webp;base64,{base64.b64encode(path.read_bytes()).decode('ascii')}"
         for task, path in paths.items()

@@ -90,8 +90,9 @@ class ScenarioView:
         seeds = sorted({len(view.row.seeds) for view in self.rows})
         count = counted(seeds[0], "seed") if len(seeds) == 1 else f"{seeds[0]} to {seeds[-1]} seeds"
         return (
-            f"{policy} is fine-tuned on {counted(targets, 'new task')}, one after another. The final average is "
-            f"its success on all of them at the end. Means over {count}, with 95 % confidence intervals."
+            f"{policy} is fine-tuned on {counted(targets, 'new task')}, one after another. The final average "
+            "is its success on all of them at the end. "
+            f"Means over {count}, with 95 % confidence intervals."
         )
 
     @cached_property

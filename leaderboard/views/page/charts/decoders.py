@@ -6,6 +6,7 @@ from ....policies.decoders import Decoding
 from ...format import format_interval
 from .vega import SYSTEM_FONT, Spec, colour, layer, rounded, specification
 
+
 def decoders(found: Decoding, width: int, font: str = SYSTEM_FONT) -> Spec:
     """Return two charts of the decoders side by side: speed, and success beyond the first decoder's.
 

@@ -34,7 +34,8 @@ def plane(rows: Sequence[RowSummary], size: Size, font: str = FONT) -> Spec:
     """
     drawn = Plane(rows, LEARNED, SKILLS)
     found = {str(point["division"]) for point in drawn.points}
-    return filled(template(size, font, found), drawn.places | drawn.labels(size))
+    spec: Spec = filled(template(size, font, found), drawn.places | drawn.labels(size))
+    return spec
 
 
 def filled(part: Any, places: Mapping[str, Any]) -> Any:
@@ -120,13 +121,13 @@ class Plane:
     @property
     def places(self) -> dict[str, Any]:
         """What fills the template at any size: points and axes."""
-        axes = {}
+        axes: dict[str, Any] = {}
         for name, one in (("x", self.across), ("y", self.up)):
             axes |= {f"@{name} scale": one.scale, f"@{name} marks": one.marks}
         return {**axes, "@points": self.points, "@corners": self.corners}
 
     def labels(self, size: Size) -> dict[str, Any]:
-        """Return what else fills it: titles of the axes and, in pixels, labels and lines to those on the right."""
+        """Return what else fills it: titles of the axes and, in pixels, labels and lines to some of them."""
         marks = [self._mark(point, size) for point in self.points]
         rows = {round((1 - self.up.share(corner["y"])) * size.height, 3) for corner in self.corners}
         labels = place(marks, sorted(rows), size.width, size.height)

@@ -64,7 +64,9 @@ def test_the_first_screen_says_which_method_keeps_most_without_prior_data_and_it
     free = [row for row in rows() if row["division"] == "prior-data-free"]
     best = max(free, key=lambda row: row["estimates"]["kept"][0])
     kept, cost = best["estimates"]["kept"][0], best["costs"]["relative_cost"]
-    answer = f"At equal learning, {best['method']} keeps most: {kept:.2f}, at {cost:.2f}\N{MULTIPLICATION SIGN}"
+    answer = (
+        f"At equal learning, {best['method']} keeps most: {kept:.2f}, at {cost:.2f}\N{MULTIPLICATION SIGN}"
+    )
     assert in_first_viewport(opened, answer)
 
 

@@ -90,15 +90,15 @@ def test_a_leader_that_is_told_apart_is_called_best(board: Callable[..., Any]) -
     (verdict,) = verdicts(board(sft=matrix(0.1), lora=matrix(0.9), finch=matrix(0.1)))
     assert verdict.leader.method == "lora"
     assert verdict.standing.startswith("Best final average, ")
-    assert verdict.keeping == (
-        "At equal learning, lora keeps most: 0.90, at a cost that was not measured."
-    )
+    assert verdict.keeping == ("At equal learning, lora keeps most: 0.90, at a cost that was not measured.")
 
 
 def test_a_leader_that_learns_less_does_not_keep_most_at_equal_learning(board: Callable[..., Any]) -> None:
     (verdict,) = verdicts(board(sft=matrix(0.1), lora=matrix(1.0, 0.3), finch=matrix(0.2)))
     assert verdict.leader.method == "lora"
-    assert "It learns less than sft: 0.30 against 1.00. At equal learning, finch keeps most" in verdict.keeping
+    assert (
+        "It learns less than sft: 0.30 against 1.00. At equal learning, finch keeps most" in verdict.keeping
+    )
 
 
 def test_the_only_method_of_a_division_is_compared_with_plain_fine_tuning(board: Callable[..., Any]) -> None:

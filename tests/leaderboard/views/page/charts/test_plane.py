@@ -61,8 +61,8 @@ def test_every_place_of_the_template_is_filled(rows: Any) -> None:
     size = resolve(f"{PLANE}:WIDE")
     drawn = Plane(rows, learned, kept)
     template = resolve(f"{PLANE}:template")(size)
-    assert "\"@" in json.dumps(template)
-    assert "\"@" not in json.dumps(resolve(f"{PLANE}:filled")(template, drawn.places | drawn.labels(size)))
+    assert '"@' in json.dumps(template)
+    assert '"@' not in json.dumps(resolve(f"{PLANE}:filled")(template, drawn.places | drawn.labels(size)))
 
 
 def test_one_method_of_a_division_has_no_front(rows: Any) -> None:
