@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from axe_playwright_python.sync_playwright import Axe
 from playwright.sync_api import Browser, Page, sync_playwright
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
@@ -90,3 +91,11 @@ def test_no_place_is_wider_than_the_screen(opened: Page) -> None:
         place.click()
         opened.wait_for_timeout(300)
         assert opened.evaluate("document.documentElement.scrollWidth <= window.innerWidth")
+
+
+def test_axe_finds_nothing_serious_on_any_tab(opened: Page) -> None:
+    for place in opened.locator(".tabs a").all():
+        place.click()
+        opened.wait_for_timeout(300)
+        found = Axe().run(opened).response["violations"]
+        assert not [one["id"] for one in found if one["impact"] in ("serious", "critical")]
