@@ -91,7 +91,8 @@ def template(size: Size, font: str = SYSTEM_FONT, named: Iterable[str] = ()) -> 
 
 
 def _named(data: str, mark: Spec, **encoding: Any) -> Spec:
-    return layer([], mark, **encoding) | {"data": {"name": data}}
+    # A layer may be empty, and an empty group without a name is an error for screen readers.
+    return layer([], mark | {"aria": False}, **encoding) | {"data": {"name": data}}
 
 
 class Plane:
