@@ -17,7 +17,7 @@ from clbench.records.paths import RECORDS
 if TYPE_CHECKING:
     from clbench.records.record import Record
 
-    from .views.page.plot import Plot
+    from .views.page.charts.plot import Plot
 
 __all__ = ["curves", "frontier", "matrix", "plane"]
 
@@ -38,7 +38,7 @@ def matrix(runs: Record | Iterable[Record] | Path | str, *, dark: bool = False) 
         InputError: There is no record, or they are of several methods, or of different scenarios.
         RecordError: A file is no record, or its run failed.
     """
-    from .views.page.plot import themed
+    from .views.page.charts.plot import themed
     from .views.page.runs import Runs, matrix_of
 
     return themed(matrix_of(Runs.of(_records(runs))), dark)
@@ -61,7 +61,7 @@ def curves(
         InputError: There is no record, or they are of several methods, or of different scenarios.
         RecordError: A file is no record, or its run failed.
     """
-    from .views.page.plot import themed
+    from .views.page.charts.plot import themed
     from .views.page.runs import Runs, curves_of
 
     beside = None if sft is None else Runs.of(_records(sft))
@@ -82,14 +82,15 @@ def plane(records: Path | str = RECORDS, scenario: str | None = None, *, dark: b
         UnknownNameError: The scenario has no row.
     """
     from .publishing import read_board
-    from .views.page.charts import FONT, WIDE, heading
-    from .views.page.charts import plane as chart
-    from .views.page.plot import themed
+    from .views.page.charts.plane import WIDE
+    from .views.page.charts.plane import plane as chart
+    from .views.page.charts.plot import themed
+    from .views.page.charts.vega import heading
 
     rows = read_board(Path(records)).rows
     names = [row.scenario for row in rows]
     chosen = _chosen(scenario, {name: names.count(name) for name in names}, "row", records)
-    drawn = chart([row for row in rows if row.scenario == chosen], WIDE, font=FONT)
+    drawn = chart([row for row in rows if row.scenario == chosen], WIDE)
     return themed({**drawn, "title": heading(chosen)}, dark)
 
 
@@ -108,10 +109,10 @@ def frontier(records: Path | str = RECORDS, scenario: str | None = None, *, dark
         UnknownNameError: The scenario has none.
     """
     from .board.frontier import ladder_of, read_frontiers
-    from .views.page.charts import FONT, heading
-    from .views.page.frontier import WIDE
-    from .views.page.frontier import frontier as chart
-    from .views.page.plot import themed
+    from .views.page.charts.frontier import WIDE
+    from .views.page.charts.frontier import frontier as chart
+    from .views.page.charts.plot import themed
+    from .views.page.charts.vega import FONT, heading
 
     folder = ladder_of(Path(records))
     found, _ = read_frontiers(folder)

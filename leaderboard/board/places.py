@@ -1,4 +1,4 @@
-"""Defaults of the commands and pages of the leaderboard, relative to the working directory."""
+"""Places that commands and pages of the leaderboard know, most of them relative to the working directory."""
 
 from __future__ import annotations
 
@@ -12,3 +12,6 @@ CONTROLS = Path("leaderboard/controls")
 
 LADDER = Path("leaderboard/ladder")
 """Folder of records with the step sizes of the ladder, next to the folder of records."""
+
+CARDS = Path(__file__).parents[2] / "docs/reference/scenarios"
+"""Folder of the scenario cards, beside the code. An installed wheel has none."""

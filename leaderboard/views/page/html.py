@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import hashlib
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -16,21 +16,33 @@ from markupsafe import Markup
 
 from clbench.base.text import counted
 from clbench.records.paths import parts_of
-from clbench.spec.identifiers import folder_name
+from clbench.spec.identifiers import built_in_methods, folder_name
 
-from ...board.overall import overall
-from ...board.rows import Row, Table
+from ...board.rows import Table
+from ...board.summary import DIVISIONS
 from ...board.tiers import TIERS
 from ..format import format_interval, number_text, title_of
-from .charts import FONT, NARROW, PALETTE, SERIES, SHAPES, WIDE, along_a_run, decoders, in_theme, plane
-from .frontier import NARROW as NARROW_FRONTIER
-from .frontier import WIDE as WIDE_FRONTIER
-from .frontier import frontier
-from .plot import VEGA_LITE, on_paper
-from .view import SHADES, ScenarioView, columns, grouped, number, scenarios
+from .charts.along import SERIES, along_a_run
+from .charts.axes import ACROSS, UP
+from .charts.decoders import decoders
+from .charts.frontier import NARROW as NARROW_FRONTIER
+from .charts.frontier import WIDE as WIDE_FRONTIER
+from .charts.frontier import frontier
+from .charts.plane import FULL, NARROW, WIDE, Plane, plane, template
+from .charts.plot import VEGA_LITE, on_paper
+from .charts.vega import FONT, PALETTE, SHAPES, in_theme
+from .heat import COLUMNS, heat_maps
+from .rows import MAIN, SHADES
+from .view import ScenarioView, scenarios, tables_of, title_of_place
 
 FOLDER = Path(__file__).parent
 """Folder of the templates, the style and the script."""
+
+REPOSITORY = "https://github.com/clbench/clbench"
+"""Address of the project, as in its metadata."""
+
+PLANES = {"full": FULL, "wide": WIDE, "narrow": NARROW}
+"""Sizes of the plane by name."""
 
 GROUPS = {"retained": "old skills to keep", "target": "new tasks", "held out": "never trained"}
 """Titles of the groups of tasks."""
@@ -64,7 +76,7 @@ def page(table: Table) -> str:
     views = scenarios(table)
     scripts = [_library(), _source("page.js")]
     style = _source("style.css") + _colours()
-    averages = overall(table.rows)
+    tables = tables_of(table)
     return (
         _templates()
         .get_template("page.html")
@@ -74,8 +86,7 @@ def page(table: Table) -> str:
             scripts=[Markup(script) for script in scripts],
             data=Markup(_embedded(_data(views))),
             scenarios=views,
-            overall=grouped(averages, [row.division for row in averages]),
-            overall_columns=columns(averages),
+            heat_maps=heat_maps(tables),
             not_shown=table.not_shown,
         )
     )
@@ -86,11 +97,8 @@ def pictures(table: Table) -> dict[str, str]:
 
     They are the plane of the scenario with the most methods, and the frontier of each scenario that has one.
     """
-    by_scenario: dict[str, list[Row]] = {}
-    for row in table.rows:
-        by_scenario.setdefault(row.scenario, []).append(row)
-    rows = max(by_scenario.values(), key=len, default=[])
-    specs = {"pareto": plane(rows, WIDE, font=FONT)}
+    rows = max(tables_of(table).values(), key=len, default=[])
+    specs = {"pareto": plane(rows, WIDE)}
     for scenario, curves in table.frontiers.items():
         specs[f"frontier-{folder_name(scenario)}"] = frontier(curves, WIDE_FRONTIER, FONT)
     found = {}
@@ -121,10 +129,25 @@ def _templates() -> Environment:
         counted=counted,
         format_interval=format_interval,
         number_text=number_text,
-        number_of=number,
+        shade=lambda value: round(round(value, 9) * SHADES),
         shade_of_rank=_shade_of_rank,
+        main=MAIN,
+        across=ACROSS,
+        up=UP,
+        repository=REPOSITORY,
+        method_page=_method_page,
+        title_of_place=title_of_place,
+        heat_columns=COLUMNS,
+        divisions=list(enumerate(DIVISIONS)),
     )
     return templates
+
+
+def _method_page(method: str) -> str:
+    """Return the address of a method's page, empty if the method is not built in."""
+    return (
+        f"{REPOSITORY}/blob/main/docs/reference/methods/{method}.md" if method in built_in_methods() else ""
+    )
 
 
 def _shade_of_rank(rank: int, count: int) -> int:
@@ -146,7 +169,7 @@ def _policy(scripts: Sequence[str], style: str) -> str:
     """Return a content security policy that allows only these scripts and this style."""
     sources = " ".join(map(_hash, scripts))
     others = "default-src 'none'; base-uri 'none'; form-action 'none'"
-    return f"{others}; script-src {sources}; style-src {_hash(style)}"
+    return f"{others}; img-src data:; script-src {sources}; style-src {_hash(style)}"
 
 
 def _hash(text: str) -> str:
@@ -177,16 +200,29 @@ def _rgb(colour: str) -> tuple[int, ...]:
 
 
 def _data(views: Sequence[ScenarioView]) -> dict[str, Any]:
-    """Return the data of the charts."""
+    """Return what the page draws when the reader asks for it: charts, and the sections of the rows."""
     return {
-        "rows": {view.anchor: {**view.data, "scenario": one.id} for one in views for view in one.rows},
+        "rows": {
+            view.anchor: {**view.data, "scenario": one.id, "html": _section(one, number)}
+            for one in views
+            for number, view in enumerate(one.rows)
+        },
         "scenarios": {one.id: _scenario_data(one) for one in views},
         "series": SERIES,
+        "planes": {name: template(size) for name, size in PLANES.items()},
     }
 
 
+def _section(one: ScenarioView, number: int) -> str:
+    """Return the section of a row as HTML."""
+    before, after = (
+        one.rows[place] if 0 <= place < len(one.rows) else None for place in (number - 1, number + 1)
+    )
+    section = _templates().get_template("row.html")
+    return section.render(one=one, view=one.rows[number], previous=before, next=after)
+
+
 def _scenario_data(one: ScenarioView) -> dict[str, Any]:
-    rows = [view.row for view in one.rows]
     anchors = {view.row.method: view.anchor for view in one.rows}
     extra = {}
     if one.frontier:
@@ -198,6 +234,9 @@ def _scenario_data(one: ScenarioView) -> dict[str, Any]:
     names = one.tasks["target"]
     titles = names if one.balanced else [f"{number} {name}" for number, name in enumerate(names, 1)]
     steps = (1,) if one.to_criterion else one.steps
+    length = None if one.to_criterion else one.steps[-1]
+    if one.has_agents:
+        extra["run_elsewhere"] = along_a_run(titles, length, by_agent=True)
     return {
         **extra,
         "to_criterion": one.to_criterion,
@@ -205,13 +244,27 @@ def _scenario_data(one: ScenarioView) -> dict[str, Any]:
         "sft": anchors.get("sft"),
         "steps": steps,
         "targets": one.tasks["target"],
-        "run": along_a_run(titles, None if one.to_criterion else one.steps[-1]),
-        "wide": plane(rows, WIDE, anchors),
-        "narrow": plane(rows, NARROW, anchors),
+        "run": along_a_run(titles, length),
+        "planes": _planes(one, anchors),
+    }
+
+
+def _planes(one: ScenarioView, anchors: Mapping[str, str]) -> dict[str, Any]:
+    """Return what fills the template of the plane, by its two quantities."""
+    planes = {
+        f"{across.name}, {up.name}": Plane(one.table, across, up, anchors) for across in ACROSS for up in UP
+    }
+    return {
+        name: {
+            "note": drawn.note,
+            "places": drawn.places,
+            **{size: drawn.labels(PLANES[size]) for size in PLANES},
+        }
+        for name, drawn in planes.items()
     }
 
 
 def _embedded(values: Any) -> str:
     """Return JSON that cannot close its script element, whatever a stranger wrote."""
     text = json.dumps(values, sort_keys=True, separators=(",", ":"), allow_nan=False)
-    return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
+    return text.replace("<", "\\u003c")

@@ -25,7 +25,62 @@
   dark.addEventListener("change", nameTheme);
   nameTheme();
 
-  // ---- tables: sort and filter -----------------------------------------------------------------------------
+  // ---- the tip: what is behind a number, by mouse, by tap and by key ----------------------------------------
+
+  const tip = document.getElementById("tip");
+
+  function showTip(text, left, top, bottom) {
+    tip.textContent = text;
+    (document.querySelector("dialog[open]") ?? document.body).append(tip); // above an open dialog
+    tip.showPopover();
+    const below = bottom + 6 + tip.offsetHeight < window.innerHeight;
+    tip.style.left = `${Math.max(Math.min(left, window.innerWidth - tip.offsetWidth - 8), 8)}px`;
+    tip.style.top = `${below ? bottom + 6 : top - 6 - tip.offsetHeight}px`;
+  }
+
+  const hideTip = () => tip.hidePopover();
+
+  function showNote(element) {
+    const { left, top, bottom } = element.getBoundingClientRect();
+    showTip(element.dataset.note, left, top, bottom);
+  }
+
+  const noted = (event) => event.target.closest?.("[data-note]");
+  for (const [begin, end] of [["focusin", "focusout"], ["mouseover", "mouseout"]]) {
+    document.addEventListener(begin, (event) => { if (noted(event)) showNote(noted(event)); });
+    document.addEventListener(end, (event) => { if (noted(event)) hideTip(); });
+  }
+  document.addEventListener("scroll", () => {
+    const focused = document.activeElement.closest("[data-note]"); // the focus may have moved the page
+    if (focused?.matches(":focus-visible")) showNote(focused);
+    else hideTip();
+  }, { capture: true, passive: true });
+
+  /* One number of a table is a stop of the Tab key; the arrow keys lead to the others. */
+  function roam(table) {
+    const cells = () => [...table.tBodies].flatMap((body) => [...body.rows])
+      .filter((row) => row.checkVisibility())
+      .map((row) => [...row.querySelectorAll("td[data-note]")].filter((cell) => cell.checkVisibility()))
+      .filter((row) => row.length);
+    for (const cell of table.querySelectorAll("td[data-note]")) cell.tabIndex = -1;
+    const first = cells()[0]?.[0];
+    if (first) first.tabIndex = 0;
+    table.addEventListener("keydown", (event) => {
+      const step = { ArrowLeft: [0, -1], ArrowRight: [0, 1], ArrowUp: [-1, 0], ArrowDown: [1, 0] }[event.key];
+      const here = event.target.closest("td[data-note]");
+      if (!step || !here) return;
+      const all = cells(), row = all.findIndex((row) => row.includes(here));
+      const line = all[row + step[0]], at = all[row].indexOf(here) + step[1];
+      const next = line?.[Math.min(at, line.length - 1)];
+      event.preventDefault();
+      if (!next) return;
+      here.tabIndex = -1;
+      next.tabIndex = 0;
+      next.focus();
+    });
+  }
+
+  // ---- a scenario: its filters, its table and its picture ---------------------------------------------------
 
   function prepare(part) {
     const table = part.querySelector(".board");
@@ -33,6 +88,8 @@
     const bodies = [...table.tBodies];
     const rows = bodies.flatMap((body) => [...body.rows].slice(1).map((row) => ({ row, body })));
     const form = part.querySelector(".filters");
+    const { all, grouped } = Object.fromEntries(
+      [...part.querySelectorAll(".choices input")].map((box) => [box.name, box]));
     const sorted = heads.find((head) => head.ariaSort !== "none");
     let column = heads.indexOf(sorted), direction = sorted.ariaSort;
 
@@ -44,9 +101,9 @@
     }
 
     function arrange() {
-      const grouped = !form || form.elements.grouped.checked;
-      table.classList.toggle("grouped", grouped);
-      for (const one of [...rows].sort(compare)) (grouped ? one.body : bodies[0]).append(one.row);
+      table.classList.toggle("grouped", grouped.checked);
+      table.parentElement.classList.toggle("all", all.checked);
+      for (const one of [...rows].sort(compare)) (grouped.checked ? one.body : bodies[0]).append(one.row);
       heads.forEach((head, number) => { head.ariaSort = number === column ? direction : "none"; });
     }
 
@@ -54,17 +111,22 @@
       const { text, tier } = form.elements;
       const wanted = text.value.trim().toLowerCase();
       const divisions = [...form.querySelectorAll("[name=division]:checked")].map((box) => box.value);
-      let count = 0;
+      const methods = new Set();
       for (const { row } of rows) {
-        const name = row.querySelector(".name").textContent.toLowerCase();
-        row.hidden = !name.includes(wanted) || !divisions.includes(row.dataset.division)
-          || (tier.value !== "" && row.dataset.tier !== tier.value);
-        count += !row.hidden;
+        const name = row.querySelector(".name").textContent;
+        row.hidden = !name.toLowerCase().includes(wanted) || !divisions.includes(row.dataset.division)
+          || (tier?.value && row.dataset.tier !== tier.value);
+        if (!row.hidden) methods.add(name);
       }
       for (const body of bodies) {
         body.rows[0].hidden = rows.every((one) => one.body !== body || one.row.hidden);
       }
-      form.elements.count.value = `${count} of ${rows.length} methods`;
+      form.elements.count.value = `${methods.size} of ${rows.length} methods`;
+      return methods;
+    }
+
+    function picture() {
+      drawPlane(part, form.elements.across.value, form.elements.up.value, filter());
     }
 
     table.tHead.addEventListener("click", (event) => {
@@ -76,53 +138,66 @@
       column = heads.indexOf(head);
       arrange();
     });
-    table.addEventListener("click", (event) => {
-      const link = event.target.closest("tbody tr")?.querySelector(".name a");
-      if (link && !event.target.closest("a") && !getSelection().toString()) link.click();
-    });
-    form?.addEventListener("input", () => { arrange(); filter(); });
-    form?.addEventListener("submit", (event) => event.preventDefault());
-    form?.reset();
+    part.querySelector(".choices").addEventListener("input", arrange);
+    form.addEventListener("input", picture);
+    form.addEventListener("submit", (event) => event.preventDefault());
+    form.reset();
+    all.checked = false;
+    grouped.checked = true;
+    roam(table);
+    part.picture = picture;
   }
 
-  for (const table of document.querySelectorAll(".board")) prepare(table.closest(".part"));
-
   const files = document.getElementById("not-shown");
-  files.querySelector(".filters")?.addEventListener("input", ({ currentTarget: form }) => {
+  files?.querySelector(".filters").addEventListener("input", ({ currentTarget: form }) => {
     const rows = [...files.querySelector("tbody").rows];
     const wanted = form.elements.text.value.trim().toLowerCase();
     for (const row of rows) row.hidden = !row.textContent.toLowerCase().includes(wanted);
     form.elements.count.value = `${rows.filter((row) => !row.hidden).length} of ${rows.length} files`;
   });
-  files.querySelector(".filters")?.addEventListener("submit", (event) => event.preventDefault());
+  files?.querySelector(".filters").addEventListener("submit", (event) => event.preventDefault());
 
   // ---- charts ----------------------------------------------------------------------------------------------
 
-  const tip = document.getElementById("tip");
-
-  function showTip(handler, event, item, value) {
-    if (!value) return tip.hidePopover();
-    tip.textContent = Object.entries(value).map(([name, text]) => `${name}: ${text}`).join("\n");
-    tip.showPopover();
-    const left = Math.min(event.clientX + 12, window.innerWidth - tip.offsetWidth - 8);
-    const below = event.clientY + 12 + tip.offsetHeight < window.innerHeight;
-    tip.style.left = `${Math.max(left, 8)}px`;
-    tip.style.top = `${below ? event.clientY + 12 : event.clientY - 12 - tip.offsetHeight}px`;
+  function showPoint(handler, event, item, value) {
+    if (!value) return hideTip();
+    const known = new Set(["across", "up"]); // their texts have their names
+    const lines = Object.entries(value).map(([name, text]) => (known.has(name) ? text : `${name}: ${text}`));
+    showTip(lines.join("\n"), event.clientX + 12, event.clientY, event.clientY + 8);
   }
 
   async function draw(element, spec) {
     // `ast` interprets expressions: the policy of the page forbids code made from text.
-    const options = { actions: false, ast: true, renderer: "svg", defaultStyle: false, tooltip: showTip };
-    // Vega sets its own class names on the element that it draws in.
-    const { view } = await vegaEmbed(element.appendChild(document.createElement("div")), spec, options);
+    const options = { actions: false, ast: true, renderer: "svg", defaultStyle: false, tooltip: showPoint };
+    // Vega sets its own class names on the element that it draws in, and asks for its width.
+    const place = element.latest = element.appendChild(document.createElement("div"));
+    const { view } = await vegaEmbed(place, spec, options);
     view.addEventListener("click", (event, item) => {
       if (item?.datum?.anchor) location.hash = `#${item.datum.anchor}`;
     });
+    if (element.latest === place) element.replaceChildren(place); // the reader may have chosen again meanwhile
   }
 
-  function drawPlane(element) {
-    const one = data.scenarios[element.dataset.plane];
-    draw(element, narrow() ? one.narrow : one.wide);
+  const sizeOfPlane = () => (narrow() ? "narrow" : window.innerWidth < 1340 ? "wide" : "full");
+
+  /* The template with its places filled by points, axes and labels; hidden methods have neither. */
+  function drawPlane(part, across, up, methods) {
+    const element = part.querySelector("[data-plane]");
+    const plane = data.scenarios[part.id].planes[`${across}, ${up}`];
+    const size = part.size = sizeOfPlane();
+    const places = { ...plane.places, ...plane[size] };
+    for (const name of ["@points", "@leaders", "@left", "@right"]) {
+      places[name] = places[name].filter((one) => methods.has(one.method));
+    }
+    // A front holds for all methods of its division.
+    const whole = new Set(plane.places["@points"].filter((one) => !methods.has(one.method)).map((one) => one.division));
+    places["@corners"] = places["@corners"].filter((one) => !whole.has(one.division));
+    const empty = plane.places["@points"].length === 0;
+    element.classList.toggle("empty", empty);
+    part.querySelector("[data-plane-note]").textContent = (empty ? `No method here has both ${up} and ${across}. ` : "") + plane.note;
+    if (empty) return element.replaceChildren();
+    const fill = (name, value) => (typeof value === "string" && value in places ? places[value] : value);
+    draw(element, JSON.parse(JSON.stringify(data.planes[size]), fill));
   }
 
   function drawFrontier(element) {
@@ -144,17 +219,18 @@
     return { retained: [[0, 0], ...each(steps)], target: each([0, ...steps]) };
   }
 
-  /* Where stages end when the target is learned, their length differs between runs: a stage is one step long. */
-  const when = (one, step) => one.to_criterion ? ["start", "end"][step] : String(step);
+  /* Stages that end when the target is learned, and those of agents, have no common number of steps. */
+  const whole = (row, one) => row.elsewhere || one.to_criterion;
+  const when = (row, one, step) => (whole(row, one) ? (step ? "end" : "start") : String(step));
 
-  function points(series, numbers, at, one, perStage) {
+  function points(series, numbers, at, row, one, perStage) {
     return numbers.flatMap(([y, low, high], index) => {
       if (y === null) return [];
       const [stage, step] = at[index];
       const x = stage * one.steps.at(-1) + step;
       return [{
         series, x, y, low: low ?? y, high: high ?? y, stage: series + (perStage ? stage : ""),
-        at: one.to_criterion ? `${when(one, step)} of stage ${stage + 1}` : `step ${x}`, success: words([y, low, high]),
+        at: whole(row, one) ? `${when(row, one, step)} of stage ${stage + 1}` : `step ${x}`, success: words([y, low, high]),
       }];
     });
   }
@@ -165,15 +241,16 @@
     const at = places(one);
     const [retained, target, beside] = data.series;
     const all = [
-      ...points(retained, row.retained, at.retained, one, false),
-      ...points(target, row.target, at.target, one, true),
+      ...points(retained, row.retained, at.retained, row, one, false),
+      ...points(target, row.target, at.target, row, one, true),
     ];
-    if (one.sft && one.sft !== element.dataset.run) {
+    if (one.sft && one.sft !== element.dataset.run && !row.elsewhere) {
       const values = data.rows[one.sft].retained.map(([value]) => [value, null, null]);
-      all.push(...points(beside, values, at.retained, one, false));
+      all.push(...points(beside, values, at.retained, row, one, false));
     }
     const shown = [...new Set(all.map((point) => point.series))];
-    draw(element, { ...one.run, params: [{ name: "shown", value: shown }], datasets: { points: all } });
+    const chart = row.elsewhere ? one.run_elsewhere : one.run;
+    draw(element, { ...chart, params: [{ name: "shown", value: shown }], datasets: { points: all } });
   }
 
   // ---- tables that are long and made when they open -------------------------------------------------
@@ -193,10 +270,13 @@
     const head = made.createTHead().insertRow();
     heads.forEach((text, number) => cell(head, "th", text, number > 0));
     const body = made.createTBody();
-    for (const { texts, title } of rows) {
+    for (const { texts, meaning } of rows) {
       const row = body.insertRow();
       texts.forEach((text, number) => cell(row, number ? "td" : "th", text, number > 0));
-      if (title) row.title = title;
+      if (!meaning) continue;
+      const more = row.cells[0].appendChild(document.createElement("span"));
+      more.className = "meaning";
+      more.textContent = meaning;
     }
     return region;
   }
@@ -206,7 +286,8 @@
       const one = data.scenarios[row.scenario], count = one.steps.length;
       const rows = places(one).target.map(([stage, step], index) => {
         const place = index - stage * (count + 1);
-        return { texts: [one.targets[stage], when(one, step), words(row.target[index]), words(row.retained[stage * count + place])] };
+        const texts = [words(row.target[index]), words(row.retained[stage * count + place])];
+        return { texts: [one.targets[stage], when(row, one, step), ...texts] };
       });
       return table("The curves", ["target", "step", "success on the target", "on the old skills"], rows);
     },
@@ -216,38 +297,38 @@
         const [name, description, missing] = data.scenarios[row.scenario].metrics[index];
         const [value, low, high, ...each] = numbers;
         const texts = [name, words([value, low, high]), ...each.map((one) => words([one, null, null]))];
-        return { texts, title: value === null ? `Missing: ${missing}` : description };
+        return { texts, meaning: value === null ? `Missing: ${missing}` : description };
       });
       const heads = ["metric", "value [95 % interval]", ...seeds.map((seed) => `seed ${seed}`)];
       return table("All other metrics and definitions", heads, rows);
     },
   };
 
+  // ---- the section of a row, made when it opens -------------------------------------------------------------
+
+  const dialog = document.getElementById("row");
+  let opened = "";
+
   document.addEventListener("toggle", ({ target }) => {
     const make = tables[target.dataset?.table];
-    if (!make || !target.open || target.children.length > 1) return;
-    target.append(make(data.rows[target.closest("dialog").id]));
+    if (make && target.open && target.children.length < 2) target.append(make(data.rows[opened]));
   }, true);
 
-  function drawInside(part) {
-    for (const element of part.querySelectorAll("[data-plane], [data-frontier], [data-decoders], [data-run]")) {
-      const hidden = element.closest("dialog:not([open])");
-      if (hidden || element.dataset.drawn) continue;
-      element.dataset.drawn = "yes";
-      const { plane, frontier, decoders } = element.dataset;
-      (plane ? drawPlane : frontier ? drawFrontier : decoders ? drawDecoders : drawRun)(element);
-    }
+  function openRow(anchor) {
+    opened = anchor;
+    dialog.innerHTML = data.rows[anchor].html; // the templates of the page escaped what strangers wrote
+    if (!dialog.open) dialog.showModal();
+    dialog.querySelector("h2").focus();
+    dialog.scrollTop = 0;
+    drawRun(dialog.querySelector("[data-run]"));
   }
 
-  // ---- the success matrix of one seed ----------------------------------------------------------------------
-
-  document.addEventListener("click", (event) => {
+  dialog.addEventListener("click", (event) => {
     const chosen = event.target.closest("[data-seed]");
     if (!chosen) return;
-    const dialog = chosen.closest("dialog");
     const matrix = dialog.querySelector(".matrix");
     matrix.mean ??= [...matrix.tBodies[0].rows].map((row) => [...row.cells].slice(1).map((cell) => cell.textContent));
-    const seed = data.rows[dialog.id].seeds[chosen.dataset.seed];
+    const seed = data.rows[opened].seeds[chosen.dataset.seed];
     [...matrix.tBodies[0].rows].forEach((row, stage) => [...row.cells].slice(1).forEach((cell, task) => {
       const value = seed ? seed[stage][task] : parseFloat(matrix.mean[stage][task]);
       const known = value !== null && !isNaN(value);
@@ -257,50 +338,76 @@
     for (const other of chosen.parentElement.children) other.ariaPressed = String(other === chosen);
   });
 
+  dialog.addEventListener("click", (event) => {
+    const close = event.target.closest(".close");
+    const outside = event.target === dialog && event.clientX < dialog.getBoundingClientRect().left; // the backdrop
+    if (!close && !outside) return;
+    event.preventDefault();
+    dialog.close();
+  });
+
+  dialog.addEventListener("close", () => {
+    document.body.append(tip);
+    hideTip();
+    dialog.replaceChildren();
+    if (!opened) return;
+    // Closed by a key or a click: restore the address of the scenario, and the focus on the row.
+    const { scenario } = data.rows[opened];
+    history.replaceState(null, "", `#${scenario}`);
+    const links = [...document.getElementById(scenario).querySelectorAll(".board .name a")];
+    links.find((link) => link.hash === `#${opened}`)?.focus({ preventScroll: true });
+    opened = "";
+  });
+
   // ---- places: #scenario shows a scenario, #scenario/method opens a row ------------------------------------
 
-  const parts = [...document.querySelectorAll(".part:not(.always)")];
-  const links = [...document.querySelectorAll(".top nav a")];
+  const parts = [...document.querySelectorAll(".part")];
+  const tabs = document.querySelector(".tabs");
 
   function go() {
     const name = decodeURIComponent(location.hash.slice(1));
-    const target = document.getElementById(name);
-    const part = target?.closest(".part:not(.always)") ?? parts.find((one) => !one.hidden) ?? parts[0];
+    const row = data.rows[name];
+    const wanted = document.getElementById(row ? row.scenario : name)?.closest(".part");
+    const part = wanted ?? parts.find((one) => !one.hidden) ?? parts[0];
+    const moved = part?.hidden !== false;
     for (const one of parts) one.hidden = one !== part;
-    for (const link of links) {
-      link.toggleAttribute("aria-current", part && link.hash.slice(1) === part.id);
-      if (link.hasAttribute("aria-current")) link.setAttribute("aria-current", "true");
+    for (const link of tabs.querySelectorAll("a")) {
+      const here = part && link.hash.slice(1) === part.id;
+      if (here) link.setAttribute("aria-current", "true");
+      else link.removeAttribute("aria-current");
+      if (here) link.parentElement.scrollLeft = link.offsetLeft - 40;
     }
-    for (const dialog of document.querySelectorAll("dialog[open]")) if (dialog !== target) dialog.close("moved");
-    if (target?.matches("dialog.row")) {
-      if (!target.open) target.showModal();
-      target.querySelector("h2").focus();
-      target.scrollTop = 0;
-      drawInside(target);
-    } else if (target?.matches(".part")) {
-      target.scrollIntoView();
-    }
-    if (part) drawInside(part);
+    // The tabs stay where they are: a part that the reader has scrolled into begins below them.
+    if (moved) window.scrollTo({ top: Math.min(window.scrollY, document.querySelector(".top").offsetHeight), behavior: "instant" });
+    if (part) show(part);
+    if (row) return openRow(name);
+    opened = "";
+    if (dialog.open) dialog.close();
   }
 
-  document.addEventListener("close", ({ target: dialog }) => {
-    // Closed by a key or a click: restore the address of the scenario, and the focus on the row.
-    if (dialog.returnValue !== "moved") {
-      const part = dialog.closest(".part");
-      history.replaceState(null, "", `#${part.id}`);
-      [...part.querySelectorAll(".board .name a")].find((link) => link.hash === `#${dialog.id}`)?.focus();
+  function show(part) {
+    if (part.picture && !part.drawn) part.picture();
+    if (!part.drawn) {
+      part.querySelectorAll("[data-frontier]").forEach(drawFrontier);
+      part.querySelectorAll("[data-decoders]").forEach(drawDecoders);
     }
-    dialog.returnValue = "";
-    tip.hidePopover();
-  }, true);
-  document.addEventListener("click", (event) => {
-    const close = event.target.closest("dialog .close");
-    const outside = event.target.matches("dialog.row"); // the backdrop is the dialog itself
-    if (!close && !(outside && event.clientX < event.target.getBoundingClientRect().left)) return;
-    event.preventDefault();
-    event.target.closest("dialog").close();
+    part.drawn = true;
+  }
+
+  tabs.addEventListener("click", (event) => {
+    const link = event.target.closest("a");
+    if (!link) return;
+    event.preventDefault(); // the browser would scroll
+    history.pushState(null, "", link.hash);
+    go();
   });
-  window.addEventListener("hashchange", go);
+  // Back and forward change the address, too.
+  window.addEventListener("popstate", go);
+  window.addEventListener("resize", () => {
+    for (const part of parts) if (part.drawn && part.picture && part.size !== sizeOfPlane()) part.picture();
+  });
+  for (const part of parts) if (part.querySelector(".board")) prepare(part);
+  document.querySelectorAll(".heat, .definitions").forEach(roam);
   parts.slice(1).forEach((part) => { part.hidden = true; });
   go();
 })();

@@ -19,9 +19,11 @@ from clbench.scoring.rates import check_same
 from clbench.scoring.scores import Scores
 
 from ..format import format_interval
-from .charts import FONT, SERIES, WIDE, Spec, along_a_run, heading, rounded, with_points
+from .charts.along import SERIES, along_a_run, with_points
+from .charts.matrix import matrix
+from .charts.plane import WIDE
+from .charts.vega import FONT, Spec, heading, rounded
 from .curves import estimated, retained_curve, target_curves
-from .matrix import matrix
 
 
 @dataclass(frozen=True)

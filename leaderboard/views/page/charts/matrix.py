@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 
 from clbench.scoring.layout import Array
 
-from .charts import Spec, colour, heading, rounded, specification
+from .vega import Spec, colour, heading, rounded, specification
 
 CELL = {"step": 56}, {"step": 30}
 """Width and height of a cell in pixels."""

@@ -6,9 +6,9 @@ import math
 from collections.abc import Iterable, Sequence
 from typing import Any
 
-from ...board.frontier import Curve, Rung
-from ..format import format_interval, number_text
-from .charts import SYSTEM_FONT, Size, Spec, axis, colour, layer, rounded, specification
+from ....board.frontier import Curve, Rung
+from ...format import format_interval, number_text
+from .vega import SYSTEM_FONT, Size, Spec, axis, colour, layer, rounded, specification
 
 HUES, DASHES = ("mark-0", "mark-1", "mark-2", "mark-3"), ([1, 0], [6, 3], [2, 2], [8, 3, 2, 3])
 """Colours and dashes of the lines. Together they distinguish 16 methods, neighbours by both."""
@@ -23,19 +23,17 @@ BESIDE = "mark-5"
 """Colour of plain fine-tuning, which lies under all others."""
 
 
-WIDE = Size(
-    620,
-    400,
-    4,
-    (
-        "learned: success on each target right after learning it",
-        "kept: success at the end on all that was known before the last target",
-    ),
-)
+WIDE = Size(620, 400, 4)
 """Size on a desktop."""
 
-NARROW = Size(240, 320, 2, ("learned", "kept"))
+NARROW = Size(240, 320, 2)
 """Size on a phone."""
+
+LONG_TITLES = (
+    "learned: success on each target right after learning it",
+    "kept: success at the end on all that was known before the last target",
+)
+"""Titles of the axes where there is room."""
 
 
 def frontier(curves: Sequence[Curve], size: Size, font: str = SYSTEM_FONT) -> Spec:
@@ -49,7 +47,8 @@ def frontier(curves: Sequence[Curve], size: Size, font: str = SYSTEM_FONT) -> Sp
     points = [_point(curve, rung) for curve in curves for rung in curve.rungs if _is_known(rung)]
     names = [curve.method for curve in curves]
     factors = [_text(factor) for factor in sorted({one["order"] for one in points}, reverse=True)]
-    x, y = (_position(name, points, title) for name, title in zip("xy", size.titles, strict=True))
+    titles = LONG_TITLES if size.width > NARROW.width else ("learned", "kept")
+    x, y = (_position(name, points, title) for name, title in zip("xy", titles, strict=True))
     legend = {"columns": size.columns, "symbolType": "stroke", "symbolStrokeWidth": 3, "symbolSize": 250}
     of_method = {"field": "method", "type": "nominal", "legend": legend}
     hue = of_method | {"scale": {"domain": names, "range": [colour(name) for name in _hues(curves)]}}

@@ -26,7 +26,7 @@ pytestmark = pytest.mark.skipif(not CHROMIUM, reason="there is no chromium: apt-
 
 @pytest.fixture(scope="module")
 def address(make_record: Callable[..., Record], tmp_path_factory: pytest.TempPathFactory) -> str:
-    """The address of a page with two scenarios, and strange names on it."""
+    """The address of a page with three scenarios, and strange names on it."""
     records = tmp_path_factory.mktemp("board") / "records"
 
     def add(method: str, seed: int, change: float, scenario: str = "clbench/Toy-v0", **run: Any) -> None:
@@ -49,6 +49,7 @@ def address(make_record: Callable[..., Record], tmp_path_factory: pytest.TempPat
             add(method, seed, number / 10)
         add("replay", seed, 0.2, uses=REPLAY)
         add("sft", seed, seed / 5, scenario="clbench/Other-v0")
+        add("alone", seed, 0.1, scenario="clbench/Without-v0")
     (records / f"{HOSTILE.replace('/', '')}.json").write_text("{", encoding="utf-8")
     (records / "torn.json").write_text("{", encoding="utf-8")
     page = resolve("clbench.leaderboard.views.page:page")(
@@ -132,8 +133,9 @@ def test_a_click_on_a_head_sorts_and_a_second_one_the_other_way(open_page: Calla
     button.press("Enter")
     assert names(page)[0] == "x_with_a_name_that_is_longer_than_a_phone"
     # lower is better first, and missing values last either way
-    head(page, "forgetting").get_by_role("button").click()
-    expect(head(page, "forgetting")).to_have_attribute("aria-sort", "ascending")
+    head(page, "cost").get_by_role("button").click()
+    assert names(page)[:4] == ["sft", "x_with_a_name_that_is_longer_than_a_phone", "other", "l2"]
+    expect(head(page, "cost")).to_have_attribute("aria-sort", "ascending")
 
 
 def test_divisions_are_sorted_apart_until_the_reader_wants_one_list(open_page: Callable[..., Page]) -> None:
@@ -150,12 +152,16 @@ def test_filters_hide_rows_and_say_how_many_are_left(open_page: Callable[..., Pa
     form.get_by_label("Method").fill("O")
     assert names(page) == ["x_with_a_name_that_is_longer_than_a_phone", "other"]
     expect(form.get_by_role("status")).to_have_text("2 of 5 methods")
+    picture = page.locator("figure[data-plane]:visible svg")
+    expect(picture).to_contain_text("other")
+    expect(picture).not_to_contain_text("sft")
     form.get_by_label("Method").fill("")
     form.get_by_label("prior-data-free").uncheck()
     assert names(page) == ["replay"]
     expect(page.locator(".division-head:visible")).to_have_count(1)
-    form.get_by_label("Tier").select_option("retrained")
+    form.get_by_label("Method").fill("no such method")
     expect(form.get_by_role("status")).to_have_text("0 of 5 methods")
+    expect(page.locator(".board:visible thead")).to_be_visible()
 
 
 def test_enter_opens_a_row_and_escape_leads_back_to_it(open_page: Callable[..., Page]) -> None:
@@ -179,7 +185,7 @@ def test_an_address_opens_a_row_and_the_way_back_closes_it(open_page: Callable[.
     expect(row(page)).to_have_count(0)
     expect(page.locator("[id='clbench/Other-v0']")).to_be_visible()
     expect(page.locator("[id='clbench/Toy-v0']")).to_be_hidden()
-    page.locator("[id='clbench/Other-v0'] .board tbody tr").nth(1).locator("td").nth(3).click()
+    page.locator("[id='clbench/Other-v0'] .board .name a").click()
     expect(row(page)).to_have_count(1)
     page.go_back()
     expect(row(page)).to_have_count(0)
@@ -201,17 +207,18 @@ def test_a_row_has_each_seed_its_curves_and_every_definition(open_page: Callable
     expect(curves.locator("tbody tr").nth(1)).to_contain_text("0.70 [")
     row(page).get_by_text("All other metrics and definitions").click()
     expect(row(page)).to_contain_text("forgetting mammoth")
+    assert page.locator("dialog").count() == 1
 
 
 def test_the_keys_lead_through_the_page_and_show_where_they_are(open_page: Callable[..., Page]) -> None:
     page = open_page()
     page.keyboard.press("Tab")
-    expect(page.get_by_role("link", name="Skip to the tables")).to_be_focused()
+    expect(page.get_by_role("link", name="Skip to the results")).to_be_focused()
     page.keyboard.press("Enter")
     expect(page.locator("main")).to_be_focused()
     page = open_page("clbench/Toy-v0")
     met = []
-    for _ in range(26):
+    for _ in range(32):
         page.keyboard.press("Tab")
         what, ring, width = page.evaluate("""() => {
             const one = document.activeElement, style = getComputedStyle(one);
@@ -220,7 +227,18 @@ def test_the_keys_lead_through_the_page_and_show_where_they_are(open_page: Calla
         assert ring == "solid"
         assert width == "2px"
         met.append(what)
-    order = ["text", "division", "tier", "grouped", "group", "method", "final average", "other", "replay"]
+    order = [
+        "up",
+        "across",
+        "text",
+        "division",
+        "all",
+        "grouped",
+        "group",
+        "method",
+        "final average",
+        "other",
+    ]
     assert [met.index(one) for one in order] == sorted(met.index(one) for one in order)
 
 
@@ -266,16 +284,111 @@ def test_texts_of_strangers_are_shown_unchanged(open_page: Callable[..., Page]) 
     page = open_page("clbench/Toy-v0/sft")
     expect(row(page)).to_contain_text(HOSTILE)
     assert page.locator("img").count() == 0
+    row(page).get_by_role("link", name="Close").click()
+    page.get_by_role("link", name="2 files not shown").click()
     files = page.locator("#not-shown")
     expect(files.locator("tbody tr")).to_have_count(2)
-    row(page).get_by_role("link", name="Close").click()
     files.get_by_label("Path or reason").fill("onerror")
     expect(files.locator("tbody tr:visible")).to_have_count(1)
     expect(files.get_by_role("status")).to_have_text("1 of 2 files")
 
 
-def test_without_scripts_the_tables_and_rows_are_there(open_page: Callable[..., Page]) -> None:
-    page = open_page("clbench/Toy-v0/l2", java_script_enabled=False)
-    expect(page.get_by_text("clbench run clbench/Toy-v0 l2 --seeds 2")).to_be_visible()
-    expect(page.locator(".board")).to_have_count(3)
+def test_without_scripts_the_verdicts_and_tables_are_there(open_page: Callable[..., Page]) -> None:
+    page = open_page(java_script_enabled=False)
+    expect(page.locator(".board:visible")).to_have_count(3)
+    expect(page.locator(".heat:visible")).to_have_count(1)
+    expect(page.locator("td.extra").first).to_be_visible()
     expect(page.get_by_role("button", name="Dark theme")).to_be_hidden()
+
+
+def cells(page: Page) -> Locator:
+    return page.locator(".board:visible td.numeric[data-note]:visible")
+
+
+def test_a_focused_number_shows_its_interval_and_arrows_lead_on(open_page: Callable[..., Page]) -> None:
+    page = open_page("clbench/Toy-v0")
+    tip = page.get_by_role("tooltip")
+    expect(tip).to_be_hidden()
+    cells(page).first.focus()
+    expect(tip).to_have_text(re.compile(r"95 % interval from 0\.\d\d to 0\.\d\d"))
+    before = cells(page).first.inner_text()
+    page.keyboard.press("ArrowRight")
+    expect(cells(page).nth(1)).to_be_focused()
+    expect(tip).to_be_visible()
+    page.keyboard.press("ArrowLeft")
+    page.keyboard.press("ArrowDown")
+    assert page.evaluate("document.activeElement.innerText") != before
+    page.locator(".board:visible .name a").first.focus()
+    expect(tip).to_be_hidden()
+
+
+def test_a_tap_on_a_number_shows_its_interval(open_page: Callable[..., Page]) -> None:
+    page = open_page("clbench/Toy-v0", viewport=PHONE, has_touch=True, is_mobile=True)
+    cells(page).first.tap()
+    expect(page.get_by_role("tooltip")).to_have_text(re.compile("95 % interval"))
+    assert row(page).count() == 0
+
+
+def test_the_reader_chooses_the_axes_and_reads_why_a_picture_is_empty(open_page: Callable[..., Page]) -> None:
+    page = open_page("clbench/Toy-v0")
+    form = page.locator("[id='clbench/Toy-v0'] form")
+    picture = page.locator("[id='clbench/Toy-v0'] figure[data-plane]")
+    expect(picture).to_contain_text("learned: success on each new task")
+    form.get_by_label("from bottom to top").select_option("kept skills")
+    expect(picture).to_contain_text("kept skills: success on the old skills")
+    form.get_by_label("from left to right").select_option("cost")
+    expect(picture).to_contain_text("cost, less is better")
+    note = page.locator("[data-plane-note]:visible")
+    expect(note).to_contain_text(
+        "Not in the picture: x_with_a_name_that_is_longer_than_a_phone (no cost, kept skills"
+    )
+    page.get_by_role("link", name="Without-v0").click()
+    page.get_by_label("from left to right").locator("visible=true").select_option("cost")
+    expect(page.locator("figure[data-plane]:visible svg")).to_have_count(0)
+    expect(note).to_contain_text("No method here has both kept and cost. Not in the picture: alone (no cost")
+
+
+def test_a_click_on_a_tab_leaves_the_tabs_in_their_place(open_page: Callable[..., Page]) -> None:
+    page = open_page("clbench/Toy-v0")
+    tabs = page.locator(".tabs")
+    tabs.get_by_role("link", name="Other-v0").click()
+    assert page.evaluate("scrollY") == 0
+    tabs.get_by_role("link", name="Toy-v0").click()
+    expect(page.locator("figure[data-plane]:visible svg")).to_have_count(1)
+    page.evaluate("scrollTo(0, 900)")
+    at = tabs.evaluate("one => one.getBoundingClientRect().top")
+    assert at == 0
+    tabs.get_by_role("link", name="Other-v0").click()
+    assert tabs.evaluate("one => one.getBoundingClientRect().top") == at
+    page.go_back()
+    expect(page.locator("[id='clbench/Toy-v0']")).to_be_visible()
+
+
+def test_the_head_of_a_table_stays_below_the_tabs(open_page: Callable[..., Page]) -> None:
+    page = open_page("clbench/Toy-v0")
+    expect(page.locator("figure[data-plane]:visible svg")).to_have_count(1)
+    page.locator(".board:visible tbody tr").nth(3).evaluate("one => one.scrollIntoView({ block: 'start' })")
+    head, tabs = (page.locator(one).first.bounding_box() for one in (".board:visible thead th", ".tabs"))
+    assert head is not None
+    assert tabs is not None
+    assert abs(head["y"] - tabs["y"] - tabs["height"]) < 3
+
+
+def test_on_a_phone_the_head_stays_on_top_of_a_table_that_scrolls(open_page: Callable[..., Page]) -> None:
+    page = open_page("clbench/Toy-v0", viewport={"width": 390, "height": 420})
+    region = page.locator(".board-region:visible")
+    assert region.evaluate("one => { one.scrollTop = 80; return one.scrollTop; }") == 80
+    head, box = region.locator("thead th").first.bounding_box(), region.bounding_box()
+    assert head is not None
+    assert box is not None
+    assert abs(head["y"] - box["y"]) < 3
+
+
+def test_no_type_is_smaller_than_12_pixels(open_page: Callable[..., Page]) -> None:
+    page = open_page("clbench/Toy-v0")
+    expect(page.locator("figure[data-plane]:visible svg")).to_have_count(1)
+    smallest = page.evaluate("""() => Math.min(...[...document.body.querySelectorAll("*")]
+        .filter((one) => one.checkVisibility() && [...one.childNodes].some((part) => part.nodeType === 3
+            && part.data.trim()))
+        .map((one) => parseFloat(getComputedStyle(one).fontSize)))""")
+    assert smallest >= 12

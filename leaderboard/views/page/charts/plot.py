@@ -11,7 +11,7 @@ import vl_convert
 
 from clbench.base.errors import InputError
 
-from .charts import Spec, colour, in_theme
+from .vega import Spec, colour, in_theme
 
 VEGA_LITE = "6.4"
 """Version of Vega-Lite that the charts are written for."""

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 HEIGHT = 14.0
 """Distance from one label to the next."""
 
-LETTER = 6.2
-"""Mean width of a letter at font size 11."""
+LETTER = 6.8
+"""Mean width of a letter at font size 12."""
 
 LONGEST = 160
 """Maximum width of a label: longer text is cut, and the tooltip has all of it."""
@@ -69,15 +69,19 @@ def place(marks: Sequence[Mark], rows: Sequence[float], width: float, height: fl
         width: Width of the plane.
         height: Height of the plane.
     """
-    taken = [box for mark in marks for box in _boxes(mark)] + [(0.0, width, row, row) for row in rows]
+    covered = [_boxes(mark) for mark in marks]
+    kept_free = [boxes[0] for boxes in covered]
+    taken = [box for boxes in covered for box in boxes] + [(0.0, width, row, row) for row in rows]
     labels: list[Label] = []
     crowded: list[Mark] = []
     for mark in sorted(marks, key=lambda mark: (mark.y, -mark.x, mark.name)):
         alone = not any(_is_near(mark, other) for other in marks if other is not mark)
-        found = _beside(mark, taken, width, height) if alone else None
-        if found:
+        # A label over a thin line is legible: better than a list far from the mark.
+        found = _beside(mark, taken, width, height) or _beside(mark, kept_free, width, height)
+        if alone and found:
             labels.append(found)
             taken.append(_box(found))
+            kept_free.append(_box(found))
         else:
             crowded.append(mark)
     listed = crowded[: int(height // HEIGHT) + 1]

@@ -1,0 +1,176 @@
+"""The verdict of a scenario: what its rows say, in a few sentences and numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from itertools import groupby
+
+from clbench.base.text import counted, printable
+from clbench.scoring.groups import groups
+from clbench.scoring.intervals import Estimate
+from clbench.spec.references import BASELINE
+
+from ...board.rows import Row, standing_of
+from ...board.summary import DIVISIONS, METHODS, RANKED_BY
+from ..descriptions import RULES
+from ..format import number_text
+from .numbers import MISSING, cost, size
+
+NAMED = 3
+"""Number of methods that a sentence names; further ones are only counted."""
+
+
+@dataclass(frozen=True)
+class Fact:
+    """A number of the leading method."""
+
+    name: str
+    text: str
+    interval: str = ""
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What a scenario says of one division."""
+
+    division: int
+    """Number of the division."""
+    name: str
+    rule: str
+    leader: Row
+    """The row with the highest final average."""
+    standing: str
+    """How surely it leads."""
+    keeping: str
+    """Sentence on the method that keeps most at equal learning, empty if there is nothing to compare."""
+    facts: tuple[Fact, ...]
+
+
+def headline(rows: Sequence[Row]) -> str:
+    """Return what the rows of a scenario say of plain fine-tuning and the methods against forgetting."""
+    competing = [row for row in rows if row.division in METHODS]
+    baseline = next((row for row in competing if row.method == BASELINE), None)
+    others = [row for row in competing if row.method != BASELINE]
+    if baseline is None:
+        return f"{counted(len(competing), 'method')}, not yet compared with plain fine-tuning."
+    if not others:
+        kept = number_text(baseline.estimates["kept"].value, ".2f", MISSING)
+        return f"Plain fine-tuning keeps {kept} of what the policy knew. No other method has run here."
+    ahead = [row for row in others if (row.estimates["gain"].low or 0.0) > 0]
+    if not ahead:
+        methods = "The one other method is not" if len(others) == 1 else "No method is"
+        return f"{methods} shown to end above plain fine-tuning."
+    gain = max(row.estimates["gain"].value or 0.0 for row in ahead)
+    first = f"{_listed(ahead)} end above plain fine-tuning, by up to {number_text(gain, '.2f')}."
+    if len(ahead) == 1:
+        first = f"{_listed(ahead)} ends {number_text(gain, '.2f')} above plain fine-tuning."
+    left = len(others) - len(ahead)
+    if not left:
+        return first
+    return f"{first} " + (
+        "The one other method is not shown to."
+        if left == 1
+        else f"None of the other {left} methods is shown to."
+    )
+
+
+def verdicts(rows: Sequence[Row]) -> list[Verdict]:
+    """Return the verdict on each division of methods with a final average."""
+    found = []
+    baseline = next((row for row in rows if row.method == BASELINE), None)
+    for division, members in groupby(rows, key=lambda row: row.division):
+        known = [row for row in members if row.groups is not None]
+        if division not in METHODS or not known:
+            continue
+        leader = known[0]
+        found.append(
+            Verdict(
+                DIVISIONS.index(division),
+                division,
+                RULES[division],
+                leader,
+                _standing(leader, rows),
+                _keeping(known, baseline),
+                tuple(_facts(leader, baseline)),
+            )
+        )
+    return found
+
+
+def _standing(leader: Row, rows: Iterable[Row]) -> str:
+    standing = standing_of(leader, rows)
+    value = number_text(leader.estimates[RANKED_BY].value, ".2f")
+    if standing is None or standing.count == 1:
+        return f"The only method of its division. Final average {value}."
+    if standing.alike:
+        names = _names(standing.alike)
+        return f"Highest final average, {value}, but not told apart from {names}."
+    return f"Best final average, {value}, told apart from all others."
+
+
+def _keeping(members: Sequence[Row], baseline: Row | None) -> str:
+    if baseline is None or all(row.method == BASELINE for row in members):
+        return ""
+    pool = {row.method: row for row in (baseline, *members)}
+    equal = [row for row in members if row.method in _alike("adaptation", baseline.method, pool)]
+    if not equal:
+        return _other_learning(members[0], baseline)
+    slower = "" if members[0] in equal else f"{_other_learning(members[0], baseline)} "
+    keeper = max(equal, key=lambda row: row.estimates["kept"].value or 0.0)
+    kept = number_text(keeper.estimates["kept"].value, ".2f", MISSING)
+    price = cost(keeper)
+    paid = f"{price.text} the training time of sft" if price.order else "a cost that was not measured"
+    if len(members) == 1:
+        usual = number_text(baseline.estimates["kept"].value, ".2f", MISSING)
+        apart = _apart("kept", keeper, baseline)
+        return f"It learns as much as sft and keeps {kept}, sft {usual}{apart}, at {paid}."
+    peers = _alike("kept", keeper.method, {row.method: row for row in equal})
+    others = counted(len(peers) - 1, "other")
+    sure = f"; not told apart from {others}" if len(peers) > 1 else ""
+    return f"{slower}At equal learning, {printable(keeper.method)} keeps most: {kept}, at {paid}{sure}."
+
+
+def _other_learning(leader: Row, baseline: Row) -> str:
+    """Return the sentence on a leader that does not learn as much as fine-tuning."""
+    usual, own = (row.estimates["adaptation"].value or 0.0 for row in (baseline, leader))
+    less = "less" if own < usual else "more"
+    return f"It learns {less} than sft: {number_text(own, '.2f')} against {number_text(usual, '.2f')}."
+
+
+def _apart(metric: str, row: Row, other: Row) -> str:
+    alike = other.method in _alike(metric, row.method, {row.method: row, other.method: other})
+    return ", not told apart" if alike else ""
+
+
+def _alike(metric: str, method: str, rows: dict[str, Row]) -> set[str]:
+    """Return the methods that are not told apart from a method in a metric, itself included."""
+    letters = groups(metric, {name: row.scores for name, row in rows.items()})
+    own = set(letters.get(method, ""))
+    return {name for name, groups in letters.items() if own & set(groups)}
+
+
+def _facts(row: Row, baseline: Row | None) -> list[Fact]:
+    usual = "tuned sft" if baseline is not None and baseline.tried is not None else "sft"
+    names = (("learned", "adaptation"), ("kept", "kept"), (f"gain over {usual}", "gain"))
+    found = [_fact(title, row.estimates[name], "+.2f" if name == "gain" else ".2f") for title, name in names]
+    if row.method == BASELINE:
+        found.pop()
+    return [*found, Fact("training time", cost(row).text), Fact("bytes kept", size(row).text)]
+
+
+def _fact(title: str, one: Estimate, form: str) -> Fact:
+    interval = "" if one.low is None else f"{number_text(one.low, form)} to {number_text(one.high, form)}"
+    return Fact(title, number_text(one.value, form, MISSING), interval)
+
+
+def _listed(rows: Sequence[Row]) -> str:
+    return _names([row.method for row in rows])
+
+
+def _names(names: Sequence[str]) -> str:
+    """Return names in a sentence: all if they are few, otherwise the first ones and a count."""
+    shown = [printable(name) for name in names[:NAMED]]
+    if len(names) > NAMED:
+        return f"{', '.join(shown)} and {len(names) - NAMED} more"
+    return " and ".join([", ".join(shown[:-1]), shown[-1]] if len(shown) > 1 else shown)

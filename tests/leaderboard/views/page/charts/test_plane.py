@@ -1,0 +1,70 @@
+"""The plane of two quantities: right and up are better, whatever the reader chooses."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from clbench.base.entry_points import resolve
+
+Plane = resolve("clbench.leaderboard.views.page.charts.plane:Plane")
+PLANE = "clbench.leaderboard.views.page.charts.plane"
+AXES = "clbench.leaderboard.views.page.charts.axes"
+learned, cost, bytes_kept = resolve(f"{AXES}:ACROSS")
+kept, skills, targets = resolve(f"{AXES}:UP")
+read_table = resolve("clbench.leaderboard.board.rows:read_table")
+REFERENCE = {"demonstrations": "never", "questions": "never", "reference": True}
+
+
+@pytest.fixture
+def rows(add: Callable[..., Path], matrix: Any, tmp_path: Path) -> Any:
+    """Return the rows of two methods and of a reference that learns nothing."""
+    for seed in range(2):
+        add("sft", seed, edit=lambda record: setattr(record.costs, "bytes_kept", 0))
+        add("heavy", seed, matrix * 0.9, edit=lambda record: setattr(record.costs, "bytes_kept", 5_000_000))
+        add("frozen", seed, matrix * 0.0, uses=REFERENCE)
+    return read_table(tmp_path / "leaderboard" / "records").rows
+
+
+def test_less_data_is_further_right(rows: Any) -> None:
+    axis = Plane(rows, bytes_kept, kept).across
+    assert 0 < axis.share(5_000_000) < axis.share(2_000) < axis.share(0) < 1
+    assert axis.share(axis.worst) == pytest.approx(0)
+    assert axis.scale["reverse"]
+
+
+def test_more_success_is_further_right(rows: Any) -> None:
+    axis = Plane(rows, learned, kept).across
+    assert axis.share(0.5) < axis.share(0.9)
+    assert axis.share(axis.worst) == pytest.approx(0)
+
+
+def test_a_row_outside_the_plane_is_named_with_its_values(rows: Any) -> None:
+    plane = Plane(rows, learned, kept)
+    assert [point["method"] for point in plane.points] == ["sft", "heavy"]
+    assert plane.note.startswith("Not in the picture: frozen (learned 0.00 [")
+
+
+def test_a_row_without_a_quantity_is_named_as_such(rows: Any) -> None:
+    assert "heavy (no cost, kept skills 0." in Plane(rows, cost, skills).note
+
+
+def test_a_scenario_without_a_quantity_has_no_point_and_says_why(rows: Any) -> None:
+    plane = Plane([row for row in rows if row.method == "heavy"], cost, targets)
+    assert not plane.points
+    assert "no cost" in plane.note
+
+
+def test_every_place_of_the_template_is_filled(rows: Any) -> None:
+    size = resolve(f"{PLANE}:WIDE")
+    drawn = Plane(rows, learned, kept)
+    template = resolve(f"{PLANE}:template")(size)
+    assert '"@' in json.dumps(template)
+    assert '"@' not in json.dumps(resolve(f"{PLANE}:filled")(template, drawn.places | drawn.labels(size)))
+
+
+def test_one_method_of_a_division_has_no_front(rows: Any) -> None:
+    assert Plane(rows, learned, kept).corners
+    assert not Plane([row for row in rows if row.method != "heavy"], learned, kept).corners

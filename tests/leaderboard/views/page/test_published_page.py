@@ -1,0 +1,101 @@
+"""The published page: what a researcher learns from its first screen, and how soon."""
+
+import json
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from axe_playwright_python.sync_playwright import Axe
+from playwright.sync_api import Browser, Page, sync_playwright
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
+SITE = Path(__file__).parents[4] / "leaderboard" / "site"
+SIZES = [{"width": 1440, "height": 900}, {"width": 390, "height": 844}]
+MAIN = "clbench/Fetch-v1"
+SECOND = 1000.0
+"""Milliseconds."""
+
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(not CHROMIUM, reason="there is no chromium: apt-get install chromium"),
+]
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    with sync_playwright() as playwright:
+        started = playwright.chromium.launch(
+            executable_path=CHROMIUM, args=["--no-sandbox", "--disable-dev-shm-usage"]
+        )
+        yield started
+        started.close()
+
+
+@pytest.fixture(params=SIZES, ids=["desktop", "phone"])
+def opened(request: pytest.FixtureRequest, browser: Browser) -> Iterator[Page]:
+    """The page as it opens, without a network."""
+    context = browser.new_context(viewport=request.param, offline=True)
+    page = context.new_page()
+    page.goto((SITE / "index.html").as_uri())
+    yield page
+    context.close()
+
+
+def in_first_viewport(page: Page, text: str) -> bool:
+    """Return whether a text is on the first screen, none of it cut off."""
+    found: bool = page.evaluate(
+        r"""(wanted) => [...document.querySelectorAll("h2, h3, p, dl > div")].some((one) => {
+            const text = one.textContent.replace(/\\\\s+/g, " "), box = one.getBoundingClientRect();
+            return text.includes(wanted) && one.checkVisibility() && box.top >= 0 && box.left >= 0
+                && box.bottom <= window.innerHeight && box.right <= window.innerWidth;
+        })""",
+        text,
+    )
+    return found
+
+
+def rows() -> list[dict[str, Any]]:
+    board = json.loads((SITE / "board.json").read_text(encoding="utf-8"))["board"]
+    return [row for row in board["rows"] if row["scenario"] == MAIN]
+
+
+def test_the_first_screen_says_which_method_keeps_most_without_prior_data_and_its_cost(opened: Page) -> None:
+    free = [row for row in rows() if row["division"] == "prior-data-free"]
+    best = max(free, key=lambda row: row["estimates"]["kept"][0])
+    kept, cost = best["estimates"]["kept"][0], best["costs"]["relative_cost"]
+    answer = (
+        f"At equal learning, {best['method']} keeps most: {kept:.2f}, at {cost:.2f}\N{MULTIPLICATION SIGN}"
+    )
+    assert in_first_viewport(opened, answer)
+
+
+def test_the_first_screen_says_what_beats_plain_fine_tuning(opened: Page) -> None:
+    ahead = [row["method"] for row in rows() if row["method"] != "sft" and row["estimates"]["gain"][1] > 0]
+    for method in ahead[:3]:
+        assert in_first_viewport(opened, method)
+    assert in_first_viewport(opened, "above plain fine-tuning")
+
+
+def test_it_is_light_and_can_be_read_within_a_second(opened: Page) -> None:
+    opened.wait_for_function("performance.getEntriesByName('first-contentful-paint').length")
+    paint = opened.evaluate("performance.getEntriesByName('first-contentful-paint')[0].startTime")
+    assert paint < SECOND
+    assert opened.evaluate("document.querySelectorAll('*').length") < 7000
+    assert (SITE / "index.html").stat().st_size < 3_000_000
+
+
+def test_no_place_is_wider_than_the_screen(opened: Page) -> None:
+    for place in opened.locator(".tabs a").all():
+        place.click()
+        opened.wait_for_timeout(300)
+        assert opened.evaluate("document.documentElement.scrollWidth <= window.innerWidth")
+
+
+def test_axe_finds_nothing_serious_on_any_tab(opened: Page) -> None:
+    for place in opened.locator(".tabs a").all():
+        place.click()
+        opened.wait_for_timeout(300)
+        found = Axe().run(opened).response["violations"]
+        assert not [one["id"] for one in found if one["impact"] in ("serious", "critical")]
