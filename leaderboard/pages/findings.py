@@ -31,7 +31,7 @@ from ..claims.judges import Judged
 from ..policies.compared import by_table
 from ..views.format import format_interval
 from ..views.markdown import templates
-from ..views.page.plot import themed
+from ..views.page.charts.plot import themed
 from .findings_chart import gains_chart
 
 WITHOUT_DEMONSTRATIONS = METHODS[:2]

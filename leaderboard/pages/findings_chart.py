@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 
 from ..board.rows import Row
 from ..board.summary import DIVISIONS
-from ..views.page.charts import FONT, Spec, axis, colour, rounded, specification
+from ..views.page.charts.vega import FONT, Spec, axis, colour, rounded, specification
 
 WIDTH = 520
 """Width of the plot in pixels."""
