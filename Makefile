@@ -4,7 +4,7 @@ BIN := .venv/bin
 SCENARIO := clbench/Fetch-v1
 QUICK := build/quick
 
-.PHONY: leaderboard tuning records ladder controls docs site benchmark test test-slow check wheel-test clean
+.PHONY: leaderboard tuning records ladder controls docs site benchmark test test-slow libero-test check wheel-test clean
 
 # The main job: from nothing to a table in minutes, with one seed. The full board takes `make records`.
 leaderboard:
@@ -88,6 +88,11 @@ test: .venv/installed-dev
 # What takes minutes: more of the same random input, a Ray cluster, and all that a stranger types from nothing to a row.
 test-slow: .venv/installed-dev
 	$(BIN)/pytest -m slow
+
+# The LIBERO world beside LIBERO's own, which the extra brings: 340 MB. Elsewhere its tests are skipped.
+libero-test: .venv/installed-dev
+	$(BIN)/pip install -q -c constraints.txt -e ".[dev,libero]"
+	$(BIN)/pytest tests/envs/test_libero.py tests/envs/test_libero_physics.py
 
 # Besides style and types: whether the committed board and pages are those of the committed records.
 check: .venv/installed-dev

@@ -69,9 +69,9 @@ def headline(rows: Sequence[Row]) -> str:
     if not left:
         return first
     return f"{first} " + (
-        "The one other method is not shown to."
+        "The one other method shows no certain gain."
         if left == 1
-        else f"None of the other {left} methods is shown to."
+        else f"The other {left} methods show no certain gain."
     )
 
 
