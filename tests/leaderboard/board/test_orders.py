@@ -97,9 +97,13 @@ def test_other_orders_change_nothing_else_of_a_row(add: Callable[..., Path], rec
 
 
 def show(records: Path) -> str:
-    """Return the page, without the breaks of its lines."""
+    """Return the details of all rows of the page, without the breaks of their lines."""
     resolve("clbench.leaderboard.cli:show")(records=records)
-    return " ".join((records.parent / "site" / "index.html").read_text(encoding="utf-8").split())
+    page = (records.parent / "site" / "index.html").read_text(encoding="utf-8")
+    data = json.loads(
+        page.partition('<script type="application/json" id="data">')[2].partition("</script>")[0]
+    )
+    return " ".join(" ".join(row["html"] for row in data["rows"].values()).split())
 
 
 def test_the_page_and_the_csv_show_every_order_and_the_range(add: Callable[..., Path], records: Path) -> None:

@@ -143,7 +143,8 @@ def test_bytes_have_three_digits_and_go_on_to_the_next_unit(
         (size,) = (line[-2] for line in printed if f"size_{number}" in line)
         assert size == text
         unit = f" {text[-1]}B" if text[-1].isalpha() else ""
-        assert f'<span title="{count:,} bytes">{text.rstrip("kMGT")}{unit}</span>' in page
+        shown = f"{text.rstrip('kMGT')}{unit}"
+        assert f'data-note="{count:,} bytes">{shown}<span class="unseen">, {count:,} bytes</span>' in page
 
 
 def set_in(name: str, key: str, value: Any) -> Callable[[Record], None]:

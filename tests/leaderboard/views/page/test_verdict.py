@@ -46,7 +46,7 @@ def test_a_method_that_ends_higher_is_named_with_its_gain(board: Callable[..., A
     rows = board(sft=matrix(0.2), replay=matrix(0.9), lora=matrix(0.2))
     gain = next(row.estimates["gain"].value for row in rows if row.method == "replay")
     assert headline(rows) == (
-        f"replay ends {gain:.2f} above plain fine-tuning. The one other method is not shown to."
+        f"replay ends {gain:.2f} above plain fine-tuning. The one other method shows no certain gain."
     )
 
 
