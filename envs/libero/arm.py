@@ -58,7 +58,7 @@ class Sensed(NamedTuple):
     """Positions of the arm's joints (7,)."""
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True)  # type: ignore[untyped-decorator, unused-ignore]  # typed where numba is
 def _drive(
     sensed: Sensed,
     bias: Vector,

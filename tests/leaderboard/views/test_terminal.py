@@ -142,8 +142,8 @@ def test_bytes_have_three_digits_and_go_on_to_the_next_unit(
     for number, (count, text) in enumerate(counts.items()):
         (size,) = (line[-2] for line in printed if f"size_{number}" in line)
         assert size == text
-        unit = f" {text[-1]}B" if text[-1].isalpha() else ""
-        shown = f"{text.rstrip('kMGT')}{unit}"
+        digits = text.rstrip("kMGT")
+        shown = f"{digits} {text.removeprefix(digits)}B" if count else "0"
         assert f'data-note="{count:,} bytes">{shown}<span class="unseen">, {count:,} bytes</span>' in page
 
 
