@@ -105,7 +105,7 @@ check: .venv/installed-dev
 # found by name, the commands; and all that strangers type.
 WALKS := tests/cli tests/test_readme.py tests/test_submission.py tests/test_your_scenario.py tests/runs/test_agents_guide.py
 WHEEL_TESTS := $(WALKS) tests/test_package.py tests/methods/test_methods.py \
-	$(addprefix tests/leaderboard/,views/test_page.py views/test_markdown.py submission claims pages)
+	$(addprefix tests/leaderboard/,views/page/test_html.py views/test_markdown.py submission claims pages)
 wheel-test: .venv/installed-dev
 	rm -rf build/wheel && mkdir -p build/wheel
 	$(BIN)/python -m build --wheel --outdir build/wheel . >/dev/null

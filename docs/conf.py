@@ -31,7 +31,10 @@ myst_fence_as_directive = ["mermaid"]
 myst_heading_anchors = 4
 nb_execution_mode = "off"  # tests/test_notebooks.py executes them
 
-suppress_warnings = ["ref.python"]  # two fields are called `bytes`, like the type of others
+suppress_warnings = [
+    "ref.python",  # two fields are called `bytes`, like the type of others
+    "misc.highlighting_failure",  # a table in `csv`, which GitHub colours and Pygments does not know
+]
 autodoc_typehints = "description"
 autodoc_typehints_description_target = "documented"
 autodoc_member_order = "bysource"

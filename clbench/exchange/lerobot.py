@@ -157,7 +157,7 @@ def _array(values: NDArray[Any], kind: str) -> pa.Array:
 
 def _png(picture: NDArray[np.uint8]) -> bytes:
     """Return a picture (N, N, 3) as a PNG file, which loses nothing."""
-    require("PIL", "exchange", "A LeRobotDataset with pictures")
+    require("PIL", "film", "A LeRobotDataset with pictures")
     from PIL import Image
 
     file = io.BytesIO()
