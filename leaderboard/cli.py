@@ -35,6 +35,7 @@ from .board.places import CONTROLS, SCENARIO
 if TYPE_CHECKING:
     from .board.rows import Table
     from .board.summary import Summary
+    from .claims.judges import Judged
 
 # Whatever imports PyTorch, SciPy or the charts is imported where it is needed: `--help` does not wait for it.
 
@@ -290,11 +291,9 @@ def claims(
         scenario: Gymnasium id of the scenario on which all claims are judged (default: each names its own).
         output: Path of the page.
     """
-    from .claims.evidence import read_evidence
-    from .claims.judges import judge_all
     from .pages.claims_page import page, terminal
 
-    judged = judge_all(lambda name: read_evidence(name, records, controls), scenario)
+    judged = _judged(records, controls, scenario)
     console = Console()
     console.print(terminal(judged))
     _write(output, page(judged))
@@ -313,13 +312,12 @@ def findings(
         controls: Folder of the records of changed settings.
         output: Path of the page; pictures go to the folder `findings` beside it.
     """
-    from .claims.evidence import read_evidence
-    from .claims.judges import judge_all
     from .pages.findings import page, pictures, sections
     from .views.format import write_all
 
-    found = sections(_table(records), judge_all(lambda name: read_evidence(name, records, controls)))
-    drawn = {output.parent / "findings" / name: svg for name, svg in pictures(_table(records)).items()}
+    table = _table(records)
+    found = sections(table, _judged(records, controls))
+    drawn = {output.parent / "findings" / name: svg for name, svg in pictures(table).items()}
     _print_written(write_all({output: page(found), **drawn}))
 
 
@@ -339,12 +337,11 @@ def method_pages(
         output: Folder of the pages.
     """
     from .claims.evidence import read_evidence
-    from .claims.judges import judge_all
     from .pages.method_pages import pages, read_sources
     from .views.descriptions import built_in_methods
     from .views.format import write_if_changed
 
-    judged = judge_all(lambda name: read_evidence(name, records, controls))
+    judged = _judged(records, controls)
     evidence = read_evidence(scenario, records, controls)
     sources = read_sources(evidence, judged, _table(records))
     texts = pages(built_in_methods(), sources)
@@ -399,6 +396,14 @@ def scenario_card(
         drawn = {task.name for task in scenario.tasks if picture_path(home, task).is_file()}
         card = Card(scenario, board, experts, frozenset(drawn), typed[scenario.id], records)
         _write(output / f"{home.name}.md", card.page())
+
+
+def _judged(records: Path, controls: Path, scenario: str | None = None) -> tuple[Judged, ...]:
+    """Return the findings on all claims, on one scenario alone if it is given."""
+    from .claims.evidence import read_evidence
+    from .claims.judges import judge_all
+
+    return judge_all(lambda name: read_evidence(name, records, controls), scenario)
 
 
 def _table(records: Path) -> Table:

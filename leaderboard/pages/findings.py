@@ -29,7 +29,7 @@ from ..board.summary import METHODS, RANKED_BY
 from ..claims.claim import Verdict
 from ..claims.judges import Judged
 from ..policies.compared import by_table
-from ..views.format import format_interval
+from ..views.format import format_interval, tau_text
 from ..views.markdown import templates
 from ..views.page.charts.plot import themed
 from .findings_chart import gains_chart
@@ -257,9 +257,8 @@ def _values(rows: Sequence[Row], metric: str) -> Array | None:
 
 
 def _tau(found: Agreement) -> str:
-    interval = format_interval(Estimate(found.tau, found.low, found.high))
     words = "alike" if found.low > 0 else "in opposite orders" if found.high < 0 else "cannot be told"
-    return f"{words}, Kendall's tau {interval}"
+    return f"{words}, Kendall's tau {tau_text(found)}"
 
 
 def _predictors(boards: dict[str, list[Row]]) -> Section:
@@ -270,8 +269,7 @@ def _predictors(boards: dict[str, list[Row]]) -> Section:
             told = (
                 "predicts it" if one.low > 0 else "predicts the opposite" if one.high < 0 else "may be chance"
             )
-            interval = format_interval(Estimate(one.tau, one.low, one.high))
-            answers.append(f"On {name}, {one.predictor} {told}: Kendall's tau {interval}.")
+            answers.append(f"On {name}, {one.predictor} {told}: Kendall's tau {tau_text(one)}.")
     return Section("What predicts how much a method forgets?", tuple(answers))
 
 

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 
 from ..board.rows import Row
 from ..board.summary import DIVISIONS
-from ..views.page.charts.vega import FONT, Spec, axis, colour, rounded, specification
+from ..views.page.charts.vega import FONT, Spec, axis, colour, heading, layer, rounded, specification
 
 WIDTH = 520
 """Width of the plot in pixels."""
@@ -47,13 +47,10 @@ def _panel(name: str, rows: Sequence[Row]) -> Spec:
     }
     gain = axis("value", "gain over tuned fine-tuning, with 95 % interval", axis={"format": ".2~f"})
     ends = {"x": {"field": "low", "type": "quantitative"}, "x2": {"field": "high"}}
-    zero = {
-        "data": {"values": [{"zero": 0}]},
-        "mark": {"type": "rule", "color": colour("edge"), "strokeDash": [4, 3]},
-        "encoding": {"x": {"field": "zero", "type": "quantitative"}},
-    }
+    line = {"type": "rule", "color": colour("edge"), "strokeDash": [4, 3]}
+    zero = layer([{"zero": 0}], line, x={"field": "zero", "type": "quantitative"})
     return {
-        "title": {"text": name, "anchor": "start", "color": colour("ink"), "fontSize": 13},
+        "title": heading(name),
         "width": WIDTH,
         "height": ROW_HEIGHT * len(rows),
         "data": {"values": values},

@@ -18,7 +18,7 @@ from clbench.scoring.scores import WEAK, WEAK_WARNING
 
 from ..board.agreement import Agreement
 from ..board.overall import OverallRow
-from ..board.predictors import predictions
+from ..board.predictors import Prediction, predictions
 from ..board.rows import Row, standing_of
 from ..board.summary import DIVISIONS, RowSummary
 
@@ -128,10 +128,9 @@ def agreement_text(found: Agreement | None) -> str:
     if found is None:
         return ""
     how = "order" if found.low > 0 else "do not surely order"
-    interval = format_interval(Estimate(found.tau, found.low, found.high))
     return (
         f"The two halves of the {found.seeds} seeds {how} the {found.rows} methods alike: "
-        f"Kendall's tau {interval}."
+        f"Kendall's tau {tau_text(found)}."
     )
 
 
@@ -141,7 +140,7 @@ def prediction_text(rows: Iterable[Row]) -> str:
     if not found:
         return ""
     parts = [
-        f"{one.predictor} {format_interval(Estimate(one.tau, one.low, one.high))}"
+        f"{one.predictor} {tau_text(one)}"
         + (", the other way round" if one.high < 0 else "" if one.low > 0 else ", which may be chance")
         for one in found
     ]
@@ -149,6 +148,11 @@ def prediction_text(rows: Iterable[Row]) -> str:
         f"What orders the {found[0].rows} methods as the share that a stage forgets does (Kendall's tau): "
         f"{'; '.join(parts)}."
     )
+
+
+def tau_text(found: Agreement | Prediction) -> str:
+    """Return Kendall's tau with its interval."""
+    return format_interval(Estimate(found.tau, found.low, found.high))
 
 
 def title_of(name: str) -> str:
