@@ -1,5 +1,6 @@
 """The LIBERO world: episodes that their seeds alone determine, in any order and on any worker."""
 
+import ast
 import copy
 import hashlib
 import os
@@ -65,7 +66,7 @@ def fresh_trails(start: Start, steps: int = 15) -> Mapping[Start, str]:
     done = subprocess.run(
         command, env={**os.environ, "PYTHONPATH": path}, check=True, capture_output=True, text=True
     )
-    found: Mapping[Start, str] = eval(done.stdout)
+    found: Mapping[Start, str] = ast.literal_eval(done.stdout)
     return found
 
 
