@@ -2,7 +2,8 @@
 
 Python raises KeyboardInterrupt wherever the main thread happens to be. In a destructor or a callback the
 exception is printed and dropped, and a library may swallow it. The handler therefore also remembers it: long
-work calls `check`.
+work calls `check`. A compiled module that meets the exception while it loads may abort the process, so the
+handler lets imports finish first.
 """
 
 from __future__ import annotations
@@ -11,10 +12,17 @@ import _thread
 import signal
 import sys
 import threading
+import time
 from types import FrameType
 
 _interrupted = False
+_raise_from = 0.0
+"""Time from which Ctrl-C stops an import as well."""
+
 _AGAIN_SECONDS = 0.01
+
+_IMPORT_SECONDS = 10.0
+"""PyTorch is imported in 1 s, on a busy machine in several. One that never ends must not block Ctrl-C."""
 
 
 def install() -> None:
@@ -36,17 +44,34 @@ def check() -> None:
 
 
 def _handle(number: int, frame: FrameType | None) -> None:
-    global _interrupted
+    global _interrupted, _raise_from
+    if not _interrupted:
+        _raise_from = time.monotonic() + _IMPORT_SECONDS
     _interrupted = True
-    raise KeyboardInterrupt
+    if _imports(frame) and time.monotonic() < _raise_from:
+        _soon_again()
+    else:
+        raise KeyboardInterrupt
+
+
+def _imports(frame: FrameType | None) -> bool:
+    """Return whether an import is under way in a frame or in those that called it."""
+    while frame is not None:
+        if frame.f_code.co_filename == "<frozen importlib._bootstrap>":
+            return True
+        frame = frame.f_back
+    return False
 
 
 def _raise_again(unraisable: sys.UnraisableHookArgs) -> None:
     if isinstance(unraisable.exc_value, KeyboardInterrupt):
-        # a moment later, as Python drops exceptions raised here too
-        threading.Timer(_AGAIN_SECONDS, _interrupt_main).start()
+        _soon_again()  # Python drops exceptions raised here too
     else:
         sys.__unraisablehook__(unraisable)
+
+
+def _soon_again() -> None:
+    threading.Timer(_AGAIN_SECONDS, _interrupt_main).start()
 
 
 def _interrupt_main() -> None:
