@@ -79,6 +79,7 @@ benchmark: .venv/installed-dev
 		$(BIN)/python benchmarks/whole_run.py clbench/$$id || exit; \
 	done
 	$(BIN)/python benchmarks/workers.py
+	$(BIN)/python benchmarks/served_policy.py
 	$(BIN)/python benchmarks/scaling.py
 	$(BIN)/python benchmarks/report.py
 
