@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -21,6 +22,7 @@ from clbench.cli.arguments import (
 from clbench.jobs.folders import check_folders
 
 if TYPE_CHECKING:
+    from clbench.policy.policy import Policy
     from clbench.runs.spec import ResolvedRun
 
 # PyTorch and Pillow are imported where they are needed: `--help` does not wait for them.
@@ -28,9 +30,8 @@ if TYPE_CHECKING:
 
 def film(
     scenario: ScenarioId,
-    method: MethodName,
     /,
-    *,
+    *methods: MethodName,
     seed: Annotated[int, whole_number(0)] = 0,
     tasks: str | None = None,
     stages: str | None = None,
@@ -42,54 +43,80 @@ def film(
     device: str = "cpu",
     changes: Annotated[dict[str, str] | None, Parameter(name="--set")] = None,
 ) -> None:
-    """Film METHOD on SCENARIO: the policies of all stages side by side, from the same initial states.
+    """Film METHODS on SCENARIO: their policies side by side, from the same initial states.
 
-    The policies are those that `clbench run` kept. If it kept none, they are made again without evaluation.
+    One method is shown after each stage, several are shown before the first target and after the last. The
+    policies are those that `clbench run` kept. If it kept none, they are made again without evaluation.
 
     Args:
         scenario: Gymnasium id of the scenario.
-        method: Name of an installed method, or module:Class.
+        methods: Names of installed methods, or module:Class.
         seed: Seed of the run.
         tasks: Names of tasks, for example push,lift; all retained skills and targets if not given.
-        stages: Numbers of stages, for example 0,4; all if not given. Stage 0 is before any target.
+        stages: Numbers of stages, for example 0,4; all for one method, 0 and the last for several if not
+            given. Stage 0 is before any target.
         episode: Number of the validation episode; test episodes are not filmed.
         output: A .gif or .mp4 file; a .gif below films/ if not given.
         size: Width of each picture in pixels.
         fps: Steps shown per second, at most 50; the speed of the simulated world if not given.
         checkpoints: Folder below which `clbench run` kept policies.
         device: Device on which the policies were computed, and are computed now.
-        changes: Hyper-parameters that differ from the defaults of the method, as --set.name value.
+        changes: Hyper-parameters that differ from the defaults of the methods, as --set.name value.
     """
-    check_names([scenario], [method])
+    check_names([scenario], methods)
     from clbench.jobs.bars import Bars
-    from clbench.runs.checkpoints import load_stages
-    from clbench.runs.film import FASTEST, FILMS, check_format, film_run, steps_per_second
+    from clbench.runs.film import FASTEST, check_format, film_runs, steps_per_second
     from clbench.runs.spec import RunSpec, check_device
     from clbench.worlds.gl_backend import choose_back_end
 
     add_cwd_to_path()
     with checked_input():
+        if not methods:
+            raise InputError("Name at least one method, for example sft.")
         if fps is not None and fps > FASTEST:
             raise InputError(f"--fps must be from 1 to {FASTEST}, not {fps}.")
         check_device(device)
-        run = RunSpec(scenario, method, seed, changes or {}, device).resolve()
-        loaded = run.scenario
+        runs = [RunSpec(scenario, name, seed, changes or {}, device).resolve() for name in methods]
+        loaded = runs[0].scenario
         shown = [loaded.task(name) for name in tasks.split(",")] if tasks else loaded.retained + loaded.target
-        numbers = _numbers("--stages", stages, len(loaded.target))
+        last = len(loaded.target)
+        numbers = [0, last] if stages is None and len(runs) > 1 else _numbers("--stages", stages, last)
         (episode,) = _numbers("--episode", str(episode), loaded.budget.validation_episodes - 1)
-        path = output or run.path(FILMS).with_suffix(".gif")
+        path = output or _path(runs)
         check_format(path)
         check_folders({"--output": path.parent})
         choose_back_end(task.world for task in shown)
     console = Console(stderr=True)
-    policies = load_stages(run, _stages_folder(run, checkpoints, console))
-    with Bars(len(shown) * len(numbers), console) as bars:
-        bars.start("film", len(shown) * len(numbers))
-        chosen = {number: policies[number] for number in numbers}
-        made = film_run(run, chosen, shown, episode, size, lambda takes: bars.advance("film", takes))
+    policies = _policies(runs, numbers, checkpoints, console)
+    with Bars(len(shown) * len(policies), console) as bars:
+        bars.start("film", len(shown) * len(policies))
+        made = film_runs(runs, policies, shown, episode, size, lambda takes: bars.advance("film", takes))
         made.save(path, fps or steps_per_second(shown[0]))
         width, height = made.size
         bars.finish("film", f"{path} ({width} x {height} pixels, {path.stat().st_size / 1e6:.1f} MB)")
+
+
+def _path(runs: Sequence[ResolvedRun]) -> Path:
+    """Return the path of a film without --output."""
+    from clbench.runs.film import FILMS
+
+    path = runs[0].path(FILMS)
+    return path.parents[1] / ",".join(run.path(FILMS).parent.name for run in runs) / f"{path.stem}.gif"
+
+
+def _policies(
+    runs: Sequence[ResolvedRun], numbers: Sequence[int], checkpoints: Path | None, console: Console
+) -> dict[str, Policy]:
+    """Return the policies by the captions of their columns; methods share the one before any target."""
+    from clbench.runs.checkpoints import load_stages
+    from clbench.runs.film import column_of
+
+    columns: dict[str, Policy] = {}
+    for run in runs:
+        stages = load_stages(run, _stages_folder(run, checkpoints, console))
+        for number in numbers:
+            columns.setdefault(column_of(run, number, alone=len(runs) == 1), stages[number])
+    return columns
 
 
 def _numbers(option: str, text: str | None, last: int) -> list[int]:

@@ -1,4 +1,4 @@
-"""Films: show the same episode side by side with the policy of each stage of a run.
+"""Films: show the same episode side by side with the policies of several stages or methods.
 
 A film shows validation episodes, never test episodes. The policies act as in evaluation: the drawn world
 repeats the actions of an `Evaluator`, so a film ends like the recorded episode.
@@ -279,34 +279,42 @@ def _write(draw: ImageDraw.ImageDraw, place: tuple[int, int], text: str, width: 
     draw.text((place[0], place[1] + LINE // 2), text, fill=colour, font=font, anchor="lm")
 
 
-def film_run(
-    run: ResolvedRun,
-    policies: Mapping[int, Policy],
+def film_runs(
+    runs: Sequence[ResolvedRun],
+    policies: Mapping[str, Policy],
     tasks: Sequence[Task],
     number: int,
     width: int,
     progress: ProgressCallback = no_progress,
 ) -> Film:
-    """Return the film of a run.
+    """Return the film of one run or of several of the same scenario and seed.
 
     Args:
-        run: The run.
-        policies: Policies by the number of their stage, in the order of the columns.
+        runs: The runs.
+        policies: Policies by the captions of their columns.
         tasks: Tasks of the rows.
         number: Number of the validation episode.
         width: Width of a picture, in pixels.
         progress: Called with the number of takes made since its last call.
     """
-    scenario, seed = run.scenario, run.spec.seed
+    scenario, seed = runs[0].scenario, runs[0].spec.seed
     trials: list[Trial] = [(task, "validation", number) for task in tasks]
     rows = [
         f"{task.name} ({scenario.group(task.name).replace('_', ' ')}): {start_of(trial, seed)[1]}"
         for task, trial in zip(tasks, trials, strict=True)
     ]
-    stages = ["before any target", *(f"after {task.name}" for task in scenario.target)]
-    title = f"{scenario.id}, {run.label}, seed {seed}, validation episode {number}"
+    labels = ", ".join(run.label for run in runs)
+    title = f"{scenario.id}, {labels}, seed {seed}, validation episode {number}"
     takes = shoot(scenario, seed, list(policies.values()), trials, width, progress)
-    return Film(title, rows, [f"stage {stage}, {stages[stage]}" for stage in policies], takes)
+    return Film(title, rows, list(policies), takes)
+
+
+def column_of(run: ResolvedRun, stage: int, *, alone: bool) -> str:
+    """Return the caption of a stage's column; with other methods beside it, it names the method."""
+    when = f"after {run.scenario.target[stage - 1].name}" if stage else "before any target"
+    if alone:
+        return f"stage {stage}, {when}"
+    return f"{run.label}, {when}" if stage else when
 
 
 def steps_per_second(task: Task) -> int:

@@ -17,7 +17,17 @@ from clbench.cli.film import film
 from clbench.evaluation.rollouts import Episode, Trial
 from clbench.records.record import Record
 from clbench.runs.checkpoints import stage_policies
-from clbench.runs.film import FAILURE, FASTEST, SUCCESS, Film, Take, film_run, shoot, steps_per_second
+from clbench.runs.film import (
+    FAILURE,
+    FASTEST,
+    SUCCESS,
+    Film,
+    Take,
+    column_of,
+    film_runs,
+    shoot,
+    steps_per_second,
+)
 from clbench.runs.run import execute
 from clbench.runs.spec import RunSpec
 from clbench.spec.registry import load_scenario
@@ -140,8 +150,10 @@ def test_a_film_ends_like_the_recorded_episodes(recorded: tuple[Record, Path]) -
     ends = {0: 0, 1: 60, 2: 60}
     rows = set(zip(*(record.episodes[name] for name in COLUMNS), strict=True))
     outcomes = set()
+    run = SPEC.resolve()
+    columns = {column_of(run, stage, alone=True): policy for stage, policy in enumerate(policies)}
     for number in (0, 3):
-        made = film_run(SPEC.resolve(), dict(enumerate(policies)), tasks, number, 96)
+        made = film_runs([run], columns, tasks, number, 96)
         for task, takes in zip(tasks, made.takes, strict=True):
             for stage, take in enumerate(takes):
                 episode = take.episode
@@ -210,6 +222,17 @@ def test_the_command_writes_the_requested_film(recorded: tuple[Record, Path], tm
         assert gif.info["duration"] == 100  # ten steps in a second, as the world says
 
 
+def test_a_film_of_several_methods_shows_each_after_the_last_target(
+    recorded: tuple[Record, Path], tmp_path: Path, written: list[str]
+) -> None:
+    path = tmp_path / "toy.gif"
+    film(TOY, "sft", "frozen", tasks="left", size=120, output=path, checkpoints=recorded[1])
+    assert written[0].startswith("clbench/Toy-v0, sft, frozen, seed 0, val")
+    assert written[2:5] == ["before any target", "sft, after down", "frozen, after down"]
+    with Image.open(path) as gif:
+        assert gif.size[0] == 3 * (120 + 8) + 8
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [
@@ -230,6 +253,13 @@ def test_bad_input_ends_with_exit_code_2_before_any_work(
         film(TOY, "sft", **options)
     assert left.value.code == 2
     assert message in capsys.readouterr().err
+
+
+def test_a_film_needs_a_method(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as left:
+        film(TOY)
+    assert left.value.code == 2
+    assert "Name at least one method, for example sft." in capsys.readouterr().err
 
 
 def test_an_mp4_without_its_package_names_it(
