@@ -61,6 +61,8 @@ controls: .venv/installed
 
 # The pages of docs/reference that come from the records; experts are measured once.
 docs: .venv/installed
+	$(BIN)/clbench film $(SCENARIO) sft experience_replay --tasks pick_and_place --size 180 \
+		--output docs/reference/scenarios/Fetch-v1/film.gif
 	$(BIN)/clbench claims
 	$(BIN)/clbench findings
 	$(BIN)/clbench method-pages
@@ -130,5 +132,7 @@ clean:
 	@touch $@
 
 .venv/installed-docs: .venv/installed
+	$(BIN)/clbench film $(SCENARIO) sft experience_replay --tasks pick_and_place --size 180 \
+		--output docs/reference/scenarios/Fetch-v1/film.gif
 	$(BIN)/pip install -q -c constraints.txt -e ".[docs]"
 	@touch $@

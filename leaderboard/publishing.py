@@ -21,7 +21,7 @@ from clbench.records.content import content_hash
 from clbench.spec.identifiers import installed_methods
 
 from .board.frontier import ladder_of
-from .board.places import CARDS
+from .board.places import CARDS, FILM
 from .board.summary import Summary
 from .policies.decoders import RESULTS
 from .views.csv import csv_text
@@ -69,13 +69,13 @@ def inputs_of(records: Path) -> dict[str, str]:
 
     Ask before the records are read: a record that arrives in between then changes the hash.
     """
-    stills = sorted(CARDS.glob("*/*.webp"))
+    pictures = sorted([*CARDS.glob("*/*.webp"), *CARDS.glob(f"*/{FILM}")])
     packages = {package_of(entry.value) for entry in installed_methods().values()}
     return {
         "records": _folder_hash(records),
         "ladder": _folder_hash(ladder_of(records)),
-        "stills": hash_of(
-            {path.relative_to(CARDS).as_posix(): _text_hash(path.read_bytes()) for path in stills}
+        "pictures": hash_of(
+            {path.relative_to(CARDS).as_posix(): _text_hash(path.read_bytes()) for path in pictures}
         ),
         "decoding": _text_hash(RESULTS.read_bytes()) if RESULTS.is_file() else "",
         "code": source_hash(*_CODE, *packages),

@@ -12,10 +12,11 @@ from clbench.scoring.metrics import measure
 from clbench.scoring.scores import Scores
 
 README = Path(__file__).parents[1] / "README.md"
+BOARD = README.parent / "docs" / "guide" / "board.md"
 
 
-def _blocks(language: str) -> list[str]:
-    return re.findall(rf"```{language}\n(.*?)```", README.read_text(encoding="utf-8"), flags=re.DOTALL)
+def _blocks(language: str, page: Path = README) -> list[str]:
+    return re.findall(rf"```{language}\n(.*?)```", page.read_text(encoding="utf-8"), flags=re.DOTALL)
 
 
 def _python(code: str, folder: Path) -> str:
@@ -96,6 +97,13 @@ def test_the_third_snippet_draws_the_table(folder: Path) -> None:
     printed = _python(_blocks("python")[2].replace("/Fetch-v1", "/Toy-v0"), folder)
     assert "HeadOnly" in printed
     assert "pretrained" in printed
+
+
+@pytest.mark.slow
+def test_the_pictures_of_the_guide_are_drawn(folder: Path) -> None:
+    (code,) = _blocks("python", BOARD)
+    assert "HeadOnly" in _python(code.replace("/Fetch-v1", "/Toy-v0"), folder)
+    assert all((folder / name).stat().st_size for name in ("matrix.png", "curves.png", "plane.pdf"))
 
 
 def test_every_command_and_file_that_the_readme_names_exists() -> None:

@@ -314,6 +314,8 @@ def column_of(run: ResolvedRun, stage: int, *, alone: bool) -> str:
     when = f"after {run.scenario.target[stage - 1].name}" if stage else "before any target"
     if alone:
         return f"stage {stage}, {when}"
+    if stage == len(run.scenario.target):
+        return f"after {run.label}"
     return f"{run.label}, {when}" if stage else when
 
 

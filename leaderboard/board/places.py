@@ -15,3 +15,6 @@ LADDER = Path("leaderboard/ladder")
 
 CARDS = Path(__file__).parents[2] / "docs/reference/scenarios"
 """Folder of the scenario cards, beside the code. An installed wheel has none."""
+
+FILM = "film.gif"
+"""File with a film of a scenario, in the folder of its card; `clbench film --output` makes it."""

@@ -2,6 +2,7 @@
 
 import dataclasses
 import importlib
+import re
 import shutil
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,8 @@ from clbench.records.reader import read_record
 from clbench.runs.tuning import tuned
 from clbench.scoring.scores import Scores
 
-RECORDS = Path(__file__).parents[2] / "leaderboard" / "records"
+README = Path(__file__).parents[2] / "README.md"
+RECORDS = README.parent / "leaderboard" / "records"
 
 pytestmark = pytest.mark.skipif(not RECORDS.exists(), reason="records are not part of an installed package")
 
@@ -109,6 +111,23 @@ def test_aegis_sheds_little_energy_at_every_stage() -> None:
         shares = [reported["layers_projected_mean"] for reported in record.diagnostics.values()]
         assert sum(share > 0 for share in shares) >= 3
         assert max(shares) <= 1
+
+
+def test_the_readme_shows_the_committed_board() -> None:
+    board = (RECORDS.parent / "site" / "LEADERBOARD.md").read_text(encoding="utf-8").replace("\\_", "_")
+    section = board.split("## clbench/Fetch-v1\n")[1].split("\n## ")[0]
+    head, _, *rows = [_cells(line) for line in section.splitlines() if line.startswith("| ")]
+    names = ("final average", "gain", "learned", "kept skills", "kept targets")
+    published = {cells[head.index("method")]: [cells[head.index(name)] for name in names] for cells in rows}
+    lines = README.read_text(encoding="utf-8").splitlines()
+    shown = [_cells(line) for line in lines if len(re.findall(r"\d \[-?\d", line)) == len(names)]
+    assert len(shown) == 6
+    for method, *values in shown:
+        assert values == published[method], f"README.md: the row of {method} is another on the board"
+
+
+def _cells(line: str) -> list[str]:
+    return [cell.strip() for cell in line.strip("| ").split(" | ")]
 
 
 @pytest.mark.slow

@@ -228,7 +228,7 @@ def test_a_film_of_several_methods_shows_each_after_the_last_target(
     path = tmp_path / "toy.gif"
     film(TOY, "sft", "frozen", tasks="left", size=120, output=path, checkpoints=recorded[1])
     assert written[0].startswith("clbench/Toy-v0, sft, frozen, seed 0, val")
-    assert written[2:5] == ["before any target", "sft, after down", "frozen, after down"]
+    assert written[2:5] == ["before any target", "after sft", "after frozen"]
     with Image.open(path) as gif:
         assert gif.size[0] == 3 * (120 + 8) + 8
 

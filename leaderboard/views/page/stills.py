@@ -1,4 +1,4 @@
-"""Stills of the tasks: the pictures of the scenario cards. Without cards, the page has no stills."""
+"""Pictures of the scenario cards: stills of the tasks, and a film. Without cards, the page has none."""
 
 from __future__ import annotations
 
@@ -9,8 +9,9 @@ from pathlib import Path
 
 from clbench.records.paths import parts_of
 from clbench.spec.identifiers import folder_name
+from clbench.spec.policies import DEFAULT_POLICY
 
-from ...board.places import CARDS
+from ...board.places import CARDS, FILM
 
 _SCENARIO = re.compile(r"clbench/[A-Za-z0-9_]+-v\d+")
 _NAME = re.compile(r"[A-Za-z0-9_]+")
@@ -24,12 +25,26 @@ def stills(place: str, tasks: Iterable[str], cards: Path = CARDS) -> dict[str, s
         tasks: Names of its tasks; a stranger may have written them.
         cards: Folder of the cards.
     """
+    found = {task: _picture(place, f"{task}.webp", cards) for task in tasks if _NAME.fullmatch(task)}
+    return {task: still for task, still in found.items() if still}
+
+
+def film(place: str, cards: Path = CARDS) -> str | None:
+    """Return the film of a scenario as a data address; None if there is none, or for another policy.
+
+    Args:
+        place: Name of a table.
+        cards: Folder of the cards.
+    """
+    return _picture(place, FILM, cards) if parts_of(place)[1] == DEFAULT_POLICY else None
+
+
+def _picture(place: str, name: str, cards: Path) -> str | None:
+    """Return a file of a scenario's card as a data address; None if there is no such file."""
     scenario = parts_of(place)[0]
     if not _SCENARIO.fullmatch(scenario):
-        return {}
-    paths = {task: cards / folder_name(scenario) / f"{task}.webp" for task in tasks if _NAME.fullmatch(task)}
-    return {
-        task: f"data:image/webp;base64,{base64.b64encode(path.read_bytes()).decode('ascii')}"
-        for task, path in paths.items()
-        if path.is_file()
-    }
+        return None
+    path = cards / folder_name(scenario) / name
+    if not path.is_file():
+        return None
+    return f"data:image/{path.suffix[1:]};base64,{base64.b64encode(path.read_bytes()).decode('ascii')}"

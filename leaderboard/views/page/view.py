@@ -24,7 +24,7 @@ from ..descriptions import RULES
 from ..format import Column, agreement_text, prediction_text, start_text, title_of
 from .definitions import Family, families
 from .rows import RowView, columns, others, places, row_view
-from .stills import stills
+from .stills import film, stills
 from .verdict import Verdict, headline, verdicts
 
 FEWEST = 4
@@ -99,6 +99,11 @@ class ScenarioView:
     def stills(self) -> dict[str, str]:
         """Pictures of its tasks that have one."""
         return stills(self.id, [name for names in self.groups.values() for name in names])
+
+    @property
+    def film(self) -> str | None:
+        """The film of its skills before and after, if it has one."""
+        return film(self.id)
 
     @property
     def tiers(self) -> list[str]:

@@ -235,7 +235,10 @@ def test_a_card_that_is_made_again_has_the_same_bytes_and_nothing_is_measured_tw
 ) -> None:
     bench.add_all()
     bench.card()
+    (bench.output / "Toy-v0" / "film.gif").write_bytes(b"a film")
+    (bench.output / "Toy-v0" / "gone.webp").write_bytes(b"a task that the scenario no longer has")
     files = {path: path.read_bytes() for path in bench.output.rglob("*") if path.is_file()}
+    del files[bench.output / "Toy-v0" / "gone.webp"]
     assert "5 experts measured, 5 pictures drawn" in capsys.readouterr().err
     bench.card()
     assert "0 experts measured, 0 pictures drawn" in capsys.readouterr().err
@@ -247,6 +250,7 @@ def test_a_card_that_is_made_again_has_the_same_bytes_and_nothing_is_measured_tw
     assert {path: path.read_bytes() for path in files} == files
     bench.card(episodes=4)
     assert "5 experts measured, 0 pictures drawn" in capsys.readouterr().err
+    assert {*bench.output.glob("Toy-v0/*")} == {path for path in files if path.parent.name == "Toy-v0"}
 
 
 def test_the_card_reports_records_of_another_version_of_the_scenario(bench: Bench) -> None:

@@ -8,6 +8,7 @@ import pytest
 from clbench.base.entry_points import resolve
 
 stills = resolve("clbench.leaderboard.views.page.stills:stills")
+film = resolve("clbench.leaderboard.views.page.stills:film")
 
 
 @pytest.fixture
@@ -29,6 +30,13 @@ def test_a_task_with_a_picture_has_a_still(cards: Path) -> None:
 
 def test_another_policy_does_the_same_tasks(cards: Path) -> None:
     assert stills("clbench/Toy-v0+discrete_diffusion", ["lift"], cards)
+
+
+def test_a_scenario_with_a_film_has_it_for_the_default_policy(cards: Path) -> None:
+    assert film("clbench/Toy-v0", cards) is None
+    (cards / "Toy-v0" / "film.gif").write_bytes(b"a film")
+    assert film("clbench/Toy-v0", cards) == "data:image/gif;base64," + base64.b64encode(b"a film").decode()
+    assert film("clbench/Toy-v0+discrete_diffusion", cards) is None
 
 
 def test_names_of_strangers_lead_to_no_file(cards: Path) -> None:
