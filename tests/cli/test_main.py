@@ -27,7 +27,7 @@ PLACES = {name: place for commands in COMMANDS.values() for name, place in comma
 
 def _clbench(*arguments: str, folder: Path | None = None) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, "-m", "clbench", *arguments]
-    return subprocess.run(command, capture_output=True, text=True, cwd=folder, timeout=200, check=False)
+    return subprocess.run(command, capture_output=True, text=True, cwd=folder, timeout=600, check=False)
 
 
 @pytest.mark.parametrize(

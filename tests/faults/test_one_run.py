@@ -3,7 +3,7 @@
 import random
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -20,22 +20,6 @@ FULL_DISKS = 20
 
 KILLS, PAST_A_CHECKPOINT = 60, 20
 """Kills at random moments, and how many of them must come after the first checkpoint at least."""
-
-
-@pytest.fixture(scope="module")
-def runs() -> Iterator[Runs]:
-    with fault_server.start() as runs:
-        yield runs
-
-
-@pytest.fixture(scope="module")
-def whole(runs: Runs, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, int]:
-    """Return the folder of a run that nothing disturbed, and the number of its operations."""
-    folder = tmp_path_factory.mktemp("whole")
-    count, end = runs.do(folder)
-    assert end == "success"
-    assert count is not None
-    return folder, count
 
 
 def _leftovers(folder: Path) -> list[str]:

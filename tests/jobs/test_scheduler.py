@@ -284,8 +284,8 @@ def test_one_worker_and_two_make_equal_records_and_a_stopped_benchmark_continues
 
 
 def _is_gone(group: int) -> bool:
-    """Return whether all processes of a group end within 10 seconds."""
-    for _ in range(100):
+    """Return whether all processes of a group end within a minute."""
+    for _ in range(600):
         try:
             os.killpg(group, 0)
         except ProcessLookupError:
@@ -320,11 +320,11 @@ def test_stopping_the_command_ends_its_workers_and_keeps_finished_records(
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )
     first = tmp_path / "records" / "Toy-v0" / "frozen" / "seed-0.json"
-    deadline = time.monotonic() + 100
+    deadline = time.monotonic() + 600
     while not first.exists() and time.monotonic() < deadline:
         time.sleep(0.1)
     send(process.pid, stop)
-    _, output = process.communicate(timeout=60)
+    _, output = process.communicate(timeout=600)
     assert process.returncode == code
     assert said in output
     assert "Traceback" not in output

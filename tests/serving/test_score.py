@@ -127,7 +127,7 @@ if not is_scored(ID, **options):
 @pytest.mark.parametrize(
     "killed",
     [
-        pytest.param([[2], [], [3]], id="twice"),
+        pytest.param([[], [], [3]], id="once"),
         pytest.param([[0, 1, 2], [3, 0, 1, 2], [3, 1, 0]], id="ten times", marks=pytest.mark.slow),
     ],
 )
@@ -142,11 +142,12 @@ def test_a_killed_program_loses_only_the_stage_that_was_running(
         expected = run(policy_of(stage), stage, records=tmp_path / "here")
         with serving(tmp_path, stage) as (address, _):
             codes = []
-            for allowed in [*killed[stage], 100, 0]:  # the last one finds nothing to do
+            again = [0] if stage == STAGES[-1] else []  # it finds nothing to do
+            for allowed in [*killed[stage], 100, *again]:
                 command = [sys.executable, "-c", program, address, str(stage), str(allowed)]
                 done = subprocess.run(command, cwd=tmp_path, env=environment, check=False)
                 codes.append(done.returncode)
-            assert codes == [*[9 for _ in killed[stage]], 0, 0]
+            assert codes == [*[9 for _ in killed[stage]], 0, *again]
     found = read_record(tmp_path / "records/Toy-v0/me--elsewhere/seed-0.json")
     assert outcomes(found) == outcomes(expected)
     assert not list((empty_caches / "cache" / "online").iterdir())
