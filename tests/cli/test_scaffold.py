@@ -72,7 +72,10 @@ def test_a_fresh_policy_is_linted_and_formatted_by_ruffs_own_settings(
     assert result.returncode == 0, result.stdout + result.stderr
 
 
-@pytest.mark.parametrize("method", ["sft", "experience_replay", "lora", "consft"])
+@pytest.mark.parametrize(
+    "method",
+    ["sft", "lora", *(pytest.param(name, marks=pytest.mark.slow) for name in ("consft", "experience_replay"))],
+)
 def test_methods_fine_tune_a_fresh_policy(method: str, fresh_policy: str, tmp_path: Path) -> None:
     spec = RunSpec("clbench.testing:clbench/Toy-v0", method, 0, policy=fresh_policy)
     record = execute(spec, tmp_path / "records")

@@ -51,7 +51,7 @@ def killed(progress):
     os.kill(os.getpid(), signal.SIGKILL)
 
 def leaves_a_thread(progress):
-    threading.Thread(target=time.sleep, args=(60,)).start()
+    threading.Thread(target=time.sleep, args=(600,)).start()
     return "went well"
 
 def slow(progress, path):
@@ -157,7 +157,7 @@ def test_a_job_that_leaves_a_thread_behind_ends_with_its_result(
     monkeypatch.setattr("clbench.jobs.processes._LEAVE_SECONDS", 0.2)
     begin = time.monotonic()
     assert run_jobs([_job("loose", "leaves_a_thread"), _job("next", "good")], Processes(1), bars) == {}
-    assert time.monotonic() - begin < 50
+    assert time.monotonic() - begin < 500
     assert "next: went well" in _printed(bars)
 
 

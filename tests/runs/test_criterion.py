@@ -132,12 +132,10 @@ def test_the_scenario_says_which_order_a_seed_has(record: Record) -> None:
     assert load_scenario(EAGER.id).for_seed(1).target[0].name == "down"
 
 
-def test_a_record_with_a_criterion_reaches_every_tier(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_record_with_a_criterion_reaches_every_tier(record: Record, tmp_path: Path) -> None:
     records = tmp_path / "records"
     spec = RunSpec(EAGER.id, "sft", seed=0)
-    execute(spec, records)
+    write_record(record, spec.path(records))
     for tier in ("replayed", "retrained"):
         request = subject.Request(tier, 20, 7, None, None, None)
         checks = verification.verify(spec.path(records), records, request)
