@@ -62,9 +62,7 @@ def imported(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[str]]:
 
 
 @pytest.mark.parametrize("stage", STAGES)
-def test_a_key_names_every_package_that_its_stage_imports(
-    stage: str, imported: dict[str, list[str]]
-) -> None:
+def test_a_key_names_every_package_that_its_stage_imports(stage: str, imported: dict[str, list[str]]) -> None:
     packages, _ = STAGES[stage]
     covered = (*packages, *ELSEWHERE)
     names = imported[stage]

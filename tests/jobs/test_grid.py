@@ -87,7 +87,7 @@ def test_a_failed_run_raises_with_its_reason(
         raise ArithmeticError("no loss today")
 """
     write_module("lossless", METHOD + loss)
-    with pytest.raises(clbench.RunsFailedError, match="Slow seed 0: .*ArithmeticError: no loss today"):
+    with pytest.raises(clbench.RunsFailedError, match=r"Slow seed 0: .*ArithmeticError: no loss today"):
         clbench.run(TOY, "lossless:Slow", seeds=1, records=tmp_path / "records")
 
 

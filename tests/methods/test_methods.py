@@ -78,7 +78,7 @@ FEWER: dict[str, dict[str, Any]] = {
 
 
 OF_THE_KIND = ("aegis", "lora", "lwf", "stop_gradient")
-"""Methods that use what differs between the kinds of policy: hidden states, modules, outputs and gradients."""
+"""Methods that use what differs between kinds of policy: hidden states, modules, outputs and gradients."""
 
 
 @pytest.mark.parametrize(
