@@ -1,4 +1,4 @@
-"""The run that the tests of faults share, and their counts: what they tried is as telling as that they passed."""
+"""What the tests of faults share, and their counts: what they tried is as telling as that they passed."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -16,7 +16,7 @@ def runs() -> Iterator[Runs]:
 
 @pytest.fixture(scope="session")
 def whole(runs: Runs, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, int]:
-    """Return the folder of a run that nothing disturbed, and the number of its operations; no test changes it."""
+    """Return the folder of an undisturbed run, which no test changes, and the number of its operations."""
     folder = tmp_path_factory.mktemp("whole")
     count, end = runs.do(folder)
     assert end == "success"
