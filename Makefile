@@ -94,12 +94,13 @@ libero-test: .venv/installed-dev
 	$(BIN)/pip install -q -c constraints.txt -e ".[dev,libero]"
 	$(BIN)/pytest tests/envs/test_libero.py tests/envs/test_libero_physics.py
 
-# Besides style and types: whether the committed board and pages are those of the committed records.
+# Besides style and types: whether the committed board and pages are those of the committed records, and the largest
+# scenario is what its definition says.
 check: .venv/installed-dev
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/mypy
-	$(BIN)/pytest -m slow tests/leaderboard/test_records.py
+	$(BIN)/pytest -m slow tests/leaderboard/test_records.py tests/evaluation/test_definition.py
 
 # What a wheel may do otherwise than the checkout, against a built one outside of it: its files, the parts that are
 # found by name, the commands; and all that strangers type. It has an environment of its own, which sees the packages of

@@ -13,8 +13,8 @@ from fault_server import Runs
 
 from clbench.base.leftovers import sweep
 
-POINTS = 3
-"""Operations that the quick test tries, spread over the run; the slow one tries all."""
+POINTS = (0.5, 1.0)
+"""Operations at which the quick test lets a run die, as shares of their number; the slow one tries all."""
 
 FULL_DISKS = 20
 
@@ -58,7 +58,7 @@ def test_a_run_that_dies_at_some_operation_is_completed_by_the_next_start(
     lasting_records: Callable[[Path], dict[str, Any]],
 ) -> None:
     folder, count = whole
-    points = [1 + point * (count - 1) // (POINTS - 1) for point in range(POINTS)]
+    points = [round(share * count) for share in POINTS]
     _die(points, runs, tmp_path, folder, lasting_records)
 
 

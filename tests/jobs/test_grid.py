@@ -14,6 +14,8 @@ from clbench.base.errors import ClbenchError
 from clbench.base.progress import ProgressCallback
 from clbench.jobs.job import Job
 from clbench.jobs.processes import Here
+from clbench.runs.run import execute
+from clbench.runs.spec import RunSpec
 
 TOY = "clbench.testing:clbench/Toy-v0"
 
@@ -42,6 +44,7 @@ def run_script(text: str, folder: Path) -> subprocess.CompletedProcess[str]:
 
 
 def test_a_class_of_the_script_itself_runs_and_its_change_is_noticed(tmp_path: Path) -> None:
+    execute(RunSpec(TOY, "frozen", 0), tmp_path)  # all that the runs need is in the cache
     result = run_script(SCRIPT, tmp_path)
     assert result.stdout == "__main__:Slow success 0 0.5\n"  # once: no process did the script again
     again = run_script(SCRIPT, tmp_path)

@@ -272,7 +272,7 @@ def test_a_run_waits_for_the_data_that_it_needs_and_no_other_data_is_made(
 def test_one_worker_and_two_make_equal_records_and_a_stopped_benchmark_continues(
     tmp_path: Path, bars: Bars, lasting_records: Callable[[Path], dict[str, Any]]
 ) -> None:
-    specs = [RunSpec(TOY, method, 0) for method in ("frozen", "sft", "joint")]
+    specs = [RunSpec(TOY, method, 0, targets=1) for method in ("frozen", "sft", "joint")]
     assert run_jobs(_plan(tmp_path / "one", *specs), Processes(1), bars) == {}
     assert run_jobs(_plan(tmp_path / "two", *specs[:1]), Processes(2), bars) == {}
     missing = [spec for spec in specs if not has_record(spec.resolve(), tmp_path / "two")]
