@@ -94,8 +94,8 @@ libero-test: .venv/installed-dev
 	$(BIN)/pip install -q -c constraints.txt -e ".[dev,libero]"
 	$(BIN)/pytest tests/envs/test_libero.py tests/envs/test_libero_physics.py
 
-# Besides style and types: whether the committed board and pages are those of the committed records, and the largest
-# scenario is what its definition says.
+# Besides style and types: whether the committed board and pages are those of the committed records, and every scenario
+# is what its definition says.
 check: .venv/installed-dev
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
