@@ -114,7 +114,7 @@ def _check_readable(path: Path) -> None:
 
 
 def _fields(value: Any) -> Any:
-    """Return the fields of a dataclass by name, and all else as it is; `asdict` copies every entry of a table."""
+    """Return the fields of a dataclass by name, all else as it is; `asdict` copies each entry of a table."""
     if not dataclasses.is_dataclass(value):
         return value
     return {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
