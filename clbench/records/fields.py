@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
 import json
 import types
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
@@ -39,7 +38,7 @@ def load_fields(cls: type[Any], values: Any, what: str, inside: str = "") -> Any
         InputError: A field is missing, unknown or of another type; the message names it.
     """
     _check_type(values, dict, what)
-    hints = _hints(cls)
+    hints = get_type_hints(cls)
     names = [field.name for field in dataclasses.fields(cls)]
     missing = [name for name in names if name not in values]
     if missing:
@@ -48,11 +47,6 @@ def load_fields(cls: type[Any], values: Any, what: str, inside: str = "") -> Any
         if name not in names:
             raise InputError(str(unknown(f"field of {what}", name, names)))
     return cls(**{name: _load(hints[name], values[name], inside + name) for name in names})
-
-
-@functools.cache  # a board reads a thousand records, each of five dataclasses
-def _hints(cls: type[Any]) -> dict[str, Any]:
-    return get_type_hints(cls)
 
 
 def _load(hint: Any, value: Any, where: str) -> Any:
