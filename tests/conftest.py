@@ -55,9 +55,12 @@ def _own_caches(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 
 
 @pytest.fixture(scope="session", autouse=True)
-def _one_core_each() -> None:
-    """Compute with one thread outside of runs too: there is a process of tests for each core."""
+def _one_core_each() -> Iterator[None]:
+    """Compute with one thread outside of runs too, also in new processes: each core has its own tests."""
     torch.set_num_threads(1)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("OMP_NUM_THREADS", "1")
+        yield
 
 
 @pytest.fixture

@@ -20,7 +20,7 @@ def _python(*arguments: str, folder: Path, path: Path | None = None) -> str:
     environment = {**os.environ, "PYTHONPATH": str(path) if path else "", "COLUMNS": "200"}
     command = [sys.executable, "-m", *arguments]
     result = subprocess.run(
-        command, cwd=folder, env=environment, capture_output=True, text=True, timeout=300, check=False
+        command, cwd=folder, env=environment, capture_output=True, text=True, timeout=600, check=False
     )
     assert result.returncode == 0, result.stdout + result.stderr
     return result.stdout

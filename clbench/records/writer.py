@@ -75,7 +75,7 @@ def record_text(record: Record) -> str:
         InputError: The record holds values that JSON cannot hold.
     """
     try:
-        values = {"schema": SCHEMA, **dataclasses.asdict(record)}
+        values = {"schema": SCHEMA, **{name: _fields(part) for name, part in _fields(record).items()}}
         if isinstance(record.error, dict):
             values["error"] = {name: _cut(text) for name, text in record.error.items()}
         lines = [f"{json.dumps(name)}: {_dump(value)}" for name, value in values.items()]
@@ -111,6 +111,13 @@ def _check_readable(path: Path) -> None:
     except RecordError as error:
         reason = str(error).removeprefix(f"{path}: ")
         raise InputError(f"the record could not be read again: {reason}") from error
+
+
+def _fields(value: Any) -> Any:
+    """Return the fields of a dataclass by name, all else as it is; `asdict` copies each entry of a table."""
+    if not dataclasses.is_dataclass(value):
+        return value
+    return {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
 
 
 def _cut(text: Any) -> Any:

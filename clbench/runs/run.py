@@ -90,7 +90,7 @@ def execute(
 def _checkpoints(run: ResolvedRun, records: Path) -> Path:
     """Return the folder of the checkpoints of a run in the cache."""
     # two commands may do the same run for different folders at once
-    return cache_folder() / "runs" / hash_of({**_inputs(run, 0), "records": str(records.resolve())})
+    return cache_folder() / "runs" / hash_of({**_inputs(run), "records": str(records.resolve())})
 
 
 def pretrained_hash(folder: Path) -> str:
@@ -142,6 +142,8 @@ class _Run:
     kept: Path | None
     """Folder below which the policies of all stages are kept."""
     tensorboard: Path | None
+    inputs: dict[str, Any]
+    """Everything that the checkpoints depend on. Code that changes while a run goes on is not the run's."""
     begin: float = dataclasses.field(default_factory=time.perf_counter)
     seconds_before: float = 0.0
     """Seconds that the run took before it was interrupted."""
@@ -165,9 +167,8 @@ class _Run:
         examiner = Examiner(scenario, run.protocol, data, pretrained, spec.seed, progress)
         checker = Checker(scenario, run.protocol, spec.seed)
         record = _new_record(run, trainer, folder)
-        return cls(
-            run, trainer, examiner, checker, record, Log(), progress, checkpoints, lease, kept, tensorboard
-        )
+        parts = (run, trainer, examiner, checker, record, Log(), progress, checkpoints, lease)
+        return cls(*parts, kept, tensorboard, _inputs(run))
 
     def go(self) -> Record:
         """Go through all stages without a checkpoint, and return the record."""
@@ -320,7 +321,7 @@ class _Run:
             if self.kept is not None:
                 keep_stage(self.run, self.kept, number, folder)
 
-        cached(self._checkpoint(number), _inputs(self.run, number), write)
+        cached(self._checkpoint(number), {**self.inputs, "stage": number}, write)
         shutil.rmtree(self._checkpoint(number - 1), ignore_errors=True)
 
     def _load(self, number: int) -> None:
@@ -338,7 +339,7 @@ class _Run:
         targets = len(self.run.scenario.target)
         for number in range(targets, -1, -1):
             folder = self._checkpoint(number)
-            if not is_cached(folder, _inputs(self.run, number)):
+            if not is_cached(folder, {**self.inputs, "stage": number}):
                 continue
             if self.kept is not None and not has_stages(self.run, self.kept, number):
                 continue
@@ -352,11 +353,10 @@ class _Run:
         return None
 
 
-def _inputs(run: ResolvedRun, number: int) -> dict[str, Any]:
-    """Return everything that the state after stage `number` depends on."""
+def _inputs(run: ResolvedRun) -> dict[str, Any]:
+    """Return everything that the state after a stage depends on, besides its number."""
     return {
         "run": dataclasses.asdict(run.info),
         "scenario": dataclasses.asdict(run.scenario_info),
-        "stage": number,
         **sources(run.scenario, run.spec.seed, *method_packages(run.method)),
     }

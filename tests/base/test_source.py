@@ -35,21 +35,39 @@ ELSEWHERE = ("clbench.envs", "clbench.testing")
 """Suites: keys name the package of each task. The toy's package is `clbench.testing`."""
 
 
+PROGRAM = """
+import os, sys
+import minari, torch, torch._inductor.config  # they take seconds, and import nothing of clbench
+assert not any(name.startswith("clbench") for name in sys.modules)
+for stage, code in {codes}.items():
+    if not os.fork():
+        from clbench.spec.registry import load_scenario
+        scenario = load_scenario("clbench.testing:clbench/Toy-v0")
+        exec(code)
+        print(stage, *(name for name in sys.modules if name.startswith("clbench.")), flush=True)
+        os._exit(0)
+    assert os.wait()[1] == 0
+"""
+"""Does each stage in a process of its own, and prints the modules that it imported."""
+
+
+@pytest.fixture(scope="module")
+def imported(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[str]]:
+    """Return the names of the modules that each stage imports."""
+    program = PROGRAM.format(codes={stage: code for stage, (_, code) in STAGES.items()})
+    command, folder = [sys.executable, "-c", program], tmp_path_factory.mktemp("stages")
+    result = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=True)
+    lines = [line.split() for line in result.stdout.splitlines()]
+    return {stage: names for stage, *names in lines if stage in STAGES}
+
+
 @pytest.mark.parametrize("stage", STAGES)
-def test_a_key_names_every_package_that_its_stage_imports(stage: str, tmp_path: Path) -> None:
-    packages, code = STAGES[stage]
-    program = (
-        "import sys\nfrom clbench.spec.registry import load_scenario\n"
-        f"scenario = load_scenario('clbench.testing:clbench/Toy-v0')\n{code}\n"
-        "print(*(name for name in sys.modules if name.startswith('clbench.')), sep='\\n')"
-    )
-    result = subprocess.run(
-        [sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True, check=True
-    )
+def test_a_key_names_every_package_that_its_stage_imports(stage: str, imported: dict[str, list[str]]) -> None:
+    packages, _ = STAGES[stage]
     covered = (*packages, *ELSEWHERE)
-    imported = result.stdout.split()
-    assert [name for name in imported if not f"{name}.".startswith(tuple(f"{one}." for one in covered))] == []
-    used = {package for package in packages for name in imported if f"{name}.".startswith(f"{package}.")}
+    names = imported[stage]
+    assert [name for name in names if not f"{name}.".startswith(tuple(f"{one}." for one in covered))] == []
+    used = {package for package in packages for name in names if f"{name}.".startswith(f"{package}.")}
     assert used == set(packages), "the key names packages that its stage does not use"
 
 

@@ -69,7 +69,7 @@ def _wait_for(process: subprocess.Popen[str], line: str) -> None:
 
 def _exit_code(process: subprocess.Popen[str]) -> tuple[int, str, str]:
     """Return the exit code as a shell reports it, and what the process has printed since."""
-    out, err = process.communicate(timeout=100)
+    out, err = process.communicate(timeout=600)
     code = process.returncode
     return (128 - code if code < 0 else code), out, err
 

@@ -3,13 +3,14 @@
 import re
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 from verification import failures, verify
 
 from clbench.base.errors import InputError
+from clbench.cli.main import app
 from clbench.cli.scaffold import class_name, write_method, write_policy
 from clbench.learning.registry import load_method
 from clbench.records.reader import read_record
@@ -22,7 +23,15 @@ from clbench.testing import check_method, check_policy
 
 def _python(*arguments: str, folder: Path) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, "-m", *arguments]
-    return subprocess.run(command, capture_output=True, text=True, cwd=folder, timeout=300, check=False)
+    return subprocess.run(command, capture_output=True, text=True, cwd=folder, timeout=600, check=False)
+
+
+@pytest.fixture
+def clbench(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
+    """Return a function that does a command in the folder of the test."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)  # and take back what the command puts there
+    return lambda *words: app(words, result_action="return_value")
 
 
 @pytest.fixture
@@ -72,7 +81,14 @@ def test_a_fresh_policy_is_linted_and_formatted_by_ruffs_own_settings(
     assert result.returncode == 0, result.stdout + result.stderr
 
 
-@pytest.mark.parametrize("method", ["sft", "experience_replay", "lora", "consft"])
+@pytest.mark.parametrize(
+    "method",
+    [
+        "sft",
+        "lora",
+        *(pytest.param(name, marks=pytest.mark.slow) for name in ("consft", "experience_replay")),
+    ],
+)
 def test_methods_fine_tune_a_fresh_policy(method: str, fresh_policy: str, tmp_path: Path) -> None:
     spec = RunSpec("clbench.testing:clbench/Toy-v0", method, 0, policy=fresh_policy)
     record = execute(spec, tmp_path / "records")
@@ -109,15 +125,15 @@ def test_a_method_whose_need_a_fresh_policy_lacks_is_refused_by_name(fresh_polic
             RunSpec("clbench.testing:clbench/Toy-v0", method, 0, policy=fresh_policy).resolve()
 
 
-def test_new_policy_prints_the_next_steps(tmp_path: Path) -> None:
-    result = _python("clbench", "new-policy", "diffusion", folder=tmp_path)
-    assert result.stdout.splitlines() == [
+def test_new_policy_prints_the_next_steps(
+    clbench: Callable[..., None], capsys: pytest.CaptureFixture[str]
+) -> None:
+    clbench("new-policy", "diffusion")
+    assert capsys.readouterr().out.splitlines() == [
         "Wrote diffusion.py and test_diffusion.py. Make the policy yours, then:",
         "  python -m pytest test_diffusion.py",
         "  clbench run clbench/Fetch-v1 sft --policy diffusion:Diffusion",
     ]
-    tested = _python("pytest", "--collect-only", "-q", "test_diffusion.py", folder=tmp_path)
-    assert "test_diffusion_keeps_the_contract" in tested.stdout
 
 
 def test_a_policy_cannot_be_named_like_a_built_in_one(tmp_path: Path) -> None:
@@ -125,15 +141,23 @@ def test_a_policy_cannot_be_named_like_a_built_in_one(tmp_path: Path) -> None:
         write_policy("flow", tmp_path)
 
 
-def test_the_command_prints_the_next_steps(tmp_path: Path) -> None:
-    result = _python("clbench", "new-method", "freshly_written", folder=tmp_path)
-    assert result.stdout.splitlines() == [
+def test_the_command_prints_the_next_steps(
+    clbench: Callable[..., None], capsys: pytest.CaptureFixture[str]
+) -> None:
+    clbench("new-method", "freshly_written")
+    assert capsys.readouterr().out.splitlines() == [
         "Wrote freshly_written.py and test_freshly_written.py. Make the method yours, then:",
         "  python -m pytest test_freshly_written.py",
         "  clbench submit freshly_written:FreshlyWritten",
     ]
-    tested = _python("pytest", "--collect-only", "-q", "test_freshly_written.py", folder=tmp_path)
-    assert "test_freshly_written_keeps_the_contract" in tested.stdout
+
+
+def test_pytest_finds_the_fresh_tests(tmp_path: Path) -> None:
+    write_method("freshly_written", tmp_path)
+    write_policy("diffusion", tmp_path)
+    found = _python("pytest", "--collect-only", "-q", folder=tmp_path).stdout
+    assert "test_diffusion_keeps_the_contract" in found
+    assert "test_freshly_written_keeps_the_contract" in found
 
 
 def test_a_fresh_template_runs(fresh: str, tmp_path: Path) -> None:
@@ -142,10 +166,12 @@ def test_a_fresh_template_runs(fresh: str, tmp_path: Path) -> None:
     assert (record.status, record.run.settings) == ("success", {"step_factor": 1.0, "share": 0.9})
 
 
-def test_the_next_steps_name_another_folder(tmp_path: Path) -> None:
+def test_the_next_steps_name_another_folder(
+    tmp_path: Path, clbench: Callable[..., None], capsys: pytest.CaptureFixture[str]
+) -> None:
     (tmp_path / "mine").mkdir()
-    result = _python("clbench", "new-method", "freshly_written", "--folder", "mine", folder=tmp_path)
-    assert result.stdout.splitlines()[1] == "  cd mine"
+    clbench("new-method", "freshly_written", "--folder", "mine")
+    assert capsys.readouterr().out.splitlines()[1] == "  cd mine"
     assert sorted(path.name for path in (tmp_path / "mine").iterdir()) == [
         "freshly_written.py",
         "test_freshly_written.py",
@@ -195,12 +221,16 @@ def test_a_link_is_not_followed(tmp_path: Path) -> None:
     assert not (tmp_path / "elsewhere.py").exists()
 
 
-def test_a_bad_name_or_folder_ends_the_command_with_one_line(tmp_path: Path) -> None:
+def test_a_bad_name_or_folder_ends_the_command_with_one_line(
+    tmp_path: Path, clbench: Callable[..., None], capsys: pytest.CaptureFixture[str]
+) -> None:
     for arguments in (("sft",), ("mine", "--folder", "nowhere")):
-        result = _python("clbench", "new-method", *arguments, folder=tmp_path)
-        assert result.returncode == 2
-        assert len(result.stderr.splitlines()) == 1
-        assert result.stderr.startswith("error: ")
+        with pytest.raises(SystemExit) as ended:
+            clbench("new-method", *arguments)
+        said = capsys.readouterr().err
+        assert ended.value.code == 2
+        assert len(said.splitlines()) == 1
+        assert said.startswith("error: ")
     assert list(tmp_path.iterdir()) == []
 
 

@@ -120,7 +120,7 @@ def test_training_without_the_extra_names_the_extra_to_install(tmp_path: Path) -
         "from clbench.cli.main import main; main()"
     )
     command = [sys.executable, "-c", program]
-    result = subprocess.run(command, capture_output=True, text=True, timeout=100, check=False, cwd=tmp_path)
+    result = subprocess.run(command, capture_output=True, text=True, timeout=600, check=False, cwd=tmp_path)
     assert result.returncode == 2
     assert (
         "Training an expert needs the package stable_baselines3: pip install 'clbench[online]'"

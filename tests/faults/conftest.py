@@ -1,6 +1,27 @@
-"""The tests of faults print their counts at the end, as what they tried is as telling as that they passed."""
+"""What the tests of faults share, and their counts: what they tried is as telling as that they passed."""
 
+from collections.abc import Iterator
+from pathlib import Path
+
+import fault_server
 import pytest
+from fault_server import Runs
+
+
+@pytest.fixture(scope="session")
+def runs() -> Iterator[Runs]:
+    with fault_server.start() as runs:
+        yield runs
+
+
+@pytest.fixture(scope="session")
+def whole(runs: Runs, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, int]:
+    """Return the folder of an undisturbed run, which no test changes, and the number of its operations."""
+    folder = tmp_path_factory.mktemp("whole")
+    count, end = runs.do(folder)
+    assert end == "success"
+    assert count is not None
+    return folder, count
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:

@@ -5,7 +5,7 @@ import json
 import random
 import shutil
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -75,17 +75,9 @@ def _files(folder: Path, place: str) -> list[Path]:
 
 
 @pytest.fixture(scope="module")
-def runs() -> Iterator[Runs]:
-    with fault_server.start() as runs:
-        yield runs
-
-
-@pytest.fixture(scope="module")
-def finished(runs: Runs, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def finished(whole: tuple[Path, int]) -> Path:
     """Return the folder of a finished run."""
-    folder = tmp_path_factory.mktemp("finished")
-    assert runs.do(folder)[1] == "success"
-    return folder
+    return whole[0]
 
 
 @pytest.fixture(scope="module")

@@ -3,7 +3,7 @@
 import random
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -13,29 +13,13 @@ from fault_server import Runs
 
 from clbench.base.leftovers import sweep
 
-POINTS = 3
-"""Operations that the quick test tries, spread over the run; the slow one tries all."""
+POINTS = (0.5, 1.0)
+"""Operations at which the quick test lets a run die, as shares of their number; the slow one tries all."""
 
 FULL_DISKS = 20
 
 KILLS, PAST_A_CHECKPOINT = 60, 20
 """Kills at random moments, and how many of them must come after the first checkpoint at least."""
-
-
-@pytest.fixture(scope="module")
-def runs() -> Iterator[Runs]:
-    with fault_server.start() as runs:
-        yield runs
-
-
-@pytest.fixture(scope="module")
-def whole(runs: Runs, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, int]:
-    """Return the folder of a run that nothing disturbed, and the number of its operations."""
-    folder = tmp_path_factory.mktemp("whole")
-    count, end = runs.do(folder)
-    assert end == "success"
-    assert count is not None
-    return folder, count
 
 
 def _leftovers(folder: Path) -> list[str]:
@@ -74,7 +58,7 @@ def test_a_run_that_dies_at_some_operation_is_completed_by_the_next_start(
     lasting_records: Callable[[Path], dict[str, Any]],
 ) -> None:
     folder, count = whole
-    points = [1 + point * (count - 1) // (POINTS - 1) for point in range(POINTS)]
+    points = [round(share * count) for share in POINTS]
     _die(points, runs, tmp_path, folder, lasting_records)
 
 

@@ -51,7 +51,7 @@ def killed(progress):
     os.kill(os.getpid(), signal.SIGKILL)
 
 def leaves_a_thread(progress):
-    threading.Thread(target=time.sleep, args=(60,)).start()
+    threading.Thread(target=time.sleep, args=(600,)).start()
     return "went well"
 
 def slow(progress, path):
@@ -157,7 +157,7 @@ def test_a_job_that_leaves_a_thread_behind_ends_with_its_result(
     monkeypatch.setattr("clbench.jobs.processes._LEAVE_SECONDS", 0.2)
     begin = time.monotonic()
     assert run_jobs([_job("loose", "leaves_a_thread"), _job("next", "good")], Processes(1), bars) == {}
-    assert time.monotonic() - begin < 50
+    assert time.monotonic() - begin < 500
     assert "next: went well" in _printed(bars)
 
 
@@ -272,7 +272,7 @@ def test_a_run_waits_for_the_data_that_it_needs_and_no_other_data_is_made(
 def test_one_worker_and_two_make_equal_records_and_a_stopped_benchmark_continues(
     tmp_path: Path, bars: Bars, lasting_records: Callable[[Path], dict[str, Any]]
 ) -> None:
-    specs = [RunSpec(TOY, method, 0) for method in ("frozen", "sft", "joint")]
+    specs = [RunSpec(TOY, method, 0, targets=1) for method in ("frozen", "sft", "joint")]
     assert run_jobs(_plan(tmp_path / "one", *specs), Processes(1), bars) == {}
     assert run_jobs(_plan(tmp_path / "two", *specs[:1]), Processes(2), bars) == {}
     missing = [spec for spec in specs if not has_record(spec.resolve(), tmp_path / "two")]
@@ -284,8 +284,8 @@ def test_one_worker_and_two_make_equal_records_and_a_stopped_benchmark_continues
 
 
 def _is_gone(group: int) -> bool:
-    """Return whether all processes of a group end within 10 seconds."""
-    for _ in range(100):
+    """Return whether all processes of a group end within a minute."""
+    for _ in range(600):
         try:
             os.killpg(group, 0)
         except ProcessLookupError:
@@ -320,11 +320,11 @@ def test_stopping_the_command_ends_its_workers_and_keeps_finished_records(
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )
     first = tmp_path / "records" / "Toy-v0" / "frozen" / "seed-0.json"
-    deadline = time.monotonic() + 100
+    deadline = time.monotonic() + 600
     while not first.exists() and time.monotonic() < deadline:
         time.sleep(0.1)
     send(process.pid, stop)
-    _, output = process.communicate(timeout=60)
+    _, output = process.communicate(timeout=600)
     assert process.returncode == code
     assert said in output
     assert "Traceback" not in output

@@ -16,7 +16,7 @@ from clbench.jobs.work import (
 from clbench.records.record import Record
 from clbench.runs.spec import RunSpec
 
-SPEC = RunSpec("clbench.testing:clbench/Toy-v0", "sft", 0)
+SPEC = RunSpec("clbench.testing:clbench/Toy-v0", "frozen", 0)
 
 
 def test_a_policy_that_can_do_little_is_called_weak_before_and_after_a_run(

@@ -23,7 +23,7 @@ from clbench.runs.run import execute
 from clbench.runs.spec import RunSpec
 from clbench.scoring.metrics import METRICS, measure
 from clbench.scoring.scores import Scores
-from clbench.spec.policies import POLICIES
+from clbench.spec.policies import DEFAULT_POLICY, POLICIES
 from clbench.testing import check_method
 
 TOY = "clbench.testing:clbench/Toy-v0"
@@ -77,8 +77,22 @@ FEWER: dict[str, dict[str, Any]] = {
 """Settings that make the preparation short."""
 
 
-@pytest.mark.parametrize("policy", POLICIES)
-@pytest.mark.parametrize("name", method_names())
+OF_THE_KIND = ("aegis", "lora", "lwf", "stop_gradient")
+"""Methods that use what differs between kinds of policy: hidden states, modules, outputs and gradients."""
+
+
+@pytest.mark.parametrize(
+    ("name", "policy"),
+    [
+        pytest.param(
+            name,
+            policy,
+            marks=[] if policy == DEFAULT_POLICY or name in OF_THE_KIND else [pytest.mark.slow],
+        )
+        for name in method_names()
+        for policy in POLICIES
+    ],
+)
 def test_every_method_keeps_the_contract_with_every_policy(name: str, policy: str) -> None:
     check_method(load_method(name), policy=policy, **FEWER.get(name, {}))
 

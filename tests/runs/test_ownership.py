@@ -61,9 +61,9 @@ class _Raises(Method):
 def test_commands_that_start_together_do_each_run_once(tmp_path: Path) -> None:
     # their workers import the toy, pretrained in the cache of the tests
     command = [*COMMAND, "--records", str(tmp_path / "records")]
-    processes = [subprocess.Popen(command, stderr=subprocess.PIPE, text=True) for _ in range(3)]
+    processes = [subprocess.Popen(command, stderr=subprocess.PIPE, text=True) for _ in range(2)]
     said = [process.communicate()[1] for process in processes]
-    assert [process.returncode for process in processes] == [0, 0, 0], said
+    assert [process.returncode for process in processes] == [0, 0], said
     lines = [line for text in said for line in text.splitlines()]
     for label in ("sft", "frozen"):
         ends = [line for line in lines if line.startswith(f"Toy-v0 {label} seed 0: ")]

@@ -25,7 +25,7 @@ def reports() -> Path:
 def test_progress_adds_up_to_the_length_of_the_run(perturb: bool, tmp_path: Path, reports: Path) -> None:
     for _ in range(2):  # the second time the cache has the evaluation of the pretrained policy
         amounts: list[float] = []
-        run = RunSpec(TOY, "sft", seed=0, perturb=perturb).resolve()
+        run = RunSpec(TOY, "sft", seed=0, perturb=perturb, targets=1).resolve()
         execute(run, tmp_path, amounts.append)
         assert sum(amounts) == pytest.approx(run_length(run.scenario, run.protocol))
 

@@ -124,17 +124,14 @@ if not is_scored(ID, **options):
 """
 
 
-@pytest.mark.parametrize(
-    "killed",
-    [
-        pytest.param([[2], [], [3]], id="twice"),
-        pytest.param([[0, 1, 2], [3, 0, 1, 2], [3, 1, 0]], id="ten times", marks=pytest.mark.slow),
-    ],
-)
+KILLS = [[0, 1, 2], [3, 0, 1, 2], [3, 1, 0]]
+"""Numbers of requests after which the program is killed, by stage."""
+
+
+@pytest.mark.slow
 def test_a_killed_program_loses_only_the_stage_that_was_running(
-    killed: list[list[int]], run: Callable[..., Record], tmp_path: Path, empty_caches: Path
+    run: Callable[..., Record], tmp_path: Path, empty_caches: Path
 ) -> None:
-    """`killed` has the numbers of requests after which the program is killed, by stage."""
     policy_of = write_policy(tmp_path)
     program = KILLED.replace("ID", repr(ID))
     environment = {**os.environ, "CLBENCH_CACHE": str(empty_caches / "cache")}
@@ -142,11 +139,11 @@ def test_a_killed_program_loses_only_the_stage_that_was_running(
         expected = run(policy_of(stage), stage, records=tmp_path / "here")
         with serving(tmp_path, stage) as (address, _):
             codes = []
-            for allowed in [*killed[stage], 100, 0]:  # the last one finds nothing to do
+            for allowed in [*KILLS[stage], 100, 0]:  # the last one finds nothing to do
                 command = [sys.executable, "-c", program, address, str(stage), str(allowed)]
                 done = subprocess.run(command, cwd=tmp_path, env=environment, check=False)
                 codes.append(done.returncode)
-            assert codes == [*[9 for _ in killed[stage]], 0, 0]
+            assert codes == [*[9 for _ in KILLS[stage]], 0, 0]
     found = read_record(tmp_path / "records/Toy-v0/me--elsewhere/seed-0.json")
     assert outcomes(found) == outcomes(expected)
     assert not list((empty_caches / "cache" / "online").iterdir())

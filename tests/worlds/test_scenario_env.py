@@ -225,6 +225,6 @@ def _draw(scenario: str, folder: Path, side_by_side: str) -> None:
     hidden = ("MUJOCO_GL", "DISPLAY", "WAYLAND_DISPLAY")
     environment = {name: value for name, value in os.environ.items() if name not in hidden}
     command = [sys.executable, "-c", DRAW, scenario, str(folder), side_by_side]
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False, timeout=300)
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False, timeout=600)
     assert done.returncode == 0, done.stderr
     assert [path.suffix for path in folder.iterdir()] == [".mp4"]

@@ -93,11 +93,11 @@ def test_a_team_that_one_of_its_threads_drops_does_not_wait_for_itself(
         if threading.current_thread() is not threading.main_thread() and teams:
             teams.pop().close()
             dropped.set()
-        dropped.wait(10)
+        dropped.wait(60)
 
     teams[0].each(drop, range(2))
     assert dropped.is_set()
-    deadline = time.monotonic() + 10
+    deadline = time.monotonic() + 60
     while _own_threads(before) and time.monotonic() < deadline:
         time.sleep(0.01)
 
@@ -106,6 +106,6 @@ def test_an_interpreter_exits_at_once_with_a_team_that_nobody_closed() -> None:
     code = "from clbench.worlds.threads import Team; team = Team(3); done = []; team.each(done.append, 'abc')"
     code += "; print(sorted(done))"
     ended = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=600, check=True
     )
     assert (ended.stdout, ended.stderr) == ("['a', 'b', 'c']\n", "")

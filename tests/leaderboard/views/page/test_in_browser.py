@@ -72,7 +72,7 @@ def open_page(browser: Browser, address: str) -> Iterator[Callable[..., Page]]:
     def open_page(place: str = "", **context: Any) -> Page:
         made = browser.new_context(**{"viewport": DESKTOP, "reduced_motion": "reduce", **context})
         page = made.new_page()
-        page.set_default_timeout(20_000)
+        page.set_default_timeout(300_000)  # a busy machine is slow
         page.on("console", lambda message: troubles.append(f"{message.type}: {message.text}"))
         page.on("pageerror", lambda error: troubles.append(str(error)))
         page.on("dialog", lambda dialog: troubles.append(f"dialog: {dialog.message}"))
