@@ -1,7 +1,10 @@
 """Functions that several test files call; `pythonpath` in pyproject.toml lets them import this module."""
 
+import base64
 import dataclasses
+import gzip
 import json
+import re
 from collections.abc import Mapping
 from typing import Any
 
@@ -60,4 +63,17 @@ def same_demonstrations(first: list[Demonstration], second: list[Demonstration])
         np.array_equal(a, b)
         for one, other in zip(first, second, strict=True)
         for a, b in zip(dataclasses.astuple(one), dataclasses.astuple(other), strict=True)
+    )
+
+
+def data_of(page: str) -> Any:
+    """Return the data that a page of the leaderboard unpacks when it opens."""
+    (packed,) = re.findall(r'<script type="application/gzip" id="data">(.*?)</script>', page)
+    return json.loads(gzip.decompress(base64.b64decode(packed)))
+
+
+def unpacked(page: str) -> str:
+    """Return a page with its data as text: compressed bytes depend on the version of zlib."""
+    return re.sub(
+        r'(id="data">).*?(</script>)', lambda found: json.dumps(data_of(page)).join(found.groups()), page
     )

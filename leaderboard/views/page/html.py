@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import gzip
 import hashlib
 import json
 from collections.abc import Mapping, Sequence
@@ -84,7 +85,7 @@ def page(table: Table) -> str:
             policy=_policy(scripts, style),
             style=Markup(style),
             scripts=[Markup(script) for script in scripts],
-            data=Markup(_embedded(_data(views))),
+            data=_packed(_data(views)),
             scenarios=views,
             heat_maps=heat_maps(tables),
             not_shown=table.not_shown,
@@ -264,7 +265,7 @@ def _planes(one: ScenarioView, anchors: Mapping[str, str]) -> dict[str, Any]:
     }
 
 
-def _embedded(values: Any) -> str:
-    """Return JSON that cannot close its script element, whatever a stranger wrote."""
+def _packed(values: Any) -> str:
+    """Return JSON as gzip in base64: a fifth of the size, and it cannot close its element."""
     text = json.dumps(values, sort_keys=True, separators=(",", ":"), allow_nan=False)
-    return text.replace("<", "\\u003c")
+    return base64.b64encode(gzip.compress(text.encode(), mtime=0)).decode("ascii")

@@ -1,7 +1,9 @@
 "use strict";
-(() => {
+(async () => {
   const root = document.documentElement;
-  const data = JSON.parse(document.getElementById("data").textContent);
+  const packed = Uint8Array.from(atob(document.getElementById("data").textContent), (one) => one.charCodeAt(0));
+  const unpacked = new Blob([packed]).stream().pipeThrough(new DecompressionStream("gzip"));
+  const data = await new Response(unpacked).json();
   const narrow = () => window.innerWidth < 720;
   root.classList.remove("no-script");
 
@@ -410,4 +412,5 @@
   document.querySelectorAll(".heat, .definitions").forEach(roam);
   parts.slice(1).forEach((part) => { part.hidden = true; });
   go();
+  root.dataset.ready = ""; // for tests
 })();

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pandas
 import pytest
-from helpers import complete_record, sealed
+from helpers import complete_record, data_of, sealed
 
 import clbench
 from clbench.base.entry_points import resolve
@@ -100,10 +100,7 @@ def show(records: Path) -> str:
     """Return the details of all rows of the page, without the breaks of their lines."""
     resolve("clbench.leaderboard.cli:show")(records=records)
     page = (records.parent / "site" / "index.html").read_text(encoding="utf-8")
-    data = json.loads(
-        page.partition('<script type="application/json" id="data">')[2].partition("</script>")[0]
-    )
-    return " ".join(" ".join(row["html"] for row in data["rows"].values()).split())
+    return " ".join(" ".join(row["html"] for row in data_of(page)["rows"].values()).split())
 
 
 def test_the_page_and_the_csv_show_every_order_and_the_range(add: Callable[..., Path], records: Path) -> None:

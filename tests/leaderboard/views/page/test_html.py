@@ -16,6 +16,7 @@ from xml.etree import ElementTree
 import html5lib
 import numpy as np
 import pytest
+from helpers import data_of
 
 from clbench.base.entry_points import resolve
 from clbench.records.paths import record_path
@@ -59,7 +60,7 @@ def by_id(document: ElementTree.Element, name: str) -> ElementTree.Element:
 
 def row_of(text: str, anchor: str) -> ElementTree.Element:
     """Return the section of a row, which the page makes when the reader opens it."""
-    data = json.loads(by_id(parsed(text), "data").text or "")
+    data = data_of(text)
     parser = html5lib.HTMLParser(strict=True, namespaceHTMLElements=False)
     section: ElementTree.Element = parser.parseFragment(data["rows"][anchor]["html"])
     return section
@@ -266,7 +267,7 @@ def test_the_stages_of_an_agent_begin_after_the_old_skills(add: Callable[..., Pa
     add("me/agent", 0, uses=uses)
     text = page(read_table(records))
     assert "after the old skills" in words(row_of(text, "clbench/Toy-v0/me/agent"))
-    data = json.loads(by_id(parsed(text), "data").text or "")
+    data = data_of(text)
     chart = json.dumps(data["scenarios"]["clbench/Toy-v0"]["run_elsewhere"])
     assert data["rows"]["clbench/Toy-v0/me/agent"]["elsewhere"]
     assert "stages, one after another" in chart
@@ -335,5 +336,5 @@ def test_15_methods_with_5_seeds_on_4_scenarios_are_less_than_3_megabytes(
     ]
     large = dataclasses.replace(table, rows=tuple(rows), scenarios=dict.fromkeys(names, scenario))
     text = page(large)
-    assert len(json.loads(by_id(parsed(text), "data").text or "")["rows"]) == 60
+    assert len(data_of(text)["rows"]) == 60
     assert len(text.encode()) < 3_000_000

@@ -78,6 +78,7 @@ def open_page(browser: Browser, address: str) -> Iterator[Callable[..., Page]]:
         page.on("dialog", lambda dialog: troubles.append(f"dialog: {dialog.message}"))
         page.on("request", check)
         page.goto(f"{address}#{place}")
+        page.locator("html[data-ready]").wait_for()
         return page
 
     yield open_page
@@ -247,6 +248,7 @@ def test_on_a_phone_nothing_is_wider_than_the_screen(open_page: Callable[..., Pa
     expect(page.locator("figure[data-plane]:visible svg")).to_have_count(1)
     assert page.evaluate(width) == PHONE["width"]
     page.goto(f"{page.url.split('#')[0]}#clbench/Toy-v0/x_with_a_name_that_is_longer_than_a_phone")
+    page.locator("html[data-ready]").wait_for()
     expect(row(page).locator("figure svg")).to_have_count(1)
     assert row(page).evaluate("e => e.scrollWidth") == PHONE["width"]
     assert page.evaluate(width) == PHONE["width"]

@@ -29,6 +29,7 @@ def opened(request: pytest.FixtureRequest, browser: Browser) -> Iterator[Page]:
     context = browser.new_context(viewport=request.param, offline=True)
     page = context.new_page()
     page.goto((SITE / "index.html").as_uri())
+    page.locator("html[data-ready]").wait_for()
     yield page
     context.close()
 
