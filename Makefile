@@ -33,7 +33,7 @@ records: .venv/installed
 	$(BIN)/clbench run clbench/Fetch-v1 sft consft consft_calibrated --seeds 8 --perturb
 	$(BIN)/clbench run clbench/Fetch-v1 frozen $(METHODS) --seeds 8
 	$(BIN)/clbench run clbench/MetaWorld-v1 frozen $(METHODS) --seeds 4
-	$(BIN)/clbench run $(KNOWLEDGE) frozen sft stop_gradient aegis lora --seeds 4
+	$(BIN)/clbench run $(KNOWLEDGE) frozen joint sft stop_gradient aegis lora --seeds 4
 	$(BIN)/clbench run clbench/Fetch-v1 frozen sft consft aegis experience_replay lora stop_gradient --seeds 3 \
 		--policy discrete_diffusion
 	$(BIN)/clbench run $(FIXED),clbench/MetaWorldCW-v0 sft frozen joint from_scratch --seeds 3
