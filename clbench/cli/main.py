@@ -58,6 +58,7 @@ NAMES = {
     "leaderboard": "[SCENARIO]",
     "score": "SCENARIO",
     "metrics": "[NAME|FILE]",
+    "film": "SCENARIO METHODS...",
     "tune": "SCENARIO [METHODS...]",
     "verify": "PATHS...",
     "scenario-card": "[SCENARIOS...]",

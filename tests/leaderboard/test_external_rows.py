@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 from agents import ID
-from helpers import sealed
+from helpers import sealed, unpacked
 from served import write_policy
 
 from clbench.base.entry_points import resolve
@@ -56,7 +56,7 @@ def test_the_page_says_what_is_declared_and_that_no_method_is_compared_with_it(
     show(records=board / "records")
     lines = [" ".join(line.split()) for line in capsys.readouterr().out.splitlines()]
     assert lines[lines.index("external") + 1].startswith("a me/elsewhere 1 0.")
-    page = (board / "site" / "index.html").read_text(encoding="utf-8")
+    page = unpacked((board / "site" / "index.html").read_text(encoding="utf-8"))
     assert "were fine-tuned elsewhere, on what their authors declare: not comparable with methods" in page
     assert "# me/elsewhere is a separate program: docs/guide/external.md" in page
     assert "clbench run clbench/Toy-v0 me/elsewhere" not in page

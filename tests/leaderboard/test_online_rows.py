@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 from agents import ID, LEARNED, Knowing, trained
-from helpers import sealed
+from helpers import sealed, unpacked
 
 from clbench.base.entry_points import resolve
 from clbench.runs.agents import evaluate_agent
@@ -55,7 +55,7 @@ def test_the_page_marks_an_agent_and_shows_no_run_command_for_it(
     show(records=board / "records")
     lines = [" ".join(line.split()) for line in capsys.readouterr().out.splitlines()]
     assert lines[lines.index("online") + 1].startswith("a me/knows 1 0.75")
-    page = (board / "site" / "index.html").read_text(encoding="utf-8")
+    page = unpacked((board / "site" / "index.html").read_text(encoding="utf-8"))
     assert "# me/knows is a separate program: docs/guide/online.md" in page
     assert "clbench run clbench/Toy-v0 me/knows" not in page
     assert "| a | me/knows | online |" in (board / "site" / "LEADERBOARD.md").read_text(encoding="utf-8")

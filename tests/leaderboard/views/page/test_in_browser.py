@@ -78,7 +78,8 @@ def open_page(browser: Browser, address: str) -> Iterator[Callable[..., Page]]:
         page.on("dialog", lambda dialog: troubles.append(f"dialog: {dialog.message}"))
         page.on("request", check)
         page.goto(f"{address}#{place}")
-        page.locator("html[data-ready]").wait_for()
+        if context.get("java_script_enabled", True):
+            page.locator("html[data-ready]").wait_for()
         return page
 
     yield open_page
