@@ -112,8 +112,8 @@ def _policies(
     from clbench.runs.film import column_of
 
     columns: dict[str, Policy] = {}
-    for run in runs:
-        stages = load_stages(run, _stages_folder(run, checkpoints, console))
+    for run, folder in zip(runs, _stages_folders(runs, checkpoints, console), strict=True):
+        stages = load_stages(run, folder)
         for number in numbers:
             columns.setdefault(column_of(run, number, alone=len(runs) == 1), stages[number])
     return columns
@@ -129,18 +129,18 @@ def _numbers(option: str, text: str | None, last: int) -> list[int]:
     return [int(word) for word in words]
 
 
-def _stages_folder(run: ResolvedRun, checkpoints: Path | None, console: Console) -> Path:
-    """Return the folder of the policies of all stages of a run; missing policies are made first."""
+def _stages_folders(runs: Sequence[ResolvedRun], checkpoints: Path | None, console: Console) -> list[Path]:
+    """Return the folders of the policies of all stages of each run; missing policies are made first."""
     from clbench.jobs.plan import Plan
     from clbench.jobs.processes import Processes
     from clbench.jobs.scheduler import run_with_bars
     from clbench.runs.checkpoints import find_stages, make_stages
 
-    found = find_stages(run, checkpoints)
-    if found is not None:
-        return found
+    found = [find_stages(run, checkpoints) for run in runs]
     plan = Plan()
-    plan.add_stages(run, None)
-    if run_with_bars(plan.jobs, Processes(), console):
+    for run, folder in zip(runs, found, strict=True):
+        if folder is None:
+            plan.add_stages(run, None)
+    if plan.jobs and run_with_bars(plan.jobs, Processes(), console):
         sys.exit(1)
-    return make_stages(run)
+    return [folder or make_stages(run) for run, folder in zip(runs, found, strict=True)]
