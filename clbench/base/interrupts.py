@@ -15,9 +15,8 @@ import threading
 import time
 from types import FrameType
 
-_interrupted = False
-_raise_from = 0.0
-"""Time from which Ctrl-C stops an import as well."""
+_interrupted_at: float | None = None
+"""Time of the first Ctrl-C."""
 
 _AGAIN_SECONDS = 0.01
 
@@ -27,8 +26,8 @@ _IMPORT_SECONDS = 10.0
 
 def install() -> None:
     """Remember each Ctrl-C from now on, and raise it again if a destructor or a callback dropped it."""
-    global _interrupted
-    _interrupted = False  # an earlier command in this process may have been stopped
+    global _interrupted_at
+    _interrupted_at = None  # an earlier command in this process may have been stopped
     signal.signal(signal.SIGINT, _handle)
     sys.unraisablehook = _raise_again
 
@@ -39,16 +38,16 @@ def check() -> None:
     Raises:
         KeyboardInterrupt: There was one.
     """
-    if _interrupted:
+    if _interrupted_at is not None:
         raise KeyboardInterrupt
 
 
 def _handle(number: int, frame: FrameType | None) -> None:
-    global _interrupted, _raise_from
-    if not _interrupted:
-        _raise_from = time.monotonic() + _IMPORT_SECONDS
-    _interrupted = True
-    if _imports(frame) and time.monotonic() < _raise_from:
+    global _interrupted_at
+    now = time.monotonic()
+    if _interrupted_at is None:
+        _interrupted_at = now
+    if _imports(frame) and now - _interrupted_at < _IMPORT_SECONDS:
         _soon_again()
     else:
         raise KeyboardInterrupt
