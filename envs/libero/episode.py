@@ -37,10 +37,11 @@ class Episode:
 
         Args:
             problem: Problem in the same scene.
-            seed: Number of the initial state, modulo their count, and seed of the places of fixtures.
+            seed: Number of an initial state of LIBERO, or seed of a drawn one.
         """
-        self.problem, self._places = problem, problem.places(seed)
-        model, data, start = problem.scene.model, self.data, problem.starts[seed % len(problem.starts)]
+        self.problem = problem
+        start, self._places = problem.start(seed)
+        model, data = problem.scene.model, self.data
         mujoco.mj_resetData(model, data)  # also clears controls and the warm start of the solver
         data.time = start[0]
         data.qpos[:], data.qvel[:] = np.split(start[1:], [model.nq])

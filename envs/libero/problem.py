@@ -34,16 +34,37 @@ class Problem:
     """Addresses of the positions of drawers and knobs."""
     fixtures: dict[str, int]
     """Bodies of the fixtures by name. Their places are no joints, and therefore in no state of LIBERO."""
-    sampler: Any
-    """LIBERO's sampler of the places of fixtures and objects."""
+    original: Any
+    """LIBERO's environment of the task, for its samplers; nobody steps it."""
+
+    def start(self, seed: int) -> tuple[Vector, Places]:
+        """Return how an episode begins: time, positions and velocities (1 + nq + nv,), and places of all bodies.
+
+        Seeds below 50 are numbers of LIBERO's initial states. For any other seed LIBERO draws a state, as it
+        drew those: 50 are too few for demonstrations and test episodes that have none in common.
+        """
+        if 0 <= seed < len(self.starts):
+            return self.starts[seed], self.places(seed)
+        sim, model = self.original.sim, self.scene.model
+        with _own_randomness(seed):
+            while True:
+                sim.reset()
+                model.body_pos[:], model.body_quat[:] = self.scene.places
+                try:
+                    self.original._reset_internal()
+                    break
+                except RandomizationError:  # things overlap: LIBERO draws all again
+                    continue
+        start = np.concatenate(([0.0], sim.data.qpos, np.zeros(model.nv)))
+        return start, (model.body_pos.copy(), model.body_quat.copy())
 
     def places(self, seed: int) -> Places:
-        """Return the places of all bodies, with fixtures where LIBERO's sampler puts them for a seed.
+        """Return the places of all bodies in an initial state of LIBERO, with fixtures as its sampler puts them.
 
-        In LIBERO they depend on all resets before, and a state does not contain them.
+        In LIBERO they depend on all resets before, and its initial states do not contain them.
         """
         positions, quaternions = (part.copy() for part in self.scene.places)
-        drawn = _drawn(self.sampler, seed)
+        drawn = _drawn(self.original.placement_initializer, seed)
         for name, body in self.fixtures.items():
             positions[body], quaternions[body], _ = drawn[name]
         return positions, quaternions
@@ -82,7 +103,7 @@ def problem_of(task: str) -> Problem:
         np.array([bodies[name] for name in sorted(bodies)]),
         model.jnt_qposadr[of_fixtures].astype(np.int64),
         fixtures,
-        env.placement_initializer,
+        env,
     )
 
 
