@@ -38,7 +38,7 @@ class Problem:
     """LIBERO's environment of the task, for its samplers; nobody steps it."""
 
     def start(self, seed: int) -> tuple[Vector, Places]:
-        """Return how an episode begins: time, positions and velocities (1 + nq + nv,), and places of all bodies.
+        """Return the first state of an episode, as in `starts` (1 + nq + nv,), and the places of all bodies.
 
         Seeds below 50 are numbers of LIBERO's initial states. For any other seed LIBERO draws a state, as it
         drew those: 50 are too few for demonstrations and test episodes that have none in common.
@@ -59,7 +59,7 @@ class Problem:
         return start, (model.body_pos.copy(), model.body_quat.copy())
 
     def places(self, seed: int) -> Places:
-        """Return the places of all bodies in an initial state of LIBERO, with fixtures as its sampler puts them.
+        """Return the places of all bodies in an initial state of LIBERO; its sampler draws those of fixtures.
 
         In LIBERO they depend on all resets before, and its initial states do not contain them.
         """
