@@ -28,6 +28,8 @@ TURN_GAIN = 3.0
 OPEN_UP, CLOSE = -1.0, 1.0
 NEAR = 0.012
 """Distance in metres, in the plane and in height, from which the fingers close."""
+HELD = 0.045
+"""Distance up to which closed fingers hold a thing: it can slip and tilt on its way."""
 CARRYING = 0.7
 """Share of its speed at which the hand carries a thing."""
 
@@ -135,13 +137,17 @@ class Grip:
     """Way aside per height by which the hand comes down, along the offset; 0 is straight down."""
 
     def place(self, sight: Sight) -> Vector:
-        """Return the place (3,) of the grasp, or the place aside of it on the way down."""
+        """Return the place (3,) of the grasp, or the place aside of it on the way down with open fingers."""
         offset, thing_at = np.array(self.offset), sight.place(self.number)
-        if self.slant:
+        if self.slant and not self.is_closed(sight):
             aside = min(max(self.slant * (sight.hand - thing_at - offset)[2], 0.0), 0.07)
             offset[:2] *= 1.0 + aside / math.hypot(offset[0], offset[1])
         place: Vector = thing_at + offset
         return place
+
+    def is_closed(self, sight: Sight) -> bool:
+        """Return whether the fingers are as close to each other as the thing allows."""
+        return sight.opening < self.width + 0.006
 
 
 BOWL, CHEESE, STOVE, PLATE, BOTTLE, RACK, CABINET = range(7)
@@ -161,7 +167,7 @@ def _grasp(sight: Sight, grip: Grip) -> Action | None:
     axes = _turned(0.0, grip.yaw)
     way = grip.place(sight) - sight.hand
     aside, height = math.hypot(way[0], way[1]), abs(way[2])
-    if sight.opening < grip.width + 0.006 and aside < 0.035 and height < 0.035:
+    if grip.is_closed(sight) and aside < HELD and height < HELD:
         return None
     if aside < NEAR and height < NEAR:
         return _move(sight, way, CLOSE, axes)
