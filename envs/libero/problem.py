@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import functools
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import mujoco
@@ -16,7 +16,7 @@ from clbench.base.entry_points import unknown
 
 from .original import TASKS, RandomizationError, environment, initial_states
 from .rules import Predicate, goal_of
-from .scene import Places, Scene, Vector, scene_of
+from .scene import Places, Scene, Vector, heavier, scene_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,18 +45,18 @@ class Problem:
         """
         if 0 <= seed < len(self.starts):
             return self.starts[seed], self.places(seed)
-        sim, model = self.original.sim, self.scene.model
+        sim = self.original.sim
         with _own_randomness(seed):
             while True:
                 sim.reset()
-                model.body_pos[:], model.body_quat[:] = self.scene.places
+                sim.model.body_pos[:], sim.model.body_quat[:] = self.scene.places
                 try:
                     self.original._reset_internal()
                     break
                 except RandomizationError:  # things overlap: LIBERO draws all again
                     continue
-        start = np.concatenate(([0.0], sim.data.qpos, np.zeros(model.nv)))
-        return start, (model.body_pos.copy(), model.body_quat.copy())
+        start = np.concatenate(([0.0], sim.data.qpos, np.zeros(self.scene.model.nv)))
+        return start, (sim.model.body_pos.copy(), sim.model.body_quat.copy())
 
     def places(self, seed: int) -> Places:
         """Return the places of all bodies in an initial state of LIBERO; its sampler draws those of fixtures.
@@ -105,6 +105,13 @@ def problem_of(task: str) -> Problem:
         fixtures,
         env,
     )
+
+
+@functools.cache
+def heavier_problem_of(task: str, mass: float) -> Problem:
+    """Return the problem of a task whose objects are `mass` times as heavy."""
+    problem = problem_of(task)
+    return replace(problem, scene=heavier(problem.scene, mass))
 
 
 def _drawn(sampler: Any, seed: int) -> dict[str, Any]:
