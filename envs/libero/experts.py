@@ -171,19 +171,22 @@ def _grasp(sight: Sight, grip: Grip) -> Action | None:
         return None
     if aside < NEAR and height < NEAR:
         return _move(sight, way, CLOSE, axes)
-    if sight.opening < grip.width + 0.02 and aside < 0.06 and -way[2] < 0.04:
-        # fingers that are not open yet would come down on the thing
+    is_ready = sight.opening > min(grip.width + 0.02, 0.07) and np.linalg.norm(_turn(sight, axes)) < 0.3
+    if not is_ready and aside < 0.06 and -way[2] < 0.04:
+        # fingers that are not open or not turned yet would come down on the thing
         return _move(sight, np.array([0.0, 0.0, grip.clearance + way[2]]), OPEN_UP, axes)
     return _move(sight, _funnel(way, grip.clearance), OPEN_UP, axes)
 
 
-def _carry(sight: Sight, grip: Grip, goal: Vector) -> Action:
-    """Return the action that carries a held thing to a goal (3,) from 10 cm above."""
-    way = _funnel(goal - sight.place(grip.number), 0.1)
+def _carry(sight: Sight, grip: Grip, goal: Vector, clearance: float) -> Action:
+    """Return the action that carries a held thing to a goal (3,) from `clearance` metres above."""
+    way = _funnel(goal - sight.place(grip.number), clearance)
     return _move(sight, CARRYING * way, CLOSE, _turned(0.0, grip.yaw))
 
 
-def _put(state: State, grip: Grip, support: int, offset: tuple[float, float, float]) -> Action:
+def _put(
+    state: State, grip: Grip, support: int, offset: tuple[float, float, float], clearance: float = 0.1
+) -> Action:
     """Return the action that puts a thing on another one.
 
     Args:
@@ -191,10 +194,13 @@ def _put(state: State, grip: Grip, support: int, offset: tuple[float, float, flo
         grip: Grasp of the thing.
         support: Number of the other thing.
         offset: Goal of the thing, from the other one's own axes.
+        clearance: Height in metres above the goal from which the thing comes down.
     """
     sight = Sight(state)
     action = _grasp(sight, grip)
-    return _carry(sight, grip, sight.point(support, np.array(offset))) if action is None else action
+    if action is not None:
+        return action
+    return _carry(sight, grip, sight.point(support, np.array(offset)), clearance)
 
 
 KNOB = np.array([-0.015, 0.0, 0.035])
@@ -280,8 +286,38 @@ def _open_and_put(state: State) -> Action:
     goal = sight.point(CABINET, np.array(INSIDE) + np.array([0.0, sight.joints[TOP], 0.0]))
     if bowl[2] < goal[2] - 0.03 and bowl[0] > goal[0] - 0.17:  # out from under the drawer
         return _move(sight, np.array([-0.05, 0.02, 0.0]), CLOSE, _turned(0.0, BESIDE_DRAWER.yaw))
-    return _carry(sight, BESIDE_DRAWER, goal)
+    return _carry(sight, BESIDE_DRAWER, goal, 0.1)
 
+
+SPATIAL_PLATE = 5
+"""Number of the plate in libero_spatial, where the bowl to carry is thing 0, too."""
+OUT_OF = ("in_the_top_drawer_of_the_wooden_cabinet", "on_the_wooden_cabinet")
+"""Places from which the bowl is first lifted 25 cm above the plate."""
+PLACES = (
+    "between_the_plate_and_the_ramekin",
+    "next_to_the_ramekin",
+    "from_table_center",
+    "on_the_cookie_box",
+    "on_the_ramekin",
+    "next_to_the_cookie_box",
+    "on_the_stove",
+    "next_to_the_plate",
+    *OUT_OF,
+)
+"""Places of the bowl in libero_spatial."""
+GOODS = {  # the number of the basket, and the grip: 2.5 cm below the top, or at half the height
+    "alphabet_soup": (1, Grip(0, (0.0, -0.003, 0.013), 0.063)),
+    "cream_cheese": (1, Grip(3, (0.0, 0.0, 0.0), 0.042)),
+    "salad_dressing": (1, Grip(5, (0.0, 0.0, 0.048), 0.036)),
+    "bbq_sauce": (1, Grip(2, (0.0, 0.0, 0.027), 0.037)),
+    "ketchup": (1, Grip(4, (0.0, 0.0, 0.048), 0.034)),
+    "tomato_sauce": (0, Grip(6, (0.0, -0.003, 0.013), 0.063)),
+    "butter": (0, Grip(2, (0.0, 0.0, 0.0), 0.04)),
+    "milk": (0, Grip(4, (0.0, 0.0, 0.036), 0.053)),
+    "chocolate_pudding": (1, Grip(3, (0.0, 0.0, 0.0), 0.046)),
+    "orange_juice": (0, Grip(5, (0.0, 0.0, 0.036), 0.053)),
+}
+"""The things of libero_object, which lie and stand along the axes of the world."""
 
 _put_bowl = functools.partial(_put, grip=AT_RIM)
 _put_bottle = functools.partial(_put, grip=AT_NECK)
@@ -306,6 +342,21 @@ _EXPERTS: dict[str, Callable[[State], Action]] = {
     "put_the_wine_bottle_on_the_rack": functools.partial(
         _put_bottle, support=RACK, offset=(0.0, -0.08, 0.215)
     ),
+    **{
+        f"pick_up_the_black_bowl_{place}_and_place_it_on_the_plate": functools.partial(
+            _put_bowl,
+            support=SPATIAL_PLATE,
+            offset=(0.0, 0.0, 0.0),
+            clearance=0.3 if place in OUT_OF else 0.1,
+        )
+        for place in PLACES
+    },
+    **{
+        f"pick_up_the_{name}_and_place_it_in_the_basket": functools.partial(
+            _put, grip=grip, support=basket, offset=(0.0, 0.0, 0.12), clearance=0.17
+        )
+        for name, (basket, grip) in GOODS.items()
+    },
 }
 
 
