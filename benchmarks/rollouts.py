@@ -165,7 +165,8 @@ class LiberoEnv(gymnasium.Env[NDArray[np.float64], NDArray[np.float32]]):
 
         self.env = libero(task)
         self.env.seed(0)
-        self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, self._flat(self.env.reset()).shape)
+        size = self._flat(self.env.reset()).size
+        self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (size,), np.float64)
         self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (7,), np.float32)
 
     def reset(

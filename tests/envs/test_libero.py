@@ -216,7 +216,6 @@ def test_importing_the_world_leaves_the_process_as_it_was() -> None:
 
 def test_the_experts_do_all_ten_goals() -> None:
     scenario = load_scenario("clbench/LiberoGoal-v1")
-    # the lowest success of an expert in 100 episodes is in the card
     tasks = [task for task in scenario.tasks for _ in range(2)]
     lanes, experts = Lanes(len(tasks)), [resolve(task.expert)(task.name) for task in tasks]
     going, done = list(range(len(tasks))), []
@@ -227,4 +226,4 @@ def test_the_experts_do_all_ten_goals() -> None:
         states[going], _, successes = lanes.step(going, actions)
         done += [lane for lane, success in zip(going, successes, strict=True) if success]
     lanes.close()
-    assert len(done) >= len(tasks) - 1
+    assert len(done) >= len(tasks) - 1, sorted({tasks[lane].name for lane in going})
