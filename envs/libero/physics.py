@@ -4,16 +4,18 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Sequence
+from typing import ClassVar
 
 import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
+from clbench.worlds.perturbation import draw_perturbation
 from clbench.worlds.threads import Team
 from clbench.worlds.world import Drawable, checked_actions, lane_at
 
 from .episode import Episode
-from .problem import problem_of
+from .problem import heavier_problem_of, problem_of
 from .scene import CAMERA, Scene
 from .state import SIZE, State
 
@@ -37,11 +39,15 @@ class LiberoVectorWorld:
         lanes: Number of lanes. The first reset to a task compiles its scene.
         threads: Number of threads that advance the physics; MuJoCo releases the interpreter lock. Results do
             not depend on it. Each thread but one copies the models that it needs, of 65 to 106 MB.
+        perturbed: Whether objects are heavier or lighter, and the arm starts elsewhere.
     """
 
-    def __init__(self, lanes: int, threads: int = 1) -> None:
+    perturbable: ClassVar[bool] = True
+
+    def __init__(self, lanes: int, threads: int = 1, perturbed: bool = False) -> None:
         self.single_observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (SIZE,), np.float32)
         self.single_action_space = gymnasium.spaces.Box(-1.0, 1.0, (7,), np.float32)
+        self._perturbed = perturbed
         self._lanes: list[Episode | None] = [None] * lanes
         self._idle: defaultdict[Scene, list[Episode]] = defaultdict(list)
         self._team = Team(threads)
@@ -49,7 +55,7 @@ class LiberoVectorWorld:
     def reset(self, lanes: Sequence[int], seeds: Sequence[int], tasks: Sequence[str]) -> State:
         """Start an episode in each of `lanes` and return the states (N, 62), which the seeds alone determine.
 
-        Seed k starts from LIBERO's initial state k modulo 50.
+        Seeds below 50 are numbers of LIBERO's initial states; for all others LIBERO draws a state.
 
         Raises:
             UnknownNameError: LIBERO has no task of this name; the error names the nearest one.
@@ -57,12 +63,14 @@ class LiberoVectorWorld:
         return np.stack([self._begin(*start) for start in zip(lanes, seeds, tasks, strict=True)])
 
     def _begin(self, lane: int, seed: int, task: str) -> State:
-        problem, before = problem_of(task), self._lanes[lane]
+        perturbation = draw_perturbation(seed) if self._perturbed else None
+        problem = heavier_problem_of(task, perturbation.mass) if perturbation else problem_of(task)
+        before = self._lanes[lane]
         if before is not None:
             self._idle[before.problem.scene].append(before)
         idle = self._idle[problem.scene]
         self._lanes[lane] = episode = idle.pop() if idle else Episode(problem)
-        return episode.begin(problem, seed)
+        return episode.begin(problem, seed, perturbation.start if perturbation else None)
 
     def step(
         self, lanes: Sequence[int], actions: NDArray[np.float32]

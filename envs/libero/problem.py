@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import functools
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import mujoco
@@ -16,7 +16,7 @@ from clbench.base.entry_points import unknown
 
 from .original import TASKS, RandomizationError, environment, initial_states
 from .rules import Predicate, goal_of
-from .scene import Places, Scene, Vector, scene_of
+from .scene import Places, Scene, Vector, heavier, scene_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,16 +34,37 @@ class Problem:
     """Addresses of the positions of drawers and knobs."""
     fixtures: dict[str, int]
     """Bodies of the fixtures by name. Their places are no joints, and therefore in no state of LIBERO."""
-    sampler: Any
-    """LIBERO's sampler of the places of fixtures and objects."""
+    original: Any
+    """LIBERO's environment of the task, for its samplers; nobody steps it."""
+
+    def start(self, seed: int) -> tuple[Vector, Places]:
+        """Return the first state of an episode, as in `starts` (1 + nq + nv,), and the places of all bodies.
+
+        Seeds below 50 are numbers of LIBERO's initial states. For any other seed LIBERO draws a state, as it
+        drew those: 50 are too few for demonstrations and test episodes that have none in common.
+        """
+        if 0 <= seed < len(self.starts):
+            return self.starts[seed], self.places(seed)
+        sim = self.original.sim
+        with _own_randomness(seed):
+            while True:
+                sim.reset()
+                sim.model.body_pos[:], sim.model.body_quat[:] = self.scene.places
+                try:
+                    self.original._reset_internal()
+                    break
+                except RandomizationError:  # things overlap: LIBERO draws all again
+                    continue
+        start = np.concatenate(([0.0], sim.data.qpos, np.zeros(self.scene.model.nv)))
+        return start, (sim.model.body_pos.copy(), sim.model.body_quat.copy())
 
     def places(self, seed: int) -> Places:
-        """Return the places of all bodies, with fixtures where LIBERO's sampler puts them for a seed.
+        """Return the places of all bodies in an initial state of LIBERO; its sampler draws those of fixtures.
 
-        In LIBERO they depend on all resets before, and a state does not contain them.
+        In LIBERO they depend on all resets before, and its initial states do not contain them.
         """
         positions, quaternions = (part.copy() for part in self.scene.places)
-        drawn = _drawn(self.sampler, seed)
+        drawn = _drawn(self.original.placement_initializer, seed)
         for name, body in self.fixtures.items():
             positions[body], quaternions[body], _ = drawn[name]
         return positions, quaternions
@@ -82,8 +103,15 @@ def problem_of(task: str) -> Problem:
         np.array([bodies[name] for name in sorted(bodies)]),
         model.jnt_qposadr[of_fixtures].astype(np.int64),
         fixtures,
-        env.placement_initializer,
+        env,
     )
+
+
+@functools.cache
+def heavier_problem_of(task: str, mass: float) -> Problem:
+    """Return the problem of a task whose objects are `mass` times as heavy."""
+    problem = problem_of(task)
+    return replace(problem, scene=heavier(problem.scene, mass))
 
 
 def _drawn(sampler: Any, seed: int) -> dict[str, Any]:

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import copy
 import functools
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, TypeAlias
 from xml.etree import ElementTree
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
+
+from clbench.worlds.perturbation import with_mass
 
 from .arm import JOINTS, REST, Arm, Sensed
 
@@ -83,6 +85,14 @@ def scene_of(xml: str) -> Scene:
     mujoco.mj_forward(model, data)
     rest = Sensed(*(part.copy() for part in Arm(model, data).sense(model)))
     return Scene(xml, model, Models(model), (model.body_pos.copy(), model.body_quat.copy()), rest)
+
+
+@functools.cache
+def heavier(scene: Scene, mass: float) -> Scene:
+    """Return a scene in which all objects are `mass` times as heavy; all its episodes share the copy."""
+    free = scene.model.jnt_type == mujoco.mjtJoint.mjJNT_FREE
+    model = with_mass(scene.model, scene.model.jnt_bodyid[free].tolist(), mass)
+    return replace(scene, model=model, models=Models(model))
 
 
 def _without_textures(xml: str) -> str:

@@ -18,7 +18,8 @@ pytest.importorskip("libero", reason="pip install 'clbench[libero]'")
 
 from clbench.base.entry_points import resolve
 from clbench.base.errors import InputError, UnknownNameError
-from clbench.worlds.lanes import vector_world
+from clbench.spec.registry import load_scenario
+from clbench.worlds.lanes import Lanes, vector_world
 
 WORLD = "clbench.envs.libero.world:LiberoWorld"
 World = resolve(WORLD)
@@ -31,6 +32,8 @@ OPEN, BOWL, PLATE, MILK = (
     "pick_up_the_black_bowl_on_the_stove_and_place_it_on_the_plate",
     "pick_up_the_milk_and_place_it_in_the_basket",
 )
+
+IN_DRAWER = "pick_up_the_black_bowl_in_the_top_drawer_of_the_wooden_cabinet_and_place_it_on_the_plate"
 
 Start = tuple[str, int]
 """Task and seed of an episode."""
@@ -120,19 +123,38 @@ def test_global_generators_have_no_part_in_it_and_are_left_alone() -> None:
     np.testing.assert_array_equal(np.random.get_state()[1], before)  # type: ignore[index]  # noqa: NPY002
 
 
-def test_fixtures_have_places_of_their_own_for_each_seed_and_fifty_initial_states_take_turns() -> None:
-    problem = problem_of(OPEN)
-    first, again, other = (problem.places(seed) for seed in (1, 1, 51))
-    np.testing.assert_array_equal(first[0], again[0])
+def test_seeds_below_fifty_are_liberos_initial_states_with_fixtures_of_their_own() -> None:
+    problem, episode = problem_of(OPEN), Episode(problem_of(OPEN))
+    for seed in (0, 49):
+        episode.begin(problem, seed)
+        joints = problem.scene.model.nq
+        np.testing.assert_array_equal(episode.data.qpos, problem.starts[seed, 1 : 1 + joints])
+    first, other = problem.start(1)[1], problem.start(2)[1]
     moved = np.flatnonzero((first[0] != other[0]).any(axis=1))
     assert set(moved) == set(problem.fixtures.values())
-    episode = Episode(problem)
-    joints = []
-    for seed in (1, 51, 2):
+
+
+@pytest.mark.parametrize("task", [OPEN, IN_DRAWER, MILK])
+def test_other_seeds_draw_states_like_liberos_and_none_of_them(task: str) -> None:
+    problem = problem_of(task)
+    drawn = np.stack([problem.start(seed)[0] for seed in range(50, 80)])
+    assert not {row.tobytes() for row in drawn} & {row.tobytes() for row in problem.starts}
+    spread = problem.starts.std(axis=0)
+    # means of 30 and of 50 draws: four of their standard errors
+    far = abs(drawn.mean(axis=0) - problem.starts.mean(axis=0)) > 4 * spread * np.sqrt(1 / 30 + 1 / 50) + 1e-6
+    assert not far.any()
+    again, places = problem.start(50)
+    np.testing.assert_array_equal(drawn[0], again)
+    np.testing.assert_array_equal(problem.start(50)[1][0], places[0])
+
+
+def test_a_drawn_bowl_lies_in_the_drawer_wherever_the_cabinet_stands() -> None:
+    episode, problem = Episode(problem_of(IN_DRAWER)), problem_of(IN_DRAWER)
+    region = episode.data.site("wooden_cabinet_1_top_region")
+    bowl = episode.data.body("akita_black_bowl_1_main")
+    for seed in range(100, 110):
         episode.begin(problem, seed)
-        joints.append(episode.data.qpos.copy())
-    np.testing.assert_array_equal(joints[0], joints[1])
-    assert (joints[0] != joints[2]).any()
+        assert np.linalg.norm((bowl.xpos - region.xpos)[:2]) < 0.05
 
 
 @pytest.mark.parametrize("task", [OPEN, MILK])
@@ -190,3 +212,18 @@ def test_importing_the_world_leaves_the_process_as_it_was() -> None:
         [sys.executable, "-W", "error", "-c", code], capture_output=True, text=True, check=False
     )
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+
+
+def test_the_experts_do_all_ten_goals() -> None:
+    scenario = load_scenario("clbench/LiberoGoal-v1")
+    tasks = [task for task in scenario.tasks for _ in range(2)]
+    lanes, experts = Lanes(len(tasks)), [resolve(task.expert)(task.name) for task in tasks]
+    going, done = list(range(len(tasks))), []
+    states = lanes.reset(going, [seed % 2 + 100 for seed in going], tasks)
+    for step in range(max(task.horizon for task in tasks)):
+        going = [lane for lane in going if lane not in done and step < tasks[lane].horizon]
+        actions = np.stack([experts[lane](states[lane]) for lane in going])
+        states[going], _, successes = lanes.step(going, actions)
+        done += [lane for lane, success in zip(going, successes, strict=True) if success]
+    lanes.close()
+    assert len(done) >= len(tasks) - 1, sorted({tasks[lane].name for lane in going})

