@@ -10,6 +10,7 @@ from clbench.base.entry_points import resolve
 from clbench.base.lease import Lease
 from clbench.jobs.recorded import has_record
 from clbench.records.reader import read_record
+from clbench.records.record import Record
 from clbench.records.writer import write_record
 from clbench.runs.run import execute
 from clbench.runs.spec import RunSpec
@@ -17,10 +18,16 @@ from clbench.runs.spec import RunSpec
 TOY = "clbench.testing:clbench/Toy-v0"
 
 
+@pytest.fixture(scope="module")
+def done(tmp_path_factory: pytest.TempPathFactory) -> Record:
+    """A run of frozen."""
+    return execute(RunSpec(TOY, "frozen", seed=0), tmp_path_factory.mktemp("done"))
+
+
 @pytest.fixture
-def records(tmp_path: Path) -> Path:
+def records(done: Record, tmp_path: Path) -> Path:
     """Return a folder with one run of frozen that is done, and one of sft that cannot be read."""
-    execute(RunSpec(TOY, "frozen", seed=0), tmp_path)
+    write_record(done, RunSpec(TOY, "frozen", seed=0).path(tmp_path))
     damaged = RunSpec(TOY, "sft", seed=0).path(tmp_path)
     damaged.parent.mkdir()
     damaged.write_text("{", encoding="utf-8")

@@ -5,6 +5,7 @@ from typing import Any
 
 import pytest
 from eager import EAGER
+from tiny import TINY
 
 from clbench.jobs.work import (
     collect_demonstrations,
@@ -40,8 +41,8 @@ def test_a_policy_is_evaluated_where_stages_end_when_the_target_is_learned() -> 
 def test_what_is_in_the_cache_is_not_said_to_be_made(empty_caches: Path) -> None:
     nothing: Any = lambda _: None  # noqa: E731
     for end in ("steps", "steps, from the cache"):
-        assert collect_demonstrations(SPEC.scenario, "left", nothing).endswith(end)
+        assert collect_demonstrations(TINY.id, "left", nothing).endswith(end)
     for end in ("for the test", "for the test, from the cache"):
-        assert collect_scenes(SPEC.scenario, nothing).endswith(end)
+        assert collect_scenes(TINY.id, nothing).endswith(end)
     for end in ("parameters", "parameters, from the cache"):
-        assert pretrain(SPEC.scenario, "flow", 0, nothing).endswith(end)
+        assert pretrain(TINY.id, "flow", 0, nothing).endswith(end)

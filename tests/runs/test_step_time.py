@@ -9,13 +9,12 @@ from typing import Any, ClassVar
 
 import pytest
 import torch
+from tiny import TINY
 
 from clbench.learning.method import Method
 from clbench.policy.transformer import TransformerPolicy
 from clbench.runs.run import execute
 from clbench.runs.spec import RunSpec
-
-TOY = "clbench.testing:clbench/Toy-v0"
 
 
 @dataclasses.dataclass
@@ -42,7 +41,7 @@ class OnlyOnce(Method):
 
 
 def _timing(method: str, folder: Path, **options: Any) -> Any:
-    record = execute(RunSpec(TOY, method, 0, targets=1, **options), folder)
+    record = execute(RunSpec(TINY.id, method, 0, targets=1, **options), folder)
     assert record.status == "success"
     return record.timing
 
@@ -93,5 +92,5 @@ def test_the_measurement_changes_nothing_else(
     for name in ("with", "without"):
         if name == "without":
             monkeypatch.setattr("clbench.runs.run.step_ratio", lambda trainer, folder: None)
-        execute(RunSpec(TOY, "experience_replay", 0, targets=1), tmp_path / name)
+        execute(RunSpec(TINY.id, "experience_replay", 0, targets=1), tmp_path / name)
     assert json.dumps(lasting_records(tmp_path / "with")) == json.dumps(lasting_records(tmp_path / "without"))
