@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from fault_server import Runs
 from helpers import resealed
-from verification import verify
+from verification import TOY, verify
 
 from clbench.base.cache import fault_of
 from clbench.base.errors import InputError
@@ -175,7 +175,7 @@ def test_a_damaged_record_is_refused_by_all_commands_or_shows_the_same_numbers(
     count: int, tmp_path: Path, record_property: Callable[[str, object], None]
 ) -> None:
     records = tmp_path / "records"
-    spec = RunSpec(fault_server.TOY, "sft", 0)
+    spec = RunSpec(TOY, "sft", 0)
     execute(spec, records)
     run = spec.resolve()
     path, chance = run.path(records), random.Random(0)
@@ -216,7 +216,7 @@ def test_a_damaged_record_is_refused_by_all_commands_or_shows_the_same_numbers(
 def board(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return the folder of a board with a record that was verified."""
     folder = tmp_path_factory.mktemp("board")
-    records, spec = folder / "records", RunSpec(fault_server.TOY, "frozen", 0)
+    records, spec = folder / "records", RunSpec(TOY, "frozen", 0)
     execute(spec, records)
     verify(spec.path(records), "recomputed", by="Ada")
     publishing.write_site(rows.read_table(records), records, publishing.inputs_of(records))

@@ -3,10 +3,13 @@
 from pathlib import Path
 
 import pytest
+from tiny import TINY
 
 import clbench
 from clbench.base.errors import InputError, UnknownNameError
 from clbench.records.writer import write_record
+from clbench.runs.run import execute
+from clbench.runs.spec import RunSpec
 
 TOY = "clbench.testing:clbench/Toy-v0"
 
@@ -25,12 +28,13 @@ def test_methods_are_compared_over_the_seeds_that_were_asked_for(
 
 
 def test_a_method_whose_record_makes_no_row_is_named_with_the_reason(tmp_path: Path) -> None:
-    clbench.run(TOY, "sft", seeds=1, records=tmp_path)
-    (record,) = clbench.run(TOY, "frozen", seeds=1, records=tmp_path)
+    sft, frozen = (RunSpec(TINY.id, method, seed=0) for method in ("sft", "frozen"))
+    execute(sft, tmp_path)
+    record = execute(frozen, tmp_path)
     record.fingerprint["rollouts"] = dict.fromkeys(record.fingerprint["rollouts"], "0" * 16)
-    write_record(record, tmp_path / "Toy-v0" / "frozen" / "seed-0.json")
+    write_record(record, frozen.path(tmp_path))
     with pytest.raises(InputError, match=r"No row for sft\. .*sft/seed-0\.json: its simulator does not"):
-        clbench.compare(TOY, ["frozen"], seeds=1, records=tmp_path)
+        clbench.compare(TINY.id, ["frozen"], seeds=1, records=tmp_path)
 
 
 def test_an_unknown_method_is_named_before_anything_runs(tmp_path: Path) -> None:

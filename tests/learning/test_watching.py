@@ -7,13 +7,15 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from tiny import TINY
 
 import clbench
 from clbench.base.cache import cache_folder
 from clbench.learning.watching import watches
-from clbench.testing import TOY, ContractError, check_method
+from clbench.testing import ContractError, check_method
 
-ID = "clbench.testing:clbench/Toy-v0"
+ID = f"tiny:{TINY.id}"
+"""Processes that do the runs import the module of the scenario."""
 
 METHOD = """
 from dataclasses import dataclass
@@ -84,7 +86,7 @@ def test_a_method_sees_every_step_and_pays_for_it(
     method = importlib.import_module("watching_method").Watching
     (first,) = clbench.run(ID, method, seeds=1, records=tmp_path / "one")
     (second,) = clbench.run(ID, method, seeds=1, records=tmp_path / "two")
-    steps = TOY.budget.pretraining_steps
+    steps = TINY.budget.pretraining_steps
     assert first.costs.preparation_steps == second.costs.preparation_steps == steps
     assert first.episodes == second.episodes  # the second one had it from the cache
     (state,) = (cache_folder() / "watched").glob("*/method.json")

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from tiny import TINY
 from torch import Tensor
 
 from clbench.cli.runs import run
@@ -23,8 +24,7 @@ from clbench.runs.checkpoints import find_stages, has_stages, keep_stages, load_
 from clbench.runs.run import execute
 from clbench.runs.spec import RunSpec
 
-TOY = "clbench.testing:clbench/Toy-v0"
-SPEC = RunSpec(TOY, "lora", seed=0)
+SPEC = RunSpec(TINY.id, "lora", seed=0)
 
 
 @dataclasses.dataclass
@@ -80,7 +80,7 @@ def _assert_equal(first: list[Policy], second: list[Policy]) -> None:
 
 def test_a_run_keeps_a_folder_for_each_stage(kept: Path) -> None:
     files = {"policy.safetensors", "policy.json", "method.safetensors", "method.json", "clbench.json"}
-    folders = sorted((kept / "Toy-v0" / "lora" / "seed-0").iterdir())
+    folders = sorted((kept / "me--Tiny-v0" / "lora" / "seed-0").iterdir())
     assert [folder.name for folder in folders] == ["stage-0", "stage-1", "stage-2"]
     assert all({path.name for path in folder.iterdir()} == files for folder in folders)
 
@@ -90,7 +90,7 @@ def test_policies_that_are_made_again_equal_the_kept_ones(kept: Path) -> None:
     again = stage_policies(SPEC.resolve(), progress=amounts.append)
     _assert_equal(stage_policies(SPEC.resolve(), kept), again)
     assert len(again) == 3
-    assert sum(amounts) == 2 * 60
+    assert sum(amounts) == 2 * TINY.budget.adaptation_steps
     words = "backbone.words.weight"  # under the adapters: it never changes
     changed = [name for name in again[0].state_dict() if "lora_" in name]
     first, _, last = _tensors(again)
@@ -110,7 +110,7 @@ def test_policies_of_the_same_run_with_another_evaluation_count(kept: Path) -> N
 def test_a_method_that_draws_from_global_generators_makes_the_same_policies_again(
     tmp_path: Path, stranger: Callable[[type[Method]], str]
 ) -> None:
-    spec = RunSpec(TOY, stranger(Restless), seed=0, targets=1)
+    spec = RunSpec(TINY.id, stranger(Restless), seed=0, targets=1)
     execute(spec, tmp_path / "records", checkpoints=tmp_path)
     _assert_equal(stage_policies(spec.resolve(), tmp_path), stage_policies(spec.resolve()))
 
@@ -118,7 +118,7 @@ def test_a_method_that_draws_from_global_generators_makes_the_same_policies_agai
 def test_a_killed_run_keeps_all_stages_once_it_has_finished(
     tmp_path: Path, execute_and_kill: Callable[..., None]
 ) -> None:
-    spec = RunSpec(TOY, "sft", seed=0)
+    spec = RunSpec(TINY.id, "sft", seed=0)
     execute_and_kill(spec, tmp_path, 0.75, checkpoints=tmp_path)
     assert not has_stages(spec.resolve(), tmp_path)
     assert execute(spec, tmp_path, checkpoints=tmp_path).timing["resumed_after"] == 1
@@ -126,7 +126,7 @@ def test_a_killed_run_keeps_all_stages_once_it_has_finished(
 
 
 def test_policies_kept_by_another_version_of_the_code_are_replaced(kept: Path, tmp_path: Path) -> None:
-    stale = tmp_path / "Toy-v0" / "lora" / "seed-0" / "stage-2"
+    stale = tmp_path / "me--Tiny-v0" / "lora" / "seed-0" / "stage-2"
     stale.mkdir(parents=True)
     (stale / "policy.safetensors").write_bytes(b"stale")
     keep_stages(SPEC.resolve(), tmp_path)
@@ -139,10 +139,10 @@ def test_the_command_keeps_the_policies_of_a_run_that_has_a_record(
 ) -> None:
     monkeypatch.setattr(sys, "path", sys.path.copy())  # the command adds to it
     records = kept.parent / "records"
-    run(TOY, "lora", seeds=1, records=records, checkpoints=tmp_path, workers=1)
+    run(TINY.id, "lora", seeds=1, records=records, checkpoints=tmp_path, workers=1)
     assert "0 runs and the policies of 1 in" in capsys.readouterr().err
     _assert_equal(stage_policies(SPEC.resolve(), tmp_path), stage_policies(SPEC.resolve(), kept))
-    run(TOY, "lora", seeds=1, records=records, checkpoints=tmp_path, workers=1)
+    run(TINY.id, "lora", seeds=1, records=records, checkpoints=tmp_path, workers=1)
     assert "policies" not in capsys.readouterr().err  # they are there now
 
 
@@ -150,7 +150,7 @@ def test_a_torn_policy_is_not_used_and_the_log_says_so(
     kept: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     keep_stages(SPEC.resolve(), tmp_path)
-    path = tmp_path / "Toy-v0" / "lora" / "seed-0" / "stage-1" / "policy.safetensors"
+    path = tmp_path / "me--Tiny-v0" / "lora" / "seed-0" / "stage-1" / "policy.safetensors"
     path.write_bytes(path.read_bytes()[:-4] + bytes(4))
     assert not has_stages(SPEC.resolve(), tmp_path)
     assert has_stages(SPEC.resolve(), tmp_path, last=0)
@@ -171,7 +171,7 @@ def test_a_torn_policy_is_not_used_and_the_log_says_so(
 def test_an_untrusted_state_is_read_within_limits_and_refused_by_name(
     kept: Path, tmp_path: Path, text: str, reason: str
 ) -> None:
-    folder = shutil.copytree(kept / "Toy-v0" / "lora" / "seed-0", tmp_path / "stages")
+    folder = shutil.copytree(kept / "me--Tiny-v0" / "lora" / "seed-0", tmp_path / "stages")
     (folder / "stage-1" / "method.json").write_text(text)
     with pytest.raises(CheckpointError, match=reason) as refused:
         load_stages(SPEC.resolve(), folder)
@@ -191,9 +191,9 @@ def test_a_state_that_cannot_be_read_again_is_refused_when_it_is_written(
 ) -> None:
     message = r"failed in state\(\) after stage 0: .*best: a number that is not finite"
     with pytest.raises(MethodError, match=message):
-        stage_policies(RunSpec(TOY, stranger(Boundless), seed=0).resolve())
+        stage_policies(RunSpec(TINY.id, stranger(Boundless), seed=0).resolve())
 
 
 def test_the_error_of_a_failing_method_names_the_stage(stranger: Callable[[type[Method]], str]) -> None:
     with pytest.raises(MethodError, match=r"failed in stage 1 \(right\): RuntimeError: cannot merge right"):
-        stage_policies(RunSpec(TOY, stranger(Stumbling), seed=0).resolve())
+        stage_policies(RunSpec(TINY.id, stranger(Stumbling), seed=0).resolve())

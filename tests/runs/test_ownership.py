@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from tiny import TINY
 
 from clbench.base import lease as leases
 from clbench.base.cache import CacheError, cache_folder
@@ -74,7 +75,7 @@ def test_commands_that_start_together_do_each_run_once(tmp_path: Path) -> None:
 
 
 def test_a_full_disk_is_no_failure_of_the_method(tmp_path: Path) -> None:
-    spec = RunSpec(TOY, "sft", seed=0)
+    spec = RunSpec(TINY.id, "sft", seed=0)
     execute(dataclasses.replace(spec, method="frozen"), tmp_path)  # the policy and the data are in the cache
     with _largest_file(2000), pytest.raises(CacheError, match="cannot be written"):
         execute(spec, tmp_path)
@@ -109,7 +110,7 @@ def test_a_run_that_another_process_took_over_writes_nothing_more(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(leases, "SECONDS", 0.3)
-    spec = RunSpec(TOY, stranger(_Waits), seed=0)
+    spec = RunSpec(TINY.id, stranger(_Waits), seed=0)
     with pytest.raises(LeaseLostError, match="was lost to another process"):
         execute(spec, tmp_path / "records")
     assert not (tmp_path / "records").exists()
@@ -159,7 +160,7 @@ def test_a_method_that_kills_its_process_is_named_with_its_hook(
 def test_a_run_that_fails_leaves_a_good_record_of_another_configuration_alone(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    spec = RunSpec(TOY, "sft", seed=0)
+    spec = RunSpec(TINY.id, "sft", seed=0)
     execute(spec, tmp_path)
     before = spec.path(tmp_path).read_bytes()
 

@@ -11,6 +11,7 @@ from typing import Any, ClassVar
 import numpy as np
 import pytest
 import torch
+from tiny import TINY
 from torch import Tensor
 
 from clbench.base.cache import cache_folder
@@ -120,7 +121,8 @@ def test_a_record_holds_every_episode_and_answer_once(tmp_path: Path) -> None:
 
 def test_all_methods_have_the_same_initial_states_and_the_same_pretrained_policy(tmp_path: Path) -> None:
     records = [
-        execute(RunSpec(TOY, method, seed=0, targets=1), tmp_path) for method in ("sft", "experience_replay")
+        execute(RunSpec(TINY.id, method, seed=0, targets=1), tmp_path)
+        for method in ("sft", "experience_replay")
     ]
     first, second = (
         [row for row in zip(*record.episodes.values(), strict=True) if row[0] == 0] for record in records
@@ -171,13 +173,13 @@ def test_a_run_with_perturbed_episodes_has_everything_that_a_plain_run_has(tmp_p
 def test_a_record_with_perturbed_episodes_counts_as_a_plain_one_but_not_vice_versa(
     tmp_path: Path,
 ) -> None:
-    plain, perturbed = (RunSpec(TOY, "frozen", 0, perturb=perturb) for perturb in (False, True))
+    plain, perturbed = (RunSpec(TINY.id, "frozen", 0, perturb=perturb) for perturb in (False, True))
     assert plain.path(tmp_path) == perturbed.path(tmp_path)
     execute(plain, tmp_path)
     assert (has_record(plain.resolve(), tmp_path), has_record(perturbed.resolve(), tmp_path)) == (True, False)
     execute(perturbed, tmp_path)
     assert (has_record(plain.resolve(), tmp_path), has_record(perturbed.resolve(), tmp_path)) == (True, True)
-    assert not has_record(RunSpec(TOY, "frozen", 0, perturb=True, order=1).resolve(), tmp_path)
+    assert not has_record(RunSpec(TINY.id, "frozen", 0, perturb=True, order=1).resolve(), tmp_path)
 
 
 def test_a_scenario_that_cannot_be_perturbed_is_refused_before_any_work(
@@ -407,7 +409,7 @@ def test_a_method_that_fails_leaves_a_record_that_names_the_place(
 def test_a_record_of_another_budget_device_or_setting_or_a_failed_or_torn_one_does_not_count(
     tmp_path: Path,
 ) -> None:
-    spec = RunSpec(TOY, "experience_replay", 0, targets=1)
+    spec = RunSpec(TINY.id, "experience_replay", 0, targets=1)
     assert not has_record(spec.resolve(), tmp_path)
     record = execute(spec, tmp_path)
     assert has_record(spec.resolve(), tmp_path)
@@ -429,7 +431,7 @@ def test_a_record_of_another_budget_device_or_setting_or_a_failed_or_torn_one_do
 
 def test_a_run_leaves_no_global_state_behind(tmp_path: Path) -> None:
     before = torch.get_rng_state(), torch.get_num_threads(), torch.get_default_dtype()
-    execute(RunSpec(TOY, "sft", seed=0, targets=1), tmp_path)
+    execute(RunSpec(TINY.id, "sft", seed=0, targets=1), tmp_path)
     after = torch.get_rng_state(), torch.get_num_threads(), torch.get_default_dtype()
     assert before[0].equal(after[0])
     assert before[1:] == after[1:]

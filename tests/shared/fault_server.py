@@ -1,4 +1,4 @@
-"""A process that forks runs of the toy and lets the file system fail, or the process die, at one operation.
+"""A process that forks runs of `tiny` and lets the file system fail, or the process die, at one operation.
 
 It reads one order per line, as JSON, from standard input, and answers each with a line: how many operations
 that change files the run began, and how it ended. Forking takes milliseconds; a new Python takes seconds to
@@ -21,12 +21,11 @@ from typing import Any
 
 import minari  # noqa: F401
 import torch._inductor.config  # noqa: F401
+from tiny import TINY
 
 from clbench.base.leftovers import sweep
 from clbench.runs.run import execute
 from clbench.runs.spec import RunSpec
-
-TOY = "clbench.testing:clbench/Toy-v0"
 
 CHANGES = {"os.mkdir", "os.rename", "os.remove", "os.rmdir", "os.link"}
 """Audit events of operations that change files, besides opening a file to write. The heartbeat of a lease is
@@ -79,7 +78,7 @@ def _run(order: dict[str, Any], answer: int) -> None:
         _die_after(order["after"])
     try:
         sweep(records, *map(Path, order["environment"].values()))
-        end: str = execute(RunSpec(TOY, order["method"], order["seed"]), records).status
+        end: str = execute(RunSpec(TINY.id, order["method"], order["seed"]), records).status
     except OSError as error:  # such as CacheError
         end = f"refused: {error}"
     os.write(answer, json.dumps([operations(), end]).encode())
@@ -103,7 +102,7 @@ def serve() -> None:
 
 
 class Runs:
-    """Runs of the toy in forked processes."""
+    """Runs of `tiny` in forked processes."""
 
     def __init__(self, process: subprocess.Popen[str]) -> None:
         self.process = process
