@@ -18,7 +18,7 @@ def decoders(found: Decoding, narrow: bool, font: str = SYSTEM_FONT) -> Spec:
     panels = (("speed_up", "speed-up", 1.0), ("difference", "difference of success", 0.0))
     if narrow:
         lines = {"labelExpr": "split(datum.label, ', ')", "labelLimit": 190}
-        return specification(font, vconcat=[_compared(found, *one, 140, 44, lines) for one in panels])
+        return specification(font, vconcat=[_compared(found, *one, 140, 50, lines) for one in panels])
     speed, success = panels
     beside = [_compared(found, *speed, 220, 22, {"labelLimit": 340})]
     beside += [_compared(found, *success, 220, 22, {"labels": False})]
