@@ -41,11 +41,6 @@
   openPart(); // before the data are unpacked: no other part flashes up
   measureTabs();
 
-  const packed = Uint8Array.from(atob(document.getElementById("data").textContent), (one) => one.charCodeAt(0));
-  const unpacked = new Blob([packed]).stream().pipeThrough(new DecompressionStream("gzip"));
-  const library = new Promise((done) => { document.addEventListener("DOMContentLoaded", done); }); // it comes last
-  const [data] = await Promise.all([new Response(unpacked).json(), library]);
-
   // ---- theme: the reader's choice, otherwise the system's ---------------------------------------------------
 
   const dark = matchMedia("(prefers-color-scheme: dark)");
@@ -65,6 +60,13 @@
   });
   dark.addEventListener("change", nameTheme);
   nameTheme();
+
+  // ---- data, and the library that draws charts ---------------------------------------------------------------
+
+  const packed = Uint8Array.from(atob(document.getElementById("data").textContent), (one) => one.charCodeAt(0));
+  const unpacked = new Blob([packed]).stream().pipeThrough(new DecompressionStream("gzip"));
+  const library = new Promise((done) => { document.addEventListener("DOMContentLoaded", done); }); // it comes last
+  const [data] = await Promise.all([new Response(unpacked).json(), library]);
 
   // ---- the tip: what is behind a number, by mouse, by tap and by key ----------------------------------------
 
