@@ -123,13 +123,15 @@ def read_board(records: Path) -> Summary:
 def write_site(table: Table, records: Path, inputs: dict[str, str]) -> list[Path]:
     """Write every form of the table to the folder of the board, and return the paths."""
     # They load the charts, SciPy and PyTorch: 3 s.
+    from .policies.compared import by_table
     from .views import page as web_page
     from .views.markdown import markdown
 
+    comparisons = by_table(table.rows)
     texts = {
-        "LEADERBOARD.md": markdown(table),
+        "LEADERBOARD.md": markdown(table, comparisons),
         "leaderboard.csv": csv_text(table),
-        "index.html": web_page.page(table),
+        "index.html": web_page.page(table, comparisons),
         **web_page.pictures(table),
     }
     files = {name: _text_hash(text.encode()) for name, text in texts.items()}

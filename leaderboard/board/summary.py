@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field
-from typing import Any
+from typing import Any, Protocol, TypeVar
 
 from clbench.scoring.intervals import Estimate
 from clbench.scoring.metrics import METRICS
@@ -128,6 +128,34 @@ def _row_to_json(row: RowSummary) -> dict[str, Any]:
 def _row_from_json(values: Mapping[str, Any]) -> RowSummary:
     estimates = {name: Estimate(*ends) for name, ends in values["estimates"].items()}
     return RowSummary(**{**values, "seeds": tuple(values["seeds"]), "estimates": estimates})
+
+
+class Placed(Protocol):
+    """A row with a division, of one scenario or of all."""
+
+    @property
+    def division(self) -> str:
+        """One of `DIVISIONS`."""
+
+
+OneRow = TypeVar("OneRow", bound=RowSummary)
+PlacedRow = TypeVar("PlacedRow", bound=Placed)
+
+
+def tables_of(rows: Iterable[OneRow]) -> dict[str, list[OneRow]]:
+    """Return the rows by the name of their table, tables and rows in the order of `rows`."""
+    found: dict[str, list[OneRow]] = {}
+    for row in rows:
+        found.setdefault(row.scenario, []).append(row)
+    return found
+
+
+def divisions_of(rows: Iterable[PlacedRow]) -> dict[str, list[PlacedRow]]:
+    """Return the rows by their division, divisions and rows in the order of `rows`."""
+    found: dict[str, list[PlacedRow]] = {}
+    for row in rows:
+        found.setdefault(row.division, []).append(row)
+    return found
 
 
 def column_names() -> list[str]:

@@ -25,11 +25,11 @@ from clbench.spec.references import BASELINE
 from ..board.agreement import Agreement, Array, agreement_between
 from ..board.predictors import predictions
 from ..board.rows import Row, Table
-from ..board.summary import METHODS, RANKED_BY
+from ..board.summary import METHODS, RANKED_BY, tables_of
 from ..claims.claim import Verdict
 from ..claims.judges import Judged
 from ..policies.compared import by_table
-from ..views.format import format_interval, tau_text
+from ..views.format import format_interval, tau_text, title_of
 from ..views.markdown import templates
 from ..views.page.charts.plot import themed
 from .findings_chart import gains_chart
@@ -88,11 +88,10 @@ def sections(table: Table, judged: Sequence[Judged]) -> list[Section]:
 
 def _boards(table: Table) -> dict[str, list[Row]]:
     """Return the rows of each scenario at equal learning, with the usual policy."""
-    by_name = groupby(table.rows, key=lambda row: row.scenario)
     return {
         name: rows
-        for name, members in by_name
-        if parts_of(name)[1] == DEFAULT_POLICY and (rows := list(members))[0].to_criterion
+        for name, rows in tables_of(table.rows).items()
+        if parts_of(name)[1] == DEFAULT_POLICY and rows[0].to_criterion
     }
 
 
@@ -229,8 +228,7 @@ def _orders(table: Table, boards: dict[str, list[Row]]) -> Section:
         for metric in ("kept_share", "forgetting", "backward_transfer"):
             same = _between(rows, rows, RANKED_BY, metric)
             if same is not None:
-                title = metric.replace("_", " ")
-                answers.append(f"Final average and {title} on {name}: {_tau(same)}.")
+                answers.append(f"Final average and {title_of(metric)} on {name}: {_tau(same)}.")
     return Section("Do seeds, scenarios and definitions order the methods alike?", tuple(answers))
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
 
@@ -16,6 +17,10 @@ from clbench.scoring.scores import Scores
 from clbench.spec.policies import DEFAULT_POLICY
 
 from ..board.rows import Row
+from ..board.summary import tables_of
+
+Comparisons: TypeAlias = "Mapping[str, tuple[Comparison, ...]]"
+"""Comparisons of each table of another policy than the default one, by its name."""
 
 COMPARED = ("final_average", "adaptation", "retention", "kept_targets", "kept_share")
 """Metrics that are compared."""
@@ -44,11 +49,9 @@ def compare_policies(rows: Sequence[Row], others: Sequence[Row]) -> tuple[Compar
     return tuple(one for one in found if one is not None)
 
 
-def by_table(rows: Sequence[Row]) -> dict[str, tuple[Comparison, ...]]:
+def by_table(rows: Sequence[Row]) -> Comparisons:
     """Return the comparisons of each table of another policy, by its name."""
-    tables: dict[str, list[Row]] = {}
-    for row in rows:
-        tables.setdefault(row.scenario, []).append(row)
+    tables = tables_of(rows)
     return {
         name: compare_policies(tables.get(scenario, ()), members)
         for name, members in tables.items()

@@ -90,8 +90,17 @@ def shown(rows: Rows) -> tuple[Column, ...]:
     to_criterion = _to_criterion(rows)
     names = TO_CRITERION if to_criterion else FIXED
     found = {name for name in METRICS if any(row.estimates[name].value is not None for row in rows)}
-    titles = TITLES_TO_CRITERION if to_criterion else {}
-    return tuple(Column(METRICS[name], titles.get(name) or title_of(name)) for name in names if name in found)
+    return tuple(Column(METRICS[name], column_title(name, to_criterion)) for name in names if name in found)
+
+
+def column_title(name: str, to_criterion: bool) -> str:
+    """Return the title of a metric in the tables of a scenario.
+
+    Args:
+        name: Name of the metric.
+        to_criterion: Whether the stages of the scenario end when the target is learned.
+    """
+    return (TITLES_TO_CRITERION if to_criterion else {}).get(name) or title_of(name)
 
 
 def fitting(rows: Rows) -> tuple[Column, ...]:

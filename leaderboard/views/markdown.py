@@ -9,7 +9,6 @@ import math
 import re
 from collections.abc import Iterable, Sequence
 from functools import cache
-from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -22,12 +21,14 @@ from clbench.scoring.metric import Metric
 
 from ..board.overall import overall
 from ..board.rows import Row, Table
-from ..policies.compared import by_table
+from ..board.summary import tables_of
+from ..policies.compared import Comparisons
 from ..policies.decoders import read_decoding
 from .format import (
     MISSING,
     Column,
     agreement_text,
+    column_title,
     format_interval,
     number_text,
     prediction_text,
@@ -43,13 +44,16 @@ class Markdown(str):
     """Text that is Markdown already: templates do not escape it."""
 
 
-def markdown(table: Table) -> str:
-    """Return the leaderboard as a page of Markdown."""
+def markdown(table: Table, comparisons: Comparisons) -> str:
+    """Return the leaderboard as a page of Markdown.
+
+    Args:
+        table: The table.
+        comparisons: What `compared.by_table` says of its rows.
+    """
     template = templates(Path(__file__).with_name("templates")).get_template("leaderboard.md.jinja")
     averages = overall(table.rows)
-    by_scenario = {
-        scenario: list(rows) for scenario, rows in groupby(table.rows, key=lambda row: row.scenario)
-    }
+    by_scenario = tables_of(table.rows)
     return template.render(
         table=table,
         averages=averages,
@@ -57,7 +61,8 @@ def markdown(table: Table) -> str:
         shown=shown,
         all_shown=_all_shown(by_scenario.values()),
         agreement_text=agreement_text,
-        comparisons=by_table(table.rows),
+        comparisons=comparisons,
+        column_title=column_title,
         decoding=read_decoding(),
         counted=counted,
         policy_of=lambda place: parts_of(place)[1],

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from itertools import groupby
 from typing import Any
 
 from rich.box import SIMPLE_HEAD
@@ -17,7 +16,7 @@ from clbench.scoring.intervals import Estimate
 from clbench.scoring.metrics import METRICS
 
 from ..board.overall import OverallRow, overall
-from ..board.summary import RowSummary, Summary
+from ..board.summary import RowSummary, Summary, divisions_of, tables_of
 from ..board.tiers import TIERS
 from .format import MISSING, Column, Rows, agreement_text, aligned, fitting, number_text, scaled, start_text
 
@@ -79,8 +78,7 @@ def terminal(table: Summary, width: int = 108, sort: str | None = None) -> Rende
     # Text and not str: rich would obey markup in a stranger's words.
     parts: list[RenderableType] = []
     tables: list[Rows] = []
-    for scenario, members in groupby(table.rows, key=lambda row: row.scenario):
-        rows = list(members)
+    for scenario, rows in tables_of(table.rows).items():
         tables.append(rows)
         parts += _fitted(scenario, _sorted(rows, sort), _heads(rows), width)
         sentences = (start_text(table.starts.get(scenario)), agreement_text(table.agreements.get(scenario)))
@@ -112,8 +110,7 @@ def _sorted(rows: list[RowSummary], metric: str | None) -> list[RowSummary]:
         value = row.estimates[metric].value
         return value is None, 0.0 if value is None else -sign * value
 
-    by_division = [list(members) for _, members in groupby(rows, key=lambda row: row.division)]
-    return [row for members in by_division for row in sorted(members, key=place)]
+    return [row for members in divisions_of(rows).values() for row in sorted(members, key=place)]
 
 
 def _fitted(
@@ -150,17 +147,16 @@ def _table(
     for head in heads:
         # One word a line: a header must not make its column wider than the numbers.
         table.add_column(head.title.replace(" ", "\n"), justify="right", no_wrap=True)
-    for division, members in groupby(rows, key=lambda row: row.division):
+    for division, members in divisions_of(rows).items():
         table.add_section()
         table.add_row("", Text(division, style="italic"))
-        division_rows = list(members)
-        best = [_best(head, division_rows) for head in heads]
-        for row in division_rows:
+        best = [_best(head, members) for head in heads]
+        for row in members:
             cells = [
                 Text(head.cell(row), style="bold" if top is not None and head.value(row) == top else "")
                 for head, top in zip(heads, best, strict=True)
             ]
-            table.add_row(Text(_letters(row, division_rows)), Text(row.method), *cells)
+            table.add_row(Text(_letters(row, members)), Text(row.method), *cells)
     return table
 
 

@@ -57,7 +57,7 @@ def shown(
     shown_with_page: Callable[[], tuple[str, str]], monkeypatch: pytest.MonkeyPatch
 ) -> Callable[[], tuple[str, str]]:
     """Return the same without the HTML page and its pictures, which take most of the time."""
-    monkeypatch.setattr("clbench.leaderboard.views.page.page", lambda _: "")
+    monkeypatch.setattr("clbench.leaderboard.views.page.page", lambda *_: "")
     monkeypatch.setattr("clbench.leaderboard.views.page.pictures", lambda _: {})
     return shown_with_page
 

@@ -121,7 +121,7 @@ def test_a_board_is_computed_again_when_something_changed_that_it_was_made_from(
 def test_a_board_whose_reader_leaves_is_written_whole(
     four_methods: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("clbench.leaderboard.views.page.page", lambda _: "a page")
+    monkeypatch.setattr("clbench.leaderboard.views.page.page", lambda *_: "a page")
     monkeypatch.setattr("clbench.leaderboard.views.page.pictures", lambda _: {})
     with open(tmp_path / "out", "w", encoding="utf-8") as file:
 

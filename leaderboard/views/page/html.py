@@ -22,6 +22,7 @@ from clbench.spec.identifiers import built_in_methods, folder_name
 from ...board.rows import Table
 from ...board.summary import DIVISIONS
 from ...board.tiers import TIERS
+from ...policies.compared import Comparisons
 from ..format import format_interval, number_text, title_of
 from .charts.along import SERIES, along_a_run
 from .charts.axes import ACROSS, UP
@@ -34,7 +35,7 @@ from .charts.plot import VEGA_LITE, on_paper
 from .charts.vega import FONT, PALETTE, SHAPES, in_theme
 from .heat import COLUMNS, heat_maps
 from .rows import MAIN, SHADES
-from .view import ScenarioView, scenarios, tables_of, title_of_place
+from .view import ScenarioView, scenarios, sorted_tables, title_of_place
 
 FOLDER = Path(__file__).parent
 """Folder of the templates, the style and the script."""
@@ -72,12 +73,17 @@ CIVIDIS = (
 same to colour-blind readers and rise in lightness, so that numbers on them are legible in both themes."""
 
 
-def page(table: Table) -> str:
-    """Return the page."""
-    views = scenarios(table)
-    scripts = [_library(), _source("page.js")]
+def page(table: Table, comparisons: Comparisons) -> str:
+    """Return the page.
+
+    Args:
+        table: The table.
+        comparisons: What `compared.by_table` says of its rows.
+    """
+    tables = sorted_tables(table)
+    views = scenarios(tables, table, comparisons)
+    scripts = [_source("page.js"), _library()]  # the page waits for the library only to draw
     style = _source("style.css") + _colours()
-    tables = tables_of(table)
     return (
         _templates()
         .get_template("page.html")
@@ -98,7 +104,7 @@ def pictures(table: Table) -> dict[str, str]:
 
     They are the plane of the scenario with the most methods, and the frontier of each scenario that has one.
     """
-    rows = max(tables_of(table).values(), key=len, default=[])
+    rows = max(sorted_tables(table).values(), key=len, default=[])
     specs = {"pareto": plane(rows, WIDE)}
     for scenario, curves in table.frontiers.items():
         specs[f"frontier-{folder_name(scenario)}"] = frontier(curves, WIDE_FRONTIER, FONT)
@@ -230,8 +236,8 @@ def _scenario_data(one: ScenarioView) -> dict[str, Any]:
         extra["wide_frontier"] = frontier(one.frontier, WIDE_FRONTIER)
         extra["narrow_frontier"] = frontier(one.frontier, NARROW_FRONTIER)
     if one.decoding:
-        extra["wide_decoders"] = decoders(one.decoding, 260)
-        extra["narrow_decoders"] = decoders(one.decoding, 90)
+        extra["wide_decoders"] = decoders(one.decoding, narrow=False)
+        extra["narrow_decoders"] = decoders(one.decoding, narrow=True)
     names = one.tasks["target"]
     titles = names if one.balanced else [f"{number} {name}" for number, name in enumerate(names, 1)]
     steps = (1,) if one.to_criterion else one.steps

@@ -1,11 +1,45 @@
 "use strict";
 (async () => {
   const root = document.documentElement;
-  const packed = Uint8Array.from(atob(document.getElementById("data").textContent), (one) => one.charCodeAt(0));
-  const unpacked = new Blob([packed]).stream().pipeThrough(new DecompressionStream("gzip"));
-  const data = await new Response(unpacked).json();
   const narrow = () => window.innerWidth < 720;
+
+  // ---- parts: one is open, and the others are text until the reader opens them ------------------------------
+
+  const parts = [...document.querySelectorAll(".part")];
+  const tabs = document.querySelector(".tabs");
+  const place = () => decodeURIComponent(location.hash.slice(1));
+
+  /* Make the elements of a part from its text, in which the templates escaped what strangers wrote. */
+  function build(part) {
+    const text = part.querySelector(":scope > noscript")?.textContent;
+    if (text !== undefined) part.innerHTML = text;
+  }
+
+  /* Open the part of the address, #scenario or #scenario/method. */
+  function openPart() {
+    const name = place();
+    const wanted = parts.find((one) => name === one.id || name.startsWith(`${one.id}/`));
+    const part = wanted ?? parts.find((one) => !one.hidden);
+    const moved = part?.hidden;
+    for (const one of parts) one.hidden = one !== part;
+    for (const link of tabs.querySelectorAll("a")) {
+      const here = part && link.hash.slice(1) === part.id;
+      if (here) link.setAttribute("aria-current", "true");
+      else link.removeAttribute("aria-current");
+      if (here) link.parentElement.scrollLeft = link.offsetLeft - 40;
+    }
+    if (part) build(part);
+    // The tabs stay where they are: a part that the reader has scrolled into begins below them.
+    if (moved) window.scrollTo({ top: Math.min(window.scrollY, document.querySelector(".top").offsetHeight), behavior: "instant" });
+    return part;
+  }
+
+  const measureTabs = () => root.style.setProperty("--tabs", `${tabs.offsetHeight}px`);
+
   root.classList.remove("no-script");
+  parts.slice(1).forEach((part) => { part.hidden = true; });
+  openPart(); // before the data are unpacked: no other part flashes up
+  measureTabs();
 
   // ---- theme: the reader's choice, otherwise the system's ---------------------------------------------------
 
@@ -26,6 +60,13 @@
   });
   dark.addEventListener("change", nameTheme);
   nameTheme();
+
+  // ---- data, and the library that draws charts ---------------------------------------------------------------
+
+  const packed = Uint8Array.from(atob(document.getElementById("data").textContent), (one) => one.charCodeAt(0));
+  const unpacked = new Blob([packed]).stream().pipeThrough(new DecompressionStream("gzip"));
+  const library = new Promise((done) => { document.addEventListener("DOMContentLoaded", done); }); // it comes last
+  const [data] = await Promise.all([new Response(unpacked).json(), library]);
 
   // ---- the tip: what is behind a number, by mouse, by tap and by key ----------------------------------------
 
@@ -150,14 +191,16 @@
     part.picture = picture;
   }
 
-  const files = document.getElementById("not-shown");
-  files?.querySelector(".filters").addEventListener("input", ({ currentTarget: form }) => {
-    const rows = [...files.querySelector("tbody").rows];
-    const wanted = form.elements.text.value.trim().toLowerCase();
-    for (const row of rows) row.hidden = !row.textContent.toLowerCase().includes(wanted);
-    form.elements.count.value = `${rows.filter((row) => !row.hidden).length} of ${rows.length} files`;
-  });
-  files?.querySelector(".filters").addEventListener("submit", (event) => event.preventDefault());
+  function prepareFiles(part) {
+    const form = part.querySelector(".filters");
+    form.addEventListener("input", () => {
+      const rows = [...part.querySelector("tbody").rows];
+      const wanted = form.elements.text.value.trim().toLowerCase();
+      for (const row of rows) row.hidden = !row.textContent.toLowerCase().includes(wanted);
+      form.elements.count.value = `${rows.filter((row) => !row.hidden).length} of ${rows.length} files`;
+    });
+    form.addEventListener("submit", (event) => event.preventDefault());
+  }
 
   // ---- charts ----------------------------------------------------------------------------------------------
 
@@ -363,37 +406,24 @@
 
   // ---- places: #scenario shows a scenario, #scenario/method opens a row ------------------------------------
 
-  const parts = [...document.querySelectorAll(".part")];
-  const tabs = document.querySelector(".tabs");
-
   function go() {
-    const name = decodeURIComponent(location.hash.slice(1));
-    const row = data.rows[name];
-    const wanted = document.getElementById(row ? row.scenario : name)?.closest(".part");
-    const part = wanted ?? parts.find((one) => !one.hidden) ?? parts[0];
-    const moved = part?.hidden !== false;
-    for (const one of parts) one.hidden = one !== part;
-    for (const link of tabs.querySelectorAll("a")) {
-      const here = part && link.hash.slice(1) === part.id;
-      if (here) link.setAttribute("aria-current", "true");
-      else link.removeAttribute("aria-current");
-      if (here) link.parentElement.scrollLeft = link.offsetLeft - 40;
-    }
-    // The tabs stay where they are: a part that the reader has scrolled into begins below them.
-    if (moved) window.scrollTo({ top: Math.min(window.scrollY, document.querySelector(".top").offsetHeight), behavior: "instant" });
+    const part = openPart(), name = place();
     if (part) show(part);
-    if (row) return openRow(name);
+    if (data.rows[name]) return openRow(name);
     opened = "";
     if (dialog.open) dialog.close();
   }
 
+  /* Give a part its behaviour and its pictures, once. */
   function show(part) {
-    if (part.picture && !part.drawn) part.picture();
-    if (!part.drawn) {
-      part.querySelectorAll("[data-frontier]").forEach(drawFrontier);
-      part.querySelectorAll("[data-decoders]").forEach(drawDecoders);
-    }
-    part.drawn = true;
+    if (part.shown) return;
+    part.shown = true;
+    if (part.querySelector(".board")) prepare(part);
+    if (part.id === "not-shown") prepareFiles(part);
+    part.querySelectorAll(".heat, .definitions").forEach(roam);
+    part.picture?.();
+    part.querySelectorAll("[data-frontier]").forEach(drawFrontier);
+    part.querySelectorAll("[data-decoders]").forEach(drawDecoders);
   }
 
   tabs.addEventListener("click", (event) => {
@@ -406,11 +436,9 @@
   // Back and forward change the address, too.
   window.addEventListener("popstate", go);
   window.addEventListener("resize", () => {
-    for (const part of parts) if (part.drawn && part.picture && part.size !== sizeOfPlane()) part.picture();
+    measureTabs();
+    for (const part of parts) if (part.picture && part.size !== sizeOfPlane()) part.picture();
   });
-  for (const part of parts) if (part.querySelector(".board")) prepare(part);
-  document.querySelectorAll(".heat, .definitions").forEach(roam);
-  parts.slice(1).forEach((part) => { part.hidden = true; });
   go();
   root.dataset.ready = ""; // for tests
 })();

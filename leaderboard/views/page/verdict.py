@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from itertools import groupby
 
 from clbench.base.text import counted, printable
 from clbench.scoring.groups import groups
@@ -12,7 +11,7 @@ from clbench.scoring.intervals import Estimate
 from clbench.spec.references import BASELINE
 
 from ...board.rows import Row, standing_of
-from ...board.summary import DIVISIONS, METHODS, RANKED_BY
+from ...board.summary import DIVISIONS, METHODS, RANKED_BY, divisions_of
 from ..descriptions import RULES
 from ..format import number_text
 from .numbers import MISSING, cost, size
@@ -79,7 +78,7 @@ def verdicts(rows: Sequence[Row]) -> list[Verdict]:
     """Return the verdict on each division of methods with a final average."""
     found = []
     baseline = next((row for row in rows if row.method == BASELINE), None)
-    for division, members in groupby(rows, key=lambda row: row.division):
+    for division, members in divisions_of(rows).items():
         known = [row for row in members if row.groups is not None]
         if division not in METHODS or not known:
             continue

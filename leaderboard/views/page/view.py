@@ -5,20 +5,19 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import groupby
-from typing import TypeVar
 
 from clbench.base.text import counted, printable
 from clbench.records.paths import parts_of
 from clbench.scoring.metric import Metric
 from clbench.spec.policies import DEFAULT_POLICY
+from clbench.spec.references import BASELINE
 
 from ...board.frontier import Curve
 from ...board.places import SCENARIO
 from ...board.rows import Row, Table
-from ...board.summary import DIVISIONS, ELSEWHERE, METHODS
+from ...board.summary import DIVISIONS, ELSEWHERE, METHODS, divisions_of, tables_of
 from ...board.tiers import TIERS
-from ...policies.compared import Comparison, by_table
+from ...policies.compared import Comparison, Comparisons
 from ...policies.decoders import Decoding, read_decoding
 from ..descriptions import RULES
 from ..format import Column, agreement_text, prediction_text, start_text, title_of
@@ -29,16 +28,6 @@ from .verdict import Verdict, headline, verdicts
 
 FEWEST = 4
 """Fewest competing methods whose ranks under each definition are worth a table."""
-
-Item = TypeVar("Item")
-Group = tuple[int, str, str, list[Item]]
-"""Number, name and rule of a division, and its rows."""
-
-
-def grouped(rows: Iterable[Item], divisions: Iterable[str]) -> list[Group[Item]]:
-    """Return sorted rows by division, given the division of each row."""
-    groups = groupby(zip(divisions, rows, strict=True), key=lambda pair: pair[0])
-    return [(DIVISIONS.index(name), name, RULES[name], [row for _, row in pairs]) for name, pairs in groups]
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,11 +78,14 @@ class ScenarioView:
         policy = f"A policy with {counted(skills, 'skill')}" if skills else "A policy"
         seeds = sorted({len(view.row.seeds) for view in self.rows})
         count = counted(seeds[0], "seed") if len(seeds) == 1 else f"{seeds[0]} to {seeds[-1]} seeds"
-        return (
-            f"{policy} is fine-tuned on {counted(targets, 'new task')}, one after another. The final average "
-            "is its success on all of them at the end. "
-            f"Means over {count}, with 95 % confidence intervals."
-        )
+        sentences = [
+            f"{policy} is fine-tuned on {counted(targets, 'new task')}, one after another.",
+            "The final average is its success on all of them at the end.",
+            f"Means over {count}, with 95 % confidence intervals.",
+        ]
+        if any(row.method == BASELINE for row in self.table):
+            sentences.append(f"Plain fine-tuning is called {BASELINE}.")
+        return " ".join(sentences)
 
     @cached_property
     def stills(self) -> dict[str, str]:
@@ -136,9 +128,13 @@ class ScenarioView:
         return others(self.table)
 
     @property
-    def divisions(self) -> list[Group[RowView]]:
-        """Its rows by division."""
-        return grouped(self.rows, [view.row.division for view in self.rows])
+    def divisions(self) -> list[tuple[int, str, str, list[RowView]]]:
+        """Number, name and rule of each division, and its rows."""
+        views = {view.row.method: view for view in self.rows}
+        return [
+            (DIVISIONS.index(name), name, RULES[name], [views[row.method] for row in rows])
+            for name, rows in divisions_of(self.table).items()
+        ]
 
     @property
     def columns(self) -> tuple[Column, ...]:
@@ -163,11 +159,9 @@ def title_of_place(place: str) -> str:
     return name if policy == DEFAULT_POLICY else f"{name}, {printable(title_of(policy))}"
 
 
-def tables_of(table: Table) -> dict[str, list[Row]]:
+def sorted_tables(table: Table) -> dict[str, list[Row]]:
     """Return the rows by the name of their table: the main scenario first, then those of most methods."""
-    found: dict[str, list[Row]] = {}
-    for row in table.rows:
-        found.setdefault(row.scenario, []).append(row)
+    found = tables_of(table.rows)
 
     def place(name: str) -> tuple[bool, int, str]:
         competing = sum(row.division in METHODS for row in found[name])
@@ -176,11 +170,17 @@ def tables_of(table: Table) -> dict[str, list[Row]]:
     return {name: found[name] for name in sorted(found, key=place)}
 
 
-def scenarios(table: Table) -> list[ScenarioView]:
-    """Return the view of each scenario, in the order of `tables_of`."""
+def scenarios(tables: Mapping[str, list[Row]], table: Table, comparisons: Comparisons) -> list[ScenarioView]:
+    """Return the view of each scenario.
+
+    Args:
+        tables: Rows of each scenario, in the order of the result.
+        table: The table that they are from.
+        comparisons: What `compared.by_table` says of its rows.
+    """
     found = []
-    comparisons, decoding = by_table(table.rows), read_decoding()
-    for scenario, rows in tables_of(table).items():
+    decoding = read_decoding()
+    for scenario, rows in tables.items():
         layout, published = rows[0].runs[0].scores.layout, rows[0].runs[0].published
         groups = {"retained": layout.retained, "target": published.target, "held out": layout.held_out}
         tasks = {**groups, "target": places(rows[0])}

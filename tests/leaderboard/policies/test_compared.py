@@ -54,7 +54,7 @@ def test_methods_are_compared_over_the_seeds_that_both_policies_have(both: Path)
 
 def test_the_page_shows_both_policies_and_never_ranks_one_against_the_other(both: Path) -> None:
     table = read_table(both)
-    page = markdown(table)
+    page = markdown(table, by_table(table.rows))
     heading = PLACE.replace("_", "\\_")
     section = page.partition(f"## {heading}")[2].partition("\n## ")[0]
     assert "Does forgetting depend on the policy?" in section
@@ -68,4 +68,4 @@ def test_a_table_of_one_policy_has_no_comparison(add: Callable[..., Path], tmp_p
     add("sft", 0)
     table = read_table(tmp_path / "leaderboard" / "records")
     assert by_table(table.rows) == {}
-    assert "Does forgetting depend" not in markdown(table)
+    assert "Does forgetting depend" not in markdown(table, by_table(table.rows))

@@ -40,7 +40,9 @@ def words(element: ElementTree.Element) -> str:
 
 
 def section_of(records: Path) -> ElementTree.Element:
-    document = html5lib.HTMLParser(strict=True, namespaceHTMLElements=False).parse(page(read_table(records)))
+    document = html5lib.HTMLParser(strict=True, namespaceHTMLElements=False).parse(
+        page(read_table(records), {})
+    )
     found: ElementTree.Element
     (found,) = (one for one in document.iter() if one.get("id") == SCENARIO)
     return found
@@ -57,11 +59,11 @@ def test_scenarios_with_a_criterion_come_first(records: Path, make_record: Calla
     assert list(dict.fromkeys(row.scenario for row in rows)) == [SCENARIO, fixed]
     (whole,) = overall(rows)
     assert whole.groups == tuple(row.groups for row in rows if row.method == "sft") == ("c", "a")
-    assert f"Means over {SCENARIO}, {fixed}, for methods" in markdown(read_table(records))
+    assert f"Means over {SCENARIO}, {fixed}, for methods" in markdown(read_table(records), {})
 
 
 def test_a_scenario_with_a_criterion_has_its_own_columns(records: Path) -> None:
-    head = next(line for line in markdown(read_table(records)).splitlines() if line.startswith("| group"))
+    head = next(line for line in markdown(read_table(records), {}).splitlines() if line.startswith("| group"))
     columns = [cell.strip() for cell in head.strip("|").split("|")][5:]
     assert columns[:6] == ["final average", "gain", "learned", "kept skills", "kept targets", "kept"]
     assert columns[6:9] == ["kept share", "steps to criterion", "settings tried"]
@@ -87,7 +89,7 @@ def test_the_terminal_shows_gain_and_kept(
 def test_settings_tried_are_counted(records: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     tuned = resolve("clbench.runs.tuning:Tuned")({}, (None,) * 6)
     monkeypatch.setattr("clbench.leaderboard.board.rows.tuned", lambda _: {"finch": tuned})
-    text = markdown(read_table(records))
+    text = markdown(read_table(records), {})
     assert "| 6 | - |" in next(line for line in text.splitlines() if "| finch | prior" in line)
     assert "| - | - |" in next(line for line in text.splitlines() if "| lora | prior" in line)
 
@@ -95,12 +97,12 @@ def test_settings_tried_are_counted(records: Path, monkeypatch: pytest.MonkeyPat
 def test_halves_of_the_seeds_that_order_the_methods_alike_are_named(records: Path) -> None:
     sentence = "The two halves of the 4 seeds order the 3 methods alike: Kendall's tau 1.00 [1.00, 1.00]."
     assert sentence in words(section_of(records))
-    assert sentence in markdown(read_table(records)).replace("\\", "")
+    assert sentence in markdown(read_table(records), {}).replace("\\", "")
 
 
 def test_targets_of_balanced_seeds_are_numbered_in_the_section_of_a_row(records: Path) -> None:
     assert "new tasks, each seed in its own order target_ 0 target_ 1" in words(section_of(records))
-    assert "after target 2" in unpacked(page(read_table(records)))
+    assert "after target 2" in unpacked(page(read_table(records), {}))
 
 
 def test_the_frontier_has_each_method_at_each_step_size(records: Path) -> None:
@@ -110,7 +112,7 @@ def test_the_frontier_has_each_method_at_each_step_size(records: Path) -> None:
         (1.0, pytest.approx(0.5), 2),
         (0.1, pytest.approx(0.7), 2),
     ]
-    assert "| finch | 0.1 | 0.90 [" in markdown(read_table(records))
+    assert "| finch | 0.1 | 0.90 [" in markdown(read_table(records), {})
     section = section_of(records)
     assert [one.get("data-frontier") for one in section.iter("figure") if one.get("data-frontier")]
     assert "\N{MULTIPLICATION SIGN} 0.1 0.90 [" in words(section)
@@ -123,7 +125,7 @@ def test_the_frontier_has_each_method_at_each_step_size(records: Path) -> None:
 def test_without_a_ladder_there_is_no_frontier(even_board: Callable[..., Path]) -> None:
     table = read_table(even_board("sft", 0, 0.2))
     assert not table.frontiers
-    assert "frontier" not in markdown(table)
+    assert "frontier" not in markdown(table, {})
     assert set(pictures(table)) == {"pareto.svg", "pareto-dark.svg"}
 
 

@@ -7,25 +7,27 @@ from ...format import format_interval
 from .vega import SYSTEM_FONT, Spec, colour, layer, rounded, specification
 
 
-def decoders(found: Decoding, width: int, font: str = SYSTEM_FONT) -> Spec:
-    """Return two charts of the decoders side by side: speed, and success beyond the first decoder's.
+def decoders(found: Decoding, narrow: bool, font: str = SYSTEM_FONT) -> Spec:
+    """Return two charts of the decoders: speed, and success beyond the first decoder's.
 
     Args:
         found: Results of the benchmark.
-        width: Width of each chart, in pixels.
+        narrow: Whether it is for a phone: the charts stand one below the other, and names have several lines.
         font: Font of all texts.
     """
-    panels = [("speed_up", "speed-up", 1.0), ("difference", "difference of success", 0.0)]
-    return specification(
-        font,
-        hconcat=[
-            _compared(found, name, title, neutral, width, labels=not number)
-            for number, (name, title, neutral) in enumerate(panels)
-        ],
-    )
+    panels = (("speed_up", "speed-up", 1.0), ("difference", "difference of success", 0.0))
+    if narrow:
+        lines = {"labelExpr": "split(datum.label, ', ')", "labelLimit": 190}
+        return specification(font, vconcat=[_compared(found, *one, 140, 50, lines) for one in panels])
+    speed, success = panels
+    beside = [_compared(found, *speed, 220, 22, {"labelLimit": 340})]
+    beside += [_compared(found, *success, 220, 22, {"labels": False})]
+    return specification(font, hconcat=beside)
 
 
-def _compared(found: Decoding, name: str, title: str, neutral: float, width: int, labels: bool) -> Spec:
+def _compared(
+    found: Decoding, name: str, title: str, neutral: float, width: int, step: int, labels: Spec
+) -> Spec:
     points = [
         {
             "decoder": one.name,
@@ -36,7 +38,7 @@ def _compared(found: Decoding, name: str, title: str, neutral: float, width: int
         }
         for one in found.decoders
     ]
-    names = {"labelLimit": 260, "title": None, "labels": labels, "ticks": False, "domain": False}
+    names = {"title": None, "ticks": False, "domain": False, **labels}
     y = {"field": "decoder", "type": "nominal", "sort": None, "axis": names}
     x = {"field": "x", "type": "quantitative", "title": title, "scale": {"zero": False}}
     x |= {"axis": {"tickCount": 5}}
@@ -49,4 +51,4 @@ def _compared(found: Decoding, name: str, title: str, neutral: float, width: int
         layer(points, whisker, y=y, x=x | {"field": "low"}, x2={"field": "high"}),
         layer(points, mark, y=y, x=x, tooltip=tooltip),
     ]
-    return {"layer": layers, "width": width, "height": {"step": 22}}
+    return {"layer": layers, "width": width, "height": {"step": step}}

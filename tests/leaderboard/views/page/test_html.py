@@ -72,7 +72,7 @@ def without_library(text: str) -> str:
 
 
 def test_the_page_is_valid_and_has_a_row_and_a_section_for_each_method(records: Path) -> None:
-    text = page(read_table(records))
+    text = page(read_table(records), {})
     section = by_id(parsed(text), "clbench/Toy-v0")
     links = [one.get("href") for one in section.iterfind(".//table/tbody/tr/th/a")]
     assert links[:2] == ["#clbench/Toy-v0/better", "#clbench/Toy-v0/sft"]
@@ -85,7 +85,7 @@ def test_the_page_is_valid_and_has_a_row_and_a_section_for_each_method(records: 
 
 
 def test_rows_show_their_groups_and_what_intervals_do_not_cover(records: Path) -> None:
-    section = by_id(parsed(page(read_table(records))), "clbench/Toy-v0")
+    section = by_id(parsed(page(read_table(records), {})), "clbench/Toy-v0")
     cells = [one for one in section.iter("td") if one.get("class") == "groups"]
     assert [(one.text, one.get("data-order"), one.get("data-note")) for one in cells] == [
         ("a", "1", "place 1 of 2; not told apart from sft"),
@@ -97,10 +97,10 @@ def test_rows_show_their_groups_and_what_intervals_do_not_cover(records: Path) -
 def test_perturbed_retention_has_a_column_only_where_a_row_has_it(
     add: Callable[..., Path], records: Path
 ) -> None:
-    assert "perturbed retention" not in words(by_id(parsed(page(read_table(records))), "clbench/Toy-v0"))
+    assert "perturbed retention" not in words(by_id(parsed(page(read_table(records), {})), "clbench/Toy-v0"))
     for seed in range(2):
         add("sft", seed, perturbed=[[0.9, 0.8], [0.5, 0.7], [0.4, 0.2]])
-    text = page(read_table(records))
+    text = page(read_table(records), {})
     section = by_id(parsed(text), "clbench/Toy-v0")
     heads = [words(one) for one in section.iterfind(".//table/thead/tr/th")]
     assert heads.index("perturbed retention") > heads.index("kept skills")
@@ -115,25 +115,25 @@ def test_perturbed_retention_has_a_column_only_where_a_row_has_it(
 
 def test_a_row_says_what_its_verification_looked_at_and_which_lie_it_could_have_missed(records: Path) -> None:
     method = "clbench/Toy-v0/sft"
-    assert "Checked by others" not in words(row_of(page(read_table(records)), method))
+    assert "Checked by others" not in words(row_of(page(read_table(records), {}), method))
     record = record_path(records, "clbench/Toy-v0", "sft", 0)
     found = "40 of 900 replayed, all ended as recorded; 64 made-up ones would have been found with 95 %"
     checks = [{"name": "episodes", "found": found, "passed": True}, {"name": HOSTILE, "found": "\x1b[2J"}, 7]
     text = record.read_bytes()
     values = {"tier": "replayed", "record": hashlib.sha256(text).hexdigest(), "checks": checks, "by": "Ada"}
     tiers.verification_path(record).write_text(tiers.verification_text(values), encoding="utf-8")
-    own = row_of(page(read_table(records)), method)
+    own = row_of(page(read_table(records), {}), method)
     assert f"seeds 0 tier replayed by Ada episodes {found} " in words(own)
     assert "\x1b" not in words(own)
     assert not list(own.iter("img"))
 
 
 def test_a_missing_value_is_a_dash_that_says_why(add: Callable[..., Path], records: Path) -> None:
-    section = by_id(parsed(page(read_table(records))), "clbench/Toy-v0")
+    section = by_id(parsed(page(read_table(records), {})), "clbench/Toy-v0")
     assert "forward transfer" not in [words(one) for one in section.iterfind(".//table/thead/tr/th")]
     add("from_scratch", 0, uses={"demonstrations": "never", "questions": "never", "reference": True})
     add("single", 0)
-    text = words(by_id(parsed(page(read_table(records))), "clbench/Toy-v0"))
+    text = words(by_id(parsed(page(read_table(records), {})), "clbench/Toy-v0"))
     assert ", missing: A point of a learning curve is missing, or there is no from_scratch" in text
 
 
@@ -166,7 +166,7 @@ def test_texts_of_strangers_stay_text(add: Callable[..., Path], records: Path) -
     add("hostile", 0, edit=edit, scenario="clbench/Hostile-v0")
     add("failed", 0, edit=fail)
     (records / "<img src=x onerror=alert(2)>.json").write_text("{", encoding="utf-8")
-    text = page(read_table(records))
+    text = page(read_table(records), {})
     document = parsed(text)
     assert not list(document.iter("img"))
     assert len(list(document.iter("script"))) == 3
@@ -185,7 +185,7 @@ def test_a_command_can_be_pasted_with_any_record(add: Callable[..., Path], recor
         record.fingerprint["commit"] = {"id": "; touch /tmp/gone", "dirty": True}
 
     add("careless", 3, edit=edit)
-    text = words(row_of(page(read_table(records)), "clbench/Toy-v0/careless"))
+    text = words(row_of(page(read_table(records), {}), "clbench/Toy-v0/careless"))
     assert (
         "clbench run clbench/Toy-v0 careless --seeds 1 --first-seed 3 --device 'cpu; touch /tmp/gone'" in text
     )
@@ -199,14 +199,14 @@ def test_seeds_of_several_commits_are_made_again_from_each(add: Callable[..., Pa
             seed,
             edit=lambda record, commit=commit: record.fingerprint.update(commit={"id": commit * 40}),
         )
-    text = words(row_of(page(read_table(records)), "clbench/Toy-v0/old"))
+    text = words(row_of(page(read_table(records), {}), "clbench/Toy-v0/old"))
     install, run = "pip install -c constraints.txt -e .", "clbench run clbench/Toy-v0 old --seeds"
     first = f"git checkout {'a' * 40} {install} {run} 1"
     assert f"{first} git checkout {'b' * 40} {install} {run} 2 --first-seed 1 {run} 1 --first-seed 5" in text
 
 
 def test_the_page_asks_no_address_and_allows_no_script_but_its_own(records: Path) -> None:
-    text = page(read_table(records))
+    text = page(read_table(records), {})
     document = parsed(text)
     (policy,) = (one.get("content", "") for one in document.iter("meta") if one.get("http-equiv"))
     assert policy.startswith("default-src 'none';")
@@ -224,7 +224,7 @@ def test_the_page_asks_no_address_and_allows_no_script_but_its_own(records: Path
 
 def test_files_that_make_no_row_are_listed_with_their_reason(records: Path) -> None:
     (records / "torn.json").write_text("{", encoding="utf-8")
-    text = words(by_id(parsed(page(read_table(records))), "not-shown"))
+    text = words(by_id(parsed(page(read_table(records), {})), "not-shown"))
     assert "torn.json cannot be read as JSON" in text
     assert "What to do" in text
 
@@ -236,7 +236,7 @@ def test_definitions_that_rank_in_opposite_orders_are_named(add: Callable[..., P
             add(same, seed, [[1, 1, 0, 0, 0], [1, 1, 1, 0, 0], [1, 1, 1, 1, 0]], scenario="clbench/Two-v0")
         add("skills", seed, [[1, 1, 0, 0, 0], [0, 0, 1, 0, 0], [0, 0, 1, 1, 0]], scenario="clbench/Two-v0")
         add("targets", seed, [[1, 1, 0, 0, 0], [1, 1, 1, 0, 0], [1, 1, 0, 1, 0]], scenario="clbench/Two-v0")
-    document = parsed(page(read_table(records)))
+    document = parsed(page(read_table(records), {}))
     text = words(by_id(document, "clbench/Two-v0"))
     assert "“forgetting” and “backward transfer” disagree most. They put 1 of 6 pairs of methods" in text
     (table,) = (
@@ -249,7 +249,7 @@ def test_definitions_that_rank_in_opposite_orders_are_named(add: Callable[..., P
 
 
 def test_fewer_than_four_methods_have_no_table_of_definitions(records: Path) -> None:
-    section = by_id(parsed(page(read_table(records))), "clbench/Toy-v0")
+    section = by_id(parsed(page(read_table(records), {})), "clbench/Toy-v0")
     assert not [one for one in section.iter("table") if one.get("class") == "definitions"]
 
 
@@ -257,7 +257,7 @@ def test_the_only_method_of_a_division_has_a_dash_instead_of_a_letter(
     add: Callable[..., Path], records: Path
 ) -> None:
     add("alone", 0, scenario="clbench/Other-v0")
-    section = by_id(parsed(page(read_table(records))), "clbench/Other-v0")
+    section = by_id(parsed(page(read_table(records), {})), "clbench/Other-v0")
     cells = [one for one in section.iter("td") if one.get("class") == "groups"]
     assert [(one.text, one.get("data-note")) for one in cells] == [("\N{EN DASH}", "place 1 of 1")]
 
@@ -265,7 +265,7 @@ def test_the_only_method_of_a_division_has_a_dash_instead_of_a_letter(
 def test_the_stages_of_an_agent_begin_after_the_old_skills(add: Callable[..., Path], records: Path) -> None:
     uses = {"demonstrations": "never", "questions": "never", "reference": False, "online": True}
     add("me/agent", 0, uses=uses)
-    text = page(read_table(records))
+    text = page(read_table(records), {})
     assert "after the old skills" in words(row_of(text, "clbench/Toy-v0/me/agent"))
     data = data_of(text)
     chart = json.dumps(data["scenarios"]["clbench/Toy-v0"]["run_elsewhere"])
@@ -277,7 +277,7 @@ def test_the_stages_of_an_agent_begin_after_the_old_skills(add: Callable[..., Pa
 
 def test_the_main_scenario_comes_first_and_names_are_short(add: Callable[..., Path], records: Path) -> None:
     add("sft", 0, scenario="clbench/Fetch-v1")
-    document = parsed(page(read_table(records)))
+    document = parsed(page(read_table(records), {}))
     (tabs,) = (one for one in document.iter("nav") if one.get("class") == "tabs")
     assert [words(one) for one in tabs.iter("a")] == ["Fetch-v1", "Toy-v0", "All scenarios"]
     assert "Every file" not in words(document)
@@ -286,7 +286,7 @@ def test_the_main_scenario_comes_first_and_names_are_short(add: Callable[..., Pa
 def test_without_rows_there_is_a_page_that_says_why(tmp_path: Path) -> None:
     (tmp_path / "torn.json").write_text("{", encoding="utf-8")
     table = read_table(tmp_path)
-    text = words(parsed(page(table)))
+    text = words(parsed(page(table, {})))
     assert "There is no row yet" in text
     assert "torn.json" in text
     assert set(pictures(table)) == {"pareto.svg", "pareto-dark.svg"}
@@ -335,6 +335,6 @@ def test_15_methods_with_5_seeds_on_4_scenarios_are_less_than_3_megabytes(
         for number in range(15)
     ]
     large = dataclasses.replace(table, rows=tuple(rows), scenarios=dict.fromkeys(names, scenario))
-    text = page(large)
+    text = page(large, {})
     assert len(data_of(text)["rows"]) == 60
     assert len(text.encode()) < 3_000_000

@@ -53,7 +53,7 @@ def address(make_record: Callable[..., Record], tmp_path_factory: pytest.TempPat
     (records / f"{HOSTILE.replace('/', '')}.json").write_text("{", encoding="utf-8")
     (records / "torn.json").write_text("{", encoding="utf-8")
     page = resolve("clbench.leaderboard.views.page:page")(
-        resolve("clbench.leaderboard.board.rows:read_table")(records)
+        resolve("clbench.leaderboard.board.rows:read_table")(records), {}
     )
     path = records.parent / "index.html"
     path.write_text(page, encoding="utf-8")
@@ -283,6 +283,64 @@ def test_texts_of_strangers_are_shown_unchanged(open_page: Callable[..., Page]) 
     files.get_by_label("Path or reason").fill("onerror")
     expect(files.locator("tbody tr:visible")).to_have_count(1)
     expect(files.get_by_role("status")).to_have_text("1 of 2 files")
+
+
+def elements(page: Page, part: str) -> int:
+    return page.locator(f"[id='{part}'] *:not(noscript)").count()
+
+
+def test_a_part_has_no_elements_until_it_is_opened(open_page: Callable[..., Page]) -> None:
+    page = open_page()
+    parts = page.locator(".part").evaluate_all("all => all.map((one) => one.id)")
+    assert parts == ["clbench/Toy-v0", "clbench/Other-v0", "clbench/Without-v0", "overall", "not-shown"]
+    assert [elements(page, part) > 0 for part in parts] == [True, False, False, False, False]
+    page.get_by_role("link", name="All scenarios").click()
+    expect(page.locator(".heat:visible")).to_have_count(1)
+    assert [elements(page, part) > 0 for part in parts] == [True, False, False, True, False]
+    page.locator(".heat thead").get_by_role("link", name="Toy-v0").first.click()
+    expect(page.locator(".heat:visible")).to_have_count(0)
+    expect(page.locator(".board:visible")).to_have_count(1)
+
+
+def test_a_part_keeps_what_the_reader_chose_in_it(open_page: Callable[..., Page]) -> None:
+    page = open_page("clbench/Other-v0")
+    page.get_by_label("all columns").locator("visible=true").check()
+    page.get_by_role("link", name="Without-v0").click()
+    page.get_by_role("link", name="Other-v0").click()
+    expect(page.get_by_label("all columns").locator("visible=true")).to_be_checked()
+    expect(page.locator("td.extra:visible").first).to_be_visible()
+
+
+@pytest.mark.parametrize("place", ["overall", "not-shown", "clbench/Without-v0"])
+def test_an_address_opens_a_part_that_was_hidden(place: str, open_page: Callable[..., Page]) -> None:
+    page = open_page(place)
+    assert page.locator(".part:visible").evaluate_all("all => all.map((one) => one.id)") == [place]
+    assert elements(page, place) > 0
+    expect(page.locator(".tabs [aria-current]")).to_have_attribute("href", f"#{place}")
+
+
+def test_printing_shows_the_open_part_and_the_whole_of_its_table(open_page: Callable[..., Page]) -> None:
+    page = open_page("clbench/Other-v0", viewport={"width": 390, "height": 420})
+    page.emulate_media(media="print")
+    expect(page.locator(".part:visible")).to_have_count(1)
+    expect(page.locator("[id='clbench/Other-v0'] .board")).to_be_visible()
+    region = page.locator(".board-region:visible")
+    assert region.evaluate(
+        "one => [one.scrollHeight - one.clientHeight, getComputedStyle(one).overflow]"
+    ) == [
+        0,
+        "visible",
+    ]
+
+
+def test_tabs_that_do_not_fit_into_one_line_take_another(open_page: Callable[..., Page]) -> None:
+    page = open_page("clbench/Toy-v0", viewport={"width": 660, "height": 700})
+    links = page.locator(".tabs a")
+    links.evaluate_all("all => all.forEach((one) => { one.textContent += ' with a long name'; })")
+    page.set_viewport_size({"width": 700, "height": 700})
+    boxes = links.evaluate_all("all => all.map((one) => one.getBoundingClientRect().right)")
+    assert max(boxes) <= 700
+    assert page.evaluate("document.documentElement.scrollWidth") <= 700
 
 
 def test_without_scripts_the_verdicts_and_tables_are_there(open_page: Callable[..., Page]) -> None:
