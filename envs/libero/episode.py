@@ -88,7 +88,8 @@ class Episode:
         """Return the state (62,)."""
         state, data, problem = np.zeros(SIZE, np.float32), self.data, self.problem
         state[HAND], state[HAND_QUATERNION], state[FINGERS] = self._hand
-        places = np.concatenate((data.xpos[problem.things], data.xquat[problem.things]), axis=1).ravel()
+        positions, turns = data.xpos[problem.things] - self._hand[0], data.xquat[problem.things]
+        places = np.concatenate((positions, turns), axis=1).ravel()
         state[PLACES][: places.size] = places
         state[JOINTS][: problem.parts.size] = data.qpos[problem.parts]
         return state
