@@ -52,7 +52,7 @@ SIDEWAYS = _turned(-1.2)
 
 
 class Sight:
-    """What an expert sees in a state (62,)."""
+    """What an expert sees in a state (83,)."""
 
     def __init__(self, state: State) -> None:
         self._state = state.astype(np.float64)
@@ -195,7 +195,7 @@ def _put(
     """Return the action that puts a thing on another one.
 
     Args:
-        state: The state (62,).
+        state: The state (83,).
         grip: Grasp of the thing.
         support: Number of the other thing.
         offset: Goal of the thing, from the other one's own axes.
@@ -366,7 +366,7 @@ _EXPERTS: dict[str, Callable[[State], Action]] = {
 
 
 def expert(task: str) -> Callable[[State], Action]:
-    """Return the expert of the task, which maps a state (62,) to an action (7,).
+    """Return the expert of the task, which maps a state (83,) to an action (7,).
 
     Raises:
         UnknownNameError: No expert has this name; the error names the nearest one.

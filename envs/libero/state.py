@@ -1,11 +1,12 @@
-"""Layout of the state of the LIBERO world: 62 numbers, lengths in metres.
+"""Layout of the state of the LIBERO world: 83 numbers, lengths in metres.
 
 x grows away from the robot, y to its left, z up. Quaternions begin with their scalar. Every scene has seven
 objects and fixtures, in the order of their names. All tasks of libero_goal have the same, and so do those of
 libero_spatial; each task of libero_object has others. Joints of fixtures are 0 where a scene has none.
 
-Positions of things are from the hand: with places in the room, pretrained policies missed 28 % of the bottle's
-necks, all by 1.3 cm or more along x.
+Positions of things are from the hand, and once more at a finer scale. A policy with places in the room kept .81
+of the skills of LiberoGoal-v1 (90 validation episodes), with positions from the hand .88 and with the finer scale
+.95 (150 episodes each): it missed the neck of the bottle by 1.3 cm or more.
 """
 
 from __future__ import annotations
@@ -16,12 +17,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 State: TypeAlias = NDArray[np.float32]
-"""One state (62,), or many (N, 62)."""
+"""One state (83,), or many (N, 83)."""
 
 THINGS, PARTS = 7, 4
 """Number of objects and fixtures, and largest number of joints of fixtures: three drawers and a knob."""
 
-SIZE = 9 + 7 * THINGS + PARTS
+SIZE = 9 + 7 * THINGS + PARTS + 3 * THINGS
 HAND = slice(0, 3)
 """Position of the point between the finger tips."""
 HAND_QUATERNION = slice(3, 7)
@@ -29,8 +30,12 @@ FINGERS = slice(7, 9)
 """Positions of the fingers: (0.04, -0.04) open, (0, 0) closed."""
 PLACES = slice(9, 9 + 7 * THINGS)
 """Position from the hand, and quaternion, of each object and fixture: seven numbers each."""
-JOINTS = slice(9 + 7 * THINGS, SIZE)
+JOINTS = slice(9 + 7 * THINGS, 9 + 7 * THINGS + PARTS)
 """Positions of the joints of fixtures: drawers, then the knob of the stove."""
+CLOSE_BY = slice(JOINTS.stop, SIZE)
+"""Positions from the hand once more, cut at `REACH` along each axis: three numbers for each thing."""
+REACH = 0.05
+"""Metres. Policies scale each number by its spread, so that a position up to 5 cm away gets the finer scale."""
 
 
 def thing(number: int) -> slice:

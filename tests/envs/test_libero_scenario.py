@@ -21,8 +21,8 @@ Place = tuple[float, float, float]
 
 
 def scene(opening: float = 0.045, hand: Place = (0.0, 0.0, 1.1), **things: Place) -> State:
-    """Return a state (1, 62) made by hand; other things are where the hand is, 0.16 m below it."""
-    state = np.zeros((1, 62), np.float32)
+    """Return a state (1, 83) made by hand; other things are where the hand is, 0.16 m below it."""
+    state = np.zeros((1, 83), np.float32)
     state[0, 0:3], state[0, 7:9] = hand, (opening / 2, -opening / 2)
     for number, name in enumerate(THINGS):
         first = 9 + 7 * number
