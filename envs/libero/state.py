@@ -4,9 +4,9 @@ x grows away from the robot, y to its left, z up. Quaternions begin with their s
 objects and fixtures, in the order of their names. All tasks of libero_goal have the same, and so do those of
 libero_spatial; each task of libero_object has others. Joints of fixtures are 0 where a scene has none.
 
-Positions of things are from the hand, and once more at a finer scale. A policy with places in the room kept .81
-of the skills of LiberoGoal-v1 (90 validation episodes), with positions from the hand .88 and with the finer scale
-.95 (150 episodes each): it missed the neck of the bottle by 1.3 cm or more.
+Positions of things are from the hand, and once more at a finer scale. A policy kept .81 of LiberoGoal-v1's
+skills with places in the room, .88 with positions from the hand, and .95 with the finer scale as well (90
+to 150 validation episodes): it had missed the neck of the bottle by 1.3 cm or more.
 """
 
 from __future__ import annotations
@@ -35,9 +35,9 @@ JOINTS = slice(9 + 7 * THINGS, 9 + 7 * THINGS + PARTS)
 CLOSE_BY = slice(JOINTS.stop, SIZE)
 """Positions from the hand once more, cut at `REACH` along each axis: three numbers for each thing."""
 REACH = 0.05
-"""Metres. Policies scale each number by its spread, so that a position up to 5 cm away gets the finer scale."""
+"""Metres. A policy scales each number by its spread, which is smaller for numbers that are cut."""
 
 
 def thing(number: int) -> slice:
-    """Return where the position (3,) from the hand and the quaternion (4,) of thing `number` are, from 0 on."""
+    """Return where thing `number`, from 0 on, has its position (3,) from the hand and its quaternion (4,)."""
     return slice(9 + 7 * number, 16 + 7 * number)
