@@ -10,7 +10,7 @@ import numpy as np
 from .arm import JOINTS as ARM_JOINTS
 from .arm import SUBSTEPS, Arm
 from .problem import Problem
-from .state import FINGERS, HAND, HAND_QUATERNION, JOINTS, PLACES, SIZE, State
+from .state import CLOSE_BY, FINGERS, HAND, HAND_QUATERNION, JOINTS, PLACES, REACH, SIZE, State
 
 FINGER_JOINTS = slice(ARM_JOINTS, ARM_JOINTS + 2)
 DISPLACED = [0, 1, 3]
@@ -40,7 +40,7 @@ class Episode:
     def begin(
         self, problem: Problem, seed: int, displaced: tuple[float, float, float] | None = None
     ) -> State:
-        """Begin an episode, and return its first state (62,).
+        """Begin an episode, and return its first state (83,).
 
         Args:
             problem: Problem in the same scene.
@@ -85,11 +85,13 @@ class Episode:
         models.give_back(model)
 
     def state(self) -> State:
-        """Return the state (62,)."""
+        """Return the state (83,)."""
         state, data, problem = np.zeros(SIZE, np.float32), self.data, self.problem
         state[HAND], state[HAND_QUATERNION], state[FINGERS] = self._hand
-        places = np.concatenate((data.xpos[problem.things], data.xquat[problem.things]), axis=1).ravel()
+        positions, turns = data.xpos[problem.things] - self._hand[0], data.xquat[problem.things]
+        places = np.concatenate((positions, turns), axis=1).ravel()
         state[PLACES][: places.size] = places
+        state[CLOSE_BY][: positions.size] = np.clip(positions, -REACH, REACH).ravel()
         state[JOINTS][: problem.parts.size] = data.qpos[problem.parts]
         return state
 

@@ -52,7 +52,7 @@ SIDEWAYS = _turned(-1.2)
 
 
 class Sight:
-    """What an expert sees in a state (62,)."""
+    """What an expert sees in a state (83,)."""
 
     def __init__(self, state: State) -> None:
         self._state = state.astype(np.float64)
@@ -64,7 +64,7 @@ class Sight:
 
     def place(self, number: int) -> Vector:
         """Return the position (3,) of a thing."""
-        place: Vector = self._state[thing(number)][:3]
+        place: Vector = self.hand + self._state[thing(number)][:3]
         return place
 
     def point(self, number: int, offset: Vector) -> Vector:
@@ -149,6 +149,10 @@ class Grip:
         """Return whether the fingers are as close to each other as the thing allows."""
         return sight.opening < self.width + 0.006
 
+    def is_missed(self, sight: Sight) -> bool:
+        """Return whether the fingers are closer to each other: the thing is not between them."""
+        return sight.opening < self.width - 0.006
+
 
 BOWL, CHEESE, STOVE, PLATE, BOTTLE, RACK, CABINET = range(7)
 """Numbers of the things in libero_goal."""
@@ -167,9 +171,10 @@ def _grasp(sight: Sight, grip: Grip) -> Action | None:
     axes = _turned(0.0, grip.yaw)
     way = grip.place(sight) - sight.hand
     aside, height = math.hypot(way[0], way[1]), abs(way[2])
-    if grip.is_closed(sight) and aside < HELD and height < HELD:
+    is_missed = grip.is_missed(sight)
+    if grip.is_closed(sight) and not is_missed and aside < HELD and height < HELD:
         return None
-    if aside < NEAR and height < NEAR:
+    if aside < NEAR and height < NEAR and not is_missed:
         return _move(sight, way, CLOSE, axes)
     is_ready = sight.opening > min(grip.width + 0.02, 0.07) and np.linalg.norm(_turn(sight, axes)) < 0.3
     if not is_ready and aside < 0.06 and -way[2] < 0.04:
@@ -190,7 +195,7 @@ def _put(
     """Return the action that puts a thing on another one.
 
     Args:
-        state: The state (62,).
+        state: The state (83,).
         grip: Grasp of the thing.
         support: Number of the other thing.
         offset: Goal of the thing, from the other one's own axes.
@@ -361,7 +366,7 @@ _EXPERTS: dict[str, Callable[[State], Action]] = {
 
 
 def expert(task: str) -> Callable[[State], Action]:
-    """Return the expert of the task, which maps a state (62,) to an action (7,).
+    """Return the expert of the task, which maps a state (83,) to an action (7,).
 
     Raises:
         UnknownNameError: No expert has this name; the error names the nearest one.

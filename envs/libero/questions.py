@@ -23,20 +23,20 @@ BOWL, CHEESE, _, PLATE, BOTTLE, _, _ = (
 )
 
 
-def _between(first: slice, second: slice, axis: int) -> Callable[[State], Answers]:
-    """Return a rule that answers whether the first thing is further along an axis than the second."""
-    return lambda states: sign(states[:, first][:, axis] - states[:, second][:, axis], MARGIN)
+def _beyond_hand(place: slice, axis: int) -> Callable[[State], Answers]:
+    """Return a rule that answers whether a thing is further along an axis than the hand."""
+    return lambda states: sign(states[:, place][:, axis], MARGIN)
 
 
-def _distance(states: State, first: slice, second: slice) -> Numbers:
-    """Return the distances (N,) between two things."""
-    distance: Numbers = np.linalg.norm(states[:, first] - states[:, second], axis=1)
+def _distance(states: State, place: slice) -> Numbers:
+    """Return the distances (N,) of a thing from the hand."""
+    distance: Numbers = np.linalg.norm(states[:, place], axis=1)
     return distance
 
 
 def _nearer(first: slice, second: slice) -> Callable[[State], Answers]:
     """Return a rule that answers which of two things is nearer to the hand."""
-    return lambda states: sign(_distance(states, second, HAND) - _distance(states, first, HAND), MARGIN)
+    return lambda states: sign(_distance(states, second) - _distance(states, first), MARGIN)
 
 
 def _opening(states: State) -> Numbers:
@@ -54,7 +54,7 @@ def _place(container: slice) -> Callable[[State], Answers]:
     """Return a rule that answers whether a thing is in the air, or on the table."""
 
     def rule(states: State) -> Answers:
-        height = states[:, container][:, 2] - TABLE
+        height = states[:, HAND][:, 2] + states[:, container][:, 2] - TABLE
         return which(height > 0.03, height < 0.01)
 
     return rule
@@ -62,9 +62,7 @@ def _place(container: slice) -> Callable[[State], Answers]:
 
 def _near(container: slice) -> Callable[[State], Answers]:
     """Return a rule that answers whether the hand is near a thing, which it can then reach into or hold."""
-    return lambda states: which(
-        _distance(states, container, HAND) < 0.14, _distance(states, container, HAND) > 0.18
-    )
+    return lambda states: which(_distance(states, container) < 0.14, _distance(states, container) > 0.18)
 
 
 def _gripper_height(states: State) -> Answers:
@@ -83,7 +81,7 @@ def _side(name: str, place: slice) -> QuestionKind:
     return _kind(
         f"{name}_side",
         ("left", "right"),
-        _between(place, HAND, 1),
+        _beyond_hand(place, 1),
         f"is the {name} left or right of the gripper",
         f"on which side of the gripper is the {name}",
         f"seen from the gripper is the {name} left or right",
@@ -95,7 +93,7 @@ def _depth(name: str, place: slice) -> QuestionKind:
     return _kind(
         f"{name}_depth",
         ("farther", "nearer"),
-        _between(place, HAND, 0),
+        _beyond_hand(place, 0),
         f"is the {name} nearer or farther than the gripper",
         f"is the {name} nearer to the robot or farther than the gripper",
         f"seen from the robot is the {name} nearer or farther",

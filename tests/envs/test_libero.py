@@ -222,6 +222,8 @@ def test_the_experts_do_all_ten_goals() -> None:
     states = lanes.reset(going, [seed % 2 + 100 for seed in going], tasks)
     for step in range(max(task.horizon for task in tasks)):
         going = [lane for lane in going if lane not in done and step < tasks[lane].horizon]
+        if not going:
+            break
         actions = np.stack([experts[lane](states[lane]) for lane in going])
         states[going], _, successes = lanes.step(going, actions)
         done += [lane for lane, success in zip(going, successes, strict=True) if success]

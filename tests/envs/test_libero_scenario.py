@@ -21,12 +21,13 @@ Place = tuple[float, float, float]
 
 
 def scene(opening: float = 0.045, hand: Place = (0.0, 0.0, 1.1), **things: Place) -> State:
-    """Return a state (1, 62) made by hand; other things are where the hand is, 0.16 m below it."""
-    state = np.zeros((1, 62), np.float32)
+    """Return a state (1, 83) made by hand; other things are where the hand is, 0.16 m below it."""
+    state = np.zeros((1, 83), np.float32)
     state[0, 0:3], state[0, 7:9] = hand, (opening / 2, -opening / 2)
     for number, name in enumerate(THINGS):
         first = 9 + 7 * number
-        state[0, first : first + 3] = things.get(name, np.subtract(hand, (0.0, 0.0, 0.16)))
+        place = things.get(name, np.subtract(hand, (0.0, 0.0, 0.16)))
+        state[0, first : first + 3] = np.subtract(place, hand)
     return state
 
 
@@ -67,6 +68,14 @@ def test_every_task_has_an_expert_and_an_unknown_one_is_named() -> None:
         assert np.abs(action).max() <= 1.0
     with pytest.raises(UnknownNameError, match="Did you mean 'turn_on_the_stove'"):
         resolve(SCENARIO.tasks[0].expert)("turn_on_a_stove")
+
+
+@pytest.mark.parametrize(("opening", "fingers"), [(0.0, -1.0), (0.014, 1.0), (0.08, 1.0)])
+def test_an_expert_grasps_again_when_nothing_is_between_its_fingers(opening: float, fingers: float) -> None:
+    state = scene(opening, hand=(0.0, 0.0, 1.1), bottle=(0.0, 0.0, 1.1 - 0.132))
+    action = resolve(SCENARIO.tasks[0].expert)("put_the_wine_bottle_on_the_rack")(state[0])
+    assert action[6] == fingers
+    assert (action[2] > 0.1) == (opening < 0.08)  # it lifts the bottle, or the open hand
 
 
 @pytest.mark.parametrize(
