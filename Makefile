@@ -50,12 +50,14 @@ ladder: .venv/installed-dev
 		$(BIN)/clbench run $$id $(METHODS) --set.step_factor $$factor --seeds 4 --records leaderboard/ladder || exit; \
 	done; done
 
-# What else docs/reference/claims.md needs: methods with one thing changed that tells what their effect is due to.
+# What else docs/reference/claims.md needs: references and rivals, and methods with one thing changed that tells what their
+# effect is due to.
 KNOWLEDGE := clbench/FetchKnowledge-v1
 CONTROLS := --seeds 4 --records leaderboard/controls
 controls: .venv/installed-dev
 	for id in $(BOARDS); do \
-		$(BIN)/clbench run $$id co_training --set.step_factor 1 $(CONTROLS) \
+		$(BIN)/clbench run $$id joint buffered_replay constant_weight shuffled_weights co_training --seeds 4 \
+		&& $(BIN)/clbench run $$id co_training --set.step_factor 1 $(CONTROLS) \
 		&& $(BIN)/clbench run $$id fast_dvla --set.direction random --set.step_factor 1 $(CONTROLS) \
 		&& $(BIN)/clbench run $$id fast_dvla --set.orthogonal 0 --set.step_factor 1 $(CONTROLS) || exit; \
 	done

@@ -202,7 +202,8 @@ def test_parts_import_neither_each_other_nor_the_front_door() -> None:
         for name in sorted(module.imports)
         if module.package in PARTS
         and (
-            name == "clbench" or any(_is_in(name, f"clbench.{part}") for part in PARTS if part != module.package)
+            name == "clbench"
+            or any(_is_in(name, f"clbench.{part}") for part in PARTS if part != module.package)
         )
     ]
     assert wrong == []
