@@ -15,13 +15,13 @@ leaderboard:
 		&& seconds=$$(($$(date +%s) - start)) \
 		&& echo "This table took $$((seconds / 60)) min $$((seconds % 60)) s, installing included."
 
-# Scenarios whose stages end when the target is learned: their methods are tuned, and judge the claims.
+# Scenarios at equal learning: methods are tuned on them, and most claims are judged on them.
 BOARDS := clbench/Fetch-v1 clbench/MetaWorld-v1
 
 METHODS := aegis consft consft_calibrated experience_replay fast_dvla finch l2_sp lora sft stop_gradient
 
 # The settings of every method, from validation episodes of seeds that no board has. Run it before `make records`.
-tuning: .venv/installed
+tuning: .venv/installed-dev
 	for id in $(BOARDS); do $(BIN)/clbench tune $$id $(METHODS) --write methods/tuned/$${id#clbench/}.json || exit; done
 
 # Scenarios whose stages have a fixed number of steps: plain fine-tuning, replay and the references.
@@ -29,7 +29,7 @@ FIXED := clbench/DMControl-v0,clbench/FetchPixels-v0,clbench/PointMaze-v0
 
 # The committed boards. Runs that have a record are skipped: a stopped command goes on. Seeds in fours are whole Latin
 # squares of orders.
-records: .venv/installed
+records: .venv/installed-dev
 	$(BIN)/clbench run clbench/Fetch-v1 sft consft consft_calibrated --seeds 8 --perturb
 	$(BIN)/clbench run clbench/Fetch-v1 frozen $(METHODS) --seeds 8
 	$(BIN)/clbench run clbench/MetaWorld-v1 frozen $(METHODS) --seeds 4
@@ -38,20 +38,26 @@ records: .venv/installed
 		--policy discrete_diffusion
 	$(BIN)/clbench run $(FIXED),clbench/MetaWorldCW-v0 sft frozen joint from_scratch --seeds 3
 	$(BIN)/clbench run $(FIXED) experience_replay --seeds 3
+	for order in 1 2; do $(BIN)/clbench run clbench/PointMaze-v0 sft --seeds 3 --order $$order || exit; done
+	for id in clbench/DMControl-v0 clbench/PointMaze-v0; do \
+		$(BIN)/python docs/guide/online_sac.py $$id --seeds 1 || exit; \
+	done
 	$(BIN)/clbench leaderboard
 
 # The frontier: what a smaller step size does, for plain fine-tuning and for the methods that compete with it.
-ladder: .venv/installed
+ladder: .venv/installed-dev
 	for id in $(BOARDS); do for factor in 1 0.3 0.1 0.03; do \
 		$(BIN)/clbench run $$id $(METHODS) --set.step_factor $$factor --seeds 4 --records leaderboard/ladder || exit; \
 	done; done
 
-# What else docs/reference/claims.md needs: methods with one thing changed that tells what their effect is due to.
+# What else docs/reference/claims.md needs: references and rivals, and methods with one thing changed that tells what their
+# effect is due to.
 KNOWLEDGE := clbench/FetchKnowledge-v1
 CONTROLS := --seeds 4 --records leaderboard/controls
-controls: .venv/installed
+controls: .venv/installed-dev
 	for id in $(BOARDS); do \
-		$(BIN)/clbench run $$id co_training --set.step_factor 1 $(CONTROLS) \
+		$(BIN)/clbench run $$id joint buffered_replay constant_weight shuffled_weights co_training --seeds 4 \
+		&& $(BIN)/clbench run $$id co_training --set.step_factor 1 $(CONTROLS) \
 		&& $(BIN)/clbench run $$id fast_dvla --set.direction random --set.step_factor 1 $(CONTROLS) \
 		&& $(BIN)/clbench run $$id fast_dvla --set.orthogonal 0 --set.step_factor 1 $(CONTROLS) || exit; \
 	done
@@ -59,15 +65,17 @@ controls: .venv/installed
 	$(BIN)/clbench run $(KNOWLEDGE) lora --set.rank 4 $(CONTROLS)
 	$(BIN)/clbench run $(KNOWLEDGE) lora --set.rank 64 $(CONTROLS)
 
-# The pages of docs/reference that come from the records; experts are measured once, and the film is made once.
+# The pages of docs/reference, from the code, the records and leaderboard/decoding.json; experts are measured once, and the
+# film is made once.
 FILM := docs/reference/scenarios/Fetch-v1/film.gif
-docs: .venv/installed $(FILM)
+docs: .venv/installed-dev $(FILM)
 	$(BIN)/clbench claims
 	$(BIN)/clbench findings
 	$(BIN)/clbench method-pages
+	$(BIN)/clbench metrics --markdown docs/reference/metrics.md
 	$(BIN)/clbench scenario-card
 
-$(FILM): | .venv/installed
+$(FILM): | .venv/installed-dev
 	$(BIN)/clbench film $(SCENARIO) sft experience_replay --tasks pick_and_place --size 180 --output $@
 
 # docs/ as a site, the reference of the Python names and the interactive leaderboard included: build/site/index.html.
@@ -90,7 +98,7 @@ benchmark: .venv/installed-dev
 test: .venv/installed-dev
 	$(BIN)/pytest
 
-# What takes minutes: more of the same random input, a Ray cluster, and all that a stranger types from nothing to a row.
+# What takes minutes: random input for longer, a Ray cluster, and all that a stranger types from nothing to a row.
 test-slow: .venv/installed-dev
 	$(BIN)/pytest -m slow
 
@@ -108,8 +116,8 @@ check: .venv/installed-dev
 	$(BIN)/mypy
 	$(BIN)/pytest -m slow tests/leaderboard/test_records.py tests/evaluation/test_definition.py
 
-# What a wheel may do otherwise than the checkout, against a built one outside of it: its files, the parts that are
-# found by name, the commands; and all that strangers type. It has an environment of its own, which sees the packages of
+# Tests of the built wheel outside the checkout, where it could differ from the checkout: its files, the parts that are
+# found by name, the commands, and all that strangers type. It has an environment of its own, which sees the packages of
 # .venv but not the checkout: to install PyTorch a second time took 90 s.
 WALKS := tests/cli tests/test_readme.py tests/test_submission.py tests/test_your_scenario.py tests/runs/test_agents_guide.py
 WHEEL_TESTS := $(WALKS) tests/test_package.py \

@@ -11,7 +11,7 @@ DOCS = Path(__file__).parent
 REPOSITORY = "https://github.com/clbench/clbench/blob/main"
 
 project = "clbench"
-author = "the clbench developers"
+author = "clbench developers"
 version = release = clbench.__version__
 language = "en"
 
@@ -24,7 +24,6 @@ extensions = [
     "sphinxcontrib.mermaid",  # the diagram in architecture.md
 ]
 external_toc_path = "_toc.yml"
-exclude_patterns = ["reference/methods/TEMPLATE.md"]
 
 myst_enable_extensions = ["dollarmath"]
 myst_fence_as_directive = ["mermaid"]

@@ -9,7 +9,7 @@ Details:
    anchor).
 3. The penalty is (strength / 2) sum_i F_i (theta_i - theta*_i)^2. Its gradient is added in closed form.
 4. If nothing is retained, no weight is important during the first target.
-5. `strength` was chosen on validation episodes of seed 100.
+5. `strength` was chosen on validation episodes of the first Fetch board (docs/history.md).
 """
 
 from dataclasses import dataclass

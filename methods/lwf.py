@@ -6,7 +6,7 @@ Details:
    Table 3) defines its baseline this way. The loss is computed on the target's data: no prior data are used.
 2. The copy is made at the start of each target, as in LwF's own sequences. In the ConSFT paper it is the
    pretrained model, which is the same thing for the first target.
-3. `strength` was chosen on validation episodes of seed 100.
+3. `strength` was chosen on validation episodes of the first Fetch board (docs/history.md).
 """
 
 from collections.abc import Iterable

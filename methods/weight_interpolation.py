@@ -6,7 +6,8 @@ theta = (1 - coefficient) theta_before + coefficient theta_after.
 Details:
 1. theta_before is the policy at the start of the target, so that the merge protects earlier targets as well
    as skills.
-2. One coefficient for all weights. It was chosen on validation episodes of seed 100.
+2. One coefficient for all weights. It was chosen on validation episodes of the first Fetch board
+   (docs/history.md).
 3. The method's policy exists only after the merge: it is evaluated there alone, and has no learning curve.
 """
 

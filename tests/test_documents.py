@@ -81,3 +81,22 @@ def test_every_guarantee_names_tests_that_exist() -> None:
         named = re.findall(r"`(tests/[^`]+)`", tests)
         assert named, promise
         assert [place for place in named if not (ROOT / place).exists()] == []
+
+
+def test_the_page_on_pypi_has_absolute_links_alone() -> None:
+    hook = tomllib.loads(_text("pyproject.toml"))["tool"]["hatch"]["metadata"]["hooks"]["fancy-pypi-readme"]
+    page = "".join(_text(fragment["path"]) for fragment in hook["fragments"])
+    files = list(_links(page))
+    for one in hook["substitutions"]:
+        page = re.sub(one["pattern"], one["replacement"], page)
+    assert list(_links(page)) == []
+    for file in files:
+        raw = file.endswith(".gif")
+        source = "raw.githubusercontent.com/clbench/clbench" if raw else "github.com/clbench/clbench/blob"
+        assert f"](https://{source}/v$HFPR_VERSION/{file})" in page
+
+
+def test_the_guide_of_runs_has_a_row_for_every_extra() -> None:
+    extras = tomllib.loads(_text("pyproject.toml"))["project"]["optional-dependencies"]
+    guide = _text("docs/guide/runs.md").partition("## Extras")[2]
+    assert sorted(re.findall(r"^\| `(\w+)` \|", guide, flags=re.MULTILINE)) == sorted(extras)

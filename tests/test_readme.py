@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from clbench.base.entry_points import resolve
 from clbench.records.reader import read_record
 from clbench.scoring.metrics import measure
 from clbench.scoring.scores import Scores
@@ -104,6 +105,11 @@ def test_the_pictures_of_the_guide_are_drawn(folder: Path) -> None:
     (code,) = _blocks("python", BOARD)
     assert "HeadOnly" in _python(code.replace("/Fetch-v1", "/Toy-v0"), folder)
     assert all((folder / name).stat().st_size for name in ("matrix.png", "curves.png", "plane.pdf"))
+
+
+def test_the_readme_states_the_number_of_claims() -> None:
+    claims = resolve("clbench.leaderboard.claims.judges:CLAIMS")
+    assert f"judge {len(claims)} statements of papers" in README.read_text(encoding="utf-8")
 
 
 def test_every_command_and_file_that_the_readme_names_exists() -> None:

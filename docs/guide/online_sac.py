@@ -1,6 +1,6 @@
 """Stable-Baselines3's SAC learns a scenario by trial and error, stage by stage, and leaves a record.
 
-    python docs/guide/online_sac.py clbench/Fetch-v1 --seeds 3
+    python docs/guide/online_sac.py clbench/PointMaze-v0 --seeds 1
 
 This is the simplest baseline: SAC with its default settings continues to train from task to task. Its replay
 buffer is emptied at each stage, so that only its weights remember. Word ids are names, not amounts, and go

@@ -105,7 +105,7 @@ FORGERIES = {
     "a column cut short": Forgery(
         "recomputed", "record: ", lambda values: values["episodes"]["success"].pop()
     ),
-    "more right answers than questions": Forgery(
+    "more correct answers than questions": Forgery(
         "recomputed", "record: ", lambda values: values["answers"]["correct"].__setitem__(-1, 51)
     ),
     "fewer questions than the budget asks": Forgery(
@@ -156,14 +156,14 @@ FORGERIES = {
     "higher returns": Forgery(
         "replayed", "episodes: ", lambda values: raise_all(values, "episodes", "return")
     ),
-    "a right answer at the end": Forgery(
+    "a correct answer at the end": Forgery(
         "replayed", "answers: different counts", lambda values: answer_more(values, 60)
     ),
     # ---- what only the whole run says
     "a success on the way": Forgery(
         "retrained", "whole run: repeated, episodes (success)", lambda values: flip(values, 0, 30)
     ),
-    "a right answer on the way": Forgery(
+    "a correct answer on the way": Forgery(
         "retrained", "whole run: repeated, answers (correct)", lambda values: answer_more(values, 30)
     ),
     "fewer changed weights": Forgery(
