@@ -61,7 +61,8 @@ def film(
         fps: Steps shown per second, at most 50; the speed of the simulated world if not given.
         checkpoints: Folder below which `clbench run` kept policies.
         device: Device on which the policies were computed, and are computed now.
-        changes: Hyper-parameters that differ from the defaults of the methods, as --set.name value.
+        changes: Hyper-parameters that differ from those tuned for the scenario or, without tuning, from the
+            method's defaults, as --set.name value.
     """
     check_names([scenario], methods)
     from clbench.jobs.bars import Bars

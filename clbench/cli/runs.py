@@ -27,6 +27,7 @@ from clbench.cli.arguments import (
 )
 from clbench.records.paths import RECORDS, record_path
 from clbench.spec.policies import DEFAULT_POLICY, SMALL, policy_name
+from clbench.spec.protocol import DEFAULT_SEEDS
 
 if TYPE_CHECKING:
     from clbench.jobs.job import Workers
@@ -41,7 +42,7 @@ def run(
     /,
     *methods: MethodName,
     every: Annotated[bool, Parameter(name="--all", negative="")] = False,
-    seeds: Annotated[int, whole_number(1)] = 3,
+    seeds: Annotated[int, whole_number(1)] = DEFAULT_SEEDS,
     first_seed: Annotated[int, whole_number(0)] = 0,
     order: Annotated[int, whole_number(0)] = 0,
     policy: PolicyName = DEFAULT_POLICY,
@@ -70,9 +71,9 @@ def run(
         every: Run all installed methods.
         seeds: Number of seeds.
         first_seed: The first seed.
-        order: Order in which the targets are learned. 0 is the published order, which the rows of the
-            leaderboard use. Other numbers are permutations: from them the leaderboard reports how much scores
-            depend on the order.
+        order: Order of the targets, for scenarios with one published order: 0 is that order, other numbers
+            are permutations. From them the leaderboard reports how much scores depend on the order. Scenarios
+            whose seeds have orders of their own (Fetch-v1, MetaWorld-v1) take 0 alone.
         policy: flow, discrete_diffusion, or a class of your own as module:Class. Each has rows of its own.
         policy_size: small, base (5 million parameters) or large (40 million) for the built-in ones.
         perturb: Also evaluate the skills and each new target in perturbed worlds: other start poses, heavier
@@ -84,8 +85,9 @@ def run(
             one.
         records: Folder of the records.
         device: Device on which policies are computed, for example cpu or cuda.
-        changes: Hyper-parameters that differ from the defaults of the methods, as --set.name value. Such a
-            run has a record of its own, which the leaderboard does not show.
+        changes: Hyper-parameters that differ from those tuned for the scenario or, without tuning, from the
+            method's defaults, as --set.name value. Such a run has a record of its own, which the
+            leaderboard does not show.
         checkpoints: Keep the policies of all stages below this folder. Policies of runs that already have a
             record are made again.
         tensorboard: Log the runs for TensorBoard below this folder while they run.

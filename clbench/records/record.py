@@ -125,7 +125,8 @@ class RunInfo:
     settings: dict[str, Any]
     """All hyper-parameters by name."""
     changes: dict[str, Any]
-    """The hyper-parameters that differ from the method's defaults."""
+    """Hyper-parameters that differ from those tuned for the scenario or, without tuning, from the method's
+    defaults, by name."""
     uses: dict[str, Any]
     """The prior data that the method may touch; `online` is true for an agent of another program, and
     `external` for a policy that a server offered, of whose data nothing is known."""

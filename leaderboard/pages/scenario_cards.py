@@ -24,7 +24,7 @@ from clbench.scoring.layout import Array, average
 from clbench.scoring.rates import Rates
 from clbench.spec.budget import Budget
 from clbench.spec.identifiers import folder_name
-from clbench.spec.protocol import check_steps
+from clbench.spec.protocol import DEFAULT_SEEDS, check_steps
 from clbench.spec.scenario import Scenario
 
 from ..board.commands import run_command
@@ -53,8 +53,8 @@ COLUMNS = ("retention", "adaptation", RANKED_BY, "zero_shot", "question_retentio
 COMPARED = ("retention", "adaptation", RANKED_BY, "question_retention")
 """Metrics that tell methods apart; none needs a reference."""
 
-SEEDS = (3, 5, 10)
-"""Numbers of seeds; the first is the default of `clbench run` and `clbench submit`."""
+SEEDS = (DEFAULT_SEEDS, 2 * DEFAULT_SEEDS)
+"""Numbers of seeds for which a card says which differences show."""
 
 PRETRAINED = 0.90
 """Lowest success of the pretrained policy on the retained skills: it cannot forget what it does not know."""
