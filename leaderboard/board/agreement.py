@@ -21,8 +21,11 @@ class Agreement:
     """Kendall's tau between the orders of rows by two boards, with its 95 % interval."""
 
     tau: float
+    """Kendall's tau: 1 for equal orders, -1 for opposite ones."""
     low: float
+    """Lower end of the interval."""
     high: float
+    """Upper end of the interval."""
     seeds: int
     """Number of seeds in both boards together."""
     rows: int
