@@ -77,7 +77,7 @@ def plane(records: Path | str = RECORDS, scenario: str | None = None, *, dark: b
         dark: Whether to use the colours for a dark page.
 
     Raises:
-        FileNotFoundError: The folder does not exist.
+        NoRecordsError: The folder does not exist.
         InputError: No record makes a row.
         UnknownNameError: The scenario has no row.
     """

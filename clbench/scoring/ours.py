@@ -287,13 +287,13 @@ def _area(steps: tuple[int, ...], curves: Array, starts: Array) -> Array:
 
 
 @metric(
-    formula="right answers divided by questions, of all kinds together, at the end of stage K",
+    formula="correct answers divided by questions, of all kinds together, at the end of stage K",
     source="clbench",
-    units="share of right answers",
+    units="share of correct answers",
     missing="No question was asked after the last target.",
 )
 def question_retention(rates: Rates) -> Array:
-    """Share of the questions about the scene that are answered rightly after the last target."""
+    """Share of the questions about the scene that are answered correctly after the last target."""
     asked, correct = (rates.asked[..., -1, :].sum(axis=-1), rates.correct[..., -1, :].sum(axis=-1))
     return np.where(asked > 0, correct / np.maximum(asked, 1), np.nan)
 
