@@ -76,7 +76,7 @@ class Module:
         return self.top | self.inside
 
     @property
-    def room(self) -> str:
+    def package(self) -> str:
         """Package of the core, or part outside it, that holds the module; empty for the front door."""
         return (self.name + "..").split(".")[1]
 
@@ -161,20 +161,20 @@ def _cycle(graph: Mapping[str, Iterable[str]]) -> list[str]:
     return []
 
 
-def _floor(room: str) -> int:
-    return next(number for number, rooms in enumerate(FLOORS) if room in rooms)
+def _floor(package: str) -> int:
+    return next(number for number, packages in enumerate(FLOORS) if package in packages)
 
 
 def test_every_package_of_the_core_has_a_floor() -> None:
-    rooms = {path.parent.name for path in (ROOT / "clbench").glob("*/__init__.py")}
-    assert rooms == {room for floor in FLOORS for room in floor}
+    packages = {path.parent.name for path in (ROOT / "clbench").glob("*/__init__.py")}
+    assert packages == {package for floor in FLOORS for package in floor}
 
 
 def test_packages_of_the_core_import_only_what_is_below_them() -> None:
     wrong = []
     for module in _modules().values():
         for name in sorted(module.imports):
-            here, there = module.room, (name + "..").split(".")[1]
+            here, there = module.package, (name + "..").split(".")[1]
             if not _is_in(name, "clbench") or not here or here in (*PARTS, "__main__") or there in PARTS:
                 continue
             if not there:  # the public names come from every floor
@@ -190,7 +190,7 @@ def test_the_core_never_imports_its_parts() -> None:
         f"{module.name} imports {name}"
         for module in _modules().values()
         for name in sorted(module.imports)
-        if module.room not in PARTS and any(_is_in(name, f"clbench.{part}") for part in PARTS)
+        if module.package not in PARTS and any(_is_in(name, f"clbench.{part}") for part in PARTS)
     ]
     assert wrong == []
 
@@ -200,9 +200,10 @@ def test_parts_import_neither_each_other_nor_the_front_door() -> None:
         f"{module.name} imports {name}"
         for module in _modules().values()
         for name in sorted(module.imports)
-        if module.room in PARTS
+        if module.package in PARTS
         and (
-            name == "clbench" or any(_is_in(name, f"clbench.{part}") for part in PARTS if part != module.room)
+            name == "clbench"
+            or any(_is_in(name, f"clbench.{part}") for part in PARTS if part != module.package)
         )
     ]
     assert wrong == []

@@ -5,9 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from clbench.scoring.layout import Array
 
 REPLICATES = 2000
 """Bootstrap draws of seeds."""

@@ -7,11 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from clbench.scoring.layout import Array
 from clbench.scoring.metrics import measure
 from clbench.scoring.scores import Scores
 from clbench.spec.references import BASELINE
 
-from .agreement import REPLICATES, Array, kendall_tau
+from .agreement import REPLICATES, kendall_tau
 from .rows import Row
 from .summary import METHODS
 

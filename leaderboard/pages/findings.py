@@ -16,11 +16,12 @@ import numpy as np
 from clbench.base.text import counted
 from clbench.records.paths import parts_of
 from clbench.scoring.intervals import Estimate
+from clbench.scoring.layout import Array
 from clbench.scoring.metrics import measure
 from clbench.spec.policies import DEFAULT_POLICY
 from clbench.spec.references import BASELINE, FROZEN
 
-from ..board.agreement import Agreement, Array, agreement_between
+from ..board.agreement import Agreement, agreement_between
 from ..board.predictors import predictions
 from ..board.rows import Row, Table
 from ..board.summary import METHODS, RANKED_BY
