@@ -338,13 +338,13 @@ def activation_drift(rates: Rates) -> Array:
 
 @metric(
     formula="mean over the stages k of the mean of (v[k] - v[k-1])^2 over the valid actions of 256 samples "
-    "of target k's demonstrations; v[k] is the velocity, in normalised actions, that the policy predicts at "
-    "the end of stage k",
+    "of target k's demonstrations; v[k] is what the policy predicts in its loss at the end of stage k, in "
+    "normalised actions: a flow policy the velocity, a discrete-diffusion policy the action",
     source="the flow policy's analogue of the KL divergence on the new task, which predicts forgetting in "
     "RL's Razor, arXiv 2509.04259",
     high=math.inf,
     higher_is_better=None,
-    units="squared velocity",
+    units="squared prediction",
     missing="It was not measured at the end of a stage.",
 )
 def shift(rates: Rates) -> Array:

@@ -46,8 +46,11 @@ class EpisodeKey(NamedTuple):
     """The identity of an episode of a scenario, besides the seed of the run."""
 
     task: str
+    """Name of the task."""
     split: Split
+    """Split of the episode."""
     number: int
+    """Number of the initial state within its task and split, from 0."""
 
 
 def check_steps(last: int) -> tuple[int, ...]:
