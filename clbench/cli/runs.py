@@ -79,7 +79,7 @@ def run(
         perturb: Also evaluate the skills and each new target in perturbed worlds: other start poses, heavier
             or lighter objects and, in pictures, another camera and light. Such a record replaces a record
             without perturbed episodes, as it holds the same episodes and more.
-        workers: Number of runs at once, each a process with one thread; all cores if not given.
+        workers: Number of runs at once, each a process with one thread (default: all cores).
         shard: Do only part i of n of the runs, for example 2/8: for array jobs with one folder of records.
         ray: Do the runs on a Ray cluster: its address, auto for a cluster on this machine, or local to start
             one.
@@ -114,7 +114,7 @@ def run(
     if dry_run:
         _print_forecast(chosen, records, workers, checkpoints)
         return
-    went_well = run_missing(chosen, records, lambda: _workers(workers, ray), checkpoints, tensorboard, quiet)
+    went_well = do_runs(chosen, records, lambda: _workers(workers, ray), checkpoints, tensorboard, quiet)
     if not changes:  # the board shows no run with changed settings
         console.print(_next(records), highlight=False, markup=False, soft_wrap=True)
     if not went_well:
@@ -146,8 +146,8 @@ def score(
         stage: Stage after whose fine-tuning the policy is evaluated.
         method: Name of the row on the leaderboard, for example me/lora.
         seed: Seed of the run. It chooses the initial states, the same for all methods.
-        execute: Actions of each chunk that are executed before the policy acts again; all if not given. It is
-            the same in all stages.
+        execute: Actions of each chunk that are executed before the policy acts again (default: all). It
+            is the same in all stages.
         data: What the policy was trained on in this stage, in words. The record keeps it.
         steps: Optimiser steps of the stage. The record keeps them.
         timeout: Seconds that a reply may take; a first one may include compilation.
@@ -279,7 +279,7 @@ def _print_forecast(
     Console(soft_wrap=True).print("\n".join(lines), highlight=False, markup=False)
 
 
-def run_missing(
+def do_runs(
     runs: Sequence[ResolvedRun],
     records: Path,
     workers: Callable[[], Workers],

@@ -32,7 +32,7 @@ def records(tmp_path: Path, make_record: Callable[..., Record]) -> Path:
 def test_all_records_come_as_one_long_table(records: Path, caplog: pytest.LogCaptureFixture) -> None:
     with caplog.at_level(logging.WARNING):
         found = clbench.load_records(records)
-    assert "notes.json: is no record of schema" in caplog.text
+    assert "notes.json: is not a record of clbench" in caplog.text
     assert list(dict.fromkeys(found.method)) == ["lora+rank=4", "sft"]
     assert set(found.seed) == {0, 3}
     assert found.success.dtype == bool
