@@ -117,8 +117,8 @@ def frontier(records: Path | str = RECORDS, scenario: str | None = None, *, dark
     folder = ladder_of(Path(records))
     if not folder.is_dir():
         raise InputError(
-            f"There is no ladder at {folder}. `make ladder` runs it in a clone, or: clbench run SCENARIO METHODS "
-            f"--set.step_factor 0.3 --records {folder}"
+            f"There is no ladder at {folder}. `make ladder` runs it in a clone, or: clbench run SCENARIO "
+            f"METHODS --set.step_factor 0.3 --records {folder}"
         )
     found, _ = read_frontiers(folder)
     chosen = _chosen(scenario, {name: len(curves) for name, curves in found.items()}, "curve", folder)

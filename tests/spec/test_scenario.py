@@ -57,7 +57,5 @@ def test_a_wrong_name_of_a_task_is_told_the_nearest_task_also_of_the_background(
 
 
 def test_a_scenario_whose_seeds_have_their_own_orders_says_so_when_another_order_is_asked_for() -> None:
-    with pytest.raises(
-        InputError, match=r"has no order 1: each seed .* Leave out --order \(order= in Python\)"
-    ):
+    with pytest.raises(InputError, match=r"has no order 1: each seed .* Leave out --order \(order="):
         load_scenario("clbench/Fetch-v1").in_order(1)
