@@ -83,7 +83,7 @@ def adapt(
             warm_up if to_criterion else None,
         )
     except GradientError as error:
-        raise GradientError(f"{error}: {_not_finite(policy)}.") from error
+        raise GradientError(f"{str(error).rstrip('.')}: {_not_finite(policy)}.") from error
     method.end_task(policy, stage)
     for name, parameter in policy.named_parameters():
         if not torch.isfinite(parameter).all():

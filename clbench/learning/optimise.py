@@ -129,7 +129,7 @@ def _clip(trained: list[nn.Parameter], step: int) -> None:
     try:
         nn.utils.clip_grad_norm_(trained, GRADIENT_NORM, error_if_nonfinite=True)
     except RuntimeError as error:
-        raise GradientError(f"step {step}: a gradient is not finite") from error
+        raise GradientError(f"step {step}: a gradient is not finite.") from error
 
 
 def _check_loss(loss: Any, step: int) -> None:
