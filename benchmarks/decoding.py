@@ -28,8 +28,8 @@ from clbench.base.seeding import derive_seed, torch_generator
 from clbench.data.demonstrations import Demonstrations, load_demonstrations
 from clbench.evaluation.rollouts import Evaluator
 from clbench.learning.distillation import discrete_head, distilled
+from clbench.learning.optimise import deterministic
 from clbench.learning.pretraining import pretrained_policy
-from clbench.learning.trainer import repeatable
 from clbench.policy.batch import Batch
 from clbench.policy.decoding import (
     EASY_FIRST_STEPS,
@@ -108,7 +108,7 @@ def successes(entry: Entry, episodes: int, seed: int) -> list[bool]:
     each = -(-episodes // len(scenario.retained))
     budget = dataclasses.replace(scenario.budget, validation_episodes=each)
     evaluator = Evaluator(dataclasses.replace(scenario, budget=budget), seed)
-    with decoding(entry, entry.decode_many) as policy, repeatable("cpu"):
+    with decoding(entry, entry.decode_many) as policy, deterministic():
         outcomes = evaluator.evaluate(policy, scenario.retained, "validation")
     evaluator.close()
     return [one.success for one in outcomes]

@@ -14,7 +14,7 @@ from rich.console import Console
 from rich.text import Text
 
 from clbench.base.entry_points import unknown
-from clbench.base.errors import InputError
+from clbench.base.errors import InputError, UnknownNameError
 from clbench.base.text import counted
 from clbench.cli.arguments import (
     AsJson,
@@ -29,6 +29,8 @@ from clbench.cli.arguments import (
 )
 from clbench.jobs.folders import check_folders
 from clbench.records.paths import RECORDS, record_path
+from clbench.spec.identifiers import scenario_ids
+from clbench.spec.protocol import DEFAULT_SEEDS
 
 from .board.places import CONTROLS, SCENARIO
 
@@ -86,7 +88,7 @@ def show(
     if board is None:
         board = table = _computed(records)
     with checked_input():
-        shown = _chosen(board, scenario)
+        shown = _chosen(board, scenario, records)
     if as_json:
         print_json([dict(zip(column_names(), values_of(row), strict=True)) for row in shown.rows])
         return
@@ -107,7 +109,7 @@ def _computed(records: Path) -> Table:
         return read_table(records)
 
 
-def _chosen(board: Summary, scenario: str | None) -> Summary:
+def _chosen(board: Summary, scenario: str | None, records: Path) -> Summary:
     """Return the part of the board that is asked for.
 
     Raises:
@@ -116,6 +118,11 @@ def _chosen(board: Summary, scenario: str | None) -> Summary:
     if scenario is None:
         return board
     rows = tuple(row for row in board.rows if row.scenario == scenario)
+    if not rows and scenario in scenario_ids():
+        raise UnknownNameError(
+            f"No record in {records} makes a row of {scenario}: `clbench run {scenario} sft` makes some. "
+            f"Scenarios with rows: {', '.join(sorted(board.starts))}."
+        )
     if not rows:
         raise unknown("scenario with records", scenario, board.starts)
     return replace(board, rows=rows, not_shown=())
@@ -126,7 +133,7 @@ def submit(
     /,
     *,
     scenario: ScenarioId = SCENARIO,
-    seeds: Annotated[int, whole_number(1)] = 3,
+    seeds: Annotated[int, whole_number(1)] = DEFAULT_SEEDS,
     first_seed: Annotated[int, whole_number(0)] = 0,
     order: Annotated[int, whole_number(0)] = 0,
     workers: Annotated[int | None, whole_number(1)] = None,
@@ -146,7 +153,9 @@ def submit(
             first.
         seeds: Number of seeds.
         first_seed: The first seed.
-        order: Order in which the targets are learned, as for `clbench run`; rows use the published order, 0.
+        order: Order of the targets, for scenarios with one published order: 0 is that order, other numbers
+            are permutations. Rows are made of order 0. Scenarios whose seeds have orders of their own
+            (Fetch-v1, MetaWorld-v1) take 0 alone.
         workers: Number of runs at once, each a process with one thread (default: all cores).
         records: Folder of the records.
         device: Device on which policies are computed, for example cpu or cuda.

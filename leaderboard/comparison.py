@@ -12,6 +12,7 @@ from clbench.jobs.grid import name_of, run_specs
 from clbench.records.paths import RECORDS
 from clbench.runs.spec import RunSpec
 from clbench.spec.policies import DEFAULT_POLICY
+from clbench.spec.protocol import DEFAULT_SEEDS
 from clbench.spec.references import BASELINE
 
 from .board.rows import read_table
@@ -27,7 +28,7 @@ def compare(
     scenario: str,
     methods: str | type[Method] | Iterable[str | type[Method]],
     *,
-    seeds: int = 2,
+    seeds: int = DEFAULT_SEEDS,
     first_seed: int = 0,
     policy: str = DEFAULT_POLICY,
     records: Path | str = RECORDS,

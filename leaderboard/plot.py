@@ -77,7 +77,7 @@ def plane(records: Path | str = RECORDS, scenario: str | None = None, *, dark: b
         dark: Whether to use the colours for a dark page.
 
     Raises:
-        FileNotFoundError: The folder does not exist.
+        NoRecordsError: The folder does not exist.
         InputError: No record makes a row.
         UnknownNameError: The scenario has no row.
     """
@@ -115,6 +115,11 @@ def frontier(records: Path | str = RECORDS, scenario: str | None = None, *, dark
     from .views.page.charts.vega import FONT, heading
 
     folder = ladder_of(Path(records))
+    if not folder.is_dir():
+        raise InputError(
+            f"There is no ladder at {folder}. `make ladder` runs it in a clone, or: clbench run SCENARIO "
+            f"METHODS --set.step_factor 0.3 --records {folder}"
+        )
     found, _ = read_frontiers(folder)
     chosen = _chosen(scenario, {name: len(curves) for name, curves in found.items()}, "curve", folder)
     return themed({**chart(found[chosen], WIDE, FONT), "title": heading(chosen)}, dark)

@@ -113,7 +113,7 @@ def read_board(records: Path) -> Summary:
     """Return the board of a folder of records: the numbers that it keeps, if they still hold.
 
     Raises:
-        FileNotFoundError: The folder does not exist.
+        NoRecordsError: The folder does not exist.
     """
     from .board.rows import read_table
 

@@ -29,7 +29,7 @@ def load_board(records: Path | str = RECORDS) -> pandas.DataFrame:
         records: Folder of the records.
 
     Raises:
-        FileNotFoundError: The folder does not exist.
+        NoRecordsError: The folder does not exist.
     """
     from .publishing import read_board
 

@@ -1,28 +1,9 @@
-"""Checks of a method's hyper-parameters, and blank samples of a policy's shapes."""
+"""Checks of a method's hyper-parameters."""
 
 import math
+from collections.abc import Collection
 
-import torch
-
-from clbench.policy.batch import Batch
-from clbench.policy.policy import Policy
-from clbench.spec.language import TEXT_LENGTH
-
-
-def blank_batch(policy: Policy, count: int) -> Batch:
-    """Return `count` empty samples of the shapes that a policy reads."""
-    config = policy.config
-    chunks = (count, config.chunk, config.action_size)
-    blank = Batch(
-        state=torch.zeros(count, config.state_size),
-        words=torch.ones(count, TEXT_LENGTH, dtype=torch.int64),
-        action=torch.zeros(chunks),
-        valid=torch.ones(chunks[:2]),
-        draw=torch.full((count,), 0.5),
-        noise=torch.zeros(chunks),
-        image=torch.zeros(count, config.image_size, config.image_size, 3, dtype=torch.uint8),
-    )
-    return blank.to(policy.device)
+from clbench.base.text import did_you_mean
 
 
 def in_range(name: str, value: float, low: float, high: float = float("inf")) -> None:
@@ -34,3 +15,14 @@ def in_range(name: str, value: float, low: float, high: float = float("inf")) ->
     if not (low <= value <= high and math.isfinite(value)):
         allowed = f"from {low:g}" + (f" to {high:g}" if high < float("inf") else "")
         raise ValueError(f"{name} must be {allowed}, not {value}.")
+
+
+def one_of(name: str, value: str, allowed: Collection[str]) -> None:
+    """Refuse a hyper-parameter that is none of the allowed words.
+
+    Raises:
+        ValueError: `value` is none of them; the message names the nearest one.
+    """
+    if value not in allowed:
+        hint = did_you_mean(value, allowed)
+        raise ValueError(f"{name} must be one of {', '.join(allowed)}, not {value!r}.{hint}")

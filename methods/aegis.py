@@ -37,7 +37,7 @@ from clbench.policy.batch import Batch
 from clbench.policy.policy import Policy
 
 from ._projection import inner, project_out, random_like
-from ._requirements import in_range
+from ._requirements import in_range, one_of
 
 
 @dataclass
@@ -55,8 +55,7 @@ class Aegis(Method):
 
     def __post_init__(self) -> None:
         in_range("samples", self.samples, 1)
-        if self.direction not in ("anchor", "random"):
-            raise ValueError(f"direction must be anchor or random, not {self.direction!r}.")
+        one_of("direction", self.direction, ("anchor", "random"))
 
     @torch.no_grad()
     def prepare(self, policy: Policy, prior: Prior) -> None:

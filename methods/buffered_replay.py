@@ -21,7 +21,7 @@ from clbench.learning.prior import Prior, Source, Uses
 from clbench.policy.batch import Batch
 from clbench.policy.policy import Policy
 
-from ._requirements import blank_batch, in_range
+from ._requirements import in_range
 
 
 @dataclass
@@ -46,16 +46,16 @@ class BufferedReplay(Method):
 
     def prepare(self, policy: Policy, prior: Prior) -> None:
         """Fill the buffer from the retained skills, if there are any."""
-        known = len(prior.demonstrations)
-        self.buffer = self._kept(prior.demonstrations) if known else blank_batch(policy, 0)
+        known = len(prior.demonstrations) > 0
+        self.buffer: Batch | None = self._kept(prior.demonstrations) if known else None
 
     def batch(self, target: Source[Batch], prior: Prior) -> Batch:
         """Return one batch of target and buffered samples."""
-        if not len(self.buffer):
+        if self.buffer is None:
             return target.sample(target.batch_size)
         count = round(self.replay * target.batch_size)
         rows = torch.randint(len(self.buffer), (count,)).to(self.buffer.state.device)
-        replayed = Batch(**{name: value[rows] for name, value in vars(self.buffer).items()})
+        replayed = self.buffer[rows]
         replayed = dataclasses.replace(
             replayed, draw=torch.rand_like(replayed.draw), noise=torch.randn_like(replayed.noise)
         )
@@ -63,12 +63,14 @@ class BufferedReplay(Method):
 
     def end_task(self, policy: Policy, stage: Stage) -> None:
         """Add a share of the target's demonstrations to the buffer."""
-        self.buffer = Batch.cat([self.buffer, self._kept(stage.target)])
+        kept = self._kept(stage.target)
+        self.buffer = kept if self.buffer is None else Batch.cat([self.buffer, kept])
 
     def state(self) -> MethodState:
-        """Return the buffer."""
-        return {**vars(self.buffer)}
+        """Return the buffer, nothing while it is empty."""
+        return {} if self.buffer is None else {**vars(self.buffer)}
 
     def load_state(self, policy: Policy, state: MethodState) -> None:
         """Restore the buffer."""
-        self.buffer = Batch(**{name: value for name, value in state.items() if isinstance(value, Tensor)})
+        columns = {name: value for name, value in state.items() if isinstance(value, Tensor)}
+        self.buffer = Batch(**columns) if columns else None

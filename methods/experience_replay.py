@@ -16,6 +16,8 @@ from clbench.learning.method import Metadata, Method
 from clbench.learning.prior import Prior, Source, Uses
 from clbench.policy.batch import Batch
 
+from ._requirements import in_range
+
 
 @dataclass
 class ExperienceReplay(Method):
@@ -29,8 +31,7 @@ class ExperienceReplay(Method):
     tunes = ("replay", (0.75, 0.9))
 
     def __post_init__(self) -> None:
-        if not 0 <= self.replay <= 1:
-            raise ValueError(f"replay must be from 0 to 1, not {self.replay}.")
+        in_range("replay", self.replay, 0.0, 1.0)
 
     def batch(self, target: Source[Batch], prior: Prior) -> Batch:
         """Return one batch of target and prior samples."""

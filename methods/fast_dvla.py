@@ -41,7 +41,7 @@ from clbench.policy.policy import Policy
 
 from ._projection import random_like
 from ._questions import with_questions
-from ._requirements import in_range
+from ._requirements import in_range, one_of
 from ._weights import Weights, copy_of, packed, unpacked
 
 Drawn = list[tuple[Batch, QuestionBatch]]
@@ -74,8 +74,7 @@ class FastDVLA(Method):
             in_range(name, getattr(self, name), 0.0)
         in_range("steps", self.steps, 1)
         in_range("step_size", self.step_size, 1e-12)
-        if self.direction not in ("capability", "random"):
-            raise ValueError(f"direction must be capability or random, not {self.direction!r}.")
+        one_of("direction", self.direction, ("capability", "random"))
 
     def prepare(self, policy: Policy, prior: Prior) -> int:
         """Make the capability vector or read it from the cache, and merge it."""

@@ -15,11 +15,12 @@ from dataclasses import dataclass
 
 from torch import nn
 
+from clbench.base.errors import InputError
 from clbench.learning.method import Metadata, Method, MethodState, Progress, Stage
 from clbench.learning.prior import Prior
 from clbench.policy.policy import Policy
 
-from ._requirements import in_range
+from ._requirements import in_range, one_of
 
 VARIANTS = ("lora", "dora", "rslora")
 
@@ -44,8 +45,7 @@ class LoRA(Method):
         in_range("rank", self.rank, 1)
         in_range("alpha", self.alpha, 1e-9)
         in_range("speed", self.speed, 1e-9)
-        if self.variant not in VARIANTS:
-            raise ValueError(f"variant must be one of {', '.join(VARIANTS)}, not {self.variant!r}.")
+        one_of("variant", self.variant, VARIANTS)
 
     def prepare(self, policy: Policy, prior: Prior) -> None:
         """Add the adapters."""
@@ -60,9 +60,9 @@ class LoRA(Method):
             if isinstance(module, nn.Linear) and "layers" in name.split(".")
         ]
         if not linear:
-            raise TypeError(
-                f"lora adapts linear maps inside modules that are called `layers`: {type(policy).__name__} "
-                "has none."
+            raise InputError(
+                f"lora needs linear maps inside modules that are called `layers`; {type(policy).__name__} "
+                "has none. Rename one, or leave lora out."
             )
         config = LoraConfig(
             r=self.rank,

@@ -36,7 +36,7 @@ def require(module: str, extra: str, purpose: str) -> None:
         purpose: Purpose of the module, as the subject of a sentence in the message.
 
     Raises:
-        LookupError: The module is not installed; the message says how to get it.
+        MissingPackageError: The module is not installed; the message says how to get it.
     """
     if find_spec(module) is None:
         raise MissingPackageError(f"{purpose} needs the package {module}: pip install 'clbench[{extra}]'")
@@ -50,7 +50,7 @@ def require_packages(packages: Iterable[str], purpose: str) -> None:
         purpose: Purpose of the distributions, as the subject of a sentence in the message.
 
     Raises:
-        LookupError: A distribution is not installed; the message says how to get it.
+        MissingPackageError: A distribution is not installed; the message says how to get it.
     """
     for package in sorted(packages):
         if not is_installed(package):

@@ -25,7 +25,7 @@ def resolve(name: str) -> Any:
     """Return the object at the entry point `name`, "module:attribute".
 
     Raises:
-        LookupError: There is no such module, or it has no such attribute; the nearest one is named.
+        UnknownNameError: There is no such module, or it has no such attribute; the nearest one is named.
     """
     module, _, attribute = name.partition(":")
     found = import_module(module, name)

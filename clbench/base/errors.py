@@ -19,6 +19,10 @@ class UnknownNameError(ClbenchError, LookupError):
     """Nothing has this name; the message names the nearest one."""
 
 
+class NoRecordsError(ClbenchError, FileNotFoundError):
+    """There is no folder of records; the message says how to get one."""
+
+
 class MissingPackageError(ClbenchError, LookupError):
     """A package is not installed; the message says how to get it."""
 

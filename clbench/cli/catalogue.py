@@ -172,7 +172,7 @@ def doctor(*, as_json: AsJson = False) -> None:
             {
                 "clbench": __version__,
                 "ready": not faults,
-                "mend": faults,
+                "fix": faults,
                 "packages": {
                     one.requirement.name: {"found": one.found, "tested": str(one.requirement.specifier)}
                     for one in packages

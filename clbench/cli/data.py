@@ -42,7 +42,7 @@ def demonstrations(
 
     Args:
         scenario: Gymnasium id of the scenario.
-        workers: Number of tasks to collect at once; all cores if not given.
+        workers: Number of tasks to collect at once (default: all cores).
     """
     from clbench.data.demonstrations import dataset_folder, dataset_id, read_dataset
     from clbench.spec.registry import load_scenario
@@ -82,11 +82,11 @@ def export(
 
     Args:
         scenario: Gymnasium id of the scenario.
-        tasks: Names of tasks; the retained skills and the targets if not given.
+        tasks: Names of tasks (default: the retained skills and the targets).
         format: lerobot for one LeRobotDataset v3, with the instructions as its tasks, or hdf5 for a file
             TASK_demo.hdf5 for each task, in the layout of robomimic and LIBERO.
         output: New folder.
-        workers: Number of tasks to collect at once; all cores if not given.
+        workers: Number of tasks to collect at once (default: all cores).
     """
     from clbench.exchange.demonstrations import check_output, chosen_tasks, export_demonstrations
 
@@ -191,7 +191,7 @@ def measure(scenario: str, /, *tasks: str, episodes: Annotated[int, whole_number
 
     Args:
         scenario: Gymnasium id of the scenario.
-        tasks: Names of tasks; all tasks of the scenario if not given.
+        tasks: Names of tasks (default: all tasks of the scenario).
         episodes: Number of episodes of each task.
     """
     from clbench.data import expert_rates

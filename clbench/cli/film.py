@@ -52,16 +52,17 @@ def film(
         scenario: Gymnasium id of the scenario.
         methods: Names of installed methods, or module:Class.
         seed: Seed of the run.
-        tasks: Names of tasks, for example push,lift; all retained skills and targets if not given.
-        stages: Numbers of stages, for example 0,4; all for one method, 0 and the last for several if not
-            given. Stage 0 is before any target.
+        tasks: Names of tasks, for example press,lift (default: all retained skills and targets).
+        stages: Numbers of stages, for example 0,4; all for one method, 0 and the last for several by
+            default. Stage 0 is before any target.
         episode: Number of the validation episode; test episodes are not filmed.
-        output: A .gif or .mp4 file; a .gif below films/ if not given.
+        output: A .gif or .mp4 file (default: a .gif below films/).
         size: Width of each picture in pixels.
-        fps: Steps shown per second, at most 50; the speed of the simulated world if not given.
+        fps: Steps shown per second, at most 50 (default: the speed of the world).
         checkpoints: Folder below which `clbench run` kept policies.
         device: Device on which the policies were computed, and are computed now.
-        changes: Hyper-parameters that differ from the defaults of the methods, as --set.name value.
+        changes: Hyper-parameters that differ from those tuned for the scenario or, without tuning, from the
+            method's defaults, as --set.name value.
     """
     check_names([scenario], methods)
     from clbench.jobs.bars import Bars

@@ -27,6 +27,7 @@ from clbench.cli.arguments import (
 )
 from clbench.records.paths import RECORDS, record_path
 from clbench.spec.policies import DEFAULT_POLICY, SMALL, policy_name
+from clbench.spec.protocol import DEFAULT_SEEDS
 
 if TYPE_CHECKING:
     from clbench.jobs.job import Workers
@@ -41,7 +42,7 @@ def run(
     /,
     *methods: MethodName,
     every: Annotated[bool, Parameter(name="--all", negative="")] = False,
-    seeds: Annotated[int, whole_number(1)] = 3,
+    seeds: Annotated[int, whole_number(1)] = DEFAULT_SEEDS,
     first_seed: Annotated[int, whole_number(0)] = 0,
     order: Annotated[int, whole_number(0)] = 0,
     policy: PolicyName = DEFAULT_POLICY,
@@ -70,22 +71,23 @@ def run(
         every: Run all installed methods.
         seeds: Number of seeds.
         first_seed: The first seed.
-        order: Order in which the targets are learned. 0 is the published order, which the rows of the
-            leaderboard use. Other numbers are permutations: from them the leaderboard reports how much scores
-            depend on the order.
+        order: Order of the targets, for scenarios with one published order: 0 is that order, other numbers
+            are permutations. From them the leaderboard reports how much scores depend on the order. Scenarios
+            whose seeds have orders of their own (Fetch-v1, MetaWorld-v1) take 0 alone.
         policy: flow, discrete_diffusion, or a class of your own as module:Class. Each has rows of its own.
         policy_size: small, base (5 million parameters) or large (40 million) for the built-in ones.
         perturb: Also evaluate the skills and each new target in perturbed worlds: other start poses, heavier
             or lighter objects and, in pictures, another camera and light. Such a record replaces a record
             without perturbed episodes, as it holds the same episodes and more.
-        workers: Number of runs at once, each a process with one thread; all cores if not given.
+        workers: Number of runs at once, each a process with one thread (default: all cores).
         shard: Do only part i of n of the runs, for example 2/8: for array jobs with one folder of records.
         ray: Do the runs on a Ray cluster: its address, auto for a cluster on this machine, or local to start
             one.
         records: Folder of the records.
         device: Device on which policies are computed, for example cpu or cuda.
-        changes: Hyper-parameters that differ from the defaults of the methods, as --set.name value. Such a
-            run has a record of its own, which the leaderboard does not show.
+        changes: Hyper-parameters that differ from those tuned for the scenario or, without tuning, from the
+            method's defaults, as --set.name value. Such a run has a record of its own, which the
+            leaderboard does not show.
         checkpoints: Keep the policies of all stages below this folder. Policies of runs that already have a
             record are made again.
         tensorboard: Log the runs for TensorBoard below this folder while they run.
@@ -112,7 +114,7 @@ def run(
     if dry_run:
         _print_forecast(chosen, records, workers, checkpoints)
         return
-    went_well = run_missing(chosen, records, lambda: _workers(workers, ray), checkpoints, tensorboard, quiet)
+    went_well = do_runs(chosen, records, lambda: _workers(workers, ray), checkpoints, tensorboard, quiet)
     if not changes:  # the board shows no run with changed settings
         console.print(_next(records), highlight=False, markup=False, soft_wrap=True)
     if not went_well:
@@ -144,8 +146,8 @@ def score(
         stage: Stage after whose fine-tuning the policy is evaluated.
         method: Name of the row on the leaderboard, for example me/lora.
         seed: Seed of the run. It chooses the initial states, the same for all methods.
-        execute: Actions of each chunk that are executed before the policy acts again; all if not given. It is
-            the same in all stages.
+        execute: Actions of each chunk that are executed before the policy acts again (default: all). It
+            is the same in all stages.
         data: What the policy was trained on in this stage, in words. The record keeps it.
         steps: Optimiser steps of the stage. The record keeps them.
         timeout: Seconds that a reply may take; a first one may include compilation.
@@ -277,7 +279,7 @@ def _print_forecast(
     Console(soft_wrap=True).print("\n".join(lines), highlight=False, markup=False)
 
 
-def run_missing(
+def do_runs(
     runs: Sequence[ResolvedRun],
     records: Path,
     workers: Callable[[], Workers],

@@ -29,6 +29,7 @@ from clbench.cli.runs import requested
 from clbench.records.paths import RECORDS
 from clbench.records.status import RunState, State, found_runs, run_state, seconds_left
 from clbench.spec.policies import DEFAULT_POLICY, SMALL, policy_name
+from clbench.spec.protocol import DEFAULT_SEEDS
 
 STATES: tuple[State, ...] = ("done", "running", "failed", "damaged", "to do")
 
@@ -38,7 +39,7 @@ def status(
     /,
     *methods: MethodName,
     every: Annotated[bool, Parameter(name="--all", negative="")] = False,
-    seeds: Annotated[int, whole_number(1)] = 3,
+    seeds: Annotated[int, whole_number(1)] = DEFAULT_SEEDS,
     first_seed: Annotated[int, whole_number(0)] = 0,
     order: Annotated[int, whole_number(0)] = 0,
     policy: PolicyName = DEFAULT_POLICY,
@@ -59,11 +60,12 @@ def status(
         every: All installed methods.
         seeds: Number of seeds.
         first_seed: The first seed.
-        order: Order in which the targets are learned.
+        order: Order of the targets, as for `clbench run`.
         policy: flow, discrete_diffusion, or a class of your own as module:Class.
         policy_size: small, base or large.
         records: Folder of the records.
-        changes: Hyper-parameters that differ from the defaults of the methods, as --set.name value.
+        changes: Hyper-parameters that differ from those tuned for the scenario or, without tuning, from the
+            method's defaults, as --set.name value.
         as_json: Print one JSON object for each run, and no table.
     """
     from clbench.scoring.scores import Scores

@@ -22,7 +22,7 @@ from clbench.cli.arguments import (
     checked_input,
     whole_number,
 )
-from clbench.cli.runs import run_missing
+from clbench.cli.runs import do_runs
 from clbench.jobs.folders import check_folders
 from clbench.records.paths import TUNING
 from clbench.spec.references import BASELINE
@@ -66,8 +66,8 @@ def tune(
         seeds: Number of tuning seeds.
         first_seed: The first of them; the boards report seeds from 0.
         values: Hyper-parameters and the values to try, as --values.tau_start 0.3,1,3
-        targets: Number of targets to learn, from the first, with --values; all if not given.
-        workers: Number of runs at once, each a process with one thread; all cores if not given.
+        targets: Number of targets to learn, from the first, with --values (default: all).
+        workers: Number of runs at once, each a process with one thread (default: all cores).
         device: Device on which policies are computed, for example cpu or cuda.
         records: Folder of the records.
         write: File that receives the chosen settings; those of other methods in it stay. For built-in methods
@@ -133,7 +133,7 @@ def _run(
             for name, settings in wanted.items()
         }
     every = [one for groups in runs.values() for group in groups for one in group]
-    if not run_missing(every, records, lambda: Processes(workers)):
+    if not do_runs(every, records, lambda: Processes(workers)):
         sys.exit(1)
     with checked_input():
         return {name: [_tried(group, records) for group in groups] for name, groups in runs.items()}

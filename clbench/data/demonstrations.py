@@ -21,6 +21,7 @@ from torch import Tensor
 from clbench.base.cache import cached, hash_of
 from clbench.base.dependencies import versions
 from clbench.base.entry_points import resolve
+from clbench.base.errors import InputError
 from clbench.base.leftovers import unfinished
 from clbench.base.progress import ProgressCallback, no_progress
 from clbench.base.seeding import derive_seed, numpy_generator
@@ -117,7 +118,7 @@ def collect(task: Task, budget: Budget, progress: ProgressCallback = no_progress
         progress: Called with the number of episodes kept since its last call.
 
     Raises:
-        RuntimeError: The expert fails more often than it succeeds.
+        InputError: The expert fails more often than it succeeds.
     """
     with contextlib.closing(_world(task)) as world:
         return _collect(world, task, budget, progress)
@@ -139,9 +140,9 @@ def _collect(world: World, task: Task, budget: Budget, progress: ProgressCallbac
             progress(1)
         if len(kept) == budget.demonstrations:
             return kept
-    raise RuntimeError(
+    raise InputError(
         f"The expert of {task.name!r} succeeded {len(kept)} times in {2 * budget.demonstrations} attempts; "
-        f"{budget.demonstrations} demonstrations are needed. Mend {task.expert} or the success rule."
+        f"{budget.demonstrations} demonstrations are needed. Fix {task.expert} or the success rule."
     )
 
 

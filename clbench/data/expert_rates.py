@@ -73,5 +73,5 @@ def complaint(task: Task, row: Measurement) -> str | None:
         return None
     return (
         f"The expert of {task.name!r} succeeds in {row.success:.0%} of its episodes: no demonstrations can "
-        f"be collected of it. Mend {task.expert} or the success rule; train it longer where it was trained."
+        f"be collected of it. Fix {task.expert} or the success rule; train it longer where it was trained."
     )

@@ -118,7 +118,7 @@ class Questions:
         text_length: Length of the questions in tokens.
 
     Raises:
-        ValueError: A kind has an answer that no state gives.
+        InputError: A kind has an answer that no state gives.
     """
 
     def __init__(

@@ -31,7 +31,8 @@ Watch = Callable[[Trial, NDArray[np.float32]], None]
 """Called with a trial and each action (A,) taken in it."""
 
 LANES = 40
-"""Number of episodes that step together where all are played."""
+"""Episodes that are stepped together, and rows of every forward pass. Another number may change the
+last bits of scores (docs/decisions/0005-forty-lanes.md)."""
 
 
 @dataclass(frozen=True)
@@ -113,6 +114,9 @@ class Evaluator:
             tasks: Tasks to evaluate.
             split: Split of the episodes. Base choices on "validation"; the others are only for scores.
             progress: Called with the number of episodes that have ended since its last call.
+
+        Raises:
+            LeakError: A hook asks for other episodes than validation episodes of tasks that it knows.
         """
         numbers = range(self.scenario.budget.episodes(split))
         return self.play(policy, [(task, split, number) for task in tasks for number in numbers], progress)
@@ -134,6 +138,9 @@ class Evaluator:
             watch: Called with every action. With these actions the plain world, reset with the seed of
                 `start_of`, repeats the episode unless it is perturbed.
             enough: Called with each outcome; once it returns True, only the episodes that have ended count.
+
+        Raises:
+            LeakError: A hook asks for other episodes than validation episodes of tasks that it knows.
         """
         check_episodes((task.name, split) for task, split, _ in trials)
         queue = list(reversed(trials))

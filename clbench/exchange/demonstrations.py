@@ -54,7 +54,8 @@ def export_demonstrations(
 
     Raises:
         InputError: The folder exists, the format is unknown, or a world does not give its steps per second.
-        LookupError: A name is unknown, or a package is not installed.
+        UnknownNameError: A name is unknown.
+        MissingPackageError: A package is not installed.
         RenderingError: The tasks have a camera, and no back end of this machine can draw.
     """
     loaded, chosen = chosen_tasks(scenario, tasks)
@@ -67,7 +68,7 @@ def chosen_tasks(scenario: Scenario | str, tasks: Iterable[str]) -> tuple[Scenar
     """Return a scenario, and those of its tasks that have some names.
 
     Raises:
-        LookupError: A name is unknown; the nearest one is named.
+        UnknownNameError: A name is unknown; the nearest one is named.
     """
     loaded = load_scenario(scenario) if isinstance(scenario, str) else scenario
     names = dict.fromkeys(tasks)
@@ -79,7 +80,8 @@ def check_output(output: Path | str, kind: str) -> Path:
 
     Raises:
         InputError: The folder exists.
-        LookupError: There is no such format, or a package that it needs is not installed.
+        UnknownNameError: There is no such format.
+        MissingPackageError: A package that it needs is not installed.
     """
     if kind not in get_args(Format):
         raise unknown("format", kind, get_args(Format))
@@ -136,7 +138,7 @@ def import_demonstrations(
     Raises:
         InputError: The file cannot be read or does not fit the task, the task has an expert or names other
             demonstrations, or the budget of the scenario has another number of them.
-        LookupError: There is no such scenario or task.
+        UnknownNameError: There is no such scenario or task.
     """
     from minari.storage.datasets_root_dir import get_dataset_path
 

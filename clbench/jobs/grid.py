@@ -25,6 +25,7 @@ from clbench.records.reader import read_record
 from clbench.runs.spec import ResolvedRun, RunSpec, check_device
 from clbench.spec.identifiers import check_known, installed_methods
 from clbench.spec.policies import DEFAULT_POLICY
+from clbench.spec.protocol import DEFAULT_SEEDS
 
 if TYPE_CHECKING:
     from clbench.jobs.plan import Plan
@@ -120,7 +121,7 @@ def run(
     scenario: str,
     method: str | type[Method],
     *,
-    seeds: int = 2,
+    seeds: int = DEFAULT_SEEDS,
     first_seed: int = 0,
     settings: Mapping[str, Any] | None = None,
     policy: str = DEFAULT_POLICY,

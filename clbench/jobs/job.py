@@ -58,6 +58,7 @@ class Event(NamedTuple):
     """A message from a worker."""
 
     job: Job
+    """Job that it is about."""
     kind: Literal["progress", "at", "done", "failed", "lost", "taken"]
     """All kinds but the first two end the job. A job is lost if its process ended without a result, and taken
     if another process took its work over."""

@@ -33,7 +33,7 @@ class _Noticed:
 
 @contextmanager
 def _explained() -> Iterator[None]:
-    """Let a job fail with the message of a wrong input: a task may have no expert that demonstrates it."""
+    """Let a job fail with the message of a wrong input: a task may have no expert, or one that fails."""
     try:
         yield
     except InputError as error:

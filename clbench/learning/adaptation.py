@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from clbench.learning.method import Method, Progress, Stage
-from clbench.learning.optimise import MethodError, optimise, warm_up
+from clbench.learning.optimise import GradientError, MethodError, optimise, warm_up
 from clbench.policy.policy import Policy
 from clbench.spec.budget import Budget
 
@@ -48,6 +48,7 @@ def adapt(
         after: Called after each step; the stage ends if it returns True.
 
     Raises:
+        GradientError: A gradient is not finite; the message names its parameter.
         MethodError: Optimisation fails, or leaves a parameter that is not finite.
     """
     parameters: list[Any] = list(method.start_task(policy, stage))
@@ -70,18 +71,33 @@ def adapt(
         return learning_rate
 
     learned = to_criterion and after(Step(0, None, None))
-    steps = optimise(
-        parameters,
-        budget.learning_rate,
-        0 if learned or (to_criterion and not parameters) else stage.steps,
-        loss_at,
-        lambda loss: method.gradients(policy, loss),
-        lambda done: after(Step(done, loss, learning_rate)),
-        rate,
-        warm_up if to_criterion else None,
-    )
+    try:
+        steps = optimise(
+            parameters,
+            budget.learning_rate,
+            0 if learned or (to_criterion and not parameters) else stage.steps,
+            loss_at,
+            lambda loss: method.gradients(policy, loss),
+            lambda done: after(Step(done, loss, learning_rate)),
+            rate,
+            warm_up if to_criterion else None,
+        )
+    except GradientError as error:
+        raise GradientError(f"{str(error).rstrip('.')}: {_not_finite(policy)}.") from error
     method.end_task(policy, stage)
     for name, parameter in policy.named_parameters():
         if not torch.isfinite(parameter).all():
             raise MethodError(f"The parameter {name} is not finite after {stage.task.name!r}.")
     return steps
+
+
+def _not_finite(policy: Policy) -> str:
+    """Return whose gradients are not finite: the first parameter, and the number of others."""
+    names = [
+        name
+        for name, parameter in policy.named_parameters()
+        if parameter.grad is not None and not torch.isfinite(parameter.grad).all()
+    ]
+    if not names:  # finite numbers whose squares overflow
+        return "its norm overflows"
+    return f"that of {names[0]}" + (f", and {len(names) - 1} more" if names[1:] else "")

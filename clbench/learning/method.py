@@ -16,7 +16,7 @@ from clbench.policy.policy import Policy
 from clbench.spec.task import Task
 
 MethodState = dict[str, Tensor | str | float | int | bool | None]
-
+"""State of a method: a flat dictionary of tensors and plain values, written as safetensors and JSON."""
 
 _TEXTS = {
     "authors": (r"(?=\S).{1,200}", "printable text of at most 200 characters"),
@@ -67,7 +67,7 @@ class Stage:
     seed: int
     """Seed for the method's own random draws in this stage."""
     steps: int
-    """Number of optimiser steps in the budget."""
+    """Most optimiser steps of the stage; it ends earlier if it has a criterion and meets it."""
     target: Source[Batch]
     """Demonstrations of the task."""
     prior: Prior
@@ -96,10 +96,12 @@ class Method:
     """
 
     step_factor: float = 1.0
-    """Factor of the scenario's learning rate: every method has the same ladder of these."""
+    """Factor of the scenario's learning rate. Tuning tries the same factors for every method."""
 
     uses: ClassVar[Uses] = Uses()
+    """Prior data that the method reads; it decides the division in which the row competes."""
     metadata: ClassVar[Metadata] = Metadata()
+    """Authors, link, licence and version, which the page of the board shows."""
     tunes: ClassVar[tuple[str, tuple[Any, Any]] | None] = None
     """Hyper-parameter that sets how strongly the method protects what is known, and two values that tuning
     tries besides the default. None: tuning tries further step sizes instead."""
@@ -119,37 +121,79 @@ class Method:
         the answer loss alone. `parameter.grad` holds the clipped gradient of the step just taken. Change
         nothing. Another object runs `prepare`: it gets what `state` returns after the last step. `uses` must
         declare prior demonstrations, and need not declare questions.
+
+        Args:
+            policy: Policy that is being pretrained.
+            progress: Progress of the pretraining.
         """
 
     def prepare(self, policy: Policy, prior: Prior) -> int | None:
         """Prepare for the sequence, once, before stage 1: anchors, vectors, adapters, frozen copies.
+
+        Args:
+            policy: Pretrained policy; changes stay.
+            prior: Data that `uses` declares, of the retained skills. It closes afterwards.
 
         Returns:
             The number of optimiser steps that it took, or that a cached result once took; None counts as 0.
         """
 
     def start_task(self, policy: Policy, stage: Stage) -> Iterable[nn.Parameter] | list[dict[str, Any]]:
-        """Return the parameters to train on this target, or optimiser groups of them."""
+        """Return the parameters to train on this target, or optimiser groups of them.
+
+        Args:
+            policy: Policy to train.
+            stage: The target and its data, open until the end of `end_task`.
+        """
         return policy.parameters()
 
     def batch(self, target: Source[Batch], prior: Prior) -> Any:
-        """Return the training data of this step; it is passed to `loss` unchanged."""
+        """Return the training data of this step; it is passed to `loss` unchanged.
+
+        Args:
+            target: Demonstrations of the target. A step may draw `target.batch_size` of them, not more.
+            prior: Data of earlier tasks that `uses` declares "throughout".
+
+        Raises:
+            MissingDataError: By `sample` of a source without data.
+        """
         return target.sample(target.batch_size)
 
     def loss(self, policy: Policy, batch: Any, progress: Progress) -> Tensor:
-        """Return the loss to minimise, a scalar."""
+        """Return the loss to minimise, a finite scalar with a gradient, shape ().
+
+        Args:
+            policy: Policy to train.
+            batch: What `batch` returned.
+            progress: Progress of the stage; `progress.step` is 0 in the first step.
+        """
         return policy.action_loss(batch).mean()
 
     def gradients(self, policy: Policy, loss: Tensor) -> None:
-        """Set the gradients of the trained parameters."""
+        """Set the gradients of the trained parameters; they are clipped afterwards, and must be finite.
+
+        Args:
+            policy: Policy to train.
+            loss: What `loss` returned.
+        """
         loss.backward()  # type: ignore[no-untyped-call]
 
     def learning_rate(self, scheduled: float, progress: Progress) -> float:
-        """Return the step size of an optimiser group; called for each group, after `loss` and `gradients`."""
+        """Return the step size of an optimiser group; called for each group, after `loss` and `gradients`.
+
+        Args:
+            scheduled: The scenario's learning rate, or the group's own, times `step_factor` and the schedule.
+            progress: Progress of the stage.
+        """
         return scheduled
 
     def end_task(self, policy: Policy, stage: Stage) -> None:
-        """Merge or consolidate after a target."""
+        """Merge or consolidate after a target.
+
+        Args:
+            policy: Policy after the last step of the stage; changes stay.
+            stage: The target and its data, as in `start_task`.
+        """
 
     def state(self) -> MethodState:
         """Return everything that later hooks need; the bytes of its tensors count as kept.
@@ -169,6 +213,9 @@ class Method:
         Args:
             policy: Plain policy. It may get its weights, and its device, only afterwards: use neither here.
             state: What `state` returned, with its tensors on the run's device.
+
+        Raises:
+            WrongTypeError: The method returns a state, but does not override this hook.
         """
         if state:
             raise WrongTypeError(f"{type(self).__name__} returns a state() but has no load_state().")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -21,6 +22,10 @@ BETAS = (0.9, 0.95)
 
 class MethodError(ClbenchError, RuntimeError):
     """A method did something after which the loop cannot continue."""
+
+
+class GradientError(MethodError):
+    """A gradient is not finite."""
 
 
 WARM_UP = 15
@@ -48,8 +53,11 @@ def learning_rate_factor(step: int, steps: int) -> float:
 
 
 @contextmanager
-def deterministic() -> Iterator[None]:
+def deterministic(device: str = "cpu") -> Iterator[None]:
     """Use one thread and deterministic kernels inside, so that a computation repeats itself bit for bit."""
+    if device != "cpu":
+        # without it cuBLAS may choose another kernel each time, and PyTorch refuses deterministic mode
+        os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")
     threads, algorithms = torch.get_num_threads(), torch.are_deterministic_algorithms_enabled()
     torch.set_num_threads(1)
     torch.use_deterministic_algorithms(True)
@@ -83,8 +91,9 @@ def optimise(
         schedule: Schedule of the step size; `learning_rate_factor` if None.
 
     Raises:
-        MethodError: The loss is not a finite scalar with a gradient, a gradient is not finite, or a step size
-            is not a finite float of at least 0.
+        GradientError: A gradient is not finite.
+        MethodError: The loss is not a finite scalar with a gradient, or a step size is not a finite float of
+            at least 0.
     """
     groups: list[Any] = list(parameters)
     if not groups:
@@ -120,7 +129,7 @@ def _clip(trained: list[nn.Parameter], step: int) -> None:
     try:
         nn.utils.clip_grad_norm_(trained, GRADIENT_NORM, error_if_nonfinite=True)
     except RuntimeError as error:
-        raise MethodError(f"step {step}: a gradient is not finite.") from error
+        raise GradientError(f"step {step}: a gradient is not finite.") from error
 
 
 def _check_loss(loss: Any, step: int) -> None:

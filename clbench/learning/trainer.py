@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import copy
 import dataclasses
-import os
-from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager
+from collections.abc import Callable
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +20,6 @@ from clbench.data.demonstrations import Demonstrations
 from clbench.data.training_data import TrainingData
 from clbench.learning.adaptation import Step, adapt
 from clbench.learning.method import Method, MethodState, Stage
-from clbench.learning.optimise import deterministic
 from clbench.learning.pretraining import pretrained_policy, pretraining_inputs
 from clbench.learning.prior import Access, Nothing, Prior, Source
 from clbench.learning.watching import read_state, watch, watches, write_state
@@ -227,13 +225,3 @@ def sources(scenario: Scenario, seed: int, *modules: str) -> dict[str, Any]:
         "tasks": [dataclasses.asdict(task) for task in scenario.tasks],
         "source": source_hash(*RUN_SOURCES, *modules, *suites),
     }
-
-
-@contextmanager
-def repeatable(device: str) -> Iterator[None]:
-    """Make computations on `device` repeat themselves bit for bit inside."""
-    if device != "cpu":
-        # without it cuBLAS may choose another kernel each time, and PyTorch refuses deterministic mode
-        os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")
-    with deterministic():
-        yield

@@ -70,7 +70,10 @@ def watch(
         again = pretrain(scenario, seed, progress, look)
         for name, value in pretrained.state_dict().items():
             if not torch.equal(value.cpu(), again.state_dict()[name]):
-                raise MethodError(f"watch_pretraining() changed the pretraining: {name} is another.")
+                raise MethodError(
+                    f"watch_pretraining() must change nothing, but {name} differs from the pretraining "
+                    "without it: draw no random number and write to no tensor in it."
+                )
         write_state(partial, method.state())
 
     return read_state(cached(cache_folder() / "watched" / hash_of(inputs), inputs, make))

@@ -28,9 +28,13 @@ class Cell(NamedTuple):
     """The place of one success rate."""
 
     method: str
+    """Name of the method, empty if the table has one method."""
     seed: str
+    """Seed as the table writes it, empty without seeds."""
     stage: int
+    """Number of targets learned so far."""
     task: str
+    """Name of the task."""
 
     def __str__(self) -> str:
         method = f"method {quoted(self.method)}, " if self.method else ""
@@ -43,8 +47,11 @@ class Groups:
     """The tasks of each group, as the user names them; None stands for the tasks in no other group."""
 
     retained: Names = ()
+    """Tasks that are known before the first target."""
     target: Names | None = None
+    """Tasks that are learned, in their order."""
     held_out: Names = ()
+    """Tasks that are never trained."""
 
 
 def from_matrix(

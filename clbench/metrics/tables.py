@@ -169,7 +169,7 @@ def _cells(row: dict[str, str], long: bool, where: str) -> list[tuple[Cell, str]
     method, seed, stage = (row.pop(key, "") for key in KEYS)
     if not stage.isascii() or not stage.isdigit():
         raise InputError(
-            f"{where}: stage {quoted(stage)} is none: expected a whole number, the targets learned so far."
+            f"{where}: stage must be a whole number, how many targets were learned, not {quoted(stage)}."
         )
     pairs = [(row["task"], row["success"])] if long else list(row.items())
     return [(Cell(method, seed, int(stage), task), text) for task, text in pairs]

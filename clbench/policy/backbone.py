@@ -117,7 +117,7 @@ class Backbone(nn.Module):
         """Map normalised states (B, S), words (B, L) and images to the hidden state (B, P, W) of every layer.
 
         Raises:
-            ValueError: There is no image (B, N, N, 3), uint8, of the size that the policy reads.
+            InputError: There is no image (B, N, N, 3), uint8, of the size that the policy reads.
         """
         batch = len(state)
         observation = [self.observation(state).view(batch, self.state_tokens, -1)]

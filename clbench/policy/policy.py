@@ -88,9 +88,13 @@ class Policy(nn.Module, ABC):
     """The action head, whose parameters belong to the policy; with the ability "hidden_states"."""
 
     state_mean: Tensor
+    """Mean of the states that `normalise_like` got, (S,), in the units of the world; 0 before."""
     state_std: Tensor
+    """Their standard deviation, (S,), at least 0.01; 1 before."""
     action_mean: Tensor
+    """Mean of the actions that `normalise_like` got, (A,), in the units of the world; 0 before."""
     action_std: Tensor
+    """Their standard deviation, (A,), at least 0.01; 1 before."""
 
     def __init__(self, config: PolicyConfig, seed: int = 0) -> None:
         super().__init__()

@@ -27,7 +27,7 @@ class Vision(nn.Module):
         width: Channels of a token.
 
     Raises:
-        ValueError: The image cannot be cut into patches.
+        InputError: The image cannot be cut into patches.
     """
 
     def __init__(self, image_size: int, width: int) -> None:
@@ -54,7 +54,7 @@ class Vision(nn.Module):
         """Map images (B, N, N, 3), uint8, to tokens (B, T, W).
 
         Raises:
-            ValueError: There is no image, or it has another size.
+            InputError: There is no image, or it has another size.
         """
         size = (self.image_size, self.image_size, 3)
         if image is None or tuple(image.shape[1:]) != size:

@@ -6,7 +6,7 @@ import logging
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from clbench.records.paths import RECORDS
+from clbench.records.paths import RECORDS, check_folder
 from clbench.records.reader import RecordError, read_record
 from clbench.records.tables import TYPES, frame, typed
 
@@ -29,12 +29,11 @@ def load_records(folder: Path | str = RECORDS) -> pandas.DataFrame:
         folder: Folder of records, at any depth.
 
     Raises:
-        FileNotFoundError: There is no such folder.
+        NoRecordsError: There is no such folder.
     """
     import pandas
 
-    if not Path(folder).is_dir():
-        raise FileNotFoundError(f"There is no folder of records at {folder}.")
+    check_folder(Path(folder))
     frames = []
     for path in sorted(Path(folder).rglob("*.json")):
         try:

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from clbench.base.errors import InputError
+from clbench.base.errors import InputError, NoRecordsError
 from clbench.spec.identifiers import check_label, check_scenario_id, folder_name
 from clbench.spec.policies import DEFAULT_POLICY, check_policy_name
 
@@ -16,6 +16,19 @@ RECORDS = Path("leaderboard/records")
 
 TUNING = Path("leaderboard/tuning")
 """Folder of the records of tuning runs, from the working directory."""
+
+
+def check_folder(folder: Path) -> None:
+    """Refuse a folder of records that does not exist.
+
+    Raises:
+        NoRecordsError: There is no such folder.
+    """
+    if not folder.is_dir():
+        raise NoRecordsError(
+            f"There is no folder of records at {folder}. `clbench run` makes records, and "
+            "`clbench leaderboard --published` copies the published ones."
+        )
 
 
 def label_of(method: str, changes: Mapping[str, Any]) -> str:

@@ -8,6 +8,7 @@ from typing import Any
 
 from clbench.base.errors import ClbenchError, InputError
 from clbench.base.strict_json import StrictJSONError, read_json
+from clbench.base.text import quoted
 from clbench.records.content import content_hash
 from clbench.records.fields import load_fields
 from clbench.records.history import to_present
@@ -57,7 +58,11 @@ def _record(values: Any) -> Record:
     """Return the record in `values`, which `json` read from its file."""
     schema = values.get("schema") if isinstance(values, dict) else None
     if type(schema) is not int or schema < 1:
-        raise RecordError(f"is no record of schema {SCHEMA}.")
+        found = "none" if schema is None else quoted(str(schema))
+        raise RecordError(
+            f"is not a record of clbench: expected an object whose `schema` is a whole number from 1 to "
+            f"{SCHEMA}, found {found}."
+        )
     if schema > SCHEMA:
         raise RecordError(f"is of schema {schema}, newer than {SCHEMA}: update clbench.")
     fields = {name: value for name, value in values.items() if name not in ("schema", "content")}

@@ -33,8 +33,9 @@ POLICY_COLUMNS = ("stage", "step", "update_sparsity", "activation_drift", "shift
 
 `update_sparsity` is the share of its parameters whose relative change from pretraining is below 1e-3.
 `activation_drift` is the squared 2-Wasserstein distance between its and the pretrained policy's hidden states
-on the questions, averaged over layers. `shift` is the mean squared change of the predicted velocity on 256
-samples of the stage's target since the beginning of the stage, in normalised actions. `captured` is the
+on the questions, averaged over layers. `shift` is the mean squared change of what `Policy.predict` returns (a
+flow policy: the velocity) on 256 samples of the stage's target since the beginning of the stage, in
+normalised actions. `captured` is the
 share of episodes in which the policy does the stage's target although it is told to do a retained skill. Only
 the ends of stages have the last two. Each may be None.
 """
@@ -49,14 +50,21 @@ class EpisodeRow(NamedTuple):
     """A row of `Record.episodes`: one evaluation episode at one point."""
 
     stage: int
+    """Stage, 0 before the first target."""
     step: int
+    """Optimiser steps done in the stage."""
     task: str
+    """Name of the task."""
     split: Split
+    """Split of the episode."""
     episode: int
+    """Number of the initial state within its task and split."""
     success: int
+    """1 if the success rule held before the horizon, else 0."""
     total_reward: float | None
     """Sum of the dense rewards, None if it is not finite."""
     length: int
+    """Steps until success or the horizon."""
 
     @property
     def point(self) -> Point:
@@ -68,30 +76,45 @@ class AnswerRow(NamedTuple):
     """A row of `Record.answers`: the answers to one kind of question at one point."""
 
     stage: int
+    """Stage, 0 before the first target."""
     step: int
+    """Optimiser steps done in the stage."""
     kind: str
+    """Kind of question."""
     asked: int
+    """Number of questions."""
     correct: int
+    """Number of correct answers."""
 
 
 class PolicyRow(NamedTuple):
     """A row of `Record.policy`: how far the policy has moved at one point."""
 
     stage: int
+    """Stage, 0 before the first target."""
     step: int
+    """Optimiser steps done in the stage."""
     update_sparsity: float | None
+    """Share of the parameters that hardly changed; see `POLICY_COLUMNS` for this and the others."""
     activation_drift: float | None
+    """Squared distance of the hidden states from where pretraining left them."""
     shift: float | None
+    """Mean squared change of the predictions since the beginning of the stage."""
     captured: float | None
+    """Share of episodes in which the policy does the target instead of the skill that it is told."""
 
 
 class CheckRow(NamedTuple):
     """A row of `Record.checks`: a check whether the target is learned."""
 
     stage: int
+    """Stage whose criterion was checked."""
     step: int
+    """Optimiser steps done in the stage."""
     episodes: int
+    """Validation episodes that had ended when the outcome was certain."""
     successes: int
+    """Successes among them."""
 
 
 @dataclass
@@ -125,7 +148,8 @@ class RunInfo:
     settings: dict[str, Any]
     """All hyper-parameters by name."""
     changes: dict[str, Any]
-    """The hyper-parameters that differ from the method's defaults."""
+    """Hyper-parameters that differ from those tuned for the scenario or, without tuning, from the method's
+    defaults, by name."""
     uses: dict[str, Any]
     """The prior data that the method may touch; `online` is true for an agent of another program, and
     `external` for a policy that a server offered, of whose data nothing is known."""

@@ -18,9 +18,9 @@ from clbench.base.cache import cache_folder, cached, hash_of, is_cached
 from clbench.base.progress import ProgressCallback, no_progress
 from clbench.evaluation.checks import Checker
 from clbench.learning.adaptation import Step
-from clbench.learning.optimise import MethodError
+from clbench.learning.optimise import MethodError, deterministic
 from clbench.learning.registry import method_packages
-from clbench.learning.trainer import STAGE_FILES, Trainer, load_stage, repeatable, sources
+from clbench.learning.trainer import STAGE_FILES, Trainer, load_stage, sources
 from clbench.policy.policy import Policy
 from clbench.spec.protocol import Point
 
@@ -120,7 +120,7 @@ def make_stages(run: ResolvedRun, progress: ProgressCallback = no_progress) -> P
             raise MethodError(message) from error
 
     checker = Checker(scenario, run.protocol, run.spec.seed)
-    with closing(checker), repeatable(run.spec.device):
+    with closing(checker), deterministic(run.spec.device):
         for number in range(len(scenario.target) + 1):
             folder, identity = root / f"stage-{number}", _identity(run, number)
             if is_cached(folder, identity):

@@ -21,9 +21,10 @@ from clbench.data.training_data import TrainingData
 from clbench.evaluation.checks import Checker
 from clbench.evaluation.examiner import Examiner
 from clbench.learning.adaptation import Step
+from clbench.learning.optimise import deterministic
 from clbench.learning.pretraining import pretrained_policy
 from clbench.learning.registry import describe_method, method_packages
-from clbench.learning.trainer import Trainer, repeatable, sources
+from clbench.learning.trainer import Trainer, sources
 from clbench.policy.checkpoint import CheckpointError
 from clbench.records.reader import read_record
 from clbench.records.record import Costs, Record
@@ -78,7 +79,7 @@ def execute(
     kept, log = (None if one is None else Path(one) for one in (checkpoints, tensorboard))
     lease = Lease(folder)
     with lease.held():
-        with repeatable(resolved.spec.device):
+        with deterministic(resolved.spec.device):
             under_way = _Run.start(resolved, folder, lease, progress, kept, log)
             record = under_way.go()
         lease.check()

@@ -11,8 +11,9 @@ from clbench.base.cache import cache_folder, cached, hash_of, hash_of_tensors, i
 from clbench.base.progress import ProgressCallback, no_progress
 from clbench.data.training_data import TrainingData
 from clbench.evaluation.examiner import Examiner
+from clbench.learning.optimise import deterministic
 from clbench.learning.pretraining import pretrained_policy
-from clbench.learning.trainer import repeatable, sources
+from clbench.learning.trainer import sources
 from clbench.policy.policy import Policy
 from clbench.records.record import Record
 from clbench.runs.length import point_length
@@ -61,7 +62,7 @@ def evaluate_pretrained(run: ResolvedRun, progress: ProgressCallback = no_progre
     Returns:
         Its success on the retained skills; None without any.
     """
-    with repeatable(run.spec.device):
+    with deterministic(run.spec.device):
         policy, _ = pretrained_policy(run.scenario, run.spec.seed)
         policy = policy.to(run.spec.device)
         data = TrainingData.open(run.scenario, policy.config)

@@ -15,7 +15,7 @@ from clbench.base.errors import InputError
 from clbench.scoring.intervals import MANY, Runs, needed_references, studentised_range_quantile
 from clbench.scoring.layout import Array
 from clbench.scoring.metric import Metric
-from clbench.scoring.metrics import load_metric, measure
+from clbench.scoring.metrics import METRICS, load_metric, measure
 from clbench.scoring.scores import rates_of
 
 UNKNOWN_DEVIATION = 0.15
@@ -92,7 +92,11 @@ def groups(
     """
     wanted = load_metric(metric)
     if wanted.higher_is_better is None:
-        raise InputError(f"{metric} says nothing of better or worse: no row is ordered by it.")
+        known = ", ".join(name for name, one in METRICS.items() if one.higher_is_better is not None)
+        raise InputError(
+            f"Rows cannot be ordered by {metric}, of which neither more nor less is better. Metrics that "
+            f"order rows: {known}."
+        )
     sign = 1.0 if wanted.higher_is_better else -1.0
     seeds = sorted({seed for runs in rows.values() for seed in runs})
     if len({run.layout for runs in rows.values() for run in runs.values()}) > 1:

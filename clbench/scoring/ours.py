@@ -287,13 +287,13 @@ def _area(steps: tuple[int, ...], curves: Array, starts: Array) -> Array:
 
 
 @metric(
-    formula="right answers divided by questions, of all kinds together, at the end of stage K",
+    formula="correct answers divided by questions, of all kinds together, at the end of stage K",
     source="clbench",
-    units="share of right answers",
+    units="share of correct answers",
     missing="No question was asked after the last target.",
 )
 def question_retention(rates: Rates) -> Array:
-    """Share of the questions about the scene that are answered rightly after the last target."""
+    """Share of the questions about the scene that are answered correctly after the last target."""
     asked, correct = (rates.asked[..., -1, :].sum(axis=-1), rates.correct[..., -1, :].sum(axis=-1))
     return np.where(asked > 0, correct / np.maximum(asked, 1), np.nan)
 
@@ -338,13 +338,13 @@ def activation_drift(rates: Rates) -> Array:
 
 @metric(
     formula="mean over the stages k of the mean of (v[k] - v[k-1])^2 over the valid actions of 256 samples "
-    "of target k's demonstrations; v[k] is the velocity, in normalised actions, that the policy predicts at "
-    "the end of stage k",
+    "of target k's demonstrations; v[k] is what the policy predicts in its loss at the end of stage k, in "
+    "normalised actions: a flow policy the velocity, a discrete-diffusion policy the action",
     source="the flow policy's analogue of the KL divergence on the new task, which predicts forgetting in "
     "RL's Razor, arXiv 2509.04259",
     high=math.inf,
     higher_is_better=None,
-    units="squared velocity",
+    units="squared prediction",
     missing="It was not measured at the end of a stage.",
 )
 def shift(rates: Rates) -> Array:

@@ -21,9 +21,9 @@ class Measured:
     asked: Array
     """Questions asked at the end of each stage, (..., stages + 1, kinds)."""
     correct: Array
-    """Questions answered rightly, (..., stages + 1, kinds)."""
+    """Questions answered correctly, (..., stages + 1, kinds)."""
     answer_curves: Array
-    """Share of all questions answered rightly at the points of each stage, (..., targets, points)."""
+    """Share of all questions answered correctly at the points of each stage, (..., targets, points)."""
     update_sparsity: Array
     """Share of the parameters that have hardly changed since pretraining, (..., targets, points)."""
     activation_drift: Array

@@ -260,7 +260,7 @@ def numbers(rows: Iterable[Row]) -> tuple[int, ...]:
 
 
 def read_answers(record: Record, protocol: Protocol) -> tuple[tuple[str, ...], Array]:
-    """Return the kinds of questions, and the counts of questions and of right answers.
+    """Return the kinds of questions, and the counts of questions and of correct answers.
 
     Returns:
         The kinds, sorted, and the counts, (2, stages + 1, points, kinds).

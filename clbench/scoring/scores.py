@@ -178,7 +178,7 @@ def _perturbed(rows: Sequence[Row], layout: Layout) -> Array:
 
 
 def _shares(asked: Array, correct: Array) -> Array:
-    """Return the share of right answers (...) of counts (..., kinds), NaN where a kind was not asked."""
+    """Return the share of correct answers (...) of counts (..., kinds), NaN where a kind was not asked."""
     complete = (asked > 0).all(axis=-1) & (asked.sum(axis=-1) > 0)
     return np.where(complete, correct.sum(axis=-1) / np.maximum(asked.sum(axis=-1), 1), np.nan)
 

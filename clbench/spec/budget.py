@@ -59,8 +59,8 @@ class Budget:
         check_share(self, "noisy_demonstrations")
         if self.curve_episodes > self.test_episodes:
             raise InputError(
-                f"curve_episodes are the first of the {self.test_episodes} test episodes: "
-                f"{self.curve_episodes} are too many."
+                f"Budget.curve_episodes must be from 0 to test_episodes ({self.test_episodes}), not "
+                f"{self.curve_episodes}."
             )
         if self.policy_width % HEADS:
             raise InputError(
@@ -68,7 +68,9 @@ class Budget:
                 f"{self.policy_width}."
             )
         if self.criterion is not None and not 0 < self.criterion <= 1:
-            raise InputError(f"criterion must be a success rate above 0, at most 1, not {self.criterion}.")
+            raise InputError(
+                f"Budget.criterion must be a success rate above 0, at most 1, not {self.criterion}."
+            )
 
     def episodes(self, split: Split) -> int:
         """Return the number of episodes per task in `split`."""

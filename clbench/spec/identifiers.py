@@ -80,7 +80,7 @@ def check_scenario_id(scenario: str) -> None:
     """Refuse a text that cannot be the id of a scenario.
 
     Raises:
-        ValueError: It does not have the form "namespace/Name-v0", or looks like another registered id.
+        InputError: It does not have the form "namespace/Name-v0", or looks like another registered id.
     """
     if len(scenario) > LONGEST or not _SCENARIO.fullmatch(scenario):
         raise InputError(
@@ -95,7 +95,7 @@ def check_method_name(method: str) -> None:
     """Refuse a text that cannot be the name of a method.
 
     Raises:
-        ValueError: It is neither a name, "package/name" nor "module:Class", or looks like a built-in.
+        InputError: It is neither a name, "package/name" nor "module:Class", or looks like a built-in.
     """
     if len(method) > LONGEST or not _METHOD.fullmatch(method):
         raise InputError(
@@ -107,14 +107,16 @@ def check_method_name(method: str) -> None:
     if package != method:
         _check_not_ours("method", method, package)
         if package == "clbench":
-            raise InputError(f"{quoted(method)} is no name of a method of clbench: these have one word.")
+            raise InputError(
+                f"Names of built-in methods have no package: write their name alone, not {quoted(method)}."
+            )
 
 
 def check_label(label: str) -> None:
     """Refuse a text that cannot be a method with its changed settings, such as "lora+rank=4".
 
     Raises:
-        ValueError: It has another form, is too long for the name of a folder, or its method is refused.
+        InputError: It has another form, is too long for the name of a folder, or its method is refused.
     """
     method, plus, changes = label.partition("+")
     check_method_name(method)
@@ -133,7 +135,7 @@ def check_plain(kind: str, name: str) -> None:
         name: Name to check.
 
     Raises:
-        ValueError: It has other characters, or too many.
+        InputError: It has other characters, or too many.
     """
     if len(name) > LONGEST or not _PLAIN.fullmatch(name):
         raise InputError(f"{quoted(name)} cannot be the name of a {kind}: letters, digits, _, - and . only.")
@@ -146,19 +148,27 @@ def folder_name(name: str) -> str:
 
 def _check_reserved(name: str) -> None:
     if re.split("[.:]", name)[0].casefold() in _RESERVED:
-        raise InputError(f"{quoted(name)} is the name of a device on Windows.")
+        raise InputError(
+            f"Nothing can be called {quoted(name)}, the name of a device on Windows: choose another name."
+        )
 
 
 def _check_alike(kind: str, name: str, ours: Iterable[str]) -> None:
     """Refuse a name that is easily mistaken for one of `ours`."""
     for other in ours:
         if name != other and _folded(name) == _folded(other):
-            raise InputError(f"{quoted(name)} can be taken for the {kind} {other!r}.")
+            raise InputError(
+                f"The {kind} cannot be called {quoted(name)}, which readers would take for {other!r}: choose "
+                "a name that differs in more than case and punctuation."
+            )
 
 
 def _check_not_ours(kind: str, name: str, package: str) -> None:
     if package != "clbench" and _folded(package) == "clbench":
-        raise InputError(f"{quoted(name)} can be taken for a {kind} of clbench.")
+        raise InputError(
+            f"The {kind} cannot be called {quoted(name)}, which readers would take for a {kind} of clbench: "
+            "put the name of your own package before it."
+        )
 
 
 def _folded(name: str) -> str:

@@ -25,6 +25,10 @@ ScoredSplit = Literal["test", "validation"]
 """Split whose episodes are scored: "validation" in a tuning run, "test" otherwise."""
 
 
+DEFAULT_SEEDS = 4
+"""Seeds of a method where no number is given. Four balance the orders of a balanced scenario of four targets;
+eight separate similar methods (docs/guide/statistics.md)."""
+
 EPISODE_WEIGHT = 0.3
 """Duration of an evaluation episode in optimiser steps, for the time left that a progress bar shows."""
 
@@ -42,8 +46,11 @@ class EpisodeKey(NamedTuple):
     """The identity of an episode of a scenario, besides the seed of the run."""
 
     task: str
+    """Name of the task."""
     split: Split
+    """Split of the episode."""
     number: int
+    """Number of the initial state within its task and split, from 0."""
 
 
 def check_steps(last: int) -> tuple[int, ...]:

@@ -26,7 +26,7 @@ def register(scenario_id: str, entry_point: str) -> None:
         entry_point: Entry point "module:attribute" of the `Scenario`.
 
     Raises:
-        ValueError: The id has another form, is easily mistaken for another, is already registered for another
+        InputError: The id has another form, is easily mistaken for another, is already registered for another
             entry point, or uses our namespace; or the entry point has another form.
     """
     check_scenario_id(scenario_id)
@@ -51,8 +51,8 @@ def load_scenario(scenario_id: str) -> Scenario:
     """Return the scenario registered with Gymnasium under this id, ready to use.
 
     Raises:
-        LookupError: No scenario is registered under this id, or a package that its tasks need is not
-            installed; the message says how to get it.
+        UnknownNameError: No scenario is registered under this id.
+        MissingPackageError: A package that its tasks need is not installed; the message says how to get it.
     """
     return opened_scenario(registered_scenario(scenario_id))
 
@@ -64,7 +64,7 @@ def registered_scenario(scenario_id: str) -> Scenario:
         scenario_id: Gymnasium id; "module:id" imports `module` first.
 
     Raises:
-        LookupError: No scenario is registered under this id.
+        UnknownNameError: No scenario is registered under this id.
     """
     module, _, name = scenario_id.rpartition(":")
     if module:
@@ -86,8 +86,9 @@ def opened_scenario(scenario: Scenario | str, order: int = 0) -> Scenario:
         order: Number of the order, see `Scenario.in_order`.
 
     Raises:
-        LookupError: The entry point leads to no scenario, or a package that the tasks need is not installed.
-        ValueError: There is no such order, or an instruction is too long or cannot be spelled.
+        UnknownNameError: The entry point leads to no scenario.
+        MissingPackageError: A package that the tasks need is not installed.
+        InputError: There is no such order, or an instruction is too long or cannot be spelled.
     """
     published = _scenario_at(scenario) if isinstance(scenario, str) else scenario
     published.require_packages()

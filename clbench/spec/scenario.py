@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 import random
+from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Literal, get_args
 
 from clbench.base.dependencies import require_packages
 from clbench.base.entry_points import resolve, unknown
-from clbench.base.errors import InputError
+from clbench.base.errors import InputError, UnknownNameError
 from clbench.base.text import html_table
 from clbench.spec.budget import Budget
 from clbench.spec.fields import check_entry_point
@@ -119,7 +120,7 @@ class Scenario:
         """Check that the packages of its tasks are installed.
 
         Raises:
-            LookupError: A package is not installed; the message says how to get it.
+            MissingPackageError: A package is not installed; the message says how to get it.
         """
         every = self.tasks + self.background
         require_packages({package for task in every for package in task.packages}, self.id)
@@ -130,15 +131,16 @@ class Scenario:
         All else stays the same: pretrained policy, demonstrations, questions and initial states of episodes.
 
         Raises:
-            ValueError: There is no such order.
+            InputError: There is no such order.
         """
         if order and self.balanced:
             raise InputError(
-                f"{self.id}: each seed has its own order of the targets: leave out order {order}."
+                f"{self.id} has no order {order}: each seed learns the targets in its own order. "
+                "Leave out --order (order= in Python)."
             )
         try:
             places = target_order(len(self.target), order)
-        except ValueError as error:
+        except InputError as error:
             raise InputError(f"{self.id}: {error}") from error
         return replace(self, target=tuple(self.target[place] for place in places)) if order else self
 
@@ -158,25 +160,30 @@ class Scenario:
         return replace(self, target=tuple(self.target[place] for place in places))
 
     def group(self, task: str) -> Group:
-        """Return the part of the scenario that the task called `task` belongs to."""
+        """Return the part of the scenario that the task called `task` belongs to.
+
+        Raises:
+            UnknownNameError: No task that is scored has this name; the nearest one is named.
+        """
         for group in ("retained", "target", "held_out"):
             if any(task == member.name for member in getattr(self, group)):
                 return group
-        raise self._unknown(task)
+        raise self._unknown(task, self.tasks)
 
     def task(self, name: str) -> Task:
         """Return the task called `name`.
 
         Raises:
-            LookupError: No task has this name; the nearest one is named.
+            UnknownNameError: No task has this name; the nearest one is named.
         """
-        for task in self.tasks + self.background:
+        every = self.tasks + self.background
+        for task in every:
             if task.name == name:
                 return task
-        raise self._unknown(name)
+        raise self._unknown(name, every)
 
-    def _unknown(self, name: str) -> LookupError:
-        return unknown(f"task of {self.id}", name, (task.name for task in self.tasks))
+    def _unknown(self, name: str, known: Iterable[Task]) -> UnknownNameError:
+        return unknown(f"task of {self.id}", name, (task.name for task in known))
 
 
 def balanced_order(count: int, seed: int) -> tuple[int, ...]:
@@ -211,7 +218,7 @@ def target_order(count: int, order: int) -> tuple[int, ...]:
         order: Number of the order.
 
     Raises:
-        ValueError: There is no such order.
+        InputError: There is no such order.
     """
     # a stranger's long list of targets has a factorial of millions of digits; the factorial of 5 is enough
     last = min(math.factorial(min(count, 5)) - 1, MOST_ORDERS)

@@ -27,8 +27,8 @@ from torch import Tensor
 from clbench.base.seeding import seeded
 from clbench.evaluation.rollouts import Evaluator
 from clbench.learning.method import Metadata, Method
+from clbench.learning.optimise import deterministic
 from clbench.learning.prior import Access, Uses
-from clbench.learning.trainer import repeatable
 from clbench.policy.policy import ABILITIES, Policy
 from clbench.spec.policies import DEFAULT_POLICY
 from clbench.testing.error import ContractError
@@ -409,7 +409,7 @@ def _mean_return(policy: Policy) -> float:
     """Return the mean return of the policy on the toy's first target, over its validation episodes."""
     evaluator = Evaluator(TOY, 0)
     policy.eval()
-    with repeatable("cpu"):
+    with deterministic():
         episodes = evaluator.evaluate(policy, TOY.target[:1])
     policy.train()
     evaluator.close()

@@ -18,10 +18,10 @@ from torch import Tensor, nn
 from clbench.base.seeding import seeded
 from clbench.data.training_data import TrainingData
 from clbench.learning.method import Method, Stage
-from clbench.learning.optimise import MethodError
+from clbench.learning.optimise import MethodError, deterministic
 from clbench.learning.pretraining import pretrained_policy
 from clbench.learning.prior import Prior, Source, UndeclaredAccessError
-from clbench.learning.trainer import Trainer, repeatable
+from clbench.learning.trainer import Trainer
 from clbench.learning.watching import watches
 from clbench.policy.batch import Batch, QuestionBatch
 from clbench.policy.checkpoint import CheckpointError
@@ -112,7 +112,7 @@ class ToyRun:
         scenario = dataclasses.replace(TOY.with_policy(policy), target=TOY.target[:targets], budget=budget)
         data, pretrained = toy_data(policy)
         # no two runs begin with the same global generators: results that depend on them differ
-        with repeatable("cpu"), seeded("toy run", next(_numbers)), tempfile.TemporaryDirectory() as folder:
+        with deterministic(), seeded("toy run", next(_numbers)), tempfile.TemporaryDirectory() as folder:
             self.trainer = Trainer(scenario, data, pretrained, self._watched_method, seed, 0)
             self._go(Path(folder), resumed)
 

@@ -62,8 +62,8 @@ def load_camera(entry_point: str) -> type[Camera]:
     """Return the camera at "module:attribute".
 
     Raises:
-        LookupError: The entry point leads to nothing.
-        TypeError: The object lacks a member of a camera.
+        UnknownNameError: The entry point leads to nothing.
+        WrongTypeError: The object lacks a member of a camera.
     """
     camera: type[Camera] = resolve(entry_point)
     members = [name for name in (*Camera.__annotations__, *vars(Camera)) if not name.startswith("_")]

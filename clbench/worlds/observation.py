@@ -76,7 +76,7 @@ class Observer:
 
         Raises:
             RenderingError: No back end can draw the world; the message names the packages to install.
-            TypeError: The camera returns numbers of another shape.
+            WrongTypeError: The camera returns numbers of another shape.
         """
         if self._camera is None:
             return states, np.zeros((len(states), 0, 0, 3), np.uint8)

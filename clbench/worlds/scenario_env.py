@@ -34,6 +34,7 @@ class ScenarioEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
     Observation: a dictionary of `state`, float32 (S,), from the task's world, and `instruction`, text, or
     with `instruction="tokens"` the word ids, int64 (L,), for agents that need numbers. Where the task has a
     camera, `state` holds only the numbers that a policy may see, and `image`, uint8 (N, N, 3), the picture.
+    Action: float32 (A,), from -1 to 1, clipped; a number that is not finite is refused.
     Reward: the task's dense reward. An episode is terminated by success and truncated at the task's horizon.
     Info: `task`, `stage`, `instruction`, `success`. A copy made by pickle is a new environment, which begins
     with its own first `reset()`.
@@ -47,7 +48,7 @@ class ScenarioEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         render_mode: "rgb_array" or None, passed on to the worlds.
 
     Raises:
-        LookupError: A package that the tasks need is not installed; the message says how to get it.
+        MissingPackageError: A package that the tasks need is not installed; the message says how to get it.
     """
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 25}  # noqa: RUF012
@@ -102,8 +103,8 @@ class ScenarioEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         """Begin an episode; the class documents `seed` and `options`.
 
         Raises:
-            LookupError: The scenario has no such task.
-            ValueError: It has no such stage, or an option is unknown.
+            UnknownNameError: The scenario has no such task.
+            InputError: It has no such stage, or an option is unknown.
         """
         super().reset(seed=seed)
         self.begun_at = self.begun_at or time.perf_counter()
@@ -122,7 +123,12 @@ class ScenarioEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         return self._begun
 
     def step(self, action: NDArray[np.float32]) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
-        """Take one step of the current task."""
+        """Take one step of the current task.
+
+        Raises:
+            ResetNeeded: There was no `reset` yet.
+            InputError: The action has another shape than the action space, or a number in it is not finite.
+        """
         state, reward, terminated, _, _ = self._world(self._start.task).step(action)
         self._steps += 1
         self.steps_taken += 1

@@ -45,7 +45,7 @@ class ScenarioVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]
         render_mode: None; environments side by side cannot be drawn.
 
     Raises:
-        LookupError: A package that the tasks need is not installed; the message says how to get it.
+        MissingPackageError: A package that the tasks need is not installed; the message says how to get it.
     """
 
     metadata: dict[str, Any] = {"render_modes": [], "autoreset_mode": AutoresetMode.NEXT_STEP}  # noqa: RUF012
@@ -108,8 +108,8 @@ class ScenarioVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]
             options: Options of `ScenarioEnv.reset`, for all environments.
 
         Raises:
-            LookupError: The scenario has no such task.
-            ValueError: It has no such stage, an option is unknown, or the number of seeds is wrong.
+            UnknownNameError: The scenario has no such task.
+            InputError: It has no such stage, an option is unknown, or the number of seeds is wrong.
         """
         self.begun_at = self.begun_at or time.perf_counter()
         seeds = self._seeds(seed)

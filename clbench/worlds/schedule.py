@@ -86,8 +86,8 @@ class Schedule:
         """Return the start of the next episode, or of the episode that `options` choose.
 
         Raises:
-            LookupError: The scenario has no such task.
-            ValueError: It has no such stage, or an option is unknown.
+            UnknownNameError: The scenario has no such task.
+            InputError: It has no such stage, or an option is unknown.
         """
         if set(options) - {"task", "stage"}:
             raise InputError(f'Options of reset are "task" and "stage", not {sorted(options)}.')

@@ -87,7 +87,7 @@ class OneLaneWorld(World, ABC):
         """Start an episode of the task `options["task"]`, by default the first, and return the state (S,).
 
         Raises:
-            LookupError: No task has this name; the nearest one is named.
+            UnknownNameError: No task has this name; the nearest one is named.
         """
         super().reset(seed=seed)
         seed = int(self.np_random.integers(2**31)) if seed is None else seed
@@ -100,7 +100,7 @@ class OneLaneWorld(World, ABC):
         """Move for one step.
 
         Raises:
-            ValueError: The action has another shape than the action space, or a number in it is not finite.
+            InputError: The action has another shape than the action space, or a number in it is not finite.
         """
         states, rewards, successes = self._world.step([0], np.asarray(action, np.float32)[None])
         success = bool(successes[0])
@@ -157,7 +157,7 @@ def checked_actions(actions: NDArray[np.float32], space: spaces.Box, world: str)
     """Return actions (N, A) within the bounds of the action space of a world.
 
     Raises:
-        ValueError: An action has another shape than the space, or a number in it is not finite.
+        InputError: An action has another shape than the space, or a number in it is not finite.
     """
     actions = np.asarray(actions, np.float32)
     if actions.shape[1:] != space.shape:

@@ -83,7 +83,7 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("scenario", help="Gymnasium id of the scenario, for example clbench/Fetch-v1")
-    parser.add_argument("--seeds", type=int, default=3, help="number of seeds")
+    parser.add_argument("--seeds", type=int, default=4, help="number of seeds")
     parser.add_argument("--first-seed", type=int, default=0, help="first seed")
     parser.add_argument("--steps", type=int, default=6000, help="environment steps per stage")
     parser.add_argument("--records", type=Path, default=RECORDS, help="folder of the records")

@@ -5,9 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from clbench.scoring.layout import Array
 
 REPLICATES = 2000
 """Bootstrap draws of seeds."""
@@ -21,8 +20,11 @@ class Agreement:
     """Kendall's tau between the orders of rows by two boards, with its 95 % interval."""
 
     tau: float
+    """Kendall's tau: 1 for equal orders, -1 for opposite ones."""
     low: float
+    """Lower end of the interval."""
     high: float
+    """Upper end of the interval."""
     seeds: int
     """Number of seeds in both boards together."""
     rows: int

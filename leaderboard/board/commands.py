@@ -9,6 +9,7 @@ from clbench.records.paths import RECORDS
 
 from .frontier import FACTOR
 from .places import CONTROLS, LADDER
+from .rows import Row
 
 
 def run_command(scenario: str, *labels: str, records: Path = RECORDS) -> str:
@@ -28,3 +29,12 @@ def run_command(scenario: str, *labels: str, records: Path = RECORDS) -> str:
     folder = (LADDER if factor else CONTROLS) if changes else records
     option = [] if folder == RECORDS else [f"--records {shlex.quote(folder.as_posix())}"]
     return " ".join(["clbench run", scenario, *methods, *settings, *option])
+
+
+def row_command(row: Row) -> str:
+    """Return the command that makes the records of a row with the usual policy."""
+    first, last = row.seeds[0], row.seeds[-1]
+    words = [run_command(row.scenario, row.method), f"--seeds {last - first + 1}"]
+    words += [f"--first-seed {first}"] if first else []
+    words += ["--perturb"] if any(run.record.run.perturb for run in row.runs) else []
+    return " ".join(words)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 SCENARIO = "clbench/Fetch-v1"
-"""Scenario whose records judge the claims and describe the methods."""
+"""Default scenario of `clbench submit` and of the method pages, and the example in messages."""
 
 CONTROLS = Path("leaderboard/controls")
 """Folder of records with changed settings. Commands on pages name it."""

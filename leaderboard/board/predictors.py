@@ -1,4 +1,4 @@
-"""Predictors of forgetting: how alike they order the methods as what the methods forget does."""
+"""Predictors of forgetting: how well each orders the methods by what they forget."""
 
 from __future__ import annotations
 
@@ -7,11 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from clbench.scoring.layout import Array
 from clbench.scoring.metrics import measure
 from clbench.scoring.scores import Scores
 from clbench.spec.references import BASELINE
 
-from .agreement import REPLICATES, Array, kendall_tau
+from .agreement import REPLICATES, kendall_tau
 from .rows import Row
 from .summary import METHODS
 
@@ -42,7 +43,7 @@ PREDICTORS: dict[str, Quantity] = {
 }
 """Quantities of a run that may predict what it forgets, by their names in a sentence."""
 
-FORGETTING = _less("kept_share")
+LOST = _less("kept_share")
 """Share of what was known before a stage that is lost at its end, mean over the stages."""
 
 
@@ -51,11 +52,17 @@ class Prediction:
     """Kendall's tau between a predictor and forgetting over the methods, with its 95 % interval."""
 
     predictor: str
+    """Its name in a sentence: a key of `PREDICTORS`."""
     tau: float
+    """Kendall's tau: 1 for equal orders, -1 for opposite ones."""
     low: float
+    """Lower end of the interval."""
     high: float
+    """Upper end of the interval."""
     seeds: int
+    """Number of seeds."""
     rows: int
+    """Number of methods."""
 
 
 def predictions(rows: Iterable[Row]) -> list[Prediction]:
@@ -68,9 +75,7 @@ def predictions(rows: Iterable[Row]) -> list[Prediction]:
     whole = [row for row in competing if set(row.seeds).issuperset(seeds)]
     found = []
     for name, quantity in PREDICTORS.items():
-        pairs = [
-            [[quantity(row.scores[seed]), FORGETTING(row.scores[seed])] for seed in seeds] for row in whole
-        ]
+        pairs = [[[quantity(row.scores[seed]), LOST(row.scores[seed])] for seed in seeds] for row in whole]
         known = [pair for pair in pairs if all(None not in values for values in pair)]
         if len(known) >= LEAST_ROWS and len(seeds) >= LEAST_SEEDS:
             prediction = prediction_of(name, np.array(known, dtype=float))

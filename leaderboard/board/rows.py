@@ -1,6 +1,6 @@
 """Rows of the leaderboard, one for each method and scenario, in the order of the table.
 
-They are made from the records alone, but for `relative_cost`: see `costs`.
+They are made from the records alone.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
+from clbench.records.paths import check_folder
 from clbench.records.record import ScenarioInfo
 from clbench.runs.tuning import tuned
 from clbench.scoring.groups import groups
@@ -64,10 +65,9 @@ def read_table(records: Path, only: Container[str] | None = None) -> Table:
         only: Paths of the records that count, from the folder; None for all.
 
     Raises:
-        FileNotFoundError: The folder does not exist.
+        NoRecordsError: The folder does not exist.
     """
-    if not records.is_dir():
-        raise FileNotFoundError(f"There is no folder of records at {records}.")
+    check_folder(records)
     runs, not_shown = read_runs(records, read_run, ALIKE, only)
     runs, alone = _beside_rows(runs)
     by_place = groupby(sorted(runs, key=lambda run: run.place), key=lambda run: run.place)

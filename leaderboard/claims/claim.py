@@ -9,13 +9,25 @@ counts for or against the paper.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
+
+from clbench.base.text import counted
 
 from .evidence import Evidence, Figure
 
 Verdict = Literal["holds", "holds in part", "does not hold", "undecided", "cannot be shown here"]
+
+PREDICATES: Mapping[Verdict, tuple[str, str]] = {
+    "holds": ("holds", "hold"),
+    "holds in part": ("holds in part", "hold in part"),
+    "does not hold": ("does not hold", "do not hold"),
+    "undecided": ("is undecided", "are undecided"),
+    "cannot be shown here": ("cannot be shown here", "cannot be shown here"),
+}
+"""Verdicts as predicates: of one claim, and of several."""
 
 BOARDS = ("clbench/Fetch-v1", "clbench/MetaWorld-v1")
 """Scenarios whose stages end at a criterion, so that methods are compared at equal learning."""
@@ -99,6 +111,18 @@ def claim(
 
 
 # ---- parts of rules ----------------------------------------------------------------------------------------
+
+
+def tally(verdicts: Iterable[Verdict]) -> str:
+    """Return how often each verdict was given: "of 3 verdicts, 1 holds and 2 are undecided"."""
+    counts = Counter(verdicts)
+    parts = [
+        f"{counts[verdict]} {one if counts[verdict] == 1 else several}"
+        for verdict, (one, several) in PREDICATES.items()
+        if counts[verdict]
+    ]
+    listed = " and ".join(filter(None, (", ".join(parts[:-1]), parts[-1])))
+    return f"of {counted(counts.total(), 'verdict')}, {listed}"
 
 
 def decided(*, holds: bool, fails: bool, in_part: bool = False) -> Verdict:

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Sequence
 from itertools import groupby
 from pathlib import Path
-from typing import get_args
 
 from rich.box import SIMPLE_HEAD
 from rich.table import Table
 from rich.text import Text
 
 from ..board.commands import run_command
-from ..claims.claim import Verdict
+from ..claims.claim import tally
 from ..claims.evidence import LEAST_SEEDS, Figure
 from ..claims.judges import Judged
 from ..views.format import MISSING, format_interval
@@ -52,9 +50,8 @@ def _tally(judged: Sequence[Judged]) -> list[str]:
     """Return a sentence for each scenario with the number of claims by verdict."""
     sentences = []
     for scenario in dict.fromkeys(one.evidence.scenario for one in judged):
-        verdicts = Counter(one.finding.verdict for one in judged if one.evidence.scenario == scenario)
-        counts = [f"{verdicts[verdict]} {verdict}" for verdict in get_args(Verdict) if verdicts[verdict]]
-        sentences.append(f"{scenario}: {', '.join(counts)}.")
+        verdicts = (one.finding.verdict for one in judged if one.evidence.scenario == scenario)
+        sentences.append(f"{scenario}: {tally(verdicts)}.")
     return sentences
 
 

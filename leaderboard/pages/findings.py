@@ -6,27 +6,26 @@ the last section says what the records cannot tell.
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import combinations, groupby
 from pathlib import Path
-from typing import get_args
 
 import numpy as np
 
 from clbench.base.text import counted
 from clbench.records.paths import parts_of
 from clbench.scoring.intervals import Estimate
+from clbench.scoring.layout import Array
 from clbench.scoring.metrics import measure
 from clbench.spec.policies import DEFAULT_POLICY
-from clbench.spec.references import BASELINE
+from clbench.spec.references import BASELINE, FROZEN
 
-from ..board.agreement import Agreement, Array, agreement_between
+from ..board.agreement import Agreement, agreement_between
 from ..board.predictors import predictions
 from ..board.rows import Row, Table
 from ..board.summary import METHODS, RANKED_BY, tables_of
-from ..claims.claim import Verdict
+from ..claims.claim import tally
 from ..claims.judges import Judged
 from ..policies.compared import by_table
 from ..views.format import format_interval, tau_text, title_of
@@ -79,7 +78,7 @@ def sections(table: Table, judged: Sequence[Judged]) -> list[Section]:
         _claims(judged),
         _orders(table, boards),
         _predictors(boards),
-        _knowledge(boards),
+        _knowledge(_usual(table)),
         _policies(table),
         _undecided(judged),
     )
@@ -88,10 +87,13 @@ def sections(table: Table, judged: Sequence[Judged]) -> list[Section]:
 
 def _boards(table: Table) -> dict[str, list[Row]]:
     """Return the rows of each scenario at equal learning, with the usual policy."""
+    return {name: rows for name, rows in _usual(table).items() if rows[0].to_criterion}
+
+
+def _usual(table: Table) -> dict[str, list[Row]]:
+    """Return the rows of each scenario with the usual policy."""
     return {
-        name: rows
-        for name, rows in tables_of(table.rows).items()
-        if parts_of(name)[1] == DEFAULT_POLICY and rows[0].to_criterion
+        name: rows for name, rows in tables_of(table.rows).items() if parts_of(name)[1] == DEFAULT_POLICY
     }
 
 
@@ -132,7 +134,11 @@ def _gain_sentences(name: str, rows: Sequence[Row]) -> Iterator[str]:
         return
     gains = {row.method: row.estimates["gain"] for row in rows}
     better = {method: gain for method, gain in gains.items() if gain.low is not None and gain.low > 0}
-    worse = {method: gain for method, gain in gains.items() if gain.high is not None and gain.high < 0}
+    worse = {
+        method: Estimate(-(gain.value or 0.0), -gain.high, -(gain.low or 0.0))
+        for method, gain in gains.items()
+        if gain.high is not None and gain.high < 0
+    }
     if better:
         yield f"On {name}, yes: {_listed(better)}."
     else:
@@ -196,9 +202,7 @@ def _claims(judged: Sequence[Judged]) -> Section:
     answers = []
     by_paper = groupby(judged, key=lambda one: one.claim.paper.name)
     for paper, members in by_paper:
-        verdicts = Counter(one.finding.verdict for one in members)
-        counts = [f"{verdicts[verdict]} {verdict}" for verdict in get_args(Verdict) if verdicts[verdict]]
-        answers.append(f"{paper}, over its claims and scenarios: {', '.join(counts)}.")
+        answers.append(f"{paper}: {tally(one.finding.verdict for one in members)}.")
     decided = [one for one in judged if one.finding.verdict != "undecided"]
     lines = tuple(
         (
@@ -219,16 +223,16 @@ def _orders(table: Table, boards: dict[str, list[Row]]) -> Section:
     answers = []
     for name, found in table.agreements.items():
         if found is not None and name in boards:
-            answers.append(f"Two halves of the {found.seeds} seeds of {name}: {_tau(found)}.")
+            answers.append(f"On {name}, two halves of the {found.seeds} seeds {_order(found)}.")
     for (one, rows), (other, others) in combinations(boards.items(), 2):
         across = _between(rows, others, RANKED_BY, RANKED_BY)
         if across is not None:
-            answers.append(f"{one} and {other}, {counted(across.rows, 'method')}: {_tau(across)}.")
+            answers.append(f"{one} and {other} {_order(across, counted(across.rows, 'method'))}.")
     for name, rows in boards.items():
         for metric in ("kept_share", "forgetting", "backward_transfer"):
             same = _between(rows, rows, RANKED_BY, metric)
             if same is not None:
-                answers.append(f"Final average and {title_of(metric)} on {name}: {_tau(same)}.")
+                answers.append(f"On {name}, final average and {title_of(metric)} {_order(same)}.")
     return Section("Do seeds, scenarios and definitions order the methods alike?", tuple(answers))
 
 
@@ -254,9 +258,14 @@ def _values(rows: Sequence[Row], metric: str) -> Array | None:
     return sign * np.array(values, dtype=float)
 
 
-def _tau(found: Agreement) -> str:
-    words = "alike" if found.low > 0 else "in opposite orders" if found.high < 0 else "cannot be told"
-    return f"{words}, Kendall's tau {tau_text(found)}"
+def _order(found: Agreement, methods: str = "the methods") -> str:
+    """Return the predicate of a sentence on two boards."""
+    words = f"order {methods} alike"
+    if found.high < 0:
+        words = f"put {methods} in opposite orders"
+    elif found.low <= 0:
+        words = f"may agree on the order of {methods} by chance"
+    return f"{words} (Kendall's tau {tau_text(found)})"
 
 
 def _predictors(boards: dict[str, list[Row]]) -> Section:
@@ -264,10 +273,14 @@ def _predictors(boards: dict[str, list[Row]]) -> Section:
     answers = []
     for name, rows in boards.items():
         for one in predictions(rows):
-            told = (
-                "predicts it" if one.low > 0 else "predicts the opposite" if one.high < 0 else "may be chance"
-            )
-            answers.append(f"On {name}, {one.predictor} {told}: Kendall's tau {tau_text(one)}.")
+            words = "orders the methods as their forgetting does"
+            if one.high < 0:
+                words = "orders the methods against their forgetting"
+            elif one.low <= 0:
+                words = "may agree with their forgetting on the order of the methods by chance"
+            answers.append(f"On {name}, {one.predictor} {words} (Kendall's tau {tau_text(one)}).")
+    if answers:
+        answers.insert(0, "Forgetting is here 1 minus the kept share.")
     return Section("What predicts how much a method forgets?", tuple(answers))
 
 
@@ -276,9 +289,11 @@ def _knowledge(boards: dict[str, list[Row]]) -> Section:
     answers = []
     for name, rows in boards.items():
         by_method = {row.method: row for row in rows}
-        if BASELINE not in by_method or "frozen" not in by_method:
+        if BASELINE not in by_method or FROZEN not in by_method:
             continue
-        after, before = (by_method[method].estimates for method in (BASELINE, "frozen"))
+        after, before = (by_method[method].estimates for method in (BASELINE, FROZEN))
+        if after["question_retention"].value is None:
+            continue
         answers.append(
             f"On {name}, plain fine-tuning keeps {format_interval(after['retention'])} of the skills "
             f"({format_interval(before['retention'])} before), and answers "

@@ -5,15 +5,15 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from jinja2 import Template
 
-from clbench.runs.tuning import Tried as Setting
 from clbench.runs.tuning import tuned
 from clbench.scoring.intervals import Estimate
 from clbench.spec.identifiers import folder_name
 
-from ..board.commands import run_command
+from ..board.commands import row_command, run_command
 from ..board.rows import Row, Table
 from ..board.runs import is_number
 from ..board.summary import DIVISIONS
@@ -43,8 +43,13 @@ class Sources:
     """Records of the scenario."""
     judged: Sequence[Judged]
     """Findings on the claims."""
-    rows: Mapping[str, Row]
-    """Rows of the board by method."""
+    board: Sequence[Row]
+    """Rows of the board."""
+
+    @property
+    def rows(self) -> dict[str, Row]:
+        """Rows of the scenario by method."""
+        return {row.method: row for row in self.board if row.scenario == self.evidence.scenario}
 
 
 @dataclass(frozen=True)
@@ -79,9 +84,7 @@ class Tried:
 
 def read_sources(evidence: Evidence, judged: Sequence[Judged], board: Table) -> Sources:
     """Return the sources; a missing folder counts as empty."""
-    return Sources(
-        evidence, judged, {row.method: row for row in board.rows if row.scenario == evidence.scenario}
-    )
+    return Sources(evidence, judged, board.rows)
 
 
 def pages(methods: Sequence[Description], sources: Sources) -> dict[str, str]:
@@ -101,7 +104,8 @@ def _page(method: Description, sources: Sources) -> str:
     """Return the page of one method."""
     text, uses, scenario = method.text, method.cls.uses, sources.evidence.scenario
     papers = arxiv_ids(" ".join((text.idea, *text.rule)))
-    names = [name for name in dict.fromkeys((method.name, *COMPARISONS)) if name in sources.rows]
+    by_method = sources.rows
+    names = [name for name in dict.fromkeys((method.name, *COMPARISONS)) if name in by_method]
     return _template("method.md.jinja").render(
         method=method,
         papers=papers,
@@ -110,15 +114,16 @@ def _page(method: Description, sources: Sources) -> str:
             USED[when].format(kind)
             for kind, when in (("demonstrations", uses.demonstrations), ("questions", uses.questions))
         ],
-        costs=sources.rows[method.name].costs if method.name in sources.rows else {},
+        costs=by_method[method.name].costs if method.name in by_method else {},
         diagnostics=_diagnostics(method, sources),
         scenario=scenario,
-        rows=[sources.rows[name] for name in names] if method.name in names else [],
+        rows=[by_method[name] for name in names] if method.name in names else [],
         shown=shown,
         command=run_command(scenario, method.name),
         claims=_claims(method, sources),
+        chosen=_chosen(method.name),
         tried=_tried(method.name),
-        commands=_commands(method.name, scenario),
+        commands=_commands(method.name, sources),
     )
 
 
@@ -174,25 +179,42 @@ def _base(label: str) -> str:
 # ---- settings ----------------------------------------------------------------------------------------------
 
 
+def _chosen(method: str) -> list[str]:
+    """Return the settings that tuning chose, board by board: "`step_factor` = 0.3 on clbench/Fetch-v1"."""
+    return [
+        f"{_words(found.settings, '`{}`')} on {scenario}"
+        for scenario in BOARDS
+        if (found := tuned(scenario).get(method))
+    ]
+
+
 def _tried(method: str) -> list[Tried]:
     """Return the settings that tuning tried, board by board."""
     rows = []
     for scenario in BOARDS:
         if found := tuned(scenario).get(method):
             rows += [
-                Tried(scenario, _words(one), one.learned, one.final_average, one.settings == found.settings)
+                Tried(
+                    scenario,
+                    _words(one.settings),
+                    one.learned,
+                    one.final_average,
+                    one.settings == found.settings,
+                )
                 for one in found.tried
             ]
     return rows
 
 
-def _words(tried: Setting) -> str:
-    return ", ".join(f"{name} = {value:g}" for name, value in sorted(tried.settings.items()))
+def _words(settings: Mapping[str, Any], form: str = "{}") -> str:
+    return ", ".join(f"{form.format(name)} = {value:g}" for name, value in sorted(settings.items()))
 
 
-def _commands(method: str, scenario: str) -> list[str]:
-    """Return the commands that make the records, also those that tuned the method."""
-    lines = [run_command(scenario, method)]
+def _commands(method: str, sources: Sources) -> list[str]:
+    """Return the commands that make the rows of the method, and those that tuned it."""
+    scenarios = dict.fromkeys((sources.evidence.scenario, *BOARDS))
+    rows = [row for row in sources.board if row.method == method and row.scenario in scenarios]
+    lines = [row_command(row) for row in rows] or [run_command(sources.evidence.scenario, method)]
     boards = [one for one in BOARDS if method in tuned(one)]
     return lines + [
         f"clbench tune {one} {method} --write {Path('methods/tuned', folder_name(one))}.json"

@@ -24,7 +24,8 @@ from clbench.scoring.layout import Array, average
 from clbench.scoring.rates import Rates
 from clbench.spec.budget import Budget
 from clbench.spec.identifiers import folder_name
-from clbench.spec.protocol import check_steps
+from clbench.spec.protocol import DEFAULT_SEEDS, check_steps
+from clbench.spec.references import COMPARED
 from clbench.spec.scenario import Scenario
 
 from ..board.commands import run_command
@@ -44,17 +45,14 @@ GROUPS = {
 OWN_ORDERS = "Targets; each seed learns them in its own order"
 """Title of the targets of a balanced scenario."""
 
-REFERENCES = ("sft", "joint", "frozen", "from_scratch")
-"""Methods whose records a card needs."""
-
 COLUMNS = ("retention", "adaptation", RANKED_BY, "zero_shot", "question_retention")
 """Metrics of the references."""
 
-COMPARED = ("retention", "adaptation", RANKED_BY, "question_retention")
+TELLING = ("retention", "adaptation", RANKED_BY, "question_retention")
 """Metrics that tell methods apart; none needs a reference."""
 
-SEEDS = (3, 5, 10)
-"""Numbers of seeds; the first is the default of `clbench run` and `clbench submit`."""
+SEEDS = (DEFAULT_SEEDS, 2 * DEFAULT_SEEDS)
+"""Numbers of seeds for which a card says which differences show."""
 
 PRETRAINED = 0.90
 """Lowest success of the pretrained policy on the retained skills: it cannot forget what it does not know."""
@@ -123,8 +121,8 @@ class Card:
 
     def page(self) -> str:
         """Return the card as Markdown."""
-        present = [self.rows[name] for name in REFERENCES if name in self.rows]
-        missing = [name for name in REFERENCES if name not in self.rows]
+        present = [self.rows[name] for name in COMPARED if name in self.rows]
+        missing = [name for name in COMPARED if name not in self.rows]
         competing = [row for row in self.rows.values() if row.division in METHODS]
         meanings, values = field_docstrings(Budget), dataclasses.asdict(self.scenario.budget)
         references = [
@@ -254,7 +252,7 @@ class Card:
 def _resolution(competing: Sequence[Row]) -> dict[str, list[float]]:
     """Return by metric the deviation of a difference, then the smallest difference for each of `SEEDS`."""
     found = {}
-    for metric in COMPARED:
+    for metric in TELLING:
         deviation = deviation_of_differences(metric, [row.scores for row in competing])
         if deviation is not None:
             widths = [student_quantile(n - 1) * deviation / math.sqrt(n) for n in SEEDS]

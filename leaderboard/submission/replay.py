@@ -18,8 +18,9 @@ from clbench.evaluation.answers import answer
 from clbench.evaluation.checks import Checker
 from clbench.evaluation.examiner import episode_row
 from clbench.evaluation.rollouts import Evaluator, Trial
+from clbench.learning.optimise import deterministic
 from clbench.learning.pretraining import pretrained_policy
-from clbench.learning.trainer import Trainer, load_stage, repeatable
+from clbench.learning.trainer import Trainer, load_stage
 from clbench.policy.policy import Policy
 from clbench.records.record import EpisodeRow
 from clbench.runs.checkpoints import kept_stages, load_stages, stage_policies
@@ -64,7 +65,7 @@ def replay(subject: Subject, progress: ProgressCallback) -> list[Check]:
                 "(--checkpoints)"
             )
             return [Check("policies", result, False)]
-    with repeatable(spec.device):
+    with deterministic(spec.device):
         policies = (
             load_stages(subject.resolved, kept)
             if kept
@@ -153,7 +154,7 @@ def _go_on(subject: Subject, kept: Path) -> Check:
     number = int(np.random.default_rng(subject.request.seed).integers(len(run.scenario.target))) + 1
     steps = subject.protocol.end(number).step
     trainer = Trainer.open(run.scenario, run.new_method, run.spec.seed, run.spec.device)
-    with repeatable(run.spec.device):
+    with deterministic(run.spec.device):
         trainer.load(kept / f"stage-{number - 1}", number - 1)
         before = copy.deepcopy(trainer.policy)
         trainer.learn(number, lambda step: step.done >= steps)

@@ -284,12 +284,12 @@ def test_lists_metrics_and_the_machine_come_as_json_too(capsys: pytest.CaptureFi
     (one,) = printed("metrics", "forgetting")
     assert one in every
     machine = printed("doctor")
-    assert (machine["ready"], machine["mend"]) == (True, [])
+    assert (machine["ready"], machine["fix"]) == (True, [])
     assert machine["clbench"] == __version__
     assert "torch" in machine["packages"]
 
 
-def test_doctor_says_what_to_mend_if_something_needed_is_wrong(
+def test_doctor_says_what_to_fix_if_something_needed_is_wrong(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(

@@ -11,6 +11,7 @@ import torch
 from helpers import same_demonstrations
 
 from clbench.base.entry_points import resolve
+from clbench.base.errors import InputError
 from clbench.data.demonstrations import (
     Demonstration,
     Demonstrations,
@@ -115,7 +116,7 @@ def test_an_expert_that_mostly_fails_is_named(monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.setattr(
         "clbench.testing.lazy_expert", lambda _: lambda state: np.zeros(2, np.float32), raising=False
     )
-    with pytest.raises(RuntimeError, match=r"The expert of 'left' succeeded 0 times in 10 attempts"):
+    with pytest.raises(InputError, match=r"The expert of 'left' succeeded 0 times in 10 attempts"):
         collect(lazy, BUDGET)
 
 

@@ -9,6 +9,7 @@ import pandas
 import pytest
 
 from clbench.base.entry_points import resolve
+from clbench.base.errors import NoRecordsError
 from clbench.records.paths import record_path
 from clbench.records.record import Record
 from clbench.scoring.metrics import METRICS
@@ -87,7 +88,7 @@ def test_the_relative_cost_counts_all_steps_with_the_time_of_one(
 
 
 def test_loading_a_folder_that_is_not_there_is_an_error(tmp_path: Path) -> None:
-    with pytest.raises(FileNotFoundError, match="nowhere"):
+    with pytest.raises(NoRecordsError, match=r"nowhere.*`clbench leaderboard --published` copies"):
         load(tmp_path / "nowhere")
 
 

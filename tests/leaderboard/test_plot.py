@@ -101,6 +101,9 @@ def test_a_plane_shows_every_method_in_the_colours_of_the_theme(four_methods: Pa
 
 
 def test_a_frontier_shows_the_methods_of_the_ladder(record: Callable[..., Record], tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"no ladder at .*ladder\. `make ladder` runs it"):
+        plot.frontier(tmp_path / "records")
+    (tmp_path / "ladder").mkdir()
     with pytest.raises(InputError, match=r"No record in .*ladder makes a curve"):
         plot.frontier(tmp_path / "records")
     for factor in (1.0, 0.3):

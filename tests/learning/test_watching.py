@@ -106,7 +106,7 @@ def test_a_method_that_only_looks_keeps_the_contract() -> None:
 @pytest.mark.parametrize(
     ("method", "message", "look"),
     [
-        (Meddling, r"watch_pretraining\(\) changed the pretraining: .* is another", "watch_pretraining()"),
+        (Meddling, r"watch_pretraining\(\) must change nothing, but .* differs", "watch_pretraining()"),
         (Undeclared, r"declare `uses = Uses\(demonstrations=\"prepare\"\)`", "uses"),
     ],
 )

@@ -1,5 +1,6 @@
 """Buffered replay: the contents of the buffer, the replayed share, and the cost."""
 
+import dataclasses
 from typing import Any
 
 import pytest
@@ -7,8 +8,9 @@ import torch
 from helpers import build_method
 from torch import Tensor
 
+from clbench.data.demonstrations import Demonstrations, collect
 from clbench.learning.method import Stage
-from clbench.learning.prior import Prior
+from clbench.learning.prior import Nothing, Prior, Source
 from clbench.policy.batch import Batch
 from clbench.policy.transformer import TransformerPolicy
 from clbench.testing import TOY
@@ -101,6 +103,24 @@ def test_after_a_target_the_same_share_of_it_is_added() -> None:
     for _ in range(20):
         replayed |= set(_moments(method.batch(toy_source("down"), prior))[8:])
     assert replayed == set(_moments(method.buffer))
+
+
+def test_the_buffer_begins_with_the_first_target_where_no_skill_is_retained_also_with_long_texts() -> None:
+    method: Any = build_method("buffered_replay", {"share": 0.1})
+    policy = TransformerPolicy(dataclasses.replace(SMALL, text_length=24))
+    target = Source(
+        Demonstrations.of_task(TOY.task("right"), collect(TOY.task("right"), TOY.budget), SMALL.chunk, 24),
+        torch.Generator().manual_seed(0),
+        TOY.budget.batch_size,
+    )
+    prior = Prior({"demonstrations": Source(Nothing(), torch.Generator(), TOY.budget.batch_size)})
+    method.prepare(policy, prior)
+    other: Any = build_method("buffered_replay", {"share": 0.1})
+    other.load_state(policy, method.state())
+    assert _ways(other.batch(target, prior)) == {(1.0, 0.0)}
+    other.end_task(policy, Stage(1, TOY.task("right"), 0, 10, target, prior))
+    assert other.buffer.words.shape == (round(0.1 * len(target)), 24)
+    assert len(other.batch(target, prior)) == TOY.budget.batch_size
 
 
 def test_the_buffer_survives_its_state() -> None:

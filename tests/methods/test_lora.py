@@ -9,8 +9,9 @@ import pytest
 import torch
 from helpers import build_method
 from numpy.typing import NDArray
-from torch import Tensor
+from torch import Tensor, nn
 
+from clbench.base.errors import InputError
 from clbench.learning.adaptation import adapt
 from clbench.learning.method import Progress, Stage
 from clbench.learning.prior import Prior
@@ -149,3 +150,22 @@ def test_an_adapted_policy_survives_saving_and_goes_on_as_it_would_have(variant:
 def test_the_step_size_of_the_adapters_is_a_multiple_of_the_scheduled_one() -> None:
     method = build_method("lora", {"speed": 2.5})
     assert method.learning_rate(0.01, Progress(3, 10)) == pytest.approx(0.025)
+
+
+class _Flat(nn.Module):
+    """A policy of a stranger, as far as adapters look at it."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.map = nn.Linear(4, 2)
+
+
+def test_a_policy_without_layers_is_refused_with_what_to_do() -> None:
+    method: Any = build_method("lora", {})
+    with pytest.raises(InputError, match=r"called `layers`; _Flat has none\. Rename one, or leave lora out"):
+        method.prepare(_Flat(), Prior({}))
+
+
+def test_a_wrong_variant_is_told_the_nearest_one() -> None:
+    with pytest.raises(ValueError, match=r"one of lora, dora, rslora, not 'doar'\. Did you mean 'dora'"):
+        build_method("lora", {"variant": "doar"})

@@ -9,6 +9,7 @@ import pandas
 import pytest
 
 import clbench
+from clbench.base.errors import NoRecordsError
 from clbench.records.paths import record_path
 from clbench.records.record import Record
 from clbench.records.writer import write_record
@@ -31,7 +32,7 @@ def records(tmp_path: Path, make_record: Callable[..., Record]) -> Path:
 def test_all_records_come_as_one_long_table(records: Path, caplog: pytest.LogCaptureFixture) -> None:
     with caplog.at_level(logging.WARNING):
         found = clbench.load_records(records)
-    assert "notes.json: is no record of schema" in caplog.text
+    assert "notes.json: is not a record of clbench" in caplog.text
     assert list(dict.fromkeys(found.method)) == ["lora+rank=4", "sft"]
     assert set(found.seed) == {0, 3}
     assert found.success.dtype == bool
@@ -44,7 +45,7 @@ def test_all_records_come_as_one_long_table(records: Path, caplog: pytest.LogCap
 
 def test_an_empty_folder_gives_an_empty_table_and_a_missing_one_an_error(tmp_path: Path) -> None:
     assert list(clbench.load_records(str(tmp_path)).columns) == list(clbench.load_records(tmp_path).columns)
-    with pytest.raises(FileNotFoundError, match=r"no folder of records at .*nowhere"):
+    with pytest.raises(NoRecordsError, match=r"no folder of records at .*nowhere"):
         clbench.load_records(tmp_path / "nowhere")
 
 

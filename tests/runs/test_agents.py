@@ -300,7 +300,7 @@ def test_a_finished_record_is_never_edited(evaluate: Callable[..., Any]) -> None
             {"method": "sft"},
             "'sft' is a method of clbench: give the agent its own name, for example 'me/sft'",
         ),
-        ({"method": "SFT"}, "can be taken for the method 'sft'"),
+        ({"method": "SFT"}, "would take for 'sft'"),
         ({"method": "../sac"}, "cannot be the name of a method"),
         ({"steps": -1}, "steps must be a whole number from 0, not -1"),
         ({"seed": -1}, "seed must be a whole number from 0, not -1"),

@@ -388,7 +388,7 @@ class _Boasts(Method):
         (_Peeks, "stage 1 (right)", "uses prior questions that it does not declare"),
         (_Boasts, "diagnostics() after stage 0", "not JSON compliant"),
         (_Hoards, "stage 2 (down)", "draws from data after the hooks that received it"),
-        (_Explodes, "stage 1 (right)", "step 0: a gradient is not finite"),
+        (_Explodes, "stage 1 (right)", "step 0: a gradient is not finite: that of "),
         (_Poisons, "stage 1 (right)", "The parameter head.position is not finite after 'right'"),
         (_Forgetful, "stage 1 (right)", "cannot merge right"),
     ],

@@ -69,7 +69,7 @@ def test_settings_that_cannot_be_in_the_name_of_a_folder_are_refused(changes: st
     ],
 )
 def test_a_name_that_is_read_as_a_built_in_one_is_refused(name: str, other: str) -> None:
-    with pytest.raises(ValueError, match=f"can be taken for the method '{other}'"):
+    with pytest.raises(ValueError, match=f"would take for '{other}'"):
         check_method_name(name)
 
 

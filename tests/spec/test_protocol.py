@@ -101,7 +101,7 @@ def test_with_a_criterion_every_evaluated_point_of_a_stage_is_its_end() -> None:
 
 @pytest.mark.parametrize("criterion", [0, -0.5, 1.1])
 def test_a_criterion_that_is_no_success_rate_is_refused(criterion: float) -> None:
-    with pytest.raises(ValueError, match="criterion must be a success rate"):
+    with pytest.raises(ValueError, match=r"Budget\.criterion must be a success rate"):
         Budget(criterion=criterion)
 
 

@@ -53,8 +53,8 @@ def test_nothing_is_imported_before_it_is_used() -> None:
         ("Mine-v0", "strangers_module:MINE", "must be of the form namespace/Name-v0"),
         ("me/Mine", "strangers_module:MINE", "must be of the form namespace/Name-v0"),
         ("me/../x-v0", "strangers_module:MINE", "must be of the form namespace/Name-v0"),
-        ("c1bench/Mine-v0", "strangers_module:MINE", "can be taken for a scenario of clbench"),
-        ("clbench/fetch-v1", "strangers_module:MINE", "can be taken for the scenario 'clbench/Fetch-v1'"),
+        ("c1bench/Mine-v0", "strangers_module:MINE", "would take for a scenario of clbench"),
+        ("clbench/fetch-v1", "strangers_module:MINE", "would take for 'clbench/Fetch-v1'"),
         ("clbench/Mine-v0", "strangers_module:MINE", "in the namespace of clbench: choose your own"),
         (
             "clbench/Fetch-v1",

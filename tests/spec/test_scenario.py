@@ -6,6 +6,8 @@ from itertools import pairwise
 
 import pytest
 
+from clbench.base.errors import InputError, UnknownNameError
+from clbench.spec.registry import load_scenario
 from clbench.spec.scenario import balanced_order
 from clbench.testing.toy import TOY
 
@@ -43,3 +45,17 @@ def test_only_a_balanced_scenario_has_an_order_for_each_seed() -> None:
     assert [task.name for task in balanced.for_seed(1).target] == ["down", "right"]
     assert balanced.for_seed(1).retained == TOY.retained
     assert TOY.for_seed(1) is TOY
+
+
+def test_a_wrong_name_of_a_task_is_told_the_nearest_task_also_of_the_background() -> None:
+    fetch = load_scenario("clbench/Fetch-v1")
+    with pytest.raises(UnknownNameError, match="Did you mean 'push'"):
+        fetch.task("pusch")
+    with pytest.raises(UnknownNameError) as raised:
+        fetch.group("push")  # it is trained, but not scored
+    assert "Did you mean 'push'?" not in str(raised.value)
+
+
+def test_a_scenario_whose_seeds_have_their_own_orders_says_so_when_another_order_is_asked_for() -> None:
+    with pytest.raises(InputError, match=r"has no order 1: each seed .* Leave out --order \(order="):
+        load_scenario("clbench/Fetch-v1").in_order(1)

@@ -110,7 +110,9 @@ def test_evaluation_points_double_and_end_with_the_stage(
 
 
 def test_a_budget_cannot_have_more_episodes_on_the_way_than_at_the_end() -> None:
-    with pytest.raises(ValueError, match="first of the 5 test episodes: 6 are too many"):
+    with pytest.raises(
+        ValueError, match=r"Budget\.curve_episodes must be from 0 to test_episodes \(5\), not 6"
+    ):
         Budget(test_episodes=5, curve_episodes=6)
 
 

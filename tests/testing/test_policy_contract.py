@@ -264,7 +264,9 @@ def test_abilities_decide_which_methods_run() -> None:
     kind = f"{__name__}:Plain"
     for name in ("sft", "lora", "consft", "experience_replay", "l2_sp", "ewc"):
         check_abilities(kind, load_method(name).needs, name)
-    with pytest.raises(InputError, match=r"aegis needs .* hidden_states; .*:Plain lacks hidden_states\."):
+    with pytest.raises(
+        InputError, match=r"aegis needs .* hidden_states; .*:Plain lacks hidden_states\. .*`abilities`"
+    ):
         check_abilities(kind, load_method("aegis").needs, "aegis")
     with pytest.raises(InputError, match=r"lacks answers, hidden_states\."):
         check_abilities(kind, load_method("knowledge_insulation").needs, "knowledge_insulation")

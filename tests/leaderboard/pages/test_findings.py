@@ -35,7 +35,7 @@ def test_a_method_that_is_certainly_better_is_named_with_its_gain(
     text = page()
     # kept counts two skills and one earlier target of four tasks in all: a gain of 3/4 of the difference
     assert "On clbench/Even-v1, yes: `finch` by 0.300 [" in text
-    assert "Certainly worse: `l2_sp` by -0.300 [" in text
+    assert "Certainly worse: `l2_sp` by 0.300 [" in text
     table = text.partition("| scenario | method | gain |")[2]
     assert [line.split(" | ")[1] for line in table.splitlines()[2:5]] == ["finch", "lora", "l2_sp"]
 
@@ -63,9 +63,23 @@ def test_definitions_that_order_the_methods_alike_have_a_tau_of_one(
     even_board: Callable[..., Path], page: Callable[[], str]
 ) -> None:
     fill(even_board, sft=0.2, finch=0.6, lora=0.4, l2_sp=0.1)
-    assert (
-        "Final average and forgetting on clbench/Even-v1: alike, Kendall's tau 1.00 [1.00, 1.00]." in page()
-    )
+    text = page()
+    order = "order the methods alike (Kendall's tau 1.00 [1.00, 1.00])."
+    assert f"On clbench/Even-v1, final average and forgetting {order}" in text
+    assert f"On clbench/Even-v1, two halves of the 4 seeds {order}" in text
+
+
+def test_boards_with_a_fixed_number_of_steps_also_tell_what_is_lost_of_skills_and_knowledge(
+    add_full: Callable[..., Path], tmp_path: Path
+) -> None:
+    for seed in range(2):
+        add_full("sft", seed)
+        add_full("frozen", seed)
+    output = tmp_path / "findings.md"
+    findings(records=tmp_path / "leaderboard/records", controls=tmp_path / "controls", output=output)
+    section = output.read_text(encoding="utf-8").partition("## Are skills and knowledge lost together?")[2]
+    assert "On clbench/Toy-v0, plain fine-tuning keeps 0." in section
+    assert "and answers 0.50" in section  # 25 of 50 questions after two stages
 
 
 def test_a_second_call_changes_no_byte(

@@ -112,10 +112,10 @@ def test_every_hyper_parameter_has_its_default_and_its_meaning(bench: Bench) -> 
         text = part(pages[name], "Hyper-parameters")
         for field in dataclasses.fields(load_method(name)):
             if field.name == "step_factor":  # the same for every method: the list of methods has it once
-                assert "step_factor" not in text
+                assert "| `step_factor`" not in text
                 continue
             assert re.search(rf"\| `{field.name}` \| `{re.escape(repr(field.default))}` \| \w", text)
-        assert text == "None." or text.startswith("| name | default | meaning |")
+        assert text.startswith(("None of its own.", "| name | default | meaning |"))
     assert "| `step_factor` | `1.0` | Factor of the" in part(
         pages["README"], "Hyper-parameters of every method"
     )
@@ -178,6 +178,16 @@ def test_the_row_of_the_board_is_next_to_three_others(bench: Bench) -> None:
     assert "| seeds | 2 | 2 | 2 | 2 |" in results
 
 
+def test_the_command_makes_the_row_with_all_its_seeds_and_perturbed_worlds(bench: Bench) -> None:
+    for seed in range(3):
+        bench.add("finch", seed=seed)
+        bench.add("lora", seed=seed + 2)
+    pages = bench.pages()
+    assert f"clbench run {SCENARIO} finch --seeds 3\n" in part(pages["finch"], "Command")
+    assert f"clbench run {SCENARIO} lora --seeds 3 --first-seed 2\n" in part(pages["lora"], "Command")
+    assert f"clbench run {SCENARIO} ewc\n" in part(pages["ewc"], "Command")
+
+
 def test_the_claims_on_a_method_are_linked_with_their_verdicts(bench: Bench) -> None:
     for seed in range(2):
         bench.add("sft", seed=seed)
@@ -218,6 +228,9 @@ def test_the_settings_that_tuning_tried_are_listed_with_the_chosen_one(
     ]
     command = "clbench tune clbench/MetaWorld-v1 consft --write methods/tuned/MetaWorld-v1.json"
     assert command in part(pages["consft"], "Command")
+    chosen = "Tuning chose `step_factor` = 0.055 on clbench/MetaWorld-v1."
+    assert part(pages["consft"], "Hyper-parameters").endswith(chosen)
+    assert "Tuning chose" not in pages["ewc"]
     assert "Settings tried" not in pages["ewc"]
     assert "clbench tune" not in pages["ewc"]
 

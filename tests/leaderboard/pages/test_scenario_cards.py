@@ -184,7 +184,7 @@ def test_without_any_record_the_card_says_so_and_invents_nothing(bench: Bench) -
     assert f"`{command}` makes them." in card
     assert {tuple(cells[1:]) for cells in bars(card).values()} == {("-", "-")}
     assert part(card, "How small a difference it resolves").startswith(
-        "Unknown: this takes 3 seeds of two methods"
+        "Unknown: this takes two seeds of two methods"
     )
     assert part(card, "Order of the targets").startswith("The records have the published order only.")
 
@@ -202,7 +202,7 @@ def test_the_resolution_is_half_of_the_interval_of_a_difference_at_the_measured_
     row = next(line for line in table.splitlines() if line.startswith("| retention |"))
     found = [float(cell) for cell in row.strip("| ").split(" | ")[1:]]
     deviation = np.std([2 / 6, 0, 2 / 6], ddof=1)
-    half_widths = [stats.t.ppf(0.975, n - 1) * deviation / np.sqrt(n) for n in (3, 5, 10)]
+    half_widths = [stats.t.ppf(0.975, n - 1) * deviation / np.sqrt(n) for n in (4, 8)]
     assert found == pytest.approx([deviation, *half_widths], abs=6e-4)
     assert "- prior-data-free: 2 methods, " in table
 
