@@ -92,9 +92,7 @@ def _boards(table: Table) -> dict[str, list[Row]]:
 
 def _usual(table: Table) -> dict[str, list[Row]]:
     """Return the rows of each scenario with the usual policy."""
-    return {
-        name: rows for name, rows in tables_of(table.rows).items() if parts_of(name)[1] == DEFAULT_POLICY
-    }
+    return {name: rows for name, rows in tables_of(table.rows).items() if parts_of(name)[1] == DEFAULT_POLICY}
 
 
 def competing(rows: Iterable[Row]) -> list[Row]:
