@@ -220,7 +220,7 @@ SUITES = {
         "clbench/MetaWorld-v1", 1, "Meta-World/MT1 faucet-close-v3", _metaworld_peer, _metaworld_physics
     ),
     "libero": Suite(
-        "clbench/LiberoGoal-v1",
+        "clbench/LiberoGoal-v0",
         1,
         f"LIBERO {DRAWER}",
         functools.partial(LiberoEnv, DRAWER),

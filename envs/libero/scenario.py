@@ -1,4 +1,4 @@
-"""The scenario clbench/LiberoGoal-v1: one scene with ten goals, which only their words tell apart."""
+"""The scenario clbench/LiberoGoal-v0: one scene with ten goals, which only their words tell apart."""
 
 from __future__ import annotations
 
@@ -151,7 +151,7 @@ _BOWL_IN_DRAWER = _task(
 )
 
 GOAL = Scenario(
-    id="clbench/LiberoGoal-v1",
+    id="clbench/LiberoGoal-v0",
     description="In one scene of LIBERO an arm learns to open, fill, turn and push, and keeps five skills.",
     retained=(_BOWL_ON_STOVE, _BOTTLE_ON_RACK, _BOWL_ON_PLATE, _BOTTLE_ON_CABINET, _BOWL_ON_CABINET),
     target=(_OPEN_DRAWER, _CHEESE_IN_BOWL, _TURN_ON_STOVE, _PUSH_PLATE),

@@ -4,7 +4,7 @@ x grows away from the robot, y to its left, z up. Quaternions begin with their s
 objects and fixtures, in the order of their names. All tasks of libero_goal have the same, and so do those of
 libero_spatial; each task of libero_object has others. Joints of fixtures are 0 where a scene has none.
 
-Positions of things are from the hand, and once more at a finer scale. A policy kept .81 of LiberoGoal-v1's
+Positions of things are from the hand, and once more at a finer scale. A policy kept .81 of LiberoGoal-v0's
 skills with places in the room, .88 with positions from the hand, and .95 with the finer scale as well (90
 to 150 validation episodes): it had missed the neck of the bottle by 1.3 cm or more.
 """

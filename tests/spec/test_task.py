@@ -47,7 +47,7 @@ def test_an_unknown_task_is_answered_with_the_nearest() -> None:
 
 @pytest.mark.parametrize("scenario_id", scenario_ids())
 def test_a_scenario_has_distinct_tasks_whose_entry_points_resolve(scenario_id: str) -> None:
-    scenario = load_scenario(scenario_id)
+    scenario = registered_scenario(scenario_id)
     names = [task.name for task in scenario.tasks]
     assert len(set(names)) == len(names)
     assert scenario.scene_tasks

@@ -90,8 +90,8 @@ def test_one_scenario_is_shown_in_the_order_of_a_metric(
             "No scenario with records is called 'clbench/Toi-v0'. Did you mean 'clbench/Toy-v0'?",
         ),
         (
-            ["clbench/LiberoGoal-v1"],
-            "makes a row of clbench/LiberoGoal-v1: `clbench run clbench/LiberoGoal-v1 sft` makes some.",
+            ["clbench/LiberoGoal-v0"],
+            "makes a row of clbench/LiberoGoal-v0: `clbench run clbench/LiberoGoal-v0 sft` makes some.",
         ),
         (["--sort", "retension"], "No metric is called 'retension'. Did you mean 'retention'?"),
     ],
