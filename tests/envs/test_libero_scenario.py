@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from clbench.base.entry_points import resolve
 from clbench.base.errors import UnknownNameError
-from clbench.spec.registry import load_scenario
+from clbench.spec.registry import registered_scenario
 
-SCENARIO = load_scenario("clbench:clbench/LiberoGoal-v0")
+SCENARIO = registered_scenario("clbench:clbench/LiberoGoal-v0")
 QUESTIONS = {kind.name: kind for kind in resolve(SCENARIO.questions)}
 THINGS = ("bowl", "cheese", "stove", "plate", "bottle", "rack", "cabinet")
 
