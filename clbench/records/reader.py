@@ -58,7 +58,9 @@ def _record(values: Any) -> Record:
     """Return the record in `values`, which `json` read from its file."""
     schema = values.get("schema") if isinstance(values, dict) else None
     if type(schema) is not int or schema < 1:
-        found = "none" if schema is None else quoted(str(schema))
+        found = (
+            "no object" if not isinstance(values, dict) else "none" if schema is None else quoted(str(schema))
+        )
         raise RecordError(
             f"is not a record of clbench: expected an object whose `schema` is a whole number from 1 to "
             f"{SCHEMA}, found {found}."

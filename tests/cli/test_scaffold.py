@@ -192,7 +192,7 @@ def test_the_next_steps_name_another_folder(
         ("m" * 51, "at most 50 small letters"),
         ("lambda", "'lambda' is a word of Python"),
         ("sft", "'sft' is a built-in method. Did you mean 'my_sft'?"),
-        ("s_f_t", "'s_f_t' would take for 'sft'"),
+        ("s_f_t", "would take for 'sft'"),
         ("nul", "the name of a device on Windows"),
         ("torch", "There is a module 'torch' already. Did you mean 'torch_method'?"),
     ],

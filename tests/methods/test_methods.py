@@ -221,7 +221,7 @@ def test_no_hyper_parameter_of_any_method_may_be_negative_or_no_number(
 @pytest.mark.parametrize(
     ("name", "field", "value", "allowed"),
     [
-        ("aegis", "direction", "away", "anchor or random, not 'away'"),
+        ("aegis", "direction", "away", "one of anchor, random, not 'away'"),
         ("aegis", "samples", 0, "from 1, not 0"),
         ("buffered_replay", "replay", 1.5, "from 0 to 1, not 1.5"),
         ("buffered_replay", "share", 1.5, "from 1e-09 to 1, not 1.5"),
@@ -234,7 +234,7 @@ def test_no_hyper_parameter_of_any_method_may_be_negative_or_no_number(
         ("consft", "schedule", 0.0, "from 1e-09, not 0.0"),
         ("ewc", "samples", 0, "from 1, not 0"),
         ("experience_replay", "replay", 1.5, "from 0 to 1, not 1.5"),
-        ("fast_dvla", "direction", "none", "capability or random, not 'none'"),
+        ("fast_dvla", "direction", "none", "one of capability, random, not 'none'"),
         ("fast_dvla", "steps", 0, "from 1, not 0"),
         ("fast_dvla", "step_size", 0.0, "from 1e-12, not 0.0"),
         ("finch", "kappa", 0.0, "from 1e-09, not 0.0"),

@@ -99,7 +99,7 @@ def test_each_seed_learns_the_targets_in_its_own_order(tmp_path: Path) -> None:
     names = [[task.name for task in order] for order in orders]
     assert names[:2] == [["right", "down"], ["down", "right"]]
     assert sorted(names[2:]) == sorted(names[:2])
-    with pytest.raises(ValueError, match="each seed has its own order"):
+    with pytest.raises(ValueError, match="each seed learns the targets in its own order"):
         RunSpec(EAGER.id, "sft", seed=0, order=1).resolve()
 
 
