@@ -36,6 +36,7 @@ records: .venv/installed-dev
 	$(BIN)/clbench run $(KNOWLEDGE) frozen joint sft stop_gradient aegis lora --seeds 4
 	$(BIN)/clbench run clbench/Fetch-v1 frozen sft consft aegis experience_replay lora stop_gradient --seeds 3 \
 		--policy discrete_diffusion
+	$(BIN)/clbench run clbench/Fetch-v1 sft experience_replay lora --seeds 1 --policy-size base
 	$(BIN)/clbench run $(FIXED),clbench/MetaWorldCW-v0 sft frozen joint from_scratch --seeds 3
 	$(BIN)/clbench run $(FIXED) experience_replay --seeds 3
 	for order in 1 2; do $(BIN)/clbench run clbench/PointMaze-v0 sft --seeds 3 --order $$order || exit; done

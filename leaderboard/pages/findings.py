@@ -188,8 +188,8 @@ def _step_sizes(table: Table) -> Section:
                 first, best = curve.rungs[0], max(curve.rungs, key=lambda rung: rung.kept.value or 0.0)
                 answers.append(
                     f"On {name}, plain fine-tuning keeps {format_interval(first.kept)} at "
-                    f"{first.factor:g} of the published step size, and {format_interval(best.kept)} at "
-                    f"{best.factor:g}, where it learns {format_interval(best.learned)}."
+                    f"{first.factor:g} times the published step size, and {format_interval(best.kept)} at "
+                    f"{best.factor:g} times, where it learns {format_interval(best.learned)}."
                 )
     head = ("scenario", "method", "factor", "learned", "kept")
     return Section("How much does a smaller step size do alone?", tuple(answers), head, tuple(lines))
@@ -302,24 +302,24 @@ def _knowledge(boards: dict[str, list[Row]]) -> Section:
 
 
 def _policies(table: Table) -> Section:
-    """Whether forgetting depends on the action head."""
+    """Whether forgetting depends on the policy: its action head, or its size."""
     answers, lines = [], []
     for name, comparisons in by_table(table.rows).items():
         scenario, policy = parts_of(name)
-        differences = {one.method: one.estimates[RANKED_BY] for one in comparisons}
-        lines += [(scenario, method, *map(format_interval, three)) for method, three in differences.items()]
-        lower = [
-            method
-            for method, (_, _, apart) in differences.items()
-            if apart.high is not None and apart.high < 0
-        ]
-        if differences:
+        for one in comparisons:
+            three = map(format_interval, one.estimates[RANKED_BY])
+            lines.append((scenario, one.method, policy, *three, str(one.seeds)))
+        apart = [one.estimates[RANKED_BY][2] for one in comparisons if one.seeds > 1]
+        if apart:
+            lower = sum(one.high is not None and one.high < 0 for one in apart)
             answers.append(
-                f"On {scenario} with {policy}, {len(lower)} of {counted(len(differences), 'method')} end "
-                f"lower for certain than with the flow policy."
+                f"On {scenario} with {policy}, {lower} of {counted(len(apart), 'method')} end lower for "
+                f"certain than with the flow policy."
             )
-    head = ("scenario", "method", "flow", "other policy", "difference")
-    return Section("Does forgetting depend on the action head?", tuple(answers), head, tuple(lines))
+        elif comparisons:
+            answers.append(f"On {scenario} with {policy} there is one seed, which tells nothing for certain.")
+    head = ("scenario", "method", "other policy", "flow", "the other", "difference", "seeds")
+    return Section("Does forgetting depend on the policy?", tuple(answers), head, tuple(lines))
 
 
 def _undecided(judged: Sequence[Judged]) -> Section:

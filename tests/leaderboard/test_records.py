@@ -42,10 +42,12 @@ def test_every_method_has_the_same_seeds_and_the_same_pretrained_policies() -> N
     seeds: dict[tuple[str, str], set[int]] = {}
     for table, record in zip(tables, records, strict=True):
         seeds.setdefault((table, record.run.method), set()).add(record.run.seed)
-    # Fetch-v1 has two Latin squares of orders, which have four rows each, and the others with orders have one
-    squares = {"clbench/Fetch-v1": 8, "clbench/MetaWorld-v1": 4, "clbench/FetchKnowledge-v1": 4}
+    # Fetch-v1 has two Latin squares of orders, which have four rows each, and the others with orders have one; a
+    # run of a policy with 4.9 million parameters takes up to 20 minutes
+    counts = {"clbench/Fetch-v1": 8, "clbench/MetaWorld-v1": 4, "clbench/FetchKnowledge-v1": 4}
+    counts["clbench/Fetch-v1+flow-base"] = 1
     for (table, method), found in seeds.items():
-        assert found == set(range(squares.get(table, 3))), f"{table}, {method}"
+        assert found == set(range(counts.get(table, 3))), f"{table}, {method}"
     assert not any(record.run.changes for record in records)
     assert not any(record.fingerprint["commit"]["dirty"] for record in records)
 
@@ -117,7 +119,8 @@ def test_aegis_sheds_little_energy_at_every_stage() -> None:
 def test_the_readme_shows_the_committed_board() -> None:
     board = (RECORDS.parent / "site" / "LEADERBOARD.md").read_text(encoding="utf-8").replace("\\_", "_")
     section = board.split("## clbench/Fetch-v1\n")[1].split("\n## ")[0]
-    head, _, *rows = [_cells(line) for line in section.splitlines() if line.startswith("| ")]
+    table = section[section.index("\n| ") + 1 :].split("\n\n")[0]
+    head, _, *rows = map(_cells, table.splitlines())
     names = ("final average", "gain", "learned", "kept skills", "kept targets")
     published = {cells[head.index("method")]: [cells[head.index(name)] for name in names] for cells in rows}
     lines = README.read_text(encoding="utf-8").splitlines()

@@ -56,7 +56,7 @@ def test_the_ladder_tells_what_a_smaller_step_size_does(
         for seed in range(2):
             even_board("sft", seed, kept, "ladder", step_factor=factor)
     assert "plain fine-tuning keeps 0.20" in page()
-    assert "at 1 of the published step size, and 0.50" in page()
+    assert "at 1 times the published step size, and 0.50" in page()
 
 
 def test_definitions_that_order_the_methods_alike_have_a_tau_of_one(
