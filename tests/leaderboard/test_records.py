@@ -42,8 +42,8 @@ def test_every_method_has_the_same_seeds_and_the_same_pretrained_policies() -> N
     seeds: dict[tuple[str, str], set[int]] = {}
     for table, record in zip(tables, records, strict=True):
         seeds.setdefault((table, record.run.method), set()).add(record.run.seed)
-    # Fetch-v1 has two Latin squares of orders, which have four rows each, and the others with orders have one;
-    # runs of a policy with 4.9 million parameters take up to 20 minutes
+    # Fetch-v1 has two Latin squares of orders, which have four rows each, and the others with orders have
+    # one; runs of a policy with 4.9 million parameters take up to 20 minutes
     counts = {"clbench/Fetch-v1": 8, "clbench/MetaWorld-v1": 4, "clbench/FetchKnowledge-v1": 4}
     counts["clbench/Fetch-v1+flow-base"] = 1
     for (table, method), found in seeds.items():
