@@ -65,8 +65,8 @@ def test_the_program_of_the_page_makes_a_record_for_each_seed_and_skips_existing
     assert (python, script, scenario, seeds) == (
         "python",
         "docs/guide/online_sac.py",
-        "clbench/Fetch-v1",
-        ["--seeds", "3"],
+        "clbench/PointMaze-v0",
+        ["--seeds", "1"],
     )
     command = [sys.executable, str(DOCS.parents[1] / script), ID, "--seeds", "1", "--steps", "110"]
     for expected in ("seed 0, stage 2: left ", "seed 0 has a record already"):
