@@ -346,13 +346,13 @@ def method_pages(
         output: Folder of the pages.
     """
     from .claims.evidence import read_evidence
-    from .pages.method_pages import pages, read_sources
+    from .pages.method_pages import Sources, pages
     from .views.descriptions import built_in_methods
     from .views.format import write_if_changed
 
     judged = _judged(records, controls)
     evidence = read_evidence(scenario, records, controls)
-    sources = read_sources(evidence, judged, _table(records))
+    sources = Sources(evidence, judged, _table(records).rows)
     texts = pages(built_in_methods(), sources)
     output.mkdir(parents=True, exist_ok=True)
     for name, text in texts.items():

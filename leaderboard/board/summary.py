@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any, Protocol, TypeVar
 
@@ -140,21 +140,23 @@ class Placed(Protocol):
 
 OneRow = TypeVar("OneRow", bound=RowSummary)
 PlacedRow = TypeVar("PlacedRow", bound=Placed)
+AnyRow = TypeVar("AnyRow")
 
 
 def tables_of(rows: Iterable[OneRow]) -> dict[str, list[OneRow]]:
     """Return the rows by the name of their table, tables and rows in the order of `rows`."""
-    found: dict[str, list[OneRow]] = {}
-    for row in rows:
-        found.setdefault(row.scenario, []).append(row)
-    return found
+    return _grouped(rows, lambda row: row.scenario)
 
 
 def divisions_of(rows: Iterable[PlacedRow]) -> dict[str, list[PlacedRow]]:
     """Return the rows by their division, divisions and rows in the order of `rows`."""
-    found: dict[str, list[PlacedRow]] = {}
+    return _grouped(rows, lambda row: row.division)
+
+
+def _grouped(rows: Iterable[AnyRow], key: Callable[[AnyRow], str]) -> dict[str, list[AnyRow]]:
+    found: dict[str, list[AnyRow]] = {}
     for row in rows:
-        found.setdefault(row.division, []).append(row)
+        found.setdefault(key(row), []).append(row)
     return found
 
 

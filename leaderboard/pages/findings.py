@@ -133,9 +133,9 @@ def _gain_sentences(name: str, rows: Sequence[Row]) -> Iterator[str]:
     gains = {row.method: row.estimates["gain"] for row in rows}
     better = {method: gain for method, gain in gains.items() if gain.low is not None and gain.low > 0}
     worse = {
-        method: Estimate(-(gain.value or 0.0), -gain.high, -(gain.low or 0.0))
+        method: Estimate(-gain.value, -gain.high, -gain.low)
         for method, gain in gains.items()
-        if gain.high is not None and gain.high < 0
+        if gain.value is not None and gain.low is not None and gain.high is not None and gain.high < 0
     }
     if better:
         yield f"On {name}, yes: {_listed(better)}."

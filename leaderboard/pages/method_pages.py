@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ from clbench.scoring.intervals import Estimate
 from clbench.spec.identifiers import folder_name
 
 from ..board.commands import row_command, run_command
-from ..board.rows import Row, Table
+from ..board.rows import Row
 from ..board.runs import is_number
 from ..board.summary import DIVISIONS
 from ..claims.claim import BOARDS
@@ -46,7 +47,7 @@ class Sources:
     board: Sequence[Row]
     """Rows of the board."""
 
-    @property
+    @cached_property
     def rows(self) -> dict[str, Row]:
         """Rows of the scenario by method."""
         return {row.method: row for row in self.board if row.scenario == self.evidence.scenario}
@@ -82,11 +83,6 @@ class Tried:
     """Whether tuning chose it."""
 
 
-def read_sources(evidence: Evidence, judged: Sequence[Judged], board: Table) -> Sources:
-    """Return the sources; a missing folder counts as empty."""
-    return Sources(evidence, judged, board.rows)
-
-
 def pages(methods: Sequence[Description], sources: Sources) -> dict[str, str]:
     """Return the pages by file name."""
     of_methods = {f"{method.name}.md": _page(method, sources) for method in methods}
@@ -104,8 +100,7 @@ def _page(method: Description, sources: Sources) -> str:
     """Return the page of one method."""
     text, uses, scenario = method.text, method.cls.uses, sources.evidence.scenario
     papers = arxiv_ids(" ".join((text.idea, *text.rule)))
-    by_method = sources.rows
-    names = [name for name in dict.fromkeys((method.name, *COMPARISONS)) if name in by_method]
+    names = [name for name in dict.fromkeys((method.name, *COMPARISONS)) if name in sources.rows]
     return _template("method.md.jinja").render(
         method=method,
         papers=papers,
@@ -114,10 +109,10 @@ def _page(method: Description, sources: Sources) -> str:
             USED[when].format(kind)
             for kind, when in (("demonstrations", uses.demonstrations), ("questions", uses.questions))
         ],
-        costs=by_method[method.name].costs if method.name in by_method else {},
+        costs=sources.rows[method.name].costs if method.name in sources.rows else {},
         diagnostics=_diagnostics(method, sources),
         scenario=scenario,
-        rows=[by_method[name] for name in names] if method.name in names else [],
+        rows=[sources.rows[name] for name in names] if method.name in names else [],
         shown=shown,
         command=run_command(scenario, method.name),
         claims=_claims(method, sources),
