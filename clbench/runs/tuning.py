@@ -37,8 +37,8 @@ LEARNED = 0.8
 """Least mean success on the targets right after learning them, for a setting that may be chosen."""
 
 CONTROLS = {"constant_weight": "consft_calibrated", "shuffled_weights": "consft_calibrated"}
-"""Controls, with the methods that they differ from in one thing. They have the settings tuned for these, so that
-nothing else differs."""
+"""Controls, with the methods that they differ from in one thing. They have the settings tuned for these, so
+that nothing else differs."""
 
 Settings = Mapping[str, Any]
 

@@ -48,7 +48,7 @@ def _no_capability(evidence: Evidence) -> bool:
 )
 def auxiliary_objective_helps(evidence: Evidence) -> Finding:
     """Plain fine-tuning adapts poorly; an auxiliary objective helps but is expensive."""
-    steps, time = share_of_steps(evidence, CO_TRAINING, SFT), evidence.step_time("co_training")
+    steps, time = share_of_steps(evidence, CO_TRAINING, SFT), evidence.step_time(CO_TRAINING)
     helps, costs, known = steps.high < 0.95, time.low > 1.1, not math.isnan(steps.low)
     no_help = steps.low > 0.95
     whether = "It helps." if helps else "It does not help." if no_help else "Whether it helps is open."

@@ -10,7 +10,7 @@ from typing import Any
 
 from jinja2 import Template
 
-from clbench.runs.tuning import tuned
+from clbench.runs.tuning import CONTROLS, tuned
 from clbench.scoring.intervals import Estimate
 from clbench.spec.identifiers import folder_name
 
@@ -212,6 +212,6 @@ def _commands(method: str, sources: Sources) -> list[str]:
     lines = [row_command(row) for row in rows] or [run_command(sources.evidence.scenario, method)]
     boards = [one for one in BOARDS if method in tuned(one)]
     return lines + [
-        f"clbench tune {one} {method} --write {Path('methods/tuned', folder_name(one))}.json"
+        f"clbench tune {one} {CONTROLS.get(method, method)} --write {Path('methods/tuned', folder_name(one))}.json"
         for one in boards
     ]
