@@ -210,8 +210,9 @@ def _commands(method: str, sources: Sources) -> list[str]:
     scenarios = dict.fromkeys((sources.evidence.scenario, *BOARDS))
     rows = [row for row in sources.board if row.method == method and row.scenario in scenarios]
     lines = [row_command(row) for row in rows] or [run_command(sources.evidence.scenario, method)]
+    tuned_as = CONTROLS.get(method, method)
     boards = [one for one in BOARDS if method in tuned(one)]
     return lines + [
-        f"clbench tune {one} {CONTROLS.get(method, method)} --write {Path('methods/tuned', folder_name(one))}.json"
+        f"clbench tune {one} {tuned_as} --write {Path('methods/tuned', folder_name(one))}.json"
         for one in boards
     ]
