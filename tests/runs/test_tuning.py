@@ -2,6 +2,7 @@
 
 import errno
 import os
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -52,6 +53,16 @@ def test_the_best_final_average_wins_among_settings_that_learn_enough() -> None:
     assert best_of([_tried(0.5, 1.0), best, lazy]) is best
 
 
+@pytest.fixture
+def toy_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """Return the path of the file from which the settings for the toy are read."""
+    path = tmp_path / "tuned" / "Toy-v0.json"
+    monkeypatch.setattr(tuning, "tuned_file", lambda _: path)
+    tuned.cache_clear()
+    yield path
+    tuned.cache_clear()
+
+
 def test_the_first_of_equal_settings_wins() -> None:
     first, second = _tried(0.6, 0.9, 1.0), _tried(0.6, 0.9, 0.3)
     assert best_of([first, second]) is first
@@ -62,36 +73,27 @@ def test_if_no_setting_learns_enough_the_one_that_learns_most_wins() -> None:
     assert best_of([_tried(0.6, 0.1), most]) is most
 
 
-def test_a_run_takes_the_tuned_settings_unless_it_changes_them(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    path = tmp_path / "tuned" / "Toy-v0.json"
+def test_a_run_takes_the_tuned_settings_unless_it_changes_them(toy_file: Path) -> None:
     settings = {"strength": 2.0, "step_factor": 0.1}
-    write_tuned(path, "clbench/Toy-v0", [100, 101], {"l2_sp": Tuned(settings, (_tried(0.6, 0.9),))})
-    monkeypatch.setattr(tuning, "tuned_file", lambda _: path)
-    tuned.cache_clear()
+    write_tuned(toy_file, "clbench/Toy-v0", [100, 101], {"l2_sp": Tuned(settings, (_tried(0.6, 0.9),))})
     plain, changed = (RunSpec(TOY, "l2_sp", 0, changes).resolve() for changes in ({}, {"strength": "5"}))
     assert plain.info.settings == settings
     assert (plain.info.changes, plain.label) == ({}, "l2_sp")
     assert changed.info.settings == {"strength": 5.0, "step_factor": 0.1}
     assert changed.label == "l2_sp+strength=5.0" or changed.label == "l2_sp+strength=5"
     assert RunSpec(TOY, "ewc", 0).resolve().info.settings["step_factor"] == 1.0
-    tuned.cache_clear()
 
 
 @pytest.mark.parametrize("control", CONTROLS)
 def test_a_control_has_the_settings_of_its_method_and_differs_in_nothing_else(
-    control: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    control: str, toy_file: Path
 ) -> None:
-    path, settings = tmp_path / "Toy-v0.json", {"loss_scale": 0.02, "step_factor": 0.1}
-    write_tuned(path, "clbench/Toy-v0", [100, 101], {CONTROLS[control]: Tuned(settings, (_tried(0.6, 0.9),))})
-    monkeypatch.setattr(tuning, "tuned_file", lambda _: path)
-    tuned.cache_clear()
+    chosen = Tuned({"loss_scale": 0.02, "step_factor": 0.1}, (_tried(0.6, 0.9),))
+    write_tuned(toy_file, "clbench/Toy-v0", [100, 101], {CONTROLS[control]: chosen})
     found, method = (RunSpec(TOY, name, 0).resolve().info for name in (control, CONTROLS[control]))
     assert found.settings == method.settings
     assert (found.settings["loss_scale"], found.settings["step_factor"]) == (0.02, 0.1)
     assert (found.changes, found.uses) == ({}, method.uses)
-    tuned.cache_clear()
 
 
 def test_a_full_disk_leaves_the_tuned_settings_of_other_methods(
@@ -113,14 +115,8 @@ def test_a_full_disk_leaves_the_tuned_settings_of_other_methods(
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_tuned_settings_of_other_methods_stay_in_the_file(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    path = tmp_path / "Toy-v0.json"
+def test_tuned_settings_of_other_methods_stay_in_the_file(toy_file: Path) -> None:
     one, other = (Tuned({"step_factor": factor}, (_tried(0.6, 0.9, factor),)) for factor in (0.1, 0.3))
-    write_tuned(path, "clbench/Toy-v0", [100], {"sft": one})
-    write_tuned(path, "clbench/Toy-v0", [100], {"lwf": other})
-    monkeypatch.setattr(tuning, "tuned_file", lambda _: path)
-    tuned.cache_clear()
+    write_tuned(toy_file, "clbench/Toy-v0", [100], {"sft": one})
+    write_tuned(toy_file, "clbench/Toy-v0", [100], {"lwf": other})
     assert tuned("clbench/Toy-v0") == {"lwf": other, "sft": one}
-    tuned.cache_clear()
