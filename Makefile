@@ -19,7 +19,7 @@ leaderboard:
 BOARDS := clbench/Fetch-v1 clbench/MetaWorld-v1
 
 METHODS := aegis consft consft_calibrated experience_replay fast_dvla finch l2_sp lora sft stop_gradient
-# Further methods that keep demonstrations or what they taught, on Fetch-v1 alone, where a run takes a minute or two.
+# Further methods that keep demonstrations or what they taught, on Fetch-v1 alone, where a run takes one to four minutes.
 RIVALS := a_gem buffered_replay ewc
 
 # The settings of every method, from validation episodes of seeds that no board has. Run it before `make records`.

@@ -117,7 +117,8 @@ def _page(method: Description, sources: Sources) -> str:
         command=run_command(scenario, method.name),
         claims=_claims(method, sources),
         chosen=_chosen(method.name),
-        tried=_tried(method.name),
+        control_of=CONTROLS.get(method.name),
+        tried=[] if method.name in CONTROLS else _tried(method.name),
         commands=_commands(method.name, sources),
     )
 

@@ -235,6 +235,22 @@ def test_the_settings_that_tuning_tried_are_listed_with_the_chosen_one(
     assert "clbench tune" not in pages["ewc"]
 
 
+def test_a_control_names_the_method_whose_settings_it_has_and_lists_none_of_its_trials(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tuned = Tuned({"loss_scale": 0.01}, (Tried({"loss_scale": 0.01}, 0.61, 0.94),))
+    found = {"consft_calibrated": tuned, "constant_weight": tuned}
+    monkeypatch.setattr(
+        "clbench.leaderboard.pages.method_pages.tuned",
+        lambda scenario: found if scenario == "clbench/MetaWorld-v1" else {},
+    )
+    page = bench.pages()["constant_weight"]
+    has = "It has the settings tuned for `consft_calibrated`: `loss_scale` = 0.01 on clbench/MetaWorld-v1."
+    assert part(page, "Hyper-parameters").endswith(has)
+    assert "Settings tried" not in page
+    assert "clbench tune clbench/MetaWorld-v1 consft_calibrated --write" in part(page, "Command")
+
+
 def test_words_of_strangers_in_records_are_no_markup(bench: Bench) -> None:
     hostile = "x | y\n## z <b> ```"
     bench.add("aegis", diagnostics={"1": {hostile: 0.5}})
