@@ -62,7 +62,7 @@ def tune(
     Args:
         scenario: Gymnasium id of the scenario; module:id imports the module first.
         methods: Names of installed methods, or module:Class.
-        every: Tune all installed methods.
+        every: Tune all installed methods but controls, which have the settings of their method.
         seeds: Number of tuning seeds.
         first_seed: The first of them; the boards report seeds from 0.
         values: Hyper-parameters and the values to try, as --values.tau_start 0.3,1,3
@@ -76,7 +76,7 @@ def tune(
     check_names([scenario], methods)
     from clbench.learning.registry import load_method, method_names
     from clbench.runs.spec import RunSpec, check_device
-    from clbench.runs.tuning import Tuned, best_of, refinements, rungs, write_tuned
+    from clbench.runs.tuning import CONTROLS, Tuned, best_of, refinements, rungs, write_tuned
 
     numbers = range(first_seed, first_seed + seeds)
     first = RunSpec(scenario, "", first_seed, device=device, split="validation", targets=targets)
@@ -89,6 +89,8 @@ def tune(
         names = list(dict.fromkeys([*methods, *(method_names() if every else ())]))
         if not names:
             raise InputError("Name at least one method, or --all; `clbench list` shows them.")
+        if not values:  # their runs would choose settings that no run reads
+            names = _without_controls(names, CONTROLS, every)
         check_device(device)
         check_folders({"--records": records, "--write": write and write.parent})
         classes = {name: load_method(name) for name in names}
@@ -106,6 +108,15 @@ def tune(
     Console().print(_table(scenario, chosen, seeds))
     if write is not None:
         write_tuned(write, scenario.rpartition(":")[2], numbers, chosen)
+
+
+def _without_controls(names: list[str], controls: Mapping[str, str], every: bool) -> list[str]:
+    """Return the methods that have settings of their own; a control that was named is refused."""
+    own = [name for name in names if name not in controls]
+    if own != names and not every:
+        name = next(name for name in names if name in controls)
+        raise InputError(f"{name} is a control of {controls[name]} and has its settings: tune {controls[name]}.")
+    return own
 
 
 def _combinations(values: Mapping[str, str]) -> list[dict[str, str]]:
