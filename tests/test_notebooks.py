@@ -39,6 +39,7 @@ def kinds(notebook: Any) -> list[str]:
     return [kind for output in outputs if "data" in output for kind in output["data"]]
 
 
+@pytest.mark.slow  # 35 s: it pretrains a toy and runs five methods in processes
 def test_the_first_method_runs_and_is_compared(tmp_path: Path) -> None:
     toy = ("clbench.testing.fetch_toy:clbench/FetchToy-v0", "clbench.testing:clbench/Toy-v0")
     fewer = (('"experience_replay", "frozen"', '"frozen"'), ("(0.1, 10.0)", "(10.0,)"))
