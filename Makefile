@@ -49,7 +49,7 @@ records: .venv/installed-dev
 	done
 	$(BIN)/clbench leaderboard
 
-# The frontier: what a smaller step size does, for plain fine-tuning and for the methods that compete with it.
+# The frontier: what a smaller learning rate does, for plain fine-tuning and for the methods that compete with it.
 ladder: .venv/installed-dev
 	for id in $(BOARDS); do for factor in 1 0.3 0.1 0.03; do \
 		$(BIN)/clbench run $$id $(METHODS) --set.step_factor $$factor --seeds 4 --records leaderboard/ladder || exit; \

@@ -95,7 +95,7 @@ def plane(records: Path | str = RECORDS, scenario: str | None = None, *, dark: b
 
 
 def frontier(records: Path | str = RECORDS, scenario: str | None = None, *, dark: bool = False) -> Plot:
-    """Return what the methods of a scenario learn and keep at each step size of the ladder.
+    """Return what the methods of a scenario learn and keep at each learning rate of the ladder.
 
     The records of the ladder are in the folder `ladder` next to the folder of the records.
 

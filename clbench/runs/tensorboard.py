@@ -27,7 +27,7 @@ def require_tensorboard() -> None:
 class Log:
     """A log of one run's scalars over the optimiser steps since the first target.
 
-    `training/` has the loss and the step size every `LOG_STEPS` steps. At every evaluation point,
+    `training/` has the loss and the learning rate every `LOG_STEPS` steps. At every evaluation point,
     `success_test/`, `success_validation/` and `success_perturbed/` have the success rate of each task,
     `question_accuracy/` has the accuracy of each kind of question and of all questions, and `policy/` has the
     distance from the pretrained policy, at the end of a stage also the shift in it. `diagnostics/` has the

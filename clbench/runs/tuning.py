@@ -2,9 +2,9 @@
 
 All methods try the same number of settings, on the same seeds, all targets and validation episodes alone:
 
-1. `LADDER`: four factors of the step size, with the method's own strength at its default.
+1. `LADDER`: four factors of the learning rate, with the method's own strength at its default.
 2. At the best of them two more settings: two other values of the own strength that the method declares in
-   `Method.tunes`, or, if it declares none, two step sizes between the rungs.
+   `Method.tunes`, or, if it declares none, two learning rates between the rungs.
 
 Among the settings that learn at least `LEARNED` of the targets' success the one with the best final average
 wins.
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from clbench.learning.method import Method
 
 LADDER = (1.0, 0.3, 0.1, 0.03)
-"""Factors of the step size, for every method."""
+"""Factors of the learning rate, for every method."""
 
 BETWEEN = (0.55, 1.8)
 """Factors of the best rung, for methods without a strength of their own: half a rung down and up."""
@@ -66,7 +66,7 @@ class Tuned:
 
 
 def rungs(method: type[Method]) -> list[dict[str, Any]]:
-    """Return the settings that a method tries first: the ladder of step sizes."""
+    """Return the settings that a method tries first: the ladder of learning rates."""
     own = {} if method.tunes is None else {method.tunes[0]: getattr(method(), method.tunes[0])}
     return [{**own, "step_factor": factor} for factor in LADDER]
 

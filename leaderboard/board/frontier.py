@@ -1,4 +1,4 @@
-"""The frontier: what methods learn and keep at each step size of the ladder."""
+"""The frontier: what methods learn and keep at each learning rate of the ladder."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ LEARNED, KEPT = "adaptation", "kept"
 
 @dataclass(frozen=True)
 class Rung:
-    """One method at one step size."""
+    """One method at one learning rate."""
 
     factor: float
-    """Factor of the step size."""
+    """Factor of the learning rate."""
     learned: Estimate
     """Success on each target right after learning it."""
     kept: Estimate
@@ -72,7 +72,7 @@ def read_frontiers(folder: Path) -> tuple[dict[str, tuple[Curve, ...]], list[Not
 
 
 def _on_the_ladder(runs: list[Run]) -> Sifted:
-    """Keep the runs that changed the step size."""
+    """Keep the runs that changed the learning rate."""
     changed = [is_number(run.record.run.changes.get(FACTOR)) for run in runs]
     kept = [run for run, is_kept in zip(runs, changed, strict=True) if is_kept]
     others = [run for run, is_kept in zip(runs, changed, strict=True) if not is_kept]

@@ -11,7 +11,7 @@ CONTROLS = Path("leaderboard/controls")
 """Folder of records with changed settings. Commands on pages name it."""
 
 LADDER = Path("leaderboard/ladder")
-"""Folder of records with the step sizes of the ladder, next to the folder of records."""
+"""Folder of records with the learning rates of the ladder, next to the folder of records."""
 
 CARDS = Path(__file__).parents[2] / "docs/reference/scenarios"
 """Folder of the scenario cards, beside the code. An installed wheel has none."""

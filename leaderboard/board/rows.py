@@ -54,7 +54,7 @@ class Table(Summary):
     """`Record.scenario`, which the rows of a scenario share, by its id."""
     rows: tuple[Row, ...] = ()
     frontiers: Mapping[str, tuple[Curve, ...]] = field(default_factory=dict)
-    """Methods at the step sizes of the ladder, by scenario; those with records only."""
+    """Methods at the learning rates of the ladder, by scenario; those with records only."""
 
 
 def read_table(records: Path, only: Container[str] | None = None) -> Table:

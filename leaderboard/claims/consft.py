@@ -38,7 +38,7 @@ def _inactive_sentences(evidence: Evidence) -> list[str]:
     CONSFT,
     reported="0.49 on prior tasks before sft, 0.09 after; about 70 % of the parameters unchanged (pi0, "
     "LIBERO, Tables 1 and 2)",
-    rule="Holds if the lower end of the drop in retained success with sft at its best step size is above "
+    rule="Holds if the lower end of the drop in retained success with sft at its best learning rate is above "
     "0.05; does not hold if the upper end is below 0.05.",
     margin="0.05 of the retained success",
 )
@@ -114,8 +114,8 @@ def _controls(figures: tuple[Figure, ...]) -> list[str]:
         ("weighing single samples need not be what keeps skills", "the weights of single samples matter"),
         ("it need not matter which samples get small weights", "it matters which samples get small weights"),
         (
-            "a step size that follows the loss may suffice",
-            "a step size that follows the loss does not suffice",
+            "a learning rate that follows the loss may suffice",
+            "a learning rate that follows the loss does not suffice",
         ),
     )
     return [
@@ -172,7 +172,7 @@ def stays_sparse(evidence: Evidence) -> Finding:
             figures,
             (response,),
             ("One step of Adam moves nearly every weight by more than the threshold, however small it is.",),
-            "A measure of sparsity that responds to the step size.",
+            "A measure of sparsity that responds to the learning rate.",
             about=ARMS,
         )
     responds = response.high >= 0.05  # not known without the ladder

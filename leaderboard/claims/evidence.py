@@ -267,7 +267,7 @@ def read_evidence(scenario: str, records: Path, controls: Path) -> Evidence:
 
 
 def rung(method: str, factor: Any) -> str:
-    """Return the label of a run of the ladder: the method and its factor of the step size, as "sft@0.3"."""
+    """Return the label of a run of the ladder: the method and its factor of the learning rate, as "sft@0.3"."""
     return f"{method}@{factor:g}" if is_number(factor) else f"{method}@{factor}"
 
 

@@ -40,7 +40,7 @@ def _no_capability(evidence: Evidence) -> bool:
     "F1",
     CAPVECTOR,
     reported="LIBERO 87.5 with the auxiliary objective, 82.1 without, after 5,000 steps; 28 % more compute",
-    rule="Steps to the criterion at the published step size, co_training divided by sft. Holds if the upper "
+    rule="Steps to the criterion at the scenario's learning rate, co_training divided by sft. Holds if the upper "
     "end is below 0.95 and the lower end of a step's time is above 1.1 times sft's; holds in part if one of "
     "both; does not hold if the lower end of the steps is above 0.95 and the upper end of the time is below "
     "1.1.",
@@ -71,7 +71,7 @@ def auxiliary_objective_helps(evidence: Evidence) -> Finding:
     CAPVECTOR,
     reported="LIBERO 90.1 with the vector, 87.5 with the auxiliary objective, 82.1 with neither, after 5,000 "
     "steps (Table 1)",
-    rule="Steps to the criterion at the published step size. Holds if the upper ends of fast_dvla divided "
+    rule="Steps to the criterion at the scenario's learning rate. Holds if the upper ends of fast_dvla divided "
     "by sft and by a random vector of equal norms are below 0.95; does not hold if the lower end of one of "
     "the two is above 0.95. Cannot be shown here if co_training does not certainly save 5 % of the steps.",
     margin="5 % of the steps",
@@ -103,7 +103,7 @@ def _of_the_vector(evidence: Evidence) -> tuple[Figure, Figure]:
     "F3",
     CAPVECTOR,
     reported="LIBERO 90.1 without and 91.7 with it after 5,000 steps; +0.5 to +0.9 later (Table 1)",
-    rule="Steps to the criterion at the published step size, with the regulariser divided by without. Holds "
+    rule="Steps to the criterion at the scenario's learning rate, with the regulariser divided by without. Holds "
     "if the upper end is below 0.95; does not hold if the lower end is above 0.95. Cannot be shown here if "
     "co_training does not certainly save 5 % of the steps.",
     margin="5 % of the steps",
@@ -151,7 +151,7 @@ def costs_little(evidence: Evidence) -> Finding:
     CAPVECTOR,
     reported="RoboTwin 31.8, 23.7 and 9.4 with vectors of three LIBERO suites, 6.7 without (Table 2)",
     rule="The vector is made from the retained skills and used on the targets. Steps to the criterion at "
-    "the published step size, divided by those with a random vector of equal norms: holds if the upper end "
+    "the scenario's learning rate, divided by those with a random vector of equal norms: holds if the upper end "
     "is below 0.95; does not hold if the lower end is above 0.95. Cannot be shown here if co_training does "
     "not certainly save 5 % of the steps.",
     margin="5 % of the steps",

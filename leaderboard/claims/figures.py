@@ -14,7 +14,7 @@ from clbench.scoring.rates import Rates
 from .evidence import Evidence, Figure, Of
 
 PUBLISHED = 1.0
-"""Rung of the ladder with the step size that the papers' recipe gives, the benchmark's learning rate."""
+"""Rung of the ladder with the learning rate that the papers' recipe gives, the benchmark's learning rate."""
 
 
 def retention_drop(evidence: Evidence, method: str) -> Figure:

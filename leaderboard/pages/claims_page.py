@@ -22,7 +22,7 @@ INTRODUCTION = (
     "verdict follows from a rule that was in the code before the records. Most claims are judged on "
     "scenarios whose stages end when the target is learned, so that methods are compared at equal learning: "
     "each at the settings that tuning chose, or at one step of the ladder, written as `sft@0.3` for sft at "
-    "0.3 of the published step size. Numbers are means over seeds with 95 % confidence intervals over seeds "
+    "0.3 of the scenario's learning rate. Numbers are means over seeds with 95 % confidence intervals over seeds "
     "(docs/guide/statistics.md); differences and ratios are paired by seed and episode. A rule that asks "
     "for an interval needs {seeds} seeds. *Cannot be shown here* means that the setting could not have "
     "shown the claim, whether it is true or not. A control is the method without the one ingredient that is "

@@ -170,7 +170,7 @@ def _replay(boards: dict[str, list[Row]]) -> Section:
 
 
 def _step_sizes(table: Table) -> Section:
-    """How much a smaller step size does alone."""
+    """How much a smaller learning rate does alone."""
     answers, lines = [], []
     for name, curves in table.frontiers.items():
         for curve in curves:
@@ -188,11 +188,11 @@ def _step_sizes(table: Table) -> Section:
                 first, best = curve.rungs[0], max(curve.rungs, key=lambda rung: rung.kept.value or 0.0)
                 answers.append(
                     f"On {name}, plain fine-tuning keeps {format_interval(first.kept)} at "
-                    f"{first.factor:g} times the published step size, and {format_interval(best.kept)} at "
+                    f"{first.factor:g} times the scenario's learning rate, and {format_interval(best.kept)} at "
                     f"{best.factor:g} times, where it learns {format_interval(best.learned)}."
                 )
     head = ("scenario", "method", "factor", "learned", "kept")
-    return Section("How much does a smaller step size do alone?", tuple(answers), head, tuple(lines))
+    return Section("How much does a smaller learning rate do alone?", tuple(answers), head, tuple(lines))
 
 
 def _claims(judged: Sequence[Judged]) -> Section:

@@ -46,7 +46,7 @@ class ScenarioView:
     rows: tuple[RowView, ...]
     families: tuple[Family, ...]
     frontier: tuple[Curve, ...]
-    """Methods along the ladder of step sizes."""
+    """Methods along the ladder of learning rates."""
     start: str
     """Sentence on what the pretrained policy can do, empty if there is none."""
     agreement: str

@@ -85,7 +85,7 @@ def test_a_control_says_whether_it_explains_what_is_kept(bench: Bench) -> None:
         bench.add(method, kept=0.9)
     entry = section(bench.page(), "C2")
     assert "constant_weight is not told apart from it" in entry
-    assert "finch does not reach it: a step size that follows the loss does not suffice." in entry
+    assert "finch does not reach it: a learning rate that follows the loss does not suffice." in entry
     assert "The records cannot show what shuffled_weights says about it." in entry
 
 

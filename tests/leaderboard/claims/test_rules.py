@@ -11,7 +11,7 @@ from clbench.records.record import Record
 Given = dict[str, dict[str, Any]]
 
 SFT: Given = {"sft": {}, "sft@1": {}}
-"""Plain fine-tuning that keeps .2 of the skills, at its best step size and at the published one."""
+"""Plain fine-tuning that keeps .2 of the skills, at its best learning rate and at the published one."""
 ACTIVE = {"1": {"omega_counts": [[5, 5, 0, 0, 0], [0, 5, 3, 1, 1]]}}
 SAME = {"1": {"omega_counts": [[98, 1, 0, 0, 1], [60, 0, 0, 0, 40]]}}
 """Weights at the floor, or of 1."""

@@ -51,12 +51,12 @@ def test_the_ladder_tells_what_a_smaller_step_size_does(
     even_board: Callable[..., Path], page: Callable[[], str]
 ) -> None:
     fill(even_board, sft=0.4)
-    assert "smaller step size" not in page()
+    assert "smaller learning rate" not in page()
     for factor, kept in ((1.0, 0.2), (0.1, 0.5)):
         for seed in range(2):
             even_board("sft", seed, kept, "ladder", step_factor=factor)
     assert "plain fine-tuning keeps 0.20" in page()
-    assert "at 1 times the published step size, and 0.50" in page()
+    assert "at 1 times the scenario's learning rate, and 0.50" in page()
 
 
 def test_definitions_that_order_the_methods_alike_have_a_tau_of_one(

@@ -1,4 +1,4 @@
-"""Scenarios whose stages end when the target is learned: their columns, and the ladder of step sizes."""
+"""Scenarios whose stages end when the target is learned: their columns, and the ladder of learning rates."""
 
 from collections.abc import Callable
 from pathlib import Path

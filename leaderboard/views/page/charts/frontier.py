@@ -1,4 +1,4 @@
-"""The frontier as Vega-Lite: what methods learn and keep along the ladder of step sizes."""
+"""The frontier as Vega-Lite: what methods learn and keep along the ladder of learning rates."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ HUES, DASHES = ("mark-0", "mark-1", "mark-2", "mark-3"), ([1, 0], [6, 3], [2, 2]
 """Colours and dashes of the lines. Together they distinguish 16 methods, neighbours by both."""
 
 SHAPES = ("circle", "square", "triangle-up", "diamond", "cross", "triangle-down")
-"""Shapes of the step sizes, the largest first."""
+"""Shapes of the learning rates, the largest first."""
 
 HIGHEST_LOW = 0.8
 """Highest low end of an axis, so that differences of a few episodes do not look large."""
@@ -37,7 +37,7 @@ LONG_TITLES = (
 
 
 def frontier(curves: Sequence[Curve], size: Size, font: str = SYSTEM_FONT) -> Spec:
-    """Return the chart of the curves of one scenario: a line for each method, a mark for each step size.
+    """Return the chart of the curves of one scenario: a line for each method, a mark for each learning rate.
 
     Args:
         curves: Curves, plain fine-tuning first.
@@ -54,13 +54,13 @@ def frontier(curves: Sequence[Curve], size: Size, font: str = SYSTEM_FONT) -> Sp
     hue = of_method | {"scale": {"domain": names, "range": [colour(name) for name in _hues(curves)]}}
     dash = of_method | {"scale": {"domain": names, "range": _dashes(curves)}}
     shape = {
-        "field": "step size",
+        "field": "learning rate",
         "type": "nominal",
         "scale": {"domain": factors, "range": [SHAPES[n % len(SHAPES)] for n in range(len(factors))]},
-        "legend": {"title": "step size", "titleColor": colour("ink"), "columns": len(factors)}
+        "legend": {"title": "learning rate", "titleColor": colour("ink"), "columns": len(factors)}
         | {"symbolFillColor": colour("muted"), "symbolStrokeColor": colour("muted")},
     }
-    tooltip = [{"field": name} for name in ("method", "step size", "learned", "kept", "seeds")]
+    tooltip = [{"field": name} for name in ("method", "learning rate", "learned", "kept", "seeds")]
     mark = {"type": "point", "filled": True, "size": 70, "opacity": 1}
     mark |= {"stroke": colour("paper"), "strokeWidth": 1}
     line = {"x": x, "y": y, "color": hue, "strokeDash": dash}
@@ -83,7 +83,7 @@ def _is_known(rung: Rung) -> bool:
 def _point(curve: Curve, rung: Rung) -> dict[str, Any]:
     return {
         "method": curve.method,
-        "step size": _text(rung.factor),
+        "learning rate": _text(rung.factor),
         "order": rung.factor,
         "x": rounded(rung.learned.value),
         "y": rounded(rung.kept.value),
