@@ -18,6 +18,7 @@ from clbench.base.leftovers import sweep
 from clbench.base.source import package_of, source_hash
 from clbench.base.strict_json import StrictJSONError, read_regular
 from clbench.records.content import content_hash
+from clbench.records.pinned import pinned_file
 from clbench.spec.identifiers import installed_methods
 
 from .board.frontier import ladder_of
@@ -78,6 +79,7 @@ def inputs_of(records: Path) -> dict[str, str]:
             {path.relative_to(CARDS).as_posix(): _text_hash(path.read_bytes()) for path in pictures}
         ),
         "decoding": _text_hash(RESULTS.read_bytes()) if RESULTS.is_file() else "",
+        "definitions": _text_hash(pinned_file().read_bytes()),
         "code": source_hash(*_CODE, *packages),
     }
 

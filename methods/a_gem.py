@@ -1,4 +1,4 @@
-"""A-GEM: to first order, no step raises the loss on prior demonstrations (arXiv 1812.00420).
+"""A-GEM: no gradient raises, to first order, the loss on prior demonstrations (arXiv 1812.00420).
 
 Let g be the gradient on the target and r the gradient on a batch of prior demonstrations. If their inner
 product is negative, the step uses g - (g.r / ||r||^2) r instead of g (Eq. 11). AEGIS projects layer by layer,
@@ -8,6 +8,8 @@ Details:
 1. The memory holds all prior demonstrations, as in experience replay. A batch from it has the budget's size.
 2. There is one projection for all weights together.
 3. If there is no earlier task, the gradient on the target is not changed.
+4. The projected gradient is clipped and goes through Adam, whose step may still raise the prior loss; the
+   paper takes plain gradient steps.
 """
 
 from dataclasses import dataclass

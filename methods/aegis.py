@@ -113,9 +113,10 @@ class Aegis(Method):
     def diagnostics(self) -> dict[str, Any]:
         """Return how much was projected out, and the distance to the anchor during the stage.
 
-        `energy_shed`: removed share of the energy of the backbone layers' gradients. `layers_projected`:
-        share of the layers with a negative product. `anchor_distance`: squared 2-Wasserstein distance
-        between the batch and the anchor at eleven steps, the first and the last included.
+        `energy_shed_mean`, `energy_shed_highest`: removed share of the energy of the backbone layers'
+        gradients, over the steps. `layers_projected_mean`: share of the layers with a negative product.
+        `anchor_distance`: squared 2-Wasserstein distance between the batch and the anchor at eleven steps,
+        the first and the last included.
         """
         if not getattr(self, "shed", None):
             return {}

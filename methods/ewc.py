@@ -9,7 +9,9 @@ Details:
    anchor).
 3. The penalty is (strength / 2) sum_i F_i (theta_i - theta*_i)^2. Its gradient is added in closed form.
 4. If nothing is retained, no weight is important during the first target.
-5. `strength` was chosen on validation episodes of the first Fetch board (docs/history.md).
+5. The gradient of the penalty is clipped together with the loss's, to a norm of 1, and goes through Adam: a
+   strong penalty slows the target down, and `strength` does not mean what it does with plain gradient steps.
+6. `strength` was chosen on validation episodes of the first Fetch board (docs/history.md).
 """
 
 from dataclasses import dataclass

@@ -17,7 +17,8 @@ Details:
 5. The regulariser's gradient is added in closed form, lambda |g| sign(theta - theta_meta), with sign(0) = 0.
 6. No LoRA: the full matrices are regularised. lambda = 1e-4 was chosen for 7 billion parameters;
    docs/reference/methods/fast_dvla.md shows other values here.
-7. The vector is cached. The steps that made it count in every row.
+7. The regulariser's gradient is clipped together with the loss's, to a norm of 1, and goes through Adam.
+8. The vector is cached. The steps that made it count in every row.
 
 `direction="random"` is the control: a random vector with the capability vector's norm in each matrix.
 """
@@ -98,6 +99,7 @@ class FastDVLA(Method):
         }
         inputs = {
             "policy": hash_of_tensors(policy.state_dict()),
+            "device": str(policy.device),
             "drawn": hash_of_tensors(columns),
             "settings": [self.auxiliary, self.steps, self.step_size],
             "source": source_hash(__name__, *TRAINING_SOURCES),

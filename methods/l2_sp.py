@@ -4,7 +4,9 @@ Details:
 1. The penalty (strength / 2) ||theta - theta*||^2 applies to all weights, because no layer is new here. Its
    gradient is added in closed form.
 2. theta* is the pretrained policy during the whole sequence.
-3. The default of `strength` comes from validation episodes of the first Fetch board (docs/history.md). On
+3. The gradient of the penalty is clipped together with the loss's, to a norm of 1, and goes through Adam: a
+   strong penalty slows the target down, and `strength` does not mean what it does with plain gradient steps.
+4. The default of `strength` comes from validation episodes of the first Fetch board (docs/history.md). On
    Fetch-v1 and MetaWorld-v1, `clbench tune` chose again.
 """
 

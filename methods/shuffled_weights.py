@@ -19,7 +19,7 @@ from .consft import ConSFTCalibrated
 
 @dataclass
 class ShuffledWeights(ConSFTCalibrated):
-    """Give each sample the weight of another sample of the batch."""
+    """Give the samples of a batch each other's weights, in a random order."""
 
     def weights(self, losses: Tensor, progress: Progress) -> Tensor:
         """Return ConSFT's weights (B,) in a random order."""

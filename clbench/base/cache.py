@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import glob
 import hashlib
 import json
@@ -26,6 +27,9 @@ if TYPE_CHECKING:
 LOG = logging.getLogger("clbench")
 
 _MANIFEST = "clbench.json"
+
+_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO)
+"""Errors of a disk on which nothing can be written."""
 
 
 class CacheError(ClbenchError, OSError):
@@ -108,14 +112,25 @@ def _make(folder: Path, manifest: Mapping[str, Any], make: Callable[[Path], None
 
 @contextmanager
 def _explained(folder: Path) -> Iterator[None]:
-    """Name what cannot be kept if the file system fails inside."""
+    """Name what cannot be kept if the file system fails inside; files elsewhere are the affair of `make`."""
     try:
         yield
     except CacheError:  # of another result, which `make` needs
         raise
     except (OSError, SafetensorError) as error:
+        if (
+            isinstance(error, OSError)
+            and error.errno not in _FULL
+            and not _is_below(error.filename, folder.parent)
+        ):
+            raise
         reason = getattr(error, "strerror", None) or error
         raise CacheError(f"{folder} cannot be written: {reason}.") from error
+
+
+def _is_below(name: Any, folder: Path) -> bool:
+    """Return whether the file of an error lies below `folder`."""
+    return isinstance(name, str | os.PathLike) and os.path.abspath(name).startswith(os.path.abspath(folder))
 
 
 def is_cached(folder: Path, inputs: Mapping[str, Any]) -> bool:

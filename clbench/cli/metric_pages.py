@@ -20,7 +20,8 @@ LEFT_OUT = {
     "min-ACC and WC-ACC at every step": "earlier targets are evaluated at the ends of the stages only, and "
     "`minimum_accuracy` and `worst_case_accuracy` say so",
     "windowed forgetting and windowed plasticity": "their window counts evaluations after each step",
-    "recovery ratio": "no task is learned a second time, so there is no relearning to time",
+    "recovery ratio": "it compares the times of the first and the second learning of a skill, and the first "
+    "is part of the pretraining; `relearning_steps` counts the steps of the second",
     "Diaz-Rodriguez's MS, SSS, CE, CL_score and CL_stability": "they need sizes and operations of every "
     "stage, and weights that the paper leaves to the user",
     "COOM's AP": "it needs the earlier targets while later ones are learned",

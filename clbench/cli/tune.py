@@ -51,10 +51,11 @@ def tune(
 ) -> None:
     """Choose the settings of METHODS for SCENARIO on validation episodes, with equal effort for each method.
 
-    Each method runs with four learning rates, then with two values of its own strength at the best of them, or
-    with two more learning rates. All targets are learned, with seeds that no board has, and no test episode is
-    played. The setting with the best final average wins, among those that learn .8 of the targets' success.
-    Runs with a record are skipped: the same command continues a stopped one and shows the choice again.
+    Each method runs with four learning rates, then with two values of its own strength at the best of
+    them, or with two more learning rates. All targets are learned, with seeds that no board has, and no
+    test episode is played. The setting with the best final average wins, among those that learn .8 of the
+    targets' success. Runs with a record are skipped: the same command continues a stopped one and shows
+    the choice again.
 
     With --values the methods run with every combination of these values instead, besides plain fine-tuning,
     and nothing is chosen.
@@ -115,7 +116,9 @@ def _without_controls(names: list[str], controls: Mapping[str, str], every: bool
     own = [name for name in names if name not in controls]
     if own != names and not every:
         name = next(name for name in names if name in controls)
-        raise InputError(f"{name} is a control of {controls[name]} and has its settings: tune {controls[name]}.")
+        raise InputError(
+            f"{name} is a control of {controls[name]} and has its settings: tune {controls[name]}."
+        )
     return own
 
 

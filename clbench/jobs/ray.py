@@ -85,7 +85,7 @@ class RayWorkers:
     def free(self) -> int:
         """Return the number of jobs that can start now."""
         cores = int(self._ray.cluster_resources().get("CPU", 0))
-        return min(self._count or cores, cores) - len(self._running)
+        return max(0, min(self._count or cores, cores) - len(self._running))
 
     def start(self, job: Job) -> None:
         """Start a job as a task of the cluster."""

@@ -81,7 +81,7 @@ class _Leases:
         """Take the leases of as many of the jobs as can be had, in their order, and return these jobs."""
         taken: list[Job] = []
         for job in ready:
-            if len(taken) == most:
+            if len(taken) >= most:  # a cluster that shrinks has fewer than none
                 break
             if job not in self._all or self._all[job].take():
                 taken.append(job)

@@ -22,9 +22,9 @@ class Step:
     done: int
     """Number of steps done in the stage, this one included."""
     loss: Tensor | None
-    """Loss of the step, a scalar; None if the method trains nothing."""
+    """Loss of the step, a scalar; None before the first step, and if the method trains nothing."""
     learning_rate: float | None
-    """Step size of the last optimiser group; None if the method trains nothing."""
+    """Learning rate of the last optimiser group; None where there is no loss."""
 
 
 def adapt(

@@ -177,6 +177,9 @@ def pretrain(
         policy.normalise_like(demonstrations.state, demonstrations.action[:, 0])
     else:
         policy.normalise_like(questions.state)
+        if "answers" not in policy.abilities:  # there is nothing to learn from
+            progress(budget.pretraining_steps)
+            return policy
     vision = policy.vision_to_pretrain()
     if vision is not None:
         _pretrain_vision(

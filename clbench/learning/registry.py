@@ -108,7 +108,9 @@ def read_changes(spec: str, cls: type[Method], changes: Mapping[str, Any]) -> di
             raise UnknownNameError(
                 f"{spec} has no hyper-parameter {name!r}.{hint} It has: {', '.join(fields) or 'none'}."
             )
-        values[name] = _read(name, value, hints[name]) if isinstance(value, str) else value
+        values[name] = (
+            _read(name, value, hints[name]) if isinstance(value, str) else _held(value, hints[name])
+        )
     held = new_method(spec, cls, values)
     return {name: getattr(held, name) for name in values}
 
@@ -133,9 +135,21 @@ def new_method(spec: str, cls: type[Method], values: Mapping[str, Any]) -> Metho
     return method
 
 
+def _held(value: Any, hint: Any) -> Any:
+    """Return a value as a field of the type `hint` holds it: 5 is 5.0 where no whole number belongs."""
+    kinds = _kinds(hint)
+    is_whole = isinstance(value, int) and not isinstance(value, bool)
+    return float(value) if is_whole and float in kinds and int not in kinds else value
+
+
+def _kinds(hint: Any) -> tuple[Any, ...]:
+    """Return the members of a union, or the type itself."""
+    return get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)
+
+
 def _read(name: str, text: str, hint: Any) -> Any:
     """Return `text` as a value of the type `hint`: str, int, float, bool, or a union of these and None."""
-    kinds = get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)
+    kinds = _kinds(hint)
     if text.lower() == "none" and NoneType in kinds:
         return None
     for kind in (bool, int, float, str):

@@ -119,7 +119,9 @@ def _read(path: Path) -> tuple[dict[Cell, float], list[str]]:
             for (number, _), row in zip(numbered, rows, strict=True)
         ]
     except (csv.Error, ValueError) as error:
-        raise InputError(f"{path.name}: not a CSV file: {error}.") from None
+        # a quotation that goes on below leaves fewer rows than lines
+        reason = "a quotation mark is not closed on its line" if isinstance(error, ValueError) else error
+        raise InputError(f"{path.name}: not a CSV file: {reason}.") from None
     if len(lines) < 2:
         raise InputError(f"{path.name}: expected a line with the names of the columns, and rows below it.")
     header, *body = lines

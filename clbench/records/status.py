@@ -58,6 +58,8 @@ def run_state(path: Path, check: Callable[[Record], object]) -> RunState:
     except RecordError as error:
         return RunState(path, "damaged", reason=str(error))
     seconds = record.timing.get("seconds")
+    if seconds is not None and not isinstance(seconds, int | float):
+        return RunState(path, "damaged", reason=f"timing: seconds must be a number, not {seconds!r}")
     if record.error is not None:
         reason = f"{record.error['where']}: {record.error['type']}: {record.error['message']}"
         return RunState(path, "failed", seconds=seconds, reason=reason)

@@ -94,10 +94,12 @@ def _report(record: Record, point: Point) -> Iterator[tuple[str, float | None]]:
     for tag, successes in outcomes.items():
         yield tag, sum(successes) / len(successes)
     answers = list(_rows(record.answers, point))
-    for row in answers:
+    asked = [row for row in answers if row["asked"]]  # a policy without answers is asked none
+    for row in asked:
         yield f"question_accuracy/{row['kind']}", row["correct"] / row["asked"]
-    asked = sum(row["asked"] for row in answers)
-    yield "question_accuracy/all", sum(row["correct"] for row in answers) / asked
+    if asked:
+        correct, total = (sum(row[name] for row in asked) for name in ("correct", "asked"))
+        yield "question_accuracy/all", correct / total
     for row in _rows(record.policy, point):
         yield "policy/update_sparsity", row["update_sparsity"]
         yield "policy/activation_drift", row["activation_drift"]

@@ -20,6 +20,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from clbench.base.errors import InputError
 from clbench.base.leftovers import unfinished
 from clbench.base.strict_json import read_json
 from clbench.spec.identifiers import folder_name
@@ -99,10 +100,21 @@ def tuned_file(scenario: str) -> Path:
 
 
 def write_tuned(path: Path, scenario: str, seeds: Sequence[int], methods: Mapping[str, Tuned]) -> None:
-    """Write the settings of `methods` to `path`, and keep those of others that it has already."""
+    """Write the settings of `methods` to `path`, and keep those of others that it has already.
+
+    Raises:
+        InputError: The others were tuned on other seeds.
+    """
     known = {name: asdict(one) for name, one in methods.items()}
     if path.is_file():
-        known = {**read_json(path)["methods"], **known}
+        content = read_json(path)
+        others = content["methods"].keys() - known.keys()
+        if others and content["seeds"] != list(seeds):
+            raise InputError(
+                f"{path}: its other methods were tuned on seeds {content['seeds']}, not {list(seeds)}; "
+                "write to another file, or tune all methods again."
+            )
+        known = {**content["methods"], **known}
     content = {"scenario": scenario, "seeds": list(seeds), "methods": dict(sorted(known.items()))}
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = unfinished(path)

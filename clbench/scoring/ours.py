@@ -152,7 +152,7 @@ def gain(rates: Rates) -> Array:
 
 @metric(
     formula="mean over the targets of the optimiser steps until the criterion was met; a stage that never "
-    "met it counts with all its steps",
+    "met it counts with all steps of the budget",
     source="clbench",
     high=math.inf,
     higher_is_better=False,
@@ -162,6 +162,16 @@ def gain(rates: Rates) -> Array:
 def steps_to_criterion(rates: Rates) -> Array:
     """Optimiser steps until a target was learned."""
     return average(rates.steps)
+
+
+@metric(
+    formula="share of the targets whose stage met the criterion within the budget's steps",
+    source="clbench",
+    missing="The scenario has no criterion.",
+)
+def criterion_met(rates: Rates) -> Array:
+    """Share of the targets that were learned: the others count in all metrics as they are."""
+    return average(rates.met)
 
 
 @metric(
@@ -176,8 +186,8 @@ def steps_to_criterion(rates: Rates) -> Array:
 def speed(rates: Rates) -> Array:
     """How many times as fast as from scratch targets are learned.
 
-    A stage that never meets its criterion counts with all its steps: where that is from_scratch, the value is
-    too low.
+    A stage that never meets its criterion counts with all steps of the budget: where that is from_scratch,
+    the value is too low.
     """
     ratios = np.maximum(rates.references[FROM_SCRATCH].steps, 1.0) / np.maximum(rates.steps, 1.0)
     return np.exp(average(np.log(ratios)))
@@ -257,7 +267,8 @@ def backward_transfer(rates: Rates) -> Array:
     units="share of the area that learning from scratch leaves",
     references=(FROM_SCRATCH,),
     pooled=True,
-    missing=f"A point of a learning curve is missing, or there is no {FROM_SCRATCH} of the same seeds.",
+    missing="Stages end at a criterion, a point of a learning curve is missing, or there is no "
+    f"{FROM_SCRATCH} of the same seeds.",
 )
 def forward_transfer(rates: Rates) -> Array:
     """How much faster targets are learned than from scratch.
@@ -277,7 +288,8 @@ def forward_transfer(rates: Rates) -> Array:
     area = _area(rates.layout.steps, rates.learning_curves, starts)
     curves_from_scratch = rates.references[FROM_SCRATCH].learning_curves
     area_from_scratch = _area(rates.layout.steps, curves_from_scratch, np.zeros_like(starts))
-    return average((area - area_from_scratch) / (1 - area_from_scratch))
+    gained = (area - area_from_scratch) / (1 - area_from_scratch)
+    return average(np.where(rates.have_curves, gained, np.nan))
 
 
 def _area(steps: tuple[int, ...], curves: Array, starts: Array) -> Array:

@@ -284,7 +284,7 @@ def _isolated(rates: Rates) -> Array:
     formula="mean over the targets k of the mean over the evaluation points of stage k of the success on "
     "target k, R[k-1][k] before the first step included",
     source="LIBERO, arXiv 2306.03310 (FWT)",
-    missing="There are no targets, or a point of a learning curve is missing.",
+    missing="There are no targets, stages end at a criterion, or a point of a learning curve is missing.",
 )
 def forward_transfer_libero(rates: Rates) -> Array:
     """Success on the target while it is learned, compared with nothing.
@@ -298,7 +298,8 @@ def forward_transfer_libero(rates: Rates) -> Array:
 
 def _own_curves(rates: Rates) -> Array:
     """Return the mean success on target k over the points of stage k, (..., targets)."""
-    return average(np.concatenate([_starts(rates)[..., None], rates.learning_curves], axis=-1))
+    own = average(np.concatenate([_starts(rates)[..., None], rates.learning_curves], axis=-1))
+    return np.where(rates.have_curves, own, np.nan)
 
 
 @metric(
@@ -350,7 +351,7 @@ def negative_backward_transfer_arfm(rates: Rates) -> Array:
     formula="mean over the targets k of (F[k] + the sum of R[l][k] over the stages l after k) / (K - k + 1); "
     "F[k] is the part of target k in forward_transfer_libero",
     source="LIBERO, arXiv 2306.03310 (AUC)",
-    missing="There are no targets, or a success on one while or after it is learned is missing.",
+    missing="There are no targets, stages end at a criterion, or a success while or after it is missing.",
 )
 def area_under_curve_libero(rates: Rates) -> Array:
     """Success on a target from when it is learned to the end, compared with nothing.

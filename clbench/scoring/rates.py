@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from clbench.base.errors import InputError
 from clbench.scoring.layout import Array, Layout
@@ -33,7 +34,7 @@ class Measured:
     captured: Array
     """Share of episodes after each stage that do its target though asked for a skill, (..., targets)."""
     steps: Array
-    """Optimiser steps of each stage, (..., targets); NaN without a criterion."""
+    """Optimiser steps to the criterion, all of the budget if never met, (..., targets); NaN without one."""
     met: Array
     """Whether each stage met its criterion, 0 or 1, (..., targets); NaN without a criterion."""
     relearning_steps: Array
@@ -80,6 +81,11 @@ class Rates(Measured):
     def learned(self) -> Array:
         """Success rate on target k at the end of stage k, (..., targets)."""
         return np.diagonal(self.target[..., 1:, :], axis1=-2, axis2=-1)
+
+    @property
+    def have_curves(self) -> NDArray[np.bool_]:
+        """Whether stages have learning curves, (..., targets): those to a criterion have their end alone."""
+        return np.isnan(self.steps) | (len(self.layout.steps) > 1)
 
     @property
     def learning_curves(self) -> Array:

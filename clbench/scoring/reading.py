@@ -110,10 +110,15 @@ def _read_ends(record: Record) -> tuple[int, ...]:
 
 
 def read_checks(record: Record, protocol: Protocol) -> tuple[Array, Array]:
-    """Return the steps of each stage, and whether it met the criterion, both (targets,); NaN without one."""
+    """Return the steps to the criterion of each stage, and whether it was met, (targets,); NaN without one.
+
+    A stage that never met it counts with all steps of the budget, also that of a method that trains nothing
+    and is checked once.
+    """
     ends = dict.fromkeys(protocol.stages[1:], (math.nan, math.nan))
     for row in record.check_rows():
-        ends[row.stage] = float(row.step), float(protocol.is_learned(row.successes))
+        met = protocol.is_learned(row.successes)
+        ends[row.stage] = float(row.step if met else protocol.steps[-1]), float(met)
     steps, learned = np.array(list(ends.values())).reshape(-1, 2).T
     return steps, learned
 

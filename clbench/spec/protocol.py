@@ -57,8 +57,8 @@ def check_steps(last: int) -> tuple[int, ...]:
     """Return the steps of a stage at which its criterion is checked, rising.
 
     The first check comes before any step, the last one after all. In between, checks are 2 steps apart up to
-    step 20, since targets are learned in 10 to 30 steps at the published step size. Later ones are 12 %
-    apart, so that a stage is at most an eighth longer than it had to be.
+    step 20, since targets are learned in 10 to 30 steps at the scenario's learning rate. Later ones are 12 %
+    apart, so that a longer stage is at most an eighth longer than it had to be.
 
     Args:
         last: Most steps of a stage.

@@ -19,7 +19,7 @@ from clbench.spec.limits import Limits
 from clbench.spec.policies import DEFAULT_POLICY, check_policy_name
 from clbench.spec.task import Task
 
-Group = Literal["retained", "target", "held_out"]
+Group = Literal["retained", "target", "held_out", "background"]
 
 MOST_ORDERS = 99
 """Largest number of orders besides the published one: a number in a stranger's record must not keep a reader
@@ -82,9 +82,10 @@ class Scenario:
 
     def _repr_html_(self) -> str:
         """Return the tasks with their groups as a table, for notebooks."""
+        groups: tuple[Group, ...] = get_args(Group)
         rows = [
             (group.replace("_", " "), task.name, task.instructions[0], task.horizon)
-            for group in get_args(Group)
+            for group in groups
             for task in getattr(self, group)
         ]
         title = f"{self.id}: {self.description}"
@@ -163,12 +164,13 @@ class Scenario:
         """Return the part of the scenario that the task called `task` belongs to.
 
         Raises:
-            UnknownNameError: No task that is scored has this name; the nearest one is named.
+            UnknownNameError: No task has this name; the nearest one is named.
         """
-        for group in ("retained", "target", "held_out"):
+        groups: tuple[Group, ...] = get_args(Group)
+        for group in groups:
             if any(task == member.name for member in getattr(self, group)):
                 return group
-        raise self._unknown(task, self.tasks)
+        raise self._unknown(task, self.tasks + self.background)
 
     def task(self, name: str) -> Task:
         """Return the task called `name`.

@@ -344,7 +344,7 @@ def seeding(subject: Subject) -> None:
 
 
 def learning(subject: Subject) -> None:
-    """The method learns a target: the policy acts better than the pretrained one. Guides are exempt."""
+    """The method learns a target: the policy acts better than the pretrained one. References are exempt."""
     if subject.cls.uses.reference:
         return
     before, after = _frozen_return(subject.policy), _mean_return(subject.longer.trainer.policy)

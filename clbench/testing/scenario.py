@@ -219,8 +219,8 @@ def _check_questions(scenario: Scenario, episodes: int) -> None:
 
 
 def _scenes(scenario: Scenario, episodes: int) -> Iterator[NDArray[np.float32]]:
-    """Yield states (T, S) for questions, from episodes of the retained tasks, or of all if there are none."""
-    for task in scenario.retained or scenario.tasks:
+    """Yield states (T, S) for questions, from episodes of the tasks whose states are asked about."""
+    for task in scenario.scene_tasks:
         world: gymnasium.Env[Any, Any] = resolve(task.world)()
         with closing(world):
             for number in range(episodes):

@@ -99,10 +99,11 @@ class Observer:
         pictures = [np.empty((0, self.image_size, self.image_size, 3), np.uint8)]
         share = TOGETHER * len(self._processes)
         for start in range(0, len(rows), share):
-            parts = np.array_split(rows[start : start + share], len(self._processes))
-            for process, part in zip(self._processes, parts, strict=True):
+            some = rows[start : start + share]
+            busy = self._processes[: len(some)]  # none draws nothing
+            for process, part in zip(busy, np.array_split(some, len(busy)), strict=True):
                 process.ask(part)
-            pictures += [process.answer() for process in self._processes]
+            pictures += [process.answer() for process in busy]
         return np.concatenate(pictures)
 
     def close(self) -> None:

@@ -17,7 +17,7 @@ def run_command(scenario: str, *labels: str, records: Path = RECORDS) -> str:
 
     Args:
         scenario: Scenario as it was typed, with its module if it has one.
-        labels: Methods with their settings. A label such as "sft@0.3" belongs to the ladder of learning rates.
+        labels: Methods with their settings. A label such as "sft@0.3" is a run of the ladder.
         records: Folder of the records of the board.
     """
     names = [label.partition("@")[0] for label in labels]

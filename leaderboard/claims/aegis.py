@@ -16,8 +16,8 @@ from .claim import (
     not_told_apart,
     what_would_change,
 )
-from .evidence import Evidence, Figure
-from .figures import answer_curve, drift_ratio, early_success, question_drop
+from .evidence import SHARE, Evidence, Figure
+from .figures import answer_curve, drift_ratio, early_success, learning_curve, question_drop
 
 AEGIS = Paper("AEGIS", ("2604.16067",))
 
@@ -43,7 +43,7 @@ def action_loss_erodes_answers(evidence: Evidence) -> Finding:
     """The gradient of the action loss rapidly erodes question answering."""
     drop, stopped = (question_drop(evidence, method) for method in ("sft", "stop_gradient"))
     curve = answer_curve(evidence, "sft")
-    sentences = []
+    sentences = _how_rapid(evidence, curve)
     if stopped.high < drop.low:
         sentences.append("Without that gradient in the backbone less is lost: the gradient is the cause.")
     return Finding(
@@ -57,6 +57,19 @@ def action_loss_erodes_answers(evidence: Evidence) -> Finding:
         tuple(sentences),
         what_would_change(drop, 0.01),
     )
+
+
+def _how_rapid(evidence: Evidence, losses: list[Figure]) -> list[str]:
+    """Return what the stage is long compared with: the step at which the target is learned."""
+    steps, success = learning_curve(evidence, "sft")
+    learned = next((step for step, value in zip(steps, success, strict=True) if value >= 0.9), None)
+    lost = next((step for step, one in zip(steps, losses, strict=True) if one.low > 0.01), None)
+    if learned is None or lost is None:
+        return []
+    return [
+        f"sft does the target in 0.9 of the episodes after {learned} steps; it has certainly lost 0.01 of "
+        f"the answers after {lost} of {steps[-1]} steps."
+    ]
 
 
 @claim(
@@ -188,7 +201,7 @@ def sheds_little(evidence: Evidence) -> Finding:
 
 
 def _of_stages(evidence: Evidence, name: str, what: str, stage: int | None = None) -> Figure:
-    return evidence.diagnostic("aegis", what, lambda found: found.get(name), ".2%", stage)
+    return evidence.diagnostic("aegis", what, lambda found: found.get(name), ".2%", stage, SHARE)
 
 
 @claim(
@@ -215,16 +228,19 @@ def removes_drift(evidence: Evidence) -> Finding:
     "A7",
     AEGIS,
     reported="about 40 % more time; no buffer",
-    rule="Holds if the upper end of a step's time is at most 1.6 times sft's; does not hold if the lower "
-    "end is above 1.6.",
+    rule="Holds if the upper end of a step's time is at most 1.6 times sft's, and stages read no prior data; "
+    "does not hold if the lower end is above 1.6, or if they read any.",
     margin="0.2 of the time of a step",
     scenarios=ANYWHERE,
 )
 def costs_40_percent(evidence: Evidence) -> Finding:
     """Costs about 40 % more time and needs no buffer."""
     time = evidence.step_time("aegis")
+    buffer = any(
+        "throughout" in run.record.run.uses.values() for run in evidence.runs.get("aegis", {}).values()
+    )
     return Finding(
-        decided(holds=time.high <= 1.6, fails=time.low > 1.6),
+        decided(holds=time.high <= 1.6 and not buffer, fails=time.low > 1.6 or buffer),
         (time, evidence.cost("bytes_kept", "aegis", "bytes kept of aegis, the anchor")),
         change=what_would_change(time, 1.6),
     )

@@ -132,19 +132,22 @@ def decided(*, holds: bool, fails: bool, in_part: bool = False) -> Verdict:
 
 def what_would_change(figure: Figure, bar: float) -> str:
     """Return the sentence that says how far the interval of the deciding figure is from the rule's bar."""
+    interval = f'interval of "{figure.what}"'
     if math.isnan(figure.low) or math.isnan(figure.high):
         return f"Records that give an interval for this figure: {figure.what}."
     apart = max(figure.low - bar, bar - figure.high)
     form = figure.form
     if apart >= 0:
-        return f"The interval of the first figure would have to move by {apart:{form}} to reach {bar:{form}}."
+        return (
+            f"{interval[0].upper()}{interval[1:]} would have to move by {apart:{form}} to reach {bar:{form}}."
+        )
     half, gap = (figure.high - figure.low) / 2, abs(figure.value - bar)
     seeds = len(figure.seeds)
     needed = math.ceil(seeds * (half / gap) ** 2) if gap > 0 else MOST_SEEDS + 1
     if not seeds:
-        return f"A narrower interval of the first figure: it contains {bar:{form}}."
+        return f"A narrower {interval}: it contains {bar:{form}}."
     how_many = f"about {needed}" if needed <= MOST_SEEDS else f"more than {MOST_SEEDS}"
-    return f"At this spread {how_many} seeds: the interval of the first figure contains {bar:{form}}."
+    return f"At this spread {how_many} seeds: the {interval} contains {bar:{form}}."
 
 
 def not_told_apart(control: Figure, *, explains: str, does_not: str) -> str:

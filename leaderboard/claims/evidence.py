@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from clbench.scoring.intervals import Estimate, bootstrap, interval, row_generator
+from clbench.scoring.intervals import UNBOUNDED, Estimate, Span, bootstrap, interval, row_generator
 from clbench.scoring.layout import Array
 from clbench.scoring.metrics import load_metric
 from clbench.scoring.rates import Rates
@@ -36,6 +36,9 @@ LEAST_SEEDS = 2
 """An interval of one seed does not cover other seeds: it is shown but decides nothing."""
 
 NO_ESTIMATE = Estimate(None, None, None)
+
+SHARE: Span = (0.0, 1.0)
+"""Least and greatest value of a share."""
 
 Of = Mapping[str, Rates]
 """Rates by label of the method: same seeds, same draws, batch axes (..., runs)."""
@@ -167,6 +170,7 @@ class Evidence:
         read: Callable[[Mapping[str, Any]], Any],
         form: str = ".2f",
         stage: int | None = None,
+        span: Span = UNBOUNDED,
     ) -> Figure:
         """Return the mean of a diagnostic over stages and seeds, with its interval over seeds.
 
@@ -176,6 +180,7 @@ class Evidence:
             read: Returns the value from the diagnostics of a stage; None if they do not have it.
             form: Format of the number.
             stage: The only stage that counts; all count if None.
+            span: Least and greatest possible value.
         """
 
         def values(run: Run) -> list[Any]:
@@ -184,7 +189,18 @@ class Evidence:
             read_ones = [read(found) for found in chosen if isinstance(found, dict)]
             return [value for value in read_ones if value is not None]
 
-        return self._mean_of(method, what, values, form)
+        return self._mean_of(method, what, values, form, span)
+
+    def pooled(
+        self, method: str, what: str, read: Callable[[Sequence[Mapping[str, Any]]], Any], span: Span
+    ) -> Figure:
+        """Return the mean over seeds of what `read` makes of the diagnostics of all stages of a run."""
+
+        def values(run: Run) -> list[Any]:
+            value = read([found for found in run.record.diagnostics.values() if isinstance(found, dict)])
+            return [] if value is None else [value]
+
+        return self._mean_of(method, what, values, ".2f", span)
 
     def share_of_preparation(self, method: str) -> Figure:
         """Return the share of a run's optimiser steps that its preparation took, mean over seeds."""
@@ -194,9 +210,18 @@ class Evidence:
             steps, taken = costs.optimiser_steps, costs.preparation_steps
             return [taken / steps] if taken is not None and steps else []
 
-        return self._mean_of(method, f"share of the optimiser steps that prepare {method}", share, ".1%")
+        return self._mean_of(
+            method, f"share of the optimiser steps that prepare {method}", share, ".1%", SHARE
+        )
 
-    def _mean_of(self, method: str, what: str, values: Callable[[Run], Sequence[Any]], form: str) -> Figure:
+    def _mean_of(
+        self,
+        method: str,
+        what: str,
+        values: Callable[[Run], Sequence[Any]],
+        form: str,
+        span: Span = UNBOUNDED,
+    ) -> Figure:
         runs = self.runs.get(method, {})
         missing = () if runs else (method,)
         means = [number_mean(values(run)) for run in runs.values()]
@@ -204,7 +229,7 @@ class Evidence:
             note = "" if missing else "not in these records"
             return Figure(what, (method,), NO_ESTIMATE, tuple(runs), missing, note, form)
         without_one = [number_mean(means[:place] + means[place + 1 :]) for place in range(len(means))]
-        estimate = interval(number_mean(means), np.array(without_one if len(means) > 1 else []))
+        estimate = interval(number_mean(means), np.array(without_one if len(means) > 1 else []), span=span)
         return Figure(what, (method,), estimate, tuple(runs), (), "", form)
 
     def step_time(self, method: str) -> Figure:
@@ -267,7 +292,7 @@ def read_evidence(scenario: str, records: Path, controls: Path) -> Evidence:
 
 
 def rung(method: str, factor: Any) -> str:
-    """Return the label of a run of the ladder: the method and its factor of the learning rate, as "sft@0.3"."""
+    """Return the label of a run of the ladder: the method and its factor, as "sft@0.3"."""
     return f"{method}@{factor:g}" if is_number(factor) else f"{method}@{factor}"
 
 

@@ -25,25 +25,25 @@ AT_RANDOM = f"fast_dvla+direction=random+step_factor={PUBLISHED}"
 NO_REGULARISER = f"fast_dvla+orthogonal=0.0+step_factor={PUBLISHED}"
 
 NO_CAPABILITY = (
-    "The auxiliary objective does not certainly save 5 % of the steps, so there is no capability that a "
+    "The auxiliary objective certainly saves less than 5 % of the steps, so there is no capability that a "
     "vector could carry."
 )
 A_CAPABILITY = "An auxiliary objective that speeds up learning, or a policy that lacks it."
 
 
 def _no_capability(evidence: Evidence) -> bool:
-    """Return whether the records show that the auxiliary objective itself is no certain help."""
-    return share_of_steps(evidence, CO_TRAINING, SFT).high >= 0.95
+    """Return whether the records show that the auxiliary objective itself is no help."""
+    return share_of_steps(evidence, CO_TRAINING, SFT).low > 0.95
 
 
 @claim(
     "F1",
     CAPVECTOR,
     reported="LIBERO 87.5 with the auxiliary objective, 82.1 without, after 5,000 steps; 28 % more compute",
-    rule="Steps to the criterion at the scenario's learning rate, co_training divided by sft. Holds if the upper "
-    "end is below 0.95 and the lower end of a step's time is above 1.1 times sft's; holds in part if one of "
-    "both; does not hold if the lower end of the steps is above 0.95 and the upper end of the time is below "
-    "1.1.",
+    rule="Steps to the criterion at the scenario's learning rate, co_training divided by sft. Holds if the "
+    "upper end is below 0.95 and the lower end of a step's time is above 1.1 times sft's; holds in part if "
+    "one of both; does not hold if the lower end of the steps is above 0.95 and the upper end of the time "
+    "is below 1.1.",
     margin="5 % of the steps, 10 % of the time",
 )
 def auxiliary_objective_helps(evidence: Evidence) -> Finding:
@@ -71,9 +71,10 @@ def auxiliary_objective_helps(evidence: Evidence) -> Finding:
     CAPVECTOR,
     reported="LIBERO 90.1 with the vector, 87.5 with the auxiliary objective, 82.1 with neither, after 5,000 "
     "steps (Table 1)",
-    rule="Steps to the criterion at the scenario's learning rate. Holds if the upper ends of fast_dvla divided "
-    "by sft and by a random vector of equal norms are below 0.95; does not hold if the lower end of one of "
-    "the two is above 0.95. Cannot be shown here if co_training does not certainly save 5 % of the steps.",
+    rule="Steps to the criterion at the scenario's learning rate. Holds if the upper ends of fast_dvla "
+    "divided by sft and by a random vector of equal norms are below 0.95; does not hold if the lower end "
+    "of one of the two is above 0.95. Cannot be shown here if co_training certainly saves less than 5 % of "
+    "the steps.",
     margin="5 % of the steps",
 )
 def vector_carries_the_capability(evidence: Evidence) -> Finding:
@@ -103,9 +104,9 @@ def _of_the_vector(evidence: Evidence) -> tuple[Figure, Figure]:
     "F3",
     CAPVECTOR,
     reported="LIBERO 90.1 without and 91.7 with it after 5,000 steps; +0.5 to +0.9 later (Table 1)",
-    rule="Steps to the criterion at the scenario's learning rate, with the regulariser divided by without. Holds "
-    "if the upper end is below 0.95; does not hold if the lower end is above 0.95. Cannot be shown here if "
-    "co_training does not certainly save 5 % of the steps.",
+    rule="Steps to the criterion at the scenario's learning rate, with the regulariser divided by without. "
+    "Holds if the upper end is below 0.95; does not hold if the lower end is above 0.95. Cannot be shown "
+    "here if co_training certainly saves less than 5 % of the steps.",
     margin="5 % of the steps",
 )
 def regulariser_keeps_the_vector(evidence: Evidence) -> Finding:
@@ -151,9 +152,9 @@ def costs_little(evidence: Evidence) -> Finding:
     CAPVECTOR,
     reported="RoboTwin 31.8, 23.7 and 9.4 with vectors of three LIBERO suites, 6.7 without (Table 2)",
     rule="The vector is made from the retained skills and used on the targets. Steps to the criterion at "
-    "the scenario's learning rate, divided by those with a random vector of equal norms: holds if the upper end "
-    "is below 0.95; does not hold if the lower end is above 0.95. Cannot be shown here if co_training does "
-    "not certainly save 5 % of the steps.",
+    "the scenario's learning rate, divided by those with a random vector of equal norms: holds if the "
+    "upper end is below 0.95; does not hold if the lower end is above 0.95. Cannot be shown here if "
+    "co_training certainly saves less than 5 % of the steps.",
     margin="5 % of the steps",
 )
 def vector_transfers(evidence: Evidence) -> Finding:
@@ -177,8 +178,9 @@ def vector_transfers(evidence: Evidence) -> Finding:
     rule="One chunk at a time, the fastest pipeline of a distilled student against easy-first decoding in "
     "12 forwards. Holds if the lower end of the speed-up is at least 2.65 and that of the difference in "
     "success at least -0.03; does not hold if one of the upper ends is below. Cannot be shown here if it "
-    "would not hold, success is equal, and a forward of all tokens takes less than 1.5 times as long as one "
-    "of a block: the time is then that of forwards, whatever their tokens.",
+    "would not hold, success is equal, and one forward succeeds as often as 12 (there is nothing to speed "
+    "up), or a forward of all tokens takes less than 1.5 times as long as one of a block (the time is then "
+    "that of forwards, whatever their tokens).",
     margin="a speed-up of 2.65, 0.03 of success",
     scenarios=ANYWHERE,
 )
@@ -196,15 +198,23 @@ def decodes_faster(evidence: Evidence) -> Finding:
     fails = speed.high < LEAST_SPEED_UP or success.high < -MOST_LOSS
     change = what_would_change(speed, LEAST_SPEED_UP)
     figures = (speed, success)
-    if fails and success.low >= -MOST_LOSS and forward.high < LEAST_RATIO:
-        why = "A forward takes as long for all tokens as for a block: only fewer forwards save time here."
-        return Finding("cannot be shown here", figures, (forward, *_counts(found)), (why,), WIDER)
-    return Finding(decided(holds=holds, fails=fails), figures, (forward, *_counts(found)), (), change)
+    single = min(found.decoders, key=lambda one: one.forwards)
+    at_once = Figure(f"success, {single.name} - easy first", (), single.difference)
+    controls = (at_once, forward, *_counts(found))
+    if fails and success.low >= -MOST_LOSS:
+        if single.forwards <= 1 and at_once.low >= -MOST_LOSS:
+            why = "One forward succeeds as often as 12: there is nothing that a pipeline must speed up."
+            return Finding("cannot be shown here", figures, controls, (why,), HARDER)
+        if forward.high < LEAST_RATIO:
+            why = "A forward takes as long for all tokens as for a block: only fewer forwards save time here."
+            return Finding("cannot be shown here", figures, controls, (why,), WIDER)
+    return Finding(decided(holds=holds, fails=fails), figures, controls, (), change)
 
 
 LEAST_SPEED_UP, MOST_LOSS, LEAST_RATIO = 2.65, 0.03, 1.5
 """The bars of F6: speed-up, loss of success, and how much longer a forward of all tokens must take."""
 
+HARDER = "Tasks in which actions that are decoded in one forward fail."
 WIDER = "A policy that is wide enough for the time of a forward to follow its tokens."
 
 

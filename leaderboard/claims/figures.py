@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -11,10 +11,10 @@ from clbench.scoring.layout import Array, average
 from clbench.scoring.metrics import load_metric
 from clbench.scoring.rates import Rates
 
-from .evidence import Evidence, Figure, Of
+from .evidence import SHARE, Evidence, Figure, Of
 
 PUBLISHED = 1.0
-"""Rung of the ladder with the learning rate that the papers' recipe gives, the benchmark's learning rate."""
+"""Rung of the ladder with the scenario's own learning rate."""
 
 
 def retention_drop(evidence: Evidence, method: str) -> Figure:
@@ -24,7 +24,8 @@ def retention_drop(evidence: Evidence, method: str) -> Figure:
         kept = average(of[method].retained)
         return average(kept[..., 0] - kept[..., -1])
 
-    return evidence.figure(f"retained success, pretrained - {method} after the last target", drop, method)
+    what = f"retained success, pretrained - {method} after the last target"
+    return evidence.figure(what, drop, method, span=(-1, 1))
 
 
 def kept(evidence: Evidence, method: str, other: str) -> Figure:
@@ -57,7 +58,7 @@ def question_drop(evidence: Evidence, method: str) -> Figure:
         return average(_accuracy(of[method], 0) - _accuracy(of[method], -1))
 
     what = f"question accuracy, pretrained - {method} after the last target"
-    return evidence.figure(what, drop, method, form=".3f")
+    return evidence.figure(what, drop, method, span=(-1, 1), form=".3f")
 
 
 def answer_curve(evidence: Evidence, method: str) -> list[Figure]:
@@ -73,9 +74,19 @@ def answer_curve(evidence: Evidence, method: str) -> list[Figure]:
 
     what = "question accuracy, pretrained - {} after {} steps of the first target"
     return [
-        evidence.figure(what.format(method, step), drop(point), method, form=".3f")
+        evidence.figure(what.format(method, step), drop(point), method, span=(-1, 1), form=".3f")
         for point, step in enumerate(steps)
     ]
+
+
+def learning_curve(evidence: Evidence, method: str) -> tuple[tuple[int, ...], list[float]]:
+    """Return the evaluated steps of the first target, and the mean success on it after each."""
+    runs = evidence.runs.get(method, {})
+    if not runs:
+        return (), []
+    rates = [run.scores.rates() for run in runs.values()]
+    curves = np.mean([one.learning_curves[0] for one in rates], axis=0)
+    return next(iter(runs.values())).scores.layout.steps, [float(value) for value in curves]
 
 
 def _accuracy(rates: Rates, stage: int) -> Array:
@@ -146,9 +157,11 @@ def share_between(evidence: Evidence, method: str) -> Figure:
     Weights below are at the floor, alike for all samples, and weights above are those of plain fine-tuning.
     """
 
-    def share(stage: Mapping[str, Any]) -> float | None:
-        counts = np.asarray(stage.get("omega_counts", []), dtype=np.float64)
-        total = counts.sum() if counts.ndim == 2 and counts.shape[1] > 2 else 0.0
-        return float(counts[:, 1:-1].sum() / total) if total > 0 else None
+    def share(stages: Sequence[Mapping[str, Any]]) -> float | None:
+        tables = (np.asarray(stage.get("omega_counts", []), dtype=np.float64) for stage in stages)
+        counts = [table.sum(axis=0) for table in tables if table.ndim == 2 and table.shape[1] > 2]
+        total = sum(float(count.sum()) for count in counts)
+        return sum(float(count[1:-1].sum()) for count in counts) / total if total > 0 else None
 
-    return evidence.diagnostic(method, f"share of the weights of {method} between 0.01 and 0.9", share)
+    what = f"share of the weights of {method} between 0.01 and 0.9"
+    return evidence.pooled(method, what, share, SHARE)

@@ -188,8 +188,8 @@ def _step_sizes(table: Table) -> Section:
                 first, best = curve.rungs[0], max(curve.rungs, key=lambda rung: rung.kept.value or 0.0)
                 answers.append(
                     f"On {name}, plain fine-tuning keeps {format_interval(first.kept)} at "
-                    f"{first.factor:g} times the scenario's learning rate, and {format_interval(best.kept)} at "
-                    f"{best.factor:g} times, where it learns {format_interval(best.learned)}."
+                    f"{first.factor:g} times the scenario's learning rate, and {format_interval(best.kept)} "
+                    f"at {best.factor:g} times, where it learns {format_interval(best.learned)}."
                 )
     head = ("scenario", "method", "factor", "learned", "kept")
     return Section("How much does a smaller learning rate do alone?", tuple(answers), head, tuple(lines))

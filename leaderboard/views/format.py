@@ -44,6 +44,7 @@ TO_CRITERION = (
     "kept_targets",
     "kept",
     "kept_share",
+    "criterion_met",
     "steps_to_criterion",
     "speed",
     "question_retention",

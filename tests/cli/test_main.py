@@ -86,7 +86,10 @@ def _clbench(*arguments: str, folder: Path | None = None) -> subprocess.Complete
             'Invalid value "20" for --size. Must be >= 96.',
         ),
         (["tune", "clbench/Fetch-v1", "sft", "--values.x", "1", "--targets", "0"], "Must be >= 1."),
-        (["tune", "clbench/Fetch-v1", "sft", "shuffled_weights"], "has its settings: tune consft_calibrated."),
+        (
+            ["tune", "clbench/Fetch-v1", "sft", "shuffled_weights"],
+            "has its settings: tune consft_calibrated.",
+        ),
         (
             ["tune", "clbench/Fetch-v1", "consft", "--values.kapa", "1,2"],
             "consft has no hyper-parameter 'kapa'. Did you mean 'kappa'?",

@@ -44,7 +44,14 @@ def test_a_row_has_every_metric_with_its_interval_and_the_costs(four_methods: Pa
     assert row.parameters == 1000
     assert np.isnan(row.intransigence)  # there is no joint
     assert np.isnan(row.perturbed_retention)
-    to_criterion = {"steps_to_criterion", "speed", "relearning_steps", "instruction_capture", "shift"}
+    to_criterion = {
+        "criterion_met",
+        "steps_to_criterion",
+        "speed",
+        "relearning_steps",
+        "instruction_capture",
+        "shift",
+    }
     assert row[sorted(to_criterion)].isna().all()
     missing = {"intransigence", "perturbed_retention", "perturbed_adaptation", "gain", *to_criterion}
     for name in set(METRICS) - missing:

@@ -145,7 +145,7 @@ def test_a_run_records_its_uses_and_costs_and_has_every_metric(
     missing = {metric for metric, value in values.items() if value is None and not metric.endswith("_cora")}
     adapted = {"update_sparsity"} if record.costs.parameters_added else set()
     # the stages of the toy have no criterion
-    to_criterion = {"steps_to_criterion", "instruction_capture", "relearning_steps"}
+    to_criterion = {"criterion_met", "steps_to_criterion", "instruction_capture", "relearning_steps"}
     assert missing == {"perturbed_retention", "perturbed_adaptation", *to_criterion, *adapted}
     assert all(
         METRICS[metric].low <= value <= METRICS[metric].high for metric, value in values.items() if value

@@ -82,7 +82,9 @@ def test_an_interrupted_run_continues_to_the_same_record(
 def test_a_method_that_trains_nothing_is_checked_once(tmp_path: Path) -> None:
     record = execute(RunSpec(EAGER.id, "frozen", seed=0), tmp_path)
     assert [(row.stage, row.step) for row in record.check_rows()] == [(1, 0), (2, 0)]
-    assert measure("steps_to_criterion", Scores.from_record(record)) == 0
+    scores = Scores.from_record(record)
+    assert measure("steps_to_criterion", scores) == 200  # never learned: all steps of the budget
+    assert measure("criterion_met", scores) == 0
 
 
 def test_a_stage_that_never_meets_the_criterion_takes_all_its_steps(tmp_path: Path) -> None:

@@ -48,7 +48,15 @@ def test_a_metric_has_the_value_worked_out_by_hand(name: str, scores: Callable[.
 def test_every_metric_of_the_leaderboard_is_worked_out_by_hand() -> None:
     others = {"forward_transfer", "question_retention"}
     others |= {"perturbed_retention", "perturbed_adaptation", "update_sparsity", "activation_drift"}
-    others |= {"gain", "steps_to_criterion", "speed", "shift", "relearning_steps", "instruction_capture"}
+    others |= {
+        "gain",
+        "criterion_met",
+        "steps_to_criterion",
+        "speed",
+        "shift",
+        "relearning_steps",
+        "instruction_capture",
+    }
     found = {name for name, metric in METRICS.items() if metric.function.__module__ == MODULE}
     assert {*BY_HAND, *others} == found
 
@@ -75,7 +83,14 @@ def test_steps_to_the_criterion_count_a_stage_that_never_met_it_with_all_its_ste
     run, scratch = (scores(MATRIX, steps=(100,), ends=ends) for ends in ((8, 0), (100, 25)))
     assert measure("steps_to_criterion", run) == (8 + 0) / 2
     assert measure("steps_to_criterion", scratch) == (100 + 25) / 2
+    assert (measure("criterion_met", run), measure("criterion_met", scratch)) == (1, 0.5)
     assert measure("speed", run, {"from_scratch": scratch}) == pytest.approx((100 / 8 * 25 / 1) ** 0.5)
+
+
+def test_a_stage_to_a_criterion_has_no_learning_curve(scores: Callable[..., Scores]) -> None:
+    run = scores(MATRIX, steps=(100,), ends=(8, 12))
+    for name in ("forward_transfer", "forward_transfer_libero", "area_under_curve_libero"):
+        assert measure(name, run, {"from_scratch": run}) is None
 
 
 def test_without_a_criterion_there_are_no_steps_to_it(scores: Callable[..., Scores]) -> None:

@@ -11,7 +11,7 @@ from clbench.records.record import Record
 Given = dict[str, dict[str, Any]]
 
 SFT: Given = {"sft": {}, "sft@1": {}}
-"""Plain fine-tuning that keeps .2 of the skills, at its best learning rate and at the published one."""
+"""Plain fine-tuning that keeps .2 of the skills, at its tuned learning rate and at the scenario's."""
 ACTIVE = {"1": {"omega_counts": [[5, 5, 0, 0, 0], [0, 5, 3, 1, 1]]}}
 SAME = {"1": {"omega_counts": [[98, 1, 0, 0, 1], [60, 0, 0, 0, 40]]}}
 """Weights at the floor, or of 1."""
@@ -105,8 +105,7 @@ CASES: list[tuple[str, str, Given]] = [
         "C4",
         "holds",
         {
-            "sft@0.03": {"sparsity": 0.9},
-            "sft@1": {"sparsity": 0.3},
+            "l2_sp": {"sparsity": 0.9},
             "sft": {"sparsity": 0.3},
             "consft": {"sparsity": 0.5},
         },
@@ -115,8 +114,7 @@ CASES: list[tuple[str, str, Given]] = [
         "C4",
         "does not hold",
         {
-            "sft@0.03": {"sparsity": 0.9},
-            "sft@1": {"sparsity": 0.3},
+            "l2_sp": {"sparsity": 0.9},
             "sft": {"sparsity": 0.3},
             "consft": {"sparsity": 0.3},
             "consft_calibrated": {"sparsity": 0.3},
@@ -126,13 +124,12 @@ CASES: list[tuple[str, str, Given]] = [
         "C4",
         "cannot be shown here",
         {
-            "sft@0.03": {"sparsity": 0.3},
-            "sft@1": {"sparsity": 0.3},
+            "l2_sp": {"sparsity": 0.3},
             "sft": {"sparsity": 0.3},
             "consft": {"sparsity": 0.5},
         },
     ),
-    # without the ladder it is not known whether the measure responds
+    # without l2_sp it is not known whether the measure responds
     (
         "C4",
         "undecided",
@@ -143,6 +140,12 @@ CASES: list[tuple[str, str, Given]] = [
     ("C6", "undecided", {"sft": {}, "consft": {}}),
     ("C7", "holds", {"consft": {"earlier": 1.0}, "consft_calibrated": {"earlier": 0.4}}),
     ("C7", "does not hold", {"consft": {"earlier": 0.5}, "consft_calibrated": {"earlier": 0.4}}),
+    # an arm whose samples all weigh the same is plain fine-tuning
+    (
+        "C7",
+        "does not hold",
+        {"consft": {"earlier": 1.0, "diagnostics": SAME}, "consft_calibrated": {"earlier": 0.4}},
+    ),
     ("C8", "holds", {"sft": {"displaced": 0.5}, "consft": {"displaced": 0.8}}),
     (
         "C8",
