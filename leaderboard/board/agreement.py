@@ -64,16 +64,20 @@ def agreement_of(values: Array, replicates: int = REPLICATES) -> Agreement | Non
     return agreement_between(values[:, : seeds // 2], values[:, seeds // 2 :], replicates)
 
 
-def agreement_between(one: Array, other: Array, replicates: int = REPLICATES) -> Agreement | None:
+def agreement_between(
+    one: Array, other: Array, replicates: int = REPLICATES, *, paired: bool = False
+) -> Agreement | None:
     """Return the agreement of two boards on the order of the same rows.
 
     The interval holds the percentiles of `replicates` pairs of boards whose seeds are drawn with replacement,
-    in each board on its own; all rows share the draws, since seeds differ a lot.
+    in each board on its own unless they are of the same runs; all rows share the draws, since seeds differ a
+    lot.
 
     Args:
         one: Value of each row and seed, (rows, seeds).
         other: The same of the other board, (rows, other seeds).
         replicates: Number of draws.
+        paired: Whether both boards are of the same runs, which they then draw together.
 
     Returns:
         None with too few rows, or if a board does not order the rows at all.
@@ -83,9 +87,10 @@ def agreement_between(one: Array, other: Array, replicates: int = REPLICATES) ->
     if len(one) < LEAST_ROWS or not np.isfinite(tau):
         return None
     generator = np.random.default_rng(0)
-    drawn = [
-        board[:, generator.integers(board.shape[1], size=(replicates, board.shape[1]))].mean(axis=2).T
-        for board in boards
-    ]
+    draws = [generator.integers(board.shape[1], size=(replicates, board.shape[1])) for board in boards]
+    if paired:
+        draws[1] = draws[0]
+    drawn = [board[:, seeds].mean(axis=2).T for board, seeds in zip(boards, draws, strict=True)]
     low, high = np.nanpercentile(kendall_tau(*drawn), (2.5, 97.5))
-    return Agreement(tau, float(low), float(high), sum(board.shape[1] for board in boards), len(one))
+    seeds = one.shape[1] if paired else sum(board.shape[1] for board in boards)
+    return Agreement(tau, float(low), float(high), seeds, len(one))

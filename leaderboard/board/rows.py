@@ -26,7 +26,7 @@ from .costs import costs_of
 from .frontier import Curve, ladder_of, read_frontiers
 from .orders import Orders, orders_of
 from .runs import ALIKE, Run, Sifted, no_row, read_run, read_runs
-from .summary import DIVISIONS, METHODS, RANKED_BY, RowSummary, Summary
+from .summary import DIVISIONS, ELSEWHERE, METHODS, RANKED_BY, RowSummary, Summary
 from .tiers import TIERS
 
 
@@ -170,11 +170,13 @@ def _estimates(method: str, by_method: Mapping[str, list[Run]]) -> dict[str, Est
     never_itself = {
         name for metric in METRICS.values() if not metric.compares_itself for name in metric.references
     }
-    # A reference is compared with itself only where that means something.
-    references = {
-        name: _scores(runs) for name, runs in by_method.items() if name != method or name not in never_itself
-    }
     runs = by_method[method]
+    # A reference is compared with itself only where that means something, an agent with none.
+    references = {
+        name: _scores(them)
+        for name, them in by_method.items()
+        if runs[0].division not in ELSEWHERE and (name != method or name not in never_itself)
+    }
     generator = row_generator(runs[0].place, method)
     return estimate(METRICS, _scores(runs), generator, references=references)
 

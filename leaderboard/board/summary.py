@@ -23,6 +23,9 @@ ELSEWHERE = ("online", "external")
 METHODS = DIVISIONS[:3]
 """Divisions of methods, which start from the same policy and learn from the same demonstrations."""
 
+WITHOUT_DEMONSTRATIONS = METHODS[:2]
+"""Divisions of methods that may not look at prior demonstrations."""
+
 COSTS = {
     "steps": "optimiser_steps",
     "bytes_kept": "bytes_kept",

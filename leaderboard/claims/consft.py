@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 from .claim import ANYWHERE, Finding, Paper, best_first, claim, decided, not_told_apart, what_would_change
 from .evidence import Evidence, Figure, rung
@@ -84,6 +85,7 @@ def keeps_20_points_more(evidence: Evidence) -> Finding:
     sft = [evidence.metric("retention", label) for label in ("sft", rung("sft", PUBLISHED))]
     counting = [figure for figure in at_best if figure.methods[0] in arms]
     published = [figure for figure in at_one if figure.methods[0] in {rung(arm, PUBLISHED) for arm in arms}]
+    judged = (*counting, *published)
     best = best_first(counting or at_best)[0]
     figures = (best, *(one for one in (*at_best, *at_one) if one is not best))
     controls = _controls_of(evidence, best.methods[0])
@@ -101,12 +103,12 @@ def keeps_20_points_more(evidence: Evidence) -> Finding:
         decided(
             holds=any(one.low >= 0.20 for one in counting),
             in_part=any(one.low >= 0.20 for one in published),
-            fails=all(one.high < 0.20 for one in (*counting, *published)),
+            fails=all(one.high < 0.20 for one in judged),
         ),
         figures,
         shown,
-        (*_inactive_sentences(evidence), *_what_controls_say(controls)),
-        what_would_change(next((one for one in (*counting, *published) if _is_open(one, 0.20)), best), 0.20),
+        (*_inactive_sentences(evidence), *_what_controls_say(controls, arms)),
+        what_would_change(next((one for one in judged if _is_open(one, 0.20)), best), 0.20),
         about=ARMS,
     )
 
@@ -134,16 +136,14 @@ CONTROLS = {
 
 
 def _controls_of(evidence: Evidence, arm: str) -> tuple[Figure, ...]:
-    """Return an arm's gain in retained success over its controls.
-
-    The first two have the settings of consft_calibrated, and control this arm alone.
-    """
-    names = tuple(CONTROLS) if arm == "consft_calibrated" else ("finch",)
-    return tuple(kept(evidence, arm, control) for control in names)
+    """Return the gains in retained success over the controls: the first two are of consft_calibrated alone."""
+    first = [kept(evidence, "consft_calibrated", name) for name in ("constant_weight", "shuffled_weights")]
+    return (*first, kept(evidence, arm, "finch"))
 
 
-def _what_controls_say(figures: tuple[Figure, ...]) -> list[str]:
-    says = [(figure, *CONTROLS[figure.methods[-1]]) for figure in figures]
+def _what_controls_say(figures: tuple[Figure, ...], arms: Sequence[str]) -> list[str]:
+    """Return what the controls of the arms that count say."""
+    says = [(one, *CONTROLS[one.methods[-1]]) for one in figures if one.methods[0] in arms]
     return [not_told_apart(figure, explains=yes, does_not=no) for figure, yes, no in says]
 
 

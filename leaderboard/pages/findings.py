@@ -8,33 +8,33 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from itertools import combinations, groupby
+from itertools import groupby
 from pathlib import Path
 
 import numpy as np
 
 from clbench.base.text import counted
 from clbench.records.paths import parts_of
+from clbench.scoring.groups import groups
 from clbench.scoring.intervals import Estimate
-from clbench.scoring.layout import Array
-from clbench.scoring.metrics import measure
 from clbench.spec.policies import DEFAULT_POLICY
-from clbench.spec.references import BASELINE, FROZEN
+from clbench.spec.references import BASELINE, FROM_SCRATCH, FROZEN
 
-from ..board.agreement import Agreement, agreement_between
+from ..board.frontier import Curve
 from ..board.predictors import predictions
 from ..board.rows import Row, Table
-from ..board.summary import METHODS, RANKED_BY, tables_of
-from ..claims.claim import tally
+from ..board.summary import METHODS, RANKED_BY, WITHOUT_DEMONSTRATIONS, tables_of
+from ..claims.claim import PREDICATES, Verdict, tally
 from ..claims.judges import Judged
 from ..policies.compared import by_table
-from ..views.format import format_interval, tau_text, title_of
+from ..views.format import MISSING, format_interval, tau_text
 from ..views.markdown import templates
 from ..views.page.charts.plot import themed
 from .findings_chart import gains_chart
+from .orders import order_sentences
 
-WITHOUT_DEMONSTRATIONS = METHODS[:2]
-"""Divisions of methods that may not look at earlier demonstrations."""
+FORGOTTEN_BY = "kept_share"
+"""Metric by which policies are compared: the final average also counts what they knew and learned."""
 
 
 @dataclass(frozen=True)
@@ -74,9 +74,13 @@ def sections(table: Table, judged: Sequence[Judged]) -> list[Section]:
     found = (
         _gains(boards),
         _replay(boards),
-        _step_sizes(table),
+        _learning_rates(table),
+        _relearning(boards),
         _claims(judged),
-        _orders(table, boards),
+        Section(
+            "Do seeds, scenarios and definitions order the methods alike?",
+            tuple(order_sentences(table, boards)),
+        ),
         _predictors(boards),
         _knowledge(_usual(table)),
         _policies(table),
@@ -103,12 +107,12 @@ def competing(rows: Iterable[Row]) -> list[Row]:
 
 
 def _gains(boards: dict[str, list[Row]]) -> Section:
-    """Does any method beat tuned fine-tuning without earlier demonstrations?"""
+    """Does any method beat tuned fine-tuning without prior demonstrations?"""
     answers: list[str] = []
     lines = []
     for name, rows in boards.items():
         others = competing(rows)
-        answers += _gain_sentences(name, [row for row in others if row.division in WITHOUT_DEMONSTRATIONS])
+        answers += _gain_sentences(name, rows)
         lines += [
             (
                 name,
@@ -119,7 +123,7 @@ def _gains(boards: dict[str, list[Row]]) -> Section:
             for row in others
         ]
     return Section(
-        "Does a method without earlier demonstrations beat tuned fine-tuning?",
+        "Does a method without prior demonstrations beat tuned fine-tuning?",
         tuple(answers),
         ("scenario", "method", "gain", "learned", "kept", "seeds"),
         tuple(lines),
@@ -128,25 +132,47 @@ def _gains(boards: dict[str, list[Row]]) -> Section:
 
 
 def _gain_sentences(name: str, rows: Sequence[Row]) -> Iterator[str]:
-    if not rows:
+    """Yield what Tukey's test of all rows without prior demonstrations says of each gain."""
+    others = [row for row in competing(rows) if row.division in WITHOUT_DEMONSTRATIONS]
+    baseline = next((row for row in rows if row.method == BASELINE), None)
+    if not others or baseline is None:
         return
-    gains = {row.method: row.estimates["gain"] for row in rows}
-    better = {method: gain for method, gain in gains.items() if gain.low is not None and gain.low > 0}
-    worse = {
-        method: Estimate(-gain.value, -gain.high, -gain.low)
-        for method, gain in gains.items()
-        if gain.value is not None and gain.low is not None and gain.high is not None and gain.high < 0
-    }
+    gains = {row.method: row.estimates["gain"] for row in others}
+    letters = groups(RANKED_BY, {row.method: row.scores for row in (baseline, *others)})
+    apart = {method for method in gains if not set(letters[method]) & set(letters[BASELINE])}
+    better = {method: gains[method] for method in gains if method in apart and (gains[method].value or 0) > 0}
     if better:
         yield f"On {name}, yes: {_listed(better)}."
     else:
         best = next(iter(gains))
         yield (
-            f"On {name}, not for certain: the largest gain of {counted(len(gains), 'method')} is "
-            f"{format_interval(gains[best], '.3f')}, by `{best}`."
+            f"On {name}, none is told apart from it as better: the largest gain of "
+            f"{counted(len(gains), 'method')} is {format_interval(gains[best], '.3f')}, by `{best}`. "
+            f"{_power(gains.values())}"
         )
+    lower = {
+        method: Estimate(-gain.value, -gain.high, -gain.low)
+        for method, gain in gains.items()
+        if gain.value is not None and gain.low is not None and gain.high is not None and gain.high < 0
+    }
+    worse = {method: loss for method, loss in lower.items() if method in apart}
     if worse:
-        yield f"Certainly worse: {_listed(worse)}."
+        yield f"Told apart from it as worse: {_listed(worse)}."
+    if len(worse) < len(lower):
+        rest = {method: loss for method, loss in lower.items() if method not in worse}
+        yield (
+            "Lower by an interval of their own, which does not count the "
+            f"{counted(len(gains), 'comparison')}: {_listed(rest)}."
+        )
+
+
+def _power(gains: Iterable[Estimate]) -> str:
+    """Return the sentence on the differences that the records cannot show."""
+    halves = [(one.high - one.low) / 2 for one in gains if one.low is not None and one.high is not None]
+    if not halves:
+        return ""
+    half = float(np.median(halves))
+    return f"A difference below {half:.2f}, half the width of the median interval, would not show."
 
 
 def _listed(estimates: dict[str, Estimate]) -> str:
@@ -154,22 +180,27 @@ def _listed(estimates: dict[str, Estimate]) -> str:
 
 
 def _replay(boards: dict[str, list[Row]]) -> Section:
-    """What earlier demonstrations buy, and what they cost."""
+    """What prior demonstrations buy, and what they cost."""
     answers = []
     for name, rows in boards.items():
+        usual = next((format_interval(_steps(row), ".0f") for row in rows if row.method == BASELINE), MISSING)
         for row in competing(rows):
             kept = row.costs.get("bytes_kept")
             if row.division in WITHOUT_DEMONSTRATIONS or not kept:
                 continue
-            steps = format_interval(row.estimates["steps_to_criterion"], ".0f")
             answers.append(
-                f"On {name}, `{row.method}` gains {format_interval(row.estimates['gain'])} with "
-                f"{kept / 1e6:.1f} MB of earlier data, and takes {steps} steps to learn a target."
+                f"On {name}, `{row.method}` gains {format_interval(row.estimates['gain'])}, keeps "
+                f"{kept / 1e6:.1f} MB between stages, and takes {format_interval(_steps(row), '.0f')} steps "
+                f"to learn a target (plain fine-tuning: {usual})."
             )
-    return Section("What do earlier demonstrations buy?", tuple(answers))
+    return Section("What do prior demonstrations buy?", tuple(answers))
 
 
-def _step_sizes(table: Table) -> Section:
+def _steps(row: Row) -> Estimate:
+    return row.estimates["steps_to_criterion"]
+
+
+def _learning_rates(table: Table) -> Section:
     """How much a smaller learning rate does alone."""
     answers, lines = [], []
     for name, curves in table.frontiers.items():
@@ -187,12 +218,60 @@ def _step_sizes(table: Table) -> Section:
             if curve.is_baseline:
                 first, best = curve.rungs[0], max(curve.rungs, key=lambda rung: rung.kept.value or 0.0)
                 answers.append(
-                    f"On {name}, plain fine-tuning keeps {format_interval(first.kept)} at "
-                    f"{first.factor:g} times the scenario's learning rate, and {format_interval(best.kept)} "
-                    f"at {best.factor:g} times, where it learns {format_interval(best.learned)}."
+                    f"On {name}, plain fine-tuning keeps {format_interval(first.kept)} at {first.factor:g} "
+                    f"times the scenario's learning rate, and {format_interval(best.kept)} at "
+                    f"{best.factor:g} times, where it learns {format_interval(best.learned)}."
                 )
+                answers += _at_the_first_rung(curve, curves)
+        answers += _of_frozen(name, _usual(table).get(name, []))
     head = ("scenario", "method", "factor", "learned", "kept")
     return Section("How much does a smaller learning rate do alone?", tuple(answers), head, tuple(lines))
+
+
+def _at_the_first_rung(baseline: Curve, curves: Sequence[Curve]) -> Iterator[str]:
+    """Yield what the methods without prior demonstrations keep at the learning rate of the first rung."""
+    factor = baseline.rungs[0].factor
+    kept = {
+        curve.method: curve.rungs[0].kept
+        for curve in curves
+        if curve.division in WITHOUT_DEMONSTRATIONS
+        and curve is not baseline
+        and curve.rungs[0].factor == factor
+    }
+    if kept:
+        falling = sorted(kept, key=lambda method: -(kept[method].value or 0.0))
+        listed = ", ".join(f"`{method}` {format_interval(kept[method])}" for method in falling)
+        yield f"At {factor:g} times, without prior demonstrations: {listed}."
+
+
+def _of_frozen(name: str, rows: Sequence[Row]) -> Iterator[str]:
+    """Yield what a policy that learns nothing keeps by this measure."""
+    for row in rows:
+        if row.method == FROZEN:
+            yield (
+                f"On {name}, `{FROZEN}`, which learns nothing, keeps "
+                f"{format_interval(row.estimates['kept'])} by this measure: a target that was never learned "
+                "counts as not kept."
+            )
+
+
+def _relearning(boards: dict[str, list[Row]]) -> Section:
+    """How fast the skill that was lost most comes back."""
+    answers = []
+    for name, rows in boards.items():
+        steps = {row.method: row.estimates["relearning_steps"] for row in rows}
+        lost, never = (steps.get(method) for method in (BASELINE, FROM_SCRATCH))
+        if lost is None or lost.value is None:
+            continue
+        compared = ""
+        if never is not None and never.value is not None:
+            own = format_interval(never, ".0f")
+            compared = f"; a policy that was never pretrained takes {own} steps for its own"
+        answers.append(
+            f"On {name}, the skill that plain fine-tuning lost most is back at the criterion after "
+            f"{format_interval(lost, '.0f')} steps of its demonstrations{compared}."
+        )
+    return Section("Is a lost skill gone?", tuple(answers))
 
 
 def _claims(judged: Sequence[Judged]) -> Section:
@@ -214,56 +293,6 @@ def _claims(judged: Sequence[Judged]) -> Section:
     return Section(
         "Which claims of the papers hold here?", tuple(answers), ("id", "claim", "scenario", "verdict"), lines
     )
-
-
-def _orders(table: Table, boards: dict[str, list[Row]]) -> Section:
-    """Whether seeds, scenarios and definitions order the methods alike."""
-    answers = []
-    for name, found in table.agreements.items():
-        if found is not None and name in boards:
-            answers.append(f"On {name}, two halves of the {found.seeds} seeds {_order(found)}.")
-    for (one, rows), (other, others) in combinations(boards.items(), 2):
-        across = _between(rows, others, RANKED_BY, RANKED_BY)
-        if across is not None:
-            answers.append(f"{one} and {other} {_order(across, counted(across.rows, 'method'))}.")
-    for name, rows in boards.items():
-        for metric in ("kept_share", "forgetting", "backward_transfer"):
-            same = _between(rows, rows, RANKED_BY, metric)
-            if same is not None:
-                answers.append(f"On {name}, final average and {title_of(metric)} {_order(same)}.")
-    return Section("Do seeds, scenarios and definitions order the methods alike?", tuple(answers))
-
-
-def _between(rows: Sequence[Row], others: Sequence[Row], metric: str, other_metric: str) -> Agreement | None:
-    """Return the agreement of two metrics on the order of the methods that both lists have."""
-    theirs = {row.method: row for row in others if row.division in METHODS}
-    pairs = [(row, theirs[row.method]) for row in rows if row.division in METHODS and row.method in theirs]
-    if not pairs:
-        return None
-    one, other = (
-        _values([pair[side] for pair in pairs], name) for side, name in enumerate((metric, other_metric))
-    )
-    return None if one is None or other is None else agreement_between(one, other)
-
-
-def _values(rows: Sequence[Row], metric: str) -> Array | None:
-    """Return a metric of each row and of the seeds that all have, (rows, seeds); None if one is missing."""
-    seeds = sorted(set.intersection(*(set(row.seeds) for row in rows)))
-    sign = -1.0 if metric == "forgetting" else 1.0
-    values = [[measure(metric, row.scores[seed]) for seed in seeds] for row in rows]
-    if not seeds or any(value is None for line in values for value in line):
-        return None
-    return sign * np.array(values, dtype=float)
-
-
-def _order(found: Agreement, methods: str = "the methods") -> str:
-    """Return the predicate of a sentence on two boards."""
-    words = f"order {methods} alike"
-    if found.high < 0:
-        words = f"put {methods} in opposite orders"
-    elif found.low <= 0:
-        words = f"may agree on the order of {methods} by chance"
-    return f"{words} (Kendall's tau {tau_text(found)})"
 
 
 def _predictors(boards: dict[str, list[Row]]) -> Section:
@@ -292,9 +321,14 @@ def _knowledge(boards: dict[str, list[Row]]) -> Section:
         after, before = (by_method[method].estimates for method in (BASELINE, FROZEN))
         if after["question_retention"].value is None:
             continue
+        skills = ""
+        if after["retention"].value is not None:
+            skills = (
+                f"keeps {format_interval(after['retention'])} of the skills "
+                f"({format_interval(before['retention'])} before), and "
+            )
         answers.append(
-            f"On {name}, plain fine-tuning keeps {format_interval(after['retention'])} of the skills "
-            f"({format_interval(before['retention'])} before), and answers "
+            f"On {name}, plain fine-tuning {skills}answers "
             f"{format_interval(after['question_retention'])} of the questions "
             f"({format_interval(before['question_retention'])} before)."
         )
@@ -307,32 +341,35 @@ def _policies(table: Table) -> Section:
     for name, comparisons in by_table(table.rows).items():
         scenario, policy = parts_of(name)
         for one in comparisons:
-            three = map(format_interval, one.estimates[RANKED_BY])
+            three = map(format_interval, one.estimates[FORGOTTEN_BY])
             lines.append((scenario, one.method, policy, *three, str(one.seeds)))
-        apart = [one.estimates[RANKED_BY][2] for one in comparisons if one.seeds > 1]
+        apart = [one.estimates[FORGOTTEN_BY][2] for one in comparisons if one.seeds > 1]
         if apart:
             lower = sum(one.high is not None and one.high < 0 for one in apart)
+            higher = sum(one.low is not None and one.low > 0 for one in apart)
             answers.append(
-                f"On {scenario} with {policy}, {lower} of {counted(len(apart), 'method')} end lower for "
-                f"certain than with the flow policy."
+                f"On {scenario} with {policy}, the kept share of {lower} of "
+                f"{counted(len(apart), 'method')} is lower than with the flow policy, and that of {higher} "
+                "higher, by intervals of their own."
             )
         elif comparisons:
             answers.append(f"On {scenario} with {policy} there is one seed, which tells nothing for certain.")
-    head = ("scenario", "method", "other policy", "flow", "the other", "difference", "seeds")
+    head = ("scenario", "method", "other policy", "kept share, flow", "the other", "difference", "seeds")
     return Section("Does forgetting depend on the policy?", tuple(answers), head, tuple(lines))
 
 
 def _undecided(judged: Sequence[Judged]) -> Section:
     """What the records cannot tell."""
     answers = []
-    for verdict, why in (
+    reasons: tuple[tuple[Verdict, str], ...] = (
         ("undecided", "runs are missing, or the intervals are too wide"),
         ("cannot be shown here", "the setting could not have shown the effect"),
-    ):
+    )
+    for verdict, why in reasons:
         found = [one for one in judged if one.finding.verdict == verdict]
         for scenario, members in groupby(
             sorted(found, key=lambda one: one.evidence.scenario), key=lambda one: one.evidence.scenario
         ):
-            names = ", ".join(one.claim.id for one in members)
-            answers.append(f"{scenario}: {names} are {verdict}; {why}.")
+            names = [one.claim.id for one in members]
+            answers.append(f"{scenario}: {', '.join(names)} {PREDICATES[verdict][len(names) > 1]}; {why}.")
     return Section("What can the records not tell?", tuple(answers))

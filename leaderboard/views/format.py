@@ -155,7 +155,7 @@ def prediction_text(rows: Iterable[Row]) -> str:
         for one in found
     ]
     return (
-        f"What orders the {found[0].rows} methods as the share that a stage forgets does (Kendall's tau): "
+        f"Rank correlation with the share that a stage forgets, {found[0].rows} methods (Kendall's tau): "
         f"{'; '.join(parts)}."
     )
 

@@ -105,7 +105,10 @@ def _standing(leader: Row, rows: Iterable[Row]) -> str:
     if standing.alike:
         names = _names(standing.alike)
         return f"Highest final average, {value}, but not told apart from {names}."
-    return f"Best final average, {value}, told apart from all others."
+    others = [row for row in rows if row.division == leader.division and row is not leader]
+    if len(others) == 1:
+        return f"Best final average, {value}, told apart from {printable(others[0].method)}."
+    return f"Best final average, {value}, told apart from all others of its division."
 
 
 def _keeping(members: Sequence[Row], baseline: Row | None) -> str:

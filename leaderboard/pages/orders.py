@@ -1,0 +1,109 @@
+"""Sentences of the findings on the order of the methods, and on what its differences are due to."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import combinations
+
+import numpy as np
+
+from clbench.base.text import counted
+from clbench.scoring.layout import Array
+from clbench.scoring.metrics import measure
+
+from ..board.agreement import Agreement, agreement_between, agreement_of
+from ..board.rows import Row, Table
+from ..board.summary import METHODS, RANKED_BY, WITHOUT_DEMONSTRATIONS
+from ..views.format import tau_text, title_of
+
+
+def order_sentences(table: Table, boards: Mapping[str, list[Row]]) -> Iterator[str]:
+    """Yield whether seeds, scenarios and definitions order the methods alike.
+
+    Args:
+        table: The table of the records.
+        boards: Rows of each scenario at a common criterion.
+    """
+    for name, found in table.agreements.items():
+        if found is not None and name in boards:
+            yield f"On {name}, two halves of the {found.seeds} seeds {_order(found)}."
+            yield from _without_replay(name, boards[name])
+            yield from _shares_of_variance(name, boards[name])
+    for (one, rows), (other, others) in combinations(boards.items(), 2):
+        across = _between(rows, others, RANKED_BY, RANKED_BY)
+        if across is not None:
+            yield f"{one} and {other} {_order(across, counted(across.rows, 'method'))}."
+    for name, rows in boards.items():
+        for metric in ("kept_share", "forgetting", "backward_transfer"):
+            same = _between(rows, rows, RANKED_BY, metric, paired=True)
+            if same is not None:
+                yield f"On {name}, final average and {title_of(metric)} {_order(same)}."
+
+
+def _without_replay(name: str, rows: Sequence[Row]) -> Iterator[str]:
+    """Yield the same of the methods without prior demonstrations: replay is far above the others."""
+    values = _values([row for row in rows if row.division in WITHOUT_DEMONSTRATIONS], RANKED_BY)
+    found = None if values is None else agreement_of(values)
+    if found is not None:
+        yield f"On {name}, without methods that read prior demonstrations, the halves {_order(found)}."
+
+
+def _shares_of_variance(name: str, rows: Sequence[Row]) -> Iterator[str]:
+    """Yield which share of the variance of the final average the method explains, and which the seed.
+
+    They are the sums of squares of the table of methods and seeds, without prior demonstrations.
+    """
+    values = _values([row for row in rows if row.division in WITHOUT_DEMONSTRATIONS], RANKED_BY)
+    if values is None or min(values.shape) < 2 or values.std() == 0:
+        return
+    mean = values.mean()
+    total = ((values - mean) ** 2).sum()
+    of_methods = values.shape[1] * ((values.mean(axis=1) - mean) ** 2).sum() / total
+    of_seeds = values.shape[0] * ((values.mean(axis=0) - mean) ** 2).sum() / total
+    yield (
+        f"On {name}, of the variance of the final average over {values.shape[0]} methods without prior "
+        f"demonstrations and {values.shape[1]} seeds, the method explains {of_methods:.0%}, and the seed "
+        f"with its order of the targets {of_seeds:.0%}."
+    )
+
+
+def _between(
+    rows: Sequence[Row], others: Sequence[Row], metric: str, other_metric: str, *, paired: bool = False
+) -> Agreement | None:
+    """Return the agreement of two metrics on the order of the methods that both lists have.
+
+    Args:
+        rows: Rows of a scenario.
+        others: Rows of another one, or the same.
+        metric: Metric of the first rows.
+        other_metric: Metric of the others.
+        paired: Whether both are of the same runs.
+    """
+    theirs = {row.method: row for row in others if row.division in METHODS}
+    pairs = [(row, theirs[row.method]) for row in rows if row.division in METHODS and row.method in theirs]
+    if not pairs:
+        return None
+    one, other = (
+        _values([pair[side] for pair in pairs], name) for side, name in enumerate((metric, other_metric))
+    )
+    return None if one is None or other is None else agreement_between(one, other, paired=paired)
+
+
+def _values(rows: Sequence[Row], metric: str) -> Array | None:
+    """Return a metric of each row and of the seeds that all have, (rows, seeds); None if one is missing."""
+    seeds = sorted(set.intersection(*(set(row.seeds) for row in rows)))
+    sign = -1.0 if metric == "forgetting" else 1.0
+    values = [[measure(metric, row.scores[seed]) for seed in seeds] for row in rows]
+    if not seeds or any(value is None for line in values for value in line):
+        return None
+    return sign * np.array(values, dtype=float)
+
+
+def _order(found: Agreement, methods: str = "the methods") -> str:
+    """Return the predicate of a sentence on two boards."""
+    words = f"order {methods} alike"
+    if found.high < 0:
+        words = f"put {methods} in opposite orders"
+    elif found.low <= 0:
+        words = f"may agree on the order of {methods} by chance"
+    return f"{words} (Kendall's tau {tau_text(found)})"
