@@ -136,7 +136,7 @@ CONTROLS = {
 
 
 def _controls_of(evidence: Evidence, arm: str) -> tuple[Figure, ...]:
-    """Return the gains in retained success over the controls: the first two are of consft_calibrated alone."""
+    """Return the gains in retained success over the controls: two of consft_calibrated, and one of `arm`."""
     first = [kept(evidence, "consft_calibrated", name) for name in ("constant_weight", "shuffled_weights")]
     return (*first, kept(evidence, arm, "finch"))
 

@@ -193,9 +193,9 @@ def test_rows_without_a_common_seed_are_compared_by_the_variation_of_runs() -> N
 
 
 def test_where_no_row_has_a_second_seed_only_distant_rows_are_told_apart() -> None:
-    # The studentised range of three, their deviation known, is 3.31: at least 3.31 * 0.15 = 0.5 is needed.
-    assert pytest.approx(0.15) == UNKNOWN_DEVIATION
-    near, far = ({"one": row(9), "two": row(9), "three": row(last)} for last in (4, 1))
+    # The studentised range of three, their deviation known, is 3.31: at least 3.31 * 0.2 = 0.66 is needed.
+    assert pytest.approx(0.2) == UNKNOWN_DEVIATION
+    near, far = ({"one": row(9), "two": row(9), "three": row(last)} for last in (3, 1))
     assert groups("final_average", near)["three"] == "a"
     assert groups("final_average", far)["three"] == "b"
 
@@ -336,7 +336,8 @@ def results(coverage: ModuleType) -> Any:
 
 def test_the_page_has_the_figures_of_the_simulations(coverage: ModuleType, results: Any) -> None:
     page = (ROOT / "docs" / "guide" / "statistics.md").read_text(encoding="utf-8")
-    for table in coverage.tables(results):
+    shown = [one for one in results["intervals"] if one["seeds"] in (3, 4, 8)]
+    for table in (*coverage.tables({**results, "intervals": shown})[:2], *coverage.tables(results)[2:]):
         assert table in page
     for name in ("simulations", "boards"):
         assert f"{results[name]:,} " in page
