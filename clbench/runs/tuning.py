@@ -36,6 +36,10 @@ BETWEEN = (0.55, 1.8)
 LEARNED = 0.8
 """Least mean success on the targets right after learning them, for a setting that may be chosen."""
 
+CONTROLS = {"constant_weight": "consft_calibrated", "shuffled_weights": "consft_calibrated"}
+"""Controls, with the methods that they differ from in one thing. They have the settings tuned for these, so that
+nothing else differs."""
+
 Settings = Mapping[str, Any]
 
 
@@ -111,14 +115,19 @@ def write_tuned(path: Path, scenario: str, seeds: Sequence[int], methods: Mappin
 
 @cache
 def tuned(scenario: str) -> Mapping[str, Tuned]:
-    """Return what tuning chose on the scenario with this id, by method; nothing if it was never tuned."""
+    """Return what tuning chose on the scenario with this id, by method; nothing if it was never tuned.
+
+    `CONTROLS` have what was chosen for their methods.
+    """
     path = tuned_file(scenario)
     if not path.is_file():
         return {}
-    return {
+    methods = {
         name: Tuned(found["settings"], tuple(Tried(**one) for one in found["tried"]))
         for name, found in read_json(path)["methods"].items()
     }
+    controls = {control: methods[method] for control, method in CONTROLS.items() if method in methods}
+    return {**methods, **controls}
 
 
 def tuned_settings(scenario: str, method: str) -> dict[str, Any]:

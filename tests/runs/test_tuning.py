@@ -10,7 +10,7 @@ import pytest
 from clbench.learning.registry import load_method, new_method
 from clbench.runs import tuning
 from clbench.runs.spec import RunSpec
-from clbench.runs.tuning import Tried, Tuned, best_of, refinements, rungs, tuned, write_tuned
+from clbench.runs.tuning import CONTROLS, Tried, Tuned, best_of, refinements, rungs, tuned, write_tuned
 from clbench.spec.identifiers import built_in_methods
 
 TOY = "clbench.testing:clbench/Toy-v0"
@@ -76,6 +76,21 @@ def test_a_run_takes_the_tuned_settings_unless_it_changes_them(
     assert changed.info.settings == {"strength": 5.0, "step_factor": 0.1}
     assert changed.label == "l2_sp+strength=5.0" or changed.label == "l2_sp+strength=5"
     assert RunSpec(TOY, "ewc", 0).resolve().info.settings["step_factor"] == 1.0
+    tuned.cache_clear()
+
+
+@pytest.mark.parametrize("control", CONTROLS)
+def test_a_control_has_the_settings_of_its_method_and_differs_in_nothing_else(
+    control: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, settings = tmp_path / "Toy-v0.json", {"loss_scale": 0.02, "step_factor": 0.1}
+    write_tuned(path, "clbench/Toy-v0", [100, 101], {CONTROLS[control]: Tuned(settings, (_tried(0.6, 0.9),))})
+    monkeypatch.setattr(tuning, "tuned_file", lambda _: path)
+    tuned.cache_clear()
+    found, method = (RunSpec(TOY, name, 0).resolve().info for name in (control, CONTROLS[control]))
+    assert found.settings == method.settings
+    assert (found.settings["loss_scale"], found.settings["step_factor"]) == (0.02, 0.1)
+    assert (found.changes, found.uses) == ({}, method.uses)
     tuned.cache_clear()
 
 
