@@ -96,6 +96,21 @@ def test_a_control_has_the_settings_of_its_method_and_differs_in_nothing_else(
     assert (found.changes, found.uses) == ({}, method.uses)
 
 
+@pytest.mark.parametrize("control", CONTROLS)
+def test_a_control_has_the_settings_of_its_method_and_differs_in_nothing_else(
+    control: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, settings = tmp_path / "Toy-v0.json", {"loss_scale": 0.02, "step_factor": 0.1}
+    write_tuned(path, "clbench/Toy-v0", [100, 101], {CONTROLS[control]: Tuned(settings, (_tried(0.6, 0.9),))})
+    monkeypatch.setattr(tuning, "tuned_file", lambda _: path)
+    tuned.cache_clear()
+    found, method = (RunSpec(TOY, name, 0).resolve().info for name in (control, CONTROLS[control]))
+    assert found.settings == method.settings
+    assert (found.settings["loss_scale"], found.settings["step_factor"]) == (0.02, 0.1)
+    assert (found.changes, found.uses) == ({}, method.uses)
+    tuned.cache_clear()
+
+
 def test_a_full_disk_leaves_the_tuned_settings_of_other_methods(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
