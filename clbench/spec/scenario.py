@@ -19,7 +19,11 @@ from clbench.spec.limits import Limits
 from clbench.spec.policies import DEFAULT_POLICY, check_policy_name
 from clbench.spec.task import Task
 
-Group = Literal["retained", "target", "held_out", "background"]
+Group = Literal["retained", "target", "held_out"]
+"""Part of a scenario that is scored."""
+
+Part = Literal[Group, "background"]
+"""Part of a scenario."""
 
 MOST_ORDERS = 99
 """Largest number of orders besides the published one: a number in a stranger's record must not keep a reader
@@ -160,16 +164,16 @@ class Scenario:
         places = balanced_order(len(self.target), seed)
         return replace(self, target=tuple(self.target[place] for place in places))
 
-    def group(self, task: str) -> Group:
+    def group(self, task: str) -> Part:
         """Return the part of the scenario that the task called `task` belongs to.
 
         Raises:
             UnknownNameError: No task has this name; the nearest one is named.
         """
-        groups: tuple[Group, ...] = get_args(Group)
-        for group in groups:
-            if any(task == member.name for member in getattr(self, group)):
-                return group
+        parts: tuple[Part, ...] = get_args(Part)
+        for part in parts:
+            if any(task == member.name for member in getattr(self, part)):
+                return part
         raise self._unknown(task, self.tasks + self.background)
 
     def task(self, name: str) -> Task:

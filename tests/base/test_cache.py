@@ -68,3 +68,10 @@ def test_a_maker_that_fails_leaves_nothing_behind(tmp_path: Path) -> None:
     with pytest.raises(OSError, match="disk full"):
         cached(tmp_path / "x", INPUTS, make)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_file_that_a_maker_lacks_is_not_called_an_error_of_the_cache(tmp_path: Path) -> None:
+    asset = tmp_path / "elsewhere" / "asset.xml"
+    with pytest.raises(FileNotFoundError, match=r"asset\.xml"):
+        cached(tmp_path / "cache" / "result", {}, lambda _: asset.open().close())
+    assert not (tmp_path / "cache" / "result").exists()

@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 
+from clbench.base.errors import InputError
 from clbench.learning.registry import load_method, new_method
 from clbench.runs import tuning
 from clbench.runs.spec import RunSpec
@@ -96,21 +97,6 @@ def test_a_control_has_the_settings_of_its_method_and_differs_in_nothing_else(
     assert (found.changes, found.uses) == ({}, method.uses)
 
 
-@pytest.mark.parametrize("control", CONTROLS)
-def test_a_control_has_the_settings_of_its_method_and_differs_in_nothing_else(
-    control: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    path, settings = tmp_path / "Toy-v0.json", {"loss_scale": 0.02, "step_factor": 0.1}
-    write_tuned(path, "clbench/Toy-v0", [100, 101], {CONTROLS[control]: Tuned(settings, (_tried(0.6, 0.9),))})
-    monkeypatch.setattr(tuning, "tuned_file", lambda _: path)
-    tuned.cache_clear()
-    found, method = (RunSpec(TOY, name, 0).resolve().info for name in (control, CONTROLS[control]))
-    assert found.settings == method.settings
-    assert (found.settings["loss_scale"], found.settings["step_factor"]) == (0.02, 0.1)
-    assert (found.changes, found.uses) == ({}, method.uses)
-    tuned.cache_clear()
-
-
 def test_a_full_disk_leaves_the_tuned_settings_of_other_methods(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -135,3 +121,16 @@ def test_tuned_settings_of_other_methods_stay_in_the_file(toy_file: Path) -> Non
     write_tuned(toy_file, "clbench/Toy-v0", [100], {"sft": one})
     write_tuned(toy_file, "clbench/Toy-v0", [100], {"lwf": other})
     assert tuned("clbench/Toy-v0") == {"lwf": other, "sft": one}
+
+
+def test_settings_of_other_seeds_are_not_written_beside_those_of_other_methods(toy_file: Path) -> None:
+    one = Tuned({"step_factor": 0.1}, (_tried(0.6, 0.9, 0.1),))
+    write_tuned(toy_file, "clbench/Toy-v0", [100, 101], {"sft": one})
+    with pytest.raises(InputError, match=r"its other methods were tuned on seeds \[100, 101\], not \[102\]"):
+        write_tuned(toy_file, "clbench/Toy-v0", [102], {"lwf": one})
+    write_tuned(toy_file, "clbench/Toy-v0", [102], {"sft": one})  # all methods again
+
+
+def test_a_whole_number_for_a_fraction_makes_the_same_run(toy_file: Path) -> None:
+    runs = [RunSpec(TOY, "l2_sp", 0, {"strength": value}).resolve() for value in (5, 5.0, "5")]
+    assert len({run.label for run in runs}) == 1
