@@ -66,7 +66,7 @@ def test_a_scenario_with_a_criterion_has_its_own_columns(records: Path) -> None:
     head = next(line for line in markdown(read_table(records), {}).splitlines() if line.startswith("| group"))
     columns = [cell.strip() for cell in head.strip("|").split("|")][5:]
     assert columns[:6] == ["final average", "gain", "learned", "kept skills", "kept targets", "kept"]
-    assert columns[6:9] == ["kept share", "steps to criterion", "settings tried"]
+    assert columns[6:9] == ["kept share", "criterion met", "steps to criterion"]
     heads = [words(one) for one in section_of(records).iterfind(".//table/thead/tr/th")]
     assert "settings tried" in heads
     assert "gain" in heads

@@ -134,7 +134,7 @@ def test_a_missing_value_is_a_dash_that_says_why(add: Callable[..., Path], recor
     add("from_scratch", 0, uses={"demonstrations": "never", "questions": "never", "reference": True})
     add("single", 0)
     text = words(by_id(parsed(page(read_table(records), {})), "clbench/Toy-v0"))
-    assert ", missing: A point of a learning curve is missing, or there is no from_scratch" in text
+    assert "a point of a learning curve is missing, or there is no from_scratch of the same seeds" in text
 
 
 @pytest.mark.slow
