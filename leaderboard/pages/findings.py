@@ -216,19 +216,29 @@ def _learning_rates(table: Table) -> Section:
                 for rung in curve.rungs
             ]
             if curve.is_baseline:
-                first, best = curve.rungs[0], max(curve.rungs, key=lambda rung: rung.kept.value or 0.0)
-                answers.append(
-                    f"On {name}, plain fine-tuning keeps {format_interval(first.kept)} at {first.factor:g} "
-                    f"times the scenario's learning rate, and {format_interval(best.kept)} at "
-                    f"{best.factor:g} times, where it learns {format_interval(best.learned)}."
-                )
-                answers += _at_the_first_rung(curve, curves)
+                answers.append(_of_the_baseline(name, curve))
+                answers += _at_the_first_rung(name, curve, curves)
         answers += _of_frozen(name, _usual(table).get(name, []))
     head = ("scenario", "method", "factor", "learned", "kept")
     return Section("How much does a smaller learning rate do alone?", tuple(answers), head, tuple(lines))
 
 
-def _at_the_first_rung(baseline: Curve, curves: Sequence[Curve]) -> Iterator[str]:
+def _of_the_baseline(name: str, curve: Curve) -> str:
+    """Return what plain fine-tuning keeps at the first rung, and at the one where it keeps most."""
+    first, best = curve.rungs[0], max(curve.rungs, key=lambda rung: rung.kept.value or 0.0)
+    more = ""
+    if best is not first:
+        more = (
+            f", and {format_interval(best.kept)} at {best.factor:g} times, where it learns "
+            f"{format_interval(best.learned)}"
+        )
+    return (
+        f"On {name}, plain fine-tuning keeps {format_interval(first.kept)} at {first.factor:g} times the "
+        f"scenario's learning rate{more}."
+    )
+
+
+def _at_the_first_rung(name: str, baseline: Curve, curves: Sequence[Curve]) -> Iterator[str]:
     """Yield what the methods without prior demonstrations keep at the learning rate of the first rung."""
     factor = baseline.rungs[0].factor
     kept = {
@@ -241,7 +251,7 @@ def _at_the_first_rung(baseline: Curve, curves: Sequence[Curve]) -> Iterator[str
     if kept:
         falling = sorted(kept, key=lambda method: -(kept[method].value or 0.0))
         listed = ", ".join(f"`{method}` {format_interval(kept[method])}" for method in falling)
-        yield f"At {factor:g} times, without prior demonstrations: {listed}."
+        yield f"On {name}, methods without prior demonstrations keep at {factor:g} times: {listed}."
 
 
 def _of_frozen(name: str, rows: Sequence[Row]) -> Iterator[str]:

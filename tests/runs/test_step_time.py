@@ -68,7 +68,9 @@ def test_a_slow_method_of_a_stranger_has_its_ratio_in_the_record(
 
 
 @pytest.mark.usefixtures("_a_second_for_each_loss")
-def test_a_method_that_trains_nothing_has_no_time_of_a_step_and_plain_fine_tuning_is_the_unit(tmp_path: Path) -> None:
+def test_a_method_that_trains_nothing_has_no_time_of_a_step_and_plain_fine_tuning_is_the_unit(
+    tmp_path: Path,
+) -> None:
     assert _timing("frozen", tmp_path)["step_ratio"] is None
     assert "step_ratio" not in _timing("sft", tmp_path)
 
