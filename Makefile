@@ -34,7 +34,7 @@ FIXED := clbench/DMControl-v0,clbench/FetchPixels-v0,clbench/PointMaze-v0
 # squares of orders.
 records: .venv/installed-dev
 	$(BIN)/clbench run clbench/Fetch-v1 sft consft consft_calibrated --seeds 8 --perturb
-	$(BIN)/clbench run clbench/Fetch-v1 frozen $(METHODS) --seeds 8
+	$(BIN)/clbench run clbench/Fetch-v1 frozen joint from_scratch $(METHODS) --seeds 8
 	$(BIN)/clbench run clbench/Fetch-v1 $(RIVALS) --seeds 4
 	$(BIN)/clbench run clbench/MetaWorld-v1 frozen $(METHODS) --seeds 4
 	$(BIN)/clbench run $(KNOWLEDGE) frozen joint sft stop_gradient aegis lora --seeds 4
