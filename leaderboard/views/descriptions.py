@@ -28,9 +28,9 @@ RULES: Mapping[str, str] = dict(
     zip(
         DIVISIONS,
         (
-            "may reuse no earlier data",
-            "may reuse earlier questions, but no demonstrations",
-            "may reuse earlier demonstrations",
+            "may read no prior data",
+            "may read prior questions, but no demonstrations",
+            "may read prior demonstrations",
             "learn by trial and error, in as many steps as they choose: not comparable with methods",
             "were fine-tuned elsewhere, on what their authors declare: not comparable with methods",
             "do not compete: they show the best that is possible, and the result of doing nothing",

@@ -172,7 +172,8 @@ def _listed(rows: Sequence[Row]) -> str:
 
 def _names(names: Sequence[str]) -> str:
     """Return names in a sentence: all if they are few, otherwise the first ones and a count."""
-    shown = [printable(name) for name in names[:NAMED]]
-    if len(names) > NAMED:
+    many = len(names) > NAMED + 1  # "and 1 more" would be as long as its name
+    shown = [printable(name) for name in (names[:NAMED] if many else names)]
+    if many:
         return f"{', '.join(shown)} and {len(names) - NAMED} more"
     return " and ".join([", ".join(shown[:-1]), shown[-1]] if len(shown) > 1 else shown)
