@@ -118,19 +118,18 @@ def _explained(folder: Path) -> Iterator[None]:
     except CacheError:  # of another result, which `make` needs
         raise
     except (OSError, SafetensorError) as error:
-        if (
-            isinstance(error, OSError)
-            and error.errno not in _FULL
-            and not _is_below(error.filename, folder.parent)
-        ):
+        if isinstance(error, OSError) and error.errno not in _FULL and not _is_on_the_way(error, folder):
             raise
         reason = getattr(error, "strerror", None) or error
         raise CacheError(f"{folder} cannot be written: {reason}.") from error
 
 
-def _is_below(name: Any, folder: Path) -> bool:
-    """Return whether the file of an error lies below `folder`."""
-    return isinstance(name, str | os.PathLike) and os.path.abspath(name).startswith(os.path.abspath(folder))
+def _is_on_the_way(error: OSError, folder: Path) -> bool:
+    """Return whether the file of an error is below the parent of `folder`, or a folder above it."""
+    if error.filename is None:
+        return False
+    path, parent = (Path(os.path.abspath(os.fsdecode(name))) for name in (error.filename, folder.parent))
+    return path.is_relative_to(parent) or parent.is_relative_to(path)
 
 
 def is_cached(folder: Path, inputs: Mapping[str, Any]) -> bool:

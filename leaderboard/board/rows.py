@@ -18,6 +18,7 @@ from clbench.records.record import ScenarioInfo
 from clbench.runs.tuning import tuned
 from clbench.scoring.groups import groups
 from clbench.scoring.intervals import Estimate, Runs, estimate, row_generator
+from clbench.scoring.layout import Array
 from clbench.scoring.metrics import METRICS, measure
 from clbench.spec.references import BASELINE
 
@@ -212,10 +213,18 @@ def standing_of(row: Row, rows: Iterable[Row]) -> Standing | None:
 def agreement(rows: Iterable[Row]) -> Agreement | None:
     """Return how alike two halves of the seeds order the competing rows of a scenario; see `agreement_of`.
 
-    The seeds are the baseline's, and rows without one of them are left out. Only a scenario whose seeds have
-    orders of their own has an agreement.
+    Only a scenario whose seeds have orders of their own has an agreement.
     """
-    competing = [row for row in rows if row.division in METHODS and row.runs[0].published.balanced]
+    values = values_by_seed(row for row in rows if row.runs[0].published.balanced)
+    return None if values is None else agreement_of(values)
+
+
+def values_by_seed(rows: Iterable[Row]) -> Array | None:
+    """Return the final average of each competing row with each of the baseline's seeds, (rows, seeds).
+
+    Rows without one of these seeds are left out. None without the baseline, or if no row has a value.
+    """
+    competing = [row for row in rows if row.division in METHODS]
     seeds = next((row.seeds for row in competing if row.method == BASELINE), ())
     values = [
         [measure(RANKED_BY, row.scores[seed]) for seed in seeds]
@@ -223,4 +232,4 @@ def agreement(rows: Iterable[Row]) -> Agreement | None:
         if set(row.seeds).issuperset(seeds)
     ]
     known = [line for line in values if None not in line]
-    return agreement_of(np.array(known, dtype=float)) if seeds and known else None
+    return np.array(known, dtype=float) if seeds and known else None

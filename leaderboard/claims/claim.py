@@ -138,9 +138,7 @@ def what_would_change(figure: Figure, bar: float) -> str:
     apart = max(figure.low - bar, bar - figure.high)
     form = figure.form
     if apart >= 0:
-        return (
-            f"{interval[0].upper()}{interval[1:]} would have to move by {apart:{form}} to reach {bar:{form}}."
-        )
+        return f"The {interval} would have to move by {apart:{form}} to reach {bar:{form}}."
     half, gap = (figure.high - figure.low) / 2, abs(figure.value - bar)
     seeds = len(figure.seeds)
     needed = math.ceil(seeds * (half / gap) ** 2) if gap > 0 else MOST_SEEDS + 1

@@ -11,8 +11,8 @@ from clbench.base.text import counted
 from clbench.scoring.layout import Array
 from clbench.scoring.metrics import measure
 
-from ..board.agreement import Agreement, agreement_between, agreement_of
-from ..board.rows import Row, Table
+from ..board.agreement import Agreement, agreement_between
+from ..board.rows import Row, Table, agreement, values_by_seed
 from ..board.summary import METHODS, RANKED_BY, WITHOUT_DEMONSTRATIONS
 from ..views.format import tau_text, title_of
 
@@ -27,8 +27,12 @@ def order_sentences(table: Table, boards: Mapping[str, list[Row]]) -> Iterator[s
     for name, found in table.agreements.items():
         if found is not None and name in boards:
             yield f"On {name}, two halves of the {found.seeds} seeds {_order(found)}."
-            yield from _without_replay(name, boards[name])
-            yield from _shares_of_variance(name, boards[name])
+            without = [row for row in boards[name] if row.division in WITHOUT_DEMONSTRATIONS]
+            halves = agreement(without)
+            if halves is not None:  # replay is far above the others
+                order = _order(halves)
+                yield f"On {name}, without methods that read prior demonstrations, the halves {order}."
+            yield from _shares_of_variance(name, without)
     for (one, rows), (other, others) in combinations(boards.items(), 2):
         across = _between(rows, others, RANKED_BY, RANKED_BY)
         if across is not None:
@@ -40,20 +44,16 @@ def order_sentences(table: Table, boards: Mapping[str, list[Row]]) -> Iterator[s
                 yield f"On {name}, final average and {title_of(metric)} {_order(same)}."
 
 
-def _without_replay(name: str, rows: Sequence[Row]) -> Iterator[str]:
-    """Yield the same of the methods without prior demonstrations: replay is far above the others."""
-    values = _values([row for row in rows if row.division in WITHOUT_DEMONSTRATIONS], RANKED_BY)
-    found = None if values is None else agreement_of(values)
-    if found is not None:
-        yield f"On {name}, without methods that read prior demonstrations, the halves {_order(found)}."
-
-
 def _shares_of_variance(name: str, rows: Sequence[Row]) -> Iterator[str]:
     """Yield which share of the variance of the final average the method explains, and which the seed.
 
-    They are the sums of squares of the table of methods and seeds, without prior demonstrations.
+    They are the sums of squares of the table of methods and seeds.
+
+    Args:
+        name: Name of the scenario.
+        rows: Its rows without prior demonstrations.
     """
-    values = _values([row for row in rows if row.division in WITHOUT_DEMONSTRATIONS], RANKED_BY)
+    values = values_by_seed(rows)
     if values is None or min(values.shape) < 2 or values.std() == 0:
         return
     mean = values.mean()

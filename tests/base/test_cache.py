@@ -3,7 +3,7 @@ from pathlib import Path
 
 import pytest
 
-from clbench.base.cache import cached, is_cached
+from clbench.base.cache import CacheError, cached, is_cached
 
 INPUTS = {"seed": 0}
 
@@ -70,8 +70,14 @@ def test_a_maker_that_fails_leaves_nothing_behind(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_folder_that_cannot_be_made_is_an_error_of_the_cache(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(CacheError, match="cannot be written"):
+        cached(tmp_path / "file" / "cache" / "result", {}, lambda _: None)
+
+
 def test_a_file_that_a_maker_lacks_is_not_called_an_error_of_the_cache(tmp_path: Path) -> None:
-    asset = tmp_path / "elsewhere" / "asset.xml"
+    asset = tmp_path / "cache-of-another" / "asset.xml"  # its name begins like the cache's
     with pytest.raises(FileNotFoundError, match=r"asset\.xml"):
         cached(tmp_path / "cache" / "result", {}, lambda _: asset.open().close())
     assert not (tmp_path / "cache" / "result").exists()
