@@ -36,7 +36,7 @@ records: .venv/installed-dev
 	$(BIN)/clbench run clbench/Fetch-v1 sft consft consft_calibrated --seeds 8 --perturb
 	$(BIN)/clbench run clbench/Fetch-v1 frozen joint from_scratch $(METHODS) --seeds 8
 	$(BIN)/clbench run clbench/Fetch-v1 $(RIVALS) --seeds 4
-	$(BIN)/clbench run clbench/MetaWorld-v1 frozen $(METHODS) --seeds 4
+	$(BIN)/clbench run clbench/MetaWorld-v1 frozen joint from_scratch $(METHODS) --seeds 8
 	$(BIN)/clbench run $(KNOWLEDGE) frozen joint sft stop_gradient aegis lora --seeds 4
 	$(BIN)/clbench run clbench/Fetch-v1 frozen sft consft aegis experience_replay lora stop_gradient --seeds 3 \
 		--policy discrete_diffusion
@@ -61,7 +61,7 @@ KNOWLEDGE := clbench/FetchKnowledge-v1
 CONTROLS := --seeds 4 --records leaderboard/controls
 controls: .venv/installed-dev
 	for id in $(BOARDS); do \
-		$(BIN)/clbench run $$id joint from_scratch constant_weight shuffled_weights --seeds 4 \
+		$(BIN)/clbench run $$id constant_weight shuffled_weights --seeds 4 \
 		&& $(BIN)/clbench run $$id co_training --set.step_factor 1 $(CONTROLS) \
 		&& $(BIN)/clbench run $$id fast_dvla --set.direction random --set.step_factor 1 $(CONTROLS) \
 		&& $(BIN)/clbench run $$id fast_dvla --set.orthogonal 0 --set.step_factor 1 $(CONTROLS) || exit; \

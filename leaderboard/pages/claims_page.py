@@ -79,15 +79,13 @@ def terminal(judged: Sequence[Judged]) -> Table:
     table.add_column("id")
     table.add_column("scenario", no_wrap=True)
     table.add_column("verdict", no_wrap=True)
-    table.add_column("value", no_wrap=True)
-    table.add_column("figure", overflow="fold")
+    table.add_column("figure")  # value and name in one column: two columns leave the name 6 of 80 characters
     for one in judged:
         figure = one.finding.figures[0] if one.finding.figures else None
         table.add_row(
             Text(f"{one.claim.id} "),
-            Text(f"{one.evidence.scenario.rpartition('/')[2]}  "),
-            Text(f"{one.finding.verdict}  "),
-            Text(f"{figure_text(figure)}  " if figure else MISSING),
-            Text(figure.what if figure else ""),
+            Text(f"{one.evidence.scenario.rpartition('/')[2]} "),
+            Text(f"{one.finding.verdict} "),
+            Text(f"{figure_text(figure)} {figure.what}" if figure else MISSING),
         )
     return table
