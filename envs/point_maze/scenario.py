@@ -1,7 +1,10 @@
-"""The scenario clbench/PointMaze-v0: the instruction names the maze and the room where the ball must stop."""
+"""clbench/PointMaze-v1 and -v0: an instruction names a maze and the room where the ball must stop."""
 
 from __future__ import annotations
 
+import dataclasses
+
+from clbench.spec.budget import Budget
 from clbench.spec.scenario import Scenario
 from clbench.spec.task import Task
 
@@ -28,6 +31,12 @@ def _task(colour: str, room: str) -> Task:
             f"roll into the {edge} room of the {colour} maze",
             f"in the {colour} maze stop in the {compass} room",
             f"find the {plain} room in the {colour} maze and stay there",
+            f"stop in the {edge} room of the {colour} maze",
+            f"roll to the {compass} room in the {colour} maze",
+        ),
+        test_instructions=(
+            f"find the {edge} room of the {colour} maze",
+            f"in the {colour} maze go to the {compass} room",
         ),
         horizon=60,
         world="clbench.envs.point_maze.world:PointMazeWorld",
@@ -37,10 +46,46 @@ def _task(colour: str, room: str) -> Task:
     )
 
 
+_SKILLS = (_task("green", "upper_left"), _task("green", "lower_right"), _task("red", "left"))
+_BACKGROUND = (_task("blue", "upper"), _task("blue", "lower_left"), _task("red", "lower"))
+
 SCENARIO = Scenario(
+    id="clbench/PointMaze-v1",
+    description="A ball learns the way to four rooms in two mazes, and keeps three rooms it could find.",
+    retained=_SKILLS,
+    target=(
+        _task("red", "upper_right"),
+        _task("blue", "lower_right"),
+        _task("red", "lower_left"),
+        _task("blue", "upper_left"),
+    ),
+    held_out=(_task("green", "upper_right"), _task("green", "lower_left")),
+    questions="clbench.envs.point_maze.questions:QUESTIONS",
+    background=_BACKGROUND,
+    scenes=_SKILLS + _BACKGROUND,  # the skills alone show no blue maze
+    balanced=True,
+    budget=Budget(criterion=0.9, adaptation_steps=1000, validation_episodes=20),
+)
+"""Three rooms to keep, four targets of graded conflict, and two held-out rooms named in other mazes.
+
+Within a maze only words tell tasks apart: the targets of a maze compete with each other and with its skill.
+Two of the three skills are in the green maze, which has no target. With two skills in each maze of a target,
+plain fine-tuning kept none of them at any learning rate. Tried with a factor of 0.1 on seed 100, whose final
+average is 0.46 with sft, 0.43 with frozen and 0.94 with experience_replay.
+"""
+
+
+def _fixed(*tasks: Task) -> tuple[Task, ...]:
+    """Return tasks as version 0 has them: with four wordings, and none for the test alone."""
+    return tuple(
+        dataclasses.replace(task, instructions=task.instructions[:4], test_instructions=()) for task in tasks
+    )
+
+
+FIXED = Scenario(
     id="clbench/PointMaze-v0",
     description="A ball learns the way to four rooms in two mazes, after eight rooms in three mazes.",
-    retained=(
+    retained=_fixed(
         _task("red", "upper_left"),
         _task("red", "lower_right"),
         _task("red", "left"),
@@ -50,13 +95,13 @@ SCENARIO = Scenario(
         _task("green", "upper_left"),
         _task("green", "lower_right"),
     ),
-    target=(
+    target=_fixed(
         _task("red", "upper_right"),
         _task("blue", "lower_right"),
         _task("red", "lower_left"),
         _task("blue", "upper_left"),
     ),
-    held_out=(
+    held_out=_fixed(
         _task("green", "upper_right"),
         _task("green", "lower_left"),
     ),

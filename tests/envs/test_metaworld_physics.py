@@ -21,9 +21,6 @@ WORLD = SCENARIOS[0].tasks[0].world
 PlainWorld = resolve(WORLD)
 new_episode = resolve("clbench.envs.metaworld.episode:new_episode")
 PHYSICS = resolve("clbench.envs.metaworld.episode:PHYSICS")
-LONGEST = 120
-"""Steps after which an unfinished episode begins anew."""
-
 State = NDArray[np.float32]
 
 
@@ -91,7 +88,8 @@ def continue_as(original: Any, episode: Any) -> None:
 def compare(task: str, steps: int, lanes: int = 4) -> int:
     """Compare `steps` steps of a task, and return the successes.
 
-    Expert and random actions take turns; an episode begins anew after success, or at a random age.
+    Expert and random actions take turns; an episode begins anew after success, or at a random age of up to
+    twice its horizon, as random actions delay the expert.
     """
     world, peers = metaworld(lanes), [Peer(task) for _ in range(lanes)]
     generator = np.random.default_rng([7, list(TASKS).index(task)])
@@ -104,7 +102,7 @@ def compare(task: str, steps: int, lanes: int = 4) -> int:
         seeds = generator.integers(2**31, size=len(beginning)).tolist()
         if beginning:
             states[beginning] = world.reset(beginning, seeds, [task] * len(beginning))
-            left[beginning] = generator.integers(40, LONGEST, size=len(beginning))
+            left[beginning] = generator.integers(40, 2 * TASKS[task].horizon, size=len(beginning))
         for lane, seed in zip(beginning, seeds, strict=True):
             np.testing.assert_array_equal(peers[lane].reset(seed), states[lane])
         actions = generator.uniform(-1.2, 1.2, (lanes, 4)).astype(np.float32)
