@@ -150,6 +150,10 @@ def _gain_sentences(name: str, rows: Sequence[Row]) -> Iterator[str]:
             f"{counted(len(gains), 'method')} is {format_interval(gains[best], '.3f')}, by `{best}`. "
             f"{_power(gains.values())}"
         )
+    alone = f"by an interval of their own, which does not count the {counted(len(gains), 'comparison')}"
+    higher = {name: gain for name, gain in gains.items() if (gain.low or 0) > 0 and name not in better}
+    if higher:
+        yield f"Higher {alone}: {_listed(higher)}."
     lower = {
         method: Estimate(-gain.value, -gain.high, -gain.low)
         for method, gain in gains.items()
@@ -160,10 +164,7 @@ def _gain_sentences(name: str, rows: Sequence[Row]) -> Iterator[str]:
         yield f"Told apart from it as worse: {_listed(worse)}."
     if len(worse) < len(lower):
         rest = {method: loss for method, loss in lower.items() if method not in worse}
-        yield (
-            "Lower by an interval of their own, which does not count the "
-            f"{counted(len(gains), 'comparison')}: {_listed(rest)}."
-        )
+        yield f"Lower {alone}: {_listed(rest)}."
 
 
 def _power(gains: Iterable[Estimate]) -> str:

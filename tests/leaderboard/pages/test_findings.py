@@ -49,6 +49,19 @@ def test_without_one_the_page_says_so_and_names_the_largest_gain(
     assert "half the width of the median interval, would not show." in text
 
 
+def test_a_difference_that_is_certain_only_without_counting_the_comparisons_is_said_to_be_so(
+    even_board: Callable[..., Path], page: Callable[[], str]
+) -> None:
+    same = {f"method_{number}": 0.4 for number in range(7)}
+    fill(even_board, sft=0.4, finch=0.5, lora=0.3, **same)
+    text = page()
+    assert "none is told apart from it as better: the largest gain of 9 methods is 0.0" in text
+    assert (
+        "Higher by an interval of their own, which does not count the 9 comparisons: `finch` by 0.0" in text
+    )
+    assert "Lower by an interval of their own, which does not count the 9 comparisons: `lora` by 0.0" in text
+
+
 def test_the_ladder_tells_what_a_smaller_step_size_does(
     even_board: Callable[..., Path], page: Callable[[], str]
 ) -> None:

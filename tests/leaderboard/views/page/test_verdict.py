@@ -61,6 +61,16 @@ def test_without_a_method_that_surely_ends_higher_none_is_named(board: Callable[
     )
 
 
+def test_a_gain_that_is_certain_only_without_counting_the_comparisons_names_no_method(
+    board: Callable[..., Any],
+) -> None:
+    same = {f"method_{number}": matrix(0.2) for number in range(8)}
+    rows = board(sft=matrix(0.2), lora=matrix(0.3), **same)
+    gain = next(row.estimates["gain"] for row in rows if row.method == "lora")
+    assert gain.low > 0
+    assert headline(rows) == "No method is shown to end above plain fine-tuning."
+
+
 def test_plain_fine_tuning_alone_is_no_comparison(board: Callable[..., Any]) -> None:
     rows = board(sft=matrix(0.2), frozen=LEARNED)
     assert headline(rows) == (
