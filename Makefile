@@ -19,6 +19,8 @@ leaderboard:
 BOARDS := clbench/Fetch-v1 clbench/MetaWorld-v1
 
 METHODS := aegis consft consft_calibrated experience_replay fast_dvla finch l2_sp lora sft stop_gradient
+REFERENCES := frozen joint from_scratch
+CONSFT_CONTROLS := constant_weight shuffled_weights
 # Further methods that keep demonstrations or what they taught, on Fetch-v1 alone, where a run takes one to four minutes.
 RIVALS := a_gem buffered_replay ewc
 
@@ -33,10 +35,11 @@ FIXED := clbench/DMControl-v0,clbench/FetchPixels-v0,clbench/PointMaze-v0
 # The committed boards. Runs that have a record are skipped: a stopped command goes on. Seeds in fours are whole Latin
 # squares of orders.
 records: .venv/installed-dev
-	$(BIN)/clbench run clbench/Fetch-v1 sft consft consft_calibrated --seeds 8 --perturb
-	$(BIN)/clbench run clbench/Fetch-v1 frozen joint from_scratch $(METHODS) --seeds 8
-	$(BIN)/clbench run clbench/Fetch-v1 $(RIVALS) --seeds 4
-	$(BIN)/clbench run clbench/MetaWorld-v1 frozen joint from_scratch $(METHODS) --seeds 8
+	$(BIN)/clbench run clbench/Fetch-v1 sft consft consft_calibrated --seeds 12 --perturb
+	$(BIN)/clbench run clbench/Fetch-v1 $(REFERENCES) $(METHODS) $(CONSFT_CONTROLS) --seeds 12
+	$(BIN)/clbench run clbench/Fetch-v1 $(RIVALS) --seeds 8
+	$(BIN)/clbench run clbench/MetaWorld-v1 $(REFERENCES) $(METHODS) --seeds 8
+	$(BIN)/clbench run clbench/MetaWorld-v1 $(CONSFT_CONTROLS) --seeds 4
 	$(BIN)/clbench run $(KNOWLEDGE) frozen joint sft stop_gradient aegis lora --seeds 4
 	$(BIN)/clbench run clbench/Fetch-v1 frozen sft consft aegis experience_replay lora stop_gradient --seeds 3 \
 		--policy discrete_diffusion
@@ -55,14 +58,12 @@ ladder: .venv/installed-dev
 		$(BIN)/clbench run $$id $(METHODS) --set.step_factor $$factor --seeds 4 --records leaderboard/ladder || exit; \
 	done; done
 
-# What else docs/reference/claims.md needs: references, and methods with one thing changed that tells what their effect is
-# due to.
+# What else docs/reference/claims.md needs: methods with one thing changed that tells what their effect is due to.
 KNOWLEDGE := clbench/FetchKnowledge-v1
 CONTROLS := --seeds 4 --records leaderboard/controls
 controls: .venv/installed-dev
 	for id in $(BOARDS); do \
-		$(BIN)/clbench run $$id constant_weight shuffled_weights --seeds 4 \
-		&& $(BIN)/clbench run $$id co_training --set.step_factor 1 $(CONTROLS) \
+		$(BIN)/clbench run $$id co_training --set.step_factor 1 $(CONTROLS) \
 		&& $(BIN)/clbench run $$id fast_dvla --set.direction random --set.step_factor 1 $(CONTROLS) \
 		&& $(BIN)/clbench run $$id fast_dvla --set.orthogonal 0 --set.step_factor 1 $(CONTROLS) || exit; \
 	done

@@ -7,6 +7,7 @@ import shutil
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from helpers import unpacked
 
@@ -21,6 +22,17 @@ README = Path(__file__).parents[2] / "README.md"
 RECORDS = README.parent / "leaderboard" / "records"
 
 pytestmark = pytest.mark.skipif(not RECORDS.exists(), reason="records are not part of an installed package")
+
+
+FETCH, META_WORLD = "clbench/Fetch-v1", "clbench/MetaWorld-v1"
+SEEDS = {FETCH: 12, META_WORLD: 8, "clbench/FetchKnowledge-v1": 4, f"{FETCH}+flow-base": 1}
+"""Number of seeds of a table, if it is not 3. Where seeds have orders of their own, four are a Latin square.
+A run of a policy with 4.9 million parameters takes up to 20 minutes."""
+FEWER = {
+    **{(META_WORLD, control): 4 for control in CONTROLS},
+    **{(FETCH, rival): 8 for rival in ("a_gem", "buffered_replay", "ewc")},
+}
+"""Rows with fewer seeds than their table."""
 
 
 @pytest.fixture(scope="module")
@@ -42,23 +54,20 @@ def test_every_method_has_the_same_seeds_and_the_same_pretrained_policies() -> N
     seeds: dict[tuple[str, str], set[int]] = {}
     for table, record in zip(tables, records, strict=True):
         seeds.setdefault((table, record.run.method), set()).add(record.run.seed)
-    # the two boards have two Latin squares of orders, which have four rows each, and FetchKnowledge-v1 has
-    # one; runs of a policy with 4.9 million parameters take up to 20 minutes
-    counts = {"clbench/Fetch-v1": 8, "clbench/MetaWorld-v1": 8, "clbench/FetchKnowledge-v1": 4}
-    counts["clbench/Fetch-v1+flow-base"] = 1
-    one_square = {*CONTROLS, "a_gem", "buffered_replay", "ewc"}
     for (table, method), found in seeds.items():
-        count = 4 if method in one_square else counts.get(table, 3)
-        assert found == set(range(count)), f"{table}, {method}"
+        assert found == set(range(FEWER.get((table, method), SEEDS.get(table, 3)))), f"{table}, {method}"
     assert not any(record.run.changes for record in records)
     assert not any(record.fingerprint["commit"]["dirty"] for record in records)
 
 
 def test_the_pretrained_policy_has_its_skills_and_answers() -> None:
+    retained = []
     for path in (RECORDS / "Fetch-v1" / "frozen").glob("*.json"):
         rates = Scores.from_record(read_record(path)).rates()
-        assert rates.retained[0].mean() >= 0.90
+        assert rates.retained[0].mean() >= 0.80
+        retained.append(rates.retained[0].mean())
         assert rates.correct[0].sum() / rates.asked[0].sum() >= 0.95
+    assert np.mean(retained) >= 0.95
 
 
 def test_plain_fine_tuning_learns_and_forgets(board: Any) -> None:
