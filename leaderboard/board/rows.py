@@ -27,7 +27,16 @@ from .costs import costs_of
 from .frontier import Curve, ladder_of, read_frontiers
 from .orders import Orders, orders_of
 from .runs import ALIKE, Run, Sifted, no_row, read_run, read_runs
-from .summary import DIVISIONS, ELSEWHERE, METHODS, RANKED_BY, RowSummary, Summary
+from .summary import (
+    DIVISIONS,
+    ELSEWHERE,
+    METHODS,
+    RANKED_BY,
+    WITH_DEMONSTRATIONS,
+    WITHOUT_DEMONSTRATIONS,
+    RowSummary,
+    Summary,
+)
 from .tiers import TIERS
 
 
@@ -208,6 +217,23 @@ def standing_of(row: Row, rows: Iterable[Row]) -> Standing | None:
     better = [other for other in division if _falling(other.estimates[RANKED_BY]) < value - 1e-9]
     alike = [other for other in division if other is not row and set(other.groups or "") & set(row.groups)]
     return Standing(1 + len(better), len(division), tuple(other.method for other in alike))
+
+
+def apart_from_baseline(rows: Iterable[Row]) -> frozenset[str]:
+    """Return the methods of a scenario that the test of `groups` tells apart from plain fine-tuning.
+
+    Each is tested together with plain fine-tuning and all others that may look at as much: at prior
+    demonstrations, or at none. The interval of one gain alone does not count how many methods were compared.
+    """
+    competing = [row for row in rows if row.division in METHODS]
+    baseline = {row.method: row.scores for row in competing if row.method == BASELINE}
+    apart: set[str] = set()
+    for divisions in (WITHOUT_DEMONSTRATIONS, WITH_DEMONSTRATIONS):
+        members = [row for row in competing if row.division in divisions and row.method != BASELINE]
+        family = {row.method: row.scores for row in members}
+        letters = groups(RANKED_BY, {**baseline, **family})
+        apart |= {name for name in family if not set(letters.get(name, "")) & set(letters.get(BASELINE, ""))}
+    return frozenset(apart) if baseline else frozenset()
 
 
 def agreement(rows: Iterable[Row]) -> Agreement | None:

@@ -26,6 +26,9 @@ METHODS = DIVISIONS[:3]
 WITHOUT_DEMONSTRATIONS = METHODS[:2]
 """Divisions of methods that may not look at prior demonstrations."""
 
+WITH_DEMONSTRATIONS = METHODS[2:]
+"""Divisions of methods that may."""
+
 COSTS = {
     "steps": "optimiser_steps",
     "bytes_kept": "bytes_kept",

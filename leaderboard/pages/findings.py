@@ -15,15 +15,14 @@ import numpy as np
 
 from clbench.base.text import counted
 from clbench.records.paths import parts_of
-from clbench.scoring.groups import groups
 from clbench.scoring.intervals import Estimate
 from clbench.spec.policies import DEFAULT_POLICY
 from clbench.spec.references import BASELINE, FROM_SCRATCH, FROZEN
 
 from ..board.frontier import Curve
 from ..board.predictors import predictions
-from ..board.rows import Row, Table
-from ..board.summary import METHODS, RANKED_BY, WITHOUT_DEMONSTRATIONS, tables_of
+from ..board.rows import Row, Table, apart_from_baseline
+from ..board.summary import METHODS, WITHOUT_DEMONSTRATIONS, tables_of
 from ..claims.claim import PREDICATES, Verdict, tally
 from ..claims.judges import Judged
 from ..policies.compared import by_table
@@ -138,8 +137,7 @@ def _gain_sentences(name: str, rows: Sequence[Row]) -> Iterator[str]:
     if not others or baseline is None:
         return
     gains = {row.method: row.estimates["gain"] for row in others}
-    letters = groups(RANKED_BY, {row.method: row.scores for row in (baseline, *others)})
-    apart = {method for method in gains if not set(letters[method]) & set(letters[BASELINE])}
+    apart = apart_from_baseline(rows)
     better = {method: gains[method] for method in gains if method in apart and (gains[method].value or 0) > 0}
     if better:
         yield f"On {name}, yes: {_listed(better)}."

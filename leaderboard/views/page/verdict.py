@@ -10,7 +10,7 @@ from clbench.scoring.groups import groups
 from clbench.scoring.intervals import Estimate
 from clbench.spec.references import BASELINE
 
-from ...board.rows import Row, standing_of
+from ...board.rows import Row, apart_from_baseline, standing_of
 from ...board.summary import DIVISIONS, METHODS, RANKED_BY, divisions_of
 from ..descriptions import RULES
 from ..format import number_text
@@ -47,11 +47,7 @@ class Verdict:
 
 
 def headline(rows: Sequence[Row]) -> str:
-    """Return what the rows of a scenario say of plain fine-tuning and the methods against forgetting.
-
-    A method is above plain fine-tuning if the test of `groups` over all methods tells them apart. The
-    interval of one gain alone does not count how many methods were compared.
-    """
+    """Return what the rows of a scenario say of plain fine-tuning and the methods against forgetting."""
     competing = [row for row in rows if row.division in METHODS]
     baseline = next((row for row in competing if row.method == BASELINE), None)
     others = [row for row in competing if row.method != BASELINE]
@@ -60,9 +56,8 @@ def headline(rows: Sequence[Row]) -> str:
     if not others:
         kept = number_text(baseline.estimates["kept"].value, ".2f", MISSING)
         return f"Plain fine-tuning keeps {kept} of what the policy knew. No other method has run here."
-    letters = groups(RANKED_BY, {row.method: row.scores for row in competing})
-    apart = [row for row in others if not set(letters.get(row.method, "")) & set(letters.get(BASELINE, ""))]
-    ahead = [row for row in apart if (row.estimates["gain"].value or 0.0) > 0]
+    apart = apart_from_baseline(rows)
+    ahead = [row for row in others if row.method in apart and (row.estimates["gain"].value or 0.0) > 0]
     if not ahead:
         methods = "The one other method is not" if len(others) == 1 else "No method is"
         return f"{methods} shown to end above plain fine-tuning."
