@@ -73,7 +73,7 @@ def run(
         first_seed: The first seed.
         order: Order of the targets, for scenarios with one published order: 0 is that order, other numbers
             are permutations. From them the leaderboard reports how much scores depend on the order. Scenarios
-            whose seeds have orders of their own (Fetch-v1, MetaWorld-v1) take 0 alone.
+            whose seeds have orders of their own, such as Fetch-v1, take 0 alone.
         policy: flow, discrete_diffusion, or a class of your own as module:Class. Each has rows of its own.
         policy_size: small, base (5 million parameters) or large (40 million) for the built-in ones.
         perturb: Also evaluate the skills and each new target in perturbed worlds: other start poses, heavier

@@ -224,16 +224,17 @@ def apart_from_baseline(rows: Iterable[Row]) -> frozenset[str]:
 
     Each is tested together with plain fine-tuning and all others that may look at as much: at prior
     demonstrations, or at none. The interval of one gain alone does not count how many methods were compared.
+    A row without a final average is not told apart from any.
     """
-    competing = [row for row in rows if row.division in METHODS]
-    baseline = {row.method: row.scores for row in competing if row.method == BASELINE}
+    members = list(rows)
     apart: set[str] = set()
     for divisions in (WITHOUT_DEMONSTRATIONS, WITH_DEMONSTRATIONS):
-        members = [row for row in competing if row.division in divisions and row.method != BASELINE]
-        family = {row.method: row.scores for row in members}
-        letters = groups(RANKED_BY, {**baseline, **family})
-        apart |= {name for name in family if not set(letters.get(name, "")) & set(letters.get(BASELINE, ""))}
-    return frozenset(apart) if baseline else frozenset()
+        family = [row for row in members if row.method == BASELINE or row.division in divisions]
+        letters = groups(RANKED_BY, {row.method: row.scores for row in family})
+        if BASELINE in letters:
+            own = set(letters[BASELINE])
+            apart |= {method for method, others in letters.items() if not own & set(others)}
+    return frozenset(apart)
 
 
 def agreement(rows: Iterable[Row]) -> Agreement | None:

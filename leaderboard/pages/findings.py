@@ -133,8 +133,7 @@ def _gains(boards: dict[str, list[Row]]) -> Section:
 def _gain_sentences(name: str, rows: Sequence[Row]) -> Iterator[str]:
     """Yield what Tukey's test of all rows without prior demonstrations says of each gain."""
     others = [row for row in competing(rows) if row.division in WITHOUT_DEMONSTRATIONS]
-    baseline = next((row for row in rows if row.method == BASELINE), None)
-    if not others or baseline is None:
+    if not others or BASELINE not in {row.method for row in rows}:
         return
     gains = {row.method: row.estimates["gain"] for row in others}
     apart = apart_from_baseline(rows)
@@ -149,7 +148,7 @@ def _gain_sentences(name: str, rows: Sequence[Row]) -> Iterator[str]:
             f"{_power(gains.values())}"
         )
     alone = f"by an interval of their own, which does not count the {counted(len(gains), 'comparison')}"
-    higher = {name: gain for name, gain in gains.items() if (gain.low or 0) > 0 and name not in better}
+    higher = {method: gain for method, gain in gains.items() if (gain.low or 0) > 0 and method not in better}
     if higher:
         yield f"Higher {alone}: {_listed(higher)}."
     lower = {
