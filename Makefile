@@ -36,8 +36,8 @@ FIXED := clbench/DMControl-v0,clbench/FetchPixels-v0,clbench/PointMaze-v0
 # squares of orders.
 records: .venv/installed-dev
 	$(BIN)/clbench run clbench/Fetch-v1 sft consft consft_calibrated --seeds 12 --perturb
-	$(BIN)/clbench run clbench/Fetch-v1 $(REFERENCES) $(METHODS) $(CONSFT_CONTROLS) --seeds 12
-	$(BIN)/clbench run clbench/Fetch-v1 $(RIVALS) --seeds 8
+	$(BIN)/clbench run clbench/Fetch-v1 $(REFERENCES) $(METHODS) $(CONSFT_CONTROLS) ewc --seeds 12
+	$(BIN)/clbench run clbench/Fetch-v1 a_gem buffered_replay --seeds 8
 	$(BIN)/clbench run clbench/MetaWorld-v1 $(REFERENCES) $(METHODS) --seeds 8
 	$(BIN)/clbench run clbench/MetaWorld-v1 $(CONSFT_CONTROLS) --seeds 4
 	$(BIN)/clbench run $(KNOWLEDGE) frozen joint sft stop_gradient aegis lora --seeds 4

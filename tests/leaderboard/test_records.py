@@ -30,7 +30,7 @@ SEEDS = {FETCH: 12, META_WORLD: 8, "clbench/FetchKnowledge-v1": 4, f"{FETCH}+flo
 A run of a policy with 4.9 million parameters takes up to 20 minutes."""
 FEWER = {
     **{(META_WORLD, control): 4 for control in CONTROLS},
-    **{(FETCH, rival): 8 for rival in ("a_gem", "buffered_replay", "ewc")},
+    **{(FETCH, rival): 8 for rival in ("a_gem", "buffered_replay")},
 }
 """Rows with fewer seeds than their table."""
 
