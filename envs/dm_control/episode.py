@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -42,16 +43,27 @@ class Episode:
         begin = start(self.rule.body, self.rule.start)
         if perturbation:
             begin = start_with_mass(self.rule.body, self.rule.start, perturbation.mass)
-        self.start = begin
-        if begin not in self._kept:
-            data = mujoco.MjData(begin.model)
-            self._kept[begin] = (data, begin.body.observer(begin.model, data))
-        self.data, self._observe = self._kept[begin]
-        self.control = self.data.ctrl
+        self._take(begin)
         begin.begin(seed, self.data)
         if perturbation:
             self._push(perturbation.start)
         return self._observe()
+
+    def _take(self, begin: Start) -> None:
+        """Make the physics of a body the current one."""
+        if begin not in self._kept:
+            data = mujoco.MjData(begin.model)
+            self._kept[begin] = (data, begin.body.observer(begin.model, data))
+        self.start, (self.data, self._observe) = begin, self._kept[begin]
+        self.control = self.data.ctrl
+
+    def __deepcopy__(self, _: dict[int, Any]) -> Episode:
+        """Return an episode with its own physics, in the same state."""
+        copied = Episode()
+        copied.task, copied.rule = self.task, self.rule
+        copied._take(self.start)
+        mujoco.mj_copyData(copied.data, self.start.model, self.data)
+        return copied
 
     def _push(self, start: tuple[float, float, float]) -> None:
         """Add a share, from -1 to 1 for each of two axes, of the largest speeds to the body's joints."""

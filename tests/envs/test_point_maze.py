@@ -43,17 +43,14 @@ def random_actions(seed: int, steps: int) -> NDArray[np.float32]:
     return np.random.default_rng(seed).uniform(-1.0, 1.0, (steps, 2)).astype(np.float32)
 
 
-def expert_succeeds(task: Task, seed: int, noisy: bool) -> bool:
-    """Run the task's expert for an episode, with five random actions from the tenth step on if noisy."""
+def expert_recovers(task: Task, seed: int) -> bool:
+    """Run the task's expert for an episode in which steps 10 to 14 are random, and return its success."""
     world, expert = World(), resolve(task.expert)(task.name)
-    state, _ = world.reset(seed=seed, options={"task": task.name})
+    current, _ = world.reset(seed=seed, options={"task": task.name})
     noise = random_actions(seed, 5)
     for step in range(task.horizon):
-        action = noise[step - 10] if noisy and 10 <= step < 15 else expert(state)
-        state, _, terminated, truncated, info = world.step(action)
-        assert not truncated
-        assert info == {"success": terminated, "task": task.name}
-        if terminated:
+        current, _, success, *_ = world.step(noise[step - 10] if 10 <= step < 15 else expert(current))
+        if success:
             return True
     return False
 
@@ -167,11 +164,10 @@ def test_the_ball_starts_anywhere_that_is_three_cells_from_the_goal() -> None:
     assert starts == {cell for cell in maze.free if maze.steps(cell, "upper") >= 3}
 
 
-@pytest.mark.parametrize("noisy", [False, True])
 @pytest.mark.parametrize("task", SCENARIO.tasks, ids=NAMES)
-def test_the_expert_does_its_task(task: Task, noisy: bool) -> None:
-    # five random actions can carry the ball to the other end: one episode may lack time for the way back
-    assert sum(expert_succeeds(task, seed, noisy) for seed in range(100, 104)) >= 4 - noisy
+def test_the_expert_recovers_from_random_actions(task: Task) -> None:
+    # they can carry the ball to the other end: one episode may lack time for the way back
+    assert sum(expert_recovers(task, seed) for seed in range(100, 104)) >= 3
 
 
 def test_the_reward_grows_while_the_expert_acts_and_is_highest_at_success() -> None:
