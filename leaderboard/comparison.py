@@ -52,7 +52,7 @@ def compare(
         device: Device on which policies are computed, for example "cpu" or "cuda".
 
     Returns:
-        One row for each method, the best final average first, with the columns of `clbench.load_board`:
+        One row for each method, by division, the best first, with the columns of `clbench.load_board`:
         each metric with its interval, the costs, and in `groups` which methods are not told apart.
 
     Raises:

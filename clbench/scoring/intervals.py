@@ -12,7 +12,8 @@ several seeds vary for both reasons. Therefore:
    episodes drawn with replacement, for each task. All stages and evaluation points of a run get the same
    draws, and so do runs of other methods with this seed: they met the same initial states. Fewer episodes are
    run before the end of a stage. There the rate is the mean over the drawn ones among them. Right answers are
-   drawn from a binomial for each stage and kind of question, since records hold counts only.
+   drawn from a binomial for each stage and kind of question, since records hold counts only. Metrics of
+   `OF_WHOLE_RUNS`, such as the steps to the criterion, have no interval with one seed.
 
 Tasks are fixed: a scenario consists of them. All seeds share demonstrations, scenes and questions: intervals
 do not cover other ones. Choices on a run's validation episodes are fixed too: the interval does not cover the
@@ -49,10 +50,20 @@ REPLICATES = 2000
 """Draws behind an interval of episodes."""
 LEVEL = 95.0
 """Nominal coverage of the intervals in per cent."""
+OF_WHOLE_RUNS = (
+    "answer_curves",
+    "update_sparsity",
+    "activation_drift",
+    "shift",
+    "captured",
+    "steps",
+    "met",
+    "relearning_steps",
+)
+"""Arrays of `Rates` that no draw of test episodes changes: one seed tells nothing of how much they vary."""
 SEED_DEVIATION = 0.1
-"""Standard deviation of a success rate between seeds, assumed where none is measured. In the committed
-records of Fetch-v1 retention deviates by 0.087 beyond the noise of episodes (root mean square over methods),
-and by 0.17 at most; on MetaWorld-v1 by 0.17 and 0.25."""
+"""Standard deviation of a success rate between seeds, assumed where none is measured.
+`docs/guide/statistics.md` has what is measured in the committed records."""
 MANY = 10**6
 """Degrees of freedom of a standard deviation that is known."""
 
@@ -325,7 +336,9 @@ class _Samples:
         rates = combine(parts, lambda arrays: np.stack(arrays, axis=1))
         share = rates.correct / np.maximum(rates.asked, 1)
         correct = self.generator.binomial(rates.asked.astype(np.int64), share)
-        return replace(rates, correct=correct.astype(np.float64))
+        unknown = OF_WHOLE_RUNS if len(runs) == 1 else ()
+        of_runs = {name: np.full_like(getattr(rates, name), np.nan) for name in unknown}
+        return replace(rates, correct=correct.astype(np.float64), **of_runs)
 
 
 # ---- quantiles ---------------------------------------------------------------------------------------------

@@ -29,10 +29,13 @@ def costs_of(runs: Sequence[Run], baseline: Sequence[Run]) -> dict[str, float | 
 
     Args:
         runs: Runs of the method.
-        baseline: Runs of plain fine-tuning on the same scenario; may be empty.
+        baseline: Runs of plain fine-tuning on the same scenario; may be empty. Those with the seeds of `runs`
+            count: without one of them the relative cost is None.
     """
     costs = {column: _mean(runs, name) for column, name in COSTS.items()}
-    steps, usual = costs["steps"], _mean(baseline, "optimiser_steps")
+    seeds = {run.seed for run in runs}
+    same = [run for run in baseline if run.seed in seeds]
+    steps, usual = costs["steps"], _mean(same, "optimiser_steps") if len(same) == len(seeds) else None
     times = [ratio for run in runs if (ratio := step_ratio(run)) is not None]
     relative = None
     if steps == 0:

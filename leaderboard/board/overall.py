@@ -71,7 +71,8 @@ def mean_estimate(parts: Sequence[Estimate]) -> Estimate:
     """Return the mean of independent estimates; a missing one leaves none.
 
     The interval is recovered from the parts' intervals, whose distances from their values add up in squares:
-    Zou and Donner 2008, doi 10.1002/sim.3095 (MOVER). Scenarios share neither policies nor episodes.
+    Zou and Donner 2008, doi 10.1002/sim.3095 (MOVER). Two scenarios with tasks in common, as Fetch-v1 and
+    FetchKnowledge-v1, share demonstrations and initial states: that is as little covered as in one scenario.
     """
     values = [one.value for one in parts if one.value is not None]
     if not values or len(values) < len(parts):

@@ -18,7 +18,6 @@ from clbench.records.record import ScenarioInfo
 from clbench.runs.tuning import tuned
 from clbench.scoring.groups import groups
 from clbench.scoring.intervals import Estimate, Runs, estimate, row_generator
-from clbench.scoring.layout import Array
 from clbench.scoring.metrics import METRICS, measure
 from clbench.spec.references import BASELINE
 
@@ -30,6 +29,7 @@ from .runs import ALIKE, Run, Sifted, no_row, read_run, read_runs
 from .summary import (
     DIVISIONS,
     ELSEWHERE,
+    GAIN,
     METHODS,
     RANKED_BY,
     WITH_DEMONSTRATIONS,
@@ -105,7 +105,7 @@ def _beside_rows(runs: list[Run]) -> Sifted:
 
 
 def _scenario_rows(runs: list[Run]) -> list[Row]:
-    """Return the rows of the runs of one scenario, by division and falling final average."""
+    """Return the rows of the runs of one scenario, by division, the best first: see `ordered_by`."""
     by_method: dict[str, list[Run]] = {}
     for run in sorted(runs, key=lambda run: run.seed):
         if not run.order:
@@ -116,7 +116,8 @@ def _scenario_rows(runs: list[Run]) -> list[Row]:
         estimates = {method: _estimates(method, by_method) for method in members}
         competing = {method: _scores(runs) for method, runs in members.items() if division != "reference"}
         letters = groups(RANKED_BY, competing)
-        order = sorted(members, key=lambda method: (_falling(estimates[method][RANKED_BY]), method))
+        by = ordered_by(estimates.values())
+        order = sorted(members, key=lambda method: (_falling(estimates[method][by]), method))
         rows += [
             _row(method, estimates[method], letters.get(method), members[method], by_method, runs)
             for method in order
@@ -171,6 +172,16 @@ def pretrained_success(rows: Iterable[Row]) -> float | None:
     return math.fsum(known) / len(known) if known else None
 
 
+def ordered_by(estimates: Iterable[Mapping[str, Estimate]]) -> str:
+    """Return the metric that orders the rows of a division, higher first.
+
+    It is the gain over plain fine-tuning, which compares equal seeds: seeds differ so much that the final
+    average of other seeds says little. Where a row with a final average has no gain, it is the final average.
+    """
+    ranked = [values for values in estimates if values[RANKED_BY].value is not None]
+    return GAIN if all(values[GAIN].value is not None for values in ranked) else RANKED_BY
+
+
 def _falling(one: Estimate) -> float:
     return math.inf if one.value is None else -one.value
 
@@ -200,11 +211,11 @@ class Standing:
     """A row among the rows of its division that have a final average."""
 
     place: int
-    """One more than the number of rows with a higher final average; it ignores noise."""
+    """One more than the number of rows that are higher in the metric of `ordered_by`; it ignores noise."""
     count: int
     """Number of rows."""
     alike: tuple[str, ...]
-    """Methods of the other rows that are not told apart from it, by falling final average."""
+    """Methods of the other rows that are not told apart from it, the best first."""
 
 
 def standing_of(row: Row, rows: Iterable[Row]) -> Standing | None:
@@ -212,9 +223,10 @@ def standing_of(row: Row, rows: Iterable[Row]) -> Standing | None:
     if row.groups is None:
         return None
     division = [other for other in rows if other.division == row.division and other.groups is not None]
-    value = _falling(row.estimates[RANKED_BY])
+    by = ordered_by(other.estimates for other in division)
+    value = _falling(row.estimates[by])
     # Values are quotients of whole numbers: equal ones may differ in the last bit.
-    better = [other for other in division if _falling(other.estimates[RANKED_BY]) < value - 1e-9]
+    better = [other for other in division if _falling(other.estimates[by]) < value - 1e-9]
     alike = [other for other in division if other is not row and set(other.groups or "") & set(row.groups)]
     return Standing(1 + len(better), len(division), tuple(other.method for other in alike))
 
@@ -243,20 +255,24 @@ def agreement(rows: Iterable[Row]) -> Agreement | None:
     Only a scenario whose seeds have orders of their own has an agreement.
     """
     values = values_by_seed(row for row in rows if row.runs[0].published.balanced)
-    return None if values is None else agreement_of(values)
+    return agreement_of(np.array(list(values.values()))) if values else None
 
 
-def values_by_seed(rows: Iterable[Row]) -> Array | None:
-    """Return the final average of each competing row with each of the baseline's seeds, (rows, seeds).
+def values_by_seed(rows: Iterable[Row], metric: str = RANKED_BY) -> dict[str, list[float]]:
+    """Return a metric of each competing row with each of the baseline's seeds, by method.
 
-    Rows without one of these seeds are left out. None without the baseline, or if no row has a value.
+    Rows that lack one of these seeds, or a value, are left out. There is none without the baseline.
+
+    Args:
+        rows: Rows of a scenario.
+        metric: Name of a metric that needs no reference.
     """
     competing = [row for row in rows if row.division in METHODS]
     seeds = next((row.seeds for row in competing if row.method == BASELINE), ())
-    values = [
-        [measure(RANKED_BY, row.scores[seed]) for seed in seeds]
-        for row in competing
-        if set(row.seeds).issuperset(seeds)
-    ]
-    known = [line for line in values if None not in line]
-    return np.array(known, dtype=float) if seeds and known else None
+    found = {}
+    for row in competing:
+        if seeds and set(seeds) <= set(row.seeds):
+            values = [measure(metric, row.scores[seed]) for seed in seeds]
+            if None not in values:
+                found[row.method] = [value for value in values if value is not None]
+    return found

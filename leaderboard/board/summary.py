@@ -39,7 +39,10 @@ COSTS = {
 """Fields of `Record.costs` by column of the table."""
 
 RANKED_BY = "final_average"
-"""Metric that rows are sorted and compared by."""
+"""Metric that rows are compared by."""
+
+GAIN = "gain"
+"""The same metric less plain fine-tuning's with the same seeds."""
 
 
 @dataclass(frozen=True, kw_only=True)

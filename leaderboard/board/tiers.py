@@ -56,6 +56,7 @@ def _verification(record: Path) -> dict[str, Any]:
     try:
         values = read_json(verification_path(record))
         whole = values["content"] == content_hash(values) and values["tier"] in TIERS
+        whole = whole and isinstance(values.get("checks", []), list)
         if whole and values["record"] == hashlib.sha256(record.read_bytes()).hexdigest():
             return dict(values)
     except (OSError, ValueError, KeyError, TypeError):

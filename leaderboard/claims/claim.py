@@ -150,11 +150,13 @@ def what_would_change(figure: Figure, bar: float) -> str:
 
 def not_told_apart(control: Figure, *, explains: str, does_not: str) -> str:
     """Return what a control says: the figure is the method's gain over the control, higher is better."""
-    name = control.methods[-1]
+    name = control.methods[1]
     if math.isnan(control.low):
         return f"The records cannot show what {name} says about it."
     if control.low > 0:
         return f"{name} does not reach it: {does_not}."
+    if control.high < 0:
+        return f"{name} is even better than it: {explains}."
     return f"{name} is not told apart from it: {explains}."
 
 

@@ -308,7 +308,7 @@ def _predictors(boards: dict[str, list[Row]]) -> Section:
     answers = []
     for name, rows in boards.items():
         for one in predictions(rows):
-            words = "orders the methods as their forgetting does"
+            words = "agrees with their forgetting on the order of the methods more than by chance"
             if one.high < 0:
                 words = "orders the methods against their forgetting"
             elif one.low <= 0:

@@ -45,7 +45,7 @@ def _panel(name: str, rows: Sequence[Row]) -> Spec:
             "range": [colour(f"mark-{DIVISIONS.index(division)}") for division in divisions],
         },
     }
-    gain = axis("value", "gain over tuned fine-tuning, with 95 % interval", axis={"format": ".2~f"})
+    gain = axis("value", "gain over plain fine-tuning, with 95 % interval", axis={"format": ".2~f"})
     ends = {"x": {"field": "low", "type": "quantitative"}, "x2": {"field": "high"}}
     line = {"type": "rule", "color": colour("edge"), "strokeDash": [4, 3]}
     zero = layer([{"zero": 0}], line, x={"field": "zero", "type": "quantitative"})

@@ -8,12 +8,11 @@ from itertools import combinations
 import numpy as np
 
 from clbench.base.text import counted
-from clbench.scoring.layout import Array
-from clbench.scoring.metrics import measure
+from clbench.scoring.metrics import load_metric
 
 from ..board.agreement import Agreement, agreement_between
 from ..board.rows import Row, Table, agreement, values_by_seed
-from ..board.summary import METHODS, RANKED_BY, WITHOUT_DEMONSTRATIONS
+from ..board.summary import RANKED_BY, WITHOUT_DEMONSTRATIONS
 from ..views.format import tau_text, title_of
 
 
@@ -53,8 +52,8 @@ def _shares_of_variance(name: str, rows: Sequence[Row]) -> Iterator[str]:
         name: Name of the scenario.
         rows: Its rows without prior demonstrations.
     """
-    values = values_by_seed(rows)
-    if values is None or min(values.shape) < 2 or values.std() == 0:
+    values = np.array(list(values_by_seed(rows).values()), ndmin=2)
+    if min(values.shape) < 2 or values.std() == 0:
         return
     mean = values.mean()
     total = ((values - mean) ** 2).sum()
@@ -79,29 +78,20 @@ def _between(
         other_metric: Metric of the others.
         paired: Whether both are of the same runs.
     """
-    theirs = {row.method: row for row in others if row.division in METHODS}
-    pairs = [(row, theirs[row.method]) for row in rows if row.division in METHODS and row.method in theirs]
-    if not pairs:
+    ours, theirs = values_by_seed(rows, metric), values_by_seed(others, other_metric)
+    both = [method for method in ours if method in theirs]
+    if not both:
         return None
     one, other = (
-        _values([pair[side] for pair in pairs], name) for side, name in enumerate((metric, other_metric))
+        (1.0 if load_metric(name).higher_is_better else -1.0) * np.array([values[method] for method in both])
+        for name, values in ((metric, ours), (other_metric, theirs))
     )
-    return None if one is None or other is None else agreement_between(one, other, paired=paired)
-
-
-def _values(rows: Sequence[Row], metric: str) -> Array | None:
-    """Return a metric of each row and of the seeds that all have, (rows, seeds); None if one is missing."""
-    seeds = sorted(set.intersection(*(set(row.seeds) for row in rows)))
-    sign = -1.0 if metric == "forgetting" else 1.0
-    values = [[measure(metric, row.scores[seed]) for seed in seeds] for row in rows]
-    if not seeds or any(value is None for line in values for value in line):
-        return None
-    return sign * np.array(values, dtype=float)
+    return agreement_between(one, other, paired=paired)
 
 
 def _order(found: Agreement, methods: str = "the methods") -> str:
     """Return the predicate of a sentence on two boards."""
-    words = f"order {methods} alike"
+    words = f"agree on the order of {methods} more than by chance"
     if found.high < 0:
         words = f"put {methods} in opposite orders"
     elif found.low <= 0:

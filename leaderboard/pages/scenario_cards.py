@@ -254,7 +254,7 @@ def _resolution(competing: Sequence[Row]) -> dict[str, list[float]]:
     found = {}
     for metric in TELLING:
         deviation = deviation_of_differences(metric, [row.scores for row in competing])
-        if deviation is not None:
+        if deviation:  # equal differences for all seeds tell nothing
             widths = [student_quantile(n - 1) * deviation / math.sqrt(n) for n in SEEDS]
             found[metric] = [deviation, *widths]
     return found

@@ -217,7 +217,8 @@ def _check_origin(subject: Subject, again: Record) -> Check:
     wrong = [f"{name} {theirs.get(name)} is {ours.get(name)} here" for name in differences(theirs, ours)]
     if wrong:
         return Check("origin", f"the record states what is not so here: {some(wrong)}", False)
-    source = [record.fingerprint.get("method", {}).get("source") for record in (subject.run.record, again)]
+    methods = [record.fingerprint.get("method") for record in (subject.run.record, again)]
+    source = [values.get("source") if isinstance(values, dict) else None for values in methods]
     same = "the method's source is the same" if source[0] == source[1] else "the method's source has changed"
     return Check(
         "origin",

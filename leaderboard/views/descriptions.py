@@ -88,11 +88,6 @@ class Description:
         """Division in which the method competes."""
         return division_of(dataclasses.asdict(self.cls.uses))
 
-    @property
-    def defaults(self) -> dict[str, Any]:
-        """Default hyper-parameters by name."""
-        return dataclasses.asdict(self.cls())
-
     def hook(self, name: str) -> list[str]:
         """Return the paragraphs on what a hook returns, none if the method does not override the hook."""
         function = getattr(self.cls, name)

@@ -2,16 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from clbench.base.text import counted, printable
 from clbench.scoring.groups import groups
-from clbench.scoring.intervals import Estimate
+from clbench.scoring.intervals import Estimate, paired_difference, row_generator
 from clbench.spec.references import BASELINE
 
 from ...board.rows import Row, apart_from_baseline, standing_of
-from ...board.summary import DIVISIONS, METHODS, RANKED_BY, divisions_of
+from ...board.summary import (
+    DIVISIONS,
+    METHODS,
+    RANKED_BY,
+    WITH_DEMONSTRATIONS,
+    WITHOUT_DEMONSTRATIONS,
+    divisions_of,
+)
 from ..descriptions import RULES
 from ..format import number_text
 from .numbers import MISSING, cost, size
@@ -38,11 +45,12 @@ class Verdict:
     name: str
     rule: str
     leader: Row
-    """The row with the highest final average."""
+    """The first row of the division."""
     standing: str
     """How surely it leads."""
     keeping: str
-    """Sentence on the method that keeps most at equal learning, empty if there is nothing to compare."""
+    """Sentence on the method that keeps most among those that learn like plain fine-tuning, empty if there is
+    nothing to compare."""
     facts: tuple[Fact, ...]
 
 
@@ -54,17 +62,15 @@ def headline(rows: Sequence[Row]) -> str:
     if baseline is None:
         return f"{counted(len(competing), 'method')}, not yet compared with plain fine-tuning."
     if not others:
-        kept = number_text(baseline.estimates["kept"].value, ".2f", MISSING)
-        return f"Plain fine-tuning keeps {kept} of what the policy knew. No other method has run here."
+        value = number_text(baseline.estimates[RANKED_BY].value, ".2f", MISSING)
+        return f"Plain fine-tuning ends with a final average of {value}. No other method has run here."
     apart = apart_from_baseline(rows)
-    ahead = [row for row in others if row.method in apart and (row.estimates["gain"].value or 0.0) > 0]
+    gains = {row.method: _paired(RANKED_BY, row, baseline) for row in others if row.method in apart}
+    ahead = [row for row in others if gains.get(row.method, 0.0) > 0]
     if not ahead:
         methods = "The one other method is not" if len(others) == 1 else "No method is"
         return f"{methods} shown to end above plain fine-tuning."
-    gain = max(row.estimates["gain"].value or 0.0 for row in ahead)
-    first = f"{_listed(ahead)} end above plain fine-tuning, by up to {number_text(gain, '.2f')}."
-    if len(ahead) == 1:
-        first = f"{_listed(ahead)} ends {number_text(gain, '.2f')} above plain fine-tuning."
+    first = _above(ahead, gains)
     left = len(others) - len(ahead)
     if not left:
         return first
@@ -73,6 +79,29 @@ def headline(rows: Sequence[Row]) -> str:
         if left == 1
         else f"The other {left} methods show no certain gain."
     )
+
+
+def _above(ahead: Sequence[Row], gains: Mapping[str, float]) -> str:
+    """Return the sentence on the methods that end above plain fine-tuning, without demonstrations first."""
+    parts = []
+    for kind, divisions in (("out", WITHOUT_DEMONSTRATIONS), ("", WITH_DEMONSTRATIONS)):
+        members = sorted(
+            (row for row in ahead if row.division in divisions), key=lambda row: -gains[row.method]
+        )
+        if members:
+            texts = [number_text(gains[row.method], ".2f") for row in (members[-1], members[0])]
+            by = texts[0] if texts[0] == texts[1] else f"{texts[0]} to {texts[1]}"
+            verb = "ends" if len(members) == 1 else "end"
+            parts.append((f"with{kind} prior demonstrations", _listed(members), verb, by))
+    (where, names, verb, by), *more = parts
+    first = f"{where.capitalize()}, {names} {verb} {by} above plain fine-tuning"
+    return "; ".join([first, *(f"{where}, {names} by {by}" for where, names, _, by in more)]) + "."
+
+
+def _paired(metric: str, row: Row, other: Row) -> float:
+    """Return how much higher a row is than another over the seeds that both have, 0 without one."""
+    generator = row_generator(row.scenario, row.method)
+    return paired_difference(metric, row.scores, other.scores, generator).value or 0.0
 
 
 def verdicts(rows: Sequence[Row]) -> list[Verdict]:
@@ -102,14 +131,14 @@ def _standing(leader: Row, rows: Iterable[Row]) -> str:
     standing = standing_of(leader, rows)
     value = number_text(leader.estimates[RANKED_BY].value, ".2f")
     if standing is None or standing.count == 1:
-        return f"The only method of its division. Final average {value}."
+        return f"Alone in its division. Final average {value}."
+    first = f"First of {standing.count}, with a final average of {value}"
     if standing.alike:
-        names = _names(standing.alike)
-        return f"Highest final average, {value}, but not told apart from {names}."
+        return f"{first}, but not told apart from {_names(standing.alike)}."
     others = [row for row in rows if row.division == leader.division and row is not leader]
     if len(others) == 1:
-        return f"Best final average, {value}, told apart from {printable(others[0].method)}."
-    return f"Best final average, {value}, told apart from all others of its division."
+        return f"{first}, told apart from {printable(others[0].method)}."
+    return f"{first}, told apart from all others of its division."
 
 
 def _keeping(members: Sequence[Row], baseline: Row | None) -> str:
@@ -120,18 +149,25 @@ def _keeping(members: Sequence[Row], baseline: Row | None) -> str:
     if not equal:
         return _other_learning(members[0], baseline)
     slower = "" if members[0] in equal else f"{_other_learning(members[0], baseline)} "
-    keeper = max(equal, key=lambda row: row.estimates["kept"].value or 0.0)
+    keeper = max(equal, key=lambda row: _paired("kept", row, baseline))
     kept = number_text(keeper.estimates["kept"].value, ".2f", MISSING)
     price = cost(keeper)
     paid = f"{price.text} the training time of sft" if price.order else "a cost that was not measured"
     if len(members) == 1:
         usual = number_text(baseline.estimates["kept"].value, ".2f", MISSING)
         apart = _apart("kept", keeper, baseline)
-        return f"It learns as much as sft and keeps {kept}, sft {usual}{apart}, at {paid}."
+        return f"{_learning(keeper, baseline)}. It keeps {kept}, sft {usual}{apart}, at {paid}."
     peers = _alike("kept", keeper.method, {row.method: row for row in equal})
     others = counted(len(peers) - 1, "other")
     sure = f"; not told apart from {others}" if len(peers) > 1 else ""
-    return f"{slower}At equal learning, {printable(keeper.method)} keeps most: {kept}, at {paid}{sure}."
+    name, like = printable(keeper.method), "Of methods not told apart from sft in learning"
+    return f"{slower}{like}, {name} keeps most: {kept}, at {paid}{sure}."
+
+
+def _learning(row: Row, baseline: Row) -> str:
+    """Return what a row learns that is not told apart from plain fine-tuning in it."""
+    own, usual = (number_text(one.estimates["adaptation"].value, ".2f", MISSING) for one in (row, baseline))
+    return f"Learning {own}, not told apart from sft's {usual}"
 
 
 def _other_learning(leader: Row, baseline: Row) -> str:

@@ -78,8 +78,9 @@ class ScenarioView:
         policy = f"A policy with {counted(skills, 'skill')}" if skills else "A policy"
         seeds = sorted({len(view.row.seeds) for view in self.rows})
         count = counted(seeds[0], "seed") if len(seeds) == 1 else f"{seeds[0]} to {seeds[-1]} seeds"
+        turns = ", one after another" if targets > 1 else ""
         sentences = [
-            f"{policy} is fine-tuned on {counted(targets, 'new task')}, one after another.",
+            f"{policy} is fine-tuned on {counted(targets, 'new task')}{turns}.",
             "The final average is its success on all of them at the end.",
             f"Means over {count}, with 95 % confidence intervals.",
         ]

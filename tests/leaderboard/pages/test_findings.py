@@ -79,7 +79,7 @@ def test_definitions_that_order_the_methods_alike_have_a_tau_of_one(
 ) -> None:
     fill(even_board, sft=0.2, finch=0.6, lora=0.4, l2_sp=0.1)
     text = page()
-    order = "order the methods alike (Kendall's tau 1.00 [1.00, 1.00])."
+    order = "agree on the order of the methods more than by chance (Kendall's tau 1.00 [1.00, 1.00])."
     assert f"On clbench/Even-v1, final average and forgetting {order}" in text
     assert f"On clbench/Even-v1, two halves of the 4 seeds {order}" in text
     assert "without methods that read prior demonstrations, the halves order the methods alike" in text

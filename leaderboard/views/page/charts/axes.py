@@ -80,7 +80,9 @@ class Axis:
             return cls(quantity, min(max(math.floor(least * 10 + 1e-9) / 10, 0.0), HIGHEST_LOW), 1.0)
         if quantity.source == "bytes_kept":
             return cls(quantity, 0.0, max(most, NOT_ZERO) * 2)
-        return cls(quantity, (least or 1.0) / 1.25, most * 1.25)
+        # The axis is logarithmic: a method that takes no steps has no place on it.
+        positive = [end for end in ends if end > 0]
+        return cls(quantity, min(positive, default=1.0) / 1.25, max(positive, default=1.0) * 1.25)
 
     def holds(self, one: Estimate) -> bool:
         """Return whether a value is known and on the axis."""

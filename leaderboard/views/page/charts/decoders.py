@@ -7,22 +7,21 @@ from ...format import format_interval
 from .vega import SYSTEM_FONT, Spec, colour, layer, rounded, specification
 
 
-def decoders(found: Decoding, narrow: bool, font: str = SYSTEM_FONT) -> Spec:
+def decoders(found: Decoding, narrow: bool) -> Spec:
     """Return two charts of the decoders: speed, and success beyond the first decoder's.
 
     Args:
         found: Results of the benchmark.
         narrow: Whether it is for a phone: the charts stand one below the other, and names have several lines.
-        font: Font of all texts.
     """
     panels = (("speed_up", "speed-up", 1.0), ("difference", "difference of success", 0.0))
     if narrow:
         lines = {"labelExpr": "split(datum.label, ', ')", "labelLimit": 190}
-        return specification(font, vconcat=[_compared(found, *one, 140, 50, lines) for one in panels])
+        return specification(SYSTEM_FONT, vconcat=[_compared(found, *one, 140, 50, lines) for one in panels])
     speed, success = panels
     beside = [_compared(found, *speed, 220, 22, {"labelLimit": 340})]
     beside += [_compared(found, *success, 220, 22, {"labels": False})]
-    return specification(font, hconcat=beside)
+    return specification(SYSTEM_FONT, hconcat=beside)
 
 
 def _compared(
