@@ -32,6 +32,7 @@ DEMONSTRATIONS = "demonstrations"
 
 KINDS = {
     DEMONSTRATIONS: "episodes of the experts, as Minari datasets",
+    "definitions": "hashes of what scenarios do",
     "scenes": "states that questions are asked about",
     "frames": "pictures of demonstrations and scenes",
     "pretrained": "pretrained policies",
@@ -341,7 +342,7 @@ def _table(found: Sequence[Entry], stale: Mapping[Entry, str], now: float, is_wi
     if is_wide:
         table.add_column("contents")
     present = {entry.kind for entry in found}
-    for kind in (*(kind for kind in KINDS if kind in present), *sorted(present - set(KINDS))):
+    for kind in (kind for kind in KINDS if kind in present):
         ours = [entry for entry in found if entry.kind == kind]
         unused = [entry.size for entry in ours if entry in stale]
         table.add_row(
@@ -350,7 +351,7 @@ def _table(found: Sequence[Entry], stale: Mapping[Entry, str], now: float, is_wi
             _size(sum(entry.size for entry in ours)),
             _days(max(now - entry.made for entry in ours)),
             f"{len(unused)} ({_size(sum(unused))})" if unused else "-",
-            *([KINDS.get(kind, "")] if is_wide else []),
+            *([KINDS[kind]] if is_wide else []),
         )
     return table
 

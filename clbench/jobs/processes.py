@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import multiprocessing
 import os
 import queue
@@ -258,14 +259,14 @@ def _work(
     if hasattr(signal, "pthread_sigmask"):  # children of a job must not inherit the mask of the server
         signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
 
-    def send(amount: float) -> None:
+    def tell(kind: str, value: Any) -> None:
         try:
-            connection.send(("progress", amount))
+            connection.send((kind, value))
         except OSError:  # the parent is gone: stop as if killed, so that the run can be resumed
             sys.exit(1)
 
-    listen(lambda place, remark: connection.send(("at", (place, remark))))
-    connection.send(_do_job(function, arguments, send))
+    listen(lambda place, remark: tell("at", (place, remark)))
+    connection.send(_do_job(function, arguments, functools.partial(tell, "progress")))
 
 
 def _do_job(

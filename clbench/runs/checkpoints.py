@@ -14,20 +14,26 @@ from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from clbench.base.cache import cache_folder, cached, hash_of, is_cached
+from clbench.base.cache import CacheError, cache_folder, cached, hash_of, is_cached
+from clbench.base.lease import LeaseLostError
 from clbench.base.progress import ProgressCallback, no_progress
 from clbench.evaluation.checks import Checker
 from clbench.learning.adaptation import Step
 from clbench.learning.optimise import MethodError, deterministic
 from clbench.learning.registry import method_packages
 from clbench.learning.trainer import STAGE_FILES, Trainer, load_stage, sources
+from clbench.policy.checkpoint import CheckpointError
 from clbench.policy.policy import Policy
 from clbench.spec.protocol import Point
+from clbench.worlds.gl_backend import RenderingError
 
 if TYPE_CHECKING:
     from clbench.runs.spec import ResolvedRun
 
 LOG = logging.getLogger("clbench")
+
+NOT_THE_METHOD = (CacheError, CheckpointError, LeaseLostError, RenderingError)
+"""Failures of the machine: a run can be done again, and leaves no record that blames its method."""
 
 
 def stage_policies(
@@ -115,6 +121,8 @@ def make_stages(run: ResolvedRun, progress: ProgressCallback = no_progress) -> P
             else:
                 trainer.prepare(progress)
             trainer.save(folder, trainer.state(number))
+        except NOT_THE_METHOD:
+            raise
         except Exception as error:
             message = f"{run.label} failed in {trainer.where}: {type(error).__name__}: {error}"
             raise MethodError(message) from error

@@ -13,9 +13,9 @@ from typing import Any
 
 import torch
 
-from clbench.base.cache import CacheError, cache_folder, cached, hash_of, is_cached
+from clbench.base.cache import cache_folder, cached, hash_of, is_cached
 from clbench.base.errors import WrongTypeError
-from clbench.base.lease import Lease, LeaseLostError
+from clbench.base.lease import Lease
 from clbench.base.progress import ProgressCallback, announce, no_progress
 from clbench.data.training_data import TrainingData
 from clbench.evaluation.checks import Checker
@@ -25,11 +25,10 @@ from clbench.learning.optimise import deterministic
 from clbench.learning.pretraining import pretrained_policy
 from clbench.learning.registry import describe_method, method_packages
 from clbench.learning.trainer import Trainer, sources
-from clbench.policy.checkpoint import CheckpointError
 from clbench.records.reader import read_record
 from clbench.records.record import Costs, Record
 from clbench.records.writer import check_diagnostics, write_record, write_result
-from clbench.runs.checkpoints import drop_stages, has_stages, keep_stage
+from clbench.runs.checkpoints import NOT_THE_METHOD, drop_stages, has_stages, keep_stage
 from clbench.runs.fingerprint import fingerprint
 from clbench.runs.length import relearning_length, relearns, run_length
 from clbench.runs.relearning import relearn
@@ -39,10 +38,6 @@ from clbench.runs.step_time import step_ratio
 from clbench.runs.tensorboard import Log, require_tensorboard
 from clbench.spec.protocol import Point
 from clbench.spec.references import BASELINE
-from clbench.worlds.gl_backend import RenderingError
-
-NOT_THE_METHOD = (CacheError, CheckpointError, LeaseLostError, RenderingError)
-"""Failures of the machine: the run can be done again, and leaves no record that blames its method."""
 
 
 def execute(
@@ -179,6 +174,8 @@ class _Run:
         except NOT_THE_METHOD:
             raise
         except Exception as error:
+            if isinstance(error.__cause__, KeyboardInterrupt):  # it came while a hook ran
+                raise error.__cause__ from None
             self.record.status = "failed"
             self.record.error = {
                 "where": self.trainer.where,
@@ -205,6 +202,7 @@ class _Run:
             self.log = Log(folder, scenario.budget.adaptation_steps, done)
         if done is None:
             done = 0
+            self.forget()  # a stage found there would not be kept
             if self.kept is not None:
                 drop_stages(self.run, self.kept)
             self._prepare()

@@ -35,6 +35,8 @@ class Layout:
     end."""
     kinds: tuple[str, ...]
     """Kinds of questions, sorted."""
+    to_criterion: bool = False
+    """Whether a stage ends at its criterion, so that only its end is evaluated."""
     targets: frozenset[str] = field(init=False)
     """Names of the tasks that are learned."""
 

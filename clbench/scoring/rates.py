@@ -7,7 +7,6 @@ from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from clbench.base.errors import InputError
 from clbench.scoring.layout import Array, Layout
@@ -83,9 +82,9 @@ class Rates(Measured):
         return np.diagonal(self.target[..., 1:, :], axis1=-2, axis2=-1)
 
     @property
-    def have_curves(self) -> NDArray[np.bool_]:
-        """Whether stages have learning curves, (..., targets): those to a criterion have their end alone."""
-        return np.isnan(self.steps) | (len(self.layout.steps) > 1)
+    def have_curves(self) -> bool:
+        """Whether stages have learning curves: those to a criterion have their end alone."""
+        return not self.layout.to_criterion
 
     @property
     def learning_curves(self) -> Array:

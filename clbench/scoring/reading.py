@@ -66,6 +66,8 @@ def read_protocol(record: Record) -> Protocol:
             raise RecordError(f"scenario: {name} of its budget must be a whole number, not {count!r}.")
     # few rows may ask for more memory than there is
     check_cells("stages x points x tasks", len(scenario.target) + 1, len(scenario.evaluation_steps), tasks)
+    episodes = max(scenario.budget[name] for name in ("validation_episodes", "test_episodes"))
+    check_cells("tasks x episodes", tasks, episodes)
     criterion = scenario.budget.get("criterion")
     if criterion is None:
         if any(record.checks.values()):
@@ -74,6 +76,8 @@ def read_protocol(record: Record) -> Protocol:
     if not _is_number(criterion, 1) or len(scenario.evaluation_steps) != 1:
         raise RecordError("scenario: a criterion must be a success rate, with one evaluation step.")
     if record.run.trained_elsewhere:  # it chose its own steps; its stages count as full ones
+        if any(record.checks.values()):
+            raise RecordError("checks: a policy that was trained elsewhere is not checked.")
         ends = tuple(scenario.evaluation_steps * len(scenario.target))
     else:
         ends = _read_ends(record)

@@ -83,6 +83,7 @@ class Scores(Measured):
             validation_episodes=numbers(_chosen_on(rows, protocol)),
             steps=protocol.steps,
             kinds=kinds,
+            to_criterion=protocol.criterion is not None,
         )
         # one table for all points, with a place for the pretrained policy's; the end is the last point
         success = _success(protocol, scored, layout)

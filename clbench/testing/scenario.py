@@ -59,14 +59,15 @@ def check_scenario(scenario: Scenario, *, episodes: int = 10, success: float = 0
         UnknownNameError: An entry point does not exist.
         ScenarioError: Any other part is wrong.
     """
+    learned = scenario.tasks + scenario.background
     try:
         check_scenario_id(scenario.id)
-        for task in scenario.tasks:
+        for task in learned:
             fitting_length(task.instructions + task.test_instructions)
     except ValueError as error:
         raise ScenarioError(f"{scenario.id}: {error}") from error
     wordings: dict[str, str] = {}
-    for task in scenario.tasks + scenario.background:
+    for task in learned:
         for words in task.instructions + task.test_instructions:
             if wordings.setdefault(words, task.name) != task.name:
                 raise ScenarioError(
@@ -76,12 +77,12 @@ def check_scenario(scenario: Scenario, *, episodes: int = 10, success: float = 0
     if not scenario.target:
         raise ScenarioError(f"{scenario.id}: there is no target to learn.")
     sizes: dict[tuple[int, ...], str] = {}
-    for entry_point in dict.fromkeys(task.world for task in scenario.tasks):
+    for entry_point in dict.fromkeys(task.world for task in learned):
         world: World = resolve(entry_point)()
         with closing(world):
             state, action = _check_spaces(entry_point, world)
             sizes.setdefault((*state.shape, *action.shape), entry_point)
-            for task in scenario.tasks:
+            for task in learned:
                 if task.world == entry_point:
                     _check_task(task, world, episodes, success)
     if len(sizes) > 1:

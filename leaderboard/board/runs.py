@@ -156,7 +156,7 @@ def _published(record: Record) -> ScenarioInfo:
     """Return `Record.scenario` with the targets in their published order."""
     targets = record.scenario.target
     try:
-        if record.scenario.balanced:
+        if record.scenario.balanced and not record.run.trained_elsewhere:  # those keep the published order
             places = balanced_order(len(targets), record.run.seed)
         else:
             places = target_order(len(targets), record.run.order)

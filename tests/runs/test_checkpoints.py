@@ -125,6 +125,15 @@ def test_a_killed_run_keeps_all_stages_once_it_has_finished(
     _assert_equal(stage_policies(spec.resolve(), tmp_path), stage_policies(spec.resolve()))
 
 
+def test_a_run_killed_without_keeping_its_policies_keeps_them_all_if_it_goes_on_with_a_folder(
+    tmp_path: Path, execute_and_kill: Callable[..., None]
+) -> None:
+    spec = RunSpec(TINY.id, "sft", seed=0)
+    execute_and_kill(spec, tmp_path, 0.75)
+    execute(spec, tmp_path, checkpoints=tmp_path)
+    assert has_stages(spec.resolve(), tmp_path)
+
+
 def test_policies_kept_by_another_version_of_the_code_are_replaced(kept: Path, tmp_path: Path) -> None:
     stale = tmp_path / "me--Tiny-v0" / "lora" / "seed-0" / "stage-2"
     stale.mkdir(parents=True)

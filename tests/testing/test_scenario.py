@@ -176,6 +176,16 @@ def test_an_expert_that_cannot_do_its_task_is_named(expert: str, message: str) -
         check_scenario(with_parts(expert=expert), episodes=3)
 
 
+def test_the_expert_of_a_background_task_is_checked_too() -> None:
+    task = dataclasses.replace(
+        TOY.held_out[0], name="right", instructions=("go far right",), expert=f"{HERE}lazy"
+    )
+    task = dataclasses.replace(task, test_instructions=())
+    scenario = dataclasses.replace(TOY, target=TOY.target[1:], background=(task,))
+    with pytest.raises(ScenarioError, match=r"task right: its expert .*:lazy succeeds in 0%"):
+        check_scenario(scenario, episodes=3)
+
+
 @pytest.mark.parametrize(
     ("questions", "message"),
     [

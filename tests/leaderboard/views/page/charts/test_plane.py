@@ -1,5 +1,6 @@
 """The plane of two quantities: right and up are better, whatever the reader chooses."""
 
+import dataclasses
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -55,6 +56,19 @@ def test_a_scenario_without_a_quantity_has_no_point_and_says_why(rows: Any) -> N
     plane = Plane([row for row in rows if row.method == "heavy"], cost, targets)
     assert not plane.points
     assert "no cost" in plane.note
+
+
+@pytest.mark.parametrize("costs", [(0.0, 0.0), (0.0, 0.5)])
+def test_a_method_without_steps_has_no_place_among_logarithmic_costs(rows: Any, costs: Any) -> None:
+    competing = [row for row in rows if row.division != "reference"]
+    priced = [
+        dataclasses.replace(row, costs={**row.costs, "relative_cost": one})
+        for row, one in zip(competing, costs, strict=True)
+    ]
+    plane = Plane(priced, cost, kept)
+    assert [point["method"] for point in plane.points] == [
+        row.method for row, one in zip(priced, costs, strict=True) if one
+    ]
 
 
 def test_every_place_of_the_template_is_filled(rows: Any) -> None:

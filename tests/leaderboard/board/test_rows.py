@@ -1,0 +1,128 @@
+"""Rows of the board where methods have other seeds than plain fine-tuning, or were trained elsewhere."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from helpers import complete_record
+
+from clbench.base.entry_points import resolve
+from clbench.records.record import Record
+from clbench.records.writer import record_text
+
+read_table = resolve("clbench.leaderboard.board.rows:read_table")
+standing_of = resolve("clbench.leaderboard.board.rows:standing_of")
+values_by_seed = resolve("clbench.leaderboard.board.rows:values_by_seed")
+
+LUCK = (0.1, 0.1, 0.5, 0.5)
+"""What plain fine-tuning keeps with each of four seeds."""
+
+
+@pytest.fixture
+def board(even_board: Callable[..., Path]) -> Path:
+    """Return records in which a method has lucky seeds only; with them it is worse than plain fine-tuning."""
+    for seed, kept in enumerate(LUCK):
+        even_board("sft", seed, kept)
+        records = even_board("lora", seed, kept + 0.1)
+    for seed in (2, 3):
+        even_board("finch", seed, LUCK[seed] - 0.1)
+    return records
+
+
+def test_a_method_with_lucky_seeds_alone_does_not_stand_above_methods_that_beat_it_on_them(
+    board: Path,
+) -> None:
+    rows = read_table(board).rows
+    assert [row.method for row in rows] == ["lora", "sft", "finch"]
+    finals = {row.method: row.estimates["final_average"].value for row in rows}
+    assert finals["finch"] > finals["sft"]
+    assert [standing_of(row, rows).place for row in rows] == [1, 2, 3]
+
+
+def test_a_row_with_fewer_seeds_takes_no_seed_from_the_others(board: Path) -> None:
+    rows = read_table(board).rows
+    values = values_by_seed(rows)
+    assert {method: len(found) for method, found in values.items()} == {"lora": 4, "sft": 4}
+
+
+def test_values_of_two_metrics_are_of_the_same_seeds(board: Path) -> None:
+    rows = read_table(board).rows
+    kept = values_by_seed(rows, "kept")
+    assert kept["sft"] == pytest.approx(LUCK, abs=0.03)
+    assert values_by_seed(rows, "gain") == {}  # it needs a reference
+
+
+def test_the_relative_cost_compares_equal_seeds(even_board: Callable[..., Path]) -> None:
+    for seed in range(2):
+        records = even_board("sft", seed, 0.5)
+    even_board("lora", 1, 0.5)
+    costs_of = resolve("clbench.leaderboard.board.costs:costs_of")
+    runs = {row.method: row.runs for row in read_table(records).rows}
+    for run, steps in zip((*runs["sft"], *runs["lora"]), (10, 40, 20), strict=True):
+        run.record.costs.optimiser_steps = steps
+        run.record.timing["step_ratio"] = 3.0
+    assert costs_of(runs["lora"], runs["sft"])["relative_cost"] == pytest.approx(1.5)
+    assert costs_of(runs["lora"], runs["sft"][:1])["relative_cost"] is None
+
+
+def test_steps_to_the_criterion_of_one_seed_have_no_interval(even_board: Callable[..., Path]) -> None:
+    (row,) = read_table(even_board("sft", 0, 0.5)).rows
+    steps, success = row.estimates["steps_to_criterion"], row.estimates["final_average"]
+    assert steps.value is not None
+    assert (steps.low, steps.high) == (None, None)
+    assert success.low < success.value < success.high
+
+
+@pytest.fixture
+def add_elsewhere(make_record: Callable[..., Record], tmp_path: Path) -> Callable[..., Path]:
+    """Return a function that adds the record of a policy that was trained elsewhere."""
+
+    def add(seed: int, checks: dict[str, list[Any]] | None = None) -> Path:
+        run = {
+            "method": "me/elsewhere",
+            "seed": seed,
+            "scenario": "clbench/Even-v1",
+            "uses": {"external": True},
+        }
+        record = make_record(np.full((3, 5), 0.5), steps=(20,), ends=(20, 20), complete=False, **run)
+        record.scenario.balanced = True  # its targets keep the published order all the same
+        record.checks = {name: [] for name in record.checks}
+        complete_record(record)
+        record.checks |= checks or {}
+        path = tmp_path / "records" / "Even-v1" / "me--elsewhere" / f"seed-{seed}.json"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(record_text(record), encoding="utf-8")
+        return tmp_path / "records"
+
+    return add
+
+
+def test_a_policy_trained_elsewhere_has_a_row_with_every_seed(
+    even_board: Callable[..., Path], add_elsewhere: Callable[..., Path]
+) -> None:
+    for seed in range(4):
+        even_board("sft", seed, 0.5)
+        records = add_elsewhere(seed)
+    table = read_table(records)
+    assert table.not_shown == ()
+    assert {row.method: row.seeds for row in table.rows} == {
+        "sft": (0, 1, 2, 3),
+        "me/elsewhere": (0, 1, 2, 3),
+    }
+
+
+def test_a_policy_trained_elsewhere_has_no_learning_curve_where_stages_end_at_a_criterion(
+    add_elsewhere: Callable[..., Path],
+) -> None:
+    (row,) = read_table(add_elsewhere(0)).rows
+    assert row.estimates["forward_transfer_libero"].value is None
+    assert row.estimates["area_under_curve_libero"].value is None
+
+
+def test_a_policy_trained_elsewhere_cannot_have_checks(add_elsewhere: Callable[..., Path]) -> None:
+    checks = {"stage": [99], "step": [1], "successes": ["x"], "episodes": [20]}
+    table = read_table(add_elsewhere(0, checks))
+    assert table.rows == ()
+    assert "a policy that was trained elsewhere is not checked" in table.not_shown[0].reason
