@@ -54,8 +54,8 @@ def show(
     """Show the leaderboard, and write it to the folder `site` next to the records.
 
     Files: LEADERBOARD.md; leaderboard.csv with every metric; index.html, a page for the browser with the
-    details of every row, which needs no network; pareto.svg and pareto-dark.svg, its chart as pictures. They
-    always hold all scenarios.
+    details of every row, which needs no network; pareto.svg, pareto-dark.svg and frontier-SCENARIO.svg, its
+    charts as pictures; board.json. They always hold all scenarios.
 
     Args:
         scenario: Show this scenario alone.

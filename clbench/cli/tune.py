@@ -51,10 +51,10 @@ def tune(
 ) -> None:
     """Choose the settings of METHODS for SCENARIO on validation episodes, with equal effort for each method.
 
-    Each method runs with four learning rates, then with two values of its own strength at the best of
-    them, or with two more learning rates. All targets are learned, with seeds that no board has, and no
-    test episode is played. The setting with the best final average wins, among those that learn .8 of the
-    targets' success. Runs with a record are skipped: the same command continues a stopped one and shows
+    Each method runs with four learning rates, then with two values of its own strength at the best of them,
+    or with two more learning rates. All targets are learned, with seeds that no board has, and no test
+    episode is played. The setting with the best final average wins, among those that learn at least 0.8 of
+    the targets' success. Runs with a record are skipped: the same command continues a stopped one and shows
     the choice again.
 
     With --values the methods run with every combination of these values instead, besides plain fine-tuning,

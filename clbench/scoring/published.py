@@ -336,7 +336,7 @@ def _over_later(rates: Rates) -> Array:
 
 @metric(
     formula="mean over all targets k but the last of max(0, R[k][k] - R[K][k])",
-    source="ARFM (NBT), from our survey of related work",
+    source="ARFM (NBT)",
     missing=TWO_TARGETS,
     higher_is_better=False,
 )

@@ -89,7 +89,7 @@ class Summary:
     """The numbers of the board."""
 
     rows: tuple[RowSummary, ...] = ()
-    """Rows by scenario, division and falling final average; scenarios with a criterion come first."""
+    """Rows by scenario and division, the best first; scenarios with a criterion come first."""
     starts: Mapping[str, float | None] = field(default_factory=dict)
     """Mean success of the pretrained policy on its skills, by scenario."""
     agreements: Mapping[str, Agreement | None] = field(default_factory=dict)

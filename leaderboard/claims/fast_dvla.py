@@ -15,7 +15,7 @@ from .claim import ANYWHERE, Finding, Paper, claim, decided, what_would_change
 from .evidence import NO_ESTIMATE, Evidence, Figure, rung
 from .figures import PUBLISHED, share_of_steps
 
-CAPVECTOR = Paper("Fast-dVLA's abstract, which is CapVector's", ("2603.25661", "2605.10903"))
+CAPVECTOR = Paper("CapVector (the abstract of Fast-dVLA)", ("2603.25661", "2605.10903"))
 FAST_DVLA = Paper("Fast-dVLA's body", ("2603.25661",))
 
 SFT = rung("sft", PUBLISHED)

@@ -147,7 +147,7 @@ def _gain_sentences(name: str, rows: Sequence[Row]) -> Iterator[str]:
             f"{counted(len(gains), 'method')} is {format_interval(gains[best], '.3f')}, by `{best}`. "
             f"{_power(gains.values())}"
         )
-    alone = f"by an interval of their own, which does not count the {counted(len(gains), 'comparison')}"
+    alone = f"by its own interval alone, without correction for {counted(len(gains), 'comparison')}"
     higher = {method: gain for method, gain in gains.items() if (gain.low or 0) > 0 and method not in better}
     if higher:
         yield f"Higher {alone}: {_listed(higher)}."
@@ -227,13 +227,14 @@ def _of_the_baseline(name: str, curve: Curve) -> str:
     more = ""
     if best is not first:
         more = (
-            f", and {format_interval(best.kept)} at {best.factor:g} times, where it learns "
+            f", and {format_interval(best.kept)} at {_rate(best.factor)}, where it learns "
             f"{format_interval(best.learned)}"
         )
-    return (
-        f"On {name}, plain fine-tuning keeps {format_interval(first.kept)} at {first.factor:g} times the "
-        f"scenario's learning rate{more}."
-    )
+    return f"On {name}, plain fine-tuning keeps {format_interval(first.kept)} at {_rate(first.factor)}{more}."
+
+
+def _rate(factor: float) -> str:
+    return "the scenario's learning rate" if factor == 1 else f"{factor:g} times that rate"
 
 
 def _at_the_first_rung(name: str, baseline: Curve, curves: Sequence[Curve]) -> Iterator[str]:
@@ -249,7 +250,7 @@ def _at_the_first_rung(name: str, baseline: Curve, curves: Sequence[Curve]) -> I
     if kept:
         falling = sorted(kept, key=lambda method: -(kept[method].value or 0.0))
         listed = ", ".join(f"`{method}` {format_interval(kept[method])}" for method in falling)
-        yield f"On {name}, methods without prior demonstrations keep at {factor:g} times: {listed}."
+        yield f"On {name}, methods without prior demonstrations keep at {_rate(factor)}: {listed}."
 
 
 def _of_frozen(name: str, rows: Sequence[Row]) -> Iterator[str]:
@@ -312,7 +313,7 @@ def _predictors(boards: dict[str, list[Row]]) -> Section:
             if one.high < 0:
                 words = "orders the methods against their forgetting"
             elif one.low <= 0:
-                words = "may agree with their forgetting on the order of the methods by chance"
+                words = "shows no certain agreement with forgetting on the order of the methods"
             answers.append(f"On {name}, {one.predictor} {words} (Kendall's tau {tau_text(one)}).")
     if answers:
         answers.insert(0, "Forgetting is here 1 minus the kept share.")
