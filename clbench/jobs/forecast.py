@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import statistics
 import time
 from collections import Counter
@@ -15,6 +14,7 @@ from clbench.base.text import counted
 from clbench.jobs import work
 from clbench.jobs.job import Job
 from clbench.jobs.plan import Plan
+from clbench.jobs.processes import cores
 from clbench.learning.pretraining import policy_config
 from clbench.policy.batch import Batch
 from clbench.policy.kinds import new_policy
@@ -55,7 +55,7 @@ def forecast(
     to_do = ", ".join(counted(count, *words) for words, count in counts.items())
     return [
         f"To do: {to_do}.",
-        _time(plan.jobs, list(scenarios.values()), workers or os.cpu_count() or 1),
+        _time(plan.jobs, list(scenarios.values()), workers or cores()),
         _disk(plan.jobs, runs, scenarios, checkpoints),
     ]
 

@@ -7,11 +7,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, Protocol
 
+from clbench.base.errors import ClbenchError
 from clbench.base.lease import Lease
 from clbench.spec.limits import Limits
 
 
-class JobError(Exception):
+class JobError(ClbenchError):
     """A job failed for a reason that the message explains in full."""
 
 

@@ -31,7 +31,10 @@ The 44 runs of Fetch-v1 took 15 ms for a unit of length, those with replay 29 ms
 
 
 class Plan:
-    """The jobs of a benchmark. Runs share jobs for common needs; a result in the cache needs no job.
+    """The jobs of a benchmark. Runs share jobs for common needs.
+
+    A pretrained policy or an evaluation in the cache needs no job. Jobs for demonstrations and questions are
+    always there, and read the cache.
 
     Scenarios are named by their ids, which travel to the processes of the jobs: "module:id" imports the
     module there.

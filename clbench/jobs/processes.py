@@ -19,9 +19,10 @@ from multiprocessing.process import BaseProcess
 from types import ModuleType
 from typing import Any, Literal
 
+from clbench.base.errors import ClbenchError
 from clbench.base.lease import LeaseLostError
 from clbench.base.progress import ProgressCallback, listen
-from clbench.jobs.job import Event, Job, JobError
+from clbench.jobs.job import Event, Job
 from clbench.jobs.process_limits import end, exceeded
 
 SEND_SECONDS = 0.2
@@ -44,6 +45,11 @@ class _Worker:
     """Hook of a method that it announced last."""
 
 
+def cores() -> int:
+    """Return the number of cores that this process may use: a cluster gives a job some of a machine's."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
 class Processes:
     """Workers on this machine.
 
@@ -52,7 +58,7 @@ class Processes:
     """
 
     def __init__(self, count: int | None = None) -> None:
-        self._count = count or os.cpu_count() or 1
+        self._count = count or cores()
         self._running: dict[Connection, _Worker] = {}
 
     def free(self) -> int:
@@ -102,13 +108,9 @@ class Processes:
 
 
 class Here:
-    """This process as a worker: one job at a time, for methods that no other process can import.
+    """This process as a worker: one job at a time, for methods that no other process can import."""
 
-    Args:
-        count: Ignored; other workers have a number of jobs at once.
-    """
-
-    def __init__(self, count: int | None = None) -> None:
+    def __init__(self) -> None:
         self._job: Job | None = None
         self._thread = threading.Thread()
         self._events: queue.Queue[Event] = queue.Queue()
@@ -293,7 +295,7 @@ def _do_job(
         send(owed)
     except LeaseLostError as error:
         return "taken", str(error)
-    except JobError as error:
+    except ClbenchError as error:  # its message says all
         return "failed", str(error)
     except Exception as error:
         return "failed", f"{type(error).__name__}: {error}\n{traceback.format_exc()}"

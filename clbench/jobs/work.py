@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
-from clbench.base.errors import InputError
 from clbench.base.progress import ProgressCallback
 from clbench.jobs.job import JobError
 from clbench.runs.spec import RunSpec
@@ -31,23 +28,13 @@ class _Noticed:
         return "" if self._made else ", from the cache"
 
 
-@contextmanager
-def _explained() -> Iterator[None]:
-    """Let a job fail with the message of a wrong input: a task may have no expert, or one that fails."""
-    try:
-        yield
-    except InputError as error:
-        raise JobError(str(error)) from error
-
-
 def collect_demonstrations(scenario: str, task: str, progress: ProgressCallback) -> str:
     """Collect the demonstrations of a task, unless they are in the cache."""
     from clbench.data.demonstrations import dataset_folder, read_dataset
 
     loaded = load_scenario(scenario)
     noticed = _Noticed(progress)
-    with _explained():
-        episodes = read_dataset(dataset_folder(loaded.task(task), loaded.budget, noticed))
+    episodes = read_dataset(dataset_folder(loaded.task(task), loaded.budget, noticed))
     steps = sum(len(episode.executed) for episode in episodes)
     return f"{len(episodes)} episodes, {steps} steps{noticed.source}"
 
@@ -58,8 +45,7 @@ def collect_scenes(scenario: str, progress: ProgressCallback) -> str:
 
     loaded = load_scenario(scenario)
     noticed = _Noticed(progress)
-    with _explained():
-        scenes_folder(loaded, noticed)
+    scenes_folder(loaded, noticed)
     train, test = load_questions(loaded)
     states = f"{len(train.scenes)} states, and {len(test.scenes)} for the test"
     return f"{len(train.kinds)} kinds about {states}{noticed.source}"
@@ -121,17 +107,13 @@ def make_policies(spec: RunSpec, checkpoints: Path | None, progress: ProgressCal
     """Make the policies of all stages of a run again, and keep them below `checkpoints`, if given.
 
     Raises:
-        JobError: The method fails.
+        MethodError: The method fails.
     """
-    from clbench.learning.optimise import MethodError
     from clbench.runs.checkpoints import keep_stages, make_stages
 
     run = spec.resolve()
-    try:
-        if checkpoints is None:
-            make_stages(run, progress)
-        else:
-            keep_stages(run, checkpoints, progress)
-    except MethodError as error:
-        raise JobError(str(error)) from error
+    if checkpoints is None:
+        make_stages(run, progress)
+    else:
+        keep_stages(run, checkpoints, progress)
     return "policies of all stages"

@@ -171,7 +171,13 @@ def test_pictures_are_kept_without_loss(tmp_path: Path) -> None:
     assert np.array_equal(np.stack(pictures), images)
     assert np.array_equal(table.column("observation.state").to_numpy(), numbers[:, 0])
     stats = json.loads((folder / "meta" / "stats.json").read_text())["observation.images.image"]
-    assert np.allclose(np.array(stats["mean"])[:, 0, 0], images.mean(axis=(0, 1, 2)) / 255)
+    colours = images.reshape(-1, 3) / 255
+    expected = {"min": colours.min(0), "max": colours.max(0), "mean": colours.mean(0), "std": colours.std(0)}
+    expected |= {
+        f"q{100 * share:02.0f}": np.quantile(colours, share, axis=0) for share in (0.01, 0.1, 0.5, 0.9, 0.99)
+    }
+    for name, value in expected.items():
+        assert np.allclose(np.array(stats[name])[:, 0, 0], value), name
 
 
 @pytest.mark.skipif(find_spec("lerobot_doctor") is None, reason="lerobot-doctor is not installed")

@@ -406,21 +406,6 @@ def test_a_method_that_fails_leaves_a_record_that_names_the_place(
     assert "Traceback" in record.error["traceback"]
 
 
-@dataclasses.dataclass
-class _Interrupted(Method):
-    def gradients(self, policy: Policy, loss: Tensor) -> None:
-        raise KeyboardInterrupt
-
-
-def test_ctrl_c_in_a_hook_ends_the_run_without_a_record(
-    tmp_path: Path, stranger: Callable[[type[Method]], str]
-) -> None:
-    spec = RunSpec(TOY, stranger(_Interrupted), seed=0)
-    with pytest.raises(KeyboardInterrupt):
-        execute(spec, tmp_path)
-    assert not spec.path(tmp_path).exists()
-
-
 def test_a_record_of_another_budget_device_or_setting_or_a_failed_or_torn_one_does_not_count(
     tmp_path: Path,
 ) -> None:
