@@ -284,10 +284,9 @@ def forward_transfer(rates: Rates) -> Array:
     3. Curves are averaged over seeds before the ratio, as in the source's code.
     4. The value is capped by 1 and not bounded below. Point 2 keeps the divisor above 0.
     """
-    starts = np.diagonal(rates.target[..., :-1, :], axis1=-2, axis2=-1)
-    area = _area(rates.layout.steps, rates.learning_curves, starts)
+    area = _area(rates.layout.steps, rates.learning_curves, rates.starts)
     curves_from_scratch = rates.references[FROM_SCRATCH].learning_curves
-    area_from_scratch = _area(rates.layout.steps, curves_from_scratch, np.zeros_like(starts))
+    area_from_scratch = _area(rates.layout.steps, curves_from_scratch, np.zeros_like(rates.starts))
     gained = (area - area_from_scratch) / (1 - area_from_scratch)
     return average(np.where(rates.have_curves, gained, np.nan))
 
@@ -306,8 +305,7 @@ def _area(steps: tuple[int, ...], curves: Array, starts: Array) -> Array:
 )
 def question_retention(rates: Rates) -> Array:
     """Share of the questions about the scene that are answered correctly after the last target."""
-    asked, correct = (rates.asked[..., -1, :].sum(axis=-1), rates.correct[..., -1, :].sum(axis=-1))
-    return np.where(asked > 0, correct / np.maximum(asked, 1), np.nan)
+    return rates.answered[..., -1]
 
 
 @metric(

@@ -46,11 +46,6 @@ def _mean(values: Array, chosen: Array) -> Array:
     return _weighted(values, chosen / max(chosen.sum(), 1.0))
 
 
-def _starts(rates: Rates) -> Array:
-    """Return R[k-1][k], (..., targets)."""
-    return np.diagonal(rates.target[..., :-1, :], axis1=-2, axis2=-1)
-
-
 # ---- matrix of the ends of the stages ----------------------------------------------------------------------
 
 
@@ -298,7 +293,7 @@ def forward_transfer_libero(rates: Rates) -> Array:
 
 def _own_curves(rates: Rates) -> Array:
     """Return the mean success on target k over the points of stage k, (..., targets)."""
-    own = average(np.concatenate([_starts(rates)[..., None], rates.learning_curves], axis=-1))
+    own = average(np.concatenate([rates.starts[..., None], rates.learning_curves], axis=-1))
     return np.where(rates.have_curves, own, np.nan)
 
 

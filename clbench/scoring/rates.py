@@ -82,6 +82,17 @@ class Rates(Measured):
         return np.diagonal(self.target[..., 1:, :], axis1=-2, axis2=-1)
 
     @property
+    def starts(self) -> Array:
+        """Success rate on target k before stage k, (..., targets)."""
+        return np.diagonal(self.target[..., :-1, :], axis1=-2, axis2=-1)
+
+    @property
+    def answered(self) -> Array:
+        """Share of all questions answered correctly at the end of each stage, (..., stages + 1)."""
+        asked, correct = self.asked.sum(axis=-1), self.correct.sum(axis=-1)
+        return np.where(asked > 0, correct / np.maximum(asked, 1), np.nan)
+
+    @property
     def have_curves(self) -> bool:
         """Whether stages have learning curves: those to a criterion have their end alone."""
         return not self.layout.to_criterion

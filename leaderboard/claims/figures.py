@@ -55,7 +55,7 @@ def question_drop(evidence: Evidence, method: str) -> Figure:
     """Return the drop in question accuracy from the pretrained policy to the end."""
 
     def drop(of: Of) -> Array:
-        return average(_accuracy(of[method], 0) - _accuracy(of[method], -1))
+        return average(of[method].answered[..., 0] - of[method].answered[..., -1])
 
     what = f"question accuracy, pretrained - {method} after the last target"
     return evidence.figure(what, drop, method, span=(-1, 1), form=".3f")
@@ -68,7 +68,7 @@ def answer_curve(evidence: Evidence, method: str) -> list[Figure]:
 
     def drop(point: int) -> Callable[[Of], Array]:
         def at(of: Of) -> Array:
-            return average(_accuracy(of[method], 0) - of[method].answer_curves[..., 0, point])
+            return average(of[method].answered[..., 0] - of[method].answer_curves[..., 0, point])
 
         return at
 
@@ -87,12 +87,6 @@ def learning_curve(evidence: Evidence, method: str) -> tuple[tuple[int, ...], li
     rates = [run.scores.rates() for run in runs.values()]
     curves = np.mean([one.learning_curves[0] for one in rates], axis=0)
     return next(iter(runs.values())).scores.layout.steps, [float(value) for value in curves]
-
-
-def _accuracy(rates: Rates, stage: int) -> Array:
-    """Return the share of correct answers at the end of a stage, NaN where no question was asked."""
-    asked, correct = rates.asked[..., stage, :].sum(axis=-1), rates.correct[..., stage, :].sum(axis=-1)
-    return np.where(asked > 0, correct / np.maximum(asked, 1), np.nan)
 
 
 def early_success(evidence: Evidence, method: str, other: str) -> Figure:

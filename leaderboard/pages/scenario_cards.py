@@ -302,15 +302,14 @@ def _held_out(rates: Rates) -> Array:
 
 
 def _answers(rates: Rates) -> Array:
-    asked, correct = rates.asked[..., 0, :].sum(axis=-1), rates.correct[..., 0, :].sum(axis=-1)
-    return np.where(asked > 0, correct / np.maximum(asked, 1), np.nan)
+    return rates.answered[..., 0]
 
 
 # ---- quantities of stages that end when the target is learned, (..., runs) --------------------------------
 
 
 def _before_its_stage(rates: Rates) -> Array:
-    return average(np.diagonal(rates.target[..., :-1, :], axis1=-2, axis2=-1))
+    return average(rates.starts)
 
 
 def _checks(rates: Rates) -> Array:

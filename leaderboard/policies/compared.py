@@ -9,11 +9,7 @@ from typing import TypeAlias
 import numpy as np
 
 from clbench.records.paths import parts_of
-from clbench.scoring.intervals import Estimate, bootstrap, row_generator
-from clbench.scoring.layout import Array
-from clbench.scoring.metrics import load_metric
-from clbench.scoring.rates import Rates
-from clbench.scoring.scores import Scores
+from clbench.scoring.intervals import Estimate, estimate, paired_difference, row_generator
 from clbench.spec.policies import DEFAULT_POLICY
 
 from ..board.rows import Row
@@ -64,31 +60,18 @@ def _compare(row: Row, other: Row) -> Comparison | None:
     seeds = sorted(set(row.scores) & set(other.scores))
     if not seeds or row.runs[0].scores.layout != other.runs[0].scores.layout:
         return None
-    runs = [[one.scores[seed] for seed in seeds] for one in (row, other)]
-    estimates = {name: _estimates(name, f"{other.scenario} {row.method}", *runs) for name in COMPARED}
-    return Comparison(row.method, len(seeds), estimates)
-
-
-def _estimates(
-    name: str, place: str, ours: list[Scores], theirs: list[Scores]
-) -> tuple[Estimate, Estimate, Estimate]:
-    """Return a metric of runs with the default policy, of runs with another one, and the difference."""
-    metric = load_metric(name)
-
-    def difference(of: Mapping[str, Rates]) -> Array:
-        return metric.over_runs(of["theirs"]) - metric.over_runs(of["ours"])
+    ours, theirs = ({seed: one.scores[seed] for seed in seeds} for one in (row, other))
 
     def generator(what: str) -> np.random.Generator:
-        return row_generator(place, f"{name} {what}")
+        return row_generator(f"{other.scenario} {row.method}", what)
 
-    def alone(what: str, runs: list[Scores]) -> Estimate:
-        return bootstrap(
-            lambda of: metric.over_runs(of[what]),
-            {what: runs},
-            generator(what),
-            span=(metric.low, metric.high),
+    alone = [estimate(COMPARED, runs, generator(what)) for what, runs in (("ours", ours), ("theirs", theirs))]
+    estimates = {
+        name: (
+            alone[0][name],
+            alone[1][name],
+            paired_difference(name, theirs, ours, generator(f"{name} difference")),
         )
-
-    both = {"ours": ours, "theirs": theirs}
-    apart = bootstrap(difference, both, generator("difference"), span=(-metric.high, metric.high))
-    return alone("ours", ours), alone("theirs", theirs), apart
+        for name in COMPARED
+    }
+    return Comparison(row.method, len(seeds), estimates)

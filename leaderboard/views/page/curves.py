@@ -28,8 +28,7 @@ def retained_curve(rates: Rates) -> Array:
 
 def target_curves(rates: Rates) -> Array:
     """Return the success on target k before the first step of stage k and at its points."""
-    before = np.diagonal(rates.target[..., :-1, :], axis1=-2, axis2=-1)
-    points = np.concatenate([before[..., None], rates.learning_curves], axis=-1)
+    points = np.concatenate([rates.starts[..., None], rates.learning_curves], axis=-1)
     return points.reshape(*points.shape[:-2], -1)
 
 

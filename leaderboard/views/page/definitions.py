@@ -6,6 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 
+from clbench.metrics.definitions import DEFINITIONS
 from clbench.scoring.intervals import Estimate
 from clbench.scoring.metric import Metric
 from clbench.scoring.metrics import METRICS
@@ -13,12 +14,8 @@ from clbench.scoring.metrics import METRICS
 from ...board.rows import Row
 from ..format import title_of
 
-FAMILIES: Mapping[str, tuple[str, ...]] = {
-    "forgetting": ("forgetting", "backward_transfer", "remembering"),
-    "transfer": ("forward_transfer", "zero_shot"),
-    "final average": ("average", "accuracy", "performance", "area_under_curve"),
-}
-"""Subjects of definitions, and the words that identify them in names; the first match counts."""
+FAMILIES: Mapping[str, str] = {"forgetting": "forgetting", "transfer": "transfer", "average": "final average"}
+"""Titles of the families of `DEFINITIONS` that papers define in several ways."""
 
 EQUAL = 1e-9
 """Values closer than this are equal: rates are quotients of integers whose last bit may differ."""
@@ -29,7 +26,7 @@ class Family:
     """Definitions of one subject, side by side."""
 
     name: str
-    """Key of `FAMILIES`."""
+    """Title of the family."""
     metrics: tuple[Metric, ...]
     """Definitions for which a row has a value."""
     ranks: Mapping[str, tuple[int | None, ...]]
@@ -44,8 +41,11 @@ class Family:
 def families(rows: Sequence[Row]) -> list[Family]:
     """Return the families of definitions with the ranks of `rows` of one scenario."""
     found = []
-    for name in FAMILIES:
-        metrics = [metric for metric in METRICS.values() if _family_of(metric) == name]
+    for family, name in FAMILIES.items():
+        members = {metric for metric, one in DEFINITIONS.items() if one.family == family}
+        metrics = [
+            one for one in METRICS.values() if one.name in members and one.higher_is_better is not None
+        ]
         metrics = [one for one in metrics if any(row.estimates[one.name].value is not None for row in rows)]
         if len(metrics) < 2 or len(rows) < 2:
             continue
@@ -53,14 +53,6 @@ def families(rows: Sequence[Row]) -> list[Family]:
         ranks = {row.method: tuple(ranks[row.method] for ranks in by_metric) for row in rows}
         found.append(Family(name, tuple(metrics), ranks, *_disagreements(metrics, rows)))
     return found
-
-
-def _family_of(metric: Metric) -> str | None:
-    """Return the family of a metric, None if it has none."""
-    if metric.higher_is_better is None:
-        return None
-    fits = (name for name, words in FAMILIES.items() if any(word in metric.name for word in words))
-    return next(fits, None)
 
 
 def _better(metric: Metric, one: Estimate, other: Estimate) -> int:
