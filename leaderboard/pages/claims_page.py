@@ -25,7 +25,7 @@ INTRODUCTION = (
     "learning: each at the settings that tuning chose, or at one step of the ladder, written as `sft@0.3` "
     "for sft at 0.3 of the scenario's learning rate. Numbers are means over seeds with 95 % confidence "
     "intervals over seeds (docs/guide/statistics.md); differences and ratios are paired by seed and "
-    "episode. A rule that asks for an interval needs {seeds} seeds. *Cannot be shown here* means that the "
+    'episode. A rule that asks for an interval needs {seeds} seeds. "Cannot be shown here" means that the '
     "setting could not have shown the claim, whether it is true or not. A control is the method without "
     "the one ingredient that is supposed to explain its success. `{missing}` marks a value that could not "
     "be computed."

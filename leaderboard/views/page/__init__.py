@@ -1,4 +1,4 @@
-"""The HTML page: the whole leaderboard in one file that needs no network, and the pictures of the README."""
+"""The HTML page: the whole leaderboard in one file that needs no network, and its charts as pictures."""
 
 from .html import page, pictures
 
