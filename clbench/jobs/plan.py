@@ -101,7 +101,8 @@ class Plan:
             checkpoints: Folder below which the policies are kept; None leaves them in the cache alone.
         """
         arguments = {"spec": run.spec, "checkpoints": checkpoints}
-        title, length = f"stages of {_label(run)}", training_length(run.scenario)
+        title = f"stages of {_label(run)}"
+        length = training_length(run.scenario) + watching_length(run.method, run.scenario)
         return self._add(run, title, work.make_policies, arguments, length, self._needs(run))
 
     def add_demonstrations(self, name: str, scenario: Scenario, tasks: Iterable[Task]) -> tuple[Job, ...]:

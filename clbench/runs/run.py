@@ -347,7 +347,7 @@ class _Run:
             self.seconds_before = self.record.timing["seconds"]
             self.record.timing.update({"started": started, "resumed_after": number})
             length = run_length(self.run.scenario, self.run.protocol) - relearning_length(self.run.protocol)
-            self.progress(number * length / targets)
+            self.progress(number * length / max(targets, 1))
             return number
         return None
 
