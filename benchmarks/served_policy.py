@@ -21,8 +21,8 @@ from result_files import write_results
 from rich.progress import track
 
 from clbench.base.seeding import torch_generator
+from clbench.evaluation.episodes import Episode, Trial
 from clbench.evaluation.players import ChunkPolicy, play_chunks
-from clbench.evaluation.rollouts import Episode, Trial
 from clbench.learning.pretraining import pretrained_policy
 from clbench.serving.client import ServedPolicy
 from clbench.serving.server import Observations, open_server

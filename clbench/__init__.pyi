@@ -1,6 +1,6 @@
 from . import metrics as metrics
 from .data.questions import QuestionKind as QuestionKind
-from .evaluation.rollouts import Episode as Episode
+from .evaluation.episodes import Episode as Episode
 from .evaluation.rollouts import Evaluator as Evaluator
 from .exchange.demonstrations import export_demonstrations as export_demonstrations
 from .exchange.demonstrations import import_demonstrations as import_demonstrations

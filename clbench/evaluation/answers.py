@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import torch
 
 from clbench.data.questions import QuestionKind
-from clbench.evaluation.rollouts import LANES
+from clbench.evaluation.episodes import LANES
 from clbench.policy.batch import QuestionBatch
 from clbench.policy.policy import Policy
 

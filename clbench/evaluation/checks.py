@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from clbench.evaluation.rollouts import Episode, Evaluator
+from clbench.evaluation.episodes import Episode
+from clbench.evaluation.rollouts import Evaluator
 from clbench.policy.policy import Policy
 from clbench.records.record import CheckRow
 from clbench.spec.protocol import Point, Protocol

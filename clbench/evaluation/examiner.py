@@ -15,8 +15,9 @@ from clbench.base.seeding import torch_generator
 from clbench.data.questions import scored_questions
 from clbench.data.training_data import TrainingData
 from clbench.evaluation.answers import answer
+from clbench.evaluation.episodes import Episode, Trial
 from clbench.evaluation.probes import activations, shift, update_sparsity, velocities
-from clbench.evaluation.rollouts import Episode, Evaluator, Trial
+from clbench.evaluation.rollouts import Evaluator
 from clbench.policy.activations import Gaussian
 from clbench.policy.batch import Batch, QuestionBatch
 from clbench.policy.policy import Policy

@@ -6,7 +6,6 @@ import os
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
-from dataclasses import dataclass
 from functools import partial
 from typing import Any, TypeAlias
 from typing import Protocol as Interface
@@ -18,7 +17,7 @@ from numpy.typing import NDArray
 from clbench.base.errors import InputError
 from clbench.base.progress import ProgressCallback, no_progress
 from clbench.base.seeding import derive_seed
-from clbench.evaluation.rollouts import LANES, Episode, Trial, start_of
+from clbench.evaluation.episodes import LANES, Episode, Live, Trial, play_in_lanes
 from clbench.spec.scenario import Scenario
 from clbench.worlds.lanes import Lanes
 from clbench.worlds.scenario_env import Observation
@@ -46,36 +45,6 @@ def acts_on_batches(agent: Agent, instruction: InstructionFormat) -> bool:
     """Return whether an agent is known to act on batches: one of Stable-Baselines3, which read tokens."""
     module = sys.modules.get("stable_baselines3.common.base_class")
     return module is not None and instruction == "tokens" and isinstance(agent, module.BaseAlgorithm)
-
-
-@dataclass
-class _Lane:
-    """One running episode."""
-
-    number: int
-    """Number of its lane."""
-    trial: Trial
-    instruction: Any
-    """The instruction as the agent observes it."""
-    state: NDArray[np.float32]
-    seed: int
-    """Seed of its initial state."""
-    memory: Any = None
-    """What the agent returned to receive it with the next observation."""
-    total_reward: float = 0.0
-    length: int = 0
-    success: bool = False
-
-    @property
-    def ended(self) -> bool:
-        """Whether the episode is over."""
-        return self.success or self.length == self.trial[0].horizon
-
-    @property
-    def episode(self) -> Episode:
-        """Outcome of the episode."""
-        task, split, number = self.trial
-        return Episode(task.name, split, number, self.success, self.total_reward, self.length)
 
 
 def play(
@@ -136,7 +105,7 @@ def play_chunks(
 
 
 def _play(
-    act: Callable[[Lanes, Sequence[_Lane]], NDArray[np.float32]],
+    act: Callable[[Lanes, Sequence[Live]], NDArray[np.float32]],
     scenario: Scenario,
     trials: Sequence[Trial],
     seed: int,
@@ -145,51 +114,25 @@ def _play(
     progress: ProgressCallback = no_progress,
 ) -> list[Episode]:
     """Return the outcome of each of `trials` in `count` lanes; `act` returns the actions (lanes, H, A)."""
-    queue, idle = list(reversed(trials)), list(range(count))
-    live: list[_Lane] = []
-    ended: dict[tuple[str, str, int], Episode] = {}
+
+    def begin(one: Live) -> None:
+        one.shown = observed(one.instruction, instruction, scenario)
+
     with closing(Lanes(count, threads=os.cpu_count() or 1 if count > 1 else 1)) as lanes:
-        while queue or live:
-            while queue and idle:
-                number, trial = idle.pop(), queue.pop()
-                world_seed, words = start_of(trial, seed)
-                (state,) = lanes.reset([number], [world_seed], [trial[0]])
-                shown = observed(words, instruction, scenario)
-                live.append(_Lane(number, trial, shown, state, world_seed))
-            _execute(lanes, live, act(lanes, live))
-            for lane in [lane for lane in live if lane.ended]:
-                one = lane.episode
-                ended[one.task, one.split, one.number] = one
-                live.remove(lane)
-                idle.append(lane.number)
-                progress(1)
-    return [ended[task.name, split, number] for task, split, number in trials]
+        return play_in_lanes(lanes, count, trials, seed, begin, partial(act, lanes), progress=progress)
 
 
-def _execute(lanes: Lanes, live: Sequence[_Lane], chunks: NDArray[np.float32]) -> None:
-    """Step the lanes through their chunks (lanes, H, A), each until its episode ends."""
-    for step in range(chunks.shape[1]):
-        rows = [row for row, lane in enumerate(live) if not lane.ended]
-        if not rows:
-            return
-        outcomes = lanes.step([live[row].number for row in rows], chunks[rows, step])
-        for row, state, reward, success in zip(rows, *outcomes, strict=True):
-            lane = live[row]
-            lane.state, lane.length, lane.success = state, lane.length + 1, bool(success)
-            lane.total_reward += float(reward)
-
-
-def _observations(lanes: Lanes, live: Sequence[_Lane]) -> Iterator[Observation]:
+def _observations(lanes: Lanes, live: Sequence[Live]) -> Iterator[Observation]:
     """Yield what the agent observes in each lane."""
     tasks = [lane.trial[0] for lane in live]
     states = np.stack([lane.state for lane in live])
-    numbers, images = lanes.observe([lane.number for lane in live], tasks, states)
+    numbers, images = lanes.observe([lane.lane for lane in live], tasks, states)
     for row, lane in enumerate(live):
         picture = {} if lane.trial[0].camera is None else {"image": images[row]}
-        yield {"state": numbers[row], **picture, "instruction": lane.instruction}
+        yield {"state": numbers[row], **picture, "instruction": lane.shown}
 
 
-def _act(agent: Agent, lanes: Lanes, live: Sequence[_Lane]) -> NDArray[np.float32]:
+def _act(agent: Agent, lanes: Lanes, live: Sequence[Live]) -> NDArray[np.float32]:
     """Return the actions (1, A) of an agent in the only lane, and let it keep its memory."""
     (lane,), (observation,) = live, _observations(lanes, live)
     predict = getattr(agent, "predict", None)
@@ -201,7 +144,7 @@ def _act(agent: Agent, lanes: Lanes, live: Sequence[_Lane]) -> NDArray[np.float3
     return _checked(action, lanes, live, ())
 
 
-def _act_on_batch(agent: Agent, lanes: Lanes, live: Sequence[_Lane]) -> NDArray[np.float32]:
+def _act_on_batch(agent: Agent, lanes: Lanes, live: Sequence[Live]) -> NDArray[np.float32]:
     """Return the actions (lanes, A) of an agent in all lanes; unused rows repeat the first one."""
     rows = list(_observations(lanes, live))
     rows += [rows[0]] * (LANES - len(rows))
@@ -217,7 +160,7 @@ def _act_on_batch(agent: Agent, lanes: Lanes, live: Sequence[_Lane]) -> NDArray[
 
 
 def _act_in_chunks(
-    policy: ChunkPolicy, executed: int | None, lanes: Lanes, live: Sequence[_Lane]
+    policy: ChunkPolicy, executed: int | None, lanes: Lanes, live: Sequence[Live]
 ) -> NDArray[np.float32]:
     """Return the actions (lanes, H, A) to execute."""
     rows = list(_observations(lanes, live))
@@ -245,7 +188,7 @@ def _predicted(found: Any) -> tuple[Any, Any]:
     return found
 
 
-def _checked(action: Any, lanes: Lanes, live: Sequence[_Lane], rows: tuple[int, ...]) -> NDArray[np.float32]:
+def _checked(action: Any, lanes: Lanes, live: Sequence[Live], rows: tuple[int, ...]) -> NDArray[np.float32]:
     """Return actions (N, ..., A) within the space of the first lane; all tasks of a scenario share it.
 
     Args:

@@ -1,4 +1,4 @@
-"""Rollouts: many evaluation episodes in lock-step.
+"""Rollouts of policies: many evaluation episodes in lock-step.
 
 The outcome of an episode depends only on the policy, the task, the number of the episode and the seed of the
 run. Every forward pass of an evaluator has the same number of rows, with padding in unused ones, because a
@@ -8,76 +8,22 @@ matrix product may round differently for another number of rows.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from clbench.base.progress import ProgressCallback, no_progress
-from clbench.base.seeding import SPLIT_LABELS, derive_seed, torch_generator
+from clbench.base.seeding import torch_generator
 from clbench.data.access import check_episodes
+from clbench.evaluation.episodes import LANES, Episode, Live, Trial, Watch, play_in_lanes
 from clbench.policy.policy import Policy
 from clbench.spec.language import encode
 from clbench.spec.protocol import Split
 from clbench.spec.scenario import Scenario
 from clbench.spec.task import Task
 from clbench.worlds.lanes import Lanes
-
-Trial = tuple[Task, Split, int]
-"""One episode to run: its task, its split and its number."""
-
-Watch = Callable[[Trial, NDArray[np.float32]], None]
-"""Called with a trial and each action (A,) taken in it."""
-
-LANES = 40
-"""Episodes that are stepped together, and rows of every forward pass. Another number may change the
-last bits of scores (docs/decisions/0005-forty-lanes.md)."""
-
-
-@dataclass(frozen=True)
-class Episode:
-    """The outcome of one evaluation episode."""
-
-    task: str
-    """Name of the task."""
-    split: Split
-    """Split of the episode, which limits the use of its outcome."""
-    number: int
-    """Number of the episode, which chooses its initial state within its task and split."""
-    success: bool
-    """Whether the success rule held before the horizon."""
-    total_reward: float
-    """Sum of the dense rewards."""
-    length: int
-    """Number of steps."""
-
-
-@dataclass
-class _Lane:
-    """One running episode."""
-
-    number: int
-    """Number of its lane."""
-    trial: Trial
-    words: torch.Tensor
-    noise: torch.Tensor
-    """Noise for every forward pass of the episode, (forwards, H, A)."""
-    state: NDArray[np.float32]
-    total_reward: float = 0.0
-    length: int = 0
-    success: bool = False
-
-    @property
-    def ended(self) -> bool:
-        """Whether the episode is over."""
-        return self.success or self.length == self.trial[0].horizon
-
-    @property
-    def episode(self) -> Episode:
-        """Outcome of the episode."""
-        task, split, number = self.trial
-        return Episode(task.name, split, number, self.success, self.total_reward, self.length)
 
 
 class Evaluator:
@@ -143,63 +89,33 @@ class Evaluator:
             LeakError: A hook asks for other episodes than validation episodes of tasks that it knows.
         """
         check_episodes((task.name, split) for task, split, _ in trials)
-        queue = list(reversed(trials))
-        ended: dict[tuple[str, Split, int], Episode] = {}
-        live: list[_Lane] = []
-        idle = list(range(self._count))
-        certain = False
-        while (queue or live) and not certain:
-            starting = [(idle.pop(), queue.pop()) for _ in range(min(len(idle), len(queue)))]
-            live += self._start(policy, starting)
-            self._execute(live, self._act(policy, live), watch)
-            for lane in [lane for lane in live if lane.ended]:
-                episode = lane.episode
-                ended[episode.task, episode.split, episode.number] = episode
-                live.remove(lane)
-                idle.append(lane.number)
-                progress(1)
-                certain = enough(episode)
-                if certain:
-                    break
-        keys = [(task.name, split, number) for task, split, number in trials]
-        return [ended[key] for key in keys if key in ended]
-
-    def _start(self, policy: Policy, starting: Sequence[tuple[int, Trial]]) -> list[_Lane]:
-        """Begin each trial in the lane that is paired with it."""
-        if not starting:
-            return []
-        tasks = [task for _, (task, _, _) in starting]
-        starts = [start_of(trial, self.seed) for _, trial in starting]
-        states = self._lanes.reset(
-            [lane for lane, _ in starting],
-            [seed for seed, _ in starts],
-            tasks,
-            [split == "perturbed" for _, (_, split, _) in starting],
+        return play_in_lanes(
+            self._lanes,
+            self._count,
+            trials,
+            self.seed,
+            partial(_begin, policy),
+            partial(self._act, policy),
+            progress=progress,
+            watch=watch,
+            enough=enough,
         )
-        lanes = []
-        for (lane, trial), (seed, instruction), state in zip(starting, starts, states, strict=True):
-            words = encode([instruction], policy.config.text_length)[0]
-            forwards = -(-trial[0].horizon // policy.config.executed)
-            shape = (forwards, policy.config.chunk, policy.config.action_size)
-            noise = torch.randn(shape, generator=torch_generator("noise", seed))
-            lanes.append(_Lane(lane, trial, words, noise, state))
-        return lanes
 
-    def _act(self, policy: Policy, live: Sequence[_Lane]) -> NDArray[np.float32]:
+    def _act(self, policy: Policy, live: Sequence[Live]) -> NDArray[np.float32]:
         """Return the actions to execute, (len(live), executed, A)."""
         config = policy.config
         rows = self._count
         state = torch.zeros(rows, config.state_size)
-        words = torch.ones(rows, len(live[0].words), dtype=torch.int64)
+        words = torch.ones(rows, len(live[0].shown), dtype=torch.int64)
         noise = torch.zeros(rows, config.chunk, config.action_size)
         image = torch.zeros(rows, config.image_size, config.image_size, 3, dtype=torch.uint8)
-        for row, lane in enumerate(live):
-            words[row] = lane.words
-            noise[row] = lane.noise[lane.length // config.executed]
+        for row, one in enumerate(live):
+            words[row] = one.shown
+            noise[row] = one.memory[one.length // config.executed]
         shown = self._lanes.observe(
-            [lane.number for lane in live],
-            [lane.trial[0] for lane in live],
-            np.stack([lane.state for lane in live]),
+            [one.lane for one in live],
+            [one.trial[0] for one in live],
+            np.stack([one.state for one in live]),
         )
         state[: len(live)], image[: len(live)] = map(torch.from_numpy, shown)
         device = policy.device
@@ -208,29 +124,11 @@ class Evaluator:
         # a diverged policy returns NaN: with zero actions it fails and does not stop the run
         return np.nan_to_num(actions).clip(-1.0, 1.0)
 
-    def _execute(self, live: Sequence[_Lane], chunks: NDArray[np.float32], watch: Watch) -> None:
-        """Step the lanes through their chunks (len(live), executed, A), each until its episode ends."""
-        for step in range(chunks.shape[1]):
-            rows = [row for row, lane in enumerate(live) if not lane.ended]
-            if not rows:
-                return
-            for row in rows:
-                watch(live[row].trial, chunks[row, step])
-            outcomes = self._lanes.step([live[row].number for row in rows], chunks[rows, step])
-            for row, state, reward, success in zip(rows, *outcomes, strict=True):
-                lane = live[row]
-                lane.state, lane.length = state, lane.length + 1
-                lane.total_reward += float(reward)
-                lane.success = bool(success)
 
-
-def start_of(trial: Trial, seed: int) -> tuple[int, str]:
-    """Return the start of a trial in a run of `seed`: the seed of its initial state, and its instruction.
-
-    A perturbed episode has the same start as the test episode of its number.
-    """
-    task, split, number = trial
-    wordings = task.wordings(split)
-    instruction = wordings[number % len(wordings)]
-    label = SPLIT_LABELS["test" if split == "perturbed" else split]
-    return derive_seed("episode", seed, task.name, label, number), instruction
+def _begin(policy: Policy, one: Live) -> None:
+    """Give an episode the tokens of its instruction, and noise for all its forward passes, (passes, H, A)."""
+    config = policy.config
+    one.shown = encode([one.instruction], config.text_length)[0]
+    passes = -(-one.trial[0].horizon // config.executed)
+    shape = (passes, config.chunk, config.action_size)
+    one.memory = torch.randn(shape, generator=torch_generator("noise", one.seed))

@@ -30,9 +30,9 @@ from clbench.base.entry_points import resolve
 from clbench.base.errors import InputError, WrongTypeError
 from clbench.base.seeding import seeded
 from clbench.base.strict_json import check_json
+from clbench.evaluation.episodes import Episode, Trial
 from clbench.evaluation.examiner import episode_row
 from clbench.evaluation.players import Agent, acts_on_batches, play
-from clbench.evaluation.rollouts import Episode, Trial
 from clbench.learning.trainer import sources
 from clbench.records.paths import RECORDS, record_path
 from clbench.records.reader import read_record

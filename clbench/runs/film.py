@@ -23,7 +23,8 @@ from clbench.base.dependencies import require
 from clbench.base.entry_points import resolve
 from clbench.base.errors import InputError
 from clbench.base.progress import ProgressCallback, no_progress
-from clbench.evaluation.rollouts import Episode, Evaluator, Trial, start_of
+from clbench.evaluation.episodes import Episode, Trial, start_of
+from clbench.evaluation.rollouts import Evaluator
 from clbench.learning.optimise import deterministic
 from clbench.policy.policy import Policy
 from clbench.runs.spec import ResolvedRun

@@ -12,8 +12,8 @@ from pathlib import Path
 from clbench.base.errors import InputError
 from clbench.base.progress import ProgressCallback, no_progress
 from clbench.base.seeding import seeded
+from clbench.evaluation.episodes import Episode, Trial
 from clbench.evaluation.players import ChunkPolicy, play_chunks
-from clbench.evaluation.rollouts import Episode, Trial
 from clbench.records.paths import RECORDS
 from clbench.records.record import Record
 from clbench.runs.agents import StagedRun

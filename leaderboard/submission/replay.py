@@ -16,8 +16,9 @@ from clbench.base.progress import ProgressCallback
 from clbench.data.questions import load_questions, scored_questions
 from clbench.evaluation.answers import answer
 from clbench.evaluation.checks import Checker
+from clbench.evaluation.episodes import Trial
 from clbench.evaluation.examiner import episode_row
-from clbench.evaluation.rollouts import Evaluator, Trial
+from clbench.evaluation.rollouts import Evaluator
 from clbench.learning.optimise import deterministic
 from clbench.learning.pretraining import pretrained_policy
 from clbench.learning.trainer import Trainer, load_stage

@@ -8,7 +8,8 @@ from clbench.base.entry_points import resolve
 from clbench.base.seeding import derive_seed, torch_generator
 from clbench.data.questions import load_questions, scored_questions
 from clbench.evaluation.answers import answer
-from clbench.evaluation.rollouts import LANES, Episode, Evaluator, Trial, start_of
+from clbench.evaluation.episodes import LANES, Episode, Trial, start_of
+from clbench.evaluation.rollouts import Evaluator
 from clbench.learning.optimise import deterministic
 from clbench.learning.pretraining import policy_config, pretrained_policy
 from clbench.policy.policy import Policy

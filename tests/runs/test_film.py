@@ -14,7 +14,7 @@ import pytest
 from PIL import Image, ImageDraw
 
 from clbench.cli.film import film
-from clbench.evaluation.rollouts import Episode, Trial
+from clbench.evaluation.episodes import Episode, Trial
 from clbench.records.record import Record
 from clbench.runs.checkpoints import stage_policies
 from clbench.runs.film import (
