@@ -17,6 +17,9 @@ leaderboard:
 
 # Scenarios at equal learning: methods are tuned on them, and most claims are judged on them.
 BOARDS := clbench/Fetch-v1 clbench/MetaWorld-v1
+comma := ,
+space := $(subst ,, )
+BOTH := $(subst $(space),$(comma),$(BOARDS))
 
 METHODS := aegis consft consft_calibrated experience_replay fast_dvla finch l2_sp lora sft stop_gradient
 REFERENCES := frozen joint from_scratch
@@ -54,20 +57,21 @@ records: .venv/installed-dev
 	$(BIN)/clbench leaderboard
 
 # The frontier: what a smaller learning rate does, for plain fine-tuning and for the methods that compete with it.
+LADDER = $(BIN)/clbench run $(BOTH) $(filter-out consft_calibrated,$(METHODS)) --seeds 4 --records leaderboard/ladder
 ladder: .venv/installed-dev
-	for id in $(BOARDS); do for factor in 1 0.3 0.1 0.03; do \
-		$(BIN)/clbench run $$id $(METHODS) --set.step_factor $$factor --seeds 4 --records leaderboard/ladder || exit; \
-	done; done
+	$(LADDER) --set.step_factor 1
+	$(LADDER) --set.step_factor 0.3
+	$(LADDER) --set.step_factor 0.1
+	$(LADDER) --set.step_factor 0.03
+	$(BIN)/clbench run $(BOTH) consft_calibrated --set.step_factor 1 --seeds 4 --records leaderboard/ladder
 
 # What else docs/reference/claims.md needs: methods with one thing changed that tells what their effect is due to.
 KNOWLEDGE := clbench/FetchKnowledge-v1
 CONTROLS := --seeds 4 --records leaderboard/controls
 controls: .venv/installed-dev
-	for id in $(BOARDS); do \
-		$(BIN)/clbench run $$id co_training --set.step_factor 1 $(CONTROLS) \
-		&& $(BIN)/clbench run $$id fast_dvla --set.direction random --set.step_factor 1 $(CONTROLS) \
-		&& $(BIN)/clbench run $$id fast_dvla --set.orthogonal 0 --set.step_factor 1 $(CONTROLS) || exit; \
-	done
+	$(BIN)/clbench run $(BOTH) co_training --set.step_factor 1 $(CONTROLS)
+	$(BIN)/clbench run $(BOTH) fast_dvla --set.direction random --set.step_factor 1 $(CONTROLS)
+	$(BIN)/clbench run $(BOTH) fast_dvla --set.orthogonal 0 --set.step_factor 1 $(CONTROLS)
 	$(BIN)/clbench run $(KNOWLEDGE) aegis --set.direction random $(CONTROLS)
 	$(BIN)/clbench run $(KNOWLEDGE) lora --set.rank 4 $(CONTROLS)
 	$(BIN)/clbench run $(KNOWLEDGE) lora --set.rank 64 $(CONTROLS)

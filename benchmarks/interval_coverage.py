@@ -33,6 +33,8 @@ from clbench.scoring.metrics import load_metric
 from clbench.scoring.scores import Scores, rates_of
 
 RESULTS = Path(__file__).parent / "results" / "coverage.json"
+BOARDS = ("Fetch-v1", "MetaWorld-v1")
+"""Folders of records whose deviations between seeds the page states."""
 EPISODES = 200
 """Episodes of a run, of all tasks together."""
 ROOT = math.sqrt(0.5)
@@ -56,7 +58,7 @@ def main() -> None:
         "intervals": list(interval_coverage(generator, arguments.simulations)),
         "false_splits": list(false_splits(generator, arguments.boards)),
         "power": list(power(generator, arguments.boards)),
-        "records": seed_deviations(RECORDS / "Fetch-v1"),
+        "records": {name: seed_deviations(RECORDS / name) for name in BOARDS},
     }
     RESULTS.parent.mkdir(exist_ok=True)
     RESULTS.write_text(_json(results), encoding="utf-8", newline="\n")

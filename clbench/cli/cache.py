@@ -342,7 +342,7 @@ def _table(found: Sequence[Entry], stale: Mapping[Entry, str], now: float, is_wi
     if is_wide:
         table.add_column("contents")
     present = {entry.kind for entry in found}
-    for kind in (kind for kind in KINDS if kind in present):
+    for kind in filter(present.__contains__, KINDS):
         ours = [entry for entry in found if entry.kind == kind]
         unused = [entry.size for entry in ours if entry in stale]
         table.add_row(

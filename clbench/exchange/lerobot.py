@@ -205,9 +205,9 @@ def _statistics(values: NDArray[Any]) -> Columns:
 
 
 def _of_pictures(pictures: NDArray[np.uint8]) -> Columns:
-    """Return the same of pictures (N, height, width, 3) per colour (3,), from the counts of the 256 values.
+    """Return the statistics of pictures (N, height, width, 3) per colour (3,), from counts of the 256 levels.
 
-    Pictures as numbers of 8 bytes would need eight times the memory of the data set, twice.
+    As float64, the pictures would take eight times the memory of the data set, twice over.
     """
     counts = np.zeros((256, 3))
     for picture in pictures:

@@ -46,7 +46,7 @@ class _Worker:
 
 
 def cores() -> int:
-    """Return the number of cores that this process may use: a cluster gives a job some of a machine's."""
+    """Return the number of cores that this process may use, which may be only some of the machine's."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
@@ -268,7 +268,7 @@ def _work(
             sys.exit(1)
 
     listen(lambda place, remark: tell("at", (place, remark)))
-    connection.send(_do_job(function, arguments, functools.partial(tell, "progress")))
+    tell(*_do_job(function, arguments, functools.partial(tell, "progress")))
 
 
 def _do_job(

@@ -43,7 +43,7 @@ def check_scenario(scenario: Scenario, *, episodes: int = 10, success: float = 0
 
     Worlds: all have spaces of numbers, of one size in the whole scenario, and actions from -1 to 1.
 
-    Tasks: no two have an instruction in common; the expert succeeds often enough, and doing nothing does not;
+    Tasks: no two have an instruction in common; the expert succeeds often enough, and doing nothing does not always;
     `terminated` and `info["success"]` both mean success and nothing else; observations are in their space and
     rewards are numbers; the initial state depends on the seed; an episode depends only on the seed and the
     actions, also after other episodes, in a new world, and side by side in a vector world.
@@ -59,15 +59,15 @@ def check_scenario(scenario: Scenario, *, episodes: int = 10, success: float = 0
         UnknownNameError: An entry point does not exist.
         ScenarioError: Any other part is wrong.
     """
-    learned = scenario.tasks + scenario.background
+    tasks = scenario.tasks + scenario.background
     try:
         check_scenario_id(scenario.id)
-        for task in learned:
+        for task in tasks:
             fitting_length(task.instructions + task.test_instructions)
     except ValueError as error:
         raise ScenarioError(f"{scenario.id}: {error}") from error
     wordings: dict[str, str] = {}
-    for task in learned:
+    for task in tasks:
         for words in task.instructions + task.test_instructions:
             if wordings.setdefault(words, task.name) != task.name:
                 raise ScenarioError(
@@ -77,12 +77,12 @@ def check_scenario(scenario: Scenario, *, episodes: int = 10, success: float = 0
     if not scenario.target:
         raise ScenarioError(f"{scenario.id}: there is no target to learn.")
     sizes: dict[tuple[int, ...], str] = {}
-    for entry_point in dict.fromkeys(task.world for task in learned):
+    for entry_point in dict.fromkeys(task.world for task in tasks):
         world: World = resolve(entry_point)()
         with closing(world):
             state, action = _check_spaces(entry_point, world)
             sizes.setdefault((*state.shape, *action.shape), entry_point)
-            for task in learned:
+            for task in tasks:
                 if task.world == entry_point:
                     _check_task(task, world, episodes, success)
     if len(sizes) > 1:

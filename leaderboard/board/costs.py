@@ -29,19 +29,19 @@ def costs_of(runs: Sequence[Run], baseline: Sequence[Run]) -> dict[str, float | 
 
     Args:
         runs: Runs of the method.
-        baseline: Runs of plain fine-tuning on the same scenario; may be empty. Those with the seeds of `runs`
-            count: without one of them the relative cost is None.
+        baseline: Runs of plain fine-tuning on the same scenario; may be empty. The relative cost compares the
+            seeds that both have; it is None without one.
     """
     costs = {column: _mean(runs, name) for column, name in COSTS.items()}
-    seeds = {run.seed for run in runs}
-    same = [run for run in baseline if run.seed in seeds]
-    steps, usual = costs["steps"], _mean(same, "optimiser_steps") if len(same) == len(seeds) else None
-    times = [ratio for run in runs if (ratio := step_ratio(run)) is not None]
+    common = {run.seed for run in runs} & {run.seed for run in baseline}
+    same, usual = ([run for run in members if run.seed in common] for members in (runs, baseline))
+    taken, theirs = (_mean(members, "optimiser_steps") for members in (same, usual))
+    times = [ratio for run in same if (ratio := step_ratio(run)) is not None]
     relative = None
-    if steps == 0:
+    if costs["steps"] == 0:
         relative = 0.0
-    elif steps is not None and usual and times:
-        relative = steps / usual * math.fsum(times) / len(times)
+    elif taken is not None and theirs and times:
+        relative = taken / theirs * math.fsum(times) / len(times)
     return {"relative_cost": relative, **costs}
 
 

@@ -29,7 +29,6 @@ from .runs import ALIKE, Run, Sifted, no_row, read_run, read_runs
 from .summary import (
     DIVISIONS,
     ELSEWHERE,
-    GAIN,
     METHODS,
     RANKED_BY,
     WITH_DEMONSTRATIONS,
@@ -49,6 +48,8 @@ class Row(RowSummary):
     them."""
     orders: Orders
     """Its results with the targets in this and in other orders."""
+    height: float | None
+    """What orders the rows of a division, higher first, see `heights`; None without a final average."""
 
     @property
     def scores(self) -> Runs:
@@ -105,7 +106,7 @@ def _beside_rows(runs: list[Run]) -> Sifted:
 
 
 def _scenario_rows(runs: list[Run]) -> list[Row]:
-    """Return the rows of the runs of one scenario, by division, the best first: see `ordered_by`."""
+    """Return the rows of the runs of one scenario, by division, the best first: see `heights`."""
     by_method: dict[str, list[Run]] = {}
     for run in sorted(runs, key=lambda run: run.seed):
         if not run.order:
@@ -116,10 +117,20 @@ def _scenario_rows(runs: list[Run]) -> list[Row]:
         estimates = {method: _estimates(method, by_method) for method in members}
         competing = {method: _scores(runs) for method, runs in members.items() if division != "reference"}
         letters = groups(RANKED_BY, competing)
-        by = ordered_by(estimates.values())
-        order = sorted(members, key=lambda method: (_falling(estimates[method][by]), method))
+        found = heights(
+            {method: _scores(runs) for method, runs in members.items()}, by_method.get(BASELINE, ())
+        )
+        order = sorted(members, key=lambda method: (_falling(found[method]), method))
         rows += [
-            _row(method, estimates[method], letters.get(method), members[method], by_method, runs)
+            _row(
+                method,
+                estimates[method],
+                letters.get(method),
+                found[method],
+                members[method],
+                by_method,
+                runs,
+            )
             for method in order
         ]
     return rows
@@ -129,6 +140,7 @@ def _row(
     method: str,
     estimates: Mapping[str, Estimate],
     letters: str | None,
+    height: float | None,
     members: Sequence[Run],
     by_method: Mapping[str, list[Run]],
     runs: Iterable[Run],
@@ -150,6 +162,7 @@ def _row(
         tried=_tried(first.place, method),
         runs=tuple(members),
         orders=orders,
+        height=height,
     )
 
 
@@ -172,18 +185,39 @@ def pretrained_success(rows: Iterable[Row]) -> float | None:
     return math.fsum(known) / len(known) if known else None
 
 
-def ordered_by(estimates: Iterable[Mapping[str, Estimate]]) -> str:
-    """Return the metric that orders the rows of a division, higher first.
+def heights(rows: Mapping[str, Runs], baseline: Iterable[Run]) -> dict[str, float | None]:
+    """Return what orders the rows of a division, by method; None without a final average.
 
-    It is the gain over plain fine-tuning, which compares equal seeds: seeds differ so much that the final
-    average of other seeds says little. Where a row with a final average has no gain, it is the final average.
+    It is the final average minus that of plain fine-tuning over the seeds that both have: seeds differ so
+    much that the final averages of different seeds say little. If one of the rows shares no seed with plain
+    fine-tuning, it is the final average for all of them.
+
+    Args:
+        rows: Runs by seed of each method of the division.
+        baseline: Runs of plain fine-tuning on the same scenario; may be empty.
     """
-    ranked = [values for values in estimates if values[RANKED_BY].value is not None]
-    return GAIN if all(values[GAIN].value is not None for values in ranked) else RANKED_BY
+    finals = {
+        method: {seed: measure(RANKED_BY, one) for seed, one in runs.items()} for method, runs in rows.items()
+    }
+    known = {
+        method: {seed: value for seed, value in values.items() if value is not None}
+        for method, values in finals.items()
+    }
+    usual = {run.seed: value for run in baseline if (value := measure(RANKED_BY, run.scores)) is not None}
+    compared = {method: values.keys() & usual.keys() for method, values in known.items() if values}
+    if all(compared.values()):
+        known = {
+            method: {seed: known[method][seed] - usual[seed] for seed in sorted(seeds)}
+            for method, seeds in compared.items()
+        }
+    return {
+        method: math.fsum(known[method].values()) / len(known[method]) if known.get(method) else None
+        for method in rows
+    }
 
 
-def _falling(one: Estimate) -> float:
-    return math.inf if one.value is None else -one.value
+def _falling(height: float | None) -> float:
+    return math.inf if height is None else -height
 
 
 def _estimates(method: str, by_method: Mapping[str, list[Run]]) -> dict[str, Estimate]:
@@ -211,7 +245,7 @@ class Standing:
     """A row among the rows of its division that have a final average."""
 
     place: int
-    """One more than the number of rows that are higher in the metric of `ordered_by`; it ignores noise."""
+    """One more than the number of rows with a greater height; it ignores noise."""
     count: int
     """Number of rows."""
     alike: tuple[str, ...]
@@ -223,10 +257,8 @@ def standing_of(row: Row, rows: Iterable[Row]) -> Standing | None:
     if row.groups is None:
         return None
     division = [other for other in rows if other.division == row.division and other.groups is not None]
-    by = ordered_by(other.estimates for other in division)
-    value = _falling(row.estimates[by])
     # Values are quotients of whole numbers: equal ones may differ in the last bit.
-    better = [other for other in division if _falling(other.estimates[by]) < value - 1e-9]
+    better = [other for other in division if _falling(other.height) < _falling(row.height) - 1e-9]
     alike = [other for other in division if other is not row and set(other.groups or "") & set(row.groups)]
     return Standing(1 + len(better), len(division), tuple(other.method for other in alike))
 

@@ -42,7 +42,7 @@ RANKED_BY = "final_average"
 """Metric that rows are compared by."""
 
 GAIN = "gain"
-"""The same metric less plain fine-tuning's with the same seeds."""
+"""The same metric minus plain fine-tuning's with the same seeds."""
 
 
 @dataclass(frozen=True, kw_only=True)

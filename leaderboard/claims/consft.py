@@ -143,7 +143,7 @@ def _controls_of(evidence: Evidence, arm: str) -> tuple[Figure, ...]:
 
 def _what_controls_say(figures: tuple[Figure, ...], arms: Sequence[str]) -> list[str]:
     """Return what the controls of the arms that count say."""
-    says = [(one, *CONTROLS[one.methods[-1]]) for one in figures if one.methods[0] in arms]
+    says = [(one, *CONTROLS[one.methods[1]]) for one in figures if one.methods[0] in arms]
     return [not_told_apart(figure, explains=yes, does_not=no) for figure, yes, no in says]
 
 

@@ -234,7 +234,7 @@ def _of_the_baseline(name: str, curve: Curve) -> str:
 
 
 def _rate(factor: float) -> str:
-    return "the scenario's learning rate" if factor == 1 else f"{factor:g} times that rate"
+    return "the scenario's learning rate" if factor == 1 else f"{factor:g} times the scenario's learning rate"
 
 
 def _at_the_first_rung(name: str, baseline: Curve, curves: Sequence[Curve]) -> Iterator[str]:
@@ -309,7 +309,7 @@ def _predictors(boards: dict[str, list[Row]]) -> Section:
     answers = []
     for name, rows in boards.items():
         for one in predictions(rows):
-            words = "agrees with their forgetting on the order of the methods more than by chance"
+            words = "agrees with their forgetting on the order of the methods more than chance would explain"
             if one.high < 0:
                 words = "orders the methods against their forgetting"
             elif one.low <= 0:

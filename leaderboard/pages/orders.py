@@ -91,7 +91,7 @@ def _between(
 
 def _order(found: Agreement, methods: str = "the methods") -> str:
     """Return the predicate of a sentence on two boards."""
-    words = f"agree on the order of {methods} more than by chance"
+    words = f"agree on the order of {methods} more than chance would explain"
     if found.high < 0:
         words = f"put {methods} in opposite orders"
     elif found.low <= 0:

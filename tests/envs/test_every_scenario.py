@@ -181,15 +181,14 @@ def test_an_episode_repeats_itself_whatever_ran_before(scenario: Scenario) -> No
         assert not np.array_equal(rollout(world, task.name, seed=8), expected)
 
 
-@every_scenario
-def test_a_copy_of_a_world_goes_on_as_the_world_does_and_leaves_it_alone(scenario: Scenario) -> None:
-    for task in first_task_of_each_world(scenario):
-        world, expected = make(task.world), rollout(make(task.world), task.name, seed=2)
-        world.reset(seed=2, options={"task": task.name})
-        chosen = actions(world, 2, 20)
-        moved(world, chosen[:10])
-        for one in (copy.deepcopy(world), world):
-            np.testing.assert_array_equal(moved(one, chosen[10:]), expected[11:])
+@every_task
+def test_a_copy_of_a_world_goes_on_as_the_world_does_and_leaves_it_alone(task: Task) -> None:
+    world, expected = make(task.world), rollout(make(task.world), task.name, seed=2)
+    world.reset(seed=2, options={"task": task.name})
+    chosen = actions(world, 2, 20)
+    moved(world, chosen[:10])
+    for one in (copy.deepcopy(world), world):
+        np.testing.assert_array_equal(moved(one, chosen[10:]), expected[11:])
 
 
 @every_scenario

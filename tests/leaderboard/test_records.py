@@ -3,6 +3,7 @@
 import argparse
 import dataclasses
 import importlib
+import itertools
 import re
 import shlex
 import shutil
@@ -15,44 +16,51 @@ import pytest
 from helpers import unpacked
 
 import clbench
-from clbench.learning.registry import load_method
-from clbench.records.paths import parts_of, place_of, record_name
+from clbench.learning.registry import load_method, read_changes
+from clbench.records.paths import label_of, parts_of, place_of, record_name
 from clbench.records.reader import read_record
 from clbench.runs.tuning import tuned
 from clbench.scoring.scores import Scores
 from clbench.spec.policies import DEFAULT_POLICY, SMALL, policy_name
 
-README = Path(__file__).parents[2] / "README.md"
-RECORDS = README.parent / "leaderboard" / "records"
+ROOT = Path(__file__).parents[2]
+README = ROOT / "README.md"
+RECORDS = ROOT / "leaderboard" / "records"
 
 pytestmark = pytest.mark.skipif(not RECORDS.exists(), reason="records are not part of an installed package")
 
 
-def promised() -> set[Path]:
-    """Return the records that `make records` makes, without those of agents that learn by trial."""
+def promised(target: str) -> set[Path]:
+    """Return the records that a target of the Makefile makes with `clbench run`."""
     listed = subprocess.run(
-        ["make", "-n", "records"], cwd=README.parent, capture_output=True, text=True, check=True
+        ["make", "-n", target], cwd=ROOT, capture_output=True, text=True, check=True
     ).stdout
-    command = argparse.ArgumentParser()
-    command.add_argument("scenarios")
-    command.add_argument("methods", nargs="+")
-    for option in ("--seeds", "--order"):
-        command.add_argument(option, type=int, default=0)
-    command.add_argument("--policy", default=DEFAULT_POLICY)
-    command.add_argument("--policy-size", default=SMALL)
-    command.add_argument("--perturb", action="store_true")
+    options = argparse.ArgumentParser()
+    options.add_argument("scenarios")
+    options.add_argument("methods", nargs="+")
+    options.add_argument("--seeds", type=int)
+    options.add_argument("--order", type=int, default=0)
+    options.add_argument("--policy", default=DEFAULT_POLICY)
+    options.add_argument("--policy-size", default=SMALL)
+    options.add_argument("--perturb", action="store_true")
+    options.add_argument("--records", type=Path, default=RECORDS)
+    for field in ("step_factor", "direction", "orthogonal", "rank"):
+        options.add_argument(f"--set.{field}", dest=f"set.{field}")
     names = set()
     for line in listed.replace("\\\n", " ").splitlines():
         program, *words = shlex.split(line)
         if program.endswith("/clbench") and words[0] == "run":
-            asked = command.parse_args(words[1:])
-            policy = policy_name(asked.policy, asked.policy_size)
-            names |= {
-                RECORDS / record_name(scenario, method, seed, asked.order, policy)
-                for scenario in asked.scenarios.split(",")
-                for method in asked.methods
-                for seed in range(asked.seeds)
+            asked = options.parse_args(words[1:])
+            chosen = {
+                name[4:]: text for name, text in vars(asked).items() if name.startswith("set.") and text
             }
+            for scenario, method in itertools.product(asked.scenarios.split(","), asked.methods):
+                label = label_of(method, read_changes(method, load_method(method), chosen))
+                policy = policy_name(asked.policy, asked.policy_size)
+                names |= {
+                    ROOT / asked.records / record_name(scenario, label, seed, asked.order, policy)
+                    for seed in range(asked.seeds)
+                }
     return names
 
 
@@ -66,7 +74,7 @@ def board() -> Any:
 def test_the_records_are_those_of_make_records_and_runs_of_a_seed_share_their_pretrained_policy() -> None:
     every = {path: read_record(path) for path in RECORDS.rglob("*.json")}
     trained = {path: record for path, record in every.items() if "online" not in record.run.uses}
-    assert set(trained) == promised()
+    assert set(trained) == promised("records")
     records = list(trained.values())
     tables = [place_of(record.run.scenario, record.run.policy) for record in records]
     policies = {
@@ -76,6 +84,11 @@ def test_the_records_are_those_of_make_records_and_runs_of_a_seed_share_their_pr
     assert len(policies) == len({run[:2] for run in policies})
     assert not any(record.run.changes for record in records)
     assert not any(record.fingerprint["commit"]["dirty"] for record in records)
+
+
+@pytest.mark.parametrize("folder", ["ladder", "controls"])
+def test_the_records_beside_the_board_are_those_of_their_command(folder: str) -> None:
+    assert set((ROOT / "leaderboard" / folder).rglob("*.json")) == promised(folder)
 
 
 def test_the_pretrained_policy_has_its_skills_and_answers() -> None:

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from clbench.learning.method import Method
 from clbench.policy.policy import Policy
+from clbench.runs.checkpoints import make_stages
 from clbench.runs.run import execute
 from clbench.runs.spec import RunSpec
 
@@ -28,3 +29,10 @@ def test_ctrl_c_in_a_hook_ends_the_run_without_a_record(
     with pytest.raises(KeyboardInterrupt):
         execute(spec, tmp_path)
     assert not spec.path(tmp_path).exists()
+
+
+def test_ctrl_c_while_policies_are_made_again_is_no_fault_of_the_method(
+    stranger: Callable[[type[Method]], str],
+) -> None:
+    with pytest.raises(KeyboardInterrupt):
+        make_stages(RunSpec(TOY, stranger(_Interrupted), seed=0).resolve())

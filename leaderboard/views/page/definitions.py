@@ -12,10 +12,17 @@ from clbench.scoring.metric import Metric
 from clbench.scoring.metrics import METRICS
 
 from ...board.rows import Row
+from ...board.summary import GAIN
 from ..format import title_of
 
 FAMILIES: Mapping[str, str] = {"forgetting": "forgetting", "transfer": "transfer", "average": "final average"}
 """Titles of the families of `DEFINITIONS` that papers define in several ways."""
+
+OF_CURVES: Mapping[str, tuple[str, ...]] = {
+    "transfer": ("forward_transfer", "forward_transfer_libero"),
+    "average": ("area_under_curve_libero",),
+}
+"""Their members that need learning curves, which `DEFINITIONS` leaves out: a success matrix has none."""
 
 EQUAL = 1e-9
 """Values closer than this are equal: rates are quotients of integers whose last bit may differ."""
@@ -41,17 +48,19 @@ class Family:
 def families(rows: Sequence[Row]) -> list[Family]:
     """Return the families of definitions with the ranks of `rows` of one scenario."""
     found = []
-    for family, name in FAMILIES.items():
+    for family, title in FAMILIES.items():
         members = {metric for metric, one in DEFINITIONS.items() if one.family == family}
+        members |= set(OF_CURVES.get(family, ()))
         metrics = [
-            one for one in METRICS.values() if one.name in members and one.higher_is_better is not None
-        ]
+            one for name, one in METRICS.items() if name in members and name != GAIN
+        ]  # a difference of a member
+        metrics = [one for one in metrics if one.higher_is_better is not None]
         metrics = [one for one in metrics if any(row.estimates[one.name].value is not None for row in rows)]
         if len(metrics) < 2 or len(rows) < 2:
             continue
         by_metric = [_ranks(metric, rows) for metric in metrics]
         ranks = {row.method: tuple(ranks[row.method] for ranks in by_metric) for row in rows}
-        found.append(Family(name, tuple(metrics), ranks, *_disagreements(metrics, rows)))
+        found.append(Family(title, tuple(metrics), ranks, *_disagreements(metrics, rows)))
     return found
 
 

@@ -151,23 +151,25 @@ def _keeping(members: Sequence[Row], baseline: Row | None) -> str:
     slower = "" if members[0] in equal else f"{_other_learning(members[0], baseline)} "
     keeper = max(equal, key=lambda row: _paired("kept", row, baseline))
     kept = number_text(keeper.estimates["kept"].value, ".2f", MISSING)
+    if keeper.method == BASELINE:
+        return f"{slower}No method that is not told apart from sft in learning keeps more than sft's {kept}."
     price = cost(keeper)
     paid = f"{price.text} the training time of sft" if price.order else "a cost that was not measured"
     if len(members) == 1:
         usual = number_text(baseline.estimates["kept"].value, ".2f", MISSING)
         apart = _apart("kept", keeper, baseline)
-        return f"{_learning(keeper, baseline)}. It keeps {kept}, sft {usual}{apart}, at {paid}."
+        return f"{_learning(keeper, baseline)}, and keeps {kept}, sft {usual}{apart}, at {paid}."
     peers = _alike("kept", keeper.method, {row.method: row for row in equal})
     others = counted(len(peers) - 1, "other")
     sure = f"; not told apart from {others}" if len(peers) > 1 else ""
-    name, like = printable(keeper.method), "Of methods not told apart from sft in learning"
-    return f"{slower}{like}, {name} keeps most: {kept}, at {paid}{sure}."
+    name, like = printable(keeper.method), "Among the methods not told apart from sft in learning"
+    return f"{slower}{like}, {name} keeps the most: {kept}, at {paid}{sure}."
 
 
 def _learning(row: Row, baseline: Row) -> str:
     """Return what a row learns that is not told apart from plain fine-tuning in it."""
     own, usual = (number_text(one.estimates["adaptation"].value, ".2f", MISSING) for one in (row, baseline))
-    return f"Learning {own}, not told apart from sft's {usual}"
+    return f"It learns {own}, not told apart from sft's {usual}"
 
 
 def _other_learning(leader: Row, baseline: Row) -> str:

@@ -15,7 +15,7 @@ from clbench.spec.references import BASELINE
 from ...board.frontier import Curve
 from ...board.places import SCENARIO
 from ...board.rows import Row, Table
-from ...board.summary import DIVISIONS, ELSEWHERE, METHODS, divisions_of, tables_of
+from ...board.summary import DIVISIONS, ELSEWHERE, GAIN, METHODS, RANKED_BY, divisions_of, tables_of
 from ...board.tiers import TIERS
 from ...policies.compared import Comparison, Comparisons
 from ...policies.decoders import Decoding, read_decoding
@@ -70,6 +70,17 @@ class ScenarioView:
     def verdicts(self) -> list[Verdict]:
         """What its rows say of each division of methods."""
         return verdicts(self.table)
+
+    @property
+    def sorted_by(self) -> str:
+        """The column that the table is sorted by: a metric, or the group where no metric orders all rows."""
+        for metric in (GAIN, RANKED_BY):
+            values = [
+                (row.estimates[metric].value, row.height) for row in self.table if row.height is not None
+            ]
+            if all(value is not None and abs(value - height) < 1e-9 for value, height in values):
+                return metric
+        return "group"
 
     @property
     def protocol(self) -> str:

@@ -41,15 +41,35 @@ def test_a_method_with_lucky_seeds_alone_does_not_stand_above_methods_that_beat_
     assert [standing_of(row, rows).place for row in rows] == [1, 2, 3]
 
 
+def test_a_method_with_more_seeds_than_plain_fine_tuning_is_sorted_by_the_common_ones(
+    board: Path, even_board: Callable[..., Path]
+) -> None:
+    even_board("finch", 4, 0.9)
+    assert [row.method for row in read_table(board).rows] == ["lora", "sft", "finch"]
+
+
+def test_a_method_without_a_seed_of_plain_fine_tuning_has_its_division_sorted_by_final_average(
+    board: Path, even_board: Callable[..., Path]
+) -> None:
+    even_board("l2_sp", 5, 0.45)
+    rows = read_table(board).rows
+    finals = [row.estimates["final_average"].value for row in rows]
+    assert [row.method for row in rows] == ["l2_sp", "finch", "lora", "sft"]
+    assert finals == sorted(finals, reverse=True)
+
+
 def test_a_row_with_fewer_seeds_takes_no_seed_from_the_others(board: Path) -> None:
     rows = read_table(board).rows
     values = values_by_seed(rows)
     assert {method: len(found) for method, found in values.items()} == {"lora": 4, "sft": 4}
 
 
-def test_values_of_two_metrics_are_of_the_same_seeds(board: Path) -> None:
+def test_values_of_two_metrics_are_of_the_same_methods_and_seeds(board: Path) -> None:
     rows = read_table(board).rows
-    kept = values_by_seed(rows, "kept")
+    kept, finals = values_by_seed(rows, "kept"), values_by_seed(rows)
+    assert {method: len(values) for method, values in kept.items()} == {
+        method: len(values) for method, values in finals.items()
+    }
     assert kept["sft"] == pytest.approx(LUCK, abs=0.03)
     assert values_by_seed(rows, "gain") == {}  # it needs a reference
 
@@ -64,6 +84,7 @@ def test_the_relative_cost_compares_equal_seeds(even_board: Callable[..., Path])
         run.record.costs.optimiser_steps = steps
         run.record.timing["step_ratio"] = 3.0
     assert costs_of(runs["lora"], runs["sft"])["relative_cost"] == pytest.approx(1.5)
+    assert costs_of(runs["sft"], runs["sft"][:1])["relative_cost"] == 1.0
     assert costs_of(runs["lora"], runs["sft"][:1])["relative_cost"] is None
 
 

@@ -78,7 +78,9 @@ def test_definitions_that_order_the_methods_alike_have_a_tau_of_one(
 ) -> None:
     fill(even_board, sft=0.2, finch=0.6, lora=0.4, l2_sp=0.1)
     text = page()
-    order = "agree on the order of the methods more than by chance (Kendall's tau 1.00 [1.00, 1.00])."
+    order = (
+        "agree on the order of the methods more than chance would explain (Kendall's tau 1.00 [1.00, 1.00])."
+    )
     assert f"On clbench/Even-v1, final average and forgetting {order}" in text
     assert f"On clbench/Even-v1, two halves of the 4 seeds {order}" in text
     assert (

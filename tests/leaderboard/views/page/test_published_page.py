@@ -57,8 +57,8 @@ def test_the_first_screen_says_which_method_keeps_most_without_prior_data_and_it
     best = max(free, key=lambda row: row["estimates"]["kept"][0])
     kept, cost = best["estimates"]["kept"][0], best["costs"]["relative_cost"]
     answer = (
-        f"Of methods not told apart from sft in learning, {best['method']} keeps most: {kept:.2f}, at "
-        f"{cost:.2f}\N{MULTIPLICATION SIGN}"
+        f"Among the methods not told apart from sft in learning, {best['method']} keeps the most: "
+        f"{kept:.2f}, at {cost:.2f}\N{MULTIPLICATION SIGN}"
     )
     assert in_first_viewport(opened, answer)
 

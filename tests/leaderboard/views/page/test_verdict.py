@@ -120,7 +120,7 @@ def test_a_leader_that_is_told_apart_from_all_is_said_to_be_so(board: Callable[.
     assert verdict.leader.method == "lora"
     assert verdict.standing.endswith(", told apart from all others of its division.")
     assert verdict.keeping == (
-        "Of methods not told apart from sft in learning, lora keeps most: 0.90, at a cost that "
+        "Among the methods not told apart from sft in learning, lora keeps the most: 0.90, at a cost that "
         "was not measured."
     )
 
@@ -131,8 +131,8 @@ def test_a_leader_that_learns_less_does_not_keep_most_of_those_that_learn_alike(
     (verdict,) = verdicts(board(sft=matrix(0.1), lora=matrix(1.0, 0.3), finch=matrix(0.2)))
     assert verdict.leader.method == "lora"
     assert (
-        "It learns less than sft: 0.30 against 1.00. Of methods not told apart from sft in learning, finch "
-        "keeps most" in verdict.keeping
+        "It learns less than sft: 0.30 against 1.00. Among the methods not told apart from sft in learning, "
+        "finch keeps the most" in verdict.keeping
     )
 
 
@@ -140,6 +140,6 @@ def test_the_only_method_of_a_division_is_compared_with_plain_fine_tuning(board:
     rows = board(sft=matrix(0.1), replay=matrix(0.9))
     assert [verdict.name for verdict in verdicts(rows)] == ["prior-data-free", "prior demonstrations"]
     assert verdicts(rows)[1].keeping == (
-        "Learning 1.00, not told apart from sft's 1.00. It keeps 0.90, sft 0.10, at a cost that "
+        "It learns 1.00, not told apart from sft's 1.00, and keeps 0.90, sft 0.10, at a cost that "
         "was not measured."
     )
