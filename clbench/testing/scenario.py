@@ -43,10 +43,10 @@ def check_scenario(scenario: Scenario, *, episodes: int = 10, success: float = 0
 
     Worlds: all have spaces of numbers, of one size in the whole scenario, and actions from -1 to 1.
 
-    Tasks: no two have an instruction in common; the expert succeeds often enough; doing nothing fails at least once;
-    `terminated` and `info["success"]` both mean success and nothing else; observations are in their space and
-    rewards are numbers; the initial state depends on the seed; an episode depends only on the seed and the
-    actions, also after other episodes, in a new world, and side by side in a vector world.
+    Tasks: no two have an instruction in common; the expert succeeds often enough; doing nothing fails at
+    least once; `terminated` and `info["success"]` both mean success and nothing else; observations are in
+    their space and rewards are numbers; the initial state depends on the seed; an episode depends only on the
+    seed and the actions, also after other episodes, in a new world, and side by side in a vector world.
 
     Questions: all words are in the vocabulary, and every answer occurs in the experts' noisy episodes.
 
