@@ -39,10 +39,8 @@ FIXED := clbench/DMControl-v0,clbench/FetchPixels-v0,clbench/PointMaze-v0
 # squares of orders. The policy of size base has one seed: 4.9 million parameters take up to 20 minutes a run.
 records: .venv/installed-dev
 	$(BIN)/clbench run clbench/Fetch-v1 sft consft consft_calibrated --seeds 12 --perturb
-	$(BIN)/clbench run clbench/Fetch-v1 $(REFERENCES) $(METHODS) $(CONSFT_CONTROLS) ewc --seeds 12
-	$(BIN)/clbench run clbench/Fetch-v1 a_gem buffered_replay --seeds 8
-	$(BIN)/clbench run clbench/MetaWorld-v1 $(REFERENCES) $(METHODS) --seeds 8
-	$(BIN)/clbench run clbench/MetaWorld-v1 $(CONSFT_CONTROLS) --seeds 4
+	$(BIN)/clbench run clbench/Fetch-v1 $(REFERENCES) $(METHODS) $(CONSFT_CONTROLS) $(RIVALS) --seeds 12
+	$(BIN)/clbench run clbench/MetaWorld-v1 $(REFERENCES) $(METHODS) $(CONSFT_CONTROLS) --seeds 8
 	$(BIN)/clbench run $(KNOWLEDGE) frozen joint sft stop_gradient aegis lora --seeds 4
 	$(BIN)/clbench run clbench/Fetch-v1 frozen sft consft aegis experience_replay lora stop_gradient --seeds 3 \
 		--policy discrete_diffusion
@@ -56,7 +54,8 @@ records: .venv/installed-dev
 	done
 	$(BIN)/clbench leaderboard
 
-# The frontier: what a smaller learning rate does, for plain fine-tuning and for the methods that compete with it.
+# The frontier: what a smaller learning rate does, for plain fine-tuning and for the methods that compete with it. The
+# claims need consft_calibrated at the scenario's own learning rate only.
 LADDER = $(BIN)/clbench run $(BOTH) $(filter-out consft_calibrated,$(METHODS)) --seeds 4 --records leaderboard/ladder
 ladder: .venv/installed-dev
 	$(LADDER) --set.step_factor 1
