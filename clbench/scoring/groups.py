@@ -20,7 +20,7 @@ from clbench.scoring.scores import rates_of
 
 UNKNOWN_DEVIATION = 0.2
 """Standard deviation between seeds, assumed where no row has a second seed. To be on the safe side it is
-above the greatest of Fetch-v1's methods, and near that of MetaWorld-v1's: see `docs/guide/statistics.md`."""
+above the greatest in the committed records: see `docs/guide/statistics.md`."""
 
 
 def deviation_of_differences(metric: str, rows: Iterable[Runs]) -> float | None:
