@@ -49,7 +49,7 @@ class Row(RowSummary):
     orders: Orders
     """Its results with the targets in this and in other orders."""
     height: float | None
-    """What orders the rows of a division, higher first, see `heights`; None without a final average."""
+    """What orders the rows of a division, higher first, see `_heights`; None without a final average."""
 
     @property
     def scores(self) -> Runs:
@@ -106,7 +106,7 @@ def _beside_rows(runs: list[Run]) -> Sifted:
 
 
 def _scenario_rows(runs: list[Run]) -> list[Row]:
-    """Return the rows of the runs of one scenario, by division, the best first: see `heights`."""
+    """Return the rows of the runs of one scenario, by division, the best first: see `_heights`."""
     by_method: dict[str, list[Run]] = {}
     for run in sorted(runs, key=lambda run: run.seed):
         if not run.order:
@@ -115,18 +115,17 @@ def _scenario_rows(runs: list[Run]) -> list[Row]:
     for division in DIVISIONS:
         members = {method: runs for method, runs in by_method.items() if runs[0].division == division}
         estimates = {method: _estimates(method, by_method) for method in members}
-        competing = {method: _scores(runs) for method, runs in members.items() if division != "reference"}
-        letters = groups(RANKED_BY, competing)
-        found = heights(
-            {method: _scores(runs) for method, runs in members.items()}, by_method.get(BASELINE, ())
-        )
-        order = sorted(members, key=lambda method: (_falling(found[method]), method))
+        scores = {method: _scores(runs) for method, runs in members.items()}
+        letters = groups(RANKED_BY, scores if division != "reference" else {})
+        finals = {method: estimates[method][RANKED_BY].value for method in members}
+        heights = _heights(finals, scores, _scores(by_method.get(BASELINE, ())))
+        order = sorted(members, key=lambda method: (_falling(heights[method]), method))
         rows += [
             _row(
                 method,
                 estimates[method],
                 letters.get(method),
-                found[method],
+                heights[method],
                 members[method],
                 by_method,
                 runs,
@@ -185,35 +184,34 @@ def pretrained_success(rows: Iterable[Row]) -> float | None:
     return math.fsum(known) / len(known) if known else None
 
 
-def heights(rows: Mapping[str, Runs], baseline: Iterable[Run]) -> dict[str, float | None]:
+def mean_difference(metric: str, runs: Runs, others: Runs) -> float | None:
+    """Return the mean over the common seeds of a metric of `runs` minus that of `others`; None without one.
+
+    Args:
+        metric: Name of a metric that needs no reference.
+        runs: Runs of one method by seed.
+        others: Runs of the other method by seed.
+    """
+    pairs = [
+        [measure(metric, them[seed]) for them in (runs, others)]
+        for seed in sorted(runs.keys() & others.keys())
+    ]
+    differences = [one - other for one, other in pairs if one is not None and other is not None]
+    return math.fsum(differences) / len(differences) if differences else None
+
+
+def _heights(
+    finals: Mapping[str, float | None], rows: Mapping[str, Runs], baseline: Runs
+) -> dict[str, float | None]:
     """Return what orders the rows of a division, by method; None without a final average.
 
     It is the final average minus that of plain fine-tuning over the seeds that both have: seeds differ so
     much that the final averages of different seeds say little. If one of the rows shares no seed with plain
     fine-tuning, it is the final average for all of them.
-
-    Args:
-        rows: Runs by seed of each method of the division.
-        baseline: Runs of plain fine-tuning on the same scenario; may be empty.
     """
-    finals = {
-        method: {seed: measure(RANKED_BY, one) for seed, one in runs.items()} for method, runs in rows.items()
-    }
-    known = {
-        method: {seed: value for seed, value in values.items() if value is not None}
-        for method, values in finals.items()
-    }
-    usual = {run.seed: value for run in baseline if (value := measure(RANKED_BY, run.scores)) is not None}
-    compared = {method: values.keys() & usual.keys() for method, values in known.items() if values}
-    if all(compared.values()):
-        known = {
-            method: {seed: known[method][seed] - usual[seed] for seed in sorted(seeds)}
-            for method, seeds in compared.items()
-        }
-    return {
-        method: math.fsum(known[method].values()) / len(known[method]) if known.get(method) else None
-        for method in rows
-    }
+    known = [method for method, final in finals.items() if final is not None]
+    gains = {method: mean_difference(RANKED_BY, rows[method], baseline) for method in known}
+    return dict(finals) if None in gains.values() else {method: gains.get(method) for method in finals}
 
 
 def _falling(height: float | None) -> float:

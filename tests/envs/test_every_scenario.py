@@ -16,11 +16,11 @@ import gymnasium
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
+from helpers import expert_succeeds
 from numpy.typing import NDArray
 
 from clbench.base.entry_points import resolve
 from clbench.base.errors import InputError
-from clbench.data.demonstrations import demonstrate
 from clbench.data.questions import load_questions
 from clbench.spec.identifiers import scenario_ids
 from clbench.spec.language import spelled_words
@@ -165,20 +165,14 @@ def test_it_takes_two_hundred_random_steps(scenario: Scenario) -> None:
     environment.close()
 
 
-@every_scenario
-def test_an_episode_repeats_itself_whatever_ran_before(scenario: Scenario) -> None:
-    others = scenario.tasks[-2:]
-    for task in first_task_of_each_world(scenario):
-        world = make(task.world)
-        expected = rollout(make(task.world), task.name, seed=7)
-        for other, seed in (
-            (other.name, seed) for other in others if other.world == task.world for seed in (1, 7)
-        ):
-            rollout(world, other, seed, steps=11)
-            np.testing.assert_array_equal(rollout(world, task.name, seed=7), expected)
-        rollout(world, task.name, seed=2)
+@every_task
+def test_an_episode_repeats_itself_whatever_ran_before(task: Task) -> None:
+    world, expected = make(task.world), rollout(make(task.world), task.name, seed=7)
+    others = [name for entry_point, name in TASKS if entry_point == task.world][-2:]
+    for other, seed in (*itertools.product(others, (1, 7)), (task.name, 2)):
+        rollout(world, other, seed, steps=31)
         np.testing.assert_array_equal(rollout(world, task.name, seed=7), expected)
-        assert not np.array_equal(rollout(world, task.name, seed=8), expected)
+    assert not np.array_equal(rollout(world, task.name, seed=8), expected)
 
 
 @every_task
@@ -191,14 +185,13 @@ def test_a_copy_of_a_world_goes_on_as_the_world_does_and_leaves_it_alone(task: T
         np.testing.assert_array_equal(moved(one, chosen[10:]), expected[11:])
 
 
-@every_scenario
-def test_global_generators_have_no_part_in_it_and_are_left_alone(scenario: Scenario) -> None:
-    for task in first_task_of_each_world(scenario):
-        expected = rollout(make(task.world), task.name, seed=3)
-        np.random.seed(5)  # noqa: NPY002
-        before = np.random.get_state()[1].copy()  # type: ignore[index]  # noqa: NPY002
-        np.testing.assert_array_equal(rollout(make(task.world), task.name, seed=3), expected)
-        np.testing.assert_array_equal(np.random.get_state()[1], before)  # type: ignore[index]  # noqa: NPY002
+@every_task
+def test_global_generators_have_no_part_in_it_and_are_left_alone(task: Task) -> None:
+    expected = rollout(make(task.world), task.name, seed=3)
+    np.random.seed(5)  # noqa: NPY002
+    before = np.random.get_state()[1].copy()  # type: ignore[index]  # noqa: NPY002
+    np.testing.assert_array_equal(rollout(make(task.world), task.name, seed=3), expected)
+    np.testing.assert_array_equal(np.random.get_state()[1], before)  # type: ignore[index]  # noqa: NPY002
 
 
 @every_scenario
@@ -268,9 +261,10 @@ def test_a_perturbed_episode_follows_from_its_seed_in_any_lane_and_changes_no_pl
 
 @every_task
 def test_the_expert_does_its_task(task: Task) -> None:
-    world = make(task.world)
-    done = [demonstrate(world, task, seed, noisy=False).success for seed in range(100, 104)]
-    assert sum(done) >= 3  # the weakest expert succeeds in 90 % of its episodes
+    make(task.world).close()
+    # LIBERO's experts succeed in 90 % of their episodes, all others in these four for certain
+    least = 3 if "libero" in task.world else 4
+    assert sum(expert_succeeds(task, seed) for seed in range(100, 104)) >= least
 
 
 @pytest.mark.slow

@@ -5,17 +5,20 @@ import dataclasses
 import gzip
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from clbench.base.entry_points import resolve
 from clbench.data.demonstrations import Demonstration
 from clbench.learning.method import Method
 from clbench.learning.registry import load_method, new_method, read_changes
 from clbench.records.content import content_hash
 from clbench.records.record import AnswerRow, EpisodeRow, PolicyRow, Record
 from clbench.scoring.reading import read_protocol
+from clbench.spec.task import Task
 
 
 def build_method(spec: str, changes: Mapping[str, Any]) -> Method:
@@ -55,6 +58,20 @@ def complete_record(record: Record) -> None:
         for row in answers:
             if row.stage == point.stage - 1 and not protocol.is_end(point):
                 record.add_answers(row._replace(stage=point.stage, step=point.step))
+
+
+def expert_succeeds(task: Task, seed: int, noise: Sequence[Any] | NDArray[Any] = ()) -> bool:
+    """Run the task's expert for an episode, with `noise` for actions from the tenth step on."""
+    world, expert = resolve(task.world)(), resolve(task.expert)(task.name)
+    state, _ = world.reset(seed=seed, options={"task": task.name})
+    for step in range(task.horizon):
+        action = noise[step - 10] if 10 <= step < 10 + len(noise) else expert(state)
+        state, _, terminated, truncated, info = world.step(action)
+        assert not truncated
+        assert info == {"success": terminated, "task": task.name}
+        if terminated:
+            return True
+    return False
 
 
 def same_demonstrations(first: list[Demonstration], second: list[Demonstration]) -> bool:

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 from clbench.base.text import counted, printable
 from clbench.scoring.groups import groups
-from clbench.scoring.intervals import Estimate, paired_difference, row_generator
+from clbench.scoring.intervals import Estimate
 from clbench.spec.references import BASELINE
 
-from ...board.rows import Row, apart_from_baseline, standing_of
+from ...board.rows import Row, apart_from_baseline, mean_difference, standing_of
 from ...board.summary import (
     DIVISIONS,
     METHODS,
@@ -65,7 +65,11 @@ def headline(rows: Sequence[Row]) -> str:
         value = number_text(baseline.estimates[RANKED_BY].value, ".2f", MISSING)
         return f"Plain fine-tuning ends with a final average of {value}. No other method has run here."
     apart = apart_from_baseline(rows)
-    gains = {row.method: _paired(RANKED_BY, row, baseline) for row in others if row.method in apart}
+    gains = {
+        row.method: mean_difference(RANKED_BY, row.scores, baseline.scores) or 0.0
+        for row in others
+        if row.method in apart
+    }
     ahead = [row for row in others if gains.get(row.method, 0.0) > 0]
     if not ahead:
         methods = "The one other method is not" if len(others) == 1 else "No method is"
@@ -96,12 +100,6 @@ def _above(ahead: Sequence[Row], gains: Mapping[str, float]) -> str:
     (where, names, verb, by), *more = parts
     first = f"{where.capitalize()}, {names} {verb} {by} above plain fine-tuning"
     return "; ".join([first, *(f"{where}, {names} by {by}" for where, names, _, by in more)]) + "."
-
-
-def _paired(metric: str, row: Row, other: Row) -> float:
-    """Return how much higher a row is than another over the seeds that both have, 0 without one."""
-    generator = row_generator(row.scenario, row.method)
-    return paired_difference(metric, row.scores, other.scores, generator).value or 0.0
 
 
 def verdicts(rows: Sequence[Row]) -> list[Verdict]:
@@ -149,7 +147,7 @@ def _keeping(members: Sequence[Row], baseline: Row | None) -> str:
     if not equal:
         return _other_learning(members[0], baseline)
     slower = "" if members[0] in equal else f"{_other_learning(members[0], baseline)} "
-    keeper = max(equal, key=lambda row: _paired("kept", row, baseline))
+    keeper = max(equal, key=lambda row: mean_difference("kept", row.scores, baseline.scores) or 0.0)
     kept = number_text(keeper.estimates["kept"].value, ".2f", MISSING)
     if keeper.method == BASELINE:
         return f"{slower}No method that is not told apart from sft in learning keeps more than sft's {kept}."
