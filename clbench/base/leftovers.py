@@ -24,7 +24,7 @@ than a second. Folders have leases, which tell whether their maker lives."""
 
 _MAKER = r"(?P<host>[0-9a-f]{8})(?P<process>[0-9a-f]{8})[0-9a-f]{16}"
 _UNFINISHED = re.compile(rf"\.(?P<name>.+)\.{_MAKER}\.(?:partial|old)")
-_TRACE = re.compile(r"\.(?P<name>.+)\.(?:lease|progress)")
+_LEASE = re.compile(r"\.(?P<name>.+)\.lease")
 
 
 def unfinished(path: Path) -> Path:
@@ -71,11 +71,12 @@ def sweep(*roots: Path) -> int:
     """
     count = 0
     for path in [path for root in roots for path in _found(root)]:
-        trace = _TRACE.fullmatch(path.name)
-        if trace is None:
-            if is_left_behind(path):
-                _remove(path)
-        elif Lease(path.with_name(trace["name"])).owner is None and path.suffix == ".progress":
+        lease = _LEASE.fullmatch(path.name)
+        if lease is not None:
+            _ = Lease(
+                path.with_name(lease["name"])
+            ).owner  # removes the lease of a dead process and its report
+        elif is_left_behind(path):
             _remove(path)
         count += not path.exists()
     return count
@@ -85,7 +86,7 @@ def _found(root: Path) -> Iterator[Path]:
     """Yield everything below a folder with the name of a leftover."""
     for place, folders, files in os.walk(root):
         for name in (*folders, *files):
-            if is_unfinished(name) or (name in files and _TRACE.fullmatch(name)):
+            if is_unfinished(name) or (name in files and _LEASE.fullmatch(name)):
                 yield Path(place, name)
         folders[:] = [name for name in folders if not is_unfinished(name)]
 

@@ -259,6 +259,7 @@ def _machine() -> dict[str, str]:
     from clbench.base.cache import cache_folder
     from clbench.jobs.folders import minari_folder
     from clbench.worlds.gl_backend import DEBIAN_PACKAGES, rendering_fault
+    from clbench.worlds.threads import cores
 
     faults = {back_end: rendering_fault(back_end) for back_end in DEBIAN_PACKAGES}
     working = [back_end for back_end, fault in faults.items() if fault is None]
@@ -268,7 +269,7 @@ def _machine() -> dict[str, str]:
         rendering[f"rendering: {back_end}"] = "works" if fault is None else f"does not work; {help_}"
     return {
         "python": sys.version.split()[0],
-        "cores": f"{os.cpu_count()} ({torch.get_num_threads()} threads in PyTorch; a run uses one)",
+        "cores": f"{cores()} ({torch.get_num_threads()} threads in PyTorch; a run uses one)",
         "cuda": torch.cuda.get_device_name() if torch.cuda.is_available() else "none (and none is needed)",
         **rendering,
         "films": _films(faults),

@@ -66,7 +66,7 @@ def hooks(known: Iterable[str], readable: Iterable[str]) -> Iterator[None]:
     token = _rights.set(_Rights(frozenset(known), frozenset(readable)))
     try:
         yield
-    except Exception:
+    except (Exception, KeyboardInterrupt):  # Ctrl-C is the user's, not the method's
         raise
     except BaseException as error:
         if error is _ours.get():

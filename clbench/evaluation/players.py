@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
@@ -22,6 +21,7 @@ from clbench.spec.scenario import Scenario
 from clbench.worlds.lanes import Lanes
 from clbench.worlds.scenario_env import Observation
 from clbench.worlds.schedule import InstructionFormat, observed
+from clbench.worlds.threads import cores
 
 
 class Predictor(Interface):
@@ -118,7 +118,7 @@ def _play(
     def begin(one: Live) -> None:
         one.shown = observed(one.instruction, instruction, scenario)
 
-    with closing(Lanes(count, threads=os.cpu_count() or 1 if count > 1 else 1)) as lanes:
+    with closing(Lanes(count, threads=cores() if count > 1 else 1)) as lanes:
         return play_in_lanes(lanes, count, trials, seed, begin, partial(act, lanes), progress=progress)
 
 

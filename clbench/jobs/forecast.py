@@ -14,13 +14,13 @@ from clbench.base.text import counted
 from clbench.jobs import work
 from clbench.jobs.job import Job
 from clbench.jobs.plan import Plan
-from clbench.jobs.processes import cores
 from clbench.learning.pretraining import policy_config
 from clbench.policy.batch import Batch
 from clbench.policy.kinds import new_policy
 from clbench.runs.spec import ResolvedRun
 from clbench.spec.language import encode
 from clbench.spec.scenario import Scenario
+from clbench.worlds.threads import cores
 
 STEPS = 8
 """Optimiser steps that are timed."""

@@ -24,6 +24,7 @@ from clbench.base.lease import LeaseLostError
 from clbench.base.progress import ProgressCallback, listen
 from clbench.jobs.job import Event, Job
 from clbench.jobs.process_limits import end, exceeded
+from clbench.worlds.threads import cores
 
 SEND_SECONDS = 0.2
 """Least time between two progress reports of a worker, in seconds."""
@@ -43,11 +44,6 @@ class _Worker:
     """Limit that its process exceeded, in words; None if it exceeded none."""
     place: str | None = None
     """Hook of a method that it announced last."""
-
-
-def cores() -> int:
-    """Return the number of cores that this process may use, which may be only some of the machine's."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 class Processes:

@@ -241,6 +241,7 @@ class Blocks:
     def take(self, logits: Tensor, first: int) -> None:
         """Take the sure tokens, given the logits (B, n, K) of the tokens from `first` on."""
         confidence, best = logits.softmax(dim=2).max(dim=2)
+        confidence = confidence.nan_to_num()  # a diverged policy is sure of nothing, and must come to an end
         rest = self.tokens.shape[1] - first - logits.shape[1]
         sure = F.pad(confidence, (first, rest)).view(-1, *self.shape)
         has_begun = self.number < self.begun

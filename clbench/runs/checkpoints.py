@@ -36,16 +36,6 @@ NOT_THE_METHOD = (CacheError, CheckpointError, LeaseLostError, RenderingError)
 """Failures of the machine: a run can be done again, and leaves no record that blames its method."""
 
 
-def check_interrupt(error: Exception) -> None:
-    """Raise the Ctrl-C that came while a hook ran, which looks like a fault of the method.
-
-    Raises:
-        KeyboardInterrupt: It is the cause of the error.
-    """
-    if isinstance(error.__cause__, KeyboardInterrupt):
-        raise error.__cause__ from None
-
-
 def stage_policies(
     run: ResolvedRun, checkpoints: Path | None = None, progress: ProgressCallback = no_progress
 ) -> list[Policy]:
@@ -134,7 +124,6 @@ def make_stages(run: ResolvedRun, progress: ProgressCallback = no_progress) -> P
         except NOT_THE_METHOD:
             raise
         except Exception as error:
-            check_interrupt(error)
             message = f"{run.label} failed in {trainer.where}: {type(error).__name__}: {error}"
             raise MethodError(message) from error
 

@@ -28,7 +28,7 @@ from clbench.learning.trainer import Trainer, sources
 from clbench.records.reader import read_record
 from clbench.records.record import Costs, Record
 from clbench.records.writer import check_diagnostics, write_record, write_result
-from clbench.runs.checkpoints import NOT_THE_METHOD, check_interrupt, drop_stages, has_stages, keep_stage
+from clbench.runs.checkpoints import NOT_THE_METHOD, drop_stages, has_stages, keep_stage
 from clbench.runs.fingerprint import fingerprint
 from clbench.runs.length import relearning_length, relearns, run_length
 from clbench.runs.relearning import relearn
@@ -174,7 +174,6 @@ class _Run:
         except NOT_THE_METHOD:
             raise
         except Exception as error:
-            check_interrupt(error)
             self.record.status = "failed"
             self.record.error = {
                 "where": self.trainer.where,

@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any
 from clbench.base.errors import InputError
 from clbench.base.leftovers import unfinished
 from clbench.base.strict_json import read_json
-from clbench.spec.identifiers import folder_name
+from clbench.spec.identifiers import folder_name, scenario_ids
 
 if TYPE_CHECKING:
     from clbench.learning.method import Method
@@ -140,6 +140,11 @@ def tuned(scenario: str) -> Mapping[str, Tuned]:
     }
     controls = {control: methods[method] for control, method in CONTROLS.items() if method in methods}
     return {**methods, **controls}
+
+
+def tuned_scenarios() -> list[str]:
+    """Return the ids of the registered scenarios on which methods were tuned, sorted."""
+    return [name for name in scenario_ids() if tuned(name)]
 
 
 def tuned_settings(scenario: str, method: str) -> dict[str, Any]:

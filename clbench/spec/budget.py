@@ -52,7 +52,8 @@ class Budget:
 
     def __post_init__(self) -> None:
         check_whole(self, 1, "demonstrations", "question_episodes", "test_questions")
-        check_whole(self, 1, "adaptation_steps", "batch_size", "policy_width", "policy_layers")
+        check_whole(self, 1, "adaptation_steps", "policy_width", "policy_layers")
+        check_whole(self, 2, "batch_size")  # pretraining asks half as many questions
         check_whole(self, 1, "evaluation_points", "validation_episodes", "test_episodes")
         check_whole(self, 0, "pretraining_steps", "curve_episodes")
         check_positive(self, "pretraining_learning_rate", "learning_rate")

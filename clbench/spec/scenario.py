@@ -122,12 +122,12 @@ class Scenario:
         return fitting_length((*instructions, *questions))
 
     def require_packages(self) -> None:
-        """Check that the packages of its tasks are installed.
+        """Check that the packages of its tasks are installed, those of its `scenes` among them.
 
         Raises:
             MissingPackageError: A package is not installed; the message says how to get it.
         """
-        every = self.tasks + self.background
+        every = self.tasks + self.background + self.scenes
         require_packages({package for task in every for package in task.packages}, self.id)
 
     def in_order(self, order: int) -> Scenario:

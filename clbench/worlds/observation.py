@@ -29,6 +29,7 @@ from clbench.spec.task import Task
 from clbench.worlds.camera import VIEW_SIZE, Camera, Images, States, Views, load_camera
 from clbench.worlds.gl_backend import RenderingError, environment_of, working_back_end
 from clbench.worlds.render_worker import HEADER
+from clbench.worlds.threads import cores
 
 TOGETHER = 256
 """Pictures per request to a drawing process: 3 MB of 64 x 64 pixels, and half a second of work."""
@@ -198,7 +199,7 @@ def observed(task: Task, states: States) -> tuple[States, Images]:
     folder = cache_folder() / "frames" / hash_of(inputs)
 
     def make(partial: Path) -> None:
-        observer = Observer(task.world, task.camera, min(os.cpu_count() or 1, -(-len(states) // TOGETHER)))
+        observer = Observer(task.world, task.camera, min(cores(), -(-len(states) // TOGETHER)))
         numbers, images = observer.observe(states)
         observer.close()
         arrays: dict[str, NDArray[Any]] = {"state": np.ascontiguousarray(numbers), "image": images}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Sequence
 from copy import copy
@@ -23,6 +22,7 @@ from clbench.spec.task import Task
 from clbench.worlds.lanes import Lanes
 from clbench.worlds.scenario_env import Observation
 from clbench.worlds.schedule import InstructionFormat, Schedule, Start
+from clbench.worlds.threads import cores
 
 Flags = NDArray[np.bool_]
 Outcome = tuple[Observation, NDArray[np.float64], Flags, Flags, dict[str, Any]]
@@ -78,7 +78,7 @@ class ScenarioVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]
             Schedule(self.scenario, episodes_per_stage, instruction, stage) for _ in range(num_envs)
         ]
         self._generators: list[np.random.Generator] = [np_random()[0] for _ in range(num_envs)]
-        self._lanes = Lanes(num_envs, threads or os.cpu_count() or 1)
+        self._lanes = Lanes(num_envs, threads or cores())
         first = self.scenario.tasks[0]
         world = self._lanes.world(first)
         shown = self._lanes.observer(first).spaces(world.single_observation_space)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import threading
 import weakref
 from collections.abc import Callable, Sequence
@@ -13,6 +14,11 @@ Item = TypeVar("Item")
 _PATIENCE = 5.0
 """Longest wait in seconds for the threads of a team that nobody closed. The garbage collector ends such a
 team at any moment, even while its thread holds a lock that an ending thread needs."""
+
+
+def cores() -> int:
+    """Return the number of cores that this process may use, which may be only some of the machine's."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 class Team:

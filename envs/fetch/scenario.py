@@ -192,7 +192,7 @@ KNOWLEDGE = dataclasses.replace(
     balanced=False,
     budget=Budget(adaptation_steps=1280, evaluation_points=7, learning_rate=1e-3, validation_episodes=20),
 )
-"""The policy of `SCENARIO` and one long stage, in which plain fine-tuning loses answers to questions.
+"""The skills of `SCENARIO` and one long stage, in which plain fine-tuning loses answers to questions.
 
 Tried with sft on seed 100: .02 of the answers are lost after 80 steps, .06 after 320 and .12 after 1280. With
 a learning rate of 3e-4 it is .02 after 1280 steps.

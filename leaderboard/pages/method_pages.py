@@ -10,7 +10,7 @@ from typing import Any
 
 from jinja2 import Template
 
-from clbench.runs.tuning import CONTROLS, tuned
+from clbench.runs.tuning import CONTROLS, tuned, tuned_scenarios
 from clbench.scoring.intervals import Estimate
 from clbench.spec.identifiers import folder_name
 
@@ -18,7 +18,6 @@ from ..board.commands import row_command, run_command
 from ..board.rows import Row
 from ..board.runs import is_number
 from ..board.summary import DIVISIONS
-from ..claims.claim import BOARDS
 from ..claims.evidence import Evidence
 from ..claims.judges import Judged
 from ..views.descriptions import Description, common_hyper_parameters
@@ -179,7 +178,7 @@ def _chosen(method: str) -> list[str]:
     """Return the settings that tuning chose, board by board: "`step_factor` = 0.3 on clbench/Fetch-v1"."""
     return [
         f"{_words(found.settings, '`{}`')} on {scenario}"
-        for scenario in BOARDS
+        for scenario in tuned_scenarios()
         if (found := tuned(scenario).get(method))
     ]
 
@@ -187,7 +186,7 @@ def _chosen(method: str) -> list[str]:
 def _tried(method: str) -> list[Tried]:
     """Return the settings that tuning tried, board by board."""
     rows = []
-    for scenario in BOARDS:
+    for scenario in tuned_scenarios():
         if found := tuned(scenario).get(method):
             rows += [
                 Tried(
@@ -208,11 +207,11 @@ def _words(settings: Mapping[str, Any], form: str = "{}") -> str:
 
 def _commands(method: str, sources: Sources) -> list[str]:
     """Return the commands that make the rows of the method, and those that tuned it."""
-    scenarios = dict.fromkeys((sources.evidence.scenario, *BOARDS))
+    scenarios = dict.fromkeys((sources.evidence.scenario, *tuned_scenarios()))
     rows = [row for row in sources.board if row.method == method and row.scenario in scenarios]
     lines = [row_command(row) for row in rows] or [run_command(sources.evidence.scenario, method)]
     tuned_as = CONTROLS.get(method, method)
-    boards = [one for one in BOARDS if method in tuned(one)]
+    boards = [one for one in tuned_scenarios() if method in tuned(one)]
     return lines + [
         f"clbench tune {one} {tuned_as} --write {Path('methods/tuned', folder_name(one))}.json"
         for one in boards

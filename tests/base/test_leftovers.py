@@ -25,9 +25,17 @@ def test_what_a_killed_process_left_is_removed(tmp_path: Path) -> None:
     record = tmp_path / f".seed-0.json.{HEX}.partial"
     record.write_text("{")
     _age(record)
-    (tmp_path / ".seed-0.json.progress").write_text("[0.5, 1.0]")
-    assert sweep(tmp_path) == 4
+    assert sweep(tmp_path) == 3
     assert [path.name for path in tmp_path.rglob("*")] == ["below"]
+
+
+def test_a_lease_goes_with_its_report_once_its_process_is_dead(tmp_path: Path) -> None:
+    code = "import os, sys; from pathlib import Path; from clbench.base.lease import Lease; "
+    code += "lease = Lease(Path(sys.argv[1])); lease.take(); lease.report(0.5); os._exit(0)"
+    subprocess.run([sys.executable, "-c", code, str(tmp_path / "x")], check=True)
+    assert {path.name for path in tmp_path.iterdir()} == {".x.lease", ".x.progress"}
+    assert sweep(tmp_path) == 1
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_what_is_being_made_stays(tmp_path: Path) -> None:
@@ -53,11 +61,18 @@ def test_an_unfinished_file_goes_at_once_if_its_process_is_dead(tmp_path: Path) 
 
 
 def test_nothing_else_is_touched(tmp_path: Path) -> None:
-    for name in ("notes.partial", ".x.123.partial", ".config.lease", "seed-0.json", f"x.{HEX}.partial"):
+    for name in (
+        "notes.partial",
+        ".x.123.partial",
+        ".config.lease",
+        ".config.progress",
+        "seed-0.json",
+        f"x.{HEX}.partial",
+    ):
         (tmp_path / name).write_text("mine")
         _age(tmp_path / name)
     assert sweep(tmp_path) == 0
-    assert len(list(tmp_path.iterdir())) == 5
+    assert len(list(tmp_path.iterdir())) == 6
 
 
 def test_a_result_that_is_made_again_removes_what_its_dead_makers_left(tmp_path: Path) -> None:

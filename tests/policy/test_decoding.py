@@ -137,7 +137,7 @@ DECODERS: dict[str, tuple[int, Callable[..., Tensor], int]] = {
 
 
 @pytest.mark.parametrize("name", DECODERS)
-@pytest.mark.parametrize("sharpness", [0.0, 5.0, 40.0])
+@pytest.mark.parametrize("sharpness", [0.0, 5.0, 40.0, math.nan])  # the last one as in a diverged policy
 def test_every_decoder_ends_within_its_bound_and_leaves_no_mask(name: str, sharpness: float) -> None:
     block, decode, bound = DECODERS[name]
     made, forwards = head(block, sharpness), 0

@@ -16,7 +16,8 @@ from clbench.spec.registry import load_scenario, registered_scenario
 from clbench.spec.scenario import MOST_ORDERS, target_order
 
 FETCH = "clbench/Fetch-v1"
-MAZES = "clbench/PointMaze-v0"
+PUBLISHED = "clbench/DMControl-v0"
+"""A scenario in which all seeds learn the targets in their published order."""
 TOY = load_scenario("clbench.testing:clbench/Toy-v0")
 
 
@@ -63,12 +64,13 @@ def test_a_scenario_has_distinct_tasks_whose_entry_points_resolve(scenario_id: s
         assert task in getattr(scenario, scenario.group(task.name))
 
 
-@pytest.fixture
-def unusable() -> Iterator[str]:
-    """Register the toy as if it needed a simulator that nobody has, and return its id."""
+@pytest.fixture(params=["target", "scenes"])
+def unusable(request: pytest.FixtureRequest) -> Iterator[str]:
+    """Register the toy as if a part of it needed a simulator that nobody has, and return its id."""
     name = "clbench/Unusable-v0"
-    targets = tuple(dataclasses.replace(task, packages=("no-simulator",)) for task in TOY.target)
-    scenario = dataclasses.replace(TOY, id=name, target=targets)
+    tasks = tuple(dataclasses.replace(task, packages=("no-simulator",)) for task in TOY.target)
+    part: dict[str, Any] = {request.param: tasks}
+    scenario = dataclasses.replace(TOY, id=name, **part)
     spec = gymnasium.envs.registration.EnvSpec(
         name, "clbench.worlds.scenario_env:ScenarioEnv", kwargs={"scenario": "clbench.testing:UNUSABLE"}
     )
@@ -79,7 +81,7 @@ def unusable() -> Iterator[str]:
 
 
 def test_a_scenario_without_its_simulator_is_data_and_names_the_package_to_install(unusable: str) -> None:
-    assert registered_scenario(unusable).target[0].packages == ("no-simulator",)
+    assert registered_scenario(unusable).id == unusable
     for use in (load_scenario, gymnasium.make):
         with pytest.raises(LookupError, match=f"{unusable} needs the package no-simulator: pip install no-"):
             use(unusable)
@@ -125,6 +127,7 @@ def test_a_budget_cannot_have_more_episodes_on_the_way_than_at_the_end() -> None
     [
         ({"demonstrations": 0}, ValueError, "Budget.demonstrations must be at least 1, not 0"),
         ({"adaptation_steps": -5}, ValueError, "Budget.adaptation_steps must be at least 1, not -5"),
+        ({"batch_size": 1}, ValueError, "Budget.batch_size must be at least 2, not 1"),
         ({"batch_size": 2.5}, TypeError, r"Budget.batch_size must be a whole number, not 2\.5"),
         ({"batch_size": True}, TypeError, "Budget.batch_size must be a whole number, not True"),
         ({"policy_width": 97}, ValueError, "Budget.policy_width must be a multiple of 4, .* not 97"),
@@ -153,8 +156,8 @@ def test_all_orders_are_different_permutations_and_the_first_is_the_published_on
 
 @pytest.mark.parametrize("order", [-1, 24])
 def test_an_unknown_order_is_refused_with_the_known_ones(order: int) -> None:
-    with pytest.raises(ValueError, match=rf"{MAZES}: 4 targets have orders 0 to 23, not {order}"):
-        load_scenario(MAZES).in_order(order)
+    with pytest.raises(ValueError, match=rf"{PUBLISHED}: 4 targets have orders 0 to 23, not {order}"):
+        load_scenario(PUBLISHED).in_order(order)
 
 
 def test_an_order_never_changes() -> None:
@@ -163,7 +166,7 @@ def test_an_order_never_changes() -> None:
 
 
 def test_in_another_order_nothing_but_the_targets_differs() -> None:
-    published = load_scenario(MAZES)
+    published = load_scenario(PUBLISHED)
     other = published.in_order(1)
     assert [task.name for task in other.target] == [published.target[index].name for index in (3, 2, 1, 0)]
     assert dataclasses.replace(other, target=published.target) == published

@@ -1,6 +1,7 @@
 """Teams: each piece of work is done once, and no thread outlives its team."""
 
 import gc
+import os
 import subprocess
 import sys
 import threading
@@ -9,7 +10,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from clbench.worlds.threads import Team
+from clbench.worlds.threads import Team, cores
 
 
 class Owner:
@@ -109,3 +110,14 @@ def test_an_interpreter_exits_at_once_with_a_team_that_nobody_closed() -> None:
         [sys.executable, "-c", code], capture_output=True, text=True, timeout=600, check=True
     )
     assert (ended.stdout, ended.stderr) == ("['a', 'b', 'c']\n", "")
+
+
+@pytest.mark.skipif(
+    not hasattr(os, "sched_setaffinity"), reason="a process cannot be held to some cores here"
+)
+def test_only_the_cores_that_this_process_may_use_count() -> None:
+    code = "import os; os.sched_setaffinity(0, {min(os.sched_getaffinity(0))}); "
+    code += "from clbench.worlds.threads import cores; print(cores())"
+    one = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert int(one.stdout) == 1
+    assert cores() == len(os.sched_getaffinity(0))
