@@ -40,7 +40,7 @@ class Episode:
     def begin(
         self, problem: Problem, seed: int, displaced: tuple[float, float, float] | None = None
     ) -> State:
-        """Begin an episode, and return its first state (83,).
+        """Begin an episode, and return its first state (213,).
 
         Args:
             problem: Problem in the same scene.
@@ -85,13 +85,12 @@ class Episode:
         models.give_back(model)
 
     def state(self) -> State:
-        """Return the state (83,)."""
+        """Return the state (213,)."""
         state, data, problem = np.zeros(SIZE, np.float32), self.data, self.problem
         state[HAND], state[HAND_QUATERNION], state[FINGERS] = self._hand
         positions, turns = data.xpos[problem.things] - self._hand[0], data.xquat[problem.things]
-        places = np.concatenate((positions, turns), axis=1).ravel()
-        state[PLACES][: places.size] = places
-        state[CLOSE_BY][: positions.size] = np.clip(positions, -REACH, REACH).ravel()
+        state[PLACES].reshape(-1, 7)[problem.slots] = np.concatenate((positions, turns), axis=1)
+        state[CLOSE_BY].reshape(-1, 3)[problem.slots] = np.clip(positions, -REACH, REACH)
         state[JOINTS][: problem.parts.size] = data.qpos[problem.parts]
         return state
 

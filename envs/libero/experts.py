@@ -52,7 +52,7 @@ SIDEWAYS = _turned(-1.2)
 
 
 class Sight:
-    """What an expert sees in a state (83,)."""
+    """What an expert sees in a state (213,)."""
 
     def __init__(self, state: State) -> None:
         self._state = state.astype(np.float64)
@@ -62,14 +62,14 @@ class Sight:
         self.opening = float(right - left)
         self.joints: Vector = self._state[JOINTS]
 
-    def place(self, number: int) -> Vector:
+    def place(self, name: str) -> Vector:
         """Return the position (3,) of a thing."""
-        place: Vector = self.hand + self._state[thing(number)][:3]
+        place: Vector = self.hand + self._state[thing(name)][:3]
         return place
 
-    def point(self, number: int, offset: Vector) -> Vector:
+    def point(self, name: str, offset: Vector) -> Vector:
         """Return the position (3,) of a point of a thing, from the thing's own axes (3,)."""
-        place: Vector = self.place(number) + _matrix(self._state[thing(number)][3:]) @ offset
+        place: Vector = self.place(name) + _matrix(self._state[thing(name)][3:]) @ offset
         return place
 
 
@@ -123,8 +123,8 @@ def _funnel(way: Vector, clearance: float) -> Vector:
 class Grip:
     """A grasp of a thing from above."""
 
-    number: int
-    """Number of the thing."""
+    name: str
+    """Name of the thing."""
     offset: tuple[float, float, float]
     """Way in metres from the thing to the place of the grasp."""
     width: float
@@ -138,7 +138,7 @@ class Grip:
 
     def place(self, sight: Sight) -> Vector:
         """Return the place (3,) of the grasp, or the place aside of it on the way down with open fingers."""
-        offset, thing_at = np.array(self.offset), sight.place(self.number)
+        offset, thing_at = np.array(self.offset), sight.place(self.name)
         if self.slant and not self.is_closed(sight):
             aside = min(max(self.slant * (sight.hand - thing_at - offset)[2], 0.0), 0.07)
             offset[:2] *= 1.0 + aside / math.hypot(offset[0], offset[1])
@@ -154,8 +154,8 @@ class Grip:
         return sight.opening < self.width - 0.006
 
 
-BOWL, CHEESE, STOVE, PLATE, BOTTLE, RACK, CABINET = range(7)
-"""Numbers of the things in libero_goal."""
+BOWL, CHEESE, STOVE, PLATE = "akita_black_bowl_1", "cream_cheese_1", "flat_stove_1", "plate_1"
+BOTTLE, RACK, CABINET, BASKET = "wine_bottle_1", "wine_rack_1", "wooden_cabinet_1", "basket_1"
 
 AT_RIM = Grip(BOWL, (-0.034, 0.034, 0.038), 0.004, math.pi / 4)
 """The bowl at its rim, on the left and toward the robot."""
@@ -185,19 +185,19 @@ def _grasp(sight: Sight, grip: Grip) -> Action | None:
 
 def _carry(sight: Sight, grip: Grip, goal: Vector, clearance: float) -> Action:
     """Return the action that carries a held thing to a goal (3,) from `clearance` metres above."""
-    way = _funnel(goal - sight.place(grip.number), clearance)
+    way = _funnel(goal - sight.place(grip.name), clearance)
     return _move(sight, CARRYING * way, CLOSE, _turned(0.0, grip.yaw))
 
 
 def _put(
-    state: State, grip: Grip, support: int, offset: tuple[float, float, float], clearance: float = 0.1
+    state: State, grip: Grip, support: str, offset: tuple[float, float, float], clearance: float = 0.1
 ) -> Action:
     """Return the action that puts a thing on another one.
 
     Args:
-        state: The state (83,).
+        state: The state (213,).
         grip: Grasp of the thing.
-        support: Number of the other thing.
+        support: Name of the other thing.
         offset: Goal of the thing, from the other one's own axes.
         clearance: Height in metres above the goal from which the thing comes down.
     """
@@ -294,8 +294,6 @@ def _open_and_put(state: State) -> Action:
     return _carry(sight, BESIDE_DRAWER, goal, 0.1)
 
 
-SPATIAL_PLATE = 5
-"""Number of the plate in libero_spatial, where the bowl to carry is thing 0, too."""
 OUT_OF = ("in_the_top_drawer_of_the_wooden_cabinet", "on_the_wooden_cabinet")
 """Places from which the bowl is first lifted 25 cm above the plate."""
 PLACES = (
@@ -310,17 +308,20 @@ PLACES = (
     *OUT_OF,
 )
 """Places of the bowl in libero_spatial."""
-GOODS = {  # the number of the basket, and the grip: 2.5 cm below the top, or at half the height
-    "alphabet_soup": (1, Grip(0, (0.0, -0.003, 0.013), 0.063)),
-    "cream_cheese": (1, Grip(3, (0.0, 0.0, 0.0), 0.042)),
-    "salad_dressing": (1, Grip(5, (0.0, 0.0, 0.048), 0.036)),
-    "bbq_sauce": (1, Grip(2, (0.0, 0.0, 0.027), 0.037)),
-    "ketchup": (1, Grip(4, (0.0, 0.0, 0.048), 0.034)),
-    "tomato_sauce": (0, Grip(6, (0.0, -0.003, 0.013), 0.063)),
-    "butter": (0, Grip(2, (0.0, 0.0, 0.0), 0.04)),
-    "milk": (0, Grip(4, (0.0, 0.0, 0.036), 0.053)),
-    "chocolate_pudding": (1, Grip(3, (0.0, 0.0, 0.0), 0.046)),
-    "orange_juice": (0, Grip(5, (0.0, 0.0, 0.036), 0.053)),
+GOODS = {  # the grip: 2.5 cm below the top, or at half the height
+    name: Grip(f"{name}_1", offset, width)
+    for name, offset, width in (
+        ("alphabet_soup", (0.0, -0.003, 0.013), 0.063),
+        ("cream_cheese", (0.0, 0.0, 0.0), 0.042),
+        ("salad_dressing", (0.0, 0.0, 0.048), 0.036),
+        ("bbq_sauce", (0.0, 0.0, 0.027), 0.037),
+        ("ketchup", (0.0, 0.0, 0.048), 0.034),
+        ("tomato_sauce", (0.0, -0.003, 0.013), 0.063),
+        ("butter", (0.0, 0.0, 0.0), 0.04),
+        ("milk", (0.0, 0.0, 0.036), 0.053),
+        ("chocolate_pudding", (0.0, 0.0, 0.0), 0.046),
+        ("orange_juice", (0.0, 0.0, 0.036), 0.053),
+    )
 }
 """The things of libero_object, which lie and stand along the axes of the world."""
 
@@ -350,7 +351,7 @@ _EXPERTS: dict[str, Callable[[State], Action]] = {
     **{
         f"pick_up_the_black_bowl_{place}_and_place_it_on_the_plate": functools.partial(
             _put_bowl,
-            support=SPATIAL_PLATE,
+            support=PLATE,
             offset=(0.0, 0.0, 0.0),
             clearance=0.3 if place in OUT_OF else 0.1,
         )
@@ -358,15 +359,15 @@ _EXPERTS: dict[str, Callable[[State], Action]] = {
     },
     **{
         f"pick_up_the_{name}_and_place_it_in_the_basket": functools.partial(
-            _put, grip=grip, support=basket, offset=(0.0, 0.0, 0.12), clearance=0.17
+            _put, grip=grip, support=BASKET, offset=(0.0, 0.0, 0.12), clearance=0.17
         )
-        for name, (basket, grip) in GOODS.items()
+        for name, grip in GOODS.items()
     },
 }
 
 
 def expert(task: str) -> Callable[[State], Action]:
-    """Return the expert of the task, which maps a state (83,) to an action (7,).
+    """Return the expert of the task, which maps a state (213,) to an action (7,).
 
     Raises:
         UnknownNameError: No expert has this name; the error names the nearest one.

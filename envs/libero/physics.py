@@ -53,9 +53,10 @@ class LiberoVectorWorld:
         self._team = Team(threads)
 
     def reset(self, lanes: Sequence[int], seeds: Sequence[int], tasks: Sequence[str]) -> State:
-        """Start an episode in each of `lanes` and return the states (N, 83), which the seeds alone determine.
+        """Start an episode in each of `lanes` and return the states (N, 213).
 
-        Seeds below 50 are numbers of LIBERO's initial states; for all others LIBERO draws a state.
+        The seeds alone determine them. Seeds below 50 are numbers of LIBERO's initial states; for all others
+        LIBERO draws a state.
 
         Raises:
             UnknownNameError: LIBERO has no task of this name; the error names the nearest one.
@@ -78,7 +79,7 @@ class LiberoVectorWorld:
         """Move each of `lanes` for one step of 0.05 s by its row of actions (N, 7).
 
         Returns:
-            The states (N, 83), the rewards (N,), and which episodes succeeded (N,).
+            The states (N, 213), the rewards (N,), and which episodes succeeded (N,).
 
         Raises:
             InputError: An action has another shape than (7,), or contains a number that is not finite.

@@ -17,6 +17,7 @@ from clbench.base.entry_points import unknown
 from .original import TASKS, RandomizationError, environment, initial_states
 from .rules import Predicate, goal_of
 from .scene import Places, Scene, Vector, heavier, scene_of
+from .state import THINGS
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,6 +31,8 @@ class Problem:
     """LIBERO's initial states, (50, 1 + nq + nv): time, positions and velocities of the joints."""
     things: NDArray[np.int64]
     """Bodies of the objects and fixtures in the order of their names."""
+    slots: NDArray[np.int64]
+    """Numbers of these among all `THINGS`."""
     parts: NDArray[np.int64]
     """Addresses of the positions of drawers and knobs."""
     fixtures: dict[str, int]
@@ -101,6 +104,7 @@ def problem_of(task: str) -> Problem:
         goal_of(env, model),
         initial_states(task),
         np.array([bodies[name] for name in sorted(bodies)]),
+        np.array([THINGS.index(name) for name in sorted(bodies)]),
         model.jnt_qposadr[of_fixtures].astype(np.int64),
         fixtures,
         env,

@@ -18,8 +18,9 @@ TABLE = 0.9
 
 Numbers = NDArray[np.float32]
 
-BOWL, CHEESE, _, PLATE, BOTTLE, _, _ = (
-    slice(thing(number).start, thing(number).start + 3) for number in range(7)
+BOWL, CHEESE, PLATE, BOTTLE = (
+    slice(thing(name).start, thing(name).start + 3)
+    for name in ("akita_black_bowl_1", "cream_cheese_1", "plate_1", "wine_bottle_1")
 )
 
 

@@ -1,12 +1,12 @@
-"""Layout of the state of the LIBERO world: 83 numbers, lengths in metres.
+"""Layout of the state of the LIBERO world: 213 numbers, lengths in metres.
 
-x grows away from the robot, y to its left, z up. Quaternions begin with their scalar. Every scene has seven
-objects and fixtures, in the order of their names. All tasks of libero_goal have the same, and so do those of
-libero_spatial; each task of libero_object has others. Joints of fixtures are 0 where a scene has none.
+x grows away from the robot, y to its left, z up. Quaternions begin with their scalar. The numbers of each of
+`THINGS` have the same place in the states of all scenes. A scene has seven things; the numbers of the others
+are 0, and so are joints of fixtures that it lacks.
 
-Positions of things are from the hand, and once more at a finer scale. A policy kept .81 of LiberoGoal-v0's
-skills with places in the room, .88 with positions from the hand, and .95 with the finer scale as well (90
-to 150 validation episodes): it had missed the neck of the bottle by 1.3 cm or more.
+Positions of things are from the hand, and once more at a finer scale. A policy kept .81 of the skills of
+libero_goal with places in the room, .88 with positions from the hand, and .95 with the finer scale as well
+(90 to 150 validation episodes): it had missed the neck of the bottle by 1.3 cm or more.
 """
 
 from __future__ import annotations
@@ -17,20 +17,44 @@ import numpy as np
 from numpy.typing import NDArray
 
 State: TypeAlias = NDArray[np.float32]
-"""One state (83,), or many (N, 83)."""
+"""One state (213,), or many (N, 213)."""
 
-THINGS, PARTS = 7, 4
-"""Number of objects and fixtures, and largest number of joints of fixtures: three drawers and a knob."""
+THINGS = (
+    "akita_black_bowl_1",
+    "akita_black_bowl_2",
+    "alphabet_soup_1",
+    "basket_1",
+    "bbq_sauce_1",
+    "butter_1",
+    "chocolate_pudding_1",
+    "cookies_1",
+    "cream_cheese_1",
+    "flat_stove_1",
+    "glazed_rim_porcelain_ramekin_1",
+    "ketchup_1",
+    "milk_1",
+    "orange_juice_1",
+    "plate_1",
+    "salad_dressing_1",
+    "tomato_sauce_1",
+    "wine_bottle_1",
+    "wine_rack_1",
+    "wooden_cabinet_1",
+)
+"""Objects and fixtures of all scenes, by LIBERO's names. The bowl to carry is the first one."""
 
-SIZE = 9 + 7 * THINGS + PARTS + 3 * THINGS
+PARTS = 4
+"""Largest number of joints of fixtures: three drawers and a knob."""
+
+SIZE = 9 + 10 * len(THINGS) + PARTS
 HAND = slice(0, 3)
 """Position of the point between the finger tips."""
 HAND_QUATERNION = slice(3, 7)
 FINGERS = slice(7, 9)
 """Positions of the fingers: (0.04, -0.04) open, (0, 0) closed."""
-PLACES = slice(9, 9 + 7 * THINGS)
+PLACES = slice(9, 9 + 7 * len(THINGS))
 """Position from the hand, and quaternion, of each object and fixture: seven numbers each."""
-JOINTS = slice(9 + 7 * THINGS, 9 + 7 * THINGS + PARTS)
+JOINTS = slice(PLACES.stop, PLACES.stop + PARTS)
 """Positions of the joints of fixtures: drawers, then the knob of the stove."""
 CLOSE_BY = slice(JOINTS.stop, SIZE)
 """Positions from the hand once more, cut at `REACH` along each axis: three numbers for each thing."""
@@ -38,6 +62,7 @@ REACH = 0.05
 """Metres. A policy scales each number by its spread, which is smaller for numbers that are cut."""
 
 
-def thing(number: int) -> slice:
-    """Return where thing `number`, from 0 on, has its position (3,) from the hand and its quaternion (4,)."""
-    return slice(9 + 7 * number, 16 + 7 * number)
+def thing(name: str) -> slice:
+    """Return where the thing of this name has its position (3,) from the hand and its quaternion (4,)."""
+    first = PLACES.start + 7 * THINGS.index(name)
+    return slice(first, first + 7)

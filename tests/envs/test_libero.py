@@ -2,6 +2,7 @@
 
 import ast
 import hashlib
+import importlib
 import os
 import subprocess
 import sys
@@ -137,6 +138,26 @@ def test_a_drawn_bowl_lies_in_the_drawer_wherever_the_cabinet_stands() -> None:
     for seed in range(100, 110):
         episode.begin(problem, seed)
         assert np.linalg.norm((bowl.xpos - region.xpos)[:2]) < 0.05
+
+
+@pytest.mark.parametrize("task", [OPEN, PLATE, MILK])
+def test_a_thing_has_its_place_in_the_states_of_all_scenes_and_is_zero_where_it_is_missing(task: str) -> None:
+    layout = importlib.import_module("clbench.envs.libero.state")
+    episode = Episode(problem_of(task))
+    state, data = episode.begin(problem_of(task), 0), episode.data
+    bodies = {data.model.body(number).name for number in range(data.model.nbody)}
+    present = {name for name in layout.THINGS if f"{name}_main" in bodies}
+    assert len(present) == 7
+    for number, name in enumerate(layout.THINGS):
+        near = state[layout.CLOSE_BY][3 * number : 3 * number + 3]
+        if name not in present:
+            assert not state[layout.thing(name)].any()
+            assert not near.any()
+            continue
+        way = data.body(f"{name}_main").xpos - state[layout.HAND]
+        np.testing.assert_allclose(state[layout.thing(name)][:3], way, atol=1e-6)
+        np.testing.assert_allclose(near, way.clip(-0.05, 0.05), atol=1e-6)
+        assert np.linalg.norm(state[layout.thing(name)][3:]) == pytest.approx(1.0, abs=1e-5)
 
 
 @pytest.mark.parametrize("task", [OPEN, MILK])

@@ -14,18 +14,18 @@ from clbench.spec.registry import registered_scenario
 
 SCENARIO = registered_scenario("clbench:clbench/LiberoGoal-v0")
 QUESTIONS = {kind.name: kind for kind in resolve(SCENARIO.questions)}
-THINGS = ("bowl", "cheese", "stove", "plate", "bottle", "rack", "cabinet")
+PLACES = {"bowl": 9, "cheese": 65, "stove": 72, "plate": 107, "bottle": 128, "rack": 135, "cabinet": 142}
+"""Where the places of the things of libero_goal begin in a state."""
 
 State = NDArray[np.float32]
 Place = tuple[float, float, float]
 
 
 def scene(opening: float = 0.045, hand: Place = (0.0, 0.0, 1.1), **things: Place) -> State:
-    """Return a state (1, 83) made by hand; other things are where the hand is, 0.16 m below it."""
-    state = np.zeros((1, 83), np.float32)
+    """Return a state (1, 213) made by hand; other things are where the hand is, 0.16 m below it."""
+    state = np.zeros((1, 213), np.float32)
     state[0, 0:3], state[0, 7:9] = hand, (opening / 2, -opening / 2)
-    for number, name in enumerate(THINGS):
-        first = 9 + 7 * number
+    for name, first in PLACES.items():
         place = things.get(name, np.subtract(hand, (0.0, 0.0, 0.16)))
         state[0, first : first + 3] = np.subtract(place, hand)
     return state
