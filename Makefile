@@ -49,9 +49,6 @@ records: .venv/installed-dev
 	$(BIN)/clbench run $(FIXED) experience_replay --seeds 3
 	$(BIN)/clbench run clbench/PointMaze-v0 sft --seeds 3 --order 1
 	$(BIN)/clbench run clbench/PointMaze-v0 sft --seeds 3 --order 2
-	for id in clbench/DMControl-v0 clbench/PointMaze-v0; do \
-		$(BIN)/python docs/guide/online_sac.py $$id --seeds 1 || exit; \
-	done
 	$(BIN)/clbench leaderboard
 
 # The frontier: what a smaller learning rate does, for plain fine-tuning and for the methods that compete with it. The

@@ -1,15 +1,19 @@
 """Stable-Baselines3's SAC learns a scenario by trial and error, stage by stage, and leaves a record.
 
-    python docs/guide/online_sac.py clbench/PointMaze-v0 --seeds 1
+    python docs/guide/online_sac.py clbench/PointMaze-v1 --seeds 3
+    python docs/guide/online_sac.py clbench/PointMaze-v1 --seeds 3 --replay
 
-This is the simplest baseline: SAC with its default settings continues to train from task to task. Its replay
-buffer is emptied at each stage, so that only its weights remember. Word ids are names, not amounts, and go
-through an embedding. A seed that has a record is skipped; a seed that was stopped starts again.
+SAC continues to train from task to task. It acts in eight environments at once, and takes two gradient steps
+for each step of the eight; its other settings are the defaults. Its replay buffer is emptied at each stage,
+so that only its weights remember; with --replay it keeps the transitions of all stages. Word ids are names,
+not amounts, and go through an embedding. A seed that has a record is skipped; a seed that was stopped starts
+again.
 """
 
 from __future__ import annotations
 
 import argparse
+import functools
 from pathlib import Path
 
 import gymnasium
@@ -17,10 +21,14 @@ import torch
 from gymnasium import spaces
 from stable_baselines3 import SAC
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from stable_baselines3.common.vec_env import DummyVecEnv
 
 import clbench
 from clbench.records.paths import RECORDS
 from clbench.scoring.scores import Scores
+
+ENVIRONMENTS, GRADIENT_STEPS = 8, 2
+"""Environments that step together, and gradient steps for each of these steps."""
 
 
 class StateAndWords(BaseFeaturesExtractor):
@@ -40,41 +48,56 @@ class StateAndWords(BaseFeaturesExtractor):
         return torch.cat([observations["state"], words], dim=1)
 
 
-def learn(scenario: str, seed: int, steps: int, records: Path) -> None:
+def learn(scenario: str, seed: int, steps: int, replay: bool, records: Path) -> None:
     """Train one agent through all stages, and evaluate it after each."""
-    targets = len(clbench.load_scenario(scenario).target)
-    if clbench.next_stage(scenario, method="sac", seed=seed, records=records) > targets:
-        print(f"seed {seed} has a record already")
+    method = "sac_replay" if replay else "sac"
+    stages = len(clbench.load_scenario(scenario).target) + 1
+    if clbench.next_stage(scenario, method=method, seed=seed, records=records) == stages:
+        print(f"{method} seed {seed} has a record already")
         return
-    settings = {"steps_per_stage": steps, "replay_buffer": "emptied at each stage", "words": "embedded"}
+    settings = {
+        "steps_per_stage": steps,
+        "environments": ENVIRONMENTS,
+        "gradient_steps": GRADIENT_STEPS,
+        "replay_buffer": "kept" if replay else "emptied at each stage",
+        "words": "embedded",
+    }
     agent: SAC | None = None
-    for stage in range(targets + 1):
-        env = gymnasium.make(scenario, instruction="tokens", stage=stage)
+    for stage in range(stages):
+        make = functools.partial(gymnasium.make, scenario, instruction="tokens", stage=stage)
+        envs = DummyVecEnv([make] * ENVIRONMENTS)
         if agent is None:
-            features = {"features_extractor_class": StateAndWords}
             agent = SAC(
                 "MultiInputPolicy",
-                env,
+                envs,
                 seed=100 * seed,
-                policy_kwargs=features,
-                buffer_size=steps,
+                policy_kwargs={"features_extractor_class": StateAndWords},
+                buffer_size=steps * stages if replay else steps,
+                gradient_steps=GRADIENT_STEPS,
                 device="cpu",
             )
-        agent.set_env(env)
+        agent.set_env(envs)
         agent.set_random_seed(100 * seed + stage)
         assert agent.replay_buffer is not None
-        agent.replay_buffer.reset()
+        if not replay:
+            agent.replay_buffer.reset()
         agent.learn(steps)
         record = clbench.evaluate_agent(
-            agent, env, method="sac", seed=seed, settings=settings, records=records
+            agent,
+            envs.envs[0],
+            method=method,
+            seed=seed,
+            steps=agent.num_timesteps,
+            settings=settings,
+            records=records,
         )
-        env.close()
+        envs.close()
         scores = Scores.from_record(record, partial=True)  # later stages are still to come
         success = scores.success[stage].mean(axis=-1)
         rates = ", ".join(
             f"{task} {rate:.2f}" for task, rate in zip(scores.layout.tasks, success, strict=True)
         )
-        print(f"seed {seed}, stage {stage}: {rates}", flush=True)
+        print(f"{method} seed {seed}, stage {stage}: {rates}", flush=True)
 
 
 def main() -> None:
@@ -85,12 +108,13 @@ def main() -> None:
     parser.add_argument("scenario", help="Gymnasium id of the scenario, for example clbench/Fetch-v1")
     parser.add_argument("--seeds", type=int, default=4, help="number of seeds")
     parser.add_argument("--first-seed", type=int, default=0, help="first seed")
-    parser.add_argument("--steps", type=int, default=6000, help="environment steps per stage")
+    parser.add_argument("--steps", type=int, default=20_000, help="environment steps per stage")
+    parser.add_argument("--replay", action="store_true", help="keep the transitions of earlier stages")
     parser.add_argument("--records", type=Path, default=RECORDS, help="folder of the records")
     wanted = parser.parse_args()
     torch.set_num_threads(1)  # small networks: more threads gain nothing, and may add up in another order
     for seed in range(wanted.first_seed, wanted.first_seed + wanted.seeds):
-        learn(wanted.scenario, seed, wanted.steps, wanted.records)
+        learn(wanted.scenario, seed, wanted.steps, wanted.replay, wanted.records)
 
 
 if __name__ == "__main__":

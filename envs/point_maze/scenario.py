@@ -46,12 +46,17 @@ def _task(colour: str, room: str) -> Task:
     )
 
 
-_SKILLS = (_task("green", "upper_left"), _task("green", "lower_right"), _task("red", "left"))
-_BACKGROUND = (_task("blue", "upper"), _task("blue", "lower_left"), _task("red", "lower"))
+_SKILLS = (_task("green", "upper_left"), _task("green", "lower_right"))
+_BACKGROUND = (
+    _task("red", "left"),
+    _task("blue", "upper"),
+    _task("blue", "lower_left"),
+    _task("red", "lower"),
+)
 
 SCENARIO = Scenario(
     id="clbench/PointMaze-v1",
-    description="A ball learns the way to four rooms in two mazes, and keeps three rooms it could find.",
+    description="A ball learns the way to four rooms in two mazes, and keeps two rooms it could find.",
     retained=_SKILLS,
     target=(
         _task("red", "upper_right"),
@@ -62,16 +67,16 @@ SCENARIO = Scenario(
     held_out=(_task("green", "upper_right"), _task("green", "lower_left")),
     questions="clbench.envs.point_maze.questions:QUESTIONS",
     background=_BACKGROUND,
-    scenes=_SKILLS + _BACKGROUND,  # the skills alone show no blue maze
+    scenes=_SKILLS + _BACKGROUND,  # the skills alone show the green maze
     balanced=True,
     budget=Budget(criterion=0.9, adaptation_steps=1000, validation_episodes=20),
 )
-"""Three rooms to keep, four targets of graded conflict, and two held-out rooms named in other mazes.
+"""Two rooms to keep, four targets, and two held-out rooms named in other mazes.
 
-Within a maze only words tell tasks apart: the targets of a maze compete with each other and with its skill.
-Two of the three skills are in the green maze, which has no target. With two skills in each maze of a target,
-plain fine-tuning kept none of them at any learning rate. Tried with a factor of 0.1 on seed 100, whose final
-average is 0.46 with sft, 0.43 with frozen and 0.94 with experience_replay.
+Within a maze only words tell tasks apart: its targets compete with each other. Both skills are in the green
+maze, which has no target. With two skills in each maze of a target, plain fine-tuning kept none of them at
+any learning rate. With the left room of the red maze as a third skill, its final average on four seeds was
+0.37 [0.23, 0.54], and 0.43 without any training; without that skill the same runs would have 0.41 and 0.33.
 """
 
 

@@ -17,7 +17,7 @@ def test_lists_fit_the_terminal_and_cut_no_name(
     width: int, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("COLUMNS", str(width))
-    scenarios = [load_scenario(f"clbench/{name}") for name in ("Fetch-v1", "MetaWorldCW-v0", "PointMaze-v0")]
+    scenarios = [load_scenario(f"clbench/{name}") for name in ("Fetch-v1", "MetaWorldCW-v0", "PointMaze-v1")]
     tasks = {task.name for one in scenarios for task in one.tasks}
     for command, names in (
         ("list", {*(one.id for one in scenarios), *built_in_methods(), *tasks}),

@@ -65,12 +65,12 @@ def test_the_program_of_the_page_makes_a_record_for_each_seed_and_skips_existing
     assert (python, script, scenario, seeds) == (
         "python",
         "docs/guide/online_sac.py",
-        "clbench/PointMaze-v0",
-        ["--seeds", "1"],
+        "clbench/PointMaze-v1",
+        ["--seeds", "3"],
     )
-    command = [sys.executable, str(DOCS.parents[1] / script), ID, "--seeds", "1", "--steps", "110"]
-    for expected in ("seed 0, stage 2: left ", "seed 0 has a record already"):
+    command = [sys.executable, str(DOCS.parents[1] / script), ID, "--seeds", "1", "--steps", "112"]
+    for expected in ("sac seed 0, stage 2: left ", "sac seed 0 has a record already"):
         output = _output(command, tmp_path)
         assert expected in output
     record = read_record(tmp_path / "leaderboard/records/Toy-v0/sac/seed-0.json")
-    assert record.costs.environment_steps == 330
+    assert record.costs.environment_steps == 336

@@ -207,7 +207,7 @@ env.close()
 """
 
 
-@pytest.mark.parametrize("scenario", ["clbench/PointMaze-v0"])
+@pytest.mark.parametrize("scenario", ["clbench/PointMaze-v1"])
 def test_without_a_display_or_a_variable_environments_draw_and_are_recorded(
     scenario: str, tmp_path: Path
 ) -> None:
