@@ -68,7 +68,7 @@ def _clbench(*arguments: str, folder: Path | None = None) -> subprocess.Complete
         (["run", "clbench/Fetch-v1", "sft", "--device", "mps"], "from the 'MPS' backend.\n"),
         (["tune", "clbench/Fetch-v1", "sft", "--device", "gpu"], "The device 'gpu' cannot be used"),
         (["submit", "sft", "--device", "gpu"], "The device 'gpu' cannot be used"),
-        (["run", "clbench/Fetch-v1,clbench/PointMase-v0", "sft"], "Did you mean 'clbench/PointMaze-v1'?"),
+        (["run", "clbench/Fetch-v1,clbench/PointMase-v1", "sft"], "Did you mean 'clbench/PointMaze-v1'?"),
         (["run", "clbench/Fetch-v1", "sft", "--shard", "0/8"], "--shard must be i/n with i from 1 to n"),
         (["run", "clbench/Fetch-v1", "sft", "--shard", "9/8"], "--shard must be i/n with i from 1 to n"),
         (["run", "clbench/Fetch-v1", "sft", "--shard", "half"], "for example 2/8, not 'half'"),
