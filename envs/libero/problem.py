@@ -98,13 +98,14 @@ def problem_of(task: str) -> Problem:
     fixtures = {name: int(model.body(one.root_body).id) for name, one in env.fixtures_dict.items()}
     objects = {name: int(model.body(one.root_body).id) for name, one in env.objects_dict.items()}
     bodies = {**fixtures, **objects}
+    names = sorted(bodies)
     of_fixtures = np.isin(model.body_rootid[model.jnt_bodyid], list(fixtures.values()))
     return Problem(
         scene,
         goal_of(env, model),
         initial_states(task),
-        np.array([bodies[name] for name in sorted(bodies)]),
-        np.array([THINGS.index(name) for name in sorted(bodies)]),
+        np.array([bodies[name] for name in names]),
+        np.array([THINGS.index(name) for name in names]),
         model.jnt_qposadr[of_fixtures].astype(np.int64),
         fixtures,
         env,

@@ -67,7 +67,7 @@ SCENARIO = Scenario(
     held_out=(_task("green", "upper_right"), _task("green", "lower_left")),
     questions="clbench.envs.point_maze.questions:QUESTIONS",
     background=_BACKGROUND,
-    scenes=_SKILLS + _BACKGROUND,  # the skills alone show the green maze
+    scenes=_SKILLS + _BACKGROUND,  # the skills show only the green maze
     balanced=True,
     budget=Budget(criterion=0.9, adaptation_steps=1000, validation_episodes=20),
 )
