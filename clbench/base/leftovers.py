@@ -73,9 +73,8 @@ def sweep(*roots: Path) -> int:
     for path in [path for root in roots for path in _found(root)]:
         lease = _LEASE.fullmatch(path.name)
         if lease is not None:
-            _ = Lease(
-                path.with_name(lease["name"])
-            ).owner  # removes the lease of a dead process and its report
+            # to ask for the owner removes the lease of a dead process, and its report
+            _ = Lease(path.with_name(lease["name"])).owner
         elif is_left_behind(path):
             _remove(path)
         count += not path.exists()

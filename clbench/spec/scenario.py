@@ -122,7 +122,7 @@ class Scenario:
         return fitting_length((*instructions, *questions))
 
     def require_packages(self) -> None:
-        """Check that the packages of its tasks are installed, those of its `scenes` among them.
+        """Check that the packages of its tasks, background and scenes are installed.
 
         Raises:
             MissingPackageError: A package is not installed; the message says how to get it.
