@@ -1,8 +1,6 @@
-"""clbench/PointMaze-v1 and -v0: an instruction names a maze and the room where the ball must stop."""
+"""clbench/PointMaze-v1: an instruction names a maze and the room where the ball must stop."""
 
 from __future__ import annotations
-
-import dataclasses
 
 from clbench.spec.budget import Budget
 from clbench.spec.scenario import Scenario
@@ -38,7 +36,7 @@ def _task(colour: str, room: str) -> Task:
             f"find the {edge} room of the {colour} maze",
             f"in the {colour} maze go to the {compass} room",
         ),
-        horizon=60,
+        horizon=90,  # three times the expert's mean: with 60 a correct but slow way failed
         world="clbench.envs.point_maze.world:PointMazeWorld",
         expert="clbench.envs.point_maze.experts:expert",
         packages=("gymnasium-robotics",),
@@ -69,7 +67,7 @@ SCENARIO = Scenario(
     background=_BACKGROUND,
     scenes=_SKILLS + _BACKGROUND,  # the skills show only the green maze
     balanced=True,
-    budget=Budget(criterion=0.9, adaptation_steps=1000, validation_episodes=20),
+    budget=Budget(criterion=0.9, adaptation_steps=1500, validation_episodes=20),
 )
 """Two rooms to keep, four targets, and two held-out rooms named in other mazes.
 
@@ -78,38 +76,3 @@ maze, which has no target. With two skills in each maze of a target, plain fine-
 any learning rate. With the left room of the red maze as a third skill, its final average on four seeds was
 0.37 [0.23, 0.54], and 0.43 without any training; without that skill the same runs would have 0.41 and 0.33.
 """
-
-
-def _fixed(*tasks: Task) -> tuple[Task, ...]:
-    """Return tasks as version 0 has them: with four wordings, and none for the test alone."""
-    return tuple(
-        dataclasses.replace(task, instructions=task.instructions[:4], test_instructions=()) for task in tasks
-    )
-
-
-FIXED = Scenario(
-    id="clbench/PointMaze-v0",
-    description="A ball learns the way to four rooms in two mazes, after eight rooms in three mazes.",
-    retained=_fixed(
-        _task("red", "upper_left"),
-        _task("red", "lower_right"),
-        _task("red", "left"),
-        _task("blue", "upper_right"),
-        _task("blue", "lower_left"),
-        _task("blue", "upper"),
-        _task("green", "upper_left"),
-        _task("green", "lower_right"),
-    ),
-    target=_fixed(
-        _task("red", "upper_right"),
-        _task("blue", "lower_right"),
-        _task("red", "lower_left"),
-        _task("blue", "upper_left"),
-    ),
-    held_out=_fixed(
-        _task("green", "upper_right"),
-        _task("green", "lower_left"),
-    ),
-    questions="clbench.envs.point_maze.questions:QUESTIONS",
-)
-"""Eight rooms to keep, four to learn, and two held-out rooms whose names were learned in other mazes."""

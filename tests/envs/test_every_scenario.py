@@ -43,9 +43,6 @@ every_scenario = pytest.mark.parametrize(
 TASKS = {(task.world, task.name): task for name in BUILT_IN for task in registered_scenario(name).tasks}
 every_task = pytest.mark.parametrize("task", TASKS.values(), ids=[name for _, name in TASKS])
 
-# Gymnasium warns of a scenario that has a newer version, such as PointMaze-v0.
-pytestmark = pytest.mark.filterwarnings("ignore:.*is out of date")
-
 QUICK = ("clbench/Fetch-v1", "clbench/MetaWorld-v1")
 """Scenarios that a test in a process of its own tries by default."""
 

@@ -1,12 +1,16 @@
 """The rules of the claims: every verdict follows from records."""
 
+import math
 from collections.abc import Callable
 from typing import Any
 
 import pytest
 from claims_bench import Bench
+from clbench.leaderboard.claims.claim import not_told_apart
+from clbench.leaderboard.claims.evidence import Figure
 
 from clbench.records.record import Record
+from clbench.scoring.intervals import Estimate
 
 Given = dict[str, dict[str, Any]]
 
@@ -215,3 +219,19 @@ def test_a_verdict_follows_from_the_records_by_the_rule(
     for label, values in given.items():
         bench.add(label, **values)
     assert bench.judge(identifier).verdict == verdict
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "says"),
+    [
+        (0.01, 0.20, "finch does not reach it: it takes weights."),
+        (-0.10, 0.10, "finch is not told apart from it: a learning rate suffices."),
+        (-0.20, -0.01, "finch is even better than it: a learning rate suffices."),
+        (math.nan, math.nan, "The records cannot show what finch says about it."),
+    ],
+)
+def test_what_a_control_says_follows_from_the_interval_of_the_gain(
+    low: float, high: float, says: str
+) -> None:
+    gain = Figure("kept", ("consft", "finch"), Estimate((low + high) / 2, low, high))
+    assert not_told_apart(gain, explains="a learning rate suffices", does_not="it takes weights") == says
