@@ -67,7 +67,7 @@ def _print_next(kind: str, files: tuple[Path, Path], folder: Path, command: str)
     module, test = files
     lines = [f"Wrote {module} and {test}. Make the {kind} yours, then:"]
     lines += [f"  cd {folder}"] if folder != Path() else []
-    lines += [f"  python -m pytest {test.name}", f"  {command}"]
+    lines += [f"  python -m pytest {test.name}  # pip install pytest", f"  {command}"]
     Console().print("\n".join(lines), highlight=False, markup=False, soft_wrap=True)
 
 

@@ -53,9 +53,8 @@ def tune(
 
     Each method runs with four learning rates, then with two values of its own strength at the best of them,
     or with two more learning rates. All targets are learned, with seeds that no board has, and no test
-    episode is played. The setting with the best final average wins, among those that learn at least 0.8 of
-    the targets' success. Runs with a record are skipped: the same command continues a stopped one and shows
-    the choice again.
+    episode is played. Among the settings whose `learned` is at least 0.8, the one with the best final average
+    wins. Runs with a record are skipped: the same command continues a stopped one and shows the choice again.
 
     With --values the methods run with every combination of these values instead, besides plain fine-tuning,
     and nothing is chosen.

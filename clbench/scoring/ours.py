@@ -62,7 +62,7 @@ def kept_targets(rates: Rates) -> Array:
     missing="A success after the last target on a retained skill or an earlier target is missing.",
 )
 def kept(rates: Rates) -> Array:
-    """Success after the last target on everything that was known before it."""
+    """Success on the retained skills and the earlier targets after the last one."""
     return average(np.concatenate([rates.retained[..., -1, :], rates.target[..., -1, :-1]], axis=-1))
 
 

@@ -156,7 +156,7 @@ SCENARIO = Scenario(
     balanced=True,
     budget=Budget(demonstrations=100, criterion=0.9, adaptation_steps=1000, validation_episodes=20),
 )
-"""Six skills to keep, four targets with objects of their own, and two held-out variants.
+"""Six skills to keep, four targets with objects of these skills, and two held-out variants.
 
 Two more skills are pretrained and not scored. With all eight, a policy that never changes has a final average
 of .67, and tuned plain fine-tuning .66 and .71 on two seeds: there would be no room between them.
