@@ -154,8 +154,8 @@ def submit(
         seeds: Number of seeds.
         first_seed: The first seed.
         order: Order of the targets, for scenarios with one published order: 0 is that order, other numbers
-            are permutations. Rows are made of order 0. Scenarios whose seeds have orders of their own
-            (Fetch-v1, MetaWorld-v1) take 0 alone.
+            are permutations. Rows are made of order 0. Scenarios whose seeds have orders of their own, such
+            as Fetch-v1, take 0 alone.
         workers: Number of runs at once, each a process with one thread (default: all cores).
         records: Folder of the records.
         device: Device on which policies are computed, for example cpu or cuda.
@@ -303,6 +303,8 @@ def claims(
     from .pages.claims_page import page, terminal
 
     judged = _judged(records, controls, scenario)
+    if scenario and not any(one.evidence.runs for one in judged):
+        check_names([scenario], [])  # a scenario with records may be of a package that is not installed
     console = Console()
     console.print(terminal(judged))
     _write(output, page(judged))
@@ -352,6 +354,8 @@ def method_pages(
 
     judged = _judged(records, controls)
     evidence = read_evidence(scenario, records, controls)
+    if not evidence.runs:
+        check_names([scenario], [])
     sources = Sources(evidence, judged, _table(records).rows)
     texts = pages(built_in_methods(), sources)
     output.mkdir(parents=True, exist_ok=True)

@@ -39,7 +39,7 @@ NUMBERS = "board.json"
 
 _CODE = (
     *("clbench.base", "clbench.spec", "clbench.records", "clbench.runs", "clbench.scoring"),
-    *("clbench.learning", "clbench.leaderboard.board", "clbench.leaderboard.policies"),
+    *("clbench.learning", "clbench.metrics", "clbench.leaderboard.board", "clbench.leaderboard.policies"),
     "clbench.leaderboard.views",
 )
 """Code that the board and its pages depend on, besides the packages of the installed methods."""

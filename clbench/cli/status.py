@@ -13,7 +13,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from clbench.base.errors import InputError
-from clbench.base.text import printable
+from clbench.base.text import counted, printable
 from clbench.cli.arguments import (
     AsJson,
     MethodName,
@@ -128,7 +128,7 @@ def _line(state: RunState, records: Path) -> str | None:
 def _summary(states: Sequence[RunState]) -> str:
     counts = Counter(state.state for state in states)
     parts = [f"{counts[name]} {name}" for name in STATES if counts[name]]
-    text = f"{len(states)} runs: {', '.join(parts)}."
+    text = f"{counted(len(states), 'run')}: {', '.join(parts)}."
     left = seconds_left(states)
     return text if left is None else f"{text} About {_minutes(left)} left with {counts['running']} at once."
 

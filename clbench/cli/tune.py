@@ -29,7 +29,7 @@ from clbench.spec.references import BASELINE
 
 if TYPE_CHECKING:
     from clbench.runs.spec import ResolvedRun, RunSpec
-    from clbench.runs.tuning import Settings, Tried, Tuned
+    from clbench.runs.tuning import Settings, Tried
 
 FIRST_SEED = 100
 """First seed of tuning: no board has it or a later one."""
@@ -66,18 +66,21 @@ def tune(
         seeds: Number of tuning seeds.
         first_seed: The first of them; the boards report seeds from 0.
         values: Hyper-parameters and the values to try, as --values.tau_start 0.3,1,3
-        targets: Number of targets to learn, from the first, with --values (default: all).
+        targets: Number of targets to learn, from the first, with --values (default: all). Such runs have
+            their records in a folder of their own, for example targets-1 below --records.
         workers: Number of runs at once, each a process with one thread (default: all cores).
         device: Device on which policies are computed, for example cpu or cuda.
         records: Folder of the records.
         write: File that receives the chosen settings; those of other methods in it stay. For built-in methods
-            `clbench run` reads methods/tuned/.
+            `clbench run` reads methods/tuned/. Nothing is chosen with --values.
     """
     check_names([scenario], methods)
     from clbench.learning.registry import load_method, method_names
     from clbench.runs.spec import RunSpec, check_device
-    from clbench.runs.tuning import CONTROLS, Tuned, best_of, refinements, rungs, write_tuned
+    from clbench.runs.tuning import CONTROLS, Tuned, best_of, check_tuned, refinements, rungs, write_tuned
 
+    if targets is not None:  # a run of fewer targets must not replace the record of all
+        records = records / f"targets-{targets}"
     numbers = range(first_seed, first_seed + seeds)
     first = RunSpec(scenario, "", first_seed, device=device, split="validation", targets=targets)
 
@@ -89,15 +92,21 @@ def tune(
         names = list(dict.fromkeys([*methods, *(method_names() if every else ())]))
         if not names:
             raise InputError("Name at least one method, or --all; `clbench list` shows them.")
+        if targets is not None and not values:
+            raise InputError("--targets goes with --values: settings are chosen on all targets.")
+        if write is not None and values:
+            raise InputError("--write goes without --values: with them nothing is chosen.")
         if not values:  # their runs would choose settings that no run reads
             names = _without_controls(names, CONTROLS, every)
         check_device(device)
         check_folders({"--records": records, "--write": write and write.parent})
         classes = {name: load_method(name) for name in names}
+        if write is not None:
+            check_tuned(write, numbers, names)
     if values:
         combinations = _combinations(values)
         found = run({BASELINE: [{}], **dict.fromkeys(names, combinations)})
-        Console().print(_table(scenario, {name: Tuned({}, tuple(one)) for name, one in found.items()}, seeds))
+        Console().print(_table(scenario, {name: (None, one) for name, one in found.items()}, seeds))
         return
     begun = run({name: rungs(cls) for name, cls in classes.items()})
     refined = run({name: refinements(cls, best_of(begun[name]).settings) for name, cls in classes.items()})
@@ -105,7 +114,9 @@ def tune(
     for name in names:
         tried = (*begun[name], *refined[name])
         chosen[name] = Tuned(best_of(tried).settings, tried)
-    Console().print(_table(scenario, chosen, seeds))
+    Console().print(
+        _table(scenario, {name: (one.settings, one.tried) for name, one in chosen.items()}, seeds)
+    )
     if write is not None:
         write_tuned(write, scenario.rpartition(":")[2], numbers, chosen)
 
@@ -171,21 +182,27 @@ def _tried(runs: Sequence[ResolvedRun], records: Path) -> Tried:
     return Tried(dict(runs[0].changes), mean("final_average"), mean("adaptation"))
 
 
-def _table(scenario: str, chosen: Mapping[str, Tuned], seeds: int) -> Table:
-    """Return all settings with their scores, the chosen ones in bold."""
+def _table(scenario: str, found: Mapping[str, tuple[Settings | None, Sequence[Tried]]], seeds: int) -> Table:
+    """Return all settings with their scores, the chosen ones in bold.
+
+    Args:
+        scenario: Gymnasium id of the scenario.
+        found: For each method the settings that were chosen, None if none were, and all that were tried.
+        seeds: Number of tuning seeds.
+    """
     table = Table(title=f"{scenario}, {seeds} tuning seed{'' if seeds == 1 else 's'}, validation episodes")
     for title in ("method", "settings"):
         table.add_column(title, overflow="fold")
     for title in ("learned", "final average"):
         table.add_column(title, justify="right")
-    for name, one in chosen.items():
+    for name, (chosen, every) in found.items():
         table.add_section()
-        for tried in one.tried:
-            style = "bold" if tried.settings == one.settings else ""
+        for tried in every:
+            style = "bold" if tried.settings == chosen else ""
             values = f"{tried.learned:.2f}", f"{tried.final_average:.3f}"
             table.add_row(name, _words(tried.settings), *values, style=style)
     return table
 
 
 def _words(settings: Mapping[str, Any]) -> str:
-    return " ".join(f"{name}={value}" for name, value in settings.items()) or "defaults"
+    return " ".join(f"{name}={value}" for name, value in settings.items()) or "unchanged"

@@ -13,7 +13,7 @@ wins.
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import cache
 from importlib.util import find_spec
@@ -99,22 +99,32 @@ def tuned_file(scenario: str) -> Path:
     return Path(methods.origin).parent / "tuned" / f"{folder_name(scenario)}.json"
 
 
-def write_tuned(path: Path, scenario: str, seeds: Sequence[int], methods: Mapping[str, Tuned]) -> None:
-    """Write the settings of `methods` to `path`, and keep those of others that it has already.
+def check_tuned(path: Path, seeds: Sequence[int], methods: Iterable[str]) -> None:
+    """Refuse to write the settings of `methods`, tuned on `seeds`, to `path` beside others.
 
     Raises:
         InputError: The others were tuned on other seeds.
     """
+    if not path.is_file():
+        return
+    content = read_json(path)
+    if content["methods"].keys() - set(methods) and content["seeds"] != list(seeds):
+        raise InputError(
+            f"{path}: its other methods were tuned on seeds {content['seeds']}, not {list(seeds)}; "
+            "write to another file, or tune all methods again."
+        )
+
+
+def write_tuned(path: Path, scenario: str, seeds: Sequence[int], methods: Mapping[str, Tuned]) -> None:
+    """Write the settings of `methods` to `path`, and keep those of others that it has already.
+
+    Raises:
+        InputError: `check_tuned` refuses it.
+    """
+    check_tuned(path, seeds, methods)
     known = {name: asdict(one) for name, one in methods.items()}
     if path.is_file():
-        content = read_json(path)
-        others = content["methods"].keys() - known.keys()
-        if others and content["seeds"] != list(seeds):
-            raise InputError(
-                f"{path}: its other methods were tuned on seeds {content['seeds']}, not {list(seeds)}; "
-                "write to another file, or tune all methods again."
-            )
-        known = {**content["methods"], **known}
+        known = {**read_json(path)["methods"], **known}
     content = {"scenario": scenario, "seeds": list(seeds), "methods": dict(sorted(known.items()))}
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = unfinished(path)

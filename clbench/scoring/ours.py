@@ -92,9 +92,10 @@ def kept_targets_over_stages(rates: Rates) -> Array:
 
 
 @metric(
-    formula="mean over the stages l from 1 of the mean of R[l][s] over the retained skills and the targets "
-    "before l",
+    formula="mean over the stages l from 1 (from 2 without retained skills) of the mean of R[l][s] over the "
+    "retained skills and the targets before l",
     source="clbench",
+    version=1,
     missing="A success on something known before a stage is missing at its end.",
 )
 def kept_over_stages(rates: Rates) -> Array:
@@ -104,9 +105,10 @@ def kept_over_stages(rates: Rates) -> Array:
 
 
 @metric(
-    formula="mean over the stages l from 1 of the sum of R[l][s] divided by the sum of R[l-1][s], both over "
-    "the retained skills and the targets before l",
+    formula="mean over the stages l from 1 (from 2 without retained skills) of the sum of R[l][s] divided by "
+    "the sum of R[l-1][s], both over the retained skills and the targets before l",
     source="clbench",
+    version=1,
     high=math.inf,
     units="share of what was known",
     missing="A success on something known before a stage is missing, or nothing was known.",
@@ -120,15 +122,18 @@ def kept_share(rates: Rates) -> Array:
 def _known(rates: Rates) -> tuple[Array, Array, Array]:
     """Return the sums of success on what was known before each stage, at its end and before it.
 
+    Without retained skills nothing was known before the first stage: it does not count.
+
     Returns:
-        The sums at the end of each stage and before it, both (..., targets), and the number of tasks,
-        (targets,), at least 1.
+        The sums at the end of each stage and before it, both (..., stages), and the number of tasks known
+        before each stage, (stages,).
     """
-    count = len(rates.layout.target)
+    skills, count = len(rates.layout.retained), len(rates.layout.target)
     learned = np.tri(count, k=-1)
     after = rates.retained[..., 1:, :].sum(axis=-1) + _where(learned, rates.target[..., 1:, :])
     before = rates.retained[..., :-1, :].sum(axis=-1) + _where(learned, rates.target[..., :-1, :])
-    return after, before, np.maximum(len(rates.layout.retained) + np.arange(count), 1)
+    first = 0 if skills else 1
+    return after[..., first:], before[..., first:], skills + np.arange(first, count, dtype=float)
 
 
 def _where(chosen: Array, values: Array) -> Array:

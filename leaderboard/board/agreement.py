@@ -11,6 +11,9 @@ from clbench.scoring.layout import Array
 REPLICATES = 2000
 """Bootstrap draws of seeds."""
 
+SIGNIFICANCE = 0.05
+"""Largest probability of an agreement that is not put down to chance."""
+
 LEAST_SEEDS, LEAST_ROWS = 4, 3
 """Fewest seeds and rows: with one seed in a half there is nothing to draw, and two rows have two orders."""
 
@@ -29,6 +32,13 @@ class Agreement:
     """Number of seeds in both boards together."""
     rows: int
     """Number of rows."""
+    chance: float
+    """Probability of a tau at least as far from 0 if one board had the rows in a random order."""
+
+    @property
+    def is_certain(self) -> bool:
+        """Whether neither the draw of the seeds nor a random order of the rows explains the sign of tau."""
+        return self.chance < SIGNIFICANCE and (self.low > 0 or self.high < 0)
 
 
 def kendall_tau(one: Array, other: Array) -> Array:
@@ -41,6 +51,13 @@ def kendall_tau(one: Array, other: Array) -> Array:
     signs, others = (_signs(values[..., first] - values[..., second]) for values in (one, other))
     untied = np.sqrt(np.abs(signs).sum(axis=-1) * np.abs(others).sum(axis=-1))
     return np.asarray((signs * others).sum(axis=-1) / np.where(untied > 0, untied, np.nan))
+
+
+def chance_of(one: Array, other: Array) -> float:
+    """Return the two-sided probability of Kendall's test that values (rows,) and others are unrelated."""
+    from scipy.stats import kendalltau  # a second, which reading a board does not need
+
+    return float(kendalltau(one.round(9), other.round(9)).pvalue)
 
 
 def _signs(differences: Array) -> Array:
@@ -83,7 +100,8 @@ def agreement_between(
         None with too few rows, or if a board does not order the rows at all.
     """
     boards = (one, other)
-    tau = float(kendall_tau(*(board.mean(axis=1) for board in boards)))
+    means = [board.mean(axis=1) for board in boards]
+    tau = float(kendall_tau(*means))
     if len(one) < LEAST_ROWS or not np.isfinite(tau):
         return None
     generator = np.random.default_rng(0)
@@ -93,4 +111,4 @@ def agreement_between(
     drawn = [board[:, seeds].mean(axis=2).T for board, seeds in zip(boards, draws, strict=True)]
     low, high = np.nanpercentile(kendall_tau(*drawn), (2.5, 97.5))
     seeds = one.shape[1] if paired else sum(board.shape[1] for board in boards)
-    return Agreement(tau, float(low), float(high), seeds, len(one))
+    return Agreement(tau, float(low), float(high), seeds, len(one), chance_of(*means))

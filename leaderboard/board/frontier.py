@@ -65,13 +65,13 @@ def read_frontiers(folder: Path) -> tuple[dict[str, tuple[Curve, ...]], list[Not
 
     Their paths begin with the folder's name. A missing folder counts as empty.
     """
-    runs, refused = read_runs(folder, partial(read_run, changed=True), (*ALIKE, _on_the_ladder))
+    runs, refused = read_runs(folder, partial(read_run, changed=True), (*ALIKE, on_the_ladder))
     runs.sort(key=lambda run: run.place)
     found = {place: _curves(list(members)) for place, members in groupby(runs, lambda run: run.place)}
     return found, [dataclasses.replace(one, path=f"{folder.name}/{one.path}") for one in refused]
 
 
-def _on_the_ladder(runs: list[Run]) -> Sifted:
+def on_the_ladder(runs: list[Run]) -> Sifted:
     """Keep the runs that changed the learning rate."""
     changed = [is_number(run.record.run.changes.get(FACTOR)) for run in runs]
     kept = [run for run, is_kept in zip(runs, changed, strict=True) if is_kept]
@@ -83,7 +83,7 @@ def _curves(runs: Sequence[Run]) -> tuple[Curve, ...]:
     """Return the curves of the runs of one scenario."""
     by_label: dict[str, dict[str, list[Run]]] = {}
     for run in sorted(runs, key=lambda run: run.seed):
-        by_label.setdefault(run.record.run.method, {}).setdefault(_apart_from_the_factor(run), []).append(run)
+        by_label.setdefault(run.record.run.method, {}).setdefault(apart_from_the_factor(run), []).append(run)
     curves = [
         Curve(method if len(labels) == 1 else label, members[0].division, _rungs(members))
         for method, labels in by_label.items()
@@ -94,7 +94,8 @@ def _curves(runs: Sequence[Run]) -> tuple[Curve, ...]:
     )
 
 
-def _apart_from_the_factor(run: Run) -> str:
+def apart_from_the_factor(run: Run) -> str:
+    """Return the label of a run of the ladder without its factor: the method with its other changes."""
     changes = {name: value for name, value in run.record.run.changes.items() if name != FACTOR}
     return label_of(run.record.run.method, changes)
 

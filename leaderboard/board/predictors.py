@@ -12,7 +12,7 @@ from clbench.scoring.metrics import measure
 from clbench.scoring.scores import Scores
 from clbench.spec.references import BASELINE
 
-from .agreement import REPLICATES, kendall_tau
+from .agreement import REPLICATES, Agreement, chance_of, kendall_tau
 from .rows import Row
 from .summary import METHODS
 
@@ -48,21 +48,11 @@ LOST = _less("kept_share")
 
 
 @dataclass(frozen=True)
-class Prediction:
+class Prediction(Agreement):
     """Kendall's tau between a predictor and forgetting over the methods, with its 95 % interval."""
 
     predictor: str
     """Its name in a sentence: a key of `PREDICTORS`."""
-    tau: float
-    """Kendall's tau: 1 for equal orders, -1 for opposite ones."""
-    low: float
-    """Lower end of the interval."""
-    high: float
-    """Upper end of the interval."""
-    seeds: int
-    """Number of seeds."""
-    rows: int
-    """Number of methods."""
 
 
 def predictions(rows: Iterable[Row]) -> list[Prediction]:
@@ -98,10 +88,11 @@ def prediction_of(name: str, values: Array, replicates: int = REPLICATES) -> Pre
         None if one of the two does not order the rows at all.
     """
     rows, seeds, _ = values.shape
-    tau = float(kendall_tau(*np.moveaxis(values.mean(axis=1), -1, 0)))
+    means = np.moveaxis(values.mean(axis=1), -1, 0)
+    tau = float(kendall_tau(*means))
     if not np.isfinite(tau):
         return None
     draws = np.random.default_rng(0).integers(seeds, size=(replicates, seeds))
     drawn = values[:, draws].mean(axis=2)  # (rows, replicates, 2)
     low, high = np.nanpercentile(kendall_tau(drawn[..., 0].T, drawn[..., 1].T), (2.5, 97.5))
-    return Prediction(name, tau, float(low), float(high), seeds, rows)
+    return Prediction(tau, float(low), float(high), seeds, rows, chance_of(*means), name)

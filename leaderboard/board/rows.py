@@ -83,7 +83,7 @@ def read_table(records: Path, only: Container[str] | None = None) -> Table:
     runs, alone = _beside_rows(runs)
     by_place = groupby(sorted(runs, key=lambda run: run.place), key=lambda run: run.place)
     found = [_scenario_rows(list(members)) for _, members in by_place]
-    found.sort(key=lambda rows: not rows[0].to_criterion)  # they have tuned methods, and judge the claims
+    found.sort(key=lambda rows: not rows[0].to_criterion)  # stages to a criterion first
     by_name = {rows[0].scenario: rows for rows in found}
     frontiers, without = read_frontiers(ladder_of(records)) if only is None else ({}, [])
     return Table(

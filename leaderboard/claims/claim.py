@@ -30,7 +30,7 @@ PREDICATES: Mapping[Verdict, tuple[str, str]] = {
 """Verdicts as predicates: of one claim, and of several."""
 
 BOARDS = ("clbench/Fetch-v1", "clbench/MetaWorld-v1")
-"""Scenarios whose stages end at a criterion, so that methods are compared at equal learning."""
+"""Scenarios at equal learning, with a ladder and controls: most claims are judged on them."""
 
 ANYWHERE = BOARDS[:1]
 """Scenario of the claims that do not depend on one, such as the time of a step."""

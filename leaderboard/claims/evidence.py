@@ -15,10 +15,10 @@ from clbench.scoring.intervals import UNBOUNDED, Estimate, Span, bootstrap, inte
 from clbench.scoring.layout import Array
 from clbench.scoring.metrics import load_metric
 from clbench.scoring.rates import Rates
-from clbench.scoring.scores import Scores, rates_of
+from clbench.scoring.scores import Scores
 
 from ..board.costs import step_ratio
-from ..board.frontier import FACTOR, ladder_of
+from ..board.frontier import FACTOR, apart_from_the_factor, ladder_of, on_the_ladder
 from ..board.runs import (
     ALIKE,
     Run,
@@ -102,7 +102,6 @@ class Evidence:
         what: str,
         quantity: Quantity,
         *methods: str,
-        seeds: Sequence[int] | None = None,
         span: tuple[float, float] = (-math.inf, math.inf),
         **rest: Any,
     ) -> Figure:
@@ -112,13 +111,12 @@ class Evidence:
             what: Name of the figure; it seeds the interval.
             quantity: Function of the rates.
             methods: Labels of all methods that `quantity` reads, the subject first.
-            seeds: Seeds to use; all common seeds if None.
             span: Smallest and largest possible value.
             rest: Further fields of the figure.
         """
         methods = tuple(dict.fromkeys(methods))
         missing = tuple(label for label in methods if label not in self.runs)
-        common = self.common_seeds(methods) if seeds is None else tuple(seeds)
+        common = self.common_seeds(methods)
         found = NO_ESTIMATE
         if common and not missing:
             generator = row_generator(self.scenario, what)
@@ -138,10 +136,6 @@ class Evidence:
         """Return the seeds for which all methods have a run."""
         seeds = [set(self.runs.get(label, {})) for label in methods]
         return tuple(sorted(set.intersection(*seeds))) if seeds else ()
-
-    def rates(self, methods: Iterable[str], seeds: Iterable[int]) -> Of:
-        """Return the rates of the runs, batch axes (runs,)."""
-        return {label: rates_of(runs, {}) for label, runs in self._scores(methods, seeds).items()}
 
     def metric(self, name: str, method: str, **rest: Any) -> Figure:
         """Return a metric of one method."""
@@ -271,11 +265,11 @@ def read_evidence(scenario: str, records: Path, controls: Path) -> Evidence:
     like = _like(scored)
     changed, refused_controls = read_runs(controls, partial(read_run, changed=True), (like, *ALIKE))
     ladder = ladder_of(records)
-    rungs, refused_rungs = read_runs(ladder, partial(read_run, changed=True), (like, *ALIKE))
+    rungs, refused_rungs = read_runs(ladder, partial(read_run, changed=True), (like, *ALIKE, on_the_ladder))
     runs: dict[str, dict[int, Run]] = {}
     for label, run in (
         *((run.method, run) for run in (*scored, *changed)),
-        *((rung(run.record.run.method, run.record.run.changes.get(FACTOR)), run) for run in rungs),
+        *((rung(apart_from_the_factor(run), run.record.run.changes[FACTOR]), run) for run in rungs),
     ):
         if run.place == scenario and run.scores.layout.target and not run.order:
             runs.setdefault(label, {})[run.seed] = run
@@ -291,9 +285,9 @@ def read_evidence(scenario: str, records: Path, controls: Path) -> Evidence:
     )
 
 
-def rung(method: str, factor: Any) -> str:
+def rung(method: str, factor: float) -> str:
     """Return the label of a run of the ladder: the method and its factor, as "sft@0.3"."""
-    return f"{method}@{factor:g}" if is_number(factor) else f"{method}@{factor}"
+    return f"{method}@{factor:g}"
 
 
 def _like(scored: Sequence[Run]) -> Sift:

@@ -147,7 +147,9 @@ def _gain_sentences(name: str, rows: Sequence[Row]) -> Iterator[str]:
             f"{counted(len(gains), 'method')} is {format_interval(gains[best], '.3f')}, by `{best}`. "
             f"{_power(gains.values())}"
         )
-    alone = f"by its own interval alone, without correction for {counted(len(gains), 'comparison')}"
+    alone = "by its own interval alone"
+    if len(gains) > 1:
+        alone += f", without correction for {len(gains)} comparisons"
     higher = {method: gain for method, gain in gains.items() if (gain.low or 0) > 0 and method not in better}
     if higher:
         yield f"Higher {alone}: {_listed(higher)}."
@@ -189,9 +191,19 @@ def _replay(boards: dict[str, list[Row]]) -> Section:
             answers.append(
                 f"On {name}, `{row.method}` gains {format_interval(row.estimates['gain'])}, keeps "
                 f"{kept / 1e6:.1f} MB between stages, and takes {format_interval(_steps(row), '.0f')} steps "
-                f"to learn a target (plain fine-tuning: {usual})."
+                f"to learn a target (plain fine-tuning: {usual}){_never_learned(row)}."
             )
     return Section("What do prior demonstrations buy?", tuple(answers))
+
+
+def _never_learned(row: Row) -> str:
+    """Return the end of a sentence on steps, if some stages ended without the criterion."""
+    met = row.estimates["criterion_met"].value
+    if met is None or met == 1:
+        return ""
+    return (
+        f"; {1 - met:.0%} of its stages ended without the criterion, and count with all steps of the budget"
+    )
 
 
 def _steps(row: Row) -> Estimate:
@@ -310,11 +322,12 @@ def _predictors(boards: dict[str, list[Row]]) -> Section:
     for name, rows in boards.items():
         for one in predictions(rows):
             words = "agrees with their forgetting on the order of the methods more than chance would explain"
-            if one.high < 0:
-                words = "orders the methods against their forgetting"
-            elif one.low <= 0:
+            if not one.is_certain:
                 words = "shows no certain agreement with forgetting on the order of the methods"
-            answers.append(f"On {name}, {one.predictor} {words} (Kendall's tau {tau_text(one)}).")
+            elif one.tau < 0:
+                words = "orders the methods against their forgetting"
+            over = counted(one.rows, "method")
+            answers.append(f"On {name}, {one.predictor} {words} (Kendall's tau {tau_text(one)}, {over}).")
     if answers:
         answers.insert(0, "Forgetting is here 1 minus the kept share.")
     return Section("What predicts how much a method forgets?", tuple(answers))

@@ -92,8 +92,8 @@ def _between(
 def _order(found: Agreement, methods: str = "the methods") -> str:
     """Return the predicate of a sentence on two boards."""
     words = f"agree on the order of {methods} more than chance would explain"
-    if found.high < 0:
+    if not found.is_certain:
+        words = f"show no certain agreement on the order of {methods}"
+    elif found.tau < 0:
         words = f"put {methods} in opposite orders"
-    elif found.low <= 0:
-        words = f"may agree on the order of {methods} by chance"
     return f"{words} (Kendall's tau {tau_text(found)})"

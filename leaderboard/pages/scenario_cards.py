@@ -122,7 +122,8 @@ class Card:
     def page(self) -> str:
         """Return the card as Markdown."""
         present = [self.rows[name] for name in COMPARED if name in self.rows]
-        missing = [name for name in COMPARED if name not in self.rows]
+        needed = COMPARED if self.scenario.budget.criterion is None else (*COMPARED, "experience_replay")
+        missing = [name for name in needed if name not in self.rows]
         competing = [row for row in self.rows.values() if row.division in METHODS]
         meanings, values = field_docstrings(Budget), dataclasses.asdict(self.scenario.budget)
         references = [

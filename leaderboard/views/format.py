@@ -18,7 +18,7 @@ from clbench.scoring.scores import WEAK, WEAK_WARNING
 
 from ..board.agreement import Agreement
 from ..board.overall import OverallRow
-from ..board.predictors import Prediction, predictions
+from ..board.predictors import predictions
 from ..board.rows import Row, standing_of
 from ..board.summary import DIVISIONS, RowSummary
 
@@ -137,7 +137,7 @@ def agreement_text(found: Agreement | None) -> str:
     """Return a sentence on how alike two halves of the seeds order the methods; empty if it is not known."""
     if found is None:
         return ""
-    how = "order" if found.low > 0 else "do not surely order"
+    how = "order" if found.is_certain and found.tau > 0 else "do not surely order"
     return (
         f"The two halves of the {found.seeds} seeds {how} the {found.rows} methods alike: "
         f"Kendall's tau {tau_text(found)}."
@@ -150,17 +150,14 @@ def prediction_text(rows: Iterable[Row]) -> str:
     if not found:
         return ""
     parts = [
-        f"{one.predictor} {tau_text(one)}"
-        + (", the other way round" if one.high < 0 else "" if one.low > 0 else ", which may be chance")
+        f"{one.predictor} {tau_text(one)} over {one.rows} methods"
+        + (", which may be chance" if not one.is_certain else ", the other way round" if one.tau < 0 else "")
         for one in found
     ]
-    return (
-        f"Rank correlation with the share that a stage forgets, {found[0].rows} methods (Kendall's tau): "
-        f"{'; '.join(parts)}."
-    )
+    return f"Rank correlation with the share that a stage forgets (Kendall's tau): {'; '.join(parts)}."
 
 
-def tau_text(found: Agreement | Prediction) -> str:
+def tau_text(found: Agreement) -> str:
     """Return Kendall's tau with its interval."""
     return format_interval(Estimate(found.tau, found.low, found.high))
 

@@ -86,6 +86,11 @@ def _clbench(*arguments: str, folder: Path | None = None) -> subprocess.Complete
             'Invalid value "20" for --size. Must be >= 96.',
         ),
         (["tune", "clbench/Fetch-v1", "sft", "--values.x", "1", "--targets", "0"], "Must be >= 1."),
+        (["tune", "clbench/Fetch-v1", "sft", "--targets", "1"], "--targets goes with --values"),
+        (
+            ["tune", "clbench/Fetch-v1", "sft", "--values.step_factor", "1", "--write", "chosen.json"],
+            "--write goes without --values",
+        ),
         (
             ["tune", "clbench/Fetch-v1", "sft", "shuffled_weights"],
             "has its settings: tune consft_calibrated.",
@@ -425,11 +430,15 @@ def test_tune_compares_settings_without_test_episodes(tmp_path: Path) -> None:
     assert result.returncode == 0, result.stderr
     rows = [line.split() for line in result.stdout.splitlines() if "l2_sp" in line or " sft" in line]
     settings = [row[1:4:2] for row in rows]
-    assert settings == [["sft", "defaults"], ["l2_sp", "strength=0.0"], ["l2_sp", "strength=1.0"]]
+    assert settings == [["sft", "unchanged"], ["l2_sp", "strength=0.0"], ["l2_sp", "strength=1.0"]]
     assert rows[0][4:] == rows[1][4:]  # at strength 0 it is plain fine-tuning
     paths = list((tmp_path / "leaderboard" / "tuning").rglob("seed-3.json"))
     assert len(paths) == 3
     assert not any('"test"' in path.read_text().partition('"answers"')[0] for path in paths)
+    assert "3 of 3 runs have a record already" in _clbench(*arguments, folder=tmp_path).stderr
+    assert _clbench(*arguments, "--targets", "1", folder=tmp_path).returncode == 0
+    shorter = list((tmp_path / "leaderboard" / "tuning" / "targets-1").rglob("seed-3.json"))
+    assert len(shorter) == 3  # the records of all targets stay
     assert "3 of 3 runs have a record already" in _clbench(*arguments, folder=tmp_path).stderr
 
 

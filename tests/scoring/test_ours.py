@@ -142,7 +142,9 @@ def test_an_earlier_target_counts_as_kept_from_the_stage_after_its_own(scores: C
     # three targets and no skill: rows are stages, and success before learning counts nowhere
     run = scores([[0.9] * 3, [0.5, 0.9, 0.9], [0.4, 0.8, 0.9], [0.2, 0.6, 0.7]], groups=(0, 3, 0))
     assert measure("kept_targets_over_stages", run) == pytest.approx((0.4 + (0.2 + 0.6) / 2) / 2)
-    assert measure("kept_share", run) is None  # nothing was known before the first stage
+    # nothing was known before the first stage, which therefore does not count
+    assert measure("kept_over_stages", run) == pytest.approx((0.4 + (0.2 + 0.6) / 2) / 2)
+    assert measure("kept_share", run) == pytest.approx((0.4 / 0.5 + (0.2 + 0.6) / (0.4 + 0.8)) / 2)
 
 
 def test_forward_transfer_has_the_value_worked_out_by_hand(scores: Callable[..., Scores]) -> None:

@@ -13,8 +13,9 @@ from clbench.records.paths import label_of, record_path
 from clbench.records.reader import read_record
 from clbench.records.record import Record
 from clbench.records.writer import write_record
+from clbench.testing import TOY
 
-SCENARIO = "clbench/Toy-v0"
+SCENARIO = TOY.id
 IDS = [*(f"C{number}" for number in range(1, 9)), *(f"A{number}" for number in range(1, 8))]
 IDS += [f"F{number}" for number in range(1, 7)]
 
@@ -114,9 +115,12 @@ class Bench:
 
     def judge(self, identifier: str) -> Any:
         """Return the finding on one claim."""
+        return resolve("clbench.leaderboard.claims.judges:CLAIMS")[identifier].judge(self.evidence())
+
+    def evidence(self) -> Any:
+        """Return the evidence."""
         read = resolve("clbench.leaderboard.claims.evidence:read_evidence")
-        evidence = read(SCENARIO, self.folder / "records", self.folder / "controls")
-        return resolve("clbench.leaderboard.claims.judges:CLAIMS")[identifier].judge(evidence)
+        return read(SCENARIO, self.folder / "records", self.folder / "controls")
 
     def page(self) -> str:
         """Return the page."""

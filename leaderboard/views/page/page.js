@@ -164,7 +164,7 @@
       for (const body of bodies) {
         body.rows[0].hidden = rows.every((one) => one.body !== body || one.row.hidden);
       }
-      form.elements.count.value = `${methods.size} of ${rows.length} methods`;
+      form.elements.count.value = `${methods.size} of ${rows.length} ${rows.length === 1 ? "method" : "methods"}`;
       return methods;
     }
 
@@ -197,7 +197,7 @@
       const rows = [...part.querySelector("tbody").rows];
       const wanted = form.elements.text.value.trim().toLowerCase();
       for (const row of rows) row.hidden = !row.textContent.toLowerCase().includes(wanted);
-      form.elements.count.value = `${rows.filter((row) => !row.hidden).length} of ${rows.length} files`;
+      form.elements.count.value = `${rows.filter((row) => !row.hidden).length} of ${rows.length} ${rows.length === 1 ? "file" : "files"}`;
     });
     form.addEventListener("submit", (event) => event.preventDefault());
   }

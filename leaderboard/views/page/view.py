@@ -172,12 +172,12 @@ def title_of_place(place: str) -> str:
 
 
 def sorted_tables(table: Table) -> dict[str, list[Row]]:
-    """Return the rows by the name of their table: the main scenario first, then those of most methods."""
+    """Return the rows by the name of their table: the main scenario first, then stages to a criterion."""
     found = tables_of(table.rows)
 
-    def place(name: str) -> tuple[bool, int, str]:
+    def place(name: str) -> tuple[bool, bool, int, str]:
         competing = sum(row.division in METHODS for row in found[name])
-        return parts_of(name)[0] != SCENARIO, -competing, name
+        return parts_of(name)[0] != SCENARIO, not found[name][0].to_criterion, -competing, name
 
     return {name: found[name] for name in sorted(found, key=place)}
 

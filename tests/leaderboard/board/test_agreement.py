@@ -6,6 +6,7 @@ from scipy.stats import kendalltau
 
 from clbench.base.entry_points import resolve
 
+agreement_between = resolve("clbench.leaderboard.board.agreement:agreement_between")
 agreement_of = resolve("clbench.leaderboard.board.agreement:agreement_of")
 kendall_tau = resolve("clbench.leaderboard.board.agreement:kendall_tau")
 
@@ -26,8 +27,30 @@ def test_rows_far_apart_agree_and_rows_of_noise_do_not() -> None:
     clear = np.arange(8)[:, None] / 8 + generator.normal(0, 0.01, (8, 8))
     found = agreement_of(clear)
     assert (found.tau, found.low, found.high, found.seeds, found.rows) == (1.0, 1.0, 1.0, 8, 8)
+    assert found.is_certain
     noise = agreement_of(generator.normal(0, 1, (8, 8)))
     assert noise.low < 0 < noise.high
+    assert not noise.is_certain
+
+
+def test_the_chance_is_that_of_a_random_order_of_the_rows() -> None:
+    # of the 24 orders of four rows two are as far from chance as equal ones, of five rows 2 of 120
+    four, five = (np.arange(rows)[:, None] + np.zeros((rows, 4)) for rows in (4, 5))
+    assert agreement_between(four, four).chance == pytest.approx(2 / 24)
+    assert agreement_between(five, five).chance == pytest.approx(2 / 120)
+    assert not agreement_between(four, four).is_certain
+    assert agreement_between(five, 5 - five).is_certain
+
+
+def test_boards_whose_orders_have_nothing_in_common_rarely_agree() -> None:
+    generator = np.random.default_rng(1)
+
+    def board() -> np.ndarray:
+        return generator.normal(0, 1, (8, 1)) + generator.normal(0, 0.1, (8, 4))
+
+    found = [agreement_between(board(), board(), 200) for _ in range(200)]
+    assert sum(one.low > 0 or one.high < 0 for one in found) > 100  # the seeds alone say little of it
+    assert sum(one.is_certain for one in found) <= 16
 
 
 @pytest.mark.parametrize("shape", [(2, 8), (8, 3)])

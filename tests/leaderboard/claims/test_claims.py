@@ -152,6 +152,28 @@ def test_records_among_the_controls_that_changed_nothing_are_left_out(bench: Ben
     assert "no setting was changed" in page
 
 
+def test_a_rung_with_another_change_is_not_taken_for_the_published_method(bench: Bench) -> None:
+    bench.add("consft@1", kept=0.2)
+    bench.add("consft+kappa=9@1", kept=0.9)  # kind: the ladder
+    evidence = bench.evidence()
+    assert evidence.metric("retention", "consft@1").value == pytest.approx(0.2)
+    assert evidence.metric("retention", "consft+kappa=9@1").value == pytest.approx(0.9)
+
+
+def test_an_unknown_scenario_is_refused_and_the_page_stays(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    page = tmp_path / "claims.md"
+    page.write_text("what was there")
+    for command in ("claims", "method-pages"):
+        with pytest.raises(SystemExit):
+            resolve("clbench.cli.main:app")(
+                [command, "--scenario", "clbench/Fetsch-v1", "--output", str(page)]
+            )
+        assert "Did you mean 'clbench/Fetch-v1'?" in capsys.readouterr().err
+    assert page.read_text() == "what was there"
+
+
 def test_words_of_strangers_stay_on_their_line_and_are_no_markup(bench: Bench) -> None:
     hostile = "x | [bold]y[/bold]\n## z <b> ``` \x1b[31m https://x.example"
 

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from claims_bench import Bench, section, verdicts
+from claims_bench import SCENARIO, Bench, section, verdicts
 
 from clbench.base.entry_points import resolve
 
@@ -32,7 +32,7 @@ def decoder(
 
 def results(speed_up: float, difference: float = 0.0, forward: float = 1.1) -> dict[str, Any]:
     return {
-        "scenario": "clbench/Fetch-v1",
+        "scenario": SCENARIO,
         "seeds": 3,
         "episodes": 600,
         "hardware": {"processor": "a processor"},
@@ -108,3 +108,8 @@ def test_without_results_the_claim_is_undecided_and_names_the_command(page: Any)
     made = page(None)
     assert verdicts(made)["F6"] == "undecided"
     assert "python benchmarks/decoding.py" in section(made, "F6")
+
+
+def test_results_of_another_scenario_decide_nothing(page: Any) -> None:
+    made = page({**results(2.8), "scenario": "clbench/Fetch-v1"})
+    assert verdicts(made)["F6"] == "undecided"

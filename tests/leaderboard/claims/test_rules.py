@@ -6,11 +6,13 @@ from typing import Any
 
 import pytest
 from claims_bench import Bench
-from clbench.leaderboard.claims.claim import not_told_apart
-from clbench.leaderboard.claims.evidence import Figure
 
+from clbench.base.entry_points import resolve
 from clbench.records.record import Record
 from clbench.scoring.intervals import Estimate
+
+Figure = resolve("clbench.leaderboard.claims.evidence:Figure")
+not_told_apart = resolve("clbench.leaderboard.claims.claim:not_told_apart")
 
 Given = dict[str, dict[str, Any]]
 

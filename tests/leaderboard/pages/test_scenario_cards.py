@@ -178,6 +178,16 @@ def test_missing_records_are_named_with_the_command_that_makes_them(bench: Bench
     assert bars(card)["best final average minus that of joint"] == ["at most 0.07", "-", "-"]
 
 
+def test_stages_to_a_criterion_are_compared_with_replay_as_well() -> None:
+    strict = dataclasses.replace(TOY, budget=dataclasses.replace(TOY.budget, criterion=0.9))
+    table = resolve("clbench.leaderboard.board.rows:Table")()
+    experts = resolve("clbench.leaderboard.pages.scenario_tasks:Experts")(10, dict.fromkeys(NAMES, 9))
+    card = resolve("clbench.leaderboard.pages.scenario_cards:Card")(
+        strict, table, experts, frozenset()
+    ).page()
+    assert "`clbench run clbench/Toy-v0 sft joint frozen from_scratch experience_replay` makes them." in card
+
+
 def test_without_any_record_the_card_says_so_and_invents_nothing(bench: Bench) -> None:
     card = bench.card()
     command = f"clbench run clbench/Toy-v0 sft joint frozen from_scratch --records {bench.records}"

@@ -10,7 +10,7 @@ from clbench.scoring.intervals import Estimate
 
 from ....board.summary import METHODS, RowSummary
 from ...format import format_interval, number_text, scaled
-from .vega import Spec
+from .vega import Spec, finite, rounded
 
 ROOM = 0.02
 """Share of an axis before the first and behind the last mark."""
@@ -94,6 +94,11 @@ class Axis:
             return one.value, one.value
         low, high = self._domain
         return max(one.low, low), min(one.high, high)
+
+    def number(self, value: float | None) -> float | None:
+        """Return a value for the chart. A cost has four digits: the axis is logarithmic, and 0 not on it."""
+        known = finite(value)
+        return float(f"{known:.4g}") if self.quantity.is_cost and known is not None else rounded(known)
 
     def share(self, value: float) -> float:
         """Return where a value is, from 0 at the worse end of the axis to 1 at the better one."""

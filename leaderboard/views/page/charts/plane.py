@@ -12,7 +12,7 @@ from typing import Any
 from ....board.summary import DIVISIONS, RowSummary
 from .axes import LEARNED, SKILLS, Axis, Quantity
 from .labels import LONGEST, Mark, place
-from .vega import FONT, SHAPES, SYSTEM_FONT, Size, Spec, colour, layer, rounded, specification
+from .vega import FONT, SHAPES, SYSTEM_FONT, Size, Spec, colour, layer, specification
 
 FULL = Size(1050, 430, 6)
 """Size where the window has room for it."""
@@ -170,9 +170,9 @@ class Plane:
         for side, name, axis in (("x", "across", self.across), ("y", "up", self.up)):
             one = axis.quantity.of(row)
             low, high = axis.clipped(one)
-            point[side] = rounded(one.value)
-            point[f"{side}_low"] = rounded(low)
-            point[f"{side}_high"] = rounded(high)
+            point[side] = axis.number(one.value)
+            point[f"{side}_low"] = axis.number(low)
+            point[f"{side}_high"] = axis.number(high)
             point[name] = f"{axis.quantity.name} {axis.quantity.text(one)}"
         return point
 

@@ -36,6 +36,12 @@ def test_less_data_is_further_right(rows: Any) -> None:
     assert axis.scale["reverse"]
 
 
+def test_a_cost_that_rounds_to_zero_has_its_place(rows: Any) -> None:
+    cheap = dataclasses.replace(rows[0], costs={**rows[0].costs, "relative_cost": 0.0004})
+    (point,) = Plane([cheap], cost, kept).points
+    assert point["x"] == 0.0004
+
+
 def test_more_success_is_further_right(rows: Any) -> None:
     axis = Plane(rows, learned, kept).across
     assert axis.share(0.5) < axis.share(0.9)
