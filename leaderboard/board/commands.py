@@ -1,15 +1,19 @@
-"""The commands that make missing records, as pages and the terminal name them."""
+"""The commands that make records, as pages and the terminal name them."""
 
 from __future__ import annotations
 
 import shlex
+from collections.abc import Iterable
+from itertools import groupby
 from pathlib import Path
 
-from clbench.records.paths import RECORDS
+from clbench.base.text import printable
+from clbench.records.paths import RECORDS, parts_of
+from clbench.spec.policies import DEFAULT_POLICY
 
 from .frontier import FACTOR
 from .places import CONTROLS, LADDER
-from .rows import Row
+from .runs import Run
 
 
 def run_command(scenario: str, *labels: str, records: Path = RECORDS) -> str:
@@ -31,10 +35,36 @@ def run_command(scenario: str, *labels: str, records: Path = RECORDS) -> str:
     return " ".join(["clbench run", scenario, *methods, *settings, *option])
 
 
-def row_command(row: Row) -> str:
-    """Return the command that makes the records of a row with the usual policy."""
-    first, last = row.seeds[0], row.seeds[-1]
-    words = [run_command(row.scenario, row.method), f"--seeds {last - first + 1}"]
-    words += [f"--first-seed {first}"] if first else []
-    words += ["--perturb"] if any(run.record.run.perturb for run in row.runs) else []
-    return " ".join(words)
+def commands_of(runs: Iterable[Run]) -> list[str]:
+    """Return the commands that make the records of runs of one row again, quoted for the shell.
+
+    A stranger may have written the records.
+    """
+    lines = []
+    for (device, perturb), members in groupby(runs, key=_how):
+        same = list(members)
+        scenario, policy = parts_of(same[0].place)
+        for first, count in _in_a_row([run.seed for run in same]):
+            words = ["clbench", "run", scenario, same[0].method, "--seeds", str(count)]
+            words += [] if policy == DEFAULT_POLICY else ["--policy", policy]
+            words += ["--first-seed", str(first)] if first else []
+            words += [] if device == "cpu" else ["--device", printable(device)]
+            words += ["--perturb"] if perturb else []
+            lines.append(shlex.join(words))
+    return lines
+
+
+def _how(run: Run) -> tuple[str, bool]:
+    """Return the device of a run, and whether it has perturbed episodes."""
+    return run.record.run.device, run.record.run.perturb
+
+
+def _in_a_row(seeds: Iterable[int]) -> list[tuple[int, int]]:
+    """Return rising seeds as ranges: first seed and number of consecutive seeds."""
+    found: list[tuple[int, int]] = []
+    for seed in seeds:
+        if found and sum(found[-1]) == seed:
+            found[-1] = (found[-1][0], found[-1][1] + 1)
+        else:
+            found.append((seed, 1))
+    return found

@@ -14,7 +14,7 @@ from clbench.runs.tuning import CONTROLS, tuned, tuned_scenarios
 from clbench.scoring.intervals import Estimate
 from clbench.spec.identifiers import folder_name
 
-from ..board.commands import row_command, run_command
+from ..board.commands import commands_of, run_command
 from ..board.rows import Row
 from ..board.runs import is_number
 from ..board.summary import DIVISIONS
@@ -209,7 +209,8 @@ def _commands(method: str, sources: Sources) -> list[str]:
     """Return the commands that make the rows of the method, and those that tuned it."""
     scenarios = dict.fromkeys((sources.evidence.scenario, *tuned_scenarios()))
     rows = [row for row in sources.board if row.method == method and row.scenario in scenarios]
-    lines = [row_command(row) for row in rows] or [run_command(sources.evidence.scenario, method)]
+    lines = [line for row in rows for line in commands_of(row.runs)]
+    lines = lines or [run_command(sources.evidence.scenario, method)]
     tuned_as = CONTROLS.get(method, method)
     boards = [one for one in tuned_scenarios() if method in tuned(one)]
     return lines + [

@@ -7,8 +7,7 @@ from __future__ import annotations
 
 import json
 import re
-import shlex
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 from typing import Any, NamedTuple
@@ -16,9 +15,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from clbench.base.text import printable
-from clbench.records.paths import parts_of
-from clbench.spec.policies import DEFAULT_POLICY
 
+from ...board.commands import commands_of
 from ...board.rows import Row
 from ...board.runs import Run, is_number
 from ...board.summary import ELSEWHERE
@@ -111,38 +109,14 @@ def commands(row: Row) -> list[str]:
         if row.division in ELSEWHERE:
             lines.append(f"# {printable(row.method)} is a separate program: docs/guide/{row.division}.md")
             continue
-        for (device, perturb), members in groupby(runs, key=_how):
-            for first, count in _in_a_row([run.seed for run in members]):
-                scenario, policy = parts_of(row.scenario)
-                words = ["clbench", "run", scenario, row.method, "--seeds", str(count)]
-                words += [] if policy == DEFAULT_POLICY else ["--policy", policy]
-                words += ["--first-seed", str(first)] if first else []
-                words += [] if device == "cpu" else ["--device", printable(device)]
-                words += ["--perturb"] if perturb else []
-                lines.append(shlex.join(words))
+        lines += commands_of(runs)
     return lines
-
-
-def _how(run: Run) -> tuple[str, bool]:
-    """Return the device of a run, and whether it has perturbed episodes."""
-    return run.record.run.device, run.record.run.perturb
 
 
 def _commit(run: Run) -> str:
     commit = run.record.fingerprint.get("commit")
     name = commit.get("id") if isinstance(commit, dict) else None
     return name if isinstance(name, str) and _COMMIT.fullmatch(name) else ""
-
-
-def _in_a_row(seeds: Iterable[int]) -> list[tuple[int, int]]:
-    """Return rising seeds as ranges: first seed and number of consecutive seeds."""
-    found: list[tuple[int, int]] = []
-    for seed in seeds:
-        if found and sum(found[-1]) == seed:
-            found[-1] = (found[-1][0], found[-1][1] + 1)
-        else:
-            found.append((seed, 1))
-    return found
 
 
 # ---- diagnostics -------------------------------------------------------------------------------------------

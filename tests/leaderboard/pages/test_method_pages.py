@@ -18,8 +18,9 @@ from clbench.records.paths import record_path
 from clbench.records.record import Record
 from clbench.records.writer import write_record
 from clbench.runs.tuning import Tried, Tuned
+from clbench.testing import TOY
 
-SCENARIO = "clbench/Toy-v0"
+SCENARIO = TOY.id
 HEADINGS = [
     "Idea",
     "Paper",
