@@ -26,11 +26,14 @@ REFERENCES := frozen joint from_scratch
 CONSFT_CONTROLS := constant_weight shuffled_weights
 # Further methods that keep demonstrations or what they taught, on Fetch-v1 alone, where a run takes one to four minutes.
 RIVALS := a_gem buffered_replay ewc
+# Methods on PointMaze-v1, which has no ladder and no controls yet.
+MAZE := experience_replay sft
 
 # The settings of every method, from validation episodes of seeds that no board has. Run it before `make records`.
 tuning: .venv/installed-dev
 	for id in $(BOARDS); do $(BIN)/clbench tune $$id $(METHODS) --write methods/tuned/$${id#clbench/}.json || exit; done
 	$(BIN)/clbench tune clbench/Fetch-v1 $(RIVALS) --write methods/tuned/Fetch-v1.json
+	$(BIN)/clbench tune clbench/PointMaze-v1 $(MAZE) --write methods/tuned/PointMaze-v1.json
 
 # Scenarios whose stages have a fixed number of steps: plain fine-tuning, replay and the references.
 FIXED := clbench/DMControl-v0,clbench/FetchPixels-v0
@@ -41,6 +44,7 @@ records: .venv/installed-dev
 	$(BIN)/clbench run clbench/Fetch-v1 sft consft consft_calibrated --seeds 12 --perturb
 	$(BIN)/clbench run clbench/Fetch-v1 $(REFERENCES) $(METHODS) $(CONSFT_CONTROLS) $(RIVALS) --seeds 12
 	$(BIN)/clbench run clbench/MetaWorld-v1 $(REFERENCES) $(METHODS) $(CONSFT_CONTROLS) --seeds 8
+	$(BIN)/clbench run clbench/PointMaze-v1 $(REFERENCES) $(MAZE) --seeds 4
 	$(BIN)/clbench run $(KNOWLEDGE) frozen joint sft stop_gradient aegis lora --seeds 4
 	$(BIN)/clbench run clbench/Fetch-v1 frozen sft consft aegis experience_replay lora stop_gradient --seeds 3 \
 		--policy discrete_diffusion
