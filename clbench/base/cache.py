@@ -26,7 +26,8 @@ if TYPE_CHECKING:
 
 LOG = logging.getLogger("clbench")
 
-_MANIFEST = "clbench.json"
+MANIFEST = "clbench.json"
+"""File of an entry that lists its inputs, and its other files with their hashes."""
 
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO)
 """Errors of a disk on which nothing can be written."""
@@ -100,7 +101,7 @@ def _make(folder: Path, manifest: Mapping[str, Any], make: Callable[[Path], None
     try:
         make(partial)
         text = json.dumps({**manifest, "files": _file_hashes(partial)}, indent=1)
-        (partial / _MANIFEST).write_text(text, encoding="utf-8")
+        (partial / MANIFEST).write_text(text, encoding="utf-8")
         lease.check()
         if folder.exists():
             folder.rename(partial.with_suffix(".old"))
@@ -145,7 +146,7 @@ def fault_of(folder: Path, inputs: Mapping[str, Any]) -> str | None:
 def _fault(folder: Path, key: str) -> str | None:
     """Return the fault of `folder`, or None."""
     try:
-        manifest = json.loads((folder / _MANIFEST).read_text(encoding="utf-8"))
+        manifest = json.loads((folder / MANIFEST).read_text(encoding="utf-8"))
         if manifest["inputs"] != key:
             return "was made from other inputs"
         if manifest["files"] != _file_hashes(folder):
@@ -156,7 +157,7 @@ def _fault(folder: Path, key: str) -> str | None:
 
 
 def _file_hashes(folder: Path) -> dict[str, str]:
-    paths = sorted(path for path in folder.rglob("*") if path.is_file() and path.name != _MANIFEST)
+    paths = sorted(path for path in folder.rglob("*") if path.is_file() and path.name != MANIFEST)
     return {
         path.relative_to(folder).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest() for path in paths
     }

@@ -108,16 +108,22 @@ class Lease:
             with contextlib.suppress(OSError):  # a full disk must not end the work
                 _report_path(self._path).write_text(text, encoding="utf-8")
 
+    def clear(self) -> bool:
+        """Remove the lease of a dead process, and its report; return whether nobody holds the lease."""
+        if self._lock.owner is None:  # no lease, or a file that someone else put there
+            return True
+        if self.take():
+            self.release()
+            return True
+        return False
+
     @property
     def owner(self) -> Owner | None:
         """The process that holds the lease, None if none does. The lease of a dead process goes.
 
         A process of another machine counts for twice `SECONDS` after its last heartbeat.
         """
-        if self._lock.owner is None:  # no lease, or a file that someone else put there
-            return None
-        if self.take():
-            self.release()
+        if self.clear():
             return None
         found = self._lock.owner
         with contextlib.suppress(OSError):

@@ -73,8 +73,7 @@ def sweep(*roots: Path) -> int:
     for path in [path for root in roots for path in _found(root)]:
         lease = _LEASE.fullmatch(path.name)
         if lease is not None:
-            # to ask for the owner removes the lease of a dead process, and its report
-            _ = Lease(path.with_name(lease["name"])).owner
+            Lease(path.with_name(lease["name"])).clear()
         elif is_left_behind(path):
             _remove(path)
         count += not path.exists()

@@ -20,7 +20,7 @@ from rich.console import Console
 from rich.table import Table
 from safetensors import SafetensorError, safe_open
 
-from clbench.base.cache import cache_folder, hash_of
+from clbench.base.cache import MANIFEST, cache_folder, hash_of
 from clbench.base.errors import InputError
 from clbench.base.leftovers import finished_name, is_left_behind, is_unfinished, unfinished
 from clbench.cli.arguments import checked_input, whole_number
@@ -47,7 +47,6 @@ KINDS = {
 }
 """Kinds of entries and their contents. All kinds but the first are folders of the cache."""
 
-_MANIFEST = "clbench.json"
 _NAME = re.compile(r"(?:.*-)?[0-9a-f]{16}(?:\.\w+)?")
 """Names of entries: they end with a hash. Nothing else is shown or deleted."""
 _READ_HERE = ("ray", "experts")
@@ -148,7 +147,7 @@ class Entry:
         read = (
             stat.st_atime
             for path, stat in self._stats.items()
-            if path.name != _MANIFEST and not S_ISDIR(stat.st_mode)
+            if path.name != MANIFEST and not S_ISDIR(stat.st_mode)
         )
         return max((self.made, *read))
 
@@ -161,7 +160,7 @@ class Entry:
         if self.kind == "ray":
             ours = {path for path in files if _is_record(path)}
         else:
-            ours = set[Path]().union(*(_listed(path) for path in files if path.name == _MANIFEST))
+            ours = set[Path]().union(*(_listed(path) for path in files if path.name == MANIFEST))
         left = (path for path in files - ours if os.path.lexists(path))  # a run may just remove its own
         return sorted(path.relative_to(self.path).as_posix() for path in left)
 
@@ -173,7 +172,7 @@ class Entry:
     @cached_property
     def origin(self) -> tuple[str, str] | None:
         """Hashes of its inputs and of the code that made it; None if no manifest shows these."""
-        manifests = sorted(path for path in self._stats if path.name == _MANIFEST)
+        manifests = sorted(path for path in self._stats if path.name == MANIFEST)
         manifest = _read_manifest(manifests[0]) if manifests else None
         if manifest is None:
             return None
@@ -216,7 +215,7 @@ def entries() -> Iterator[Entry]:
         yield from _leftovers(kind, folder)
     datasets = minari_folder() / "clbench"  # the ids of its datasets begin with this name
     if _is_folder(datasets):
-        manifests = sorted(path for path in _walk(datasets) if path.name == _MANIFEST)
+        manifests = sorted(path for path in _walk(datasets) if path.name == MANIFEST)
         yield from (Entry(DEMONSTRATIONS, path.parent) for path in manifests if _is_dataset(path.parent))
         yield from _leftovers(DEMONSTRATIONS, datasets)
 
@@ -234,14 +233,14 @@ def _is_made_here(kind: str, path: Path) -> bool:
     if kind == "ray":  # records on their way; a worker that was killed leaves them
         return any(map(_is_record, _walk(path)))
     inside = (one for one in path.iterdir() if _is_folder(one))
-    return any(_read_manifest(one / _MANIFEST) is not None for one in (path, *inside))
+    return any(_read_manifest(one / MANIFEST) is not None for one in (path, *inside))
 
 
 def _is_dataset(folder: Path) -> bool:
     """Return whether a folder is a dataset that clbench collected, and nothing else is in it."""
     parts = {path.name for path in folder.iterdir()}
-    nested = any(path.name == _MANIFEST and path.parent != folder for path in _walk(folder))
-    return parts == {_MANIFEST, "data"} and not nested and _read_manifest(folder / _MANIFEST) is not None
+    nested = any(path.name == MANIFEST and path.parent != folder for path in _walk(folder))
+    return parts == {MANIFEST, "data"} and not nested and _read_manifest(folder / MANIFEST) is not None
 
 
 def _is_training(path: Path) -> bool:

@@ -41,7 +41,7 @@ _ours: ContextVar[BaseException | None] = ContextVar("ours", default=None)
 """Exception that leaves the runner's own code inside a hook."""
 
 NORMALISATION = ("state_mean", "state_std", "action_mean", "action_std")
-"""Buffers of a policy that the demonstrations of the retained skills alone determine."""
+"""Buffers of a policy that the demonstrations of pretraining alone determine."""
 
 
 class LeakError(ClbenchError, RuntimeError):
@@ -137,7 +137,7 @@ def check_policy(policy: Policy, pretrained: Policy) -> None:
 
     Args:
         policy: Policy after a hook.
-        pretrained: Policy after pretraining on the retained skills alone, on the same device.
+        pretrained: Policy after pretraining, on the same device.
 
     Raises:
         LeakError: The normalisation, the vocabulary or another size of the policy has changed.
@@ -146,6 +146,4 @@ def check_policy(policy: Policy, pretrained: Policy) -> None:
         raise LeakError("The method changes the vocabulary or a size of the policy: all stages share them.")
     for name in NORMALISATION:
         if not torch.equal(getattr(policy, name), getattr(pretrained, name)):
-            raise LeakError(
-                f"The method changes {name}: the normalisation comes from the retained skills alone."
-            )
+            raise LeakError(f"The method changes {name}: the normalisation is fixed in pretraining.")

@@ -13,7 +13,7 @@ from typing import Any
 
 import torch
 
-from clbench.base.cache import cache_folder, cached, hash_of, is_cached
+from clbench.base.cache import MANIFEST, cache_folder, cached, hash_of, is_cached
 from clbench.base.errors import WrongTypeError
 from clbench.base.lease import Lease
 from clbench.base.progress import ProgressCallback, announce, no_progress
@@ -91,7 +91,7 @@ def _checkpoints(run: ResolvedRun, records: Path) -> Path:
 
 def pretrained_hash(folder: Path) -> str:
     """Return the hash of the pretrained policy in `folder`, in the form of a record."""
-    manifest = json.loads((folder / "clbench.json").read_text(encoding="utf-8"))
+    manifest = json.loads((folder / MANIFEST).read_text(encoding="utf-8"))
     return str(manifest["files"]["policy.safetensors"][:16])
 
 

@@ -129,7 +129,7 @@ def _methods(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         ("RobustChooser", "runs perturbed episodes of right: nothing may be chosen on them"),
         ("EarlyChooser", "runs episodes of down, which its stage must not know yet"),
         ("Asker", "loads questions by itself, the test questions too"),
-        ("Normaliser", "changes state_mean: the normalisation comes from the retained skills alone"),
+        ("Normaliser", "changes state_mean: the normalisation is fixed in pretraining"),
         ("Talker", "changes the vocabulary or a size of the policy"),
     ],
 )
