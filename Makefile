@@ -27,7 +27,7 @@ CONSFT_CONTROLS := constant_weight shuffled_weights
 # Further methods that keep demonstrations or what they taught, on Fetch-v1 alone, where a run takes one to four minutes.
 RIVALS := a_gem buffered_replay ewc
 # Methods on PointMaze-v1, which has no ladder and no controls yet.
-MAZE := experience_replay sft
+MAZE := experience_replay l2_sp sft
 
 # The settings of every method, from validation episodes of seeds that no board has. Run it before `make records`.
 tuning: .venv/installed-dev

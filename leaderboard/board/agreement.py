@@ -14,8 +14,9 @@ REPLICATES = 2000
 SIGNIFICANCE = 0.05
 """Largest probability of an agreement that is not put down to chance."""
 
-LEAST_SEEDS, LEAST_ROWS = 4, 3
-"""Fewest seeds and rows: with one seed in a half there is nothing to draw, and two rows have two orders."""
+LEAST_SEEDS, LEAST_ROWS = 4, 5
+"""Fewest seeds and rows: with one seed in a half there is nothing to draw, and of the orders of four rows one
+in twelve is equal to a given one, or opposite."""
 
 
 @dataclass(frozen=True)

@@ -142,10 +142,12 @@ def _gain_sentences(name: str, rows: Sequence[Row]) -> Iterator[str]:
         yield f"On {name}, yes: {_listed(better)}."
     else:
         best = next(iter(gains))
+        which = f"the gain of `{best}`"
+        if len(gains) > 1:
+            which = f"the largest gain of {len(gains)} methods, that of `{best}`,"
         yield (
-            f"On {name}, none is told apart from it as better: the largest gain of "
-            f"{counted(len(gains), 'method')} is {format_interval(gains[best], '.3f')}, by `{best}`. "
-            f"{_power(gains.values())}"
+            f"On {name}, none is told apart from it as better: {which} is "
+            f"{format_interval(gains[best], '.3f')}. {_power(gains.values())}"
         )
     alone = "by its own interval alone"
     if len(gains) > 1:

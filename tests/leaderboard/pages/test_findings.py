@@ -45,7 +45,10 @@ def test_without_one_the_page_says_so_and_names_the_largest_gain(
 ) -> None:
     fill(even_board, sft=0.4, finch=0.4, lora=0.4)
     text = page()
-    assert "none is told apart from it as better: the largest gain of 2 methods is 0.000" in text
+    assert (
+        "none is told apart from it as better: the largest gain of 2 methods, that of `finch`, is 0.000"
+        in text
+    )
     assert "half the width of the median interval, would not show." in text
 
 
@@ -55,7 +58,9 @@ def test_a_difference_that_is_certain_only_without_counting_the_comparisons_is_s
     same = {f"method_{number}": 0.4 for number in range(7)}
     fill(even_board, sft=0.4, finch=0.5, lora=0.3, **same)
     text = page()
-    assert "none is told apart from it as better: the largest gain of 9 methods is 0.0" in text
+    assert (
+        "none is told apart from it as better: the largest gain of 9 methods, that of `finch`, is 0.0" in text
+    )
     alone = "by its own interval alone, without correction for 9 comparisons"
     assert f"Higher {alone}: `finch` by 0.0" in text
     assert f"Lower {alone}: `lora` by 0.0" in text
