@@ -421,37 +421,3 @@ def test_a_stranger_runs_a_class_from_the_working_directory_and_sees_it_on_the_b
     text = (tmp_path / "leaderboard" / "site" / "LEADERBOARD.md").read_text()
     assert "mine:Gentle" in text
     assert "no idea" in text  # why the failed run is not a row
-
-
-@pytest.mark.slow
-def test_tune_compares_settings_without_test_episodes(tmp_path: Path) -> None:
-    arguments = ("tune", TOY, "l2_sp", "--values.strength", "0,1", "--first-seed", "3", "--seeds", "1")
-    result = _clbench(*arguments, folder=tmp_path)
-    assert result.returncode == 0, result.stderr
-    rows = [line.split() for line in result.stdout.splitlines() if "l2_sp" in line or " sft" in line]
-    settings = [row[1:4:2] for row in rows]
-    assert settings == [["sft", "unchanged"], ["l2_sp", "strength=0.0"], ["l2_sp", "strength=1.0"]]
-    assert rows[0][4:] == rows[1][4:]  # at strength 0 it is plain fine-tuning
-    paths = list((tmp_path / "leaderboard" / "tuning").rglob("seed-3.json"))
-    assert len(paths) == 3
-    assert not any('"test"' in path.read_text().partition('"answers"')[0] for path in paths)
-    assert "3 of 3 runs have a record already" in _clbench(*arguments, folder=tmp_path).stderr
-    assert _clbench(*arguments, "--targets", "1", folder=tmp_path).returncode == 0
-    shorter = list((tmp_path / "leaderboard" / "tuning" / "targets-1").rglob("seed-3.json"))
-    assert len(shorter) == 3  # the records of all targets stay
-    assert "3 of 3 runs have a record already" in _clbench(*arguments, folder=tmp_path).stderr
-
-
-@pytest.mark.slow
-def test_tune_writes_the_best_of_six_settings(tmp_path: Path) -> None:
-    arguments = ("tune", TOY, "l2_sp", "--first-seed", "3", "--seeds", "1", "--write", "tuned/Toy-v0.json")
-    result = _clbench(*arguments, folder=tmp_path)
-    assert result.returncode == 0, result.stderr
-    file = json.loads((tmp_path / "tuned" / "Toy-v0.json").read_text())
-    assert (file["scenario"], file["seeds"]) == ("clbench/Toy-v0", [3])
-    found = file["methods"]["l2_sp"]
-    tried = [one["settings"] for one in found["tried"]]
-    assert [one["step_factor"] for one in tried[:4]] == [1.0, 0.3, 0.1, 0.03]
-    assert [one["strength"] for one in tried] == [0.3, 0.3, 0.3, 0.3, 0.1, 1.0]
-    assert found["settings"] in tried
-    assert "6 of 6 runs" not in result.stderr  # four, then two

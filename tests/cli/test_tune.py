@@ -1,0 +1,55 @@
+"""The command `clbench tune`; its refusals are among those of test_main.py."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+TOY = "clbench.testing:clbench/Toy-v0"
+
+
+def _tune(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "clbench", "tune", TOY, "l2_sp", "--first-seed", "3", "--seeds", "1"]
+    command += arguments
+    done = subprocess.run(command, capture_output=True, text=True, cwd=folder, timeout=600, check=False)
+    assert done.returncode == 0, done.stderr
+    return done
+
+
+@pytest.mark.slow
+def test_tune_compares_settings_without_test_episodes(tmp_path: Path) -> None:
+    result = _tune(tmp_path, "--values.strength", "0,1")
+    rows = [line.split() for line in result.stdout.splitlines() if "l2_sp" in line or " sft" in line]
+    settings = [row[1:4:2] for row in rows]
+    assert settings == [["sft", "unchanged"], ["l2_sp", "strength=0.0"], ["l2_sp", "strength=1.0"]]
+    assert rows[0][4:] == rows[1][4:]  # at strength 0 it is plain fine-tuning
+    paths = list((tmp_path / "leaderboard" / "tuning").rglob("seed-3.json"))
+    assert len(paths) == 3
+    assert not any('"test"' in path.read_text().partition('"answers"')[0] for path in paths)
+    assert "3 of 3 runs have a record already" in _tune(tmp_path, "--values.strength", "0,1").stderr
+
+
+@pytest.mark.slow
+def test_runs_of_fewer_targets_leave_the_records_of_all_targets(tmp_path: Path) -> None:
+    _tune(tmp_path, "--values.strength", "1")
+    records = tmp_path / "leaderboard" / "tuning"
+    before = {path: path.read_bytes() for path in records.rglob("seed-3.json")}
+    assert len(before) == 2
+    _tune(tmp_path, "--values.strength", "1", "--targets", "1")
+    assert {path: path.read_bytes() for path in before} == before
+    assert len(list((records / "targets-1").rglob("seed-3.json"))) == 2
+
+
+@pytest.mark.slow
+def test_tune_writes_the_best_of_six_settings(tmp_path: Path) -> None:
+    result = _tune(tmp_path, "--write", "tuned/Toy-v0.json")
+    file = json.loads((tmp_path / "tuned" / "Toy-v0.json").read_text())
+    assert (file["scenario"], file["seeds"]) == ("clbench/Toy-v0", [3])
+    found = file["methods"]["l2_sp"]
+    tried = [one["settings"] for one in found["tried"]]
+    assert [one["step_factor"] for one in tried[:4]] == [1.0, 0.3, 0.1, 0.03]
+    assert [one["strength"] for one in tried] == [0.3, 0.3, 0.3, 0.3, 0.1, 1.0]
+    assert found["settings"] in tried
+    assert "6 of 6 runs" not in result.stderr  # four, then two
