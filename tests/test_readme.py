@@ -1,6 +1,7 @@
 """The snippets of the README, run unchanged; the commands run on the toy, which takes seconds."""
 
 import re
+import shlex
 import subprocess
 import sys
 from pathlib import Path
@@ -74,7 +75,7 @@ def test_three_commands_lead_from_nothing_to_a_row_on_the_board(tmp_path: Path) 
     command = [sys.executable, "-m"]
     subprocess.run([*command, *new.split()], cwd=tmp_path, check=True, capture_output=True)
     plain = ["-p", "no:cacheprovider", "-p", "no:xdist"]
-    test = check.removeprefix("python -m ").split()
+    test = shlex.split(check.removeprefix("python -m "), comments=True)
     subprocess.run([*command, *test, *plain], cwd=tmp_path, check=True, capture_output=True)
     words = [*submit.split(), *toy.split()]
     printed = subprocess.run(
