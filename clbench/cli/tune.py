@@ -42,6 +42,7 @@ def tune(
     every: Annotated[bool, Parameter(name="--all", negative="")] = False,
     seeds: Annotated[int, whole_number(1)] = 2,
     first_seed: Annotated[int, whole_number(0)] = FIRST_SEED,
+    fixed: Annotated[dict[str, str] | None, Parameter(name="--set")] = None,
     values: dict[str, str] | None = None,
     targets: Annotated[int | None, whole_number(1)] = None,
     workers: Annotated[int | None, whole_number(1)] = None,
@@ -65,6 +66,8 @@ def tune(
         every: Tune all installed methods but controls, which have the settings of their method.
         seeds: Number of tuning seeds.
         first_seed: The first of them; the boards report seeds from 0.
+        fixed: Hyper-parameters with the same value in all settings, as --set.name value: those that the
+            scenario determines, such as the length of a schedule.
         values: Hyper-parameters and the values to try, as --values.tau_start 0.3,1,3
         targets: Number of targets to learn, from the first, with --values (default: all). Such runs have
             their records in a folder of their own, for example targets-1 below --records.
@@ -96,6 +99,8 @@ def tune(
             raise InputError("--targets goes with --values: settings are chosen on all targets.")
         if write is not None and values:
             raise InputError("--write goes without --values: with them nothing is chosen.")
+        if fixed and values:
+            raise InputError("--set goes without --values: give them the one value.")
         if not values:  # their runs would choose settings that no run reads
             names = _without_controls(names, CONTROLS, every)
         check_device(device)
@@ -103,12 +108,13 @@ def tune(
         classes = {name: load_method(name) for name in names}
         if write is not None:
             check_tuned(write, numbers, names)
+        first_ones = {name: rungs(cls, fixed) for name, cls in classes.items()}
     if values:
         combinations = _combinations(values)
         found = run({BASELINE: [{}], **dict.fromkeys(names, combinations)})
         Console().print(_table(scenario, {name: (None, one) for name, one in found.items()}, seeds))
         return
-    begun = run({name: rungs(cls) for name, cls in classes.items()})
+    begun = run(first_ones)
     refined = run({name: refinements(cls, best_of(begun[name]).settings) for name, cls in classes.items()})
     chosen: dict[str, Tuned] = {}
     for name in names:

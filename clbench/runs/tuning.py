@@ -7,7 +7,8 @@ All methods try the same number of settings, on the same seeds, all targets and 
    `Method.tunes`, or, if it declares none, two learning rates between the rungs.
 
 Among the settings that learn at least `LEARNED` of the targets' success the one with the best final average
-wins.
+wins. A hyper-parameter that the scenario determines, such as the length of a schedule, is fixed: it has the
+same value in all six.
 """
 
 from __future__ import annotations
@@ -66,16 +67,23 @@ class Tuned:
     """All settings that it tried, in their order."""
 
 
-def rungs(method: type[Method]) -> list[dict[str, Any]]:
-    """Return the settings that a method tries first: the ladder of learning rates."""
+def rungs(method: type[Method], fixed: Settings | None = None) -> list[dict[str, Any]]:
+    """Return the settings that a method tries first: the ladder of learning rates, each with what is fixed.
+
+    Raises:
+        InputError: A fixed hyper-parameter is one that tuning sets.
+    """
     own = {} if method.tunes is None else {method.tunes[0]: getattr(method(), method.tunes[0])}
-    return [{**own, "step_factor": factor} for factor in LADDER]
+    given = dict(fixed or {})
+    for name in given.keys() & {*own, "step_factor"}:
+        raise InputError(f"Tuning {method.__name__} sets {name}: it cannot be fixed.")
+    return [{**given, **own, "step_factor": factor} for factor in LADDER]
 
 
 def refinements(method: type[Method], best: Settings) -> list[dict[str, Any]]:
     """Return the settings that a method tries next, around the best of its first ones."""
     if method.tunes is None:
-        return [{"step_factor": round(share * best["step_factor"], 4)} for share in BETWEEN]
+        return [{**best, "step_factor": round(share * best["step_factor"], 4)} for share in BETWEEN]
     name, values = method.tunes
     return [{**best, name: value} for value in values]
 
@@ -133,6 +141,12 @@ def write_tuned(path: Path, scenario: str, seeds: Sequence[int], methods: Mappin
         partial.replace(path)  # a full disk leaves the settings of the others
     finally:
         partial.unlink(missing_ok=True)
+
+
+def fixed_settings(method: type[Method], found: Tuned) -> dict[str, Any]:
+    """Return the hyper-parameters that tuning was told to fix, with their values."""
+    set_by_tuning = {"step_factor", *((method.tunes or ())[:1])}
+    return {name: value for name, value in found.settings.items() if name not in set_by_tuning}
 
 
 @cache

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -10,7 +11,8 @@ from typing import Any
 
 from jinja2 import Template
 
-from clbench.runs.tuning import CONTROLS, tuned, tuned_scenarios
+from clbench.learning.registry import load_method
+from clbench.runs.tuning import CONTROLS, fixed_settings, tuned, tuned_scenarios
 from clbench.scoring.intervals import Estimate
 from clbench.spec.identifiers import folder_name
 
@@ -213,7 +215,14 @@ def _commands(method: str, sources: Sources) -> list[str]:
     lines = lines or [run_command(sources.evidence.scenario, method)]
     tuned_as = CONTROLS.get(method, method)
     boards = [one for one in tuned_scenarios() if method in tuned(one)]
-    return lines + [
-        f"clbench tune {one} {tuned_as} --write {Path('methods/tuned', folder_name(one))}.json"
-        for one in boards
-    ]
+    for one in boards:
+        fixed = fixed_settings(load_method(tuned_as), tuned(one)[tuned_as])
+        words = [
+            "clbench",
+            "tune",
+            one,
+            tuned_as,
+            *(f"--set.{name}={value:g}" for name, value in fixed.items()),
+        ]
+        lines.append(shlex.join([*words, "--write", f"{Path('methods/tuned', folder_name(one))}.json"]))
+    return lines

@@ -91,6 +91,8 @@ def _clbench(*arguments: str, folder: Path | None = None) -> subprocess.Complete
             ["tune", "clbench/Fetch-v1", "sft", "--values.step_factor", "1", "--write", "chosen.json"],
             "--write goes without --values",
         ),
+        (["tune", "clbench/Fetch-v1", "consft", "--set.tau_start", "1"], "Tuning ConSFT sets tau_start"),
+        (["tune", "clbench/Fetch-v1", "sft", "--values.x", "1", "--set.y", "1"], "--set goes without"),
         (
             ["tune", "clbench/Fetch-v1", "sft", "shuffled_weights"],
             "has its settings: tune consft_calibrated.",
@@ -399,14 +401,18 @@ class Broken(Method):
 
 
 @pytest.mark.slow
-def test_a_stranger_runs_a_class_from_the_working_directory_and_sees_it_on_the_board(tmp_path: Path) -> None:
+def test_a_stranger_runs_a_class_from_the_working_directory_and_sees_it_on_the_board(
+    tmp_path: Path, empty_caches: Path
+) -> None:
     (tmp_path / "mine.py").write_text(METHOD)
     result = _clbench("run", TOY, "mine:Gentle", "mine:Broken", "sft", "--seeds", "1", folder=tmp_path)
     assert result.returncode == 1  # the broken one; the others went on
     assert "mine:Broken seed 0: failed in stage 1 (right): ValueError: no idea" in result.stderr
     assert "Traceback" not in result.stderr  # it is in the record
     assert "1 failed: Toy-v0 mine:Broken seed 0" in result.stderr
-    records = sorted(path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*.json"))
+    records = sorted(
+        path.relative_to(tmp_path).as_posix() for path in (tmp_path / "leaderboard").rglob("*.json")
+    )
     assert records == [
         f"leaderboard/records/Toy-v0/{name}/seed-0.json" for name in ("mine.Broken", "mine.Gentle", "sft")
     ]

@@ -10,8 +10,8 @@ import pytest
 TOY = "clbench.testing:clbench/Toy-v0"
 
 
-def _tune(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "clbench", "tune", TOY, "l2_sp", "--first-seed", "3", "--seeds", "1"]
+def _tune(folder: Path, *arguments: str, method: str = "l2_sp") -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "clbench", "tune", TOY, method, "--first-seed", "3", "--seeds", "1"]
     command += arguments
     done = subprocess.run(command, capture_output=True, text=True, cwd=folder, timeout=600, check=False)
     assert done.returncode == 0, done.stderr
@@ -53,3 +53,12 @@ def test_tune_writes_the_best_of_six_settings(tmp_path: Path) -> None:
     assert [one["strength"] for one in tried] == [0.3, 0.3, 0.3, 0.3, 0.1, 1.0]
     assert found["settings"] in tried
     assert "6 of 6 runs" not in result.stderr  # four, then two
+
+
+@pytest.mark.slow
+def test_a_fixed_setting_is_in_every_run_and_in_the_file(tmp_path: Path) -> None:
+    _tune(tmp_path, "--set.schedule", "2", "--write", "tuned/Toy-v0.json", method="consft")
+    found = json.loads((tmp_path / "tuned" / "Toy-v0.json").read_text())["methods"]["consft"]
+    assert {one["settings"]["schedule"] for one in (found, *found["tried"])} == {2.0}
+    records = (tmp_path / "leaderboard" / "tuning").rglob("seed-3.json")
+    assert [json.loads(path.read_text())["run"]["settings"]["schedule"] for path in records] == [2.0] * 6

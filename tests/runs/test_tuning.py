@@ -12,7 +12,17 @@ from clbench.base.errors import InputError
 from clbench.learning.registry import load_method, new_method
 from clbench.runs import tuning
 from clbench.runs.spec import RunSpec
-from clbench.runs.tuning import CONTROLS, Tried, Tuned, best_of, refinements, rungs, tuned, write_tuned
+from clbench.runs.tuning import (
+    CONTROLS,
+    Tried,
+    Tuned,
+    best_of,
+    fixed_settings,
+    refinements,
+    rungs,
+    tuned,
+    write_tuned,
+)
 from clbench.spec.identifiers import built_in_methods
 
 TOY = "clbench.testing:clbench/Toy-v0"
@@ -47,6 +57,24 @@ def test_a_method_with_its_own_strength_tries_two_values_of_it_at_the_best_rung(
     assert rungs(cls)[1] == {"strength": 0.3, "step_factor": 0.3}
     found = refinements(cls, {"strength": 0.3, "step_factor": 0.1})
     assert found == [{"strength": 0.1, "step_factor": 0.1}, {"strength": 1.0, "step_factor": 0.1}]
+
+
+def test_what_is_fixed_is_the_same_in_all_six_settings() -> None:
+    for name in ("consft", "sft"):
+        cls = load_method(name)
+        first = rungs(cls, {"schedule": 3.25})
+        settings = [*first, *refinements(cls, first[2])]
+        assert [one["schedule"] for one in settings] == [3.25] * 6
+        assert [{**one, "schedule": 0} for one in settings] == [
+            {**one, "schedule": 0} for one in [*rungs(cls), *refinements(cls, rungs(cls)[2])]
+        ]
+        assert fixed_settings(cls, Tuned(settings[5], ())) == {"schedule": 3.25}
+
+
+@pytest.mark.parametrize("name", ["tau_start", "step_factor"])
+def test_what_tuning_sets_cannot_be_fixed(name: str) -> None:
+    with pytest.raises(InputError, match=f"Tuning ConSFT sets {name}: it cannot be fixed"):
+        rungs(load_method("consft"), {name: 1.0})
 
 
 def test_the_best_final_average_wins_among_settings_that_learn_enough() -> None:
