@@ -37,9 +37,11 @@ class Agreement:
     """Probability of a tau at least as far from 0 if one board had the rows in a random order."""
 
     @property
-    def is_certain(self) -> bool:
-        """Whether neither the draw of the seeds nor a random order of the rows explains the sign of tau."""
-        return self.chance < SIGNIFICANCE and (self.low > 0 or self.high < 0)
+    def direction(self) -> int:
+        """1: the boards agree; -1: their orders are opposite; 0: the seeds or chance may explain tau."""
+        if self.chance >= SIGNIFICANCE or self.low <= 0 <= self.high:
+            return 0
+        return 1 if self.tau > 0 else -1
 
 
 def kendall_tau(one: Array, other: Array) -> Array:

@@ -321,15 +321,15 @@ def _claims(judged: Sequence[Judged]) -> Section:
 def _predictors(boards: dict[str, list[Row]]) -> Section:
     """What orders the methods as their forgetting does."""
     answers = []
+    words = {
+        1: "agrees with their forgetting on the order of the methods more than chance would explain",
+        0: "shows no certain agreement with forgetting on the order of the methods",
+        -1: "orders the methods against their forgetting",
+    }
     for name, rows in boards.items():
         for one in predictions(rows):
-            words = "agrees with their forgetting on the order of the methods more than chance would explain"
-            if not one.is_certain:
-                words = "shows no certain agreement with forgetting on the order of the methods"
-            elif one.tau < 0:
-                words = "orders the methods against their forgetting"
-            over = counted(one.rows, "method")
-            answers.append(f"On {name}, {one.predictor} {words} (Kendall's tau {tau_text(one)}, {over}).")
+            tau = f"Kendall's tau {tau_text(one)}, {counted(one.rows, 'method')}"
+            answers.append(f"On {name}, {one.predictor} {words[one.direction]} ({tau}).")
     if answers:
         answers.insert(0, "Forgetting is here 1 minus the kept share.")
     return Section("What predicts how much a method forgets?", tuple(answers))

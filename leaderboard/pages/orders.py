@@ -91,9 +91,9 @@ def _between(
 
 def _order(found: Agreement, methods: str = "the methods") -> str:
     """Return the predicate of a sentence on two boards."""
-    words = f"agree on the order of {methods} more than chance would explain"
-    if not found.is_certain:
-        words = f"show no certain agreement on the order of {methods}"
-    elif found.tau < 0:
-        words = f"put {methods} in opposite orders"
-    return f"{words} (Kendall's tau {tau_text(found)})"
+    words = {
+        1: f"agree on the order of {methods} more than chance would explain",
+        0: f"show no certain agreement on the order of {methods}",
+        -1: f"put {methods} in opposite orders",
+    }
+    return f"{words[found.direction]} (Kendall's tau {tau_text(found)})"

@@ -137,7 +137,7 @@ def agreement_text(found: Agreement | None) -> str:
     """Return a sentence on how alike two halves of the seeds order the methods; empty if it is not known."""
     if found is None:
         return ""
-    how = "order" if found.is_certain and found.tau > 0 else "do not surely order"
+    how = "order" if found.direction > 0 else "do not surely order"
     return (
         f"The two halves of the {found.seeds} seeds {how} the {found.rows} methods alike: "
         f"Kendall's tau {tau_text(found)}."
@@ -149,10 +149,9 @@ def prediction_text(rows: Iterable[Row]) -> str:
     found = predictions(rows)
     if not found:
         return ""
+    words = {1: "", 0: ", which may be chance", -1: ", the other way round"}
     parts = [
-        f"{one.predictor} {tau_text(one)} over {one.rows} methods"
-        + (", which may be chance" if not one.is_certain else ", the other way round" if one.tau < 0 else "")
-        for one in found
+        f"{one.predictor} {tau_text(one)} over {one.rows} methods{words[one.direction]}" for one in found
     ]
     return f"Rank correlation with the share that a stage forgets (Kendall's tau): {'; '.join(parts)}."
 

@@ -27,21 +27,21 @@ def test_rows_far_apart_agree_and_rows_of_noise_do_not() -> None:
     clear = np.arange(8)[:, None] / 8 + generator.normal(0, 0.01, (8, 8))
     found = agreement_of(clear)
     assert (found.tau, found.low, found.high, found.seeds, found.rows) == (1.0, 1.0, 1.0, 8, 8)
-    assert found.is_certain
+    assert found.direction == 1
     noise = agreement_of(generator.normal(0, 1, (8, 8)))
     assert noise.low < 0 < noise.high
-    assert not noise.is_certain
+    assert noise.direction == 0
 
 
 def test_the_chance_is_that_of_a_random_order_of_the_rows() -> None:
     # of the 120 orders of five rows, 2 are as far from chance as equal ones, and 10 as far as one swap
     five = np.arange(5)[:, None] + np.zeros((5, 4))
     assert agreement_between(five, five).chance == pytest.approx(2 / 120)
-    assert agreement_between(five, 5 - five).is_certain
+    assert agreement_between(five, 5 - five).direction == -1
     swapped = agreement_between(five, five[[1, 0, 2, 3, 4]])
     assert swapped.chance == pytest.approx(10 / 120)
     assert swapped.low > 0
-    assert not swapped.is_certain
+    assert swapped.direction == 0
 
 
 def test_boards_whose_orders_have_nothing_in_common_rarely_agree() -> None:
@@ -52,7 +52,7 @@ def test_boards_whose_orders_have_nothing_in_common_rarely_agree() -> None:
 
     found = [agreement_between(board(), board(), 200) for _ in range(200)]
     assert sum(one.low > 0 or one.high < 0 for one in found) > 100  # the seeds alone say little of it
-    assert sum(one.is_certain for one in found) <= 16
+    assert sum(one.direction != 0 for one in found) <= 16
 
 
 @pytest.mark.parametrize("shape", [(4, 8), (8, 3)])
