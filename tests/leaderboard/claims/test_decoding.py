@@ -113,3 +113,4 @@ def test_without_results_the_claim_is_undecided_and_names_the_command(page: Any)
 def test_results_of_another_scenario_decide_nothing(page: Any) -> None:
     made = page({**results(2.8), "scenario": "clbench/Fetch-v1"})
     assert verdicts(made)["F6"] == "undecided"
+    assert "measured on clbench/Fetch-v1 alone" in section(made, "F6")
