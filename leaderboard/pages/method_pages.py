@@ -216,13 +216,8 @@ def _commands(method: str, sources: Sources) -> list[str]:
     tuned_as = CONTROLS.get(method, method)
     boards = [one for one in tuned_scenarios() if method in tuned(one)]
     for one in boards:
-        fixed = fixed_settings(load_method(tuned_as), tuned(one)[tuned_as])
-        words = [
-            "clbench",
-            "tune",
-            one,
-            tuned_as,
-            *(f"--set.{name}={value:g}" for name, value in fixed.items()),
-        ]
+        words = ["clbench", "tune", one, tuned_as]
+        for name, value in fixed_settings(load_method(tuned_as), tuned(one)[tuned_as]).items():
+            words += [f"--set.{name}", f"{value:g}"]
         lines.append(shlex.join([*words, "--write", f"{Path('methods/tuned', folder_name(one))}.json"]))
     return lines
