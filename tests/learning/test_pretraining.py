@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from clbench import load_scenario
-from clbench.base.cache import cache_folder
+from clbench.base.cache import cache_folder, hash_of
 from clbench.learning.pretraining import (
     SHIPPED,
     is_pretrained,
@@ -52,6 +52,9 @@ def test_a_torn_shipped_policy_is_not_used_and_the_log_says_why(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     torn = Path(shutil.copytree(SHIPS, tmp_path / SHIPS.name))
+    about = json.loads((torn / "clbench.json").read_text(encoding="utf-8"))
+    about["inputs"] = hash_of(pretraining_inputs(FETCH, 0))  # else other packages here are noticed first
+    (torn / "clbench.json").write_text(json.dumps(about), encoding="utf-8")
     weights = torn / "policy.safetensors"
     weights.write_bytes(weights.read_bytes()[:-1])
     monkeypatch.setattr("clbench.learning.pretraining.SHIPPED", tmp_path)
