@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import secrets
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -37,7 +37,7 @@ from .board.places import CONTROLS, SCENARIO
 if TYPE_CHECKING:
     from .board.rows import Table
     from .board.summary import Summary
-    from .claims.judges import Judged
+    from .claims.evidence import Evidence
 
 # Whatever imports PyTorch, SciPy or the charts is imported where it is needed: `--help` does not wait for it.
 
@@ -300,11 +300,10 @@ def claims(
         scenario: Gymnasium id of the scenario on which all claims are judged (default: each names its own).
         output: Path of the page.
     """
+    from .claims.judges import judge_all
     from .pages.claims_page import page, terminal
 
-    judged = _judged(records, controls, scenario)
-    if scenario and not any(one.evidence.runs for one in judged):
-        check_names([scenario], [])  # a scenario with records may be of a package that is not installed
+    judged = judge_all(_evidence(scenario, records, controls), scenario)
     console = Console()
     console.print(terminal(judged))
     _write(output, page(judged))
@@ -323,11 +322,12 @@ def findings(
         controls: Folder of the records of changed settings.
         output: Path of the page; pictures go to the folder `findings` beside it.
     """
+    from .claims.judges import judge_all
     from .pages.findings import page, pictures, sections
     from .views.format import write_all
 
     table = _table(records)
-    found = sections(table, _judged(records, controls))
+    found = sections(table, judge_all(_evidence(None, records, controls)))
     drawn = {output.parent / "findings" / name: svg for name, svg in pictures(table).items()}
     _print_written(write_all({output: page(found), **drawn}))
 
@@ -347,16 +347,13 @@ def method_pages(
         scenario: Gymnasium id of the scenario.
         output: Folder of the pages.
     """
-    from .claims.evidence import read_evidence
+    from .claims.judges import judge_all
     from .pages.method_pages import Sources, pages
     from .views.descriptions import built_in_methods
     from .views.format import write_if_changed
 
-    judged = _judged(records, controls)
-    evidence = read_evidence(scenario, records, controls)
-    if not evidence.runs:
-        check_names([scenario], [])
-    sources = Sources(evidence, judged, _table(records).rows)
+    evidence = _evidence(scenario, records, controls)
+    sources = Sources(evidence(scenario), judge_all(evidence), _table(records).rows)
     texts = pages(built_in_methods(), sources)
     output.mkdir(parents=True, exist_ok=True)
     for name, text in texts.items():
@@ -411,12 +408,14 @@ def scenario_card(
         _write(output / f"{home.name}.md", card.page())
 
 
-def _judged(records: Path, controls: Path, scenario: str | None = None) -> tuple[Judged, ...]:
-    """Return the findings on all claims, on one scenario alone if it is given."""
+def _evidence(scenario: str | None, records: Path, controls: Path) -> Callable[[str], Evidence]:
+    """Return what gives the evidence on a scenario; refuse `scenario` without any if it is not registered."""
     from .claims.evidence import read_evidence
-    from .claims.judges import judge_all
 
-    return judge_all(lambda name: read_evidence(name, records, controls), scenario)
+    evidence = read_evidence(records, controls)
+    if scenario is not None and not evidence(scenario).runs:  # one with records may be of a missing package
+        check_names([scenario], [])
+    return evidence
 
 
 def _table(records: Path) -> Table:

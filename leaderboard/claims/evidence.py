@@ -256,8 +256,8 @@ def measured(name: str, method: str) -> Quantity:
 # ---- reading -----------------------------------------------------------------------------------------------
 
 
-def read_evidence(scenario: str, records: Path, controls: Path) -> Evidence:
-    """Return the evidence in the folders and files; missing ones count as empty.
+def read_evidence(records: Path, controls: Path) -> Callable[[str], Evidence]:
+    """Read the folders and files, and return what gives the evidence on a scenario; missing ones are empty.
 
     A run of the ladder has the label of `rung`. The ladder's folder lies beside that of the records.
     """
@@ -266,23 +266,25 @@ def read_evidence(scenario: str, records: Path, controls: Path) -> Evidence:
     changed, refused_controls = read_runs(controls, partial(read_run, changed=True), (like, *ALIKE))
     ladder = ladder_of(records)
     rungs, refused_rungs = read_runs(ladder, partial(read_run, changed=True), (like, *ALIKE, on_the_ladder))
-    runs: dict[str, dict[int, Run]] = {}
-    for label, run in (
+    labelled = [
         *((run.method, run) for run in (*scored, *changed)),
         *((rung(apart_from_the_factor(run), run.record.run.changes[FACTOR]), run) for run in rungs),
-    ):
-        if run.place == scenario and run.scores.layout.target and not run.order:
-            runs.setdefault(label, {})[run.seed] = run
-    not_used = [
+    ]
+    not_used = tuple(
         NotShown(f"{name}/{entry.path}", entry.reason)
         for name, entries in (("records", refused), ("controls", refused_controls), ("ladder", refused_rungs))
         for entry in entries
-    ]
-    return Evidence(
-        scenario,
-        {label: dict(sorted(seeds.items())) for label, seeds in sorted(runs.items())},
-        tuple(not_used),
     )
+
+    def on(scenario: str) -> Evidence:
+        runs: dict[str, dict[int, Run]] = {}
+        for label, run in labelled:
+            if run.place == scenario and run.scores.layout.target and not run.order:
+                runs.setdefault(label, {})[run.seed] = run
+        ordered = {label: dict(sorted(seeds.items())) for label, seeds in sorted(runs.items())}
+        return Evidence(scenario, ordered, not_used)
+
+    return on
 
 
 def rung(method: str, factor: float) -> str:

@@ -120,7 +120,7 @@ class Bench:
     def evidence(self) -> Any:
         """Return the evidence."""
         read = resolve("clbench.leaderboard.claims.evidence:read_evidence")
-        return read(SCENARIO, self.folder / "records", self.folder / "controls")
+        return read(self.folder / "records", self.folder / "controls")(SCENARIO)
 
     def page(self) -> str:
         """Return the page."""
