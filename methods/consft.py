@@ -13,7 +13,8 @@ Details:
 3. The schedule restarts with each target. The paper tunes its length T for each task (2,000 steps there).
    Here T is the length of the stage; if the stage ends when the target is learned, T is the number of steps
    that plain fine-tuning takes to learn one. ConSFT learns later, so that it reaches its end temperature. The
-   number is that of Fetch-v1 and MetaWorld-v1; another scenario fixes `schedule`, the factor of T.
+   number was measured on MetaWorld-v1. Where fine-tuning takes longer, `schedule`, the factor of T, can be
+   fixed, as on PointMaze-v1.
 4. Step size, optimiser and clipping are the benchmark's, the same for every method. Adam cancels a constant
    factor of the loss, so that weights which are all at the floor change nothing.
 

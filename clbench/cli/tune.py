@@ -100,7 +100,7 @@ def tune(
         if write is not None and values:
             raise InputError("--write goes without --values: with them nothing is chosen.")
         if fixed and values:
-            raise InputError("--set goes without --values: give them the one value.")
+            raise InputError("--set goes without --values: give the value as --values.NAME.")
         if not values:  # their runs would choose settings that no run reads
             names = _without_controls(names, CONTROLS, every)
         check_device(device)

@@ -68,16 +68,17 @@ class Tuned:
 
 
 def rungs(method: type[Method], fixed: Settings | None = None) -> list[dict[str, Any]]:
-    """Return the settings that a method tries first: the ladder of learning rates, each with what is fixed.
+    """Return the settings that a method tries first: the ladder of learning rates, with the fixed values.
 
     Raises:
         InputError: A fixed hyper-parameter is one that tuning sets.
     """
-    own = {} if method.tunes is None else {method.tunes[0]: getattr(method(), method.tunes[0])}
-    given = dict(fixed or {})
-    for name in given.keys() & {*own, "step_factor"}:
-        raise InputError(f"Tuning {method.__name__} sets {name}: it cannot be fixed.")
-    return [{**given, **own, "step_factor": factor} for factor in LADDER]
+    fixed = fixed or {}
+    clash = next((name for name in fixed if name in _set_by_tuning(method)), None)
+    if clash is not None:
+        raise InputError(f"Tuning {method.__name__} sets {clash}: it cannot be fixed.")
+    defaults = {name: getattr(method(), name) for name in _set_by_tuning(method)}
+    return [{**fixed, **defaults, "step_factor": factor} for factor in LADDER]
 
 
 def refinements(method: type[Method], best: Settings) -> list[dict[str, Any]]:
@@ -145,8 +146,12 @@ def write_tuned(path: Path, scenario: str, seeds: Sequence[int], methods: Mappin
 
 def fixed_settings(method: type[Method], found: Tuned) -> dict[str, Any]:
     """Return the hyper-parameters that tuning was told to fix, with their values."""
-    set_by_tuning = {"step_factor", *((method.tunes or ())[:1])}
-    return {name: value for name, value in found.settings.items() if name not in set_by_tuning}
+    return {name: value for name, value in found.settings.items() if name not in _set_by_tuning(method)}
+
+
+def _set_by_tuning(method: type[Method]) -> tuple[str, ...]:
+    """Return the hyper-parameters that tuning sets: the method's own strength, if any, and the step size."""
+    return ("step_factor",) if method.tunes is None else (method.tunes[0], "step_factor")
 
 
 @cache

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from clbench import load_scenario
-from clbench.base.cache import cache_folder, hash_of
+from clbench.base.cache import MANIFEST, cache_folder, hash_of
 from clbench.learning.pretraining import (
     SHIPPED,
     is_pretrained,
@@ -21,7 +21,7 @@ SHIPS = shipped_folder(FETCH, 0)
 
 
 def _made_from(folder: Path) -> dict[str, object]:
-    found = json.loads((folder / "clbench.json").read_text(encoding="utf-8"))["made_from"]
+    found = json.loads((folder / MANIFEST).read_text(encoding="utf-8"))["made_from"]
     assert isinstance(found, dict)
     return found
 
@@ -38,7 +38,7 @@ def test_this_source_makes_the_policies_that_ship() -> None:
 
 
 def test_the_committed_records_of_a_seed_started_from_the_policy_that_ships() -> None:
-    files = json.loads((SHIPS / "clbench.json").read_text(encoding="utf-8"))["files"]
+    files = json.loads((SHIPS / MANIFEST).read_text(encoding="utf-8"))["files"]
     records = Path(__file__).parents[2] / "leaderboard" / "records" / "Fetch-v1"
     record = json.loads((records / "sft" / "seed-0.json").read_text(encoding="utf-8"))
     assert files["policy.safetensors"].startswith(record["fingerprint"]["pretrained"])
@@ -52,9 +52,9 @@ def test_a_torn_shipped_policy_is_not_used_and_the_log_says_why(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     torn = Path(shutil.copytree(SHIPS, tmp_path / SHIPS.name))
-    about = json.loads((torn / "clbench.json").read_text(encoding="utf-8"))
+    about = json.loads((torn / MANIFEST).read_text(encoding="utf-8"))
     about["inputs"] = hash_of(pretraining_inputs(FETCH, 0))  # else other packages here are noticed first
-    (torn / "clbench.json").write_text(json.dumps(about), encoding="utf-8")
+    (torn / MANIFEST).write_text(json.dumps(about), encoding="utf-8")
     weights = torn / "policy.safetensors"
     weights.write_bytes(weights.read_bytes()[:-1])
     monkeypatch.setattr("clbench.learning.pretraining.SHIPPED", tmp_path)

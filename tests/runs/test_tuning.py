@@ -59,7 +59,7 @@ def test_a_method_with_its_own_strength_tries_two_values_of_it_at_the_best_rung(
     assert found == [{"strength": 0.1, "step_factor": 0.1}, {"strength": 1.0, "step_factor": 0.1}]
 
 
-def test_what_is_fixed_is_the_same_in_all_six_settings() -> None:
+def test_fixed_hyper_parameters_have_the_same_value_in_all_six_settings() -> None:
     for name in ("consft", "sft"):
         cls = load_method(name)
         first = rungs(cls, {"schedule": 3.25})
@@ -72,7 +72,7 @@ def test_what_is_fixed_is_the_same_in_all_six_settings() -> None:
 
 
 @pytest.mark.parametrize("name", ["tau_start", "step_factor"])
-def test_what_tuning_sets_cannot_be_fixed(name: str) -> None:
+def test_hyper_parameters_that_tuning_sets_cannot_be_fixed(name: str) -> None:
     with pytest.raises(InputError, match=f"Tuning ConSFT sets {name}: it cannot be fixed"):
         rungs(load_method("consft"), {name: 1.0})
 
