@@ -12,8 +12,9 @@ several seeds vary for both reasons. Therefore:
    episodes drawn with replacement, for each task. All stages and evaluation points of a run get the same
    draws, and so do runs of other methods with this seed: they met the same initial states. Fewer episodes are
    run before the end of a stage. There the rate is the mean over the drawn ones among them. Right answers are
-   drawn from a binomial for each stage and kind of question, since records hold counts only. Metrics of
-   `OF_WHOLE_RUNS`, such as the steps to the criterion, have no interval with one seed.
+   drawn from a binomial for each stage and kind of question, since records hold counts only. With one
+   seed, metrics of `OF_WHOLE_RUNS`, such as the steps to the criterion, have no interval. Neither has the
+   share of targets that met the criterion if seeds agree: it has few values, so they agree by chance.
 
 Tasks are fixed: a scenario consists of them. All seeds share demonstrations, scenes and questions: intervals
 do not cover other ones. Choices on a run's validation episodes are fixed too: the interval does not cover the
@@ -336,7 +337,7 @@ class _Samples:
         rates = combine(parts, lambda arrays: np.stack(arrays, axis=1))
         share = rates.correct / np.maximum(rates.asked, 1)
         correct = self.generator.binomial(rates.asked.astype(np.int64), share)
-        unknown = OF_WHOLE_RUNS if len(runs) == 1 else ()
+        unknown = OF_WHOLE_RUNS if len(runs) == 1 else ("met",)
         of_runs = {name: np.full_like(getattr(rates, name), np.nan) for name in unknown}
         return replace(rates, correct=correct.astype(np.float64), **of_runs)
 

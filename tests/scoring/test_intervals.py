@@ -1,5 +1,6 @@
 """Intervals against simulations, against SciPy, against closed forms and against exact cases."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -81,7 +82,7 @@ def random_run(generator: np.random.Generator, shape: Layout) -> Scores:
         update_sparsity=generator.random((targets, points)),
         activation_drift=generator.random((targets, points)),
         steps=generator.integers(1, 100, targets).astype(float),
-        met=np.ones(targets),
+        met=generator.integers(0, 2, targets).astype(float),
         shift=generator.random(targets),
         captured=generator.random(targets),
         relearning_steps=np.array(float(generator.integers(1, 100))),
@@ -259,6 +260,14 @@ def test_seeds_that_agree_exactly_have_an_interval_of_episodes() -> None:
     assert width(alone) == pytest.approx(2 * width(got), rel=0.15)
 
 
+def test_seeds_that_agree_on_the_share_of_learned_targets_have_no_interval_of_it() -> None:
+    run = random_run(np.random.default_rng(0), layout(5, 20, targets=4))
+    run = replace(run, met=np.array([1.0, 1.0, 0.0, 1.0]))
+    for seeds in (4, 1):
+        got = estimate(["criterion_met"], dict.fromkeys(range(seeds), run), np.random.default_rng(0))
+        assert got["criterion_met"] == Estimate(0.75, None, None)
+
+
 def test_an_exactly_known_quantity_has_no_width() -> None:
     # A frozen policy meets the same episodes at all stages: it forgets none of its skills.
     generator, shape = np.random.default_rng(0), layout(3, 10, targets=2)
@@ -375,7 +384,7 @@ def test_methods_that_met_different_episodes_are_not_compared() -> None:
 
 
 def test_every_metric_has_an_interval() -> None:
-    generator = np.random.default_rng(0)
+    generator = np.random.default_rng(1)
     shape = layout(5, 20, targets=4, held_out=3, points=4)
     runs, scratch = ({seed: random_run(generator, shape) for seed in range(3)} for _ in range(2))
     references = dict.fromkeys(("from_scratch", "joint", "sft"), scratch)
