@@ -206,7 +206,7 @@ def verify(
     recomputed: the record is intact, matches its method and scenario, and its metrics follow from its
     episodes. replayed: the policies of its stages give the same results in randomly chosen test episodes and
     on all questions. retrained: the whole run gives the same record again. Each tier includes the tiers
-    before it.
+    before it. The file of a higher tier stays unless a check fails.
 
     Args:
         paths: Records, or folders of records.

@@ -65,7 +65,8 @@ def verify(
 ) -> list[Check]:
     """Check the record at `path`, write its tier into a file next to it, and return the checks.
 
-    The file of an earlier verification is deleted first. The first tier with a failed check is the last one.
+    The first tier with a failed check is the last one. The file of an earlier verification stays if it has a
+    higher tier than `request` and no check fails; otherwise it is deleted.
 
     Args:
         path: Path of the record.
@@ -73,10 +74,14 @@ def verify(
         request: Options of the verification.
         progress: Called with the work done since its last call, in optimiser steps.
     """
-    verification_path(path).unlink(missing_ok=True)
+    earlier = verification_path(path)
+    is_higher = TIERS.index(tier_of(path)) > TIERS.index(request.tier)
+    if not is_higher:
+        earlier.unlink(missing_ok=True)
     try:
         run = read_run(records, path, changed=None)
     except RecordError as error:
+        earlier.unlink(missing_ok=True)
         return [Check("record", str(error), False)]
     subject = Subject(run, request)
     checks: list[Check] = []
@@ -84,8 +89,11 @@ def verify(
     for tier in TIERS[1 : TIERS.index(request.tier) + 1]:
         checks += looks[tier](subject, progress)
         if not all(check.passed for check in checks):
+            if is_higher:
+                earlier.unlink()
             break
-        _write(path, subject, tier, checks)
+        if not is_higher:
+            _write(path, subject, tier, checks)
     return checks
 
 

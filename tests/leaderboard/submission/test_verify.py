@@ -1,5 +1,6 @@
 """Verification: an honest record earns each tier; a forged one is denied it, with the reason."""
 
+import hashlib
 import importlib
 import json
 import math
@@ -216,6 +217,20 @@ def test_a_failed_check_takes_an_earlier_tier_back(mine: Path, honest: Path) -> 
     edit(mine, lambda values: flip(values, 1))
     verify(mine, "recomputed", honest)
     assert not tiers.verification_path(mine).exists()
+
+
+def test_the_file_of_a_higher_tier_stays_unless_a_check_fails(mine: Path, honest: Path) -> None:
+    verify(mine, "replayed", honest)
+    file = tiers.verification_path(mine)
+    stored = file.read_bytes()
+    assert failures(verify(mine, "recomputed", honest)) == ""
+    assert file.read_bytes() == stored
+    edit(mine, lambda values: flip(values, 1))
+    claimed = {"tier": "replayed", "record": hashlib.sha256(mine.read_bytes()).hexdigest()}
+    file.write_text(tiers.verification_text(claimed), encoding="utf-8")
+    assert tiers.tier_of(mine) == "replayed"
+    verify(mine, "recomputed", honest)
+    assert not file.exists()
 
 
 def test_a_module_that_a_record_names_is_not_imported_unless_the_verifier_allows_it(
