@@ -59,7 +59,7 @@ def show(
 
     Args:
         scenario: Show this scenario alone.
-        sort: Name of the metric that orders the rows of each division, for example kept.
+        sort: Name or title of the metric that orders the rows of each division, for example kept.
         records: Folder of the records.
         published: First copy the records that come with clbench to the folder, where it lacks them: your rows
             then stand beside the published ones.
@@ -73,7 +73,7 @@ def show(
 
     if sort is not None:
         with checked_input():
-            load_metric(sort)
+            sort = load_metric(sort).name
     messages = Console(stderr=True, soft_wrap=True)
     if published:
         messages.print(Text(f"{counted(add_published(records), 'published record')} added to {records}."))

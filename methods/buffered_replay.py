@@ -8,6 +8,8 @@ Details:
    likely. After each target, the same share of its data is added. No other prior data are seen again.
 2. As in `experience_replay`, half of every batch is replayed. Flow time and noise are drawn anew each time.
    While the buffer is empty, because there is no earlier task, the batch holds the target alone.
+3. Unlike there, all steps in the buffer are equally likely, so a task with longer demonstrations is replayed
+   more often. A step keeps the wording of the instruction with which it was drawn.
 """
 
 import dataclasses

@@ -19,6 +19,7 @@ Details:
    docs/reference/methods/fast_dvla.md shows other values here.
 7. The regulariser's gradient is clipped together with the loss's, to a norm of 1, and goes through Adam.
 8. The vector is cached. The steps that made it count in every row.
+9. Where nothing is retained, there is no skill to make a vector from: the run fails and says so.
 
 `direction="random"` is the control: a random vector with the capability vector's norm in each matrix.
 """
@@ -61,7 +62,7 @@ class FastDVLA(Method):
     steps: int = 150
     """Optimiser steps of each of the two fine-tunings."""
     step_size: float = 3e-4
-    """Peak step size of these fine-tunings, the same as in adaptation."""
+    """Peak step size of these fine-tunings: that of most scenarios, whatever `step_factor` is."""
     direction: str = "capability"
     """Vector to merge: "capability", or "random" for the control."""
 

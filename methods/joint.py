@@ -1,7 +1,8 @@
-"""Joint: training on all data seen so far, questions included. The upper reference.
+"""Joint: training on all data seen so far, questions included.
 
-A reference row: it keeps every demonstration, so it does not solve forgetting, but it shows the limit of this
-policy and this budget of steps. Its success right after a target is a* in intransigence (Chaudhry 2018).
+A reference row: it keeps every demonstration, so it does not solve forgetting. It is no upper bound where
+stages end at a criterion: it is not tuned, its stages end after few steps, and replay ends above it. Its
+success right after a target is a* in intransigence (Chaudhry 2018).
 """
 
 from dataclasses import dataclass

@@ -6,8 +6,8 @@ Details:
 2. theta* is the pretrained policy during the whole sequence.
 3. The gradient of the penalty is clipped together with the loss's, to a norm of 1, and goes through Adam: a
    strong penalty slows the target down, and `strength` does not mean what it does with plain gradient steps.
-4. The default of `strength` comes from validation episodes of the first Fetch board (docs/history.md). On
-   Fetch-v1 and MetaWorld-v1, `clbench tune` chose again.
+4. The default of `strength` comes from validation episodes of the first Fetch board (docs/history.md). Where
+   methods are tuned, `clbench tune` chose again.
 """
 
 from dataclasses import dataclass

@@ -6,7 +6,7 @@ Details:
 2. One adapter is trained on all targets in turn, as in arXiv 2603.11653; the weights below it never change.
 3. `variant` is "lora", "dora" (arXiv 2402.09353) or "rslora" (arXiv 2312.03732).
 4. Adapters start from zero and must move further than full weights: `speed` multiplies the step size. It was
-   chosen on validation episodes of the first Fetch board (docs/history.md). On Fetch-v1 and MetaWorld-v1,
+   chosen on validation episodes of the first Fetch board (docs/history.md). Where methods are tuned,
    `clbench tune` chose the step size and the rank.
 """
 

@@ -7,7 +7,8 @@ Details:
 2. The copy is made at the start of each target, as in LwF's own sequences. In the ConSFT paper it is the
    pretrained model, which is the same thing for the first target.
 3. A head that fills in masked tokens distils its expected actions, not their distribution.
-4. The prediction takes a second forward pass, which counts in the time of a step.
+4. The distillation takes two more forward passes, one of the policy and one of its frozen copy. Both count
+   in the time of a step.
 5. `strength` was chosen on validation episodes of the first Fetch board (docs/history.md).
 """
 

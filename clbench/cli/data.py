@@ -167,6 +167,7 @@ def pretrain(
     """
     from clbench.jobs.bars import Bars
     from clbench.learning.pretraining import SHIPPED, pretrained_policy, shipped_folder, vision_steps
+    from clbench.policy.kinds import policy_class
     from clbench.spec.registry import load_scenario
 
     add_cwd_to_path()
@@ -174,6 +175,7 @@ def pretrain(
         loaded = load_scenario(scenario).with_policy(policy_name(policy, policy_size))
         if ship and not (SHIPPED.parents[1] / "pyproject.toml").is_file():
             raise InputError("--ship needs a checkout of clbench: it does not change an installed package.")
+        policy_class(loaded.policy)
     length = loaded.budget.pretraining_steps + vision_steps(loaded)
     with Bars(length) as bars:
         name = f"{loaded.id} pretraining seed {seed}"

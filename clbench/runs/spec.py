@@ -122,10 +122,14 @@ class ResolvedRun:
     """Changed hyper-parameters as the method holds them: the text "0.5" may have become a number."""
 
     def new_method(self) -> Method:
-        """Return a new object of the method, with the settings tuned for the scenario but for `changes`."""
+        """Return a new object of the method, with the settings tuned for the scenario but for `changes`.
+
+        A tuning run begins with the defaults instead: an earlier choice must not get into a new one.
+        """
         from clbench.learning.registry import new_method
 
-        tuned = tuned_settings(self.scenario.id, self.spec.method)
+        is_tuning = self.spec.split == "validation"
+        tuned = {} if is_tuning else tuned_settings(self.scenario.id, self.spec.method)
         return new_method(self.spec.method, self.method, {**tuned, **self.changes})
 
     @cached_property

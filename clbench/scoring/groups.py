@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from itertools import combinations, count
 
@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clbench.base.errors import InputError
-from clbench.scoring.intervals import MANY, Runs, needed_references, studentised_range_quantile
+from clbench.scoring.intervals import MANY, Runs, studentised_range_quantile
 from clbench.scoring.layout import Array
 from clbench.scoring.metric import Metric
 from clbench.scoring.metrics import METRICS, load_metric, measure
@@ -51,9 +51,7 @@ def deviation_of_differences(metric: str, rows: Iterable[Runs]) -> float | None:
 # ---- groups ------------------------------------------------------------------------------------------------
 
 
-def groups(
-    metric: str, rows: Mapping[str, Runs], *, references: Mapping[str, Runs] | None = None
-) -> dict[str, str]:
+def groups(metric: str, rows: Mapping[str, Runs]) -> dict[str, str]:
     """Return the groups of each row, the best row first: two rows share a letter if they are not told apart.
 
     A row with the letters "ab" belongs to two groups. It is not told apart from the other members of either,
@@ -72,18 +70,18 @@ def groups(
        may vary more than others do;
     3. from the episodes: the jackknife over them, since all rows may agree by chance.
 
-    So at most 5 % of the boards of equal methods have more than one group; `docs/guide/statistics.md` has the
-    figures. Rows without a common seed are compared by the variation of runs around the mean of their row.
-    Where no row has a second seed, a deviation of `UNKNOWN_DEVIATION` is assumed: only distant rows are told
-    apart.
+    So about 5 % of the boards of equal methods have more than one group, and up to 9 % where one method
+    varies far more than the others: `docs/guide/statistics.md` has the figures. Rows without a common seed
+    are compared by the variation of runs around the mean of their row. Where no row has a second seed, a
+    deviation of `UNKNOWN_DEVIATION` is assumed: only distant rows are told apart.
 
     Args:
         metric: Name of a metric.
         rows: Runs by seed of each row.
-        references: Runs of reference methods by name and seed.
 
     Returns:
-        Letters by row, the best row first; it is in group a. Rows without a value have none.
+        Letters by row, the best row first; it is in group a. Rows without a value have none, and neither has
+        any row if the metric needs a reference.
 
     Raises:
         UnknownNameError: The metric is unknown.
@@ -105,10 +103,7 @@ def groups(
     for name, runs in rows.items():
         if not runs:
             continue
-        others = {
-            key: them for key, them in (references or {}).items() if key != name or wanted.compares_itself
-        }
-        value, of_seeds, without_episode = _measured(wanted, runs, seeds, others)
+        value, of_seeds, without_episode = _measured(wanted, runs, seeds)
         if math.isfinite(value):
             entries.append((-sign * value, name, sign * of_seeds, sign * without_episode))
     entries.sort(key=lambda entry: entry[:2])
@@ -218,25 +213,18 @@ def _jackknife(without_episode: Array) -> Array:
     return np.asarray(np.nan_to_num((without_episode.shape[-1] - 1) * without_episode.var(axis=-1)))
 
 
-def _measured(
-    metric: Metric, runs: Runs, seeds: Sequence[int], references: Mapping[str, Runs]
-) -> tuple[float, Array, Array]:
+def _measured(metric: Metric, runs: Runs, seeds: Sequence[int]) -> tuple[float, Array, Array]:
     """Return a row's value, its runs' values (seeds,), and these without each episode (seeds, episodes)."""
     own = [seed for seed in seeds if seed in runs]
-    needed = needed_references([metric], own, references)
-    ordered = [runs[seed] for seed in own]
-    whole = rates_of(ordered, needed)
+    whole = rates_of([runs[seed] for seed in own], {})
     episodes = len(whole.layout.episodes)
     # Weights that add up to the number of episodes; a single one cannot be left out.
     weights = (1 - np.eye(episodes)) * episodes / (episodes - 1) if episodes > 1 else np.ones((1, 1))
     counts = np.broadcast_to(weights[:, None, :], (episodes, len(whole.layout.tasks), episodes))
     of_seeds = np.full(len(seeds), np.nan)
     without_episode = np.full((len(seeds), episodes), np.nan)
-    for number, run in enumerate(ordered):
-        place = seeds.index(own[number])
-        rates = replace(
-            run.rates(counts), references={name: them[number].rates(counts) for name, them in needed.items()}
-        )
-        without_episode[place] = metric.over_runs(rates.each(lambda array: array[:, None]))
+    for seed in own:
+        rates = runs[seed].rates(counts)
+        without_episode[seeds.index(seed)] = metric.over_runs(rates.each(lambda array: array[:, None]))
     of_seeds[[seeds.index(seed) for seed in own]] = metric.over_runs(whole.each(lambda array: array[:, None]))
     return float(metric.over_runs(whole)), of_seeds, without_episode

@@ -13,16 +13,22 @@ from clbench.scoring.scores import Scores, rates_of
 METRICS: Mapping[str, Metric] = REGISTRY
 """All metrics by name, in the order of the table."""
 
+TITLES = {"adaptation": "learned", "retention": "kept skills"}
+"""Titles of metrics on the board where they differ from the names."""
+
 
 def load_metric(name: str) -> Metric:
-    """Return the metric called `name`.
+    """Return the metric with this name, or with this title on the board.
 
     Raises:
         UnknownNameError: No metric has this name; the message names the nearest one.
     """
-    if name not in METRICS:
+    names = {title.replace(" ", "_"): one for one, title in TITLES.items()}
+    wanted = name.replace(" ", "_")
+    wanted = names.get(wanted, wanted)
+    if wanted not in METRICS:
         raise unknown("metric", name, METRICS)
-    return METRICS[name]
+    return METRICS[wanted]
 
 
 def measure(name: str, scores: Scores, references: Mapping[str, Scores] | None = None) -> float | None:

@@ -21,7 +21,6 @@ from clbench.runs.tuning import tuned_settings
 from clbench.scoring.layout import Layout
 from clbench.scoring.scores import Scores
 from clbench.spec.identifiers import built_in_methods
-from clbench.spec.protocol import Split
 from clbench.spec.scenario import balanced_order, target_order
 
 from .summary import NotShown
@@ -108,7 +107,7 @@ def _files(folder: Path) -> Iterator[Path]:
                 yield path
 
 
-def read_run(folder: Path, path: Path, split: Split = "test", changed: bool | None = False) -> Run:
+def read_run(folder: Path, path: Path, changed: bool | None = False) -> Run:
     """Return the run of the record at `path`, below `folder`.
 
     The file must have the path that a run gives it, so that its name shows which row it can change.
@@ -116,7 +115,6 @@ def read_run(folder: Path, path: Path, split: Split = "test", changed: bool | No
     Args:
         folder: Folder of the records.
         path: Path of the file.
-        split: Split that the run must have been evaluated on: "validation" for a tuning run.
         changed: Whether its settings must have been changed; None if they may.
 
     Raises:
@@ -127,7 +125,7 @@ def read_run(folder: Path, path: Path, split: Split = "test", changed: bool | No
         what = ": ".join(record.error[key] for key in ("where", "type", "message"))
         raise RecordError(f"the run failed ({what}).")
     run, name = record.run, path.relative_to(folder).as_posix()
-    _check_kind(run, split, changed)
+    _check_kind(run, changed)
     label = label_of(run.method, run.changes)
     home = _home(run, label)
     if record.scenario.id != run.scenario:
@@ -204,12 +202,10 @@ def _declared(scenario: str, method: str) -> tuple[dict[str, Any], dict[str, Any
     return dataclasses.asdict(cls.uses), {**dataclasses.asdict(cls()), **tuned_settings(scenario, method)}
 
 
-def _check_kind(run: RunInfo, split: Split, changed: bool | None) -> None:
-    """Refuse a run of another split, or with changed settings where none are expected, or the reverse."""
-    if split == "test" and run.split == "validation":
+def _check_kind(run: RunInfo, changed: bool | None) -> None:
+    """Refuse a tuning run, or one with changed settings where none are expected, or the reverse."""
+    if run.split == "validation":
         raise RecordError("it is a tuning run: its episodes may be chosen on.")
-    if split == "validation" and run.split == "test":
-        raise RecordError("it is no tuning run: its episodes are reported.")
     if changed is False and run.changes:
         raise RecordError(f"settings were changed: {', '.join(run.changes)}.")
     if changed is True and not run.changes:

@@ -289,7 +289,7 @@ def _relearning(boards: dict[str, list[Row]]) -> Section:
         compared = ""
         if never is not None and never.value is not None:
             own = format_interval(never, ".0f")
-            compared = f"; a policy that was never pretrained takes {own} steps for its own"
+            compared = f"; a policy without pretraining needs {own} for the skill that it does worst"
         answers.append(
             f"On {name}, the skill that plain fine-tuning lost most is back at the criterion after "
             f"{format_interval(lost, '.0f')} steps of its demonstrations{compared}."

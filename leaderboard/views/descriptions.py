@@ -33,7 +33,7 @@ RULES: Mapping[str, str] = dict(
             "may read prior demonstrations",
             "learn by trial and error, in as many steps as they choose: not comparable with methods",
             "were fine-tuned elsewhere, on what their authors declare: not comparable with methods",
-            "do not compete: they show the best that is possible, and the result of doing nothing",
+            "do not compete: training on all data together, doing nothing, and learning from scratch",
         ),
         strict=True,
     )

@@ -31,6 +31,22 @@ def test_a_policy_is_pretrained_unless_it_is_in_the_cache(capsys: pytest.Capture
     assert {path: path.stat().st_mtime_ns for path in folder.iterdir()} == times
 
 
+@pytest.mark.parametrize(
+    ("policy", "said"),
+    [("my:P", "No module 'my' can be imported"), ("json:JSONDecoder", "is not a subclass of clbench.Policy")],
+)
+def test_what_is_no_policy_is_refused_in_one_line_before_anything_is_made(
+    policy: str, said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as ended:
+        _clbench("pretrain", TOY, "--policy", policy)
+    assert ended.value.code == 2
+    printed = capsys.readouterr().err
+    assert printed.startswith("error: ")
+    assert said in printed
+    assert "pretraining seed" not in printed
+
+
 def test_a_policy_ships_from_a_checkout_alone(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

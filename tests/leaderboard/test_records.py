@@ -136,7 +136,9 @@ def test_stop_gradient_keeps_every_answer(board: Any) -> None:
 
 
 def test_a_row_may_touch_the_data_that_its_class_declares() -> None:
-    for path in (RECORDS / "Fetch-v1").rglob("*.json"):
+    paths = [*(RECORDS / "Fetch-v1").rglob("*.json")]
+    assert paths
+    for path in paths:
         run = read_record(path).run
         if "online" in run.uses:  # an agent, not a method
             continue
@@ -144,7 +146,9 @@ def test_a_row_may_touch_the_data_that_its_class_declares() -> None:
 
 
 def test_aegis_sheds_little_energy_at_every_stage() -> None:
-    for path in (RECORDS / "Fetch-v1" / "aegis").glob("*.json"):
+    paths = [*(RECORDS / "Fetch-v1" / "aegis").glob("*.json")]
+    assert paths
+    for path in paths:
         record = read_record(path)
         checks = zip(record.checks["stage"], record.checks["step"], strict=True)
         trained = {str(stage) for stage, step in checks if step > 0}

@@ -113,6 +113,13 @@ def test_a_run_takes_the_tuned_settings_unless_it_changes_them(toy_file: Path) -
     assert RunSpec(TOY, "ewc", 0).resolve().info.settings["step_factor"] == 1.0
 
 
+def test_a_tuning_run_inherits_nothing_from_an_earlier_choice(toy_file: Path) -> None:
+    settings = {"tau_start": 0.03, "schedule": 3.25, "step_factor": 0.1}
+    write_tuned(toy_file, "clbench/Toy-v0", [100, 101], {"consft": Tuned(settings, (_tried(0.6, 0.9),))})
+    run = RunSpec(TOY, "consft", 100, {"step_factor": 0.3}, split="validation").resolve()
+    assert (run.info.settings["schedule"], run.info.settings["tau_start"]) == (1.0, 0.003)
+
+
 @pytest.mark.parametrize("control", CONTROLS)
 def test_a_control_has_the_settings_of_its_method_and_differs_in_nothing_else(
     control: str, toy_file: Path

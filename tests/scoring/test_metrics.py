@@ -18,6 +18,12 @@ def test_an_unknown_metric_is_a_lookup_error_that_names_the_nearest() -> None:
         load_metric("retentoin")
 
 
+def test_a_metric_is_found_by_its_title_on_the_board() -> None:
+    assert load_metric("learned") is METRICS["adaptation"]
+    assert load_metric("kept skills") is load_metric("kept_skills") is METRICS["retention"]
+    assert load_metric("final average") is METRICS["final_average"]
+
+
 @pytest.mark.parametrize("name", METRICS)
 def test_every_metric_describes_itself(name: str) -> None:
     metric = load_metric(name)
