@@ -62,7 +62,7 @@ def evaluation_of_episodes() -> Callable[[int], float]:
     def seconds(count: int) -> float:
         begin = time.perf_counter()
         with deterministic():
-            evaluator.play(policy, [(scenario.retained[3], "validation", number) for number in range(count)])
+            evaluator.play(policy, [(scenario.retained[-1], "validation", number) for number in range(count)])
         return time.perf_counter() - begin
 
     return seconds

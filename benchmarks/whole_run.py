@@ -27,7 +27,7 @@ from clbench.base.cache import cache_folder
 from clbench.data.demonstrations import load_demonstrations
 from clbench.data.questions import load_questions
 from clbench.learning.pretraining import pretrained_policy
-from clbench.policy.policy import Policy
+from clbench.policy.kinds import policy_class
 from clbench.runs.length import run_length
 from clbench.runs.run import execute
 from clbench.runs.spec import ResolvedRun, RunSpec
@@ -36,7 +36,6 @@ from clbench.worlds.lanes import Lanes
 PARTS = {
     "physics": (Lanes, ("step", "reset")),
     "pictures": (Lanes, ("observe",)),
-    "policy": (Policy, ("act",)),
 }
 
 
@@ -83,7 +82,9 @@ def _cache_without_reports() -> Iterator[None]:
 def measure(run: ResolvedRun) -> dict[str, Any]:
     """Return the duration of a run and of its parts."""
     clocks: defaultdict[str, float] = defaultdict(float)
-    for part, (owner, names) in PARTS.items():
+    # each kind of policy has its own `act`
+    timed = {**PARTS, "policy": (policy_class(run.scenario.policy), ("act",))}
+    for part, (owner, names) in timed.items():
         for name in names:
             setattr(owner, name, _clocked(getattr(owner, name), clocks, part))
     speeds = [_gigaflops()]
@@ -94,7 +95,7 @@ def measure(run: ResolvedRun) -> dict[str, Any]:
         seconds = time.perf_counter() - begin
     speeds.append(_gigaflops())
     training = sum(stage["training"] for stage in record.timing["stages"])
-    parts = {"training": training, **{part: clocks[part] for part in PARTS}}
+    parts = {"training": training, **{part: clocks[part] for part in timed}}
     parts["other"] = seconds - sum(parts.values())
     return {
         "method": run.spec.method,

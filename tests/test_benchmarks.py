@@ -1,7 +1,18 @@
+import importlib
+import itertools
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+from tiny import TINY
+
+from clbench.data.demonstrations import load_demonstrations
+from clbench.learning.pretraining import policy_config
+from clbench.policy.kinds import new_policy
 
 BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
 
@@ -32,6 +43,58 @@ world.close()
 """
 
 
+def _run(program: str) -> None:
+    """Run a program that imports benchmarks: some of them replace functions of clbench."""
+    path = os.pathsep.join(map(os.fspath, (BENCHMARKS, Path(__file__).parent / "shared")))
+    environment = {**os.environ, "PYTHONPATH": path, "MUJOCO_GL": "off"}
+    subprocess.run([sys.executable, "-c", program], check=True, env=environment)
+
+
 def test_the_walker_that_is_measured_is_dm_controls() -> None:
-    environment = {**os.environ, "PYTHONPATH": os.fspath(BENCHMARKS), "MUJOCO_GL": "off"}
-    subprocess.run([sys.executable, "-c", COMPARISON], check=True, env=environment)
+    _run(COMPARISON)
+
+
+@pytest.mark.parametrize("criterion", [None, 1.0])
+def test_a_step_is_timed_without_the_first_which_makes_the_optimiser(
+    criterion: float | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(BENCHMARKS)
+    step_time = importlib.import_module("step_time")
+    readings = itertools.count()
+    monkeypatch.setattr(step_time, "time", SimpleNamespace(perf_counter=readings.__next__))
+    scenario = replace(TINY, budget=replace(TINY.budget, criterion=criterion))
+    policy = new_policy(policy_config(scenario))
+    data = {"target": load_demonstrations(scenario.target[0], scenario, policy.config)}
+    assert step_time.Bench("sft", scenario, policy, data).seconds(3) == 3
+
+
+WHOLE_RUN = """
+import itertools, types, whole_run
+from tiny import TINY
+from clbench.runs.spec import RunSpec
+
+whole_run.time = types.SimpleNamespace(perf_counter=itertools.count().__next__)  # no part is too short
+found = whole_run.measure(RunSpec(TINY.id, "sft", 0).resolve())
+assert all(found["parts"][part] > 0 for part in ("physics", "pictures", "policy")), found
+"""
+
+
+def test_every_part_of_a_whole_run_is_measured() -> None:
+    _run(WHOLE_RUN)
+
+
+@pytest.mark.parametrize(
+    ("quantity", "size"),
+    [
+        ("tasks", 1),
+        ("episodes", 1),
+        ("environments", 1),
+        pytest.param("demonstrations", 200, marks=pytest.mark.slow),
+    ],
+)
+def test_every_quantity_whose_cost_may_grow_is_measured(
+    quantity: str, size: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(BENCHMARKS)
+    prepare, _ = importlib.import_module("scaling").MEASURES[quantity]
+    assert prepare()(size) > 0

@@ -22,6 +22,7 @@ from safetensors import SafetensorError, safe_open
 
 from clbench.base.cache import MANIFEST, cache_folder, hash_of
 from clbench.base.errors import InputError
+from clbench.base.lease import Lease
 from clbench.base.leftovers import finished_name, is_left_behind, is_unfinished, unfinished
 from clbench.cli.arguments import checked_input, whole_number
 from clbench.jobs.folders import minari_folder
@@ -67,10 +68,10 @@ def cache(
     """Show what the cache and the Minari datasets of clbench hold, and which entries are stale.
 
     An entry is stale if it has not been used for --older-than days, if newer code has made its replacement
-    since its last use, or if a killed process left it behind. The cache holds no records, and everything in
-    it can be made again. Files that clbench did not make are never deleted: an entry that holds one is named,
-    and left as it is. Where the file system does not note when a file is read, an entry counts as used when
-    it was made.
+    since its last use, or if a killed process left it behind. An entry at which a process is at work, such as
+    a run in progress, is never stale. The cache holds no records, and everything in it can be made again.
+    Files that clbench did not make are never deleted: an entry that holds one is named, and left as it is.
+    Where the file system does not note when a file is read, an entry counts as used when it was made.
 
     Args:
         prune: List the stale entries, and delete them.
@@ -306,7 +307,9 @@ def _without_code(value: Any, code: list[Any]) -> Any:
 
 
 def find_stale(found: Iterable[Entry], days: int, now: float) -> dict[Entry, str]:
-    """Return the stale entries, each with the reason. An entry with foreign files is never stale.
+    """Return the stale entries, each with the reason.
+
+    An entry with foreign files is never stale, nor is one whose lease a process holds.
 
     Args:
         found: Entries.
@@ -325,6 +328,8 @@ def find_stale(found: Iterable[Entry], days: int, now: float) -> dict[Entry, str
         if entry.is_leftover:
             if is_left_behind(entry.path):
                 stale[entry] = "left behind by a killed process"
+        elif Lease(entry.path).owner is not None:
+            continue  # a run writes its checkpoints at the ends of stages only
         elif now - entry.used > days * _DAY:
             stale[entry] = f"not used for {_days(now - entry.used)}"
         elif newer is not None and newer.origin != entry.origin and entry.used < newer.made:

@@ -28,6 +28,7 @@ from gymnasium.vector import VectorEnv
 from clbench.base.cache import cache_folder, cached, hash_of, is_cached
 from clbench.base.entry_points import resolve
 from clbench.base.errors import InputError, WrongTypeError
+from clbench.base.lease import Lease
 from clbench.base.seeding import seeded
 from clbench.base.strict_json import check_json
 from clbench.evaluation.episodes import Episode, Trial
@@ -51,6 +52,13 @@ LOG = logging.getLogger("clbench")
 
 USES = {"demonstrations": "never", "questions": "never", "reference": False, "online": True}
 """`RunInfo.uses` of an agent: it uses no prior data of clbench, and another program trains it."""
+
+_LEASES: dict[Path, Lease] = {}
+"""Leases of the runs that this process has begun, by the folder of the unfinished record.
+
+A program trains much longer than it evaluates: it keeps the lease from its first stage until the record is
+written or it ends, so that no other program drops or continues the stages of its agent.
+"""
 
 
 def evaluate_agent(
@@ -87,8 +95,10 @@ def evaluate_agent(
 
     Raises:
         WrongTypeError: `env` is not an environment of a scenario, or `agent` cannot act.
-        InputError: Another stage comes next, the targets are in another order, a record exists already, an
-            action has the wrong shape, or the name, the seed, the steps or the settings are invalid.
+        InputError: Another stage comes next, the targets are in another order, a record exists already,
+            another program evaluates an agent of this name and seed, an action has the wrong shape, or the
+            name, the seed, the steps or the settings are invalid.
+        LeaseLostError: Another program took the run over, because this one did not answer.
     """
     world = getattr(env, "unwrapped", None)
     if not isinstance(world, ScenarioEnv | ScenarioVectorEnv):
@@ -214,8 +224,22 @@ class StagedRun:
     def __str__(self) -> str:
         return f"{self.method}, seed {self.seed}, on {self.scenario.id}"
 
+    def _own(self) -> None:
+        """Take the run for this process, unless it has it."""
+        if self.folder not in _LEASES:
+            lease = Lease(self.folder)
+            while not lease.take():
+                if (owner := lease.owner) is not None:
+                    raise InputError(
+                        f"{self} belongs to {owner}, which is evaluating its stages: choose another name or "
+                        "seed, or wait until that process has ended."
+                    )
+                time.sleep(0.1)  # the lease of a dead process on another machine is watched for a while
+            _LEASES[self.folder] = lease
+        _LEASES[self.folder].check()
+
     def begin(self, stage: int, settings: dict[str, Any], uses: Mapping[str, Any], agent: Any) -> Record:
-        """Return the record of the earlier stages.
+        """Take the run for this process, and return the record of the earlier stages.
 
         Args:
             stage: Stage that is evaluated.
@@ -224,7 +248,9 @@ class StagedRun:
             agent: The agent or policy.
 
         Raises:
-            InputError: Another stage comes next, or settings or uses differ from those in stage 0.
+            InputError: Another stage comes next, settings or uses differ from those in stage 0, or another
+                process has taken the run.
+            LeaseLostError: Another process took the run over.
         """
         name = str(self)
         if self.path.exists():
@@ -232,6 +258,7 @@ class StagedRun:
                 f"{name} has a record already, {self.path}, which is never edited: "
                 "choose another seed or name, or remove it."
             )
+        self._own()
         done = self.done()
         if stage == 0:
             if done is not None:
@@ -303,10 +330,16 @@ class StagedRun:
         record.timing["seconds"] = None if None in parts else round(sum(parts), 2)
 
     def keep(self, record: Record, stage: int) -> None:
-        """Write the record: to its final path after the last stage, to the cache before."""
+        """Write the record: to its final path after the last stage, which ends the run, to the cache before.
+
+        Raises:
+            LeaseLostError: Another process took the run over.
+        """
+        _LEASES[self.folder].check()
         if stage == self.last:
             write_record(record, self.path)
             shutil.rmtree(self.folder, ignore_errors=True)
+            _LEASES.pop(self.folder).release()
             return
         folder = self._stage_folder(stage)
         cached(folder, self._inputs(stage), lambda partial: write_record(record, partial / "record.json"))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import math
 from collections.abc import Sequence
 from contextlib import closing
@@ -14,6 +13,7 @@ from scipy.stats import hypergeom
 from clbench.base.errors import InputError
 from clbench.base.progress import ProgressCallback
 from clbench.data.questions import load_questions, scored_questions
+from clbench.data.training_data import TrainingData
 from clbench.evaluation.answers import answer
 from clbench.evaluation.checks import Checker
 from clbench.evaluation.episodes import Trial
@@ -21,7 +21,7 @@ from clbench.evaluation.examiner import episode_row
 from clbench.evaluation.rollouts import Evaluator
 from clbench.learning.optimise import deterministic
 from clbench.learning.pretraining import pretrained_policy
-from clbench.learning.trainer import Trainer, load_stage
+from clbench.learning.trainer import Trainer
 from clbench.policy.policy import Policy
 from clbench.records.record import EpisodeRow
 from clbench.runs.checkpoints import kept_stages, load_stages, stage_policies
@@ -77,7 +77,7 @@ def replay(subject: Subject, progress: ProgressCallback) -> list[Check]:
     origin = "kept by the run" if kept else "trained again"
     checks = _replay_checks(subject, policies) if subject.scenario.budget.criterion else []
     if kept is not None:
-        checks.append(_go_on(subject, kept))
+        checks.append(_go_on(subject, kept, policies))
     return [Check("policies", origin, True), episodes, answers, *checks]
 
 
@@ -145,21 +145,21 @@ def _replay_checks(subject: Subject, policies: Sequence[Policy]) -> list[Check]:
     return [Check("ends of stages", f"the last checks of all {len(last)} stages repeat themselves", True)]
 
 
-def _go_on(subject: Subject, kept: Path) -> Check:
+def _go_on(subject: Subject, kept: Path, policies: Sequence[Policy]) -> Check:
     """Train a randomly chosen stage again from the kept policy before it, and compare with the one after it.
 
     Policies of another method, under this one's name, do not follow from each other. On another processor the
-    last bits differ.
+    last bits differ, those of the pretrained policy too: the normalisation is that of the kept policies.
     """
     run = subject.resolved
     number = int(np.random.default_rng(subject.request.seed).integers(len(run.scenario.target))) + 1
     steps = subject.protocol.end(number).step
-    trainer = Trainer.open(run.scenario, run.new_method, run.spec.seed, run.spec.device)
+    first, before, after = policies[0], policies[number - 1], policies[number]
+    data = TrainingData.open(run.scenario, first.config)
+    trainer = Trainer(run.scenario, data, first, run.new_method, run.spec.seed)
     with deterministic(run.spec.device):
         trainer.load(kept / f"stage-{number - 1}", number - 1)
-        before = copy.deepcopy(trainer.policy)
         trainer.learn(number, lambda step: step.done >= steps)
-        after = load_stage(kept / f"stage-{number}", run.new_method(), run.spec.device, run.spec.policy)
     moved, apart = _distance(before, after), _distance(trainer.policy, after)
     return Check(
         "from stage to stage",

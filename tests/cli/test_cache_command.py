@@ -109,6 +109,20 @@ def test_an_entry_of_older_code_is_stale_unless_it_was_used_since(
 
 
 @pytest.mark.usefixtures("empty_caches")
+def test_a_run_in_progress_keeps_its_checkpoints(capsys: pytest.CaptureFixture[str]) -> None:
+    unused, replaced = _make("runs", 40), _make("runs", 5, purpose="b")
+    newer = _make("runs", 2, code="b", purpose="b")
+    leases = [Lease(folder) for folder in (unused, replaced)]
+    assert all(lease.take() for lease in leases)
+    assert "Deleted 0 stale entries" in _cache(capsys, "--prune")
+    assert "Deleted 1 stale entry" in _cache(capsys, "--prune", "--older-than", "0")
+    assert (unused.is_dir(), replaced.is_dir(), newer.is_dir()) == (True, True, False)
+    for lease in leases:
+        lease.release()
+    assert "Deleted 2 stale entries" in _cache(capsys, "--prune", "--older-than", "0")
+
+
+@pytest.mark.usefixtures("empty_caches")
 def test_leftovers_of_killed_processes_are_deleted(capsys: pytest.CaptureFixture[str]) -> None:
     root, whole = cache_folder() / "stages" / hash_of("run"), "f" * 32
     _write(root / "stage-0" / "data")

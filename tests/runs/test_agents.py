@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from agents import ID, LEARNED, TOY, Knowing, stage_env, trained
 
+from clbench.base.errors import InputError
 from clbench.policy.transformer import TransformerPolicy
 from clbench.records.reader import read_record
 from clbench.records.record import Costs
@@ -368,4 +369,34 @@ def test_a_killed_program_continues_with_the_stage_that_was_running(empty_caches
     assert next_stage(ID, method="me/still", records=records) == 3
     record = read_record(records / "Toy-v0/me--still/seed-0.json")
     assert record.costs == Costs(environment_steps=3)
+    assert not list((empty_caches / "cache" / "online").iterdir())
+
+
+OTHER = """
+import gymnasium, clbench
+for stage in range(3):
+    env = gymnasium.make("{id}", stage=stage)
+    clbench.evaluate_agent(lambda _: [0, 0], env, method="me/knows", steps=7, records="records")
+    print(stage, flush=True)
+    input()
+"""
+
+
+def test_two_programs_do_not_mix_their_stages(evaluate: Callable[..., Any], empty_caches: Path) -> None:
+    command = [sys.executable, "-c", OTHER.format(id=ID)]
+    pipes: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+    with subprocess.Popen(command, cwd=empty_caches, **pipes) as other:
+        assert other.stdin is not None
+        assert other.stdout is not None
+        for stage in range(3):
+            assert other.stdout.readline() == f"{stage}\n"
+            message = f"belongs to process {other.pid} on " if stage < 2 else "has a record already"
+            for mine in range(3):  # while the other one trains for its next stage
+                with pytest.raises(InputError, match=message):
+                    evaluate(Knowing(), stage_env(mine))
+            print(file=other.stdin, flush=True)
+    assert other.returncode == 0
+    assert read_record(empty_caches / "records/Toy-v0/me--knows/seed-0.json").costs.environment_steps == 21
+    for stage in range(3):
+        evaluate(Knowing(), stage_env(stage), seed=1)
     assert not list((empty_caches / "cache" / "online").iterdir())
