@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from clbench.base.progress import ProgressCallback, no_progress
 from clbench.base.seeding import SPLIT_LABELS, derive_seed
+from clbench.data.access import check_episodes
 from clbench.spec.protocol import Split
 from clbench.spec.task import Task
 from clbench.worlds.lanes import Lanes
@@ -107,7 +108,11 @@ def play_in_lanes(
         progress: Called with the number of episodes that have ended since its last call.
         watch: Called with every action.
         enough: Called with each outcome; once it returns True, only the episodes that have ended count.
+
+    Raises:
+        LeakError: A hook asks for other episodes than validation episodes of tasks that it knows.
     """
+    check_episodes((task.name, split) for task, split, _ in trials)
     queue, idle = list(reversed(trials)), list(range(count))
     live: list[Live] = []
     ended: dict[tuple[str, Split, int], Episode] = {}

@@ -16,7 +16,7 @@ from clbench.data.questions import scored_questions
 from clbench.data.training_data import TrainingData
 from clbench.evaluation.answers import answer
 from clbench.evaluation.episodes import Episode, Trial
-from clbench.evaluation.probes import activations, shift, update_sparsity, velocities
+from clbench.evaluation.probes import activations, predictions, shift, update_sparsity
 from clbench.evaluation.rollouts import Evaluator
 from clbench.policy.activations import Gaussian
 from clbench.policy.batch import Batch, QuestionBatch
@@ -67,7 +67,7 @@ class Examiner:
         return self._activations(self._pretrained)
 
     def examine(
-        self, policy: Policy, point: Point, record: Record, velocities_before: Tensor | None = None
+        self, policy: Policy, point: Point, record: Record, predictions_before: Tensor | None = None
     ) -> None:
         """Evaluate `policy` at `point`, and append the rows to the tables of `record`.
 
@@ -75,7 +75,7 @@ class Examiner:
             policy: Policy to evaluate.
             point: Point of the run.
             record: Record of the run.
-            velocities_before: `velocities` before the stage, at the end of which the shift and the captured
+            predictions_before: `predictions` before the stage, at the end of which the shift and the captured
                 share are measured; None elsewhere.
         """
         keys = self._protocol.episodes(point)
@@ -85,15 +85,15 @@ class Examiner:
         for kind, asked, correct in answer(policy, self._data.questions.kinds, *self._asked):
             record.add_answers(AnswerRow(*point, kind, asked, correct))
         moved = captured = None
-        if velocities_before is not None:
-            moved = self._shift(policy, point.stage, velocities_before)
+        if predictions_before is not None:
+            moved = self._shift(policy, point.stage, predictions_before)
             captured = self._captured(policy, point.stage)
         sparsity = update_sparsity(policy, self._pretrained)
         record.add_policy(PolicyRow(*point, sparsity, self._drift(policy), moved, captured))
 
-    def velocities(self, policy: Policy, stage: int) -> Tensor:
-        """Return the velocities (B, H, A) that `policy` predicts on a fixed batch of a stage's target."""
-        return velocities(policy, self._batch(stage))
+    def predictions(self, policy: Policy, stage: int) -> Tensor:
+        """Return the predictions (B, H, A) of `policy` on a fixed batch of a stage's target."""
+        return predictions(policy, self._batch(stage))
 
     def successes(self, policy: Policy) -> dict[str, int]:
         """Return the successes of `policy` in the validation episodes of each retained skill, in order."""
@@ -121,8 +121,8 @@ class Examiner:
         return activations(policy, self._asked[1].to(self._device))
 
     def _shift(self, policy: Policy, stage: int, before: Tensor) -> float | None:
-        """Return the shift since `before`, None for a diverged policy, whose velocities are not finite."""
-        moved = shift(before, self.velocities(policy, stage), self._batch(stage).valid)
+        """Return the shift since `before`, None for a diverged policy, whose predictions are not finite."""
+        moved = shift(before, self.predictions(policy, stage), self._batch(stage).valid)
         return moved if math.isfinite(moved) else None
 
     def _captured(self, policy: Policy, stage: int) -> float | None:

@@ -38,8 +38,8 @@ def update_sparsity(policy: Policy, pretrained: Policy) -> float | None:
 
 
 @torch.no_grad()
-def velocities(policy: Policy, batch: Batch) -> Tensor:
-    """Return the velocities (B, H, A) that `policy` predicts on `batch`, given on the policy's device."""
+def predictions(policy: Policy, batch: Batch) -> Tensor:
+    """Return the predictions (B, H, A) of `policy` on `batch`, given on the policy's device."""
     policy.eval()
     predicted = policy.predict(batch)
     policy.train()
@@ -47,7 +47,7 @@ def velocities(policy: Policy, batch: Batch) -> Tensor:
 
 
 def shift(before: Tensor, after: Tensor, valid: Tensor) -> float:
-    """Return the mean squared change from velocities `before` to `after`, both (B, H, A).
+    """Return the mean squared change from predictions `before` to `after`, both (B, H, A).
 
     It averages as the loss does: over the action dimensions and the valid steps (B, H), then over samples.
     """

@@ -121,13 +121,12 @@ class Trainer:
             )
         self.method = self.new_method()
         self.where = "load_state() after watch_pretraining"
-        self.method.load_state(
-            self.policy,
-            {
-                name: value.to(self.device) if isinstance(value, torch.Tensor) else value
-                for name, value in state.items()
-            },
-        )
+        moved = {
+            name: value.to(self.device) if isinstance(value, torch.Tensor) else value
+            for name, value in state.items()
+        }
+        with self._hooks(0):
+            self.method.load_state(self.policy, moved)
         return self.scenario.budget.pretraining_steps
 
     def learn(self, number: int, after: Callable[[Step], bool | None]) -> int:
@@ -183,7 +182,14 @@ class Trainer:
     def state(self, number: int) -> MethodState:
         """Return what the method keeps after stage `number`."""
         self.where = f"state() after stage {number}"
-        return self.method.state()
+        with self._hooks(number):
+            return self.method.state()
+
+    def diagnostics(self, number: int) -> Any:
+        """Return what the method reports on stage `number`."""
+        self.where = f"diagnostics() after stage {number}"
+        with self._hooks(number):
+            return self.method.diagnostics()
 
     def save(self, folder: Path, state: MethodState) -> None:
         """Write the policy and the state of the method to the `STAGE_FILES` of `folder`."""
@@ -194,8 +200,10 @@ class Trainer:
         """Load the policy and the method that stage `number` left in `folder`."""
         self.where = f"load_state() after stage {number}"
         self.method = self.new_method()
-        with seeded("method", self.seed, number):  # adapters are drawn before they are filled
+        # adapters are drawn before they are filled
+        with seeded("method", self.seed, number), self._hooks(number):
             self.policy = load_stage(folder, self.method, self.device, self.scenario.policy)
+        check_policy(self.policy, self.pretrained)
 
 
 def load_stage(folder: Path, method: Method, device: torch.device | str, policy: str) -> Policy:

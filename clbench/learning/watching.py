@@ -74,7 +74,9 @@ def watch(
                     f"watch_pretraining() must change nothing, but {name} differs from the pretraining "
                     "without it: draw no random number and write to no tensor in it."
                 )
-        write_state(partial, method.state())
+        with hooks():
+            state = method.state()
+        write_state(partial, state)
 
     return read_state(cached(cache_folder() / "watched" / hash_of(inputs), inputs, make))
 

@@ -234,7 +234,7 @@ class _Run:
         protocol = self.run.protocol
         *on_the_way, _ = protocol.points(number)
         points = set() if self.trainer.method.whole_stages else set(on_the_way)
-        velocities = self.examiner.velocities(self.trainer.policy, number)
+        predictions = self.examiner.predictions(self.trainer.policy, number)
         begin, evaluating, checking = time.perf_counter(), 0.0, 0.0
 
         def evaluate(point: Point, before: torch.Tensor | None = None) -> None:
@@ -264,7 +264,7 @@ class _Run:
 
         steps = self.trainer.learn(number, after)
         self.progress(protocol.steps[-1] - steps if protocol.criterion else 0)
-        evaluate(Point(number, steps) if protocol.criterion else protocol.end(number), velocities)
+        evaluate(Point(number, steps) if protocol.criterion else protocol.end(number), predictions)
         self._diagnose(number)
         training = time.perf_counter() - begin - evaluating - checking
         self._count_steps(steps)
@@ -280,8 +280,7 @@ class _Run:
 
     def _diagnose(self, number: int) -> None:
         """Keep the method's report on stage `number`."""
-        self.trainer.where = f"diagnostics() after stage {number}"
-        found: Any = self.trainer.method.diagnostics()
+        found = self.trainer.diagnostics(number)
         if not isinstance(found, dict):
             raise WrongTypeError(f"diagnostics() must return a dictionary, not {type(found).__name__}.")
         if found:
@@ -299,7 +298,7 @@ class _Run:
         self.record.timing["seconds"] = round(seconds, 2)
 
     def _count_costs(self) -> None:
-        costs, state = self.record.costs, self.trainer.method.state()
+        costs, state = self.record.costs, self.trainer.state(len(self.run.scenario.target))
         tensors = [value for value in state.values() if isinstance(value, torch.Tensor)]
         costs.parameters_added = _parameters(self.trainer) - (costs.parameters or 0)
         kept = self.trainer.prior(len(self.run.scenario.target), ("throughout",)).bytes

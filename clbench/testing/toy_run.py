@@ -124,7 +124,7 @@ class ToyRun:
                 else:
                     self.outcomes["prepare", "steps"] = self.trainer.prepare()
                 stage = self.trainer.where
-                self._keep(stage, "diagnostics", self.trainer.method.diagnostics())
+                self._keep(stage, "diagnostics", self.trainer.diagnostics(number))
                 self.trainer.save(folder, self.trainer.state(number))
                 for name, value in self.trainer.policy.state_dict().items():
                     self._keep(stage, name, value)

@@ -192,15 +192,16 @@ def decodes_faster(evidence: Evidence) -> Finding:
         missing = Figure("speed-up of the pipeline", (), NO_ESTIMATE, note=how)
         return Finding("undecided", (missing,), change=what_would_change(missing, LEAST_SPEED_UP))
     best, least = found.best_pipeline, found.widths[min(found.widths)]
-    speed = Figure(f"speed-up of the {best.name}", (), best.speed_up)
-    success = Figure(f"success, {best.name} - easy first", (), best.difference)
+    pooled = f"interval over {found.episodes} episodes of {found.seeds} policies, pooled"
+    speed = Figure(f"speed-up of the {best.name}", (), best.speed_up, note="one policy on one machine")
+    success = Figure(f"success, {best.name} - easy first", (), best.difference, note=pooled)
     forward = Figure("time of a forward of all tokens / of a block", (), least["forward"])
     holds = speed.low >= LEAST_SPEED_UP and success.low >= -MOST_LOSS
     fails = speed.high < LEAST_SPEED_UP or success.high < -MOST_LOSS
     change = what_would_change(speed, LEAST_SPEED_UP)
     figures = (speed, success)
     single = min(found.decoders, key=lambda one: one.forwards)
-    at_once = Figure(f"success, {single.name} - easy first", (), single.difference)
+    at_once = Figure(f"success, {single.name} - easy first", (), single.difference, note=pooled)
     controls = (at_once, forward, *_counts(found))
     if fails and success.low >= -MOST_LOSS:
         if single.forwards <= 1 and at_once.low >= -MOST_LOSS:

@@ -4,8 +4,10 @@ from pathlib import Path
 
 import pytest
 
+from clbench.learning.registry import load_method
 from clbench.runs.run import execute
 from clbench.runs.spec import RunSpec
+from clbench.testing import ContractError, check_method
 
 TOY = "clbench.testing:clbench/Toy-v0"
 
@@ -13,6 +15,7 @@ METHODS = '''
 import dataclasses
 
 from clbench.data.demonstrations import load_demonstrations
+from clbench.evaluation.players import play
 from clbench.evaluation.rollouts import Evaluator
 from clbench.learning.method import Method
 from clbench.learning.prior import Uses
@@ -88,6 +91,36 @@ class FairChooser(Chooser):
 
 
 @dataclasses.dataclass
+class Player(Method):
+    """It chooses on test episodes that a function for agents plays."""
+
+    def end_task(self, policy, stage):
+        play(lambda observation: TOY.target[0], TOY, [(TOY.target[0], "test", 0)], 0, "text", False)
+
+
+@dataclasses.dataclass
+class Late(Method):
+    """It reads the questions of the report in the hook after a stage that `hook` names."""
+
+    hook: str = "state"
+
+    def _look(self, hook):
+        if hook == self.hook:
+            load_questions(TOY)
+
+    def diagnostics(self):
+        self._look("diagnostics")
+        return {}
+
+    def state(self):
+        self._look("state")
+        return {}
+
+    def load_state(self, policy, state):
+        self._look("load_state")
+
+
+@dataclasses.dataclass
 class Asker(Method):
     """It reads the questions of the report."""
 
@@ -128,6 +161,7 @@ def _methods(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         ("Chooser", "runs test episodes of right: nothing may be chosen on them"),
         ("RobustChooser", "runs perturbed episodes of right: nothing may be chosen on them"),
         ("EarlyChooser", "runs episodes of down, which its stage must not know yet"),
+        ("Player", "runs test episodes of right: nothing may be chosen on them"),
         ("Asker", "loads questions by itself, the test questions too"),
         ("Normaliser", "changes state_mean: the normalisation is fixed in pretraining"),
         ("Talker", "changes the vocabulary or a size of the policy"),
@@ -139,6 +173,19 @@ def test_a_planted_leak_ends_the_run_and_is_named(method: str, message: str, tmp
     assert record.error is not None
     assert record.error["type"] == "LeakError"
     assert message in record.error["message"]
+
+
+@pytest.mark.parametrize("hook", ["diagnostics", "state"])
+def test_a_hook_after_a_stage_may_read_no_more_than_those_in_it(hook: str, tmp_path: Path) -> None:
+    record = execute(RunSpec(TOY, "leaky:Late", 0, {"hook": hook}), tmp_path)
+    assert record.error is not None
+    assert record.error["where"] == f"{hook}() after stage 0"
+    assert "loads questions by itself" in record.error["message"]
+
+
+def test_a_hook_that_restores_a_state_may_read_no_more() -> None:
+    with pytest.raises(ContractError, match="loads questions by itself"):
+        check_method(load_method("leaky:Late"), hook="load_state")
 
 
 @pytest.mark.parametrize("method", ["FairChooser", "Declared"])
