@@ -21,6 +21,7 @@ from ..board.overall import OverallRow
 from ..board.predictors import predictions
 from ..board.rows import Row, standing_of
 from ..board.summary import DIVISIONS, RowSummary
+from ..board.tiers import TIERS
 
 FIXED = (
     "final_average",
@@ -137,11 +138,10 @@ def agreement_text(found: Agreement | None) -> str:
     """Return a sentence on how alike two halves of the seeds order the methods; empty if it is not known."""
     if found is None:
         return ""
-    how = "order" if found.direction > 0 else "do not surely order"
-    return (
-        f"The two halves of the {found.seeds} seeds {how} the {found.rows} methods alike: "
-        f"Kendall's tau {tau_text(found)}."
-    )
+    halves = f"wo halves of the {found.seeds} seeds put the {found.rows} methods in"
+    is_alike = found.direction > 0
+    says = f"T{halves} a similar order" if is_alike else f"It is not certain that t{halves} the same order"
+    return f"{says}: Kendall's tau {tau_text(found)}."
 
 
 def prediction_text(rows: Iterable[Row]) -> str:
@@ -208,7 +208,27 @@ def standing_text(row: Row, rows: Iterable[Row], named: int | None = None) -> st
     text = f"place {standing.place} of {standing.count}"
     if standing.alike:
         return f"{text}; not told apart from {', '.join(shown)}"
-    return f"{text}; told apart from all others" if standing.count > 1 else text
+    others = {1: "", 2: "; told apart from the other one of its division"}
+    return text + others.get(standing.count, "; told apart from the others of its division")
+
+
+def tier_text(row: Row) -> str:
+    """Return the tier of a row and the runs above it: "self-reported; 1 of 12 runs retrained"."""
+    higher = _higher([row], f"{len(row.runs)} runs")
+    return f"{row.tier}; {higher}" if higher else row.tier
+
+
+def tiers_text(rows: Sequence[Row]) -> str:
+    """Return a sentence on the runs that reached a higher tier than their row has; empty if there is none."""
+    higher = _higher(rows, str(sum(len(row.runs) for row in rows)))
+    return f"A row has the lowest tier of its runs. Runs with a higher tier: {higher}." if higher else ""
+
+
+def _higher(rows: Iterable[Row], total: str) -> str:
+    """Return the number of runs with each tier above that of their row: "7 of 216 replayed, 18 retrained"."""
+    reached = [run.tier for row in rows for run in row.runs if run.tier != row.tier]
+    texts = [f"{reached.count(tier)} {tier}" for tier in TIERS if tier in reached]
+    return ", ".join(texts).replace(" ", f" of {total} ", 1)
 
 
 def scaled(count: float) -> tuple[str, str]:

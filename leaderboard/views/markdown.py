@@ -34,6 +34,7 @@ from .format import (
     prediction_text,
     shown,
     start_text,
+    tiers_text,
     title_of,
 )
 
@@ -67,6 +68,7 @@ def markdown(table: Table, comparisons: Comparisons) -> str:
         counted=counted,
         policy_of=lambda place: parts_of(place)[1],
         start_text=start_text,
+        tiers_text=tiers_text,
         prediction_text=prediction_text,
         direction=_direction,
         ends=_ends,

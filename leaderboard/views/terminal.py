@@ -23,8 +23,8 @@ from .format import MISSING, Column, Rows, agreement_text, aligned, fitting, num
 LEGEND = (
     "Rows of a division that share a letter are not told apart. "
     "± is half the width of a 95 % confidence interval; it does not cover what all seeds share: "
-    "demonstrations, scenes and questions. "
-    "Higher is better{lower}. {tried}Cost: training time relative to sft. Tier: {tiers}.\n"
+    "demonstrations, scenes and questions. Higher is better{lower}. {tried}"
+    "Cost: relative cost, the training time divided by sft's. Tier: {tiers}.\n"
 )
 """Legend below the tables."""
 

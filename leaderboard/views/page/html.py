@@ -50,10 +50,10 @@ GROUPS = {"retained": "old skills to keep", "target": "new tasks", "held out": "
 """Titles of the groups of tasks."""
 
 TIER_RULES = (
-    "Only the submitter has checked the runs.",
-    "The metrics were recomputed from the episodes.",
-    "Some of the episodes were replayed.",
-    "The whole runs were repeated.",
+    "At least one run was checked by its submitter alone.",
+    "The metrics of every run were recomputed from its episodes, or more was done.",
+    "Some episodes of every run were replayed, or more was done.",
+    "Every run was repeated as a whole.",
 )
 """How the rows of each tier were verified."""
 

@@ -20,7 +20,17 @@ from clbench.spec.identifiers import built_in_methods
 from ...board.rows import Row, standing_of
 from ...board.summary import DIVISIONS, ELSEWHERE, RANKED_BY
 from ..descriptions import Description, describe
-from ..format import Column, Rows, aligned, format_interval, number_text, shown, standing_text, title_of
+from ..format import (
+    Column,
+    Rows,
+    aligned,
+    format_interval,
+    number_text,
+    shown,
+    standing_text,
+    tier_text,
+    title_of,
+)
 from ..markdown import arxiv_ids
 from .charts.vega import finite, rounded
 from .curves import estimated, retained_curve, target_curves
@@ -89,6 +99,11 @@ class RowView:
     def division(self) -> int:
         """Number of its division."""
         return DIVISIONS.index(self.row.division)
+
+    @property
+    def tier(self) -> str:
+        """Its tier, and how many of its runs reached a higher one."""
+        return tier_text(self.row)
 
     @property
     def price(self) -> tuple[Number, Number]:

@@ -33,7 +33,8 @@ class Fact:
 
     name: str
     text: str
-    interval: str = ""
+    more: str = ""
+    """Its interval, or what it is a multiple of."""
 
 
 @dataclass(frozen=True)
@@ -71,6 +72,11 @@ def headline(rows: Sequence[Row]) -> str:
         if row.method in apart
     }
     ahead = [row for row in others if gains.get(row.method, 0.0) > 0]
+    if not apart and all(len(row.seeds) == 1 for row in competing):
+        methods = "the one other method cannot" if len(others) == 1 else "no method can"
+        return (
+            f"One seed: {methods} be told apart from plain fine-tuning. The intervals cover episodes alone."
+        )
     if not ahead:
         methods = "The one other method is not" if len(others) == 1 else "No method is"
         return f"{methods} shown to end above plain fine-tuning."
@@ -129,14 +135,20 @@ def _standing(leader: Row, rows: Iterable[Row]) -> str:
     standing = standing_of(leader, rows)
     value = number_text(leader.estimates[RANKED_BY].value, ".2f")
     if standing is None or standing.count == 1:
-        return f"Alone in its division. Final average {value}."
-    first = f"First of {standing.count}, with a final average of {value}"
+        return f"It is alone in its division, with a final average of {value}."
+    first = f"In final average ({value}) it is first of {standing.count}"
+    if len(standing.alike) == 1:
+        return f"{first}; {_names(standing.alike)} is not told apart from it."
     if standing.alike:
-        return f"{first}, but not told apart from {_names(standing.alike)}."
+        return f"{first}; {_alike_text(len(standing.alike))}: {_names(standing.alike)}."
     others = [row for row in rows if row.division == leader.division and row is not leader]
     if len(others) == 1:
         return f"{first}, told apart from {printable(others[0].method)}."
     return f"{first}, told apart from all others of its division."
+
+
+def _alike_text(count: int) -> str:
+    return f"{'one is' if count == 1 else f'{count} are'} not told apart from it"
 
 
 def _keeping(members: Sequence[Row], baseline: Row | None) -> str:
@@ -146,28 +158,44 @@ def _keeping(members: Sequence[Row], baseline: Row | None) -> str:
     equal = [row for row in members if row.method in _alike("adaptation", baseline.method, pool)]
     if not equal:
         return _other_learning(members[0], baseline)
-    slower = "" if members[0] in equal else f"{_other_learning(members[0], baseline)} "
+    leader = members[0]
+    slower = "" if leader in equal else f"{_other_learning(leader, baseline)} "
     keeper = max(equal, key=lambda row: mean_difference("kept", row.scores, baseline.scores) or 0.0)
-    kept = number_text(keeper.estimates["kept"].value, ".2f", MISSING)
+    name = "it" if keeper is leader else printable(keeper.method)
+    if len(equal) == 1 and keeper.method != BASELINE:
+        return f"{slower}{'It' if keeper is leader else name} {_beside(keeper, baseline)} {_training(keeper)}"
+    kept, like = _value("kept", keeper), "Of the methods not shown to learn more or less than sft"
     if keeper.method == BASELINE:
-        return f"{slower}No method that is not told apart from sft in learning keeps more than sft's {kept}."
-    price = cost(keeper)
-    paid = f"{price.text} the training time of sft" if price.order else "a cost that was not measured"
-    if len(members) == 1:
-        usual = number_text(baseline.estimates["kept"].value, ".2f", MISSING)
-        apart = _apart("kept", keeper, baseline)
-        return f"{_learning(keeper, baseline)}, and keeps {kept}, sft {usual}{apart}, at {paid}."
+        return f"{slower}{like}, none keeps more than sft itself ({kept})."
     peers = _alike("kept", keeper.method, {row.method: row for row in equal})
-    others = counted(len(peers) - 1, "other")
-    sure = f"; not told apart from {others}" if len(peers) > 1 else ""
-    name, like = printable(keeper.method), "Among the methods not told apart from sft in learning"
-    return f"{slower}{like}, {name} keeps the most: {kept}, at {paid}{sure}."
+    sure = f"; in this, {_alike_text(len(peers) - 1)}" if len(peers) > 1 else ""
+    return f"{slower}{like}, {name} keeps the most ({kept}){sure}. {_training(keeper)}"
 
 
-def _learning(row: Row, baseline: Row) -> str:
-    """Return what a row learns that is not told apart from plain fine-tuning in it."""
-    own, usual = (number_text(one.estimates["adaptation"].value, ".2f", MISSING) for one in (row, baseline))
-    return f"It learns {own}, not told apart from sft's {usual}"
+def _beside(row: Row, baseline: Row) -> str:
+    """Return what a row learns, not told apart from plain fine-tuning in this, and what it keeps."""
+    learned, kept = (
+        f"{_value(name, row)} ({BASELINE} {_value(name, baseline)})" for name in ("adaptation", "kept")
+    )
+    if len({*row.seeds} & {*baseline.seeds}) < 2:
+        return f"learns {learned} and keeps {kept}, with one seed alone."
+    is_alike = baseline.method in _alike("kept", row.method, {one.method: one for one in (row, baseline)})
+    sure = "neither difference is" if is_alike else "only the difference in what is kept is"
+    return f"learns {learned} and keeps {kept}; {sure} told apart."
+
+
+def _training(row: Row) -> str:
+    """Return the sentence on the training time of a row."""
+    relative = row.costs["relative_cost"]
+    if relative is None:
+        return "Its training time was not measured."
+    if relative == 0:
+        return "It takes no training."
+    return f"Its training takes {number_text(relative, '.2f')} times as long as sft's."
+
+
+def _value(metric: str, row: Row) -> str:
+    return number_text(row.estimates[metric].value, ".2f", MISSING)
 
 
 def _other_learning(leader: Row, baseline: Row) -> str:
@@ -175,11 +203,6 @@ def _other_learning(leader: Row, baseline: Row) -> str:
     usual, own = (row.estimates["adaptation"].value or 0.0 for row in (baseline, leader))
     less = "less" if own < usual else "more"
     return f"It learns {less} than sft: {number_text(own, '.2f')} against {number_text(usual, '.2f')}."
-
-
-def _apart(metric: str, row: Row, other: Row) -> str:
-    alike = other.method in _alike(metric, row.method, {row.method: row, other.method: other})
-    return ", not told apart" if alike else ""
 
 
 def _alike(metric: str, method: str, rows: dict[str, Row]) -> set[str]:
@@ -195,7 +218,9 @@ def _facts(row: Row, baseline: Row | None) -> list[Fact]:
     found = [_fact(title, row.estimates[name], "+.2f" if name == "gain" else ".2f") for title, name in names]
     if row.method == BASELINE:
         found.pop()
-    return [*found, Fact("training time", cost(row).text), Fact("bytes kept", size(row).text)]
+    price = cost(row)
+    found.append(Fact("relative cost", price.text, "the training time of sft" if price.order else ""))
+    return [*found, Fact("bytes kept", size(row).text)]
 
 
 def _fact(title: str, one: Estimate, form: str) -> Fact:

@@ -20,7 +20,7 @@ from ...board.tiers import TIERS
 from ...policies.compared import Comparison, Comparisons
 from ...policies.decoders import Decoding, read_decoding
 from ..descriptions import RULES
-from ..format import Column, agreement_text, prediction_text, start_text, title_of
+from ..format import Column, agreement_text, prediction_text, start_text, tiers_text, title_of
 from .definitions import Family, families
 from .rows import RowView, columns, others, places, row_view
 from .stills import film, stills
@@ -89,11 +89,12 @@ class ScenarioView:
         policy = f"A policy with {counted(skills, 'skill')}" if skills else "A policy"
         seeds = sorted({len(view.row.seeds) for view in self.rows})
         count = counted(seeds[0], "seed") if len(seeds) == 1 else f"{seeds[0]} to {seeds[-1]} seeds"
+        numbers = "Results of one seed" if seeds == [1] else f"Means over {count}"
         turns = ", one after another" if targets > 1 else ""
         sentences = [
             f"{policy} is fine-tuned on {counted(targets, 'new task')}{turns}.",
             "The final average is its success on all of them at the end.",
-            f"Means over {count}, with 95 % confidence intervals.",
+            f"{numbers}, with 95 % confidence intervals.",
         ]
         if any(row.method == BASELINE for row in self.table):
             sentences.append(f"Plain fine-tuning is called {BASELINE}.")
@@ -113,6 +114,11 @@ class ScenarioView:
     def tiers(self) -> list[str]:
         """Tiers of its rows, the lowest first."""
         return sorted({view.row.tier for view in self.rows}, key=TIERS.index)
+
+    @property
+    def higher_tiers(self) -> str:
+        """Sentence on the runs that reached a higher tier than their row, empty if there is none."""
+        return tiers_text(self.table)
 
     @property
     def has_agents(self) -> bool:

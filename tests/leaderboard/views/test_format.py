@@ -1,4 +1,4 @@
-"""The place of a row and its letters, in words and below each other."""
+"""The place of a row, its letters and its tier, in words; how alike halves of the seeds order the rows."""
 
 import dataclasses
 from collections.abc import Callable
@@ -9,6 +9,10 @@ import pytest
 
 from clbench.base.entry_points import resolve
 
+agreement_text = resolve("clbench.leaderboard.views.format:agreement_text")
+Agreement = resolve("clbench.leaderboard.board.agreement:Agreement")
+tier_text = resolve("clbench.leaderboard.views.format:tier_text")
+tiers_text = resolve("clbench.leaderboard.views.format:tiers_text")
 aligned = resolve("clbench.leaderboard.views.format:aligned")
 standing_text = resolve("clbench.leaderboard.views.format:standing_text")
 read_table = resolve("clbench.leaderboard.board.rows:read_table")
@@ -27,7 +31,7 @@ def rows(add: Callable[..., Path], matrix: Any, tmp_path: Path) -> dict[str, Any
 
 def test_a_place_counts_the_better_rows_and_names_those_that_are_not_told_apart(rows: dict[str, Any]) -> None:
     board = list(rows.values())
-    assert standing_text(rows["best"], board) == "place 1 of 5; told apart from all others"
+    assert standing_text(rows["best"], board) == "place 1 of 5; told apart from the others of its division"
     assert standing_text(rows["good"], board) == "place 2 of 5; not told apart from twin, middle"
     assert standing_text(rows["twin"], board) == "place 2 of 5; not told apart from good, middle"
     assert standing_text(rows["middle"], board, 2) == "place 4 of 5; not told apart from good, twin, 1 more"
@@ -40,9 +44,38 @@ def test_a_row_that_does_not_compete_has_no_place(rows: dict[str, Any]) -> None:
     lost = dataclasses.replace(rows["worst"], groups=None)
     assert standing_text(lost, board) == "no final average"
     assert standing_text(rows["best"], [rows["best"], rows["ideal"]]) == "place 1 of 1"
+    two = [rows["best"], rows["worst"]]
+    assert standing_text(rows["worst"], two) == "place 2 of 2; told apart from the other one of its division"
 
 
 def test_letters_are_below_each_other_if_their_groups_are_the_same(rows: dict[str, Any]) -> None:
     board = list(rows.values())
     letters = [aligned(row.groups, board) for row in rows.values()]
     assert letters == ["a   ", " b  ", " bc ", " bcd", "   d", ""]
+
+
+def test_a_tier_is_the_lowest_of_the_runs_and_names_those_above_it(rows: dict[str, Any]) -> None:
+    (run,) = rows["best"].runs
+    tiers = ["self-reported", "retrained", "replayed", "replayed"]
+    runs = tuple(dataclasses.replace(run, tier=tier) for tier in tiers)
+    mixed = dataclasses.replace(rows["best"], runs=runs)
+    assert tier_text(mixed) == "self-reported; 2 of 4 runs replayed, 1 retrained"
+    assert tier_text(rows["good"]) == "self-reported"
+    assert tiers_text([mixed, rows["good"]]) == (
+        "A row has the lowest tier of its runs. Runs with a higher tier: 2 of 5 replayed, 1 retrained."
+    )
+    alike = dataclasses.replace(rows["best"], tier="replayed", runs=runs[2:])
+    assert tier_text(alike) == "replayed"
+    assert tiers_text([alike, rows["good"]]) == ""
+
+
+def test_only_an_agreement_beyond_chance_is_called_a_similar_order() -> None:
+    sure = Agreement(0.7, 0.5, 0.8, seeds=12, rows=15, chance=0.001)
+    assert agreement_text(sure) == (
+        "Two halves of the 12 seeds put the 15 methods in a similar order: Kendall's tau 0.70 [0.50, 0.80]."
+    )
+    assert agreement_text(dataclasses.replace(sure, chance=0.2)) == (
+        "It is not certain that two halves of the 12 seeds put the 15 methods in the same order: Kendall's "
+        "tau 0.70 [0.50, 0.80]."
+    )
+    assert agreement_text(None) == ""

@@ -100,7 +100,9 @@ def test_halves_of_the_seeds_that_order_the_methods_alike_are_named(
     for seed in range(4):
         for method, kept in (("l2_sp", 0.6), ("stop_gradient", 0.2)):
             even_board(method, seed, kept)
-    sentence = "The two halves of the 4 seeds order the 5 methods alike: Kendall's tau 1.00 [1.00, 1.00]."
+    sentence = (
+        "Two halves of the 4 seeds put the 5 methods in a similar order: Kendall's tau 1.00 [1.00, 1.00]."
+    )
     assert sentence in words(section_of(records))
     assert sentence in markdown(read_table(records), {}).replace("\\", "")
 

@@ -49,7 +49,7 @@ class Quantity:
 
 
 LEARNED = Quantity("learned", "adaptation", "success on each new task right after learning it")
-COST = Quantity("cost", "relative_cost", "training time relative to sft", is_cost=True)
+COST = Quantity("relative cost", "relative_cost", "training time divided by sft's", is_cost=True)
 BYTES = Quantity("bytes kept", "bytes_kept", "data handed from stage to stage", is_cost=True)
 KEPT = Quantity("kept", "kept", "success at the end on all that was known before the last task")
 SKILLS = Quantity("kept skills", "retention", "success on the old skills at the end")

@@ -44,12 +44,12 @@ Spec = dict[str, Any]
 
 @dataclass(frozen=True)
 class Size:
-    """Size of a chart in pixels, without axes, legend and labels on the right."""
+    """Size of a chart or panel in pixels, without axes, legend and labels on the right."""
 
     width: int
     height: int
     columns: int
-    """Number of columns of the legend."""
+    """Number of columns of the legend, or of panels."""
 
 
 def colour(name: str) -> str:

@@ -25,6 +25,7 @@ from clbench.records.writer import write_record
 
 page = resolve("clbench.leaderboard.views.page:page")
 pictures = resolve("clbench.leaderboard.views.page:pictures")
+markdown = resolve("clbench.leaderboard.views.markdown:markdown")
 tiers = importlib.import_module("clbench.leaderboard.board.tiers")
 read_table = resolve("clbench.leaderboard.board.rows:read_table")
 
@@ -126,6 +127,24 @@ def test_a_row_says_what_its_verification_looked_at_and_which_lie_it_could_have_
     assert f"seeds 0 tier replayed by Ada episodes {found} " in words(own)
     assert "\x1b" not in words(own)
     assert not list(own.iter("img"))
+
+
+def test_a_tier_says_how_many_runs_reached_a_higher_one(records: Path) -> None:
+    record = record_path(records, "clbench/Toy-v0", "sft", 0)
+    values = {"tier": "retrained", "record": hashlib.sha256(record.read_bytes()).hexdigest()}
+    tiers.verification_path(record).write_text(tiers.verification_text(values), encoding="utf-8")
+    text = page(read_table(records), {})
+    assert "self-reported; 1 of 2 runs retrained" in words(row_of(text, "clbench/Toy-v0/sft"))
+    section = by_id(parsed(text), "clbench/Toy-v0")
+    cells = [one for one in section.iter("td") if (one.get("class") or "").startswith("tier")]
+    assert [(words(one), one.get("data-note")) for one in cells] == [
+        ("self-reported", None),
+        ("self-reported ; 1 of 2 runs retrained", "self-reported; 1 of 2 runs retrained"),
+    ]
+    sentence = "A row has the lowest tier of its runs. Runs with a higher tier: 1 of 4 retrained."
+    assert f"4 runs. {sentence}" in words(section)
+    assert sentence in markdown(read_table(records), {})
+    assert "At least one run was checked by its submitter alone." in words(section)
 
 
 def test_a_missing_value_is_a_dash_that_says_why(add: Callable[..., Path], records: Path) -> None:

@@ -96,7 +96,7 @@ def test_plain_fine_tuning_alone_is_no_comparison(board: Callable[..., Any]) -> 
         f"Plain fine-tuning ends with a final average of {final:.2f}. No other method has run here."
     )
     (verdict,) = verdicts(rows)
-    assert verdict.standing.startswith("Alone in its division.")
+    assert verdict.standing == f"It is alone in its division, with a final average of {final:.2f}."
     assert verdict.keeping == ""
     assert "gain" not in " ".join(fact.name for fact in verdict.facts)
 
@@ -110,19 +110,53 @@ def test_without_plain_fine_tuning_nothing_is_compared(board: Callable[..., Any]
 def test_a_leader_that_is_not_told_apart_is_said_to_be_so(board: Callable[..., Any]) -> None:
     rows = board(sft=matrix(0.5), lora=matrix(0.5), finch=matrix(0.55))
     (verdict,) = verdicts(rows)
-    assert verdict.standing.startswith("First of 3, with a final average of ")
-    assert "but not told apart from" in verdict.standing
-    assert "; not told apart from 2 others." in verdict.keeping
+    final = verdict.leader.estimates["final_average"].value
+    assert verdict.standing == (
+        f"In final average ({final:.2f}) it is first of 3; 2 are not told apart from it: lora and sft."
+    )
+    assert verdict.keeping == (
+        "Of the methods not shown to learn more or less than sft, it keeps the most (0.60); in this, 2 are "
+        "not told apart from it. Its training time was not measured."
+    )
+
+
+def test_the_one_method_that_is_not_told_apart_from_a_leader_is_named(board: Callable[..., Any]) -> None:
+    (verdict,) = verdicts(board(sft=matrix(0.5), lora=matrix(0.6)))
+    assert verdict.standing.endswith("it is first of 2; sft is not told apart from it.")
+    assert "; in this, one is not told apart from it." in verdict.keeping
+
+
+def test_no_method_keeps_more_than_plain_fine_tuning(board: Callable[..., Any]) -> None:
+    (verdict,) = verdicts(board(sft=matrix(0.9), lora=matrix(0.2), finch=matrix(0.1)))
+    assert verdict.keeping == (
+        "Of the methods not shown to learn more or less than sft, none keeps more than sft itself (0.90)."
+    )
 
 
 def test_a_leader_that_is_told_apart_from_all_is_said_to_be_so(board: Callable[..., Any]) -> None:
     (verdict,) = verdicts(board(sft=matrix(0.1), lora=matrix(0.9), finch=matrix(0.1)))
     assert verdict.leader.method == "lora"
-    assert verdict.standing.endswith(", told apart from all others of its division.")
+    assert verdict.standing.endswith("it is first of 3, told apart from all others of its division.")
     assert verdict.keeping == (
-        "Among the methods not told apart from sft in learning, lora keeps the most: 0.90, at a cost that "
-        "was not measured."
+        "Of the methods not shown to learn more or less than sft, it keeps the most (0.90). Its training "
+        "time was not measured."
     )
+
+
+def test_a_training_time_is_a_multiple_of_that_of_plain_fine_tuning(board: Callable[..., Any]) -> None:
+    rows = board(sft=matrix(0.1), lora=matrix(0.9))
+    for relative, sentence in (
+        (2.371, "Its training takes 2.37 times as long as sft's."),
+        (0.0, "It takes no training."),
+    ):
+        priced = [dataclasses.replace(row, costs=row.costs | {"relative_cost": relative}) for row in rows]
+        (verdict,) = verdicts(priced)
+        assert verdict.keeping.endswith(f"keeps the most (0.90). {sentence}")
+        (fact,) = (fact for fact in verdict.facts if fact.name == "relative cost")
+        assert (fact.text, fact.more) == (
+            f"{relative:.2f}\N{MULTIPLICATION SIGN}",
+            "the training time of sft",
+        )
 
 
 def test_a_leader_that_learns_less_does_not_keep_most_of_those_that_learn_alike(
@@ -131,8 +165,8 @@ def test_a_leader_that_learns_less_does_not_keep_most_of_those_that_learn_alike(
     (verdict,) = verdicts(board(sft=matrix(0.1), lora=matrix(1.0, 0.3), finch=matrix(0.2)))
     assert verdict.leader.method == "lora"
     assert (
-        "It learns less than sft: 0.30 against 1.00. Among the methods not told apart from sft in learning, "
-        "finch keeps the most" in verdict.keeping
+        "It learns less than sft: 0.30 against 1.00. Of the methods not shown to learn more or less than "
+        "sft, finch keeps the most (0.20)" in verdict.keeping
     )
 
 
@@ -140,6 +174,35 @@ def test_the_only_method_of_a_division_is_compared_with_plain_fine_tuning(board:
     rows = board(sft=matrix(0.1), replay=matrix(0.9))
     assert [verdict.name for verdict in verdicts(rows)] == ["prior-data-free", "prior demonstrations"]
     assert verdicts(rows)[1].keeping == (
-        "It learns 1.00, not told apart from sft's 1.00, and keeps 0.90, sft 0.10, at a cost that "
-        "was not measured."
+        "It learns 1.00 (sft 1.00) and keeps 0.90 (sft 0.10); only the difference in what is kept is told "
+        "apart. Its training time was not measured."
     )
+    alike = verdicts(board(sft=matrix(0.1), replay=matrix(0.1)))[1]
+    assert alike.keeping.startswith(
+        "It learns 1.00 (sft 1.00) and keeps 0.10 (sft 0.10); neither difference is told apart."
+    )
+
+
+def test_the_only_method_that_learns_like_plain_fine_tuning_is_compared_with_it(
+    board: Callable[..., Any],
+) -> None:
+    rows = board(sft=matrix(0.1), replay=matrix(0.9, 0.3), replay_more=matrix(0.4))
+    assert verdicts(rows)[1].keeping.startswith(
+        "It learns less than sft: 0.30 against 1.00. replay_more learns 1.00 (sft 1.00) and keeps 0.40 (sft "
+        "0.10); "
+    )
+
+
+def test_with_one_seed_nothing_is_told_apart(board: Callable[..., Any]) -> None:
+    rows = [
+        dataclasses.replace(row, runs=row.runs[:1], seeds=row.seeds[:1])
+        for row in board(sft=matrix(0.5), lora=matrix(0.4), replay=matrix(0.6))
+    ]
+    assert headline(rows) == (
+        "One seed: no method can be told apart from plain fine-tuning. The intervals cover episodes alone."
+    )
+    assert verdicts(rows)[1].keeping == (
+        "It learns 1.00 (sft 1.00) and keeps 0.60 (sft 0.50), with one seed alone. Its training time was not "
+        "measured."
+    )
+    assert headline(rows[:2]).startswith("One seed: the one other method cannot be told apart")

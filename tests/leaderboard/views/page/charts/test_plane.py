@@ -55,13 +55,13 @@ def test_a_row_outside_the_plane_is_named_with_its_values(rows: Any) -> None:
 
 
 def test_a_row_without_a_quantity_is_named_as_such(rows: Any) -> None:
-    assert "heavy (no cost, kept skills 0." in Plane(rows, cost, skills).note
+    assert "heavy (no relative cost, kept skills 0." in Plane(rows, cost, skills).note
 
 
 def test_a_scenario_without_a_quantity_has_no_point_and_says_why(rows: Any) -> None:
     plane = Plane([row for row in rows if row.method == "heavy"], cost, targets)
     assert not plane.points
-    assert "no cost" in plane.note
+    assert "no relative cost" in plane.note
 
 
 @pytest.mark.parametrize("costs", [(0.0, 0.0), (0.0, 0.5)])
