@@ -33,7 +33,7 @@ from clbench.scoring.metrics import load_metric
 from clbench.scoring.scores import Scores, rates_of
 
 RESULTS = Path(__file__).parent / "results" / "coverage.json"
-BOARDS = ("Fetch-v1", "MetaWorld-v1")
+BOARDS = ("Fetch-v1", "MetaWorld-v1", "PointMaze-v1")
 """Folders of records whose deviations between seeds the page states."""
 EPISODES = 200
 """Episodes of a run, of all tasks together."""

@@ -63,11 +63,13 @@ def ladder_of(records: Path) -> Path:
 def read_frontiers(folder: Path) -> tuple[dict[str, tuple[Curve, ...]], list[NotShown]]:
     """Return the curves below `folder` by scenario, plain fine-tuning first, and the files that make none.
 
-    Their paths begin with the folder's name. A missing folder counts as empty.
+    Their paths begin with the folder's name. A missing folder counts as empty. A scenario with one learning
+    rate has no curves: its runs are for the claims.
     """
     runs, refused = read_runs(folder, partial(read_run, changed=True), (*ALIKE, on_the_ladder))
     runs.sort(key=lambda run: run.place)
-    found = {place: _curves(list(members)) for place, members in groupby(runs, lambda run: run.place)}
+    by_place = {place: _curves(list(members)) for place, members in groupby(runs, lambda run: run.place)}
+    found = {place: curves for place, curves in by_place.items() if any(len(one.rungs) > 1 for one in curves)}
     return found, [dataclasses.replace(one, path=f"{folder.name}/{one.path}") for one in refused]
 
 
