@@ -171,9 +171,12 @@ def test_the_readme_shows_the_committed_board() -> None:
     published = {cells[head.index("method")]: [cells[head.index(name)] for name in names] for cells in rows}
     lines = README.read_text(encoding="utf-8").splitlines()
     shown = [_cells(line) for line in lines if len(re.findall(r"\d \[-?\d", line)) == len(names)]
-    assert len(shown) == 6
-    for method, *values in shown:
+    assert len(shown) == 7
+    for method, reads, *values in shown:
         assert values == published[method], f"README.md: the row of {method} is another on the board"
+        uses = dataclasses.asdict(load_method(method).uses)
+        read = [data for data in ("demonstrations", "questions") if uses[data] != "never"]
+        assert reads == next(iter(read), "-"), f"README.md: {method} reads something else"
 
 
 def _cells(line: str) -> list[str]:

@@ -163,7 +163,8 @@ def _keeping(members: Sequence[Row], baseline: Row | None) -> str:
     keeper = max(equal, key=lambda row: mean_difference("kept", row.scores, baseline.scores) or 0.0)
     name = "it" if keeper is leader else printable(keeper.method)
     if len(equal) == 1 and keeper.method != BASELINE:
-        return f"{slower}{'It' if keeper is leader else name} {_beside(keeper, baseline)} {_training(keeper)}"
+        which = "It" if keeper is leader else f"Of the others, {name}"
+        return f"{slower}{which} {_beside(keeper, baseline)} {_training(keeper)}"
     kept, like = _value("kept", keeper), "Of the methods not shown to learn more or less than sft"
     if keeper.method == BASELINE:
         return f"{slower}{like}, none keeps more than sft itself ({kept})."

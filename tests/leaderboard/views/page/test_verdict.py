@@ -188,8 +188,8 @@ def test_the_only_method_that_learns_like_plain_fine_tuning_is_compared_with_it(
 ) -> None:
     rows = board(sft=matrix(0.1), replay=matrix(0.9, 0.3), replay_more=matrix(0.4))
     assert verdicts(rows)[1].keeping.startswith(
-        "It learns less than sft: 0.30 against 1.00. replay_more learns 1.00 (sft 1.00) and keeps 0.40 (sft "
-        "0.10); "
+        "It learns less than sft: 0.30 against 1.00. Of the others, replay_more learns 1.00 (sft 1.00) and "
+        "keeps 0.40 (sft 0.10); "
     )
 
 
