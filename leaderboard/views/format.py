@@ -138,9 +138,10 @@ def agreement_text(found: Agreement | None) -> str:
     """Return a sentence on how alike two halves of the seeds order the methods; empty if it is not known."""
     if found is None:
         return ""
-    halves = f"wo halves of the {found.seeds} seeds put the {found.rows} methods in"
-    is_alike = found.direction > 0
-    says = f"T{halves} a similar order" if is_alike else f"It is not certain that t{halves} the same order"
+    halves = f"halves of the {found.seeds} seeds put the {found.rows} methods in"
+    says = f"It is not certain that two {halves} the same order"
+    if found.direction > 0:
+        says = f"Two {halves} a similar order"
     return f"{says}: Kendall's tau {tau_text(found)}."
 
 
