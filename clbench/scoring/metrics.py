@@ -14,7 +14,7 @@ METRICS: Mapping[str, Metric] = REGISTRY
 """All metrics by name, in the order of the table."""
 
 TITLES = {"adaptation": "learned", "retention": "kept skills"}
-"""Titles of metrics on the board where they differ from the names."""
+"""Titles of metrics on boards with a criterion, where they are beside `kept` and `kept_targets`."""
 
 
 def load_metric(name: str) -> Metric:

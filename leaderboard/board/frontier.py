@@ -68,9 +68,15 @@ def read_frontiers(folder: Path) -> tuple[dict[str, tuple[Curve, ...]], list[Not
     """
     runs, refused = read_runs(folder, partial(read_run, changed=True), (*ALIKE, on_the_ladder))
     runs.sort(key=lambda run: run.place)
-    by_place = {place: _curves(list(members)) for place, members in groupby(runs, lambda run: run.place)}
-    found = {place: curves for place, curves in by_place.items() if any(len(one.rungs) > 1 for one in curves)}
+    by_place = {place: list(members) for place, members in groupby(runs, lambda run: run.place)}
+    found = {place: _curves(members) for place, members in by_place.items() if _is_ladder(members)}
     return found, [dataclasses.replace(one, path=f"{folder.name}/{one.path}") for one in refused]
+
+
+def _is_ladder(runs: Sequence[Run]) -> bool:
+    """Return whether a method, with its other changes, ran at several learning rates."""
+    rungs = {(apart_from_the_factor(run), run.record.run.changes[FACTOR]) for run in runs}
+    return len(rungs) > len({label for label, _ in rungs})
 
 
 def on_the_ladder(runs: list[Run]) -> Sifted:

@@ -149,7 +149,7 @@ def _go_on(subject: Subject, kept: Path, policies: Sequence[Policy]) -> Check:
     """Train a randomly chosen stage again from the kept policy before it, and compare with the one after it.
 
     Policies of another method, under this one's name, do not follow from each other. On another processor the
-    last bits differ, those of the pretrained policy too: the normalisation is that of the kept policies.
+    last bits differ, even in the pretrained policy: the kept policies give the normalisation.
     """
     run = subject.resolved
     number = int(np.random.default_rng(subject.request.seed).integers(len(run.scenario.target))) + 1

@@ -5,6 +5,7 @@ The same rows give the same bytes: no date, no absolute path, fixed digits.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,7 +14,7 @@ from typing import TypeAlias
 from clbench.base.leftovers import unfinished
 from clbench.scoring.intervals import Estimate
 from clbench.scoring.metric import Metric
-from clbench.scoring.metrics import METRICS
+from clbench.scoring.metrics import METRICS, TITLES
 from clbench.scoring.scores import WEAK, WEAK_WARNING
 
 from ..board.agreement import Agreement
@@ -60,9 +61,6 @@ FITTING = ("final_average", "gain", "adaptation", "retention", "kept")
 NOT_FITTING = ("perturbed_retention", "zero_shot")
 """Metrics of `FIXED` that it has no room for."""
 
-TITLES_TO_CRITERION = {"adaptation": "learned", "retention": "kept skills"}
-"""Titles of metrics in the tables of `TO_CRITERION`, where they are beside `kept` and `kept_targets`."""
-
 MISSING = "-"
 """Text for a value that could not be computed."""
 
@@ -102,7 +100,7 @@ def column_title(name: str, to_criterion: bool) -> str:
         name: Name of the metric.
         to_criterion: Whether the stages of the scenario end when the target is learned.
     """
-    return (TITLES_TO_CRITERION if to_criterion else {}).get(name) or title_of(name)
+    return (TITLES if to_criterion else {}).get(name) or title_of(name)
 
 
 def fitting(rows: Rows) -> tuple[Column, ...]:
@@ -215,21 +213,22 @@ def standing_text(row: Row, rows: Iterable[Row], named: int | None = None) -> st
 
 def tier_text(row: Row) -> str:
     """Return the tier of a row and the runs above it: "self-reported; 1 of 12 runs retrained"."""
-    higher = _higher([row], f"{len(row.runs)} runs")
+    higher = _higher([row], " runs")
     return f"{row.tier}; {higher}" if higher else row.tier
 
 
 def tiers_text(rows: Sequence[Row]) -> str:
     """Return a sentence on the runs that reached a higher tier than their row has; empty if there is none."""
-    higher = _higher(rows, str(sum(len(row.runs) for row in rows)))
+    higher = _higher(rows)
     return f"A row has the lowest tier of its runs. Runs with a higher tier: {higher}." if higher else ""
 
 
-def _higher(rows: Iterable[Row], total: str) -> str:
+def _higher(rows: Sequence[Row], unit: str = "") -> str:
     """Return the number of runs with each tier above that of their row: "7 of 216 replayed, 18 retrained"."""
-    reached = [run.tier for row in rows for run in row.runs if run.tier != row.tier]
-    texts = [f"{reached.count(tier)} {tier}" for tier in TIERS if tier in reached]
-    return ", ".join(texts).replace(" ", f" of {total} ", 1)
+    reached = Counter(run.tier for row in rows for run in row.runs if run.tier != row.tier)
+    of_all = f" of {sum(len(row.runs) for row in rows)}{unit}"
+    found = [tier for tier in TIERS if reached[tier]]
+    return ", ".join(f"{reached[tier]}{of_all if tier == found[0] else ''} {tier}" for tier in found)
 
 
 def scaled(count: float) -> tuple[str, str]:

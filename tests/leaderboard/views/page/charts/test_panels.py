@@ -18,7 +18,7 @@ WITHOUT, WITH = "prior-data-free", "prior demonstrations"
 
 
 def curve(method: str, division: str, *marks: tuple[float | None, float | None]) -> Any:
-    """Return a curve with marks of what is learned and kept, at falling learning rates."""
+    """Return a curve with marks (learned, kept) at falling learning rates."""
     rungs = [
         Rung(0.3**number, Estimate(learned, None, None), Estimate(kept, 0.1, 0.9), (0,))
         for number, (learned, kept) in enumerate(marks)
