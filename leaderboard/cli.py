@@ -327,7 +327,8 @@ def findings(
     from .views.format import write_all
 
     table = _table(records)
-    found = sections(table, judge_all(_evidence(None, records, controls)))
+    evidence_on = _evidence(None, records, controls)
+    found = sections(table, judge_all(evidence_on), evidence_on)
     drawn = {output.parent / "findings" / name: svg for name, svg in pictures(table).items()}
     _print_written(write_all({output: page(found), **drawn}))
 

@@ -21,7 +21,8 @@ Details:
 `ConSFTCalibrated` keeps the published constants and multiplies the loss by `loss_scale` inside the weight.
 The constants belong to the losses of policies with billions of parameters. The losses of this policy are
 larger: with the constants as published, nearly all weights stay at the floor until the schedule ends.
-Multiplied by 0.003, a loss of 0.03 has a weight of 0.5 at the start.
+Multiplied by 0.003, a loss of 0.03 has a weight of 0.5 at the start. Where methods are tuned, `clbench tune` chose
+`tau_start` of ConSFT and `loss_scale` of ConSFTCalibrated, each from three values; the records have the value.
 """
 
 from dataclasses import dataclass

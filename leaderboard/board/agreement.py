@@ -1,4 +1,4 @@
-"""Agreement of two boards, or of two halves of the seeds, on the order of the rows: Kendall's tau."""
+"""Agreement on the order of the rows: of two boards, Kendall's tau; of the seeds of one, Kendall's W."""
 
 from __future__ import annotations
 
@@ -15,8 +15,27 @@ SIGNIFICANCE = 0.05
 """Largest probability of an agreement that is not put down to chance."""
 
 LEAST_SEEDS, LEAST_ROWS = 4, 5
-"""Fewest seeds and rows: with one seed in a half there is nothing to draw, and of the orders of four rows one
-in twelve is equal to a given one, or opposite."""
+"""Fewest seeds and rows: Friedman's test assumes some seeds, and of the orders of four rows one in twelve is
+equal to a given one, or opposite."""
+
+
+@dataclass(frozen=True)
+class Concordance:
+    """Kendall's W: how alike the seeds of a board order its rows."""
+
+    w: float
+    """1 if all seeds have the same order, 0 if the sums of the ranks are equal."""
+    chance: float
+    """Probability of a W as large if each seed had the rows in a random order (Friedman's test)."""
+    seeds: int
+    """Number of seeds."""
+    rows: int
+    """Number of rows."""
+
+    @property
+    def certain(self) -> bool:
+        """Whether chance does not explain it."""
+        return self.chance < SIGNIFICANCE
 
 
 @dataclass(frozen=True)
@@ -68,20 +87,23 @@ def _signs(differences: Array) -> Array:
     return np.where(np.abs(differences) < 1e-9, 0.0, np.sign(differences))
 
 
-def agreement_of(values: Array, replicates: int = REPLICATES) -> Agreement | None:
-    """Return the agreement of the first and the second half of the seeds on the order of the rows.
+def concordance(values: Array) -> Concordance | None:
+    """Return how alike the seeds order the rows (Kendall, Babington Smith 1939, doi 10.1214/aoms/1177732186).
 
     Args:
         values: Value of each row and seed, (rows, seeds).
-        replicates: Number of draws.
 
     Returns:
-        None with too few rows or seeds, or if a half does not order the rows at all.
+        None with too few rows or seeds, or if no seed orders the rows.
     """
+    from scipy.stats import friedmanchisquare  # a second, which reading a board does not need
+
     rows, seeds = values.shape
-    if rows < LEAST_ROWS or seeds < LEAST_SEEDS:
+    rounded = values.round(9)  # values are quotients of whole numbers: equal ones may differ in the last bit
+    if rows < LEAST_ROWS or seeds < LEAST_SEEDS or (rounded == rounded[0]).all():
         return None
-    return agreement_between(values[:, : seeds // 2], values[:, seeds // 2 :], replicates)
+    test = friedmanchisquare(*rounded)
+    return Concordance(float(test.statistic) / (seeds * (rows - 1)), float(test.pvalue), seeds, rows)
 
 
 def agreement_between(

@@ -21,7 +21,7 @@ from clbench.scoring.intervals import Estimate, Runs, estimate, row_generator
 from clbench.scoring.metrics import METRICS, measure
 from clbench.spec.references import BASELINE
 
-from .agreement import Agreement, agreement_of
+from .agreement import Concordance, concordance
 from .costs import costs_of
 from .frontier import Curve, ladder_of, read_frontiers
 from .orders import Orders, orders_of
@@ -279,13 +279,13 @@ def apart_from_baseline(rows: Iterable[Row]) -> frozenset[str]:
     return frozenset(apart)
 
 
-def agreement(rows: Iterable[Row]) -> Agreement | None:
-    """Return how alike two halves of the seeds order the competing rows of a scenario; see `agreement_of`.
+def agreement(rows: Iterable[Row]) -> Concordance | None:
+    """Return how alike the seeds order the competing rows of a scenario; see `concordance`.
 
     Only a scenario whose seeds have orders of their own has an agreement.
     """
     values = values_by_seed(row for row in rows if row.runs[0].published.balanced)
-    return agreement_of(np.array(list(values.values()))) if values else None
+    return concordance(np.array(list(values.values()))) if values else None
 
 
 def values_by_seed(rows: Iterable[Row], metric: str = RANKED_BY) -> dict[str, list[float]]:

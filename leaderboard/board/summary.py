@@ -9,7 +9,7 @@ from typing import Any, Protocol, TypeVar
 from clbench.scoring.intervals import Estimate
 from clbench.scoring.metrics import METRICS
 
-from .agreement import Agreement
+from .agreement import Concordance
 
 DIVISIONS = ("prior-data-free", "prior questions", "prior demonstrations", "online", "external", "reference")
 """Divisions in the order of the table: the first three by the prior data that a method may use; "online" for
@@ -92,8 +92,8 @@ class Summary:
     """Rows by scenario and division, the best first; scenarios with a criterion come first."""
     starts: Mapping[str, float | None] = field(default_factory=dict)
     """Mean success of the pretrained policy on its skills, by scenario."""
-    agreements: Mapping[str, Agreement | None] = field(default_factory=dict)
-    """How alike two halves of the seeds order the rows, by scenario."""
+    agreements: Mapping[str, Concordance | None] = field(default_factory=dict)
+    """How alike the seeds order the rows, by scenario."""
     not_shown: tuple[NotShown, ...] = ()
     """Files that make no row, by path."""
 
@@ -116,7 +116,7 @@ class Summary:
         return Summary(
             rows=tuple(_row_from_json(row) for row in values["rows"]),
             starts=values["starts"],
-            agreements={name: found and Agreement(**found) for name, found in values["agreements"].items()},
+            agreements={name: found and Concordance(**found) for name, found in values["agreements"].items()},
             not_shown=tuple(NotShown(**entry) for entry in values["not_shown"]),
         )
 

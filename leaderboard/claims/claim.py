@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from clbench.base.text import counted
+from clbench.scoring.intervals import student_quantile
 
 from .evidence import Evidence, Figure
 
@@ -141,12 +142,28 @@ def what_would_change(figure: Figure, bar: float) -> str:
     if apart >= 0:
         return f"The {interval} would have to move by {apart:{form}} to reach {bar:{form}}."
     half, gap = (figure.high - figure.low) / 2, abs(figure.value - bar)
-    seeds = len(figure.seeds)
-    needed = math.ceil(seeds * (half / gap) ** 2) if gap > 0 else MOST_SEEDS + 1
-    if not seeds:
+    if len(figure.seeds) < 2:
         return f"A narrower {interval}: it contains {bar:{form}}."
-    how_many = f"about {needed}" if needed <= MOST_SEEDS else f"more than {MOST_SEEDS}"
+    needed = _seeds_for(gap, half, len(figure.seeds))
+    how_many = f"about {needed}" if needed else f"more than {MOST_SEEDS}"
     return f"At this spread {how_many} seeds: the {interval} contains {bar:{form}}."
+
+
+def _seeds_for(reach: float, half: float, seeds: int) -> int | None:
+    """Return the number of seeds whose Student interval reaches no further than `reach`, None if too many.
+
+    Args:
+        reach: Half the width that is wished.
+        half: Half the width with `seeds` seeds.
+        seeds: Number of seeds now, at least 2.
+    """
+    error = half * math.sqrt(seeds) / student_quantile(seeds - 1)
+    enough = (
+        count
+        for count in range(seeds, MOST_SEEDS + 1)
+        if error * student_quantile(count - 1) / math.sqrt(count) <= reach
+    )
+    return next(enough, None)
 
 
 def not_told_apart(control: Figure, *, explains: str, does_not: str) -> str:

@@ -3,20 +3,28 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 from .claim import ANYWHERE, Finding, Paper, best_first, claim, decided, not_told_apart, what_would_change
 from .evidence import Evidence, Figure, rung
-from .figures import PUBLISHED, kept, retention_drop, share_between, sparsity, spatial_gain, spatial_loss
+from .figures import (
+    PUBLISHED,
+    kept,
+    perturbation_gain,
+    perturbation_loss,
+    retention_drop,
+    share_between,
+    sparsity,
+)
 
 CONSFT = Paper("ConSFT", ("2605.08879",))
 
 ARMS = ("consft", "consft_calibrated")
-"""The constants as published, and the same constants with the loss in their unit."""
+"""The published loss with a tuned first temperature; the published constants, with the loss in their unit."""
 
 LEAST_BETWEEN = 0.1
-"""Share of the weights between 0.01 and 0.9 below which an arm is plain fine-tuning: its samples all weigh
-nothing, which Adam cancels, or all weigh 1."""
+"""Share of the weights between 0.01 and 0.9, before the last tenth of the schedule, from which an arm counts.
+Below it, most samples of most steps weigh alike: nothing, which Adam cancels, or 1."""
 
 
 def _active(evidence: Evidence, arm: str) -> bool:
@@ -26,17 +34,35 @@ def _active(evidence: Evidence, arm: str) -> bool:
 
 
 def _arms(evidence: Evidence) -> tuple[str, ...]:
-    """Return the arms that count: those whose weights differ between samples, or both if none does."""
-    return tuple(arm for arm in ARMS if _active(evidence, arm)) or ARMS
+    """Return the arms that count: those whose weights differ between samples."""
+    return tuple(arm for arm in ARMS if _active(evidence, arm))
 
 
 def _inactive_sentences(evidence: Evidence) -> tuple[str, ...]:
     return tuple(
-        f"Only {share_between(evidence, arm).value:.0%} of the weights of {arm} lie between 0.01 and 0.9: "
-        "this arm is plain fine-tuning, and its figures do not count."
+        f"Before the last tenth of its schedule, {share_between(evidence, arm).value:.1%} of the weights of "
+        f"{arm} lie between 0.01 and 0.9: most samples weigh alike, and its figures do not count."
         for arm in ARMS
         if not _active(evidence, arm)
     )
+
+
+def _without_an_arm(
+    evidence: Evidence, figures: Sequence[Figure], controls: Sequence[Figure] = ()
+) -> Finding:
+    """Return the finding on a board on which no arm counts."""
+    shares = tuple(share_between(evidence, arm) for arm in ARMS)
+    return Finding(
+        "cannot be shown here",
+        best_first(figures),
+        (*controls, *shares),
+        _inactive_sentences(evidence),
+        NEEDS_WEIGHTS,
+        about=ARMS,
+    )
+
+
+NEEDS_WEIGHTS = "Weights that differ between samples while the temperature is low."
 
 
 @claim(
@@ -70,16 +96,16 @@ def sft_degrades(evidence: Evidence) -> Finding:
     "C2",
     CONSFT,
     reported="over 20 points on average; the visible margins are +25, +20, +10 and +14 (Table 2)",
-    rule="An arm (consft as published, or consft_calibrated) counts if 10 % of its weights are between 0.01 "
-    "and 0.9. Holds if the lower end of the difference in retained success to sft, each at its best "
-    "settings, is at least 0.20 for an arm; holds in part if it is so only with both at the published step "
-    "size; does not hold if all upper ends are below 0.20. Cannot be shown here if no arm counts, or if sft "
-    "certainly keeps more than 0.80 at both settings.",
+    rule="An arm (consft with a tuned first temperature, or consft_calibrated) counts if 10 % of its weights "
+    "before the last tenth of the schedule are between 0.01 and 0.9. Holds if the lower end of the "
+    "difference in retained success to sft, each at its best settings, is at least 0.20 for an arm; holds in "
+    "part if it is so only with both at the published step size; does not hold if all upper ends are below "
+    "0.20. Cannot be shown here if no arm counts, or if sft certainly keeps more than 0.80 at both settings.",
     margin="0.20 of the retained success, the claim's own",
 )
 def keeps_20_points_more(evidence: Evidence) -> Finding:
     """Keeps pretrained skills more than 20 points better than plain fine-tuning."""
-    arms = [arm for arm in ARMS if _active(evidence, arm)]
+    arms = _arms(evidence)
     at_best = [kept(evidence, arm, "sft") for arm in ARMS]
     at_one = [kept(evidence, rung(arm, PUBLISHED), rung("sft", PUBLISHED)) for arm in ARMS]
     sft = [evidence.metric("retention", label) for label in ("sft", rung("sft", PUBLISHED))]
@@ -91,13 +117,13 @@ def keeps_20_points_more(evidence: Evidence) -> Finding:
     controls = _controls_of(evidence, best.methods[0])
     shown = (*sft, *controls, *(share_between(evidence, arm) for arm in ARMS))
     if not arms or all(one.low > 0.80 for one in sft):
-        reason = "sft keeps too much for a gain of 0.20." if arms else "No arm has weights that differ."
+        reason = ("sft keeps too much for a gain of 0.20.",) if arms else ()
         return Finding(
             "cannot be shown here",
             figures,
             shown,
-            (*_inactive_sentences(evidence), reason),
-            "A setting in which sft keeps less than 0.80, and weights that differ between samples.",
+            (*_inactive_sentences(evidence), *reason),
+            "A setting in which sft keeps less than 0.80." if arms else NEEDS_WEIGHTS,
         )
     return Finding(
         decided(
@@ -153,15 +179,16 @@ def _what_controls_say(figures: tuple[Figure, ...], arms: Sequence[str]) -> list
     reported="0.34 on prior tasks against 0.18 with 1:1 replay (pi0, LIBERO, Table 3)",
     rule="Holds if the lower end of the difference in retained success is at least -0.05 against both kinds "
     "of replay, for one of the arms of C2 that count, all at their best settings; does not hold if each of "
-    "these arms has an upper end below -0.05 against one of them.",
+    "these arms has an upper end below -0.05 against one of them. Cannot be shown here if no arm counts. The "
+    "tuned share of replay is in the note; the paper compares with 1:1.",
     margin="0.05 of the retained success",
 )
 def as_good_as_replay(evidence: Evidence) -> Finding:
     """As good as experience replay, without prior data."""
-    arms = [
-        [kept(evidence, arm, replay) for replay in ("experience_replay", "buffered_replay")]
-        for arm in _arms(evidence)
-    ]
+    replays = ("experience_replay", "buffered_replay")
+    arms = [[kept(evidence, arm, replay) for replay in replays] for arm in _arms(evidence)]
+    if not arms:
+        return _without_an_arm(evidence, [kept(evidence, arm, replays[0]) for arm in ARMS])
     holding = [arm[0].methods[0] for arm in arms if all(figure.low >= -0.05 for figure in arm)]
     figures = best_first([arm[0] for arm in arms])
     sentences = [f"It holds for {' and '.join(holding)}."] if holding else []
@@ -182,13 +209,15 @@ def as_good_as_replay(evidence: Evidence) -> Finding:
     rule="Update sparsity after the last target, each method at its best settings. Holds if the lower end "
     "of the difference to sft is above 0.05 for one of the arms of C2 that count; does not hold if all their "
     "upper ends are below 0.05. Cannot be shown here if the measure does not notice a penalty on moved "
-    "weights: l2_sp's difference to sft has an upper end below 0.05.",
+    "weights (l2_sp's difference to sft has an upper end below 0.05), or if no arm counts.",
     margin="0.05 of the parameters",
 )
 def stays_sparse(evidence: Evidence) -> Finding:
     """Updates stay sparse."""
     arms = [sparsity(evidence, arm, "sft") for arm in _arms(evidence)]
     response = sparsity(evidence, "l2_sp", "sft")
+    if not arms:
+        return _without_an_arm(evidence, [sparsity(evidence, arm, "sft") for arm in ARMS], (response,))
     figures = best_first(arms)
     if response.high < 0.05:
         return Finding(
@@ -274,31 +303,50 @@ def costs_nothing(evidence: Evidence) -> Finding:
     CONSFT,
     reported="stated in the abstract; no number was found",
     rule="Holds if the lower end of backward transfer is at least -0.10 for one of the arms of C2 that "
-    "count; does not hold if all their upper ends are below -0.10.",
+    "count; does not hold if all their upper ends are below -0.10. Cannot be shown here if no arm counts.",
     margin="0.10 of the success on earlier targets",
 )
 def keeps_earlier_targets(evidence: Evidence) -> Finding:
     """Learns several targets in sequence and keeps the earlier ones."""
-    arms = [evidence.metric("backward_transfer", arm) for arm in _arms(evidence)]
+    own = {arm: evidence.metric("backward_transfer", arm) for arm in ARMS}
+    references = tuple(evidence.metric("backward_transfer", name) for name in ("sft", "experience_replay"))
+    arms = [own[arm] for arm in _arms(evidence)]
+    if not arms:
+        return _without_an_arm(evidence, tuple(own.values()), references)
     figures = best_first(arms)
-    over_sft = evidence.difference("backward_transfer", figures[0].methods[0], "sft")
+    over_sft, *over_controls = _gains_in_transfer(evidence, figures[0].methods[0])
     return Finding(
         decided(holds=any(one.low >= -0.10 for one in arms), fails=all(one.high < -0.10 for one in arms)),
         figures,
-        (
-            over_sft,
-            *(evidence.metric("backward_transfer", control) for control in ("sft", "experience_replay")),
-        ),
-        (
-            *_inactive_sentences(evidence),
-            not_told_apart(
-                over_sft,
-                explains="weighing samples need not keep any earlier target",
-                does_not="weighing samples keeps earlier targets",
-            ),
-        ),
+        (over_sft, *over_controls, *references),
+        (*_inactive_sentences(evidence), _what_keeps_targets(over_sft, over_controls)),
         what_would_change(figures[0], -0.10),
         about=ARMS,
+    )
+
+
+def _gains_in_transfer(evidence: Evidence, arm: str) -> Iterator[Figure]:
+    """Yield the gain of an arm over sft, over sft at the arm's step factor, and over its controls."""
+    run = next(iter(evidence.runs.get(arm, {}).values()), None)
+    alike = rung("sft", run.record.run.settings.get("step_factor", PUBLISHED)) if run else "sft"
+    rest = (label for label in (alike, *CONTROLS) if label in evidence.runs)
+    for other in dict.fromkeys(("sft", *rest)):
+        yield evidence.difference("backward_transfer", arm, other)
+
+
+def _what_keeps_targets(over_sft: Figure, over_controls: Sequence[Figure]) -> str:
+    """Return what sft and the controls say about an arm's gain in backward transfer."""
+    equal = [one.methods[1] for one in over_controls if not one.low > 0]
+    if over_sft.low > 0 and equal:
+        are = "is" if len(equal) == 1 else "are"
+        return (
+            f"sft at its best learning rate does not reach it, but {' and '.join(equal)} {are} not told "
+            "apart from it: weighing samples need not be the cause."
+        )
+    return not_told_apart(
+        over_sft,
+        explains="weighing samples need not keep any earlier target",
+        does_not="weighing samples keeps earlier targets",
     )
 
 
@@ -306,24 +354,27 @@ def keeps_earlier_targets(evidence: Evidence) -> Finding:
     "C8",
     CONSFT,
     reported="one case on a real robot: sft closes the gripper too high, ConSFT does not (Sec. 5.5)",
-    rule="The spatial loss is the success on each new target minus its success from displaced start poses. "
+    rule="The loss is the success on each new target minus its success in perturbed episodes, in which the "
+    "gripper starts elsewhere and the block weighs half or twice as much. "
     "Holds if the lower end of sft's loss minus the method's is above 0.05 for one of the arms of C2 that "
-    "count; does not hold if all their upper ends are below 0.05. Cannot be shown here if the upper "
-    "end of sft's own loss is below 0.05.",
+    "count; does not hold if all their upper ends are below 0.05. Cannot be shown here if no arm counts, or "
+    "if the upper end of sft's own loss is below 0.05.",
     margin="0.05 of the success",
     scenarios=ANYWHERE,
 )
 def prevents_spatial_overfitting(evidence: Evidence) -> Finding:
     """Prevents overfitting to the positions in the demonstrations."""
-    of_sft = spatial_loss(evidence, "sft")
-    arms = [spatial_gain(evidence, arm, "sft") for arm in _arms(evidence)]
+    of_sft = perturbation_loss(evidence, "sft")
+    arms = [perturbation_gain(evidence, arm, "sft") for arm in _arms(evidence)]
+    if not arms:
+        return _without_an_arm(evidence, [perturbation_gain(evidence, arm, "sft") for arm in ARMS], (of_sft,))
     figures = best_first(arms)
     if of_sft.high < 0.05:
         return Finding(
             "cannot be shown here",
             figures,
             (of_sft,),
-            ("sft loses nothing from displaced starts: there is nothing to prevent.",),
+            ("sft loses nothing in perturbed episodes: there is nothing to prevent.",),
             "Starts farther from the demonstrated ones, at which sft fails.",
             about=ARMS,
         )

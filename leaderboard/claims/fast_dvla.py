@@ -13,7 +13,7 @@ from clbench.scoring.intervals import Estimate
 from ..policies.decoders import Decoding, read_decoding
 from .claim import ANYWHERE, Finding, Paper, claim, decided, what_would_change
 from .evidence import NO_ESTIMATE, Evidence, Figure, rung
-from .figures import PUBLISHED, share_of_steps
+from .figures import PUBLISHED, median_stage, share_of_steps
 
 CAPVECTOR = Paper("CapVector (the abstract of Fast-dVLA)", ("2603.25661", "2605.10903"))
 FAST_DVLA = Paper("Fast-dVLA's body", ("2603.25661",))
@@ -31,9 +31,26 @@ NO_CAPABILITY = (
 A_CAPABILITY = "An auxiliary objective that speeds up learning, or a policy that lacks it."
 
 
+FEWEST_STEPS = 20
+"""Median steps of a stage of sft from which 5 % of them are a whole step."""
+
+TOO_SHORT = "5 % of the steps of sft's median stage is less than one step."
+LONGER = "Targets that take plain fine-tuning at least 20 steps at the scenario's learning rate."
+
+
 def _no_capability(evidence: Evidence) -> bool:
     """Return whether the records show that the auxiliary objective itself is no help."""
     return share_of_steps(evidence, CO_TRAINING, SFT).low > 0.95
+
+
+def _not_shown(evidence: Evidence, figure: Figure, *controls: Figure) -> Finding | None:
+    """Return the finding on a board that could not show what a vector saves, else None."""
+    stage = median_stage(evidence, SFT)
+    if stage.value < FEWEST_STEPS:
+        return Finding("cannot be shown here", (figure,), (*controls, stage), (TOO_SHORT,), LONGER)
+    if _no_capability(evidence):
+        return Finding("cannot be shown here", (figure,), controls, (NO_CAPABILITY,), A_CAPABILITY)
+    return None
 
 
 @claim(
@@ -42,8 +59,8 @@ def _no_capability(evidence: Evidence) -> bool:
     reported="LIBERO 87.5 with the auxiliary objective, 82.1 without, after 5,000 steps; 28 % more compute",
     rule="Steps to the criterion at the scenario's learning rate, co_training divided by sft. Holds if the "
     "upper end is below 0.95 and the lower end of a step's time is above 1.1 times sft's; holds in part if "
-    "one of both; does not hold if the lower end of the steps is above 0.95 and the upper end of the time "
-    "is below 1.1.",
+    "only the first; does not hold if the lower end of the steps is above 0.95. Cannot be shown here if "
+    "sft's median stage is shorter than 20 steps, of which 5 % is no whole step.",
     margin="5 % of the steps, 10 % of the time",
 )
 def auxiliary_objective_helps(evidence: Evidence) -> Finding:
@@ -51,16 +68,15 @@ def auxiliary_objective_helps(evidence: Evidence) -> Finding:
     steps, time = share_of_steps(evidence, CO_TRAINING, SFT), evidence.step_time(CO_TRAINING)
     helps, costs, known = steps.high < 0.95, time.low > 1.1, not math.isnan(steps.low)
     no_help = steps.low > 0.95
+    stage = median_stage(evidence, SFT)
+    if stage.value < FEWEST_STEPS:
+        return Finding("cannot be shown here", (steps, time), (stage,), (TOO_SHORT,), LONGER)
     whether = "It helps." if helps else "It does not help." if no_help else "Whether it helps is open."
     more = ["It costs more time than it saves steps."] if time.low * steps.low > 1 else []
     return Finding(
-        decided(
-            holds=helps and costs,
-            in_part=helps or (costs and known),
-            fails=no_help and time.high < 1.1,
-        ),
+        decided(holds=helps and costs, in_part=helps, fails=no_help),
         (steps, time),
-        (),
+        (stage,),
         (whether, *more) if known else (),
         what_would_change(steps, 0.95),
     )
@@ -73,16 +89,16 @@ def auxiliary_objective_helps(evidence: Evidence) -> Finding:
     "steps (Table 1)",
     rule="Steps to the criterion at the scenario's learning rate. Holds if the upper ends of fast_dvla "
     "divided by sft and by a random vector of equal norms are below 0.95; does not hold if the lower end "
-    "of one of the two is above 0.95. Cannot be shown here if co_training certainly saves less than 5 % of "
-    "the steps.",
+    "of one of the two is above 0.95. Cannot be shown here if sft's median stage is shorter than 20 "
+    "steps, or if co_training certainly saves less than 5 % of them.",
     margin="5 % of the steps",
 )
 def vector_carries_the_capability(evidence: Evidence) -> Finding:
     """The difference of two short trainings is a vector; merged, it replaces the auxiliary objective."""
     over_sft, over_random = _of_the_vector(evidence)
     controls = (over_random, share_of_steps(evidence, CO_TRAINING, SFT))
-    if _no_capability(evidence):
-        return Finding("cannot be shown here", (over_sft,), controls, (NO_CAPABILITY,), A_CAPABILITY)
+    if not_shown := _not_shown(evidence, over_sft, *controls):
+        return not_shown
     return Finding(
         decided(
             holds=over_sft.high < 0.95 and over_random.high < 0.95,
@@ -106,15 +122,16 @@ def _of_the_vector(evidence: Evidence) -> tuple[Figure, Figure]:
     reported="LIBERO 90.1 without and 91.7 with it after 5,000 steps; +0.5 to +0.9 later (Table 1)",
     rule="Steps to the criterion at the scenario's learning rate, with the regulariser divided by without. "
     "Holds if the upper end is below 0.95; does not hold if the lower end is above 0.95. Cannot be shown "
-    "here if co_training certainly saves less than 5 % of the steps.",
+    "here if sft's median stage is shorter than 20 steps, or if co_training certainly saves less than 5 % of "
+    "them.",
     margin="5 % of the steps",
 )
 def regulariser_keeps_the_vector(evidence: Evidence) -> Finding:
     """The orthogonal regulariser keeps the merged capability."""
     steps = share_of_steps(evidence, VECTOR, NO_REGULARISER)
     auxiliary = share_of_steps(evidence, CO_TRAINING, SFT)
-    if _no_capability(evidence):
-        return Finding("cannot be shown here", (steps,), (auxiliary,), (NO_CAPABILITY,), A_CAPABILITY)
+    if not_shown := _not_shown(evidence, steps, auxiliary):
+        return not_shown
     return Finding(
         decided(holds=steps.high < 0.95, fails=steps.low > 0.95),
         (steps,),
@@ -154,14 +171,14 @@ def costs_little(evidence: Evidence) -> Finding:
     rule="The vector is made from the retained skills and used on the targets. Steps to the criterion at "
     "the scenario's learning rate, divided by those with a random vector of equal norms: holds if the "
     "upper end is below 0.95; does not hold if the lower end is above 0.95. Cannot be shown here if "
-    "co_training certainly saves less than 5 % of the steps.",
+    "sft's median stage is shorter than 20 steps, or if co_training certainly saves less than 5 % of them.",
     margin="5 % of the steps",
 )
 def vector_transfers(evidence: Evidence) -> Finding:
     """The vector transfers to tasks other than those it was made from."""
     over_sft, over_random = _of_the_vector(evidence)
-    if _no_capability(evidence):
-        return Finding("cannot be shown here", (over_random,), (over_sft,), (NO_CAPABILITY,), A_CAPABILITY)
+    if not_shown := _not_shown(evidence, over_random, over_sft):
+        return not_shown
     return Finding(
         decided(holds=over_random.high < 0.95, fails=over_random.low > 0.95),
         (over_random,),

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from clbench.scoring.intervals import Estimate
 from clbench.scoring.layout import Array, average
 from clbench.scoring.metrics import load_metric
 from clbench.scoring.rates import Rates
@@ -35,7 +36,23 @@ def kept(evidence: Evidence, method: str, other: str) -> Figure:
         first, second = (average(of[label].retained)[..., -1] for label in (method, other))
         return average(first - second)
 
-    return evidence.figure(f"retained success, {method} - {other}", difference, method, other, span=(-1, 1))
+    what, note = f"retained success, {method} - {other}", _settings(evidence, method, other)
+    return evidence.figure(what, difference, method, other, span=(-1, 1), **({"note": note} if note else {}))
+
+
+TOLD = ("replay", "tau_start", "loss_scale", "step_factor")
+"""Hyper-parameters that tell how a run of a label differs from the published method."""
+
+
+def _settings(evidence: Evidence, *methods: str) -> str:
+    """Return the settings of methods that readers must know, for the note of a figure."""
+    told = []
+    for label in methods:
+        run = next(iter(evidence.runs.get(label, {}).values()), None)
+        values = run.record.run.settings if run else {}
+        named = [f"{name} {values[name]:g}" for name in TOLD if name in values]
+        told += [f"{label}: {', '.join(named)}"] if named else []
+    return "; ".join(told)
 
 
 def share_of_steps(evidence: Evidence, method: str, other: str) -> Figure:
@@ -103,19 +120,19 @@ def early_success(evidence: Evidence, method: str, other: str) -> Figure:
     return evidence.figure(what, difference, method, other, span=(-1, 1))
 
 
-def spatial_loss(evidence: Evidence, method: str) -> Figure:
-    """Return the success on each new target minus its success from displaced starts."""
+def perturbation_loss(evidence: Evidence, method: str) -> Figure:
+    """Return the success on each new target minus its success in perturbed episodes."""
     what = f"success on new targets, plain - perturbed, {method}"
     return evidence.figure(what, lambda of: average(_lost_by_perturbation(of[method])), method, span=(-1, 1))
 
 
-def spatial_gain(evidence: Evidence, method: str, other: str) -> Figure:
-    """Return how much less success on new targets `method` loses from displaced starts than `other`."""
+def perturbation_gain(evidence: Evidence, method: str, other: str) -> Figure:
+    """Return how much less success on new targets `method` loses in perturbed episodes than `other`."""
 
     def gain(of: Of) -> Array:
         return average(_lost_by_perturbation(of[other]) - _lost_by_perturbation(of[method]))
 
-    what = f"loss from displaced starts, {other} - {method}"
+    what = f"loss in perturbed episodes, {other} - {method}"
     return evidence.figure(what, gain, method, other, span=(-1, 1))
 
 
@@ -145,17 +162,28 @@ def drift_ratio(evidence: Evidence, method: str) -> Figure:
     return evidence.figure(f"activation drift, {method} / sft", ratio, method, "sft")
 
 
-def share_between(evidence: Evidence, method: str) -> Figure:
-    """Return the share of ConSFT's weights between 0.01 and 0.9, over all samples of all steps.
+def median_stage(evidence: Evidence, method: str) -> Figure:
+    """Return the median of the steps to the criterion over targets and seeds, without an interval."""
+    runs = evidence.runs.get(method, {})
+    steps = [run.scores.rates().steps for run in runs.values()]
+    value = float(np.median(steps)) if steps else None
+    missing = () if runs else (method,)
+    what = f"steps to the criterion of {method}, median"
+    return Figure(what, (method,), Estimate(value, None, None), tuple(runs), missing, form=".0f")
 
-    Weights below are at the floor, alike for all samples, and weights above are those of plain fine-tuning.
+
+def share_between(evidence: Evidence, method: str) -> Figure:
+    """Return the share of ConSFT's weights between 0.01 and 0.9 before the last tenth of the schedule.
+
+    Weights below are near the floor, most of them alike, and weights above are those of plain fine-tuning. In
+    the last tenth and after the schedule the method is plain fine-tuning for small losses by design.
     """
 
     def share(stages: Sequence[Mapping[str, Any]]) -> float | None:
         tables = (np.asarray(stage.get("omega_counts", []), dtype=np.float64) for stage in stages)
-        counts = [table.sum(axis=0) for table in tables if table.ndim == 2 and table.shape[1] > 2]
+        counts = [table[:-1].sum(axis=0) for table in tables if table.ndim == 2 and table.shape[1] > 2]
         total = sum(float(count.sum()) for count in counts)
         return sum(float(count[1:-1].sum()) for count in counts) / total if total > 0 else None
 
-    what = f"share of the weights of {method} between 0.01 and 0.9"
+    what = f"share of the weights of {method} between 0.01 and 0.9, first nine tenths of the schedule"
     return evidence.pooled(method, what, share, SHARE)

@@ -6,7 +6,7 @@ the last section says what the records cannot tell.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
@@ -17,20 +17,23 @@ from clbench.base.text import counted
 from clbench.records.paths import parts_of
 from clbench.scoring.intervals import Estimate
 from clbench.spec.policies import DEFAULT_POLICY
-from clbench.spec.references import BASELINE, FROM_SCRATCH, FROZEN
+from clbench.spec.references import BASELINE, FROZEN
 
 from ..board.frontier import Curve
 from ..board.predictors import predictions
 from ..board.rows import Row, Table, apart_from_baseline
 from ..board.summary import METHODS, WITHOUT_DEMONSTRATIONS, tables_of
 from ..claims.claim import PREDICATES, Verdict, tally
+from ..claims.evidence import Evidence, Figure
 from ..claims.judges import Judged
 from ..policies.compared import by_table
 from ..views.format import MISSING, format_interval, tau_text
 from ..views.markdown import templates
 from ..views.page.charts.plot import themed
 from .findings_chart import gains_chart
+from .lost_skills import relearning_sentences
 from .orders import order_sentences
+from .tied import gains_over_tied
 
 FORGOTTEN_BY = "kept_share"
 """Metric by which policies are compared: the final average also counts what they knew and learned."""
@@ -67,14 +70,20 @@ def pictures(table: Table) -> dict[str, str]:
     return {f"gains{'-dark' if dark else ''}.svg": themed(chart, dark).svg() for dark in (False, True)}
 
 
-def sections(table: Table, judged: Sequence[Judged]) -> list[Section]:
-    """Return the sections that the records can fill, at least in part."""
+def sections(table: Table, judged: Sequence[Judged], evidence_on: Callable[[str], Evidence]) -> list[Section]:
+    """Return the sections that the records can fill, at least in part.
+
+    Args:
+        table: The board.
+        judged: The claims.
+        evidence_on: Returns the evidence of the scenario with a Gymnasium id.
+    """
     boards = _boards(table)
     found = (
-        _gains(boards),
+        _gains(boards, evidence_on),
         _replay(boards),
         _learning_rates(table),
-        _relearning(boards),
+        Section("Is a lost skill gone?", tuple(relearning_sentences(boards))),
         _claims(judged),
         Section(
             "Do seeds, scenarios and definitions order the methods alike?",
@@ -105,13 +114,13 @@ def competing(rows: Iterable[Row]) -> list[Row]:
     return sorted(known, key=lambda row: -(row.estimates["gain"].value or 0.0))
 
 
-def _gains(boards: dict[str, list[Row]]) -> Section:
+def _gains(boards: dict[str, list[Row]], evidence_on: Callable[[str], Evidence]) -> Section:
     """Does any method beat tuned fine-tuning without prior demonstrations?"""
     answers: list[str] = []
     lines = []
     for name, rows in boards.items():
         others = competing(rows)
-        answers += _gain_sentences(name, rows)
+        answers += _gain_sentences(name, rows, evidence_on(name))
         lines += [
             (
                 name,
@@ -130,7 +139,7 @@ def _gains(boards: dict[str, list[Row]]) -> Section:
     )
 
 
-def _gain_sentences(name: str, rows: Sequence[Row]) -> Iterator[str]:
+def _gain_sentences(name: str, rows: Sequence[Row], evidence: Evidence) -> Iterator[str]:
     """Yield what Tukey's test of all rows without prior demonstrations says of each gain."""
     others = [row for row in competing(rows) if row.division in WITHOUT_DEMONSTRATIONS]
     if not others or BASELINE not in {row.method for row in rows}:
@@ -138,9 +147,13 @@ def _gain_sentences(name: str, rows: Sequence[Row]) -> Iterator[str]:
     gains = {row.method: row.estimates["gain"] for row in others}
     apart = apart_from_baseline(rows)
     better = {method: gains[method] for method in gains if method in apart and (gains[method].value or 0) > 0}
-    if better:
-        yield f"On {name}, yes: {_listed(better)}."
-    else:
+    tied = gains_over_tied(evidence, better)
+    certain = {method: gain for method, gain in better.items() if all(one.low > 0 for one in tied[method])}
+    if certain:
+        yield f"On {name}, yes: {_listed(certain)}."
+    for method in better:
+        yield from _over_tied(name, method, gains[method], tied[method])
+    if not better:
         best = next(iter(gains))
         which = f"the gain of `{best}`"
         if len(gains) > 1:
@@ -166,6 +179,19 @@ def _gain_sentences(name: str, rows: Sequence[Row]) -> Iterator[str]:
     if len(worse) < len(lower):
         rest = {method: loss for method, loss in lower.items() if method not in worse}
         yield f"Lower {alone}: {_listed(rest)}."
+
+
+def _over_tied(name: str, method: str, gain: Estimate, tied: Sequence[Figure]) -> Iterator[str]:
+    """Yield how a certain gain fares against settings of plain fine-tuning that tuning rated as high."""
+    for one in tied:
+        sure = one.low > 0
+        yield (
+            f"On {name}, {'for' if sure else 'not for'} certain: `{method}` gains "
+            f"{format_interval(gain, '.3f')} over plain fine-tuning at the setting that tuning chose, "
+            f"{'and' if sure else 'but'} "
+            f"{format_interval(one.estimate, '.3f')} over `{one.methods[1]}`, which tuning rated as high "
+            f"({counted(len(one.seeds), 'seed')})."
+        )
 
 
 def _power(gains: Iterable[Estimate]) -> str:
@@ -242,7 +268,7 @@ def _of_the_baseline(name: str, curve: Curve) -> str:
     if best is not first:
         more = (
             f", and {format_interval(best.kept)} at {_rate(best.factor)}, where it learns "
-            f"{format_interval(best.learned)}"
+            f"{format_interval(best.learned)}: the most of {len(curve.rungs)} rates, in these same episodes"
         )
     return f"On {name}, plain fine-tuning keeps {format_interval(first.kept)} at {_rate(first.factor)}{more}."
 
@@ -264,7 +290,7 @@ def _at_the_first_rung(name: str, baseline: Curve, curves: Sequence[Curve]) -> I
     if kept:
         falling = sorted(kept, key=lambda method: -(kept[method].value or 0.0))
         listed = ", ".join(f"`{method}` {format_interval(kept[method])}" for method in falling)
-        yield f"On {name}, methods without prior demonstrations keep at {_rate(factor)}: {listed}."
+        yield f"On {name}, methods without prior demonstrations keep at factor {factor:g}: {listed}."
 
 
 def _of_frozen(name: str, rows: Sequence[Row]) -> Iterator[str]:
@@ -276,25 +302,6 @@ def _of_frozen(name: str, rows: Sequence[Row]) -> Iterator[str]:
                 f"{format_interval(row.estimates['kept'])} by this measure: a target that was never learned "
                 "counts as not kept."
             )
-
-
-def _relearning(boards: dict[str, list[Row]]) -> Section:
-    """How fast the skill that was lost most comes back."""
-    answers = []
-    for name, rows in boards.items():
-        steps = {row.method: row.estimates["relearning_steps"] for row in rows}
-        lost, never = (steps.get(method) for method in (BASELINE, FROM_SCRATCH))
-        if lost is None or lost.value is None:
-            continue
-        compared = ""
-        if never is not None and never.value is not None:
-            own = format_interval(never, ".0f")
-            compared = f"; a policy without pretraining needs {own} for the skill that it does worst"
-        answers.append(
-            f"On {name}, the skill that plain fine-tuning lost most is back at the criterion after "
-            f"{format_interval(lost, '.0f')} steps of its demonstrations{compared}."
-        )
-    return Section("Is a lost skill gone?", tuple(answers))
 
 
 def _claims(judged: Sequence[Judged]) -> Section:
@@ -374,7 +381,8 @@ def _policies(table: Table) -> Section:
             answers.append(
                 f"On {scenario} with {policy}, the kept share of {lower} of "
                 f"{counted(len(apart), 'method')} is lower than with the flow policy, and that of {higher} "
-                "higher, by intervals of their own."
+                "higher, by intervals of their own. Its methods have the settings that were tuned for the "
+                "flow policy, and its stages take other numbers of steps: tuning may explain a difference."
             )
         elif comparisons:
             answers.append(f"On {scenario} with {policy} there is one seed, which tells nothing for certain.")

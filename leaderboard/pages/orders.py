@@ -10,10 +10,10 @@ import numpy as np
 from clbench.base.text import counted
 from clbench.scoring.metrics import load_metric
 
-from ..board.agreement import Agreement, agreement_between
+from ..board.agreement import Agreement, Concordance, agreement_between
 from ..board.rows import Row, Table, agreement, values_by_seed
 from ..board.summary import RANKED_BY, WITHOUT_DEMONSTRATIONS
-from ..views.format import tau_text, title_of
+from ..views.format import concordance_text, tau_text, title_of
 
 
 def order_sentences(table: Table, boards: Mapping[str, list[Row]]) -> Iterator[str]:
@@ -25,12 +25,11 @@ def order_sentences(table: Table, boards: Mapping[str, list[Row]]) -> Iterator[s
     """
     for name, found in table.agreements.items():
         if found is not None and name in boards:
-            yield f"On {name}, two halves of the {found.seeds} seeds {_order(found)}."
+            yield f"On {name}, {_seeds_order(found)}."
             without = [row for row in boards[name] if row.division in WITHOUT_DEMONSTRATIONS]
-            halves = agreement(without)
-            if halves is not None:  # replay is far above the others
-                order = _order(halves)
-                yield f"On {name}, without methods that read prior demonstrations, the halves {order}."
+            alone = agreement(without)
+            if alone is not None:  # replay is far above the others
+                yield f"On {name}, without methods that read prior demonstrations, {_seeds_order(alone)}."
             yield from _shares_of_variance(name, without)
     for (one, rows), (other, others) in combinations(boards.items(), 2):
         across = _between(rows, others, RANKED_BY, RANKED_BY)
@@ -87,6 +86,14 @@ def _between(
         for name, values in ((metric, ours), (other_metric, theirs))
     )
     return agreement_between(one, other, paired=paired)
+
+
+def _seeds_order(found: Concordance) -> str:
+    """Return the sentence on how alike the seeds of a board order its methods, in lower case."""
+    words = f"order the {found.rows} methods alike more than chance would explain"
+    if not found.certain:
+        words = f"show no certain agreement on the order of the {found.rows} methods"
+    return f"the {found.seeds} seeds {words} ({concordance_text(found)})"
 
 
 def _order(found: Agreement, methods: str = "the methods") -> str:

@@ -17,7 +17,7 @@ from clbench.scoring.metric import Metric
 from clbench.scoring.metrics import METRICS, TITLES
 from clbench.scoring.scores import WEAK, WEAK_WARNING
 
-from ..board.agreement import Agreement
+from ..board.agreement import Agreement, Concordance
 from ..board.overall import OverallRow
 from ..board.predictors import predictions
 from ..board.rows import Row, standing_of
@@ -132,15 +132,20 @@ def start_text(rate: float | None) -> str:
     return sentence if rate >= WEAK else f"{sentence} {WEAK_WARNING}"
 
 
-def agreement_text(found: Agreement | None) -> str:
-    """Return a sentence on how alike two halves of the seeds order the methods; empty if it is not known."""
+def agreement_text(found: Concordance | None) -> str:
+    """Return a sentence on how alike the seeds order the methods; empty if it is not known."""
     if found is None:
         return ""
-    halves = f"halves of the {found.seeds} seeds put the {found.rows} methods in"
-    says = f"It is not certain that two {halves} the same order"
-    if found.direction > 0:
-        says = f"Two {halves} a similar order"
-    return f"{says}: Kendall's tau {tau_text(found)}."
+    alike = f"the {found.seeds} seeds order the {found.rows} methods alike"
+    if found.certain:
+        return f"{alike[0].upper()}{alike[1:]} more than chance would explain: {concordance_text(found)}."
+    return f"It is not certain that {alike}: {concordance_text(found)}."
+
+
+def concordance_text(found: Concordance) -> str:
+    """Return Kendall's W with the probability of chance."""
+    chance = f"p = {found.chance:.2g}" if found.chance >= 0.001 else "p < 0.001"
+    return f"Kendall's W {found.w:.2f}, {chance}"
 
 
 def prediction_text(rows: Iterable[Row]) -> str:

@@ -50,7 +50,7 @@ class ScenarioView:
     start: str
     """Sentence on what the pretrained policy can do, empty if there is none."""
     agreement: str
-    """Sentence on how alike two halves of the seeds order the methods, empty if it is not known."""
+    """Sentence on how alike the seeds order the methods, empty if it is not known."""
     comparisons: tuple[Comparison, ...]
     """The same methods with the default policy; none for a table of that policy."""
     decoding: Decoding | None

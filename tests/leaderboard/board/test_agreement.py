@@ -1,4 +1,4 @@
-"""Agreement of two halves of the seeds, against SciPy's Kendall's tau."""
+"""Agreement on the order of the rows, against SciPy's Kendall's tau and a count of random orders."""
 
 import numpy as np
 import pytest
@@ -7,7 +7,7 @@ from scipy.stats import kendalltau
 from clbench.base.entry_points import resolve
 
 agreement_between = resolve("clbench.leaderboard.board.agreement:agreement_between")
-agreement_of = resolve("clbench.leaderboard.board.agreement:agreement_of")
+concordance = resolve("clbench.leaderboard.board.agreement:concordance")
 kendall_tau = resolve("clbench.leaderboard.board.agreement:kendall_tau")
 
 
@@ -22,15 +22,29 @@ def test_equal_values_that_differ_in_the_last_bit_are_ties() -> None:
     assert kendall_tau(np.array([0.1 + 0.2, 0.3, 1.0]), np.array([0.3, 0.3, 1.0])) == pytest.approx(1.0)
 
 
-def test_rows_far_apart_agree_and_rows_of_noise_do_not() -> None:
+def test_seeds_with_one_order_agree_and_seeds_with_random_orders_do_not() -> None:
     generator = np.random.default_rng(0)
     clear = np.arange(8)[:, None] / 8 + generator.normal(0, 0.01, (8, 8))
-    found = agreement_of(clear)
-    assert (found.tau, found.low, found.high, found.seeds, found.rows) == (1.0, 1.0, 1.0, 8, 8)
-    assert found.direction == 1
-    noise = agreement_of(generator.normal(0, 1, (8, 8)))
-    assert noise.low < 0 < noise.high
-    assert noise.direction == 0
+    found = concordance(clear)
+    assert (found.w, found.seeds, found.rows, found.certain) == (pytest.approx(1.0), 8, 8, True)
+    noise = [concordance(generator.normal(0, 1, (8, 6))) for _ in range(200)]
+    assert sum(one.certain for one in noise) <= 20
+
+
+def test_w_is_that_of_its_definition_and_its_chance_that_of_random_orders() -> None:
+    generator = np.random.default_rng(3)
+    values = np.arange(6)[:, None] / 4 + generator.normal(0, 1, (6, 5))
+
+    def w(ranks: np.ndarray) -> float:
+        """Return 12 S / (m^2 (n^3 - n)) of ranks (rows, seeds); S is the scatter of their sums."""
+        rows, seeds = ranks.shape
+        sums = ranks.sum(axis=1)
+        return float(12 * ((sums - sums.mean()) ** 2).sum() / (seeds**2 * (rows**3 - rows)))
+
+    found = concordance(values)
+    assert found.w == pytest.approx(w(values.argsort(axis=0).argsort(axis=0)))
+    drawn = [w(generator.permuted(np.tile(np.arange(6)[:, None], 5), axis=0)) for _ in range(4000)]
+    assert found.chance == pytest.approx(np.mean(np.array(drawn) >= found.w - 1e-9), abs=0.02)
 
 
 def test_the_chance_is_that_of_a_random_order_of_the_rows() -> None:
@@ -57,8 +71,8 @@ def test_boards_whose_orders_have_nothing_in_common_rarely_agree() -> None:
 
 @pytest.mark.parametrize("shape", [(4, 8), (8, 3)])
 def test_few_rows_or_seeds_have_no_agreement(shape: tuple[int, int]) -> None:
-    assert agreement_of(np.random.default_rng(0).random(shape)) is None
+    assert concordance(np.random.default_rng(0).random(shape)) is None
 
 
 def test_rows_of_one_value_have_no_agreement() -> None:
-    assert agreement_of(np.ones((5, 4))) is None
+    assert concordance(np.ones((5, 4))) is None

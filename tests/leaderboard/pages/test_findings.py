@@ -6,6 +6,9 @@ from pathlib import Path
 import pytest
 
 from clbench.base.entry_points import resolve
+from clbench.records.paths import record_path
+from clbench.records.record import Record, Relearning
+from clbench.records.writer import write_record
 
 findings = resolve("clbench.leaderboard.cli:findings")
 
@@ -78,6 +81,43 @@ def test_the_ladder_tells_what_a_smaller_step_size_does(
     assert "at the scenario's learning rate, and 0.50" in page()
 
 
+def test_a_gain_that_is_not_certain_over_a_tied_setting_is_no_yes(
+    even_board: Callable[..., Path], page: Callable[[], str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tuning = resolve("clbench.runs.tuning:Tuned"), resolve("clbench.runs.tuning:Tried")
+    tried = tuple(tuning[1]({"step_factor": factor}, 0.5, 0.9) for factor in (1.0, 0.1))
+    found = {"sft": tuning[0]({"step_factor": 1.0}, tried)}
+    monkeypatch.setattr("clbench.leaderboard.pages.tied.tuned", lambda scenario: found)
+    fill(even_board, sft=0.4, finch=0.8, lora=0.4)
+    for seed in range(4):
+        even_board("sft", seed, 0.8, "ladder", step_factor=0.1)
+    text = page()
+    assert "On clbench/Even-v1, yes" not in text
+    assert "On clbench/Even-v1, not for certain: `finch` gains 0.300" in text
+    assert "but 0.000 [0.000, 0.000] over `sft@0.1`, which tuning rated as high (4 seeds)." in text
+
+
+def test_how_fast_lost_skills_come_back_is_told_with_their_names(
+    make_record: Callable[..., Record], tmp_path: Path, page: Callable[[], str]
+) -> None:
+    for method, skill, steps in (("sft", "skill_1", (8, 12)), ("from_scratch", "skill_0", (20, 20))):
+        for seed in range(2):
+            record = make_record(
+                [[1, 1, 0, 0, 0], [0, 0, 0.9, 0, 0], [0, 0, 0, 0.9, 0]],
+                method=method,
+                seed=seed,
+                scenario="clbench/Even-v1",
+                steps=(20,),
+                ends=(8, 20),
+                relearning=Relearning(skill, 0, steps[seed], True),
+            )
+            write_record(record, record_path(tmp_path / "records", "clbench/Even-v1", method, seed))
+    text = page()
+    assert "plain fine-tuning loses a skill in 2 of 2 seeds (`skill_1` 2)." in text
+    assert "back at the criterion after 10 [" in text
+    assert "A policy without pretraining takes 20 (`skill_0` 2), another skill." in text
+
+
 def test_definitions_that_order_the_methods_alike_have_a_tau_of_one(
     even_board: Callable[..., Path], page: Callable[[], str]
 ) -> None:
@@ -87,10 +127,9 @@ def test_definitions_that_order_the_methods_alike_have_a_tau_of_one(
         "agree on the order of the methods more than chance would explain (Kendall's tau 1.00 [1.00, 1.00])."
     )
     assert f"On clbench/Even-v1, final average and forgetting {order}" in text
-    assert f"On clbench/Even-v1, two halves of the 4 seeds {order}" in text
-    assert (
-        "without methods that read prior demonstrations, the halves agree on the order of the methods" in text
-    )
+    alike = "methods alike more than chance would explain (Kendall's W 1.00, p = 0.003)."
+    assert f"On clbench/Even-v1, the 4 seeds order the 5 {alike}" in text
+    assert f"without methods that read prior demonstrations, the 4 seeds order the 5 {alike}" in text
     # every seed is the same: the method explains all
     assert "4 seeds, the method explains 100%, and the seed with its order of the targets 0%." in text
 

@@ -1,4 +1,4 @@
-"""The place of a row, its letters and its tier, in words; how alike halves of the seeds order the rows."""
+"""The place of a row, its letters and its tier, in words; how alike the seeds order the rows."""
 
 import dataclasses
 from collections.abc import Callable
@@ -10,7 +10,7 @@ import pytest
 from clbench.base.entry_points import resolve
 
 agreement_text = resolve("clbench.leaderboard.views.format:agreement_text")
-Agreement = resolve("clbench.leaderboard.board.agreement:Agreement")
+Concordance = resolve("clbench.leaderboard.board.agreement:Concordance")
 tier_text = resolve("clbench.leaderboard.views.format:tier_text")
 tiers_text = resolve("clbench.leaderboard.views.format:tiers_text")
 aligned = resolve("clbench.leaderboard.views.format:aligned")
@@ -69,13 +69,12 @@ def test_a_tier_is_the_lowest_of_the_runs_and_names_those_above_it(rows: dict[st
     assert tiers_text([alike, rows["good"]]) == ""
 
 
-def test_only_an_agreement_beyond_chance_is_called_a_similar_order() -> None:
-    sure = Agreement(0.7, 0.5, 0.8, seeds=12, rows=15, chance=0.001)
+def test_only_an_agreement_beyond_chance_is_called_one() -> None:
+    sure = Concordance(0.55, 0.0004, seeds=12, rows=15)
     assert agreement_text(sure) == (
-        "Two halves of the 12 seeds put the 15 methods in a similar order: Kendall's tau 0.70 [0.50, 0.80]."
+        "The 12 seeds order the 15 methods alike more than chance would explain: Kendall's W 0.55, p < 0.001."
     )
-    assert agreement_text(dataclasses.replace(sure, chance=0.2)) == (
-        "It is not certain that two halves of the 12 seeds put the 15 methods in the same order: Kendall's "
-        "tau 0.70 [0.50, 0.80]."
+    assert agreement_text(dataclasses.replace(sure, w=0.1, chance=0.2)) == (
+        "It is not certain that the 12 seeds order the 15 methods alike: Kendall's W 0.10, p = 0.2."
     )
     assert agreement_text(None) == ""

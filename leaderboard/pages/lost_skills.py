@@ -1,0 +1,78 @@
+"""Sentences of the findings on skills that are lost: how fast they come back."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from clbench.base.text import counted
+from clbench.records.record import Relearning
+from clbench.scoring.intervals import interval
+from clbench.spec.references import BASELINE, FROM_SCRATCH
+
+from ..board.rows import Row
+from ..views.format import format_interval
+
+LOST = 0.5
+"""Share of its validation episodes below which a skill counts as lost."""
+
+LOST_MEANS = (
+    "A skill is lost here if it succeeds in less than half of its validation episodes after the last target."
+)
+
+
+def relearning_sentences(boards: Mapping[str, Sequence[Row]]) -> list[str]:
+    """Return how fast the skill most lost comes back, on each board where it was measured."""
+    answers = []
+    for name, rows in boards.items():
+        by_method = {row.method: row for row in rows}
+        measured = _measured(by_method.get(BASELINE))
+        if not measured:
+            continue
+        lost = [found for found, share in measured if share < LOST]
+        seeds = counted(len(measured), "seed")
+        if len(lost) < 2:
+            answers.append(f"On {name}, plain fine-tuning loses a skill in {len(lost)} of {seeds}.")
+            continue
+        answers.append(
+            f"On {name}, plain fine-tuning loses a skill in {len(lost)} of {seeds} ({_skills(lost)}). It is "
+            f"back at the criterion after {_steps(lost)} steps of its demonstrations."
+            f"{_without_pretraining(by_method.get(FROM_SCRATCH), lost)}"
+        )
+    if answers:
+        answers.insert(0, LOST_MEANS)
+    return answers
+
+
+def _measured(row: Row | None) -> list[tuple[Relearning, float]]:
+    """Return what each run of a row relearned, with the skill's success before."""
+    runs = [run.record for run in row.runs] if row else []
+    return [
+        (record.relearning, record.relearning.successes / record.scenario.budget["validation_episodes"])
+        for record in runs
+        if record.relearning is not None
+    ]
+
+
+def _without_pretraining(row: Row | None, lost: Sequence[Relearning]) -> str:
+    """Return what a policy without pretraining needs: of the same skill, where a run has it."""
+    found = [one for one, _ in _measured(row)]
+    same = [one for one in found if one.skill in {entry.skill for entry in lost}]
+    told = same or found
+    if len(told) < 2:
+        return ""
+    other = "" if same else f", another skill{'' if len({one.skill for one in told}) == 1 else ' or two'}"
+    return f" A policy without pretraining takes {_steps(told)} ({_skills(told)}){other}."
+
+
+def _skills(found: Sequence[Relearning]) -> str:
+    counts = Counter(one.skill for one in found)
+    return ", ".join(f"`{skill}` {count}" for skill, count in counts.most_common())
+
+
+def _steps(found: Sequence[Relearning]) -> str:
+    steps = np.array([float(one.steps) for one in found])
+    without_one = (steps.sum() - steps) / (len(steps) - 1)
+    return format_interval(interval(float(steps.mean()), without_one, span=(0.0, np.inf)), ".0f")

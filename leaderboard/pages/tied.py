@@ -1,0 +1,34 @@
+"""Plain fine-tuning at settings that tuning rated as high as the chosen one, and gains over it there."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+from clbench.runs.tuning import LEARNED, tuned
+from clbench.spec.references import BASELINE
+
+from ..claims.evidence import Evidence, Figure, rung
+
+
+def tied_factors(scenario: str) -> tuple[float, ...]:
+    """Return the step factors of plain fine-tuning that are not the chosen one and have its final average."""
+    found = tuned(scenario).get(BASELINE)
+    if found is None:
+        return ()
+    learners = [one for one in found.tried if one.learned >= LEARNED]
+    best = max((one.final_average for one in learners), default=None)
+    chosen = found.settings["step_factor"]
+    factors = [one.settings["step_factor"] for one in learners if one.final_average == best]
+    return tuple(factor for factor in factors if factor != chosen)
+
+
+def gains_over_tied(evidence: Evidence, methods: Iterable[str]) -> dict[str, list[Figure]]:
+    """Return the gain of each method over plain fine-tuning at each tied factor, from runs of the ladder."""
+    factors = tied_factors(evidence.scenario)
+    return {
+        method: [
+            evidence.difference("final_average", method, rung(BASELINE, factor), form=".3f")
+            for factor in factors
+        ]
+        for method in methods
+    }
