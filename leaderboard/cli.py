@@ -117,6 +117,7 @@ def _chosen(board: Summary, scenario: str | None, records: Path) -> Summary:
     """
     if scenario is None:
         return board
+    scenario = scenario.rpartition(":")[2]  # a board needs no module
     rows = tuple(row for row in board.rows if row.scenario == scenario)
     if not rows and scenario in scenario_ids():
         raise UnknownNameError(
@@ -176,6 +177,8 @@ def submit(
         runs = [replace(first, seed=first_seed + number).resolve() for number in range(seeds)]
         check_folders({"--records": records, "--checkpoints": checkpoints})
         went_well = run_submission(runs, records, workers, checkpoints)
+    if went_well is None:
+        raise SystemExit(1)
     if records.is_dir():
         inputs = inputs_of(records)
         table = read_table(records)

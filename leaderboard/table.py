@@ -45,4 +45,5 @@ def frame_of(board: Summary) -> pandas.DataFrame:
     rows = [values_of(row) for row in board.rows]
     frame = pandas.DataFrame(rows, columns=column_names(), dtype=object)
     kinds = {"seeds": "int64", **dict.fromkeys(("scenario", "method", "division", "groups", "tier"), "str")}
-    return frame.astype({name: kinds.get(name, "float64") for name in column_names()})
+    # a copy is in one piece: else pandas warns when a column is added
+    return frame.astype({name: kinds.get(name, "float64") for name in column_names()}).copy()

@@ -102,3 +102,12 @@ class WeightedSFT(Method, ABC):
         if not hasattr(self, "counts"):
             return {}
         return {"omega_edges": list(BINS), "omega_counts": self.counts.tolist()}
+
+
+@dataclass
+class CalibratedSFT(WeightedSFT, ABC):
+    """Fine-tune on a weighted loss; inside the weights it has the unit of the published constants."""
+
+    loss_scale: float = 0.003
+
+    tunes = ("loss_scale", (0.001, 0.01))

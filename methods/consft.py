@@ -21,8 +21,9 @@ Details:
 `ConSFTCalibrated` keeps the published constants and multiplies the loss by `loss_scale` inside the weight.
 The constants belong to the losses of policies with billions of parameters. The losses of this policy are
 larger: with the constants as published, nearly all weights stay at the floor until the schedule ends.
-Multiplied by 0.003, a loss of 0.03 has a weight of 0.5 at the start. Where methods are tuned, `clbench tune` chose
-`tau_start` of ConSFT and `loss_scale` of ConSFTCalibrated, each from three values; the records have the value.
+Multiplied by 0.003, a loss of 0.03 has a weight of 0.5 at the start. Where methods are tuned, `clbench tune`
+chose `tau_start` of ConSFT and `loss_scale` of ConSFTCalibrated, each from three values; the records have the
+value.
 """
 
 from dataclasses import dataclass
@@ -31,7 +32,7 @@ from torch import Tensor
 
 from clbench.learning.method import Progress
 
-from ._consft_weights import WeightedSFT
+from ._consft_weights import CalibratedSFT, WeightedSFT
 
 
 @dataclass
@@ -44,12 +45,8 @@ class ConSFT(WeightedSFT):
 
 
 @dataclass
-class ConSFTCalibrated(WeightedSFT):
+class ConSFTCalibrated(CalibratedSFT):
     """Weigh each sample's loss by confidence, with the loss in the unit of the published constants."""
-
-    loss_scale: float = 0.003
-
-    tunes = ("loss_scale", (0.001, 0.01))
 
     def weights(self, losses: Tensor, progress: Progress) -> Tensor:
         """Return the policy's confidence in each sample (B,)."""

@@ -13,11 +13,11 @@ from torch import Tensor
 
 from clbench.learning.method import Progress
 
-from .consft import ConSFTCalibrated
+from ._consft_weights import CalibratedSFT
 
 
 @dataclass
-class ConstantWeight(ConSFTCalibrated):
+class ConstantWeight(CalibratedSFT):
     """Weigh every sample by the mean of ConSFT's weights."""
 
     def weights(self, losses: Tensor, progress: Progress) -> Tensor:

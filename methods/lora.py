@@ -5,11 +5,12 @@ Details:
    values, outputs and feed-forward. Rank 16 and alpha 32 come from AEGIS's baseline (arXiv 2604.16067).
 2. One adapter is trained on all targets in turn, as in arXiv 2603.11653; the weights below it never change.
 3. `variant` is "lora", "dora" (arXiv 2402.09353) or "rslora" (arXiv 2312.03732).
-4. Adapters start from zero and must move further than full weights: `speed` multiplies the step size, which at
-   a step factor of 1 is three times that of the other methods. It was chosen on validation episodes of the first
-   Fetch board (docs/history.md). Where methods are tuned, `clbench tune` chose the step size and the rank.
-5. `alpha` stays 32 when the rank is tuned, so that rank 4 has four times the scale of rank 16: the two are tuned
-   together.
+4. Adapters start from zero and must move further than full weights: `speed` multiplies the step size, which
+   at a step factor of 1 is three times that of the other methods. It was chosen on validation episodes of the
+   first Fetch board (docs/history.md). Where methods are tuned, `clbench tune` chose the step size and the
+   rank.
+5. `alpha` stays 32 when the rank is tuned, so that rank 4 has four times the scale of rank 16: the two are
+   tuned together.
 """
 
 from collections.abc import Iterable

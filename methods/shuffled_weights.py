@@ -14,11 +14,11 @@ from torch import Tensor
 
 from clbench.learning.method import Progress
 
-from .consft import ConSFTCalibrated
+from ._consft_weights import CalibratedSFT
 
 
 @dataclass
-class ShuffledWeights(ConSFTCalibrated):
+class ShuffledWeights(CalibratedSFT):
     """Give the samples of a batch each other's weights, in a random order."""
 
     def weights(self, losses: Tensor, progress: Progress) -> Tensor:

@@ -9,7 +9,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Annotated
 
-from cyclopts import CycloptsError, Parameter, Token, UnknownCommandError
+from cyclopts import CoercionError, CycloptsError, Parameter, Token, UnknownCommandError
 from cyclopts.validators import Number
 from rich.console import Console
 from rich.text import Text
@@ -98,7 +98,16 @@ def parsing_error(error: CycloptsError) -> Text:
         # the message of cyclopts imports every command
         commands = [name for name in error.app if not name.startswith("-")]
         return error_line(unknown("command", error.unused_tokens[0], commands))
+    token = error.token if isinstance(error, CoercionError) else None
+    if token is not None and token.keyword in BY_NAME:
+        name, _, value = token.value.partition("=")
+        example = f"{token.keyword}.{name if name.isidentifier() else 'NAME'} {value or 'VALUE'}"
+        return error_line(f"The name belongs to the option: write {example}")
     return error_line(error)
+
+
+BY_NAME = ("--set", "--values")
+"""Options that have a value for each hyper-parameter."""
 
 
 @contextmanager

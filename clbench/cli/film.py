@@ -50,7 +50,7 @@ def film(
 
     Args:
         scenario: Gymnasium id of the scenario.
-        methods: Names of installed methods, or module:Class.
+        methods: Names of installed methods, or module:Class; at least one.
         seed: Seed of the run.
         tasks: Names of tasks, for example press,lift (default: all retained skills and targets).
         stages: Numbers of stages, for example 0,4; all for one method, 0 and the last for several by

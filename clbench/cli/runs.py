@@ -67,7 +67,7 @@ def run(
     Args:
         scenarios: Gymnasium id of the scenario, for example clbench/Fetch-v1, or several ids separated by
             commas; module:id imports the module first.
-        methods: Names of installed methods, or module:Class.
+        methods: Names of installed methods, or module:Class; at least one, or --all.
         every: Run all installed methods.
         seeds: Number of seeds.
         first_seed: The first seed.

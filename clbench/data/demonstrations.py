@@ -78,6 +78,7 @@ def demonstrate(world: World, task: Task, seed: int, noisy: bool) -> Demonstrati
         if noisy and remaining == 0 and generator.random() < task.action_noise:
             remaining = int(generator.integers(3, 7))
         action = generator.uniform(low, high).astype(np.float32) if remaining else labels[-1]
+        action = np.clip(np.asarray(action, np.float32), low, high)
         random.append(remaining > 0)
         remaining = max(0, remaining - 1)
         state, reward, terminated, _, _ = world.step(action)

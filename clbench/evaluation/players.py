@@ -20,7 +20,7 @@ from clbench.evaluation.episodes import LANES, Episode, Live, Trial, play_in_lan
 from clbench.spec.scenario import Scenario
 from clbench.worlds.lanes import Lanes
 from clbench.worlds.scenario_env import Observation
-from clbench.worlds.schedule import InstructionFormat, observed
+from clbench.worlds.schedule import InstructionFormat, shown_instruction
 from clbench.worlds.threads import cores
 
 
@@ -116,7 +116,7 @@ def _play(
     """Return the outcome of each of `trials` in `count` lanes; `act` returns the actions (lanes, H, A)."""
 
     def begin(one: Live) -> None:
-        one.shown = observed(one.instruction, instruction, scenario)
+        one.shown = shown_instruction(one.instruction, instruction, scenario)
 
     with closing(Lanes(count, threads=cores() if count > 1 else 1)) as lanes:
         return play_in_lanes(lanes, count, trials, seed, begin, partial(act, lanes), progress=progress)

@@ -29,14 +29,14 @@ RECORD_BYTES = 100_000
 """Bytes of a record: the largest of the board has 97,000, those of Fetch-v1 have at most 70,000."""
 
 KINDS = {
-    work.collect_demonstrations: ("dataset to collect", "datasets to collect"),
-    work.collect_scenes: ("set of questions to collect", "sets of questions to collect"),
+    work.collect_demonstrations: ("dataset to collect or read", "datasets to collect or read"),
+    work.collect_scenes: ("set of questions to collect or read", "sets of questions to collect or read"),
     work.pretrain: ("policy to pretrain", "policies to pretrain"),
     work.evaluate_policy: ("pretrained policy to evaluate", "pretrained policies to evaluate"),
     work.do_run: ("run", "runs"),
     work.make_policies: ("run to train again for its policies", "runs to train again for their policies"),
 }
-"""What one job does, and what several do, in words."""
+"""What one job does, and what several do, in words. A plan does not know which data are in the cache."""
 
 
 def forecast(

@@ -131,8 +131,10 @@ class Here:
         listen(lambda place, remark: self._events.put(Event(job, "at", f"{place} {remark}".strip())))
         try:
             kind, value = _do_job(job.function, job.arguments, send)
-        except SystemExit:
-            return
+        except SystemExit as leaving:
+            if self._stopped.is_set():
+                return
+            kind, value = "failed", f"it ended its process ({leaving})"
         finally:
             listen(None)
         self._events.put(Event(job, kind, value))
@@ -252,7 +254,10 @@ def _work(
     environment: dict[str, str],
 ) -> None:
     """Do one job in this process and send its outcome."""
-    os.environ.update(environment)  # this process may be forked from one with an older environment
+    # this process may be forked from one with an older environment
+    for name in os.environ.keys() - environment.keys():
+        del os.environ[name]
+    os.environ.update(environment)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the parent, which ends its workers
     if hasattr(signal, "pthread_sigmask"):  # children of a job must not inherit the mask of the server
         signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from clbench.base.progress import ProgressCallback
+from clbench.base.text import counted
 from clbench.jobs.job import JobError
 from clbench.runs.spec import RunSpec
 from clbench.spec.registry import load_scenario
@@ -48,7 +49,7 @@ def collect_scenes(scenario: str, progress: ProgressCallback) -> str:
     scenes_folder(loaded, noticed)
     train, test = load_questions(loaded)
     states = f"{len(train.scenes)} states, and {len(test.scenes)} for the test"
-    return f"{len(train.kinds)} kinds about {states}{noticed.source}"
+    return f"{counted(len(train.kinds), 'kind')} about {states}{noticed.source}"
 
 
 def pretrain(scenario: str, policy: str, seed: int, progress: ProgressCallback) -> str:

@@ -26,7 +26,7 @@ class Uses:
     questions: Access = "never"
     """Access to the training questions."""
     reference: bool = False
-    """Whether the method is a reference, which does not compete: a bound or a transfer baseline."""
+    """Whether the method is a reference, which does not compete, such as one that trains nothing."""
 
 
 class UndeclaredAccessError(ClbenchError, RuntimeError):

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import importlib
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Iterable, Mapping
 from types import NoneType, UnionType
 from typing import Any, Union, get_args, get_origin, get_type_hints
 
+import numpy as np
+
 from clbench.base.cache import hash_of
+from clbench.base.entry_points import resolve
 from clbench.base.errors import InputError, UnknownNameError, WrongTypeError
 from clbench.base.source import class_hash, has_source, package_of, source_hash
 from clbench.base.text import did_you_mean
@@ -28,12 +30,13 @@ def load_method(spec: str) -> type[Method]:
 
     Raises:
         UnknownNameError: No such method is installed or can be imported; the message names the nearest one.
+        InputError: The module of the method raises an error while it is imported.
         WrongTypeError: The object of this name is not a method.
     """
     if ":" in spec:
-        cls = _import_method(spec)
+        cls = resolve(spec)
     elif spec in (installed := built_in_methods()) or spec in (installed := installed_methods()):
-        cls = _guarded(spec, installed[spec].load)
+        cls = resolve(installed[spec].value)
     else:
         raise unknown_method(spec)
     if not (isinstance(cls, type) and issubclass(cls, Method)):
@@ -65,27 +68,6 @@ def _method_classes(cls: type[Method]) -> list[type[Method]]:
     return [base for base in cls.__mro__ if issubclass(base, Method) and base is not Method]
 
 
-def _guarded(spec: str, load: Callable[[], Any]) -> Any:
-    """Return the result of `load`; any error in a third-party module becomes an error of one line."""
-    try:
-        return load()
-    except ModuleNotFoundError as error:
-        raise UnknownNameError(
-            f"No module {error.name!r} can be imported for the method {spec!r}."
-        ) from error
-    except Exception as error:
-        raise UnknownNameError(f"{spec!r} cannot be imported: {type(error).__name__}: {error}") from error
-
-
-def _import_method(spec: str) -> Any:
-    name, _, attribute = spec.partition(":")
-    module = _guarded(spec, lambda: importlib.import_module(name))
-    if not hasattr(module, attribute):
-        hint = did_you_mean(attribute, dir(module))
-        raise UnknownNameError(f"Module {name!r} has no {attribute!r}.{hint}")
-    return getattr(module, attribute)
-
-
 def read_changes(spec: str, cls: type[Method], changes: Mapping[str, Any]) -> dict[str, Any]:
     """Return changed hyper-parameters as the method holds them.
 
@@ -108,8 +90,9 @@ def read_changes(spec: str, cls: type[Method], changes: Mapping[str, Any]) -> di
             raise UnknownNameError(
                 f"{spec} has no hyper-parameter {name!r}.{hint} It has: {', '.join(fields) or 'none'}."
             )
+        told = f"{spec}: {name}"
         values[name] = (
-            _read(name, value, hints[name]) if isinstance(value, str) else _held(value, hints[name])
+            _read(told, value, hints[name]) if isinstance(value, str) else _held(told, value, hints[name])
         )
     held = new_method(spec, cls, values)
     return {name: getattr(held, name) for name in values}
@@ -135,11 +118,23 @@ def new_method(spec: str, cls: type[Method], values: Mapping[str, Any]) -> Metho
     return method
 
 
-def _held(value: Any, hint: Any) -> Any:
+def _held(name: str, value: Any, hint: Any) -> Any:
     """Return a value as a field of the type `hint` holds it: 5 is 5.0 where no whole number belongs."""
     kinds = _kinds(hint)
-    is_whole = isinstance(value, int) and not isinstance(value, bool)
-    return float(value) if is_whole and float in kinds and int not in kinds else value
+    if isinstance(value, np.generic):
+        value = value.item()
+    if type(value) is int and float in kinds and int not in kinds:
+        return float(value)
+    if all(kind in WORDS for kind in kinds) and type(value) not in kinds:
+        raise InputError(f"{name} must be {_words(kinds)}, not {value!r}.")
+    return value
+
+
+WORDS = {int: "a whole number", float: "a number", bool: "true or false", str: "a text", NoneType: "none"}
+
+
+def _words(kinds: Iterable[Any]) -> str:
+    return " or ".join(WORDS.get(kind, str(kind)) for kind in kinds)
 
 
 def _kinds(hint: Any) -> tuple[Any, ...]:
@@ -160,5 +155,4 @@ def _read(name: str, text: str, hint: Any) -> Any:
         if kind is not bool:
             with contextlib.suppress(ValueError):
                 return kind(text)
-    words = " or ".join(getattr(kind, "__name__", str(kind)).replace("NoneType", "none") for kind in kinds)
-    raise InputError(f"{name} must be {words.replace('bool', 'true or false')}, not {text!r}.")
+    raise InputError(f"{name} must be {_words(kinds)}, not {text!r}.")

@@ -31,7 +31,8 @@ def save_policy(policy: Policy, folder: Path) -> None:
     """Write `policy.safetensors` and `policy.json` to `folder`."""
     folder.mkdir(parents=True, exist_ok=True)
     save_file(
-        {name: value.contiguous() for name, value in policy.state_dict().items()},
+        # a copy: safetensors refuses tensors that share memory, such as tied weights
+        {name: value.detach().clone().contiguous() for name, value in policy.state_dict().items()},
         folder / "policy.safetensors",
     )
     (folder / "policy.json").write_text(

@@ -48,6 +48,6 @@ def check_abilities(kind: str, needs: Iterable[str], method: str) -> None:
     if missing:
         raise InputError(
             f"{method} needs a policy with the abilities {', '.join(sorted(needs))}; {kind} lacks "
-            f"{', '.join(missing)}. Built-in policies have both; a class declares them as `abilities`: "
-            "docs/guide/your_policy.md#abilities."
+            f"{', '.join(missing)}. Built-in policies have all abilities; a class declares its own as "
+            "`abilities`: docs/guide/your_policy.md#abilities."
         )

@@ -87,3 +87,8 @@ def record_path(
     if not Path(os.path.realpath(path.parent)).is_relative_to(os.path.realpath(records)):
         raise InputError(f"{path.parent}: a symbolic link leads out of {records}.")
     return path
+
+
+def stage_folder(root: Path, number: int) -> Path:
+    """Return the folder below `root` of the policy after a stage; 0 is before the first target."""
+    return root / f"stage-{number}"

@@ -35,7 +35,7 @@ from clbench.evaluation.episodes import Episode, Trial
 from clbench.evaluation.examiner import episode_row
 from clbench.evaluation.players import Agent, acts_on_batches, play
 from clbench.learning.trainer import sources
-from clbench.records.paths import RECORDS, record_path
+from clbench.records.paths import RECORDS, record_path, stage_folder
 from clbench.records.reader import read_record
 from clbench.records.record import AnswerRow, Record, RunInfo
 from clbench.records.writer import write_record
@@ -175,7 +175,7 @@ class StagedRun:
         check_method_name(self.method)
         if self.method in built_in_methods():
             raise InputError(
-                f"{self.method!r} is a method of clbench: give the agent its own name, "
+                f"{self.method!r} is a method of clbench: give your row its own name, "
                 f"for example 'me/{self.method}'."
             )
         if type(self.seed) is not int or self.seed < 0:
@@ -197,7 +197,7 @@ class StagedRun:
         return cache_folder() / "online" / hash_of(str(self.path.resolve()))
 
     def _stage_folder(self, stage: int) -> Path:
-        return self.folder / f"stage-{stage}"
+        return stage_folder(self.folder, stage)
 
     @cached_property
     def _sources(self) -> dict[str, Any]:

@@ -24,6 +24,7 @@ from clbench.learning.registry import method_packages
 from clbench.learning.trainer import STAGE_FILES, Trainer, load_stage, sources
 from clbench.policy.checkpoint import CheckpointError
 from clbench.policy.policy import Policy
+from clbench.records.paths import stage_folder
 from clbench.spec.protocol import Point
 from clbench.worlds.gl_backend import RenderingError
 
@@ -115,7 +116,7 @@ def make_stages(run: ResolvedRun, progress: ProgressCallback = no_progress) -> P
 
         try:
             if number:
-                trainer.load(root / f"stage-{number - 1}", number - 1)
+                trainer.load(stage_folder(root, number - 1), number - 1)
                 steps = trainer.learn(number, after)
                 progress(scenario.budget.adaptation_steps - steps if scenario.budget.criterion else 0)
             else:
@@ -130,7 +131,7 @@ def make_stages(run: ResolvedRun, progress: ProgressCallback = no_progress) -> P
     checker = Checker(scenario, run.protocol, run.spec.seed)
     with closing(checker), deterministic(run.spec.device):
         for number in range(len(scenario.target) + 1):
-            folder, identity = root / f"stage-{number}", _identity(run, number)
+            folder, identity = stage_folder(root, number), _identity(run, number)
             if is_cached(folder, identity):
                 progress(scenario.budget.adaptation_steps if number else 0)
             else:
@@ -142,7 +143,7 @@ def load_stages(run: ResolvedRun, folder: Path) -> list[Policy]:
     """Return the policies of all stages of a run from a folder with "stage-0" and so on."""
     numbers = range(len(run.scenario.target) + 1)
     return [
-        load_stage(folder / f"stage-{number}", run.new_method(), run.spec.device, run.spec.policy)
+        load_stage(stage_folder(folder, number), run.new_method(), run.spec.device, run.spec.policy)
         for number in numbers
     ]
 
@@ -158,7 +159,7 @@ def keep_stages(run: ResolvedRun, checkpoints: Path, progress: ProgressCallback 
     folder = make_stages(run, progress)
     drop_stages(run, checkpoints)
     for number in range(len(run.scenario.target) + 1):
-        keep_stage(run, checkpoints, number, folder / f"stage-{number}")
+        keep_stage(run, checkpoints, number, stage_folder(folder, number))
 
 
 def has_stages(run: ResolvedRun, checkpoints: Path, last: int | None = None) -> bool:
@@ -168,7 +169,7 @@ def has_stages(run: ResolvedRun, checkpoints: Path, last: int | None = None) -> 
 
 def _are_whole(run: ResolvedRun, folder: Path, last: int | None = None) -> bool:
     last = len(run.scenario.target) if last is None else last
-    return all(is_cached(folder / f"stage-{n}", _identity(run, n)) for n in range(last + 1))
+    return all(is_cached(stage_folder(folder, n), _identity(run, n)) for n in range(last + 1))
 
 
 def _kept(run: ResolvedRun, checkpoints: Path) -> Path:
@@ -189,7 +190,7 @@ def keep_stage(run: ResolvedRun, checkpoints: Path, number: int, source: Path) -
         for name in STAGE_FILES:
             shutil.copyfile(source / name, folder / name)
 
-    cached(_kept(run, checkpoints) / f"stage-{number}", _identity(run, number), write)
+    cached(stage_folder(_kept(run, checkpoints), number), _identity(run, number), write)
 
 
 def drop_stages(run: ResolvedRun, checkpoints: Path) -> None:

@@ -7,7 +7,6 @@ repeats the actions of an `Evaluator`, so a film ends like the recorded episode.
 from __future__ import annotations
 
 import functools
-import os
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack, closing
@@ -22,6 +21,7 @@ from PIL import Image, ImageColor, ImageDraw, ImageFont
 from clbench.base.dependencies import require
 from clbench.base.entry_points import resolve
 from clbench.base.errors import InputError
+from clbench.base.leftovers import unfinished
 from clbench.base.progress import ProgressCallback, no_progress
 from clbench.evaluation.episodes import Episode, Trial, start_of
 from clbench.evaluation.rollouts import Evaluator
@@ -228,10 +228,10 @@ class Film:
         """
         check_format(path)
         path.parent.mkdir(parents=True, exist_ok=True)
-        partial = path.with_name(f".{path.stem}.{os.getpid()}.partial{path.suffix}")
+        partial = unfinished(path)
         try:
             (self._save_gif if path.suffix == ".gif" else self._save_mp4)(partial, fps)
-            os.replace(partial, path)
+            partial.replace(path)
         finally:
             partial.unlink(missing_ok=True)
 
@@ -241,7 +241,7 @@ class Film:
             self.frame(time).quantize(palette=palette, dither=Image.Dither.NONE) for time in range(len(self))
         )
         milliseconds = [round(100 / fps) * 10] * (len(self) - 1) + [round(1000 * HOLD_SECONDS)]
-        next(frames).save(path, save_all=True, append_images=frames, duration=milliseconds, loop=0)
+        next(frames).save(path, "GIF", save_all=True, append_images=frames, duration=milliseconds, loop=0)
 
     def _palette(self) -> Image.Image:
         """Return 256 colours for all frames, so that unchanged parts do not flicker."""
@@ -262,7 +262,7 @@ class Film:
         from imageio_ffmpeg import write_frames
 
         # one thread and no encoder name in the file: the same film has the same bytes
-        exact = ["-threads", "1", "-fflags", "+bitexact", "-flags:v", "+bitexact", "-crf", "23"]
+        exact = ["-threads", "1", "-fflags", "+bitexact", "-flags:v", "+bitexact", "-crf", "23", "-f", "mp4"]
         writer = write_frames(path, self.size, fps=fps, macro_block_size=2, output_params=exact)
         writer.send(None)
         for time in range(len(self) + round(HOLD_SECONDS * fps)):

@@ -25,6 +25,7 @@ from clbench.learning.optimise import deterministic
 from clbench.learning.pretraining import pretrained_policy
 from clbench.learning.registry import describe_method, method_packages
 from clbench.learning.trainer import Trainer, sources
+from clbench.records.paths import stage_folder
 from clbench.records.reader import read_record
 from clbench.records.record import Costs, Record
 from clbench.records.writer import check_diagnostics, write_record, write_result
@@ -326,7 +327,7 @@ class _Run:
         self.trainer.load(self._checkpoint(number), number)
 
     def _checkpoint(self, number: int) -> Path:
-        return self.checkpoints / f"stage-{number}"
+        return stage_folder(self.checkpoints, number)
 
     def _resume(self) -> int | None:
         """Load the record of the latest checkpoint and return its stage, or None if there is no checkpoint.

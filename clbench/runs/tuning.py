@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from clbench.base.errors import InputError
+from clbench.base.lease import Lease
 from clbench.base.leftovers import unfinished
 from clbench.base.strict_json import read_json
 from clbench.spec.identifiers import folder_name, scenario_ids
@@ -130,18 +131,19 @@ def write_tuned(path: Path, scenario: str, seeds: Sequence[int], methods: Mappin
     Raises:
         InputError: `check_tuned` refuses it.
     """
-    check_tuned(path, seeds, methods)
-    known = {name: asdict(one) for name, one in methods.items()}
-    if path.is_file():
-        known = {**read_json(path)["methods"], **known}
-    content = {"scenario": scenario, "seeds": list(seeds), "methods": dict(sorted(known.items()))}
     path.parent.mkdir(parents=True, exist_ok=True)
-    partial = unfinished(path)
-    try:
-        partial.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
-        partial.replace(path)  # a full disk leaves the settings of the others
-    finally:
-        partial.unlink(missing_ok=True)
+    with Lease(path).held():  # another command may add a method at the same time
+        check_tuned(path, seeds, methods)
+        known = {name: asdict(one) for name, one in methods.items()}
+        if path.is_file():
+            known = {**read_json(path)["methods"], **known}
+        content = {"scenario": scenario, "seeds": list(seeds), "methods": dict(sorted(known.items()))}
+        partial = unfinished(path)
+        try:
+            partial.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+            partial.replace(path)  # a full disk leaves the settings of the others
+        finally:
+            partial.unlink(missing_ok=True)
 
 
 def fixed_settings(method: type[Method], found: Tuned) -> dict[str, Any]:

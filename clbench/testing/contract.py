@@ -13,7 +13,6 @@ or, for a test of each clause,
 from __future__ import annotations
 
 import dataclasses
-import difflib
 import functools
 import inspect
 import json
@@ -25,6 +24,7 @@ from typing import Any, get_args
 from torch import Tensor
 
 from clbench.base.seeding import seeded
+from clbench.base.text import did_you_mean
 from clbench.evaluation.rollouts import Evaluator
 from clbench.learning.method import Metadata, Method
 from clbench.learning.optimise import deterministic
@@ -191,10 +191,11 @@ def _check_signatures(cls: type[Method]) -> None:
     """Check that the loop can call every hook, and that no hook is misspelt."""
     for name, value in vars(cls).items():
         if callable(value) and name not in HOOKS and not name.startswith("_"):
-            near = difflib.get_close_matches(name, HOOKS, n=1, cutoff=0.85)
-            if near:
-                expected = f"hooks that the loop calls; did you mean {near[0]}()? Helpers begin with _"
-                raise _breach(declaration, expected, f"{name}() is never called", f"{name}()")
+            if any(hasattr(base, name) for base in cls.__bases__):
+                continue  # a base of its own calls it
+            hint = did_you_mean(f"{name}()", [f"{hook}()" for hook in HOOKS])
+            expected = f"hooks that the loop calls.{hint} Names of helpers begin with _"
+            raise _breach(declaration, expected, f"{name}() is never called", f"{name}()")
     for hook in HOOKS:
         given, taken = (inspect.signature(getattr(one, hook)) for one in (Method, cls))
         try:

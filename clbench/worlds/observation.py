@@ -102,9 +102,13 @@ class Observer:
         for start in range(0, len(rows), share):
             some = rows[start : start + share]
             busy = self._processes[: len(some)]  # none draws nothing
-            for process, part in zip(busy, np.array_split(some, len(busy)), strict=True):
-                process.ask(part)
-            pictures += [process.answer() for process in busy]
+            try:
+                for process, part in zip(busy, np.array_split(some, len(busy)), strict=True):
+                    process.ask(part)
+                pictures += [process.answer() for process in busy]
+            except BaseException:  # Ctrl-C too: an answer that nobody read would be the next picture
+                self.close()
+                raise
         return np.concatenate(pictures)
 
     def close(self) -> None:

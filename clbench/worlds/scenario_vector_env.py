@@ -67,6 +67,8 @@ class ScenarioVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]
                 'gymnasium.make_vec(..., vectorization_mode="sync").'
             )
         self.scenario = opened_scenario(scenario, order)
+        if num_envs < 1:
+            raise InputError(f"num_envs must be at least 1, not {num_envs}.")
         self.num_envs = num_envs
         self.instruction: InstructionFormat = instruction
         self.stage, self.order = stage, order
@@ -164,8 +166,8 @@ class ScenarioVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]
         self._begin(beginning)
         return rewards, terminated
 
-    def close_extras(self) -> None:
-        """Close the worlds."""
+    def close_extras(self, **kwargs: Any) -> None:
+        """Close the worlds; Gymnasium's options of `close` change nothing here."""
         self._lanes.close()
 
     def _begin(self, numbers: Sequence[int]) -> None:

@@ -61,8 +61,10 @@ class Schedule:
     ) -> None:
         if instruction not in ("text", "tokens"):
             raise InputError(f'instruction must be "text" or "tokens", not {instruction!r}.')
-        if episodes_per_stage < 1:
-            raise InputError(f"episodes_per_stage must be at least 1, not {episodes_per_stage}.")
+        if not _is_whole(episodes_per_stage) or episodes_per_stage < 1:
+            raise InputError(
+                f"episodes_per_stage must be a whole number, at least 1, not {episodes_per_stage!r}."
+            )
         self._scenario, self._episodes_per_stage, self._format = scenario, episodes_per_stage, instruction
         self._stage, self._episode = stage, -1
         self._first = 0 if scenario.retained else 1
@@ -91,15 +93,19 @@ class Schedule:
         """
         if set(options) - {"task", "stage"}:
             raise InputError(f'Options of reset are "task" and "stage", not {sorted(options)}.')
+        if "task" in options and "stage" in options:
+            raise InputError('Options of reset are "task" or "stage", not both: a task has its stage.')
         task, stage = self._choose(options)
         words = task.instructions[int(generator.integers(len(task.instructions)))]
-        shown = observed(words, self._format, self._scenario)
+        shown = shown_instruction(words, self._format, self._scenario)
         return Start(task, stage, words, shown, int(generator.integers(2**31)))
 
     def _choose(self, options: Mapping[str, Any]) -> tuple[Task, int]:
         """Return task and stage of the next episode."""
         scenario = self._scenario
         if "task" in options:
+            if not isinstance(options["task"], str):
+                raise InputError(f'The option "task" must be a name, not {options["task"]!r}.')
             task = scenario.task(options["task"])
             return task, scenario.target.index(task) + 1 if task in scenario.target else 0
         if "stage" in options:
@@ -115,7 +121,7 @@ class Schedule:
     def _check_stage(self, stage: Any) -> None:
         """Refuse a stage that the scenario does not have, or that this schedule never reaches."""
         last = len(self._scenario.target)
-        if stage not in range(self._first, last + 1):
+        if not _is_whole(stage) or stage not in range(self._first, last + 1):
             raise InputError(f"{self._scenario.id} has stages {self._first} to {last}, not {stage!r}.")
         if self._stage not in (None, stage):
             raise InputError(
@@ -123,6 +129,11 @@ class Schedule:
             )
 
 
-def observed(words: str, form: InstructionFormat, scenario: Scenario) -> Any:
+def _is_whole(value: Any) -> bool:
+    """Return whether a value is a whole number, of Python or of NumPy; True and 1.0 are none."""
+    return isinstance(value, int | np.integer) and not isinstance(value, bool)
+
+
+def shown_instruction(words: str, form: InstructionFormat, scenario: Scenario) -> Any:
     """Return an instruction in the form of observations: text, or the ids (L,) of its tokens."""
     return np.array(word_ids([words], scenario.text_length)[0]) if form == "tokens" else words

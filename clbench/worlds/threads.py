@@ -38,11 +38,16 @@ class Team:
             self._helpers.append(_Helper())
 
     def each(self, work: Callable[[Item], None], items: Sequence[Item]) -> None:
-        """Do the work on each item, in any order: each thread takes the next item that is left."""
-        left = iter(items)
+        """Do the work on each item, in any order: each thread takes the next item that is left.
+
+        If the calling thread is interrupted, the others end the items that they have begun, and take no more.
+        """
+        left, interrupted = iter(items), False
 
         def take() -> None:
             for item in left:
+                if interrupted:
+                    return
                 work(item)
 
         helpers = self._helpers[: len(items) - 1] if items else []
@@ -50,8 +55,11 @@ class Team:
             helper.asked.put(take)
         try:
             take()
+        except BaseException:
+            interrupted = True
+            raise
         finally:
-            errors = [error for helper in helpers if (error := helper.ended.get()) is not None]
+            errors = [error for error in map(_Helper.wait, helpers) if error is not None]
         if errors:
             raise errors[0]
 
@@ -72,6 +80,23 @@ class _Helper:
         self.ended: SimpleQueue[Exception | None] = SimpleQueue()
         self.thread = threading.Thread(target=_help, args=(self.asked, self.ended), daemon=True)
         self.thread.start()
+
+    def wait(self) -> Exception | None:
+        """Return the error of the work that was asked for, None if it succeeded.
+
+        A Ctrl-C is raised when the work has ended: an answer left in the queue would be taken for the next
+        one, while the thread still works.
+        """
+        interruption = None
+        while True:
+            try:
+                ended = self.ended.get()
+                break
+            except KeyboardInterrupt as error:
+                interruption = error
+        if interruption is not None:
+            raise interruption
+        return ended
 
 
 def _help(asked: SimpleQueue[Callable[[], None] | None], ended: SimpleQueue[Exception | None]) -> None:

@@ -23,6 +23,7 @@ from clbench.learning.optimise import deterministic
 from clbench.learning.pretraining import pretrained_policy
 from clbench.learning.trainer import Trainer
 from clbench.policy.policy import Policy
+from clbench.records.paths import stage_folder
 from clbench.records.record import EpisodeRow
 from clbench.runs.checkpoints import kept_stages, load_stages, stage_policies
 from clbench.runs.run import pretrained_hash
@@ -158,7 +159,7 @@ def _go_on(subject: Subject, kept: Path, policies: Sequence[Policy]) -> Check:
     data = TrainingData.open(run.scenario, first.config)
     trainer = Trainer(run.scenario, data, first, run.new_method, run.spec.seed)
     with deterministic(run.spec.device):
-        trainer.load(kept / f"stage-{number - 1}", number - 1)
+        trainer.load(stage_folder(kept, number - 1), number - 1)
         trainer.learn(number, lambda step: step.done >= steps)
     moved, apart = _distance(before, after), _distance(trainer.policy, after)
     return Check(

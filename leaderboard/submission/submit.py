@@ -24,14 +24,17 @@ from ..board.commands import run_command
 from ..board.rows import Row, Table
 from ..views.format import fitting, fitting_names, format_interval, standing_text
 
+CHECK = "check"
+"""Title of the job that checks the method."""
+
 CHECK_STEPS = 100.0
 """Duration of the check in optimiser steps, for the time left that the progress bar shows."""
 
 
 def run_submission(
     runs: Sequence[ResolvedRun], records: Path, workers: int | None, checkpoints: Path | None
-) -> bool:
-    """Check the method of `runs`, do the runs that have no record, and return whether all succeeded.
+) -> bool | None:
+    """Check the method of `runs`, and do the runs that have no record.
 
     Each run has its own process, which is stopped if it exceeds the scenario's limits.
 
@@ -40,6 +43,9 @@ def run_submission(
         records: Folder of the records.
         workers: Number of runs at once; None for all cores.
         checkpoints: Folder below which the policies of all stages are kept; None keeps none.
+
+    Returns:
+        Whether all runs succeeded; None if none was started, because the method breaks the contract.
     """
     console = Console(stderr=True)
     missing = [run for run in runs if not has_record(run, records)]
@@ -47,11 +53,14 @@ def run_submission(
         console.print("All runs already have a record.")
         return True
     limits, name = missing[0].scenario.limits, missing[0].spec.method
-    plan = Plan(Job("check", check_job, {"method": name}, CHECK_STEPS, limits=limits))
+    plan = Plan(Job(CHECK, check_job, {"method": name}, CHECK_STEPS, limits=limits))
     for run in missing:
         plan.add_run(run, records, limits, checkpoints=checkpoints)
     begin = time.monotonic()
     failed = run_with_bars(plan.jobs, Processes(workers), console)
+    if any(job.title == CHECK for job in failed):
+        console.print(f"No run was started: {name} breaks the contract.", highlight=False, markup=False)
+        return None
     seconds = time.monotonic() - begin
     console.print(
         f"{counted(len(missing), 'run')} in {seconds / 60:.1f} minutes; records in {records}.",

@@ -18,7 +18,7 @@ from typing import Any
 from rich.console import Console
 
 from clbench.base.cache import cached
-from clbench.base.errors import ClbenchError
+from clbench.base.errors import ClbenchError, UnknownNameError
 from clbench.base.progress import ProgressCallback, no_progress
 from clbench.jobs.job import Job, JobError
 from clbench.jobs.processes import Processes
@@ -123,6 +123,10 @@ def _recompute(subject: Subject, _: ProgressCallback) -> list[Check]:
     try:
         scenario = subject.scenario
         described = None if subject.strange else subject.resolved
+    except UnknownNameError as error:
+        name = subject.run.record.scenario.id
+        result = f"{error.args[0].partition('.')[0]}. Name its module: --scenario module:{name}"
+        return [*checks, Check("what was run", result, False)]
     except ClbenchError as error:
         return [*checks, Check("what was run", str(error.args[0]), False)]
     checks.append(_check_horizons(run.record, scenario))

@@ -153,7 +153,7 @@ def prediction_text(rows: Iterable[Row]) -> str:
     found = predictions(rows)
     if not found:
         return ""
-    words = {1: "", 0: ", which may be chance", -1: ", the other way round"}
+    words = {1: "", 0: " (not certain)", -1: ", the other way round"}
     parts = [
         f"{one.predictor} {tau_text(one)} over {one.rows} methods{words[one.direction]}" for one in found
     ]
@@ -193,6 +193,12 @@ def aligned(groups: str | None, rows: Iterable[RowSummary]) -> str:
     """
     letters = sorted({letter for row in rows for letter in row.groups or ""})
     return "".join(letter if letter in groups else " " for letter in letters) if groups else ""
+
+
+def group_of(row: RowSummary, rows: Iterable[RowSummary]) -> str:
+    """Return the letters of a row; none if its division has no other row to tell it apart from."""
+    rivals = [other for other in rows if other.division == row.division]
+    return row.groups if row.groups and len(rivals) > 1 else ""
 
 
 def standing_text(row: Row, rows: Iterable[Row], named: int | None = None) -> str:

@@ -30,6 +30,7 @@ from .format import (
     agreement_text,
     column_title,
     format_interval,
+    group_of,
     number_text,
     prediction_text,
     shown,
@@ -70,6 +71,7 @@ def markdown(table: Table, comparisons: Comparisons) -> str:
         start_text=start_text,
         tiers_text=tiers_text,
         prediction_text=prediction_text,
+        group_of=group_of,
         direction=_direction,
         ends=_ends,
     )

@@ -58,7 +58,7 @@ def _clbench(*arguments: str, folder: Path | None = None) -> subprocess.Complete
         (["run", "clbench/Fetch-v1", "sft", "--set.rate", "1"], "sft has no hyper-parameter 'rate'"),
         (
             ["run", "clbench/Fetch-v1", "experience_replay", "--set.replay", "x"],
-            "replay must be float, not 'x'",
+            "replay must be a number, not 'x'",
         ),
         (
             ["run", "clbench/Fetch-v1", "experience_replay", "--set.replay", "7"],
@@ -333,14 +333,23 @@ def test_a_dry_run_says_what_would_be_done_and_does_nothing(
     done, jobs, duration, disk = capsys.readouterr().out.splitlines()
     assert done == "0 of 4 runs done already."
     assert jobs == (
-        "To do: 4 datasets to collect, 1 set of questions to collect, 2 policies to pretrain, 2 pretrained "
-        "policies to evaluate, 4 runs."
+        "To do: 4 datasets to collect or read, 1 set of questions to collect or read, 2 policies to "
+        "pretrain, 2 pretrained policies to evaluate, 4 runs."
     )
     assert re.fullmatch(
         r"Time: about \d+ minutes with 1 at once, at \d+ ms for an optimiser step here\.", duration
     )
     assert re.fullmatch(r"Disk: about .* in the caches, 400 kB of records, .* of policies in kept\.", disk)
     assert not any(path.is_file() for path in empty_caches.rglob("*"))
+
+
+@pytest.mark.parametrize("words", [["step_factor=0.3"], ["step_factor", "0.3"]])
+def test_a_hyper_parameter_set_in_the_usual_way_is_told_the_right_one(
+    words: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit):
+        app(["run", TOY, "sft", "--set", *words])
+    assert "error: The name belongs to the option: write --set.step_factor" in capsys.readouterr().err
 
 
 def test_a_dry_run_counts_recorded_runs_whose_policies_would_be_made_again(

@@ -162,3 +162,13 @@ def test_the_same_generator_draws_the_same_sample() -> None:
     data = _constant_task("left", 50)
     first, second = (data.sample(8, torch.Generator().manual_seed(3)) for _ in range(2))
     assert all(a.equal(b) for a, b in zip(vars(first).values(), vars(second).values(), strict=True))
+
+
+def test_the_executed_actions_lie_in_the_action_space(monkeypatch: pytest.MonkeyPatch) -> None:
+    wild = dataclasses.replace(TASK, expert="clbench.testing:wild_expert")
+    monkeypatch.setattr(
+        "clbench.testing.wild_expert", lambda _: lambda state: np.full(2, -5.0, np.float32), raising=False
+    )
+    episode = demonstrate(resolve(wild.world)(), wild, seed=0, noisy=False)
+    assert np.abs(episode.executed).max() == 1.0
+    assert np.array_equal(episode.executed, episode.expert[:-1])

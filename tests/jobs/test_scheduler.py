@@ -18,7 +18,7 @@ import pytest
 from clbench.jobs.bars import Bars
 from clbench.jobs.job import Job
 from clbench.jobs.plan import Plan
-from clbench.jobs.processes import Processes
+from clbench.jobs.processes import Here, Processes
 from clbench.jobs.recorded import has_record
 from clbench.jobs.scheduler import run_jobs
 from clbench.learning.pretraining import pretrained_policy
@@ -53,6 +53,12 @@ def killed(progress):
 def leaves_a_thread(progress):
     threading.Thread(target=time.sleep, args=(600,)).start()
     return "went well"
+
+def leaves(progress):
+    raise SystemExit("for good")
+
+def reads(progress, name):
+    return os.environ.get(name, "unset")
 
 def slow(progress, path):
     Path(path).write_text(str(os.getpid()))
@@ -159,6 +165,22 @@ def test_a_job_that_leaves_a_thread_behind_ends_with_its_result(
     assert run_jobs([_job("loose", "leaves_a_thread"), _job("next", "good")], Processes(1), bars) == {}
     assert time.monotonic() - begin < 500
     assert "next: went well" in _printed(bars)
+
+
+def test_a_job_of_this_process_that_leaves_it_fails_with_its_words(bars: Bars) -> None:
+    failed = run_jobs([_job("leaver", "leaves")], Here(), bars)
+    assert "it ended its process (for good)" in str(failed)
+
+
+def test_a_variable_that_is_unset_is_unset_in_the_next_worker(
+    bars: Bars, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("CLBENCH_SOME_PLACE", "somewhere")
+    assert run_jobs([_job("before", "reads", name="CLBENCH_SOME_PLACE")], Processes(1), bars) == {}
+    monkeypatch.delenv("CLBENCH_SOME_PLACE")
+    assert run_jobs([_job("after", "reads", name="CLBENCH_SOME_PLACE")], Processes(1), bars) == {}
+    assert "before: somewhere" in _printed(bars)
+    assert "after: unset" in _printed(bars)
 
 
 def test_stopping_the_scheduler_ends_its_processes(

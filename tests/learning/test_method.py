@@ -3,6 +3,7 @@ import sys
 import types
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -58,7 +59,7 @@ def test_a_method_can_be_named_by_module_and_class(module: types.ModuleType) -> 
     ("spec", "error", "message"),
     [
         ("stf", LookupError, r"No method is called 'stf'. Did you mean 'sft'\?"),
-        ("stranger:Acmee", LookupError, r"Module 'stranger' has no 'Acmee'. Did you mean 'Acme'\?"),
+        ("stranger:Acmee", LookupError, r"module 'stranger' has no 'Acmee'. Did you mean 'Acme'\?"),
         ("no_such_module:Acme", LookupError, "No module 'no_such_module' can be imported"),
         ("stranger:Number", TypeError, "'stranger:Number' is not a subclass of clbench.Method"),
         ("stranger:Plain", TypeError, "'stranger:Plain' is not a dataclass"),
@@ -87,13 +88,16 @@ def test_changes_from_the_command_line_take_the_types_of_the_fields() -> None:
     ("changes", "error", "message"),
     [
         ({"strenght": "1"}, LookupError, r"has no hyper-parameter 'strenght'. Did you mean 'strength'\?"),
-        ({"rounds": "many"}, ValueError, "rounds must be int, not 'many'"),
+        ({"rounds": "many"}, ValueError, "rounds must be a whole number, not 'many'"),
+        ({"rounds": 2.5}, ValueError, "rounds must be a whole number, not 2.5"),
+        ({"rounds": True}, ValueError, "rounds must be a whole number, not True"),
+        ({"strength": None}, ValueError, "strength must be a number, not None"),
         ({"gentle": "perhaps"}, ValueError, "gentle must be true or false, not 'perhaps'"),
     ],
 )
 @pytest.mark.usefixtures("module")
 def test_a_wrong_change_is_refused_by_name(
-    changes: dict[str, str], error: type[Exception], message: str
+    changes: dict[str, Any], error: type[Exception], message: str
 ) -> None:
     with pytest.raises(error, match=message):
         build_method("stranger:Acme", changes)

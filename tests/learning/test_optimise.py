@@ -74,12 +74,20 @@ def test_a_loss_that_cannot_be_minimised_stops_with_the_step_in_the_error(loss: 
     assert weight.tolist() == [1.0, 1.0]
 
 
-def test_the_deterministic_block_restores_the_number_of_threads() -> None:
-    before = torch.get_num_threads(), torch.are_deterministic_algorithms_enabled()
-    with deterministic():
-        assert torch.get_num_threads() == 1
-        assert torch.are_deterministic_algorithms_enabled()
-    assert (torch.get_num_threads(), torch.are_deterministic_algorithms_enabled()) == before
+@pytest.mark.parametrize("warn_only", [False, True])
+def test_the_deterministic_block_restores_what_was_set(warn_only: bool) -> None:
+    def state() -> tuple[int, bool, bool]:
+        warns = torch.is_deterministic_algorithms_warn_only_enabled()
+        return torch.get_num_threads(), torch.are_deterministic_algorithms_enabled(), warns
+
+    torch.use_deterministic_algorithms(warn_only, warn_only=warn_only)
+    try:
+        before = state()
+        with deterministic():
+            assert state() == (1, True, False)
+        assert state() == before
+    finally:
+        torch.use_deterministic_algorithms(False)
 
 
 def test_the_step_size_can_change_at_every_step_once_the_gradient_is_known() -> None:

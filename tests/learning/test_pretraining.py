@@ -1,20 +1,25 @@
+import dataclasses
 import json
 import logging
 import shutil
 from pathlib import Path
+from typing import Any
 
 import pytest
+import torch
 
 from clbench import load_scenario
 from clbench.base.cache import MANIFEST, cache_folder, hash_of
 from clbench.learning.pretraining import (
     SHIPPED,
     is_pretrained,
+    pretrain,
     pretrained_folder,
     pretrained_policy,
     pretraining_inputs,
     shipped_folder,
 )
+from clbench.policy.policy import Policy
 
 FETCH = load_scenario("clbench/Fetch-v1")
 SHIPS = shipped_folder(FETCH, 0)
@@ -68,3 +73,21 @@ def test_a_torn_shipped_policy_is_not_used_and_the_log_says_why(
     with pytest.raises(RuntimeError, match="pretraining began"), caplog.at_level(logging.WARNING):
         pretrained_policy(FETCH, 0)
     assert f"{torn} is torn: its files are not those that were written: pretraining" in caplog.text
+
+
+def test_the_data_are_normalised_with_one_thread(monkeypatch: pytest.MonkeyPatch) -> None:
+    toy, threads = load_scenario("clbench.testing:clbench/Toy-v0"), list[int]()
+
+    def normalise_like(policy: Policy, *values: Any) -> None:
+        threads.append(torch.get_num_threads())
+
+    monkeypatch.setattr(Policy, "normalise_like", normalise_like)
+    brief = dataclasses.replace(toy, budget=dataclasses.replace(toy.budget, pretraining_steps=1))
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    try:
+        pretrain(brief, 0)
+        assert torch.get_num_threads() == 2
+    finally:
+        torch.set_num_threads(before)
+    assert threads == [1]

@@ -9,7 +9,7 @@ import pytest
 import torch
 from safetensors.torch import load, save_file
 from scipy import stats
-from torch import Tensor
+from torch import Tensor, nn
 
 from clbench.learning.optimise import deterministic
 from clbench.policy.batch import Batch, QuestionBatch
@@ -120,6 +120,17 @@ def test_a_policy_survives_saving(tmp_path: Path) -> None:
     policy.normalise_like(batch.state, batch.action[:, 0])
     save_policy(policy, tmp_path)
     assert load_policy(tmp_path).action_loss(batch).equal(policy.action_loss(batch))
+
+
+def test_a_policy_with_tied_weights_survives_saving(tmp_path: Path) -> None:
+    policy = TransformerPolicy(CONFIG, seed=5)
+    first, second = [module for module in policy.modules() if isinstance(module, nn.LayerNorm)][:2]
+    second.weight = first.weight
+    with torch.no_grad():
+        first.weight.mul_(1.5)
+    save_policy(policy, tmp_path)
+    loaded = load_policy(tmp_path).state_dict()
+    assert all(loaded[name].equal(value) for name, value in policy.state_dict().items())
 
 
 def _cut(folder: Path) -> None:

@@ -299,7 +299,7 @@ def test_a_finished_record_is_never_edited(evaluate: Callable[..., Any]) -> None
     [
         (
             {"method": "sft"},
-            "'sft' is a method of clbench: give the agent its own name, for example 'me/sft'",
+            "'sft' is a method of clbench: give your row its own name, for example 'me/sft'",
         ),
         ({"method": "SFT"}, "would take for 'sft'"),
         ({"method": "../sac"}, "cannot be the name of a method"),

@@ -48,7 +48,7 @@ def test_a_resolved_run_has_all_settings_of_its_record() -> None:
         (RunSpec("clbench/Fetsh-v1", "sft", 0), UnknownNameError, "Did you mean 'clbench/Fetch-v1'"),
         (RunSpec(TOY, "stf", 0), UnknownNameError, "Did you mean 'sft'"),
         (RunSpec(TOY, "lora", 0, {"rang": 4}), UnknownNameError, "Did you mean 'rank'"),
-        (RunSpec(TOY, "lora", 0, {"rank": "four"}), InputError, "rank must be int"),
+        (RunSpec(TOY, "lora", 0, {"rank": "four"}), InputError, "rank must be a whole number"),
         (RunSpec(TOY, "sft", 0, order=9), InputError, "not 9"),
     ],
 )

@@ -1,7 +1,10 @@
 """Tuning: the same number of settings for every method, and a choice on validation episodes."""
 
 import errno
+import json
 import os
+import threading
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -9,6 +12,7 @@ from typing import Any
 import pytest
 
 from clbench.base.errors import InputError
+from clbench.base.lease import Lease
 from clbench.learning.registry import load_method, new_method
 from clbench.runs import tuning
 from clbench.runs.spec import RunSpec
@@ -156,6 +160,27 @@ def test_tuned_settings_of_other_methods_stay_in_the_file(toy_file: Path) -> Non
     write_tuned(toy_file, "clbench/Toy-v0", [100], {"sft": one})
     write_tuned(toy_file, "clbench/Toy-v0", [100], {"lwf": other})
     assert tuned("clbench/Toy-v0") == {"lwf": other, "sft": one}
+
+
+def test_two_commands_that_write_at_once_lose_no_settings(toy_file: Path) -> None:
+    one, other = (Tuned({"step_factor": factor}, (_tried(0.6, 0.9, factor),)) for factor in (0.1, 0.3))
+    write_tuned(toy_file, "clbench/Toy-v0", [100], {"sft": one})
+    ours = json.loads(toy_file.read_text(encoding="utf-8"))
+    begun = threading.Event()
+
+    def write_slowly() -> None:
+        with Lease(toy_file).held():
+            begun.set()
+            time.sleep(0.3)
+            ours["methods"]["ewc"] = ours["methods"]["sft"]
+            toy_file.write_text(json.dumps(ours), encoding="utf-8")
+
+    writer = threading.Thread(target=write_slowly)
+    writer.start()
+    begun.wait()
+    write_tuned(toy_file, "clbench/Toy-v0", [100], {"lwf": other})
+    writer.join()
+    assert sorted(tuned("clbench/Toy-v0")) == ["ewc", "lwf", "sft"]
 
 
 def test_settings_of_other_seeds_are_not_written_beside_those_of_other_methods(toy_file: Path) -> None:

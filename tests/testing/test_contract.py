@@ -66,8 +66,11 @@ class Misdeclared(Method):
 class Misspelt(Method):
     """Misspells a hook."""
 
-    def gradient(self, policy: Policy, loss: Tensor) -> None:
-        loss.backward()  # type: ignore[no-untyped-call]
+    def gradient(self, policy: Policy, loss: Tensor) -> None: ...
+
+
+HELPS = {"__doc__": "Has a public function that is no hook.", "compute_loss": lambda self: None}
+Helpful: Any = dataclasses.dataclass(type("Helpful", (Method,), HELPS))
 
 
 @dataclasses.dataclass
@@ -244,7 +247,8 @@ FAULTS: list[tuple[Any, str, str, str]] = [
     (Annotated, "declaration", "without an annotation", "uses is a field of the dataclass"),
     (Undeclared, "declaration", "uses to be a Uses", "'questions'"),
     (Misdeclared, "declaration", "uses.questions to be one of never, prepare, throughout", "'always'"),
-    (Misspelt, "declaration", "did you mean gradients()?", "gradient() is never called"),
+    (Helpful, "declaration", "Names of helpers begin with _", "compute_loss() is never called"),
+    (Misspelt, "declaration", "Did you mean 'gradients()'?", "gradient() is never called"),
     (Forgetful, "declaration", "loss(self, policy, batch, progress)", "loss(self, policy, batch)"),
     (Counts, "sound hooks", "the number of optimiser steps that it took, or None", "0.5"),
     (Idle, "sound hooks", "only a reference, `uses = Uses(reference=True)`, may train none", "none"),

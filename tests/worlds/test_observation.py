@@ -231,3 +231,23 @@ def test_every_method_learns_from_pictures(name: str, tmp_path: Path) -> None:
     assert trainer.policy.config == policy_config(SEEN_TOY)
     trainer.save(tmp_path / "1", trainer.state(1))
     trainer.load(tmp_path / "1", 1)
+
+
+def test_after_an_interruption_the_next_picture_is_that_of_its_own_state(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    observer, states = Observer(TASK.world, TASK.camera), _states(2)
+    _, expected = observer.observe(states)
+    assert not np.array_equal(expected[0], expected[1])
+    answer = type(observer._processes[0]).answer
+
+    def interrupted(process: Any) -> Any:
+        monkeypatch.setattr(type(process), "answer", answer)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(type(observer._processes[0]), "answer", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        observer.observe(states[:1])
+    _, images = observer.observe(states[1:])
+    assert np.array_equal(images, expected[1:])
+    observer.close()

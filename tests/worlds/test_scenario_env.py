@@ -75,6 +75,10 @@ def test_options_choose_a_task_or_a_stage() -> None:
     [
         ({"task": "lefft"}, LookupError, "Did you mean 'left'"),
         ({"stage": 3}, ValueError, "has stages 0 to 2, not 3"),
+        ({"stage": 1.0}, ValueError, "has stages 0 to 2, not 1.0"),
+        ({"stage": True}, ValueError, "has stages 0 to 2, not True"),
+        ({"task": 3}, ValueError, 'The option "task" must be a name, not 3'),
+        ({"task": "left", "stage": 99}, ValueError, "not both"),
         ({"goal": 3}, ValueError, "Options of reset are"),
     ],
 )
@@ -85,7 +89,10 @@ def test_wrong_options_are_refused_by_name(
         _toy().reset(options=options)
 
 
-@pytest.mark.parametrize("options", [{"instruction": "audio"}, {"episodes_per_stage": 0}])
+@pytest.mark.parametrize(
+    "options",
+    [{"instruction": "audio"}, {"episodes_per_stage": 0}, {"episodes_per_stage": 1.5}, {"stage": 1.0}],
+)
 def test_wrong_keywords_are_refused(options: dict[str, Any]) -> None:
     with pytest.raises(ValueError, match=next(iter(options))):
         _toy(**options)

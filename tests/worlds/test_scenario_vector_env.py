@@ -105,3 +105,11 @@ def test_returned_arrays_do_not_change_later() -> None:
     np.testing.assert_array_equal(observation["state"], state)
     np.testing.assert_array_equal(observation["instruction"], tokens)
     np.testing.assert_array_equal(ended, before)
+
+
+def test_it_closes_with_the_options_of_gymnasiums_own() -> None:
+    env = ScenarioVectorEnv("clbench.testing:TOY", num_envs=2)
+    env.reset(seed=0)
+    env.close(timeout=1)
+    with pytest.raises(ValueError, match="num_envs must be at least 1, not 0"):
+        ScenarioVectorEnv("clbench.testing:TOY", num_envs=0)

@@ -121,3 +121,43 @@ def test_only_the_cores_that_this_process_may_use_count() -> None:
     one = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert int(one.stdout) == 1
     assert cores() == len(os.sched_getaffinity(0))
+
+
+@pytest.mark.parametrize("at", ["the caller works", "the caller waits"])
+def test_an_interrupted_call_returns_when_no_thread_works_any_more(
+    at: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    team, done, begun = Team(2), list[int](), threading.Event()
+    caller = threading.current_thread()
+
+    def work(item: int) -> None:
+        if threading.current_thread() is not caller:
+            begun.set()
+            time.sleep(0.3)
+            done.append(item)
+        elif at == "the caller works":
+            begun.wait()
+            raise KeyboardInterrupt
+        else:
+            begun.wait()
+
+    if at == "the caller waits":
+        (helper,), interrupted = team._helpers, list[bool]()
+        get = helper.ended.get
+
+        class Queue:
+            put = helper.ended.put
+
+            def get(self) -> Exception | None:
+                if not interrupted:
+                    interrupted.append(True)
+                    raise KeyboardInterrupt
+                return get()
+
+        monkeypatch.setattr(helper, "ended", Queue())
+    with pytest.raises(KeyboardInterrupt):
+        team.each(work, [0, 1])
+    assert len(done) == 1
+    team.each(done.append, [5, 6])
+    assert sorted(done[1:]) == [5, 6]
+    team.close()

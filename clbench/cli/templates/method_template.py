@@ -22,7 +22,7 @@ class MethodTemplate(Method):
     """Share of the batch that is trained on."""
 
     # Use of the prior data: "never", "prepare" (before the first target) or
-    # "throughout". The method competes with methods of the same use.
+    # "throughout". The method competes with methods that read the same data.
     uses = Uses(demonstrations="never", questions="never")
     metadata = Metadata(
         authors="Your name",

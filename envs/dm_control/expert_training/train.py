@@ -6,7 +6,6 @@ import dataclasses
 import hashlib
 import json
 import math
-import os
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
@@ -24,6 +23,7 @@ from torch import Tensor
 from clbench.base.cache import cache_folder, hash_of
 from clbench.base.dependencies import versions
 from clbench.base.errors import InputError
+from clbench.base.leftovers import unfinished
 from clbench.base.seeding import SPLIT_LABELS, derive_seed, seeded
 from clbench.base.source import source_hash
 
@@ -283,7 +283,7 @@ def _write_checkpoint(trainer: WrittenOutSAC, best: _Best, path: Path) -> None:
     tensors |= {f"best.{name}": value for name, value in best.actor.items()}
     words = {"steps": trainer.num_timesteps, "updates": trainer._n_updates, "value": best.value}
     path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    partial = unfinished(path)
     save_file(tensors, partial, metadata={"training": json.dumps(words | {"curve": best.curve})})
     partial.replace(path)
 
@@ -338,7 +338,11 @@ def _ship(settings: Settings, expert: Expert, curve: list[list[float]], folder: 
         "versions": versions(PACKAGES),
     }
     folder.mkdir(parents=True, exist_ok=True)
-    (folder / f"{task}.safetensors").write_bytes(content)
     text = json.dumps(card, indent=1) + "\n"
-    (folder / f"{task}.json").write_text(text, encoding="utf-8", newline="\n")
+    made = {folder / f"{task}.safetensors": content, folder / f"{task}.json": text.encode()}
+    partial = {path: unfinished(path) for path in made}
+    for path, data in made.items():
+        partial[path].write_bytes(data)
+    for path in made:  # both are whole: a card beside other weights would be refused
+        partial[path].replace(path)
     return card

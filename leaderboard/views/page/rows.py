@@ -25,6 +25,7 @@ from ..format import (
     Rows,
     aligned,
     format_interval,
+    group_of,
     number_text,
     shown,
     standing_text,
@@ -234,7 +235,8 @@ def row_view(row: Row, rows: Sequence[Row]) -> RowView:
 def _groups(row: Row, rows: Iterable[Row]) -> str:
     """Return the letters of a row; a dash if there is no other row to tell it apart from."""
     rivals = [other for other in rows if other.division == row.division]
-    return aligned(row.groups, rivals) if row.groups and len(rivals) > 1 else MISSING
+    letters = group_of(row, rivals)
+    return aligned(letters, rivals) if letters else MISSING
 
 
 @cache

@@ -105,7 +105,8 @@ def _above(ahead: Sequence[Row], gains: Mapping[str, float]) -> str:
             parts.append((f"with{kind} prior demonstrations", _listed(members), verb, by))
     (where, names, verb, by), *more = parts
     first = f"{where.capitalize()}, {names} {verb} {by} above plain fine-tuning"
-    return "; ".join([first, *(f"{where}, {names} by {by}" for where, names, _, by in more)]) + "."
+    rest = (f"{where}, {names} {verb} {by} above it" for where, names, verb, by in more)
+    return "; ".join([first, *rest]) + "."
 
 
 def verdicts(rows: Sequence[Row]) -> list[Verdict]:

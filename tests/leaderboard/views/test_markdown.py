@@ -21,7 +21,7 @@ def test_the_markdown_has_values_with_intervals_and_explains_them(
     shown: Callable[[], tuple[str, str]],
 ) -> None:
     _, page = shown()
-    row = next(line for line in page.splitlines() if line.startswith("| a | sft |"))
+    row = next(line for line in page.splitlines() if "| sft |" in line)
     assert "| prior-data-free | self-reported | 2 | 0.50 [0." in row
     assert "**forgetting** (lower is better" in page
     assert "## clbench/Toy-v0" in page

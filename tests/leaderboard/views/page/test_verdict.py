@@ -59,7 +59,7 @@ def test_several_methods_that_end_higher_share_a_sentence(board: Callable[..., A
     )
     assert headline(rows) == (
         f"Without prior demonstrations, lora ends {lora:.2f} above plain fine-tuning; with prior "
-        f"demonstrations, replay by {replay:.2f}."
+        f"demonstrations, replay ends {replay:.2f} above it."
     )
 
 
