@@ -67,10 +67,12 @@ ladder: .venv/installed-dev
 	$(BIN)/clbench run $(CLAIMED) consft_calibrated --set.step_factor 1 --seeds 4 --records leaderboard/ladder
 	$(BIN)/clbench run clbench/PointMaze-v1 sft consft fast_dvla --set.step_factor 1 --seeds 4 --records leaderboard/ladder
 
-# What else docs/reference/claims.md needs: methods with one thing changed that tells what their effect is due to.
+# What else docs/reference/claims.md needs: methods with one thing changed that tells what their effect is due to. And
+# plain fine-tuning at the other setting that tuning rated highest on Fetch-v1, which docs/reference/findings.md compares.
 KNOWLEDGE := clbench/FetchKnowledge-v1
 CONTROLS := --seeds 4 --records leaderboard/controls
 controls: .venv/installed-dev
+	$(BIN)/clbench run clbench/Fetch-v1 sft --set.step_factor 0.1 --seeds 12 --records leaderboard/controls
 	$(BIN)/clbench run $(CLAIMED) co_training --set.step_factor 1 $(CONTROLS)
 	$(BIN)/clbench run $(CLAIMED) fast_dvla --set.direction random --set.step_factor 1 $(CONTROLS)
 	$(BIN)/clbench run $(CLAIMED) fast_dvla --set.orthogonal 0 --set.step_factor 1 $(CONTROLS)

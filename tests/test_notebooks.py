@@ -55,6 +55,7 @@ def test_the_first_method_runs_and_is_compared(tmp_path: Path) -> None:
     assert "__main__:Anchored seed 0: adaptation" in "".join(streams)
 
 
+@pytest.mark.slow  # 7 s
 @pytest.mark.skipif(not (ROOT / "leaderboard" / "records").exists(), reason="no records")
 def test_the_board_is_read(tmp_path: Path) -> None:
     records = ROOT / "leaderboard" / "records" / "Fetch-v1"

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
+from clbench.records.paths import label_of
 from clbench.runs.tuning import LEARNED, tuned
 from clbench.spec.references import BASELINE
 
-from ..claims.evidence import Evidence, Figure, rung
+from ..board.frontier import FACTOR
+from ..claims.evidence import Evidence, Figure
 
 
 def tied_factors(scenario: str) -> tuple[float, ...]:
@@ -23,12 +25,9 @@ def tied_factors(scenario: str) -> tuple[float, ...]:
 
 
 def gains_over_tied(evidence: Evidence, methods: Iterable[str]) -> dict[str, list[Figure]]:
-    """Return the gain of each method over plain fine-tuning at each tied factor, from runs of the ladder."""
-    factors = tied_factors(evidence.scenario)
+    """Return the gain of each method over plain fine-tuning at each tied factor, from the controls."""
+    tied = [label_of(BASELINE, {FACTOR: factor}) for factor in tied_factors(evidence.scenario)]
     return {
-        method: [
-            evidence.difference("final_average", method, rung(BASELINE, factor), form=".3f")
-            for factor in factors
-        ]
+        method: [evidence.difference("final_average", method, label, form=".3f") for label in tied]
         for method in methods
     }

@@ -43,6 +43,7 @@ def run_script(text: str, folder: Path) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, cwd=folder, capture_output=True, text=True, check=True)
 
 
+@pytest.mark.slow  # 19 s: three processes, each imports PyTorch
 def test_a_class_of_the_script_itself_runs_and_its_change_is_noticed(tmp_path: Path) -> None:
     execute(RunSpec(TOY, "frozen", 0), tmp_path)  # all that the runs need is in the cache
     result = run_script(SCRIPT, tmp_path)

@@ -14,6 +14,7 @@ from clbench.runs.spec import RunSpec
 TOY = "clbench.testing:clbench/Toy-v0"
 
 
+@pytest.mark.slow  # 5 to 10 s: runs in processes
 def test_methods_are_compared_over_the_seeds_that_were_asked_for(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -59,6 +59,7 @@ class _Raises(Method):
         Path("/nowhere/weights").read_bytes()
 
 
+@pytest.mark.slow  # 12 s: two commands with workers
 def test_commands_that_start_together_do_each_run_once(tmp_path: Path) -> None:
     # their workers import the toy, pretrained in the cache of the tests
     command = [*COMMAND, "--records", str(tmp_path / "records")]
