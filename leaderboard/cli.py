@@ -330,8 +330,7 @@ def findings(
     from .views.format import write_all
 
     table = _table(records)
-    evidence_on = _evidence(None, records, controls)
-    found = sections(table, judge_all(evidence_on), evidence_on)
+    found = sections(table, judge_all(_evidence(None, records, controls)))
     drawn = {output.parent / "findings" / name: svg for name, svg in pictures(table).items()}
     _print_written(write_all({output: page(found), **drawn}))
 

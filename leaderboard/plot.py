@@ -108,7 +108,7 @@ def frontier(records: Path | str = RECORDS, scenario: str | None = None, *, dark
         InputError: There is no ladder.
         UnknownNameError: The scenario has none.
     """
-    from .board.frontier import ladder_of, read_frontiers
+    from .board.frontier import frontiers_of, ladder_of, read_ladder
     from .views.page.charts.frontier import WIDE
     from .views.page.charts.frontier import frontier as chart
     from .views.page.charts.plot import themed
@@ -120,7 +120,7 @@ def frontier(records: Path | str = RECORDS, scenario: str | None = None, *, dark
             f"There is no ladder at {folder}. `make ladder` runs it in a clone, or: clbench run SCENARIO "
             f"METHODS --set.step_factor 0.3 --records {folder}"
         )
-    found, _ = read_frontiers(folder)
+    found = frontiers_of(read_ladder(folder)[0])
     chosen = _chosen(scenario, {name: len(curves) for name, curves in found.items()}, "curve", folder)
     return themed({**chart(found[chosen], WIDE, FONT), "title": heading(chosen)}, dark)
 

@@ -1,21 +1,29 @@
-"""The frontier: what methods learn and keep at each learning rate of the ladder."""
+"""The frontier: what methods learn and keep at each learning rate of the ladder.
+
+The ladder also has plain fine-tuning at settings that tuning rated as high as the chosen one. A gain over the
+chosen one alone would be that of a coin.
+"""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import groupby
 from pathlib import Path
 
 from clbench.records.paths import label_of
-from clbench.scoring.intervals import Estimate, estimate, row_generator
+from clbench.runs.tuning import LEARNED as LEARNED_ENOUGH
+from clbench.runs.tuning import tuned
+from clbench.scoring.intervals import Estimate, bootstrap, estimate, row_generator
+from clbench.scoring.metrics import load_metric
+from clbench.scoring.scores import Scores
 from clbench.spec.references import BASELINE
 
 from .places import LADDER
 from .runs import ALIKE, Run, Sifted, is_number, no_row, read_run, read_runs
-from .summary import DIVISIONS, NotShown
+from .summary import DIVISIONS, RANKED_BY
 
 FACTOR = "step_factor"
 """Hyper-parameter that the ladder changes."""
@@ -60,17 +68,23 @@ def ladder_of(records: Path) -> Path:
     return records.resolve().parent / LADDER.name
 
 
-def read_frontiers(folder: Path) -> tuple[dict[str, tuple[Curve, ...]], list[NotShown]]:
-    """Return the curves below `folder` by scenario, plain fine-tuning first, and the files that make none.
+def read_ladder(folder: Path) -> Sifted:
+    """Return the runs of the ladder below `folder` by scenario, and the files that are no such run.
 
-    Their paths begin with the folder's name. A missing folder counts as empty. A scenario with one learning
-    rate has no curves: its runs are for the claims.
+    Their paths begin with the folder's name. A missing folder counts as empty.
     """
     runs, refused = read_runs(folder, partial(read_run, changed=True), (*ALIKE, on_the_ladder))
     runs.sort(key=lambda run: run.place)
-    by_place = {place: list(members) for place, members in groupby(runs, lambda run: run.place)}
-    found = {place: _curves(members) for place, members in by_place.items() if _is_ladder(members)}
-    return found, [dataclasses.replace(one, path=f"{folder.name}/{one.path}") for one in refused]
+    return runs, [dataclasses.replace(one, path=f"{folder.name}/{one.path}") for one in refused]
+
+
+def frontiers_of(ladder: Sequence[Run]) -> dict[str, tuple[Curve, ...]]:
+    """Return the curves of runs that `read_ladder` returned by scenario, plain fine-tuning first.
+
+    A scenario with one learning rate has no curves: its runs are for the claims.
+    """
+    by_place = {place: list(members) for place, members in groupby(ladder, lambda run: run.place)}
+    return {place: _curves(members) for place, members in by_place.items() if _is_ladder(members)}
 
 
 def _is_ladder(runs: Sequence[Run]) -> bool:
@@ -88,9 +102,14 @@ def on_the_ladder(runs: list[Run]) -> Sifted:
 
 
 def _curves(runs: Sequence[Run]) -> tuple[Curve, ...]:
-    """Return the curves of the runs of one scenario."""
+    """Return the curves of the runs of one scenario, over the seeds that all have, if there are any."""
+    seeds: dict[tuple[str, float], set[int]] = {}
+    for run in runs:
+        label = apart_from_the_factor(run), run.record.run.changes[FACTOR]
+        seeds.setdefault(label, set()).add(run.seed)
+    common = set.intersection(*seeds.values())
     by_label: dict[str, dict[str, list[Run]]] = {}
-    for run in sorted(runs, key=lambda run: run.seed):
+    for run in sorted((run for run in runs if not common or run.seed in common), key=lambda run: run.seed):
         by_label.setdefault(run.record.run.method, {}).setdefault(apart_from_the_factor(run), []).append(run)
     curves = [
         Curve(method if len(labels) == 1 else label, members[0].division, _rungs(members))
@@ -119,3 +138,67 @@ def _rung(factor: float, runs: Sequence[Run]) -> Rung:
     generator = row_generator(runs[0].place, runs[0].method)
     found = estimate((LEARNED, KEPT), {run.seed: run.scores for run in runs}, generator)
     return Rung(factor, found[LEARNED], found[KEPT], tuple(run.seed for run in runs))
+
+
+# ---- tied settings -----------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class TiedGain:
+    """Gain of a method over plain fine-tuning at a setting that tuning rated as high as the chosen one."""
+
+    factor: float
+    """Step factor of plain fine-tuning."""
+    gain: Estimate
+    """Difference in final average, over the common seeds; missing without one."""
+    seeds: int
+    """Number of common seeds."""
+
+    @property
+    def is_certain(self) -> bool:
+        """Whether the interval is above 0."""
+        return (self.gain.low or 0.0) > 0
+
+
+def tied_factors(scenario: str) -> tuple[float, ...]:
+    """Return the step factors of plain fine-tuning that are not the chosen one and have its final average."""
+    found = tuned(scenario).get(BASELINE)
+    if found is None:
+        return ()
+    learners = [one for one in found.tried if one.learned >= LEARNED_ENOUGH]
+    best = max((one.final_average for one in learners), default=None)
+    chosen = found.settings["step_factor"]
+    factors = [one.settings["step_factor"] for one in learners if one.final_average == best]
+    return tuple(factor for factor in factors if factor != chosen)
+
+
+def tied_gains(
+    scenario: str, methods: Mapping[str, Mapping[int, Scores]], ladder: Iterable[Run]
+) -> dict[str, tuple[TiedGain, ...]]:
+    """Return the gains of methods over plain fine-tuning at each tied setting, from runs of the ladder.
+
+    Args:
+        scenario: Gymnasium id of the scenario.
+        methods: Scores by method and seed.
+        ladder: Runs of the ladder, of any scenario and method.
+    """
+    factors = tied_factors(scenario)
+    runs = [run for run in ladder if run.place == scenario and run.record.run.method == BASELINE]
+    return {
+        method: tuple(_gain(scenario, method, scores, runs, one) for one in factors)
+        for method, scores in methods.items()
+    }
+
+
+def _gain(
+    scenario: str, method: str, scores: Mapping[int, Scores], runs: Sequence[Run], factor: float
+) -> TiedGain:
+    tied = {run.seed: run.scores for run in runs if run.record.run.changes == {FACTOR: factor}}
+    seeds = sorted(tied.keys() & scores.keys())
+    if not seeds:
+        return TiedGain(factor, Estimate(None, None, None), 0)
+    final = load_metric(RANKED_BY).over_runs
+    both = {method: [scores[seed] for seed in seeds], BASELINE: [tied[seed] for seed in seeds]}
+    generator = row_generator(scenario, f"{RANKED_BY}, {method} - {BASELINE} at {factor:g}")
+    gain = bootstrap(lambda of: final(of[method]) - final(of[BASELINE]), both, generator, span=(-1.0, 1.0))
+    return TiedGain(factor, gain, len(seeds))

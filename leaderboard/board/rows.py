@@ -23,7 +23,7 @@ from clbench.spec.references import BASELINE
 
 from .agreement import Concordance, concordance
 from .costs import costs_of
-from .frontier import Curve, ladder_of, read_frontiers
+from .frontier import Curve, TiedGain, frontiers_of, ladder_of, read_ladder, tied_factors, tied_gains
 from .orders import Orders, orders_of
 from .runs import ALIKE, Run, Sifted, no_row, read_run, read_runs
 from .summary import (
@@ -66,6 +66,9 @@ class Table(Summary):
     rows: tuple[Row, ...] = ()
     frontiers: Mapping[str, tuple[Curve, ...]] = field(default_factory=dict)
     """Methods at the learning rates of the ladder, by scenario; those with records only."""
+    tied: Mapping[str, Mapping[str, tuple[TiedGain, ...]]] = field(default_factory=dict)
+    """Gains over plain fine-tuning at settings that tuning rated as high as the chosen one, by scenario and
+    method; of a scenario without such a setting, none."""
 
 
 def read_table(records: Path, only: Container[str] | None = None) -> Table:
@@ -85,15 +88,22 @@ def read_table(records: Path, only: Container[str] | None = None) -> Table:
     found = [_scenario_rows(list(members)) for _, members in by_place]
     found.sort(key=lambda rows: not rows[0].to_criterion)  # stages to a criterion first
     by_name = {rows[0].scenario: rows for rows in found}
-    frontiers, without = read_frontiers(ladder_of(records)) if only is None else ({}, [])
+    ladder, without = read_ladder(ladder_of(records)) if only is None else ([], [])
     return Table(
         scenarios={run.place: run.published for run in runs},
         rows=tuple(chain.from_iterable(found)),
         starts={name: pretrained_success(rows) for name, rows in by_name.items()},
         agreements={name: agreement(rows) for name, rows in by_name.items()},
         not_shown=tuple(sorted([*not_shown, *alone, *without], key=lambda entry: entry.path)),
-        frontiers=frontiers,
+        frontiers=frontiers_of(ladder),
+        tied={name: _over_tied(name, rows, ladder) for name, rows in by_name.items()},
     )
+
+
+def _over_tied(name: str, rows: Sequence[Row], ladder: Sequence[Run]) -> dict[str, tuple[TiedGain, ...]]:
+    if not tied_factors(name):
+        return {}
+    return tied_gains(name, {row.method: row.scores for row in rows if row.division in METHODS}, ladder)
 
 
 def _beside_rows(runs: list[Run]) -> Sifted:

@@ -6,7 +6,7 @@ the last section says what the records cannot tell.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
@@ -19,12 +19,11 @@ from clbench.scoring.intervals import Estimate
 from clbench.spec.policies import DEFAULT_POLICY
 from clbench.spec.references import BASELINE, FROZEN
 
-from ..board.frontier import Curve
+from ..board.frontier import Curve, TiedGain
 from ..board.predictors import predictions
 from ..board.rows import Row, Table, apart_from_baseline
 from ..board.summary import METHODS, WITHOUT_DEMONSTRATIONS, tables_of
 from ..claims.claim import PREDICATES, Verdict, tally
-from ..claims.evidence import Evidence, Figure
 from ..claims.judges import Judged
 from ..policies.compared import by_table
 from ..views.format import MISSING, format_interval, tau_text
@@ -33,7 +32,6 @@ from ..views.page.charts.plot import themed
 from .findings_chart import gains_chart
 from .lost_skills import relearning_sentences
 from .orders import order_sentences
-from .tied import gains_over_tied
 
 FORGOTTEN_BY = "kept_share"
 """Metric by which policies are compared: the final average also counts what they knew and learned."""
@@ -70,17 +68,11 @@ def pictures(table: Table) -> dict[str, str]:
     return {f"gains{'-dark' if dark else ''}.svg": themed(chart, dark).svg() for dark in (False, True)}
 
 
-def sections(table: Table, judged: Sequence[Judged], evidence_on: Callable[[str], Evidence]) -> list[Section]:
-    """Return the sections that the records can fill, at least in part.
-
-    Args:
-        table: The board.
-        judged: The claims.
-        evidence_on: Returns the evidence of the scenario with a Gymnasium id.
-    """
+def sections(table: Table, judged: Sequence[Judged]) -> list[Section]:
+    """Return the sections that the records can fill, at least in part."""
     boards = _boards(table)
     found = (
-        _gains(boards, evidence_on),
+        _gains(boards, table.tied),
         _replay(boards),
         _learning_rates(table),
         Section("Is a lost skill gone?", tuple(relearning_sentences(boards))),
@@ -114,13 +106,13 @@ def competing(rows: Iterable[Row]) -> list[Row]:
     return sorted(known, key=lambda row: -(row.estimates["gain"].value or 0.0))
 
 
-def _gains(boards: dict[str, list[Row]], evidence_on: Callable[[str], Evidence]) -> Section:
+def _gains(boards: dict[str, list[Row]], tied: Mapping[str, Mapping[str, Sequence[TiedGain]]]) -> Section:
     """Does any method beat tuned fine-tuning without prior demonstrations?"""
     answers: list[str] = []
     lines = []
     for name, rows in boards.items():
         others = competing(rows)
-        answers += _gain_sentences(name, rows, evidence_on(name))
+        answers += _gain_sentences(name, rows, tied.get(name, {}))
         lines += [
             (
                 name,
@@ -139,7 +131,7 @@ def _gains(boards: dict[str, list[Row]], evidence_on: Callable[[str], Evidence])
     )
 
 
-def _gain_sentences(name: str, rows: Sequence[Row], evidence: Evidence) -> Iterator[str]:
+def _gain_sentences(name: str, rows: Sequence[Row], tied: Mapping[str, Sequence[TiedGain]]) -> Iterator[str]:
     """Yield what Tukey's test of all rows without prior demonstrations says of each gain."""
     others = [row for row in competing(rows) if row.division in WITHOUT_DEMONSTRATIONS]
     if not others or BASELINE not in {row.method for row in rows}:
@@ -147,12 +139,14 @@ def _gain_sentences(name: str, rows: Sequence[Row], evidence: Evidence) -> Itera
     gains = {row.method: row.estimates["gain"] for row in others}
     apart = apart_from_baseline(rows)
     better = {method: gains[method] for method in gains if method in apart and (gains[method].value or 0) > 0}
-    tied = gains_over_tied(evidence, better)
-    certain = {method: gain for method, gain in better.items() if all(one.low > 0 for one in tied[method])}
+    over_tied = {method: tied.get(method, ()) for method in better}
+    certain = {
+        method: gain for method, gain in better.items() if all(one.is_certain for one in over_tied[method])
+    }
     if certain:
         yield f"On {name}, yes: {_listed(certain)}."
     for method in better:
-        yield from _over_tied(name, method, gains[method], tied[method])
+        yield from _over_tied(name, method, gains[method], over_tied[method])
     if not better:
         best = next(iter(gains))
         which = f"the gain of `{best}`"
@@ -181,16 +175,15 @@ def _gain_sentences(name: str, rows: Sequence[Row], evidence: Evidence) -> Itera
         yield f"Lower {alone}: {_listed(rest)}."
 
 
-def _over_tied(name: str, method: str, gain: Estimate, tied: Sequence[Figure]) -> Iterator[str]:
+def _over_tied(name: str, method: str, gain: Estimate, tied: Sequence[TiedGain]) -> Iterator[str]:
     """Yield how a certain gain fares against settings of plain fine-tuning that tuning rated as high."""
     for one in tied:
-        sure = one.low > 0
+        sure = one.is_certain
+        chosen, other = format_interval(gain, ".3f"), format_interval(one.gain, ".3f")
         yield (
-            f"On {name}, {'for' if sure else 'not for'} certain: `{method}` gains "
-            f"{format_interval(gain, '.3f')} over plain fine-tuning at the setting that tuning chose, "
-            f"{'and' if sure else 'but'} "
-            f"{format_interval(one.estimate, '.3f')} over `{one.methods[1]}`, which tuning rated as high "
-            f"({counted(len(one.seeds), 'seed')})."
+            f"On {name}, {'for' if sure else 'not for'} certain: `{method}` gains {chosen} over plain "
+            f"fine-tuning at the setting that tuning chose, {'and' if sure else 'but'} {other} at factor "
+            f"{one.factor:g}, which tuning rated as high ({counted(one.seeds, 'seed')})."
         )
 
 

@@ -10,6 +10,7 @@ from clbench.scoring.groups import groups
 from clbench.scoring.intervals import Estimate
 from clbench.spec.references import BASELINE
 
+from ...board.frontier import TiedGain
 from ...board.rows import Row, apart_from_baseline, mean_difference, standing_of
 from ...board.summary import (
     DIVISIONS,
@@ -55,8 +56,14 @@ class Verdict:
     facts: tuple[Fact, ...]
 
 
-def headline(rows: Sequence[Row]) -> str:
-    """Return what the rows of a scenario say of plain fine-tuning and the methods against forgetting."""
+def headline(rows: Sequence[Row], tied: Mapping[str, Sequence[TiedGain]] | None = None) -> str:
+    """Return what the rows of a scenario say of plain fine-tuning and the methods against forgetting.
+
+    Args:
+        rows: The rows.
+        tied: Gains over plain fine-tuning at settings that tuning rated as high as the chosen one, by method:
+            a gain is certain if they are, too.
+    """
     competing = [row for row in rows if row.division in METHODS]
     baseline = next((row for row in competing if row.method == BASELINE), None)
     others = [row for row in competing if row.method != BASELINE]
@@ -71,7 +78,8 @@ def headline(rows: Sequence[Row]) -> str:
         for row in others
         if row.method in apart
     }
-    ahead = [row for row in others if gains.get(row.method, 0.0) > 0]
+    over_all = {method: all(one.is_certain for one in found) for method, found in (tied or {}).items()}
+    ahead = [row for row in others if gains.get(row.method, 0.0) > 0 and over_all.get(row.method, True)]
     if not apart and all(len(row.seeds) == 1 for row in competing):
         methods = "the one other method cannot" if len(others) == 1 else "no method can"
         return (

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -12,7 +12,7 @@ from clbench.scoring.metric import Metric
 from clbench.spec.policies import DEFAULT_POLICY
 from clbench.spec.references import BASELINE
 
-from ...board.frontier import Curve
+from ...board.frontier import Curve, TiedGain
 from ...board.places import SCENARIO
 from ...board.rows import Row, Table
 from ...board.summary import DIVISIONS, ELSEWHERE, GAIN, METHODS, RANKED_BY, divisions_of, tables_of
@@ -47,6 +47,8 @@ class ScenarioView:
     families: tuple[Family, ...]
     frontier: tuple[Curve, ...]
     """Methods along the ladder of learning rates."""
+    tied: Mapping[str, Sequence[TiedGain]]
+    """Gains over plain fine-tuning at settings that tuning rated as high as the chosen one, by method."""
     start: str
     """Sentence on what the pretrained policy can do, empty if there is none."""
     agreement: str
@@ -64,7 +66,7 @@ class ScenarioView:
     @property
     def headline(self) -> str:
         """What its rows say, in one or two sentences."""
-        return headline(self.table)
+        return headline(self.table, self.tied)
 
     @cached_property
     def verdicts(self) -> list[Verdict]:
@@ -214,6 +216,7 @@ def scenarios(tables: Mapping[str, list[Row]], table: Table, comparisons: Compar
                 tuple(views),
                 tuple(families(competing)) if len(competing) >= FEWEST else (),
                 table.frontiers.get(scenario, ()),
+                table.tied.get(scenario, {}),
                 start_text(table.starts.get(scenario)),
                 agreement_text(table.agreements.get(scenario)),
                 comparisons.get(scenario, ()),

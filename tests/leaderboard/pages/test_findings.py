@@ -87,16 +87,14 @@ def test_a_gain_that_is_not_certain_over_a_tied_setting_is_no_yes(
     tuning = resolve("clbench.runs.tuning:Tuned"), resolve("clbench.runs.tuning:Tried")
     tried = tuple(tuning[1]({"step_factor": factor}, 0.5, 0.9) for factor in (1.0, 0.1))
     found = {"sft": tuning[0]({"step_factor": 1.0}, tried)}
-    monkeypatch.setattr("clbench.leaderboard.pages.tied.tuned", lambda scenario: found)
+    monkeypatch.setattr("clbench.leaderboard.board.frontier.tuned", lambda scenario: found)
     fill(even_board, sft=0.4, finch=0.8, lora=0.4)
     for seed in range(4):
-        even_board("sft", seed, 0.8, "controls", step_factor=0.1)
+        even_board("sft", seed, 0.8, "ladder", step_factor=0.1)
     text = page()
     assert "On clbench/Even-v1, yes" not in text
     assert "On clbench/Even-v1, not for certain: `finch` gains 0.300" in text
-    assert (
-        "but 0.000 [0.000, 0.000] over `sft+step_factor=0.1`, which tuning rated as high (4 seeds)." in text
-    )
+    assert "but 0.000 [0.000, 0.000] at factor 0.1, which tuning rated as high (4 seeds)." in text
 
 
 def test_how_fast_lost_skills_come_back_is_told_with_their_names(

@@ -9,9 +9,11 @@ import numpy as np
 import pytest
 
 from clbench.base.entry_points import resolve
+from clbench.scoring.intervals import Estimate
 
 headline = resolve("clbench.leaderboard.views.page.verdict:headline")
 verdicts = resolve("clbench.leaderboard.views.page.verdict:verdicts")
+TiedGain = resolve("clbench.leaderboard.board.frontier:TiedGain")
 read_table = resolve("clbench.leaderboard.board.rows:read_table")
 
 REPLAY = {"demonstrations": "throughout", "questions": "never", "reference": False}
@@ -206,3 +208,13 @@ def test_with_one_seed_nothing_is_told_apart(board: Callable[..., Any]) -> None:
         "measured."
     )
     assert headline(rows[:2]).startswith("One seed: the one other method cannot be told apart")
+
+
+def test_a_gain_that_is_not_certain_over_a_tied_setting_is_not_in_the_headline(
+    board: Callable[..., Any],
+) -> None:
+    rows = board(sft=matrix(0.2), replay=matrix(0.9), lora=matrix(0.6))
+    tied = {"lora": (TiedGain(0.1, Estimate(0.01, -0.01, 0.03), 4),)}
+    assert headline(rows, tied).startswith("With prior demonstrations, replay ends ")
+    tied = {"lora": (TiedGain(0.1, Estimate(0.02, 0.01, 0.03), 4),)}
+    assert headline(rows, tied) == headline(rows)
