@@ -103,7 +103,8 @@ def read_table(records: Path, only: Container[str] | None = None) -> Table:
 def _over_tied(name: str, rows: Sequence[Row], ladder: Sequence[Run]) -> dict[str, tuple[TiedGain, ...]]:
     if not tied_factors(name):
         return {}
-    return tied_gains(name, {row.method: row.scores for row in rows if row.division in METHODS}, ladder)
+    others = {row.method: row.scores for row in rows if row.division in METHODS and row.method != BASELINE}
+    return tied_gains(name, others, ladder)
 
 
 def _beside_rows(runs: list[Run]) -> Sifted:
