@@ -115,14 +115,16 @@ def keeps_20_points_more(evidence: Evidence) -> Finding:
     best = best_first(counting or at_best)[0]
     figures = (best, *(one for one in (*at_best, *at_one) if one is not best))
     controls = _controls_of(evidence, best.methods[0])
-    shown = (*sft, *controls, *(share_between(evidence, arm) for arm in ARMS))
+    controls_at_one = _controls_at_the_published_rate(evidence)
+    shown = (*sft, *controls, *controls_at_one, *(share_between(evidence, arm) for arm in ARMS))
+    at_one_says = _what_the_published_rate_says(best_first(at_one)[0], controls_at_one)
     if not arms or all(one.low > 0.80 for one in sft):
         reason = ("sft keeps too much for a gain of 0.20.",) if arms else ()
         return Finding(
             "cannot be shown here",
             figures,
             shown,
-            (*_inactive_sentences(evidence), *reason),
+            (*_inactive_sentences(evidence), *reason, *at_one_says),
             "A setting in which sft keeps less than 0.80." if arms else NEEDS_WEIGHTS,
         )
     return Finding(
@@ -133,7 +135,7 @@ def keeps_20_points_more(evidence: Evidence) -> Finding:
         ),
         figures,
         shown,
-        (*_inactive_sentences(evidence), *_what_controls_say(controls, arms)),
+        (*_inactive_sentences(evidence), *_what_controls_say(controls, arms), *at_one_says),
         what_would_change(next((one for one in judged if _is_open(one, 0.20)), best), 0.20),
         about=ARMS,
     )
@@ -165,6 +167,24 @@ def _controls_of(evidence: Evidence, arm: str) -> tuple[Figure, ...]:
     """Return the gains in retained success over the controls: two of consft_calibrated, and one of `arm`."""
     first = [kept(evidence, "consft_calibrated", name) for name in ("constant_weight", "shuffled_weights")]
     return (*first, kept(evidence, arm, "finch"))
+
+
+def _controls_at_the_published_rate(evidence: Evidence) -> tuple[Figure, ...]:
+    """Return the gains of consft_calibrated over two controls at the published step size, where they ran."""
+    labels = [f"{name}+step_factor={PUBLISHED}" for name in ("constant_weight", "shuffled_weights")]
+    arm = rung("consft_calibrated", PUBLISHED)
+    return tuple(kept(evidence, arm, label) for label in labels if label in evidence.runs)
+
+
+def _what_the_published_rate_says(gain: Figure, controls: Sequence[Figure]) -> list[str]:
+    """Return what an arm gains at the published step size, and what the controls say about it."""
+    if not gain.low > 0:
+        return []
+    said = [f"At the published step size {gain.methods[0]} keeps {gain.value:.2f} more than sft."]
+    for one in controls:
+        explains, does_not = CONTROLS[one.methods[1].partition("+")[0]]
+        said.append(not_told_apart(one, explains=explains, does_not=does_not))
+    return said
 
 
 def _what_controls_say(figures: tuple[Figure, ...], arms: Sequence[str]) -> list[str]:

@@ -139,14 +139,11 @@ def _gain_sentences(name: str, rows: Sequence[Row], tied: Mapping[str, Sequence[
     gains = {row.method: row.estimates["gain"] for row in others}
     apart = apart_from_baseline(rows)
     better = {method: gains[method] for method in gains if method in apart and (gains[method].value or 0) > 0}
-    over_tied = {method: tied.get(method, ()) for method in better}
-    certain = {
-        method: gain for method, gain in better.items() if all(one.is_certain for one in over_tied[method])
-    }
+    certain = {method: gain for method, gain in better.items() if _over_all(tied.get(method, ()))}
     if certain:
         yield f"On {name}, yes: {_listed(certain)}."
     for method in better:
-        yield from _over_tied(name, method, gains[method], over_tied[method])
+        yield from _over_tied(name, method, gains[method], tied.get(method, ()))
     if not better:
         best = next(iter(gains))
         which = f"the gain of `{best}`"
@@ -160,8 +157,12 @@ def _gain_sentences(name: str, rows: Sequence[Row], tied: Mapping[str, Sequence[
     if len(gains) > 1:
         alone += f", without correction for {len(gains)} comparisons"
     higher = {method: gain for method, gain in gains.items() if (gain.low or 0) > 0 and method not in better}
-    if higher:
-        yield f"Higher {alone}: {_listed(higher)}."
+    over_both = {method: gain for method, gain in higher.items() if _over_all(tied.get(method, ()))}
+    if over_both:
+        yield f"Higher {alone}: {_listed(over_both)}."
+    if len(over_both) < len(higher):
+        rest = {method: gain for method, gain in higher.items() if method not in over_both}
+        yield f"Higher {alone}, and over the chosen setting of plain fine-tuning alone: {_listed(rest)}."
     lower = {
         method: Estimate(-gain.value, -gain.high, -gain.low)
         for method, gain in gains.items()
@@ -173,6 +174,11 @@ def _gain_sentences(name: str, rows: Sequence[Row], tied: Mapping[str, Sequence[
     if len(worse) < len(lower):
         rest = {method: loss for method, loss in lower.items() if method not in worse}
         yield f"Lower {alone}: {_listed(rest)}."
+
+
+def _over_all(tied: Sequence[TiedGain]) -> bool:
+    """Return whether a gain is certain over every setting that tuning rated as high as the chosen one."""
+    return all(one.is_certain for one in tied)
 
 
 def _over_tied(name: str, method: str, gain: Estimate, tied: Sequence[TiedGain]) -> Iterator[str]:
