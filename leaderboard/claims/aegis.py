@@ -1,4 +1,4 @@
-"""The claims of AEGIS, each with a rule that was fixed before there were results to judge.
+"""The claims of AEGIS, each with its rule; docs/history.md names the rules that were corrected later.
 
 Claims about answers to questions are judged on the scenario of one long stage: on the boards, stages end
 before plain fine-tuning has forgotten any answer.

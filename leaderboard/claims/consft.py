@@ -1,4 +1,4 @@
-"""The claims of ConSFT, each with a rule that was fixed before there were results to judge."""
+"""The claims of ConSFT, each with its rule; docs/history.md names the rules that were corrected later."""
 
 from __future__ import annotations
 

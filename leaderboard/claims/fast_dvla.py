@@ -1,4 +1,4 @@
-"""The claims of Fast-dVLA, each with a rule that was fixed before there were results to judge.
+"""The claims of Fast-dVLA, each with its rule; docs/history.md names the rules that were corrected later.
 
 Fast-dVLA has the abstract of CapVector; most claims here are CapVector's. Its claims are about how fast and
 how well a policy adapts. With stages to a criterion all methods learn as well, so the rules compare steps.

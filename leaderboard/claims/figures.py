@@ -12,6 +12,7 @@ from clbench.scoring.layout import Array, average
 from clbench.scoring.metrics import load_metric
 from clbench.scoring.rates import Rates
 
+from ..board.runs import is_number
 from .evidence import SHARE, Evidence, Figure, Of
 
 PUBLISHED = 1.0
@@ -50,7 +51,7 @@ def _settings(evidence: Evidence, *methods: str) -> str:
     for label in methods:
         run = next(iter(evidence.runs.get(label, {}).values()), None)
         values = run.record.run.settings if run else {}
-        named = [f"{name} {values[name]:g}" for name in TOLD if name in values]
+        named = [f"{name} {values[name]:g}" for name in TOLD if is_number(values.get(name))]
         told += [f"{label}: {', '.join(named)}"] if named else []
     return "; ".join(told)
 

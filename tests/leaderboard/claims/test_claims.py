@@ -92,6 +92,29 @@ def test_a_control_says_whether_it_explains_what_is_kept(bench: Bench) -> None:
     assert "The records cannot show what shuffled_weights says about it." in entry
 
 
+def test_what_keeps_skills_at_the_published_step_size_is_asked_of_controls_there(bench: Bench) -> None:
+    for label in ("sft", "sft@1", "consft", "consft@1", "consft_calibrated"):
+        bench.add(label)
+    for label in ("consft_calibrated@1", "constant_weight+step_factor=1.0"):
+        bench.add(label, kept=0.9)
+    bench.add("shuffled_weights+step_factor=1.0", kept=0.2)
+    entry = section(bench.page(), "C2")
+    assert "At the published step size consft_calibrated@1 keeps 0.70 more than sft." in entry
+    assert "constant_weight+step_factor=1.0 is not told apart from it" in entry
+    assert "shuffled_weights+step_factor=1.0 does not reach it" in entry
+
+
+def test_a_gain_that_a_control_shares_is_not_put_down_to_the_weights(bench: Bench) -> None:
+    bench.add("sft", earlier=0.2)
+    for label in ("consft", "consft_calibrated", "constant_weight", "shuffled_weights"):
+        bench.add(label, earlier=0.9)
+    bench.add("finch", earlier=0.2)
+    assert (
+        "sft at its best learning rate does not reach it, but constant_weight and shuffled_weights are not "
+        "told apart from it: weighing samples need not be the cause."
+    ) in section(bench.page(), "C7")
+
+
 def test_an_undecided_claim_says_how_many_seeds_would_decide(bench: Bench) -> None:
     bench.add("sft", kept=(0.85, 0.9, 0.95))
     entry = section(bench.page(), "C1")
