@@ -48,6 +48,17 @@ def section_of(records: Path) -> ElementTree.Element:
     return found
 
 
+def test_the_curves_have_the_seeds_that_all_rungs_have(
+    records: Path, even_board: Callable[..., Path]
+) -> None:
+    even_board("sft", 3, 1.0, "ladder", step_factor=0.1)
+    curves = read_table(records).frontiers[SCENARIO]
+    assert [(curve.method, {rung.seeds for rung in curve.rungs}) for curve in curves] == [
+        ("sft", {(0, 1)}),
+        ("finch", {(0, 1)}),
+    ]
+
+
 def test_scenarios_with_a_criterion_come_first(records: Path, make_record: Callable[..., Record]) -> None:
     fixed = "clbench/Alphabetic-v0"
     path = record_path(records, fixed, "sft", 0)
