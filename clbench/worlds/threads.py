@@ -55,11 +55,11 @@ class Team:
             helper.asked.put(take)
         try:
             take()
-        except BaseException:
+        except KeyboardInterrupt:
             interrupted = True
             raise
         finally:
-            errors = [error for error in map(_Helper.wait, helpers) if error is not None]
+            errors = [error for error in [helper.wait() for helper in helpers] if error is not None]
         if errors:
             raise errors[0]
 
@@ -81,22 +81,20 @@ class _Helper:
         self.thread = threading.Thread(target=_help, args=(self.asked, self.ended), daemon=True)
         self.thread.start()
 
-    def wait(self) -> Exception | None:
+    def wait(self) -> BaseException | None:
         """Return the error of the work that was asked for, None if it succeeded.
 
-        A Ctrl-C is raised when the work has ended: an answer left in the queue would be taken for the next
+        A Ctrl-C is returned when the work has ended: an answer left in the queue would be taken for the next
         one, while the thread still works.
         """
-        interruption = None
+        interruption: KeyboardInterrupt | None = None
         while True:
             try:
-                ended = self.ended.get()
-                break
-            except KeyboardInterrupt as error:
-                interruption = error
-        if interruption is not None:
-            raise interruption
-        return ended
+                error = self.ended.get()
+            except KeyboardInterrupt as stop:
+                interruption = stop
+            else:
+                return interruption or error
 
 
 def _help(asked: SimpleQueue[Callable[[], None] | None], ended: SimpleQueue[Exception | None]) -> None:

@@ -127,37 +127,33 @@ def test_only_the_cores_that_this_process_may_use_count() -> None:
 def test_an_interrupted_call_returns_when_no_thread_works_any_more(
     at: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    team, done, begun = Team(2), list[int](), threading.Event()
+    team, done, begun = Team(3), list[int](), threading.Barrier(3)
     caller = threading.current_thread()
 
     def work(item: int) -> None:
+        begun.wait()
         if threading.current_thread() is not caller:
-            begun.set()
-            time.sleep(0.3)
+            time.sleep(0.1 * item)
             done.append(item)
         elif at == "the caller works":
-            begun.wait()
             raise KeyboardInterrupt
-        else:
-            begun.wait()
 
     if at == "the caller waits":
-        (helper,), interrupted = team._helpers, list[bool]()
-        get = helper.ended.get
+        ended, interrupted = team._helpers[0].ended, list[bool]()
 
         class Queue:
-            put = helper.ended.put
+            put = ended.put
 
             def get(self) -> Exception | None:
                 if not interrupted:
                     interrupted.append(True)
                     raise KeyboardInterrupt
-                return get()
+                return ended.get()
 
-        monkeypatch.setattr(helper, "ended", Queue())
+        monkeypatch.setattr(team._helpers[0], "ended", Queue())
     with pytest.raises(KeyboardInterrupt):
-        team.each(work, [0, 1])
-    assert len(done) == 1
-    team.each(done.append, [5, 6])
-    assert sorted(done[1:]) == [5, 6]
+        team.each(work, [1, 2, 3])
+    assert len(done) == 2
+    team.each(done.append, [5, 6, 7])
+    assert sorted(done[2:]) == [5, 6, 7]
     team.close()
