@@ -47,9 +47,10 @@ def begin_both(task: str, seed: int) -> tuple[Any, Any]:
     ours.begin(problem, seed)
     theirs.seed(seed)
     theirs.reset()
+    state, places = problem.start(seed)
     model = theirs.sim.model
-    model.body_pos[:], model.body_quat[:] = problem.places(seed)
-    theirs.set_init_state(problem.starts[seed % len(problem.starts)])
+    model.body_pos[:], model.body_quat[:] = places
+    theirs.set_init_state(state)
     return ours, theirs
 
 
