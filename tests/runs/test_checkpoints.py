@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import tiny
 import torch
 from tiny import TINY
 from torch import Tensor
@@ -147,11 +148,12 @@ def test_the_command_keeps_the_policies_of_a_run_that_has_a_record(
     kept: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(sys, "path", sys.path.copy())  # the command adds to it
-    records = kept.parent / "records"
-    run(TINY.id, "lora", seeds=1, records=records, checkpoints=tmp_path, workers=1)
+    monkeypatch.setenv("PYTHONPATH", str(Path(tiny.__file__).parent))  # its workers import the scenario
+    records, scenario = kept.parent / "records", f"tiny:{TINY.id}"
+    run(scenario, "lora", seeds=1, records=records, checkpoints=tmp_path, workers=1)
     assert "0 runs and the policies of 1 in" in capsys.readouterr().err
     _assert_equal(stage_policies(SPEC.resolve(), tmp_path), stage_policies(SPEC.resolve(), kept))
-    run(TINY.id, "lora", seeds=1, records=records, checkpoints=tmp_path, workers=1)
+    run(scenario, "lora", seeds=1, records=records, checkpoints=tmp_path, workers=1)
     assert "policies" not in capsys.readouterr().err  # they are there now
 
 
