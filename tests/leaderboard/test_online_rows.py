@@ -58,7 +58,7 @@ def test_the_page_marks_an_agent_and_shows_no_run_command_for_it(
     page = unpacked((board / "site" / "index.html").read_text(encoding="utf-8"))
     assert "# me/knows is a separate program: docs/guide/online.md" in page
     assert "clbench run clbench/Toy-v0 me/knows" not in page
-    assert "| a | me/knows | online |" in (board / "site" / "LEADERBOARD.md").read_text(encoding="utf-8")
+    assert "| - | me/knows | online |" in (board / "site" / "LEADERBOARD.md").read_text(encoding="utf-8")
 
 
 def test_the_record_of_an_agent_is_recomputed_and_cannot_be_replayed(board: Path) -> None:
