@@ -106,6 +106,7 @@ def test_the_importance_of_the_skills_is_that_of_synaptic_intelligence(blocks: l
     np.testing.assert_allclose(si.state()["anchor"].numpy(), weights[-1], rtol=1e-6)
 
 
+@pytest.mark.slow  # 5 s: it pretrains and runs two methods
 def test_synaptic_intelligence_watches_the_pretraining_and_keeps_more_skills_than_fine_tuning(
     blocks: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
