@@ -255,8 +255,7 @@ def _work(
 ) -> None:
     """Do one job in this process and send its outcome."""
     # this process may be forked from one with an older environment
-    for name in os.environ.keys() - environment.keys():
-        del os.environ[name]
+    os.environ.clear()
     os.environ.update(environment)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the parent, which ends its workers
     if hasattr(signal, "pthread_sigmask"):  # children of a job must not inherit the mask of the server

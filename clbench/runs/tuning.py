@@ -95,10 +95,17 @@ def best_of(tried: Sequence[Tried]) -> Tried:
 
     If none learns enough, it is the one that learns most. The first one wins a tie.
     """
+    return rated_best(tried)[0]
+
+
+def rated_best(tried: Sequence[Tried]) -> list[Tried]:
+    """Return the setting that `best_of` chooses, and those with the same score after it."""
     learners = [one for one in tried if one.learned >= LEARNED]
     if not learners:
-        return max(tried, key=lambda one: one.learned)
-    return max(learners, key=lambda one: one.final_average)
+        most = max(one.learned for one in tried)
+        return [one for one in tried if one.learned == most]
+    best = max(one.final_average for one in learners)
+    return [one for one in learners if one.final_average == best]
 
 
 def tuned_file(scenario: str) -> Path:

@@ -221,6 +221,14 @@ def interval(
     return Estimate(value, min(float(low), value), max(float(high), value))
 
 
+def mean_of_seeds(values: Sequence[float], span: Span = UNBOUNDED) -> Estimate:
+    """Return the mean of the values of the seeds, one for each, with its interval; none with one seed."""
+    mean = math.fsum(values) / len(values)
+    rest = [[*values[:place], *values[place + 1 :]] for place in range(len(values))]
+    without_one = [math.fsum(part) / len(part) for part in rest if part]
+    return interval(mean, np.array(without_one), span=span)
+
+
 def interval_of_seeds(value: float, error: float, degrees: int, span: Span = UNBOUNDED) -> Span:
     """Return the ends of the interval of a value, given its standard error over seeds.
 

@@ -96,12 +96,12 @@ def concordance(values: Array) -> Concordance | None:
     Returns:
         None with too few rows or seeds, or if no seed orders the rows.
     """
-    from scipy.stats import friedmanchisquare  # a second, which reading a board does not need
-
     rows, seeds = values.shape
     rounded = values.round(9)  # values are quotients of whole numbers: equal ones may differ in the last bit
     if rows < LEAST_ROWS or seeds < LEAST_SEEDS or (rounded == rounded[0]).all():
         return None
+    from scipy.stats import friedmanchisquare  # a second, which a small board does not need
+
     test = friedmanchisquare(*rounded)
     return Concordance(float(test.statistic) / (seeds * (rows - 1)), float(test.pvalue), seeds, rows)
 

@@ -1,7 +1,7 @@
 """The frontier: what methods learn and keep at each learning rate of the ladder.
 
 The ladder also has plain fine-tuning at settings that tuning rated as high as the chosen one. A gain over the
-chosen one alone would be that of a coin.
+chosen one alone may come from the order in which tuning tried them.
 """
 
 from __future__ import annotations
@@ -14,16 +14,13 @@ from itertools import groupby
 from pathlib import Path
 
 from clbench.records.paths import label_of
-from clbench.runs.tuning import LEARNED as LEARNED_ENOUGH
-from clbench.runs.tuning import tuned
-from clbench.scoring.intervals import Estimate, bootstrap, estimate, row_generator
-from clbench.scoring.metrics import load_metric
-from clbench.scoring.scores import Scores
+from clbench.runs.tuning import rated_best, tuned
+from clbench.scoring.intervals import Estimate, Runs, estimate, row_generator
 from clbench.spec.references import BASELINE
 
 from .places import LADDER
 from .runs import ALIKE, Run, Sifted, is_number, no_row, read_run, read_runs
-from .summary import DIVISIONS, RANKED_BY
+from .summary import DIVISIONS, GAIN
 
 FACTOR = "step_factor"
 """Hyper-parameter that the ladder changes."""
@@ -89,8 +86,7 @@ def frontiers_of(ladder: Sequence[Run]) -> dict[str, tuple[Curve, ...]]:
 
 def _is_ladder(runs: Sequence[Run]) -> bool:
     """Return whether a method, with its other changes, ran at several learning rates."""
-    rungs = {(apart_from_the_factor(run), run.record.run.changes[FACTOR]) for run in runs}
-    return len(rungs) > len({label for label, _ in rungs})
+    return len({run.method for run in runs}) > len(set(map(apart_from_the_factor, runs)))
 
 
 def on_the_ladder(runs: list[Run]) -> Sifted:
@@ -103,10 +99,9 @@ def on_the_ladder(runs: list[Run]) -> Sifted:
 
 def _curves(runs: Sequence[Run]) -> tuple[Curve, ...]:
     """Return the curves of the runs of one scenario, over the seeds that all have, if there are any."""
-    seeds: dict[tuple[str, float], set[int]] = {}
+    seeds: dict[str, set[int]] = {}
     for run in runs:
-        label = apart_from_the_factor(run), run.record.run.changes[FACTOR]
-        seeds.setdefault(label, set()).add(run.seed)
+        seeds.setdefault(run.method, set()).add(run.seed)
     common = set.intersection(*seeds.values())
     by_label: dict[str, dict[str, list[Run]]] = {}
     for run in sorted((run for run in runs if not common or run.seed in common), key=lambda run: run.seed):
@@ -160,20 +155,13 @@ class TiedGain:
         return (self.gain.low or 0.0) > 0
 
 
-def tied_factors(scenario: str) -> tuple[float, ...]:
-    """Return the step factors of plain fine-tuning that are not the chosen one and have its final average."""
-    found = tuned(scenario).get(BASELINE)
-    if found is None:
-        return ()
-    learners = [one for one in found.tried if one.learned >= LEARNED_ENOUGH]
-    best = max((one.final_average for one in learners), default=None)
-    chosen = found.settings["step_factor"]
-    factors = [one.settings["step_factor"] for one in learners if one.final_average == best]
-    return tuple(factor for factor in factors if factor != chosen)
+def is_certain_over(tied: Iterable[TiedGain]) -> bool:
+    """Return whether a gain is certain over every setting that tuning rated as high as the chosen one."""
+    return all(one.is_certain for one in tied)
 
 
 def tied_gains(
-    scenario: str, methods: Mapping[str, Mapping[int, Scores]], ladder: Iterable[Run]
+    scenario: str, methods: Mapping[str, Runs], ladder: Iterable[Run]
 ) -> dict[str, tuple[TiedGain, ...]]:
     """Return the gains of methods over plain fine-tuning at each tied setting, from runs of the ladder.
 
@@ -182,23 +170,21 @@ def tied_gains(
         methods: Scores by method and seed.
         ladder: Runs of the ladder, of any scenario and method.
     """
-    factors = tied_factors(scenario)
+    found = tuned(scenario).get(BASELINE)
+    factors = [one.settings[FACTOR] for one in rated_best(found.tried)[1:]] if found else []
     runs = [run for run in ladder if run.place == scenario and run.record.run.method == BASELINE]
+    tied = {
+        factor: {run.seed: run.scores for run in runs if run.record.run.changes == {FACTOR: factor}}
+        for factor in factors
+    }
     return {
-        method: tuple(_gain(scenario, method, scores, runs, one) for one in factors)
+        method: tuple(_gain(scenario, method, scores, factor, tied[factor]) for factor in factors)
         for method, scores in methods.items()
     }
 
 
-def _gain(
-    scenario: str, method: str, scores: Mapping[int, Scores], runs: Sequence[Run], factor: float
-) -> TiedGain:
-    tied = {run.seed: run.scores for run in runs if run.record.run.changes == {FACTOR: factor}}
-    seeds = sorted(tied.keys() & scores.keys())
-    if not seeds:
-        return TiedGain(factor, Estimate(None, None, None), 0)
-    final = load_metric(RANKED_BY).over_runs
-    both = {method: [scores[seed] for seed in seeds], BASELINE: [tied[seed] for seed in seeds]}
-    generator = row_generator(scenario, f"{RANKED_BY}, {method} - {BASELINE} at {factor:g}")
-    gain = bootstrap(lambda of: final(of[method]) - final(of[BASELINE]), both, generator, span=(-1.0, 1.0))
-    return TiedGain(factor, gain, len(seeds))
+def _gain(scenario: str, method: str, scores: Runs, factor: float, tied: Runs) -> TiedGain:
+    common = {seed: scores[seed] for seed in sorted(tied.keys() & scores.keys())}
+    generator = row_generator(scenario, f"{GAIN} of {method} at {factor:g}")
+    gain = estimate((GAIN,), common, generator, references={BASELINE: tied})[GAIN]
+    return TiedGain(factor, gain, len(common))

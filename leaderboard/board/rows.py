@@ -23,7 +23,7 @@ from clbench.spec.references import BASELINE
 
 from .agreement import Concordance, concordance
 from .costs import costs_of
-from .frontier import Curve, TiedGain, frontiers_of, ladder_of, read_ladder, tied_factors, tied_gains
+from .frontier import Curve, TiedGain, frontiers_of, ladder_of, read_ladder, tied_gains
 from .orders import Orders, orders_of
 from .runs import ALIKE, Run, Sifted, no_row, read_run, read_runs
 from .summary import (
@@ -96,15 +96,13 @@ def read_table(records: Path, only: Container[str] | None = None) -> Table:
         agreements={name: agreement(rows) for name, rows in by_name.items()},
         not_shown=tuple(sorted([*not_shown, *alone, *without], key=lambda entry: entry.path)),
         frontiers=frontiers_of(ladder),
-        tied={name: _over_tied(name, rows, ladder) for name, rows in by_name.items()},
+        tied={name: tied_gains(name, _rivals(rows), ladder) for name, rows in by_name.items()},
     )
 
 
-def _over_tied(name: str, rows: Sequence[Row], ladder: Sequence[Run]) -> dict[str, tuple[TiedGain, ...]]:
-    if not tied_factors(name):
-        return {}
-    others = {row.method: row.scores for row in rows if row.division in METHODS and row.method != BASELINE}
-    return tied_gains(name, others, ladder)
+def _rivals(rows: Iterable[Row]) -> dict[str, Runs]:
+    """Return the scores of the rows that compete with plain fine-tuning, by method."""
+    return {row.method: row.scores for row in rows if row.division in METHODS and row.method != BASELINE}
 
 
 def _beside_rows(runs: list[Run]) -> Sifted:

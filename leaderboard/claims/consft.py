@@ -27,23 +27,23 @@ LEAST_BETWEEN = 0.1
 Below it, most samples of most steps weigh alike: nothing, which Adam cancels, or 1."""
 
 
-def _active(evidence: Evidence, arm: str) -> bool:
-    """Return whether the weights of an arm differ between samples."""
-    share = share_between(evidence, arm).value
-    return math.isnan(share) or share >= LEAST_BETWEEN
+def _counts(share: Figure) -> bool:
+    """Return whether an arm with this share has weights that differ between samples; unknown ones may."""
+    return math.isnan(share.value) or share.value >= LEAST_BETWEEN
 
 
 def _arms(evidence: Evidence) -> tuple[str, ...]:
     """Return the arms that count: those whose weights differ between samples."""
-    return tuple(arm for arm in ARMS if _active(evidence, arm))
+    return tuple(arm for arm in ARMS if _counts(share_between(evidence, arm)))
 
 
 def _inactive_sentences(evidence: Evidence) -> tuple[str, ...]:
+    shares = ((arm, share_between(evidence, arm)) for arm in ARMS)
     return tuple(
-        f"Before the last tenth of its schedule, {share_between(evidence, arm).value:.1%} of the weights of "
-        f"{arm} lie between 0.01 and 0.9: most samples weigh alike, and its figures do not count."
-        for arm in ARMS
-        if not _active(evidence, arm)
+        f"Before the last tenth of its schedule, {share.value:.1%} of the weights of {arm} lie between 0.01 "
+        "and 0.9: most samples weigh alike, and its figures do not count."
+        for arm, share in shares
+        if not _counts(share)
     )
 
 

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from clbench.scoring.intervals import UNBOUNDED, Estimate, Span, bootstrap, interval, row_generator
+from clbench.scoring.intervals import UNBOUNDED, Estimate, Span, bootstrap, mean_of_seeds, row_generator
 from clbench.scoring.layout import Array
 from clbench.scoring.metrics import load_metric
 from clbench.scoring.rates import Rates
@@ -222,9 +222,7 @@ class Evidence:
         if not means or not np.isfinite(means).all():
             note = "" if missing else "not in these records"
             return Figure(what, (method,), NO_ESTIMATE, tuple(runs), missing, note, form)
-        without_one = [number_mean(means[:place] + means[place + 1 :]) for place in range(len(means))]
-        estimate = interval(number_mean(means), np.array(without_one if len(means) > 1 else []), span=span)
-        return Figure(what, (method,), estimate, tuple(runs), (), "", form)
+        return Figure(what, (method,), mean_of_seeds(means, span), tuple(runs), (), "", form)
 
     def step_time(self, method: str) -> Figure:
         """Return the time of a step of the method, divided by sft's."""

@@ -19,7 +19,7 @@ from clbench.scoring.intervals import Estimate
 from clbench.spec.policies import DEFAULT_POLICY
 from clbench.spec.references import BASELINE, FROZEN
 
-from ..board.frontier import Curve, TiedGain
+from ..board.frontier import Curve, TiedGain, is_certain_over
 from ..board.predictors import predictions
 from ..board.rows import Row, Table, apart_from_baseline
 from ..board.summary import METHODS, WITHOUT_DEMONSTRATIONS, tables_of
@@ -139,7 +139,7 @@ def _gain_sentences(name: str, rows: Sequence[Row], tied: Mapping[str, Sequence[
     gains = {row.method: row.estimates["gain"] for row in others}
     apart = apart_from_baseline(rows)
     better = {method: gains[method] for method in gains if method in apart and (gains[method].value or 0) > 0}
-    certain = {method: gain for method, gain in better.items() if _over_all(tied.get(method, ()))}
+    certain = {method: gain for method, gain in better.items() if is_certain_over(tied.get(method, ()))}
     if certain:
         yield f"On {name}, yes: {_listed(certain)}."
     for method in better:
@@ -157,7 +157,7 @@ def _gain_sentences(name: str, rows: Sequence[Row], tied: Mapping[str, Sequence[
     if len(gains) > 1:
         alone += f", without correction for {len(gains)} comparisons"
     higher = {method: gain for method, gain in gains.items() if (gain.low or 0) > 0 and method not in better}
-    over_both = {method: gain for method, gain in higher.items() if _over_all(tied.get(method, ()))}
+    over_both = {method: gain for method, gain in higher.items() if is_certain_over(tied.get(method, ()))}
     if over_both:
         yield f"Higher {alone}: {_listed(over_both)}."
     if len(over_both) < len(higher):
@@ -174,11 +174,6 @@ def _gain_sentences(name: str, rows: Sequence[Row], tied: Mapping[str, Sequence[
     if len(worse) < len(lower):
         rest = {method: loss for method, loss in lower.items() if method not in worse}
         yield f"Lower {alone}: {_listed(rest)}."
-
-
-def _over_all(tied: Sequence[TiedGain]) -> bool:
-    """Return whether a gain is certain over every setting that tuning rated as high as the chosen one."""
-    return all(one.is_certain for one in tied)
 
 
 def _over_tied(name: str, method: str, gain: Estimate, tied: Sequence[TiedGain]) -> Iterator[str]:

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
 
-import numpy as np
-
 from clbench.base.text import counted
 from clbench.records.record import Relearning
-from clbench.scoring.intervals import interval
+from clbench.scoring.intervals import mean_of_seeds
 from clbench.spec.references import BASELINE, FROM_SCRATCH
 
 from ..board.rows import Row
@@ -73,6 +72,4 @@ def _skills(found: Sequence[Relearning]) -> str:
 
 
 def _steps(found: Sequence[Relearning]) -> str:
-    steps = np.array([float(one.steps) for one in found])
-    without_one = (steps.sum() - steps) / (len(steps) - 1)
-    return format_interval(interval(float(steps.mean()), without_one, span=(0.0, np.inf)), ".0f")
+    return format_interval(mean_of_seeds([one.steps for one in found], (0.0, math.inf)), ".0f")

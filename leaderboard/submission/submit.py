@@ -24,9 +24,6 @@ from ..board.commands import run_command
 from ..board.rows import Row, Table
 from ..views.format import fitting, fitting_names, format_interval, standing_text
 
-CHECK = "check"
-"""Title of the job that checks the method."""
-
 CHECK_STEPS = 100.0
 """Duration of the check in optimiser steps, for the time left that the progress bar shows."""
 
@@ -53,12 +50,13 @@ def run_submission(
         console.print("All runs already have a record.")
         return True
     limits, name = missing[0].scenario.limits, missing[0].spec.method
-    plan = Plan(Job(CHECK, check_job, {"method": name}, CHECK_STEPS, limits=limits))
+    check = Job("check", check_job, {"method": name}, CHECK_STEPS, limits=limits)
+    plan = Plan(check)
     for run in missing:
         plan.add_run(run, records, limits, checkpoints=checkpoints)
     begin = time.monotonic()
     failed = run_with_bars(plan.jobs, Processes(workers), console)
-    if any(job.title == CHECK for job in failed):
+    if check in failed:
         console.print(f"No run was started: {name} breaks the contract.", highlight=False, markup=False)
         return None
     seconds = time.monotonic() - begin

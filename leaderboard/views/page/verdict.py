@@ -10,7 +10,7 @@ from clbench.scoring.groups import groups
 from clbench.scoring.intervals import Estimate
 from clbench.spec.references import BASELINE
 
-from ...board.frontier import TiedGain
+from ...board.frontier import TiedGain, is_certain_over
 from ...board.rows import Row, apart_from_baseline, mean_difference, standing_of
 from ...board.summary import (
     DIVISIONS,
@@ -78,8 +78,11 @@ def headline(rows: Sequence[Row], tied: Mapping[str, Sequence[TiedGain]] | None 
         for row in others
         if row.method in apart
     }
-    over_all = {method: all(one.is_certain for one in found) for method, found in (tied or {}).items()}
-    ahead = [row for row in others if gains.get(row.method, 0.0) > 0 and over_all.get(row.method, True)]
+    ahead = [
+        row
+        for row in others
+        if gains.get(row.method, 0.0) > 0 and is_certain_over((tied or {}).get(row.method, ()))
+    ]
     if not apart and all(len(row.seeds) == 1 for row in competing):
         methods = "the one other method cannot" if len(others) == 1 else "no method can"
         return (
