@@ -1,4 +1,4 @@
-"""The scenario of LIBERO's goals as data: what it has, also where the extra is missing."""
+"""The scenarios of LIBERO as data: what they have, also where the extra is missing."""
 
 import importlib.metadata
 import re
@@ -11,9 +11,12 @@ from numpy.typing import NDArray
 from clbench.base.entry_points import resolve
 from clbench.base.errors import UnknownNameError
 from clbench.spec.registry import registered_scenario
+from clbench.spec.scenario import Scenario
 
-SCENARIO = registered_scenario("clbench:clbench/LiberoGoal-v0")
-QUESTIONS = {kind.name: kind for kind in resolve(SCENARIO.questions)}
+GOAL = registered_scenario("clbench:clbench/LiberoGoal-v0")
+SPATIAL = registered_scenario("clbench:clbench/LiberoSpatial-v1")
+both = pytest.mark.parametrize("scenario", [GOAL, SPATIAL], ids=lambda scenario: scenario.id)
+QUESTIONS = {kind.name: kind for kind in resolve(GOAL.questions)}
 PLACES = {"bowl": 9, "cheese": 65, "stove": 72, "plate": 107, "bottle": 128, "rack": 135, "cabinet": 142}
 """Where the places of the things of libero_goal begin in a state."""
 
@@ -48,32 +51,46 @@ def test_without_the_package_an_error_names_the_extra_to_install(
         make("clbench/LiberoGoal-v0")
 
 
-def test_the_scenario_has_the_promised_parts() -> None:
-    assert [len(part) for part in (SCENARIO.retained, SCENARIO.target, SCENARIO.held_out)] == [5, 4, 1]
-    assert len({task.world for task in SCENARIO.tasks}) == 1
+@pytest.mark.parametrize(
+    ("scenario", "sizes"), [(GOAL, [5, 4, 1, 0]), (SPATIAL, [4, 4, 1, 18])], ids=lambda value: str(value)[:9]
+)
+def test_a_scenario_has_the_promised_parts(scenario: Scenario, sizes: list[int]) -> None:
+    parts = scenario.retained, scenario.target, scenario.held_out, scenario.background
+    assert [len(part) for part in parts] == sizes
+    assert len({task.world for task in scenario.tasks + scenario.background}) == 1
     assert len(QUESTIONS) >= 12
 
 
-def test_wordings_of_test_episodes_are_new_and_have_no_new_word() -> None:
-    known = {word for task in SCENARIO.tasks for text in task.instructions for word in text.split()}
-    for task in SCENARIO.tasks:
+def test_the_targets_are_of_one_suite_and_the_skills_to_keep_of_the_two_others() -> None:
+    assert all(task.name.startswith("pick_up_the_black_bowl_") for task in SPATIAL.target)
+    assert sum(task.name.endswith("_in_the_basket") for task in SPATIAL.retained) == 2
+    goals = {task.name for task in GOAL.tasks}
+    assert sum(task.name in goals for task in SPATIAL.retained) == 2
+
+
+@both
+def test_wordings_of_test_episodes_are_new_and_have_no_new_word(scenario: Scenario) -> None:
+    tasks = scenario.tasks + scenario.background
+    known = {word for task in tasks for text in task.instructions for word in text.split()}
+    for task in tasks:
         assert not set(task.test_instructions) & set(task.instructions)
         assert {word for text in task.test_instructions for word in text.split()} <= known
 
 
-def test_every_task_has_an_expert_and_an_unknown_one_is_named() -> None:
-    for task in SCENARIO.tasks:
+@both
+def test_every_task_has_an_expert_and_an_unknown_one_is_named(scenario: Scenario) -> None:
+    for task in scenario.tasks + scenario.background:
         action = resolve(task.expert)(task.name)(scene()[0])
         assert action.shape == (7,)
         assert np.abs(action).max() <= 1.0
     with pytest.raises(UnknownNameError, match="Did you mean 'turn_on_the_stove'"):
-        resolve(SCENARIO.tasks[0].expert)("turn_on_a_stove")
+        resolve(scenario.tasks[0].expert)("turn_on_a_stove")
 
 
 @pytest.mark.parametrize(("opening", "fingers"), [(0.0, -1.0), (0.014, 1.0), (0.08, 1.0)])
 def test_an_expert_grasps_again_when_nothing_is_between_its_fingers(opening: float, fingers: float) -> None:
     state = scene(opening, hand=(0.0, 0.0, 1.1), bottle=(0.0, 0.0, 1.1 - 0.132))
-    action = resolve(SCENARIO.tasks[0].expert)("put_the_wine_bottle_on_the_rack")(state[0])
+    action = resolve(GOAL.tasks[0].expert)("put_the_wine_bottle_on_the_rack")(state[0])
     assert action[6] == fingers
     assert (action[2] > 0.1) == (opening < 0.08)  # it lifts the bottle, or the open hand
 
