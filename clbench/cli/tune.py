@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -28,8 +28,9 @@ from clbench.records.paths import TUNING
 from clbench.spec.references import BASELINE
 
 if TYPE_CHECKING:
+    from clbench.learning.method import Method
     from clbench.runs.spec import ResolvedRun, RunSpec
-    from clbench.runs.tuning import Settings, Tried
+    from clbench.runs.tuning import Settings, Tried, Tuned
 
 FIRST_SEED = 100
 """First seed of tuning: no board has it or a later one."""
@@ -80,7 +81,7 @@ def tune(
     check_names([scenario], methods)
     from clbench.learning.registry import load_method, method_names
     from clbench.runs.spec import RunSpec, check_device
-    from clbench.runs.tuning import CONTROLS, Tuned, best_of, check_tuned, refinements, rungs, write_tuned
+    from clbench.runs.tuning import CONTROLS, check_tuned, rungs, write_tuned
 
     if targets is not None:  # a run of fewer targets must not replace the record of all
         records = records / f"targets-{targets}"
@@ -108,23 +109,35 @@ def tune(
         classes = {name: load_method(name) for name in names}
         if write is not None:
             check_tuned(write, numbers, names)
-        first_ones = {name: rungs(cls, fixed) for name, cls in classes.items()}
+        ladder = {name: rungs(cls, fixed) for name, cls in classes.items()}
     if values:
         combinations = _combinations(values)
         found = run({BASELINE: [{}], **dict.fromkeys(names, combinations)})
         Console().print(_table(scenario, {name: (None, one) for name, one in found.items()}, seeds))
         return
-    begun = run(first_ones)
-    refined = run({name: refinements(cls, best_of(begun[name]).settings) for name, cls in classes.items()})
-    chosen: dict[str, Tuned] = {}
-    for name in names:
-        tried = (*begun[name], *refined[name])
-        chosen[name] = Tuned(best_of(tried).settings, tried)
+    chosen = _choose(classes, ladder, run)
     Console().print(
         _table(scenario, {name: (one.settings, one.tried) for name, one in chosen.items()}, seeds)
     )
     if write is not None:
         write_tuned(write, scenario.rpartition(":")[2], numbers, chosen)
+
+
+def _choose(
+    classes: Mapping[str, type[Method]],
+    ladder: Mapping[str, Sequence[Settings]],
+    run: Callable[[Mapping[str, Sequence[Settings]]], dict[str, list[Tried]]],
+) -> dict[str, Tuned]:
+    """Try the learning rates of each method, then its refinements at the best of them; return the choices."""
+    from clbench.runs.tuning import Tuned, best_of, refinements
+
+    begun = run(ladder)
+    refined = run({name: refinements(cls, best_of(begun[name]).settings) for name, cls in classes.items()})
+    chosen = {}
+    for name in classes:
+        tried = (*begun[name], *refined[name])
+        chosen[name] = Tuned(best_of(tried).settings, tried)
+    return chosen
 
 
 def _without_controls(names: list[str], controls: Mapping[str, str], every: bool) -> list[str]:
