@@ -47,13 +47,19 @@ class Missing(NamedTuple):
     stages: list[ResolvedRun]
     """Runs with a record whose policies are to be kept, and are not."""
 
-    def plan(self, records: Path, checkpoints: Path | None, tensorboard: Path | None = None) -> Plan:
-        """Return the plan of the jobs."""
+    def plan(
+        self,
+        records: Path,
+        checkpoints: Path | None,
+        tensorboard: Path | None = None,
+        check: Job | None = None,
+    ) -> Plan:
+        """Return the plan of the jobs; the runs wait for `check`, and have its limits."""
         from clbench.jobs.plan import Plan
 
-        plan = Plan()
+        plan, limits = Plan(check), check.limits if check else None
         for one in self.runs:
-            plan.add_run(one, records, checkpoints=checkpoints, tensorboard=tensorboard)
+            plan.add_run(one, records, limits, checkpoints=checkpoints, tensorboard=tensorboard)
         for one in self.stages:
             plan.add_stages(one, checkpoints)
         return plan
@@ -75,6 +81,7 @@ def run_missing(
     console: Console,
     checkpoints: Path | None = None,
     tensorboard: Path | None = None,
+    check: Job | None = None,
 ) -> dict[Job, str]:
     """Do the runs that have no record yet, and return the reason of each failure by job.
 
@@ -85,6 +92,7 @@ def run_missing(
         console: Console that shows the progress.
         checkpoints: Folder below which the policies of all stages are kept; None keeps none.
         tensorboard: Folder below which the runs are logged; None logs nothing.
+        check: Job that must succeed before anything else is done; its limits hold for the runs, too.
 
     Raises:
         InputError: A folder cannot be written to, a record is of another definition of its scenario, or this
@@ -105,8 +113,10 @@ def run_missing(
         fault = set_aside(one, records)
         if fault is not None:
             console.print(printable(fault), highlight=False, markup=False, soft_wrap=True)
-    jobs = to_do.plan(records, checkpoints, tensorboard).jobs  # refuses a camera where nothing can render
-    failed = run_with_bars(jobs, workers(), console)
+    plan = to_do.plan(records, checkpoints, tensorboard, check)  # refuses a camera where nothing can render
+    failed = run_with_bars(plan.jobs, workers(), console)
+    if check in failed:
+        return failed
     seconds = time.monotonic() - begin
     good = sum(has_record(run, records) for run in to_do.runs)
     done = f"{good} of " if good < len(to_do.runs) else ""

@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from rich.console import Console
 
 from clbench.base.text import counted
+from clbench.jobs.grid import run_missing
 from clbench.jobs.job import Job, JobError
-from clbench.jobs.plan import Plan
 from clbench.jobs.processes import Processes
-from clbench.jobs.recorded import has_record
-from clbench.jobs.scheduler import run_with_bars
 from clbench.learning.registry import load_method
 from clbench.records.paths import place_of
 from clbench.runs.spec import ResolvedRun
@@ -44,27 +41,12 @@ def run_submission(
     Returns:
         Whether all runs succeeded; None if none was started, because the method breaks the contract.
     """
-    console = Console(stderr=True)
-    missing = [run for run in runs if not has_record(run, records)]
-    if not missing:
-        console.print("All runs already have a record.")
-        return True
-    limits, name = missing[0].scenario.limits, missing[0].spec.method
-    check = Job("check", check_job, {"method": name}, CHECK_STEPS, limits=limits)
-    plan = Plan(check)
-    for run in missing:
-        plan.add_run(run, records, limits, checkpoints=checkpoints)
-    begin = time.monotonic()
-    failed = run_with_bars(plan.jobs, Processes(workers), console)
+    console, name = Console(stderr=True), runs[0].spec.method
+    check = Job("check", check_job, {"method": name}, CHECK_STEPS, limits=runs[0].scenario.limits)
+    failed = run_missing(runs, records, lambda: Processes(workers), console, checkpoints, check=check)
     if check in failed:
         console.print(f"No run was started: {name} breaks the contract.", highlight=False, markup=False)
         return None
-    seconds = time.monotonic() - begin
-    console.print(
-        f"{counted(len(missing), 'run')} in {seconds / 60:.1f} minutes; records in {records}.",
-        highlight=False,
-        markup=False,
-    )
     return not failed
 
 

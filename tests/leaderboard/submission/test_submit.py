@@ -76,9 +76,24 @@ def test_a_sound_class_gets_a_row_and_a_place(
     before = path.read_bytes()
     submit("submitted:Mine")
     printed = capsys.readouterr()
-    assert "All runs already have a record." in printed.err
+    assert "1 of 1 run has a record already." in printed.err
     assert "place 1 of 2; not told apart from another:Twin." in printed.out
     assert path.read_bytes() == before
+
+
+def test_a_record_of_older_code_is_set_aside_and_kept(capsys: pytest.CaptureFixture[str]) -> None:
+    path = record_path(Path("board/records"), "clbench/Toy-v0", "submitted:Mine", 0)
+    submit("submitted:Mine")
+    record = read_record(path)
+    record.fingerprint["method"]["source"] = "another"
+    write_record(record, path)
+    before = path.read_bytes()
+    capsys.readouterr()
+    submit("submitted:Mine")
+    said = " ".join(capsys.readouterr().err.split())
+    assert "the code of submitted:Mine has changed since. It is set aside as seed-0.json.old" in said
+    assert path.with_name("seed-0.json.old").read_bytes() == before
+    assert read_record(path).fingerprint["method"]["source"] != "another"
 
 
 def test_a_class_that_breaks_the_contract_is_not_run(capsys: pytest.CaptureFixture[str]) -> None:
