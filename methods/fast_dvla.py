@@ -62,7 +62,7 @@ class FastDVLA(Method):
     steps: int = 150
     """Optimiser steps of each of the two fine-tunings."""
     step_size: float = 3e-4
-    """Peak step size of these fine-tunings: that of most scenarios, whatever `step_factor` is."""
+    """Peak learning rate of these fine-tunings: that of most scenarios, whatever `step_factor` is."""
     direction: str = "capability"
     """Vector to merge: "capability", or "random" for the control."""
 

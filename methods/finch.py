@@ -1,8 +1,8 @@
-"""FINCH: the step size follows the loss (arXiv 2605.20005), an alternative to weighing samples.
+"""FINCH: the learning rate follows the loss (arXiv 2605.20005), an alternative to weighing samples.
 
 A step can raise the loss on earlier tasks by a bounded amount, which grows with the root of the present loss.
-The step size is therefore kappa / sqrt(EMA(L) + eps), capped: steps are small while the loss is high, at the
-start of a target.
+The learning rate is therefore kappa / sqrt(EMA(L) + eps), capped: steps are small while the loss is high, at
+the start of a target.
 
 Details:
 1. The cap is the benchmark's own schedule instead of the paper's constant 5e-5, so that no method takes
@@ -54,6 +54,6 @@ class Finch(Method):
         return loss
 
     def learning_rate(self, scheduled: float, progress: Progress) -> float:
-        """Return the scheduled step size times kappa / sqrt(average), or times 1 if that is larger."""
+        """Return the scheduled learning rate times kappa / sqrt(average), or times 1 if that is larger."""
         assert self.average is not None
         return scheduled * min(1.0, self.kappa / math.sqrt(self.average + 1e-8))

@@ -5,10 +5,10 @@ Details:
    values, outputs and feed-forward. Rank 16 and alpha 32 come from AEGIS's baseline (arXiv 2604.16067).
 2. One adapter is trained on all targets in turn, as in arXiv 2603.11653; the weights below it never change.
 3. `variant` is "lora", "dora" (arXiv 2402.09353) or "rslora" (arXiv 2312.03732).
-4. Adapters start from zero and must move further than full weights: `speed` multiplies the step size, which
-   at a step factor of 1 is three times that of the other methods. It was chosen on validation episodes of the
-   first Fetch board (docs/history.md). Where methods are tuned, `clbench tune` chose the step size and the
-   rank.
+4. Adapters start from zero and must move further than full weights: `speed` multiplies the learning rate,
+   which at a step factor of 1 is three times that of the other methods. It was chosen on validation episodes
+   of the first Fetch board (docs/history.md). Where methods are tuned, `clbench tune` chose the learning rate
+   and the rank.
 5. `alpha` stays 32 when the rank is tuned, so that rank 4 has four times the scale of rank 16: the two are
    tuned together.
 """
@@ -39,7 +39,7 @@ class LoRA(Method):
     variant: str = "lora"
     """lora, dora or rslora."""
     speed: float = 3.0
-    """Factor of the step size."""
+    """Factor of the learning rate."""
 
     metadata = Metadata(link="https://arxiv.org/abs/2106.09685")
     tunes = ("rank", (4, 64))
@@ -81,7 +81,7 @@ class LoRA(Method):
         return [parameter for name, parameter in policy.named_parameters() if "lora_" in name]
 
     def learning_rate(self, scheduled: float, progress: Progress) -> float:
-        """Return the adapters' step size."""
+        """Return the adapters' learning rate."""
         return self.speed * scheduled
 
     def state(self) -> MethodState:

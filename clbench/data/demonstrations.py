@@ -110,19 +110,18 @@ def _action_bounds(world: World) -> tuple[NDArray[np.float32], NDArray[np.float3
     return world.action_space.low, world.action_space.high
 
 
-def collect(task: Task, budget: Budget, progress: ProgressCallback = no_progress) -> list[Demonstration]:
+def collect(task: Task, budget: Budget) -> list[Demonstration]:
     """Return the successful expert episodes that a budget asks for; failed attempts are repeated.
 
     Args:
         task: Task of the episodes.
         budget: Budget with the number of demonstrations.
-        progress: Called with the number of episodes kept since its last call.
 
     Raises:
         InputError: The expert fails more often than it succeeds.
     """
     with contextlib.closing(_world(task)) as world:
-        return _collect(world, task, budget, progress)
+        return _collect(world, task, budget, no_progress)
 
 
 def _world(task: Task) -> World:

@@ -7,13 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from clbench.base.entry_points import resolve
 from clbench.base.progress import ProgressCallback, no_progress
 from clbench.base.seeding import derive_seed
 from clbench.data.demonstrations import demonstrate
 from clbench.spec.scenario import Scenario
 from clbench.spec.task import Task
-from clbench.worlds.world import World
+from clbench.worlds.world import opened_worlds
 
 
 @dataclass(frozen=True)
@@ -48,22 +47,18 @@ def measure(
         episodes: Episodes per task.
         progress: Called with the number of episodes done since its last call.
     """
-    worlds: dict[str, World] = {}
     measured = []
-    for task in tasks:
-        if task.world not in worlds:
-            worlds[task.world] = resolve(task.world)()
-        successes, returns, steps = np.zeros(episodes), np.zeros(episodes), np.zeros(episodes)
-        for number in range(episodes):
-            seed = derive_seed("expert measure", task.seed_suite, task.name, number)
-            episode = demonstrate(worlds[task.world], task, seed, noisy=False)
-            successes[number], returns[number] = episode.success, episode.reward.sum()
-            steps[number] = len(episode.reward)
-            progress(1)
-        row = (successes.mean(), returns.mean(), returns.min(), steps.mean())
-        measured.append(Measurement(task.name, scenario.group(task.name), *map(float, row)))
-    for world in worlds.values():
-        world.close()
+    with opened_worlds() as world:
+        for task in tasks:
+            successes, returns, steps = np.zeros(episodes), np.zeros(episodes), np.zeros(episodes)
+            for number in range(episodes):
+                seed = derive_seed("expert measure", task.seed_suite, task.name, number)
+                episode = demonstrate(world(task), task, seed, noisy=False)
+                successes[number], returns[number] = episode.success, episode.reward.sum()
+                steps[number] = len(episode.reward)
+                progress(1)
+            row = (successes.mean(), returns.mean(), returns.min(), steps.mean())
+            measured.append(Measurement(task.name, scenario.group(task.name), *map(float, row)))
     return measured
 
 

@@ -29,9 +29,9 @@ from clbench.policy.batch import QuestionBatch
 from clbench.spec.language import TEXT_LENGTH, encode, word_id
 from clbench.spec.scenario import Scenario
 from clbench.spec.task import packages_of
-from clbench.worlds.camera import Images, States
+from clbench.worlds.camera import Images
 from clbench.worlds.observation import observed
-from clbench.worlds.world import World
+from clbench.worlds.world import States, opened_worlds
 
 Truths: TypeAlias = NDArray[np.bool_]
 """Whether something holds in each of the states (N,)."""
@@ -90,21 +90,17 @@ def scenes_folder(scenario: Scenario, progress: ProgressCallback = no_progress) 
 
 
 def _scenes(scenario: Scenario, progress: ProgressCallback) -> dict[str, Tensor]:
-    worlds: dict[str, World] = {}
     scenes = {}
     count = scenario.budget.question_episodes
-    for split, episodes in (("train", count), ("test", max(1, count // 4))):
-        states = []
-        for number in range(episodes):
-            task = scenario.scene_tasks[number % len(scenario.scene_tasks)]
-            if task.world not in worlds:
-                worlds[task.world] = resolve(task.world)()
-            seed = derive_seed("scene", scenario.id, SPLIT_LABELS[split], number)
-            states.append(demonstrate(worlds[task.world], task, seed, noisy=True).state)
-            progress(1)
-        scenes[split] = torch.from_numpy(np.concatenate(states))
-    for world in worlds.values():
-        world.close()
+    with opened_worlds() as world:
+        for split, episodes in (("train", count), ("test", max(1, count // 4))):
+            states = []
+            for number in range(episodes):
+                task = scenario.scene_tasks[number % len(scenario.scene_tasks)]
+                seed = derive_seed("scene", scenario.id, SPLIT_LABELS[split], number)
+                states.append(demonstrate(world(task), task, seed, noisy=True).state)
+                progress(1)
+            scenes[split] = torch.from_numpy(np.concatenate(states))
     return scenes
 
 

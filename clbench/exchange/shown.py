@@ -12,8 +12,9 @@ from clbench.base.entry_points import resolve
 from clbench.base.errors import InputError
 from clbench.data.demonstrations import Demonstration
 from clbench.spec.task import Task
-from clbench.worlds.camera import Images, States
+from clbench.worlds.camera import Images
 from clbench.worlds.observation import observed
+from clbench.worlds.world import States
 
 
 @dataclass(frozen=True)

@@ -41,15 +41,15 @@ def adapt(
 ) -> int:
     """Let `method` fine-tune the policy on one target, in place, and return the optimiser steps done.
 
-    Without a criterion every stage has the same steps, and the step size falls along a cosine. With one, the
-    stage ends when `after` returns True. The step size is then constant after its warm-up, and `after` is
+    Without a criterion every stage has the same steps, and the learning rate falls along a cosine. With one,
+    the stage ends when `after` returns True. The learning rate is then constant after its warm-up. `after` is
     also called before the first step: a policy that has learned the target already takes none.
 
     Args:
         policy: Policy to train.
         method: Method that trains it.
         stage: Stage of the target, with the data that the method may use.
-        budget: Budget that gives the step size and the criterion.
+        budget: Budget that gives the learning rate and the criterion.
         after: Called after each step; the stage ends if it returns True.
 
     Raises:

@@ -11,7 +11,7 @@ Deviations from the paper:
 2. Shares of masked tokens, and the loss, are those of the code of D2F (arXiv 2508.09192), whose recipe the
    paper follows: the cross-entropy to the teacher's distribution, which has the gradient of
    KL(teacher || student), weighted by 1 / share. The paper writes KL(student || teacher) and gives no shares.
-3. The step size is that of pretraining.
+3. The learning rate is that of pretraining.
 """
 
 from __future__ import annotations
@@ -21,7 +21,6 @@ import dataclasses
 import torch
 from torch import Tensor
 
-from clbench.base.progress import ProgressCallback, no_progress
 from clbench.data.demonstrations import Demonstrations
 from clbench.learning.optimise import deterministic, optimise
 from clbench.policy.batch import Batch
@@ -43,7 +42,6 @@ def distilled(
     budget: Budget,
     generator: torch.Generator,
     block: int = 1,
-    progress: ProgressCallback = no_progress,
 ) -> Policy:
     """Return a policy with block-causal attention that has learned from `teacher`, which stays as it is.
 
@@ -53,7 +51,6 @@ def distilled(
         budget: Budget of pretraining.
         generator: Generator of every draw.
         block: Steps of the chunk in a block.
-        progress: Called with the number of steps done since its last call.
     """
     student = with_blocks(teacher, block)
     student.requires_grad_(False)
@@ -72,7 +69,6 @@ def distilled(
             budget.pretraining_learning_rate,
             round(SHARE_OF_STEPS * budget.pretraining_steps),
             loss_at,
-            after=lambda _: progress(1),
         )
     return student.requires_grad_(True)
 

@@ -104,7 +104,7 @@ class Method:
     """Authors, link, licence and version, which the page of the board shows."""
     tunes: ClassVar[tuple[str, tuple[Any, Any]] | None] = None
     """Hyper-parameter that sets how strongly the method protects what is known, and two values that tuning
-    tries besides the default. None: tuning tries further step sizes instead."""
+    tries besides the default. None: tuning tries further learning rates instead."""
     needs: ClassVar[tuple[str, ...]] = ()
     """Abilities that the policy must have besides the protocol: "hidden_states", "answers". A policy without
     them is refused by name."""
@@ -179,7 +179,7 @@ class Method:
         loss.backward()  # type: ignore[no-untyped-call]
 
     def learning_rate(self, scheduled: float, progress: Progress) -> float:
-        """Return the step size of an optimiser group; called for each group, after `loss` and `gradients`.
+        """Return the learning rate of a group of the optimiser, for each group after `loss` and `gradients`.
 
         Args:
             scheduled: The scenario's learning rate, or the group's own, times `step_factor` and the schedule.

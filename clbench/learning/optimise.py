@@ -29,14 +29,14 @@ class GradientError(MethodError):
 
 
 WARM_UP = 15
-"""Steps of linear warm-up before a constant step size."""
+"""Steps of linear warm-up before a constant learning rate."""
 
 Schedule = Callable[[int], float]
-"""Maps the number of steps done to the step size, as a share of its peak."""
+"""Maps the number of steps done to the learning rate, as a share of its peak."""
 
 
 def warm_up(step: int) -> float:
-    """Return the step size at `step` as a share of its peak: linear over `WARM_UP` steps, then constant.
+    """Return the learning rate at `step` as a share of its peak: linear over `WARM_UP` steps, then constant.
 
     A stage that ends early has then taken the same steps as one that goes on.
     """
@@ -44,7 +44,7 @@ def warm_up(step: int) -> float:
 
 
 def learning_rate_factor(step: int, steps: int) -> float:
-    """Return the step size at `step` as a share of its peak: 5 % linear warm-up, then a cosine to a tenth."""
+    """Return the learning rate at `step` as a share of its peak: 5 % warm-up, then a cosine to a tenth."""
     warm_up = max(1, round(0.05 * steps))
     if step < warm_up:
         return (step + 1) / warm_up
@@ -83,18 +83,18 @@ def optimise(
 
     Args:
         parameters: Parameters to train, or optimiser groups of them.
-        learning_rate: Peak step size, for groups without their own.
+        learning_rate: Peak learning rate, for groups without their own.
         steps: Number of steps, at most.
         loss_at: Returns the scalar loss of a step.
         gradients: Sets the gradients from the loss.
         after: Called after each step with the number of steps done. Training ends if it returns True.
-        rate: Maps the scheduled step size of a group, and the number of steps done, to its actual step size.
-        schedule: Schedule of the step size; `learning_rate_factor` if None.
+        rate: Maps the scheduled learning rate of a group, and the number of steps done, to the actual one.
+        schedule: Schedule of the learning rate; `learning_rate_factor` if None.
 
     Raises:
         GradientError: A gradient is not finite.
-        MethodError: The loss is not a finite scalar with a gradient, or a step size is not a finite float of
-            at least 0.
+        MethodError: The loss is not a finite scalar with a gradient, or a learning rate is not a finite float
+            of at least 0.
     """
     groups: list[Any] = list(parameters)
     if not groups:
@@ -122,7 +122,9 @@ def optimise(
 
 def _checked_rate(rate: float, step: int) -> float:
     if not (isinstance(rate, float) and 0.0 <= rate < math.inf):
-        raise MethodError(f"step {step}: the step size must be a finite float of at least 0, not {rate!r}.")
+        raise MethodError(
+            f"step {step}: the learning rate must be a finite float of at least 0, not {rate!r}."
+        )
     return rate
 
 

@@ -149,6 +149,7 @@ def policy_config(scenario: Scenario) -> PolicyConfig:
     return config
 
 
+@deterministic()  # the means and deviations of the data depend on the number of threads, too
 def pretrain(
     scenario: Scenario,
     seed: int,
@@ -165,14 +166,6 @@ def pretrain(
         progress: Called with the number of steps done since its last call.
         watch: Called with the policy and the number of steps done, before the first step and after each.
     """
-    with deterministic():  # the means and deviations of the data depend on the number of threads, too
-        return _pretrain(scenario, seed, progress, watch)
-
-
-def _pretrain(
-    scenario: Scenario, seed: int, progress: ProgressCallback, watch: Callable[[Policy, int], None]
-) -> Policy:
-    """Do the work of `pretrain`."""
     config, budget = policy_config(scenario), scenario.budget
     questions, _ = load_questions(scenario)
     policy = new_policy(config, seed=derive_seed("weights", seed))

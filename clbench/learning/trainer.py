@@ -20,9 +20,10 @@ from clbench.data.demonstrations import Demonstrations
 from clbench.data.training_data import TrainingData
 from clbench.learning.adaptation import Step, adapt
 from clbench.learning.method import Method, MethodState, Stage
+from clbench.learning.method_state import read_state, write_state
 from clbench.learning.pretraining import pretrained_policy, pretraining_inputs
 from clbench.learning.prior import Access, Nothing, Prior, Source
-from clbench.learning.watching import read_state, watch, watches, write_state
+from clbench.learning.watching import watch, watches
 from clbench.policy.checkpoint import CheckpointError, load_policy, save_policy
 from clbench.policy.policy import Policy
 from clbench.spec.policies import policy_packages

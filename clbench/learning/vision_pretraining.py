@@ -24,7 +24,7 @@ from clbench.worlds.camera import Camera
 STEPS_SHARE = 0.25
 """Steps of the vision for each step of pretraining."""
 LEARNING_RATE = 3e-3
-"""Peak step size."""
+"""Peak learning rate."""
 NUMBERS_WEIGHT = 3.0
 """Weight of the loss of the numbers relative to the answers: the position of an object matters more than its
 kind."""

@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from pathlib import Path
 
 import torch
-from safetensors.torch import load_file, save_file
 
 from clbench.base.cache import cache_folder, cached, hash_of
 from clbench.base.progress import ProgressCallback
-from clbench.base.strict_json import check_json, read_json
 from clbench.learning.method import Method, MethodState, Progress
+from clbench.learning.method_state import read_state, write_state
 from clbench.learning.optimise import MethodError
 from clbench.learning.pretraining import pretrain, pretraining_inputs
 from clbench.learning.registry import describe_method
@@ -79,21 +77,3 @@ def watch(
         write_state(partial, state)
 
     return read_state(cached(cache_folder() / "watched" / hash_of(inputs), inputs, make))
-
-
-def write_state(folder: Path, state: MethodState) -> None:
-    """Write the state of a method to `method.safetensors` and `method.json` in `folder`."""
-    tensors = {name: value for name, value in state.items() if isinstance(value, torch.Tensor)}
-    copies = {name: value.detach().clone().contiguous() for name, value in tensors.items()}
-    save_file(copies, folder / "method.safetensors")
-    values = {name: value for name, value in state.items() if name not in tensors}
-    text = json.dumps(values)
-    check_json(json.loads(text))  # refuse here, with a name, what reading the file would refuse
-    (folder / "method.json").write_text(text, encoding="utf-8")
-
-
-def read_state(folder: Path, device: torch.device | str = "cpu") -> MethodState:
-    """Return the state of a method that `write_state` wrote to `folder`."""
-    state: MethodState = {**read_json(folder / "method.json")}
-    state.update(load_file(folder / "method.safetensors", device=str(device)))
-    return state

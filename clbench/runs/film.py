@@ -9,7 +9,7 @@ from __future__ import annotations
 import functools
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
-from contextlib import ExitStack, closing
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -30,7 +30,7 @@ from clbench.policy.policy import Policy
 from clbench.runs.spec import ResolvedRun
 from clbench.spec.scenario import Scenario
 from clbench.spec.task import Task
-from clbench.worlds.world import World
+from clbench.worlds.world import World, opened_worlds
 
 FORMATS = (".gif", ".mp4")
 
@@ -95,21 +95,16 @@ def shoot(
     Raises:
         RuntimeError: A world does not repeat an episode.
     """
-    worlds: dict[str, World] = {}
     takes: list[list[Take]] = [[] for _ in trials]
-    with ExitStack() as opened:
-        evaluator = opened.enter_context(closing(Evaluator(scenario, seed)))
+    with closing(Evaluator(scenario, seed)) as evaluator, opened_worlds(render_mode="rgb_array") as world:
         for policy in policies:
             with deterministic():
                 episodes, actions = _act(evaluator, policy, trials)
             for column, trial, episode in zip(takes, trials, episodes, strict=True):
-                entry_point = trial[0].world
-                if entry_point not in worlds:
-                    world = resolve(entry_point)(render_mode="rgb_array")
-                    worlds[entry_point] = opened.enter_context(closing(world))
-                pictures, success = _repeat(worlds[entry_point], trial, seed, actions[trial], width)
+                task = trial[0]
+                pictures, success = _repeat(world(task), trial, seed, actions[trial], width)
                 if success != episode.success:
-                    raise RuntimeError(f"{entry_point} does not repeat an episode of {trial[0].name!r}.")
+                    raise RuntimeError(f"{task.world} does not repeat an episode of {task.name!r}.")
                 column.append(Take(pictures, episode))
                 progress(1)
     return takes

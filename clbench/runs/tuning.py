@@ -159,7 +159,7 @@ def fixed_settings(method: type[Method], found: Tuned) -> dict[str, Any]:
 
 
 def _set_by_tuning(method: type[Method]) -> tuple[str, ...]:
-    """Return the hyper-parameters that tuning sets: the method's own strength, if any, and the step size."""
+    """Return the hyper-parameters that tuning sets: the learning rate, and the method's strength, if any."""
     return ("step_factor",) if method.tunes is None else (method.tunes[0], "step_factor")
 
 

@@ -6,7 +6,8 @@ from typing import ClassVar
 
 import numpy as np
 
-from clbench.worlds.camera import Images, States, Views
+from clbench.worlds.camera import Images, Views
+from clbench.worlds.world import States
 
 REACH = 2.5
 """Distance from the middle to the edge of the picture, in the units of the toy."""

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from clbench.base.entry_points import resolve
 from clbench.base.errors import WrongTypeError
+from clbench.worlds.world import States
 
-States: TypeAlias = NDArray[np.float32]
 Images: TypeAlias = NDArray[np.uint8]
 Views: TypeAlias = NDArray[np.float32]
 """Perturbations of pictures (N, 4): azimuth, elevation and distance of the camera, and the light, from -1 to

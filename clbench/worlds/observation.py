@@ -26,10 +26,11 @@ from clbench.base.entry_points import resolve
 from clbench.base.errors import WrongTypeError
 from clbench.base.source import package_of, source_hash
 from clbench.spec.task import Task
-from clbench.worlds.camera import VIEW_SIZE, Camera, Images, States, Views, load_camera
+from clbench.worlds.camera import VIEW_SIZE, Camera, Images, Views, load_camera
 from clbench.worlds.gl_backend import RenderingError, environment_of, working_back_end
 from clbench.worlds.render_worker import HEADER
 from clbench.worlds.threads import cores
+from clbench.worlds.world import States
 
 TOGETHER = 256
 """Pictures per request to a drawing process: 3 MB of 64 x 64 pixels, and half a second of work."""

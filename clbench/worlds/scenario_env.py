@@ -78,6 +78,7 @@ class ScenarioEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         self._steps = 0
         task = self.scenario.tasks[0]
         world = self._world(task)
+        self.metadata = {**self.metadata, "render_fps": world.metadata.get("render_fps", 25)}
         assert isinstance(world.observation_space, spaces.Box)
         self.action_space = world.action_space
         shown = self._observers[task.world].spaces(world.observation_space)

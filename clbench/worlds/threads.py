@@ -1,4 +1,4 @@
-"""Threads that share the stepping of worlds."""
+"""Threads that share the stepping of worlds, and what each of them needs for itself."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import threading
 import weakref
 from collections.abc import Callable, Sequence
 from queue import SimpleQueue
-from typing import TypeVar
+from typing import Generic, TypeVar
 
 Item = TypeVar("Item")
 
@@ -95,6 +95,29 @@ class _Helper:
                 interruption = stop
             else:
                 return interruption or error
+
+
+class Copies(Generic[Item]):
+    """Something that one thread at a time may change, such as a compiled scene, and copies for the others.
+
+    Args:
+        first: What the first thread gets.
+        copied: Returns a copy, made only when a further thread needs one.
+    """
+
+    def __init__(self, first: Item, copied: Callable[[], Item]) -> None:
+        self._copied, self._free = copied, [first]
+
+    def take(self) -> Item:
+        """Return one that no other thread uses."""
+        try:
+            return self._free.pop()
+        except IndexError:
+            return self._copied()
+
+    def give_back(self, taken: Item) -> None:
+        """Make it available to other threads."""
+        self._free.append(taken)
 
 
 def _help(asked: SimpleQueue[Callable[[], None] | None], ended: SimpleQueue[Exception | None]) -> None:

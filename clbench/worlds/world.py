@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Protocol, TypeAlias, TypeVar
 
 import gymnasium
@@ -18,6 +19,8 @@ from clbench.base.errors import InputError
 if TYPE_CHECKING:
     import mujoco
     from gymnasium.envs.mujoco.mujoco_rendering import MujocoRenderer
+
+    from clbench.spec.task import Task
 
 Lane = TypeVar("Lane")
 World = gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]
@@ -57,6 +60,27 @@ class VectorWorld(Protocol):
     def close(self) -> None:
         """Free the worlds and threads that it holds."""
         ...
+
+
+@contextmanager
+def opened_worlds(**options: Any) -> Iterator[Callable[[Task], World]]:
+    """Yield a function that returns the world of a task; worlds are made on demand and closed at the end.
+
+    Args:
+        **options: Options of every world, such as its render mode.
+    """
+    made: dict[str, World] = {}
+
+    def world(task: Task) -> World:
+        if task.world not in made:
+            made[task.world] = resolve(task.world)(**options)
+        return made[task.world]
+
+    try:
+        yield world
+    finally:
+        for one in made.values():
+            one.close()
 
 
 class OneLaneWorld(World, ABC):

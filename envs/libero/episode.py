@@ -62,10 +62,15 @@ class Episode:
 
     def forward(self) -> None:
         """Compute everything that follows from the joints; the next step does not depend on this call."""
-        models = self.problem.scene.models
-        model = models.take(self._places)
+        model = self._placed()
         mujoco.mj_forward(model, self.data)
-        models.give_back(model)
+        self.problem.scene.models.give_back(model)
+
+    def _placed(self) -> mujoco.MjModel:
+        """Take a model from those of the scene, and move its fixtures to their places."""
+        model = self.problem.scene.models.take()
+        model.body_pos[:], model.body_quat[:] = self._places
+        return model
 
     def drawn(self) -> mujoco.MjModel:
         """Return the scene with its textures and with the fixtures in place, for a picture of `data`."""
@@ -76,13 +81,12 @@ class Episode:
 
     def move(self) -> None:
         """Advance the physics by `action`; several threads may do so at once, each for another episode."""
-        models = self.problem.scene.models
-        model = models.take(self._places)
+        model = self._placed()
         for substep in range(SUBSTEPS):
             mujoco.mj_step1(model, self.data)
             self._arm.drive(model, self.action, is_new=substep == 0)
             mujoco.mj_step2(model, self.data)
-        models.give_back(model)
+        self.problem.scene.models.give_back(model)
 
     def state(self) -> State:
         """Return the state (213,)."""

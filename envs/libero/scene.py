@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clbench.worlds.perturbation import with_mass
+from clbench.worlds.threads import Copies
 
 from .arm import JOINTS, REST, Arm, Sensed
 
@@ -24,31 +25,6 @@ CAMERA = {"distance": 1.6, "azimuth": 180.0, "elevation": -35.0, "lookat": np.ar
 """A view of the table from the side opposite to the robot."""
 
 
-class Models:
-    """A model and copies of it: each thread moves the bodies of fixtures in a copy of its own.
-
-    Args:
-        model: Used by the first thread; further threads get copies of 65 to 106 MB, made when needed.
-    """
-
-    def __init__(self, model: mujoco.MjModel) -> None:
-        self._model = model
-        self._free = [model]
-
-    def take(self, places: Places) -> mujoco.MjModel:
-        """Return a model that no other thread uses, with its bodies in `places`."""
-        try:
-            model = self._free.pop()
-        except IndexError:
-            model = copy.copy(self._model)
-        model.body_pos[:], model.body_quat[:] = places
-        return model
-
-    def give_back(self, model: mujoco.MjModel) -> None:
-        """Make a model available to other threads."""
-        self._free.append(model)
-
-
 @dataclass(frozen=True, eq=False)
 class Scene:
     """A compiled scene, shared by all its episodes in a process."""
@@ -57,8 +33,8 @@ class Scene:
     """The scene in MJCF."""
     model: mujoco.MjModel
     """The scene without textures, which need two thirds of its memory, and without its unused sensors."""
-    models: Models
-    """The model, for threads that advance episodes at the same time."""
+    models: Copies[mujoco.MjModel]
+    """The model, for threads that advance episodes at the same time: each moves the fixtures in its own."""
     places: Places
     """Compiled places of the bodies; a problem moves the fixtures among them."""
     rest: Sensed
@@ -84,7 +60,7 @@ def scene_of(xml: str) -> Scene:
     data.qpos[:JOINTS] = REST
     mujoco.mj_forward(model, data)
     rest = Sensed(*(part.copy() for part in Arm(model, data).sense(model)))
-    return Scene(xml, model, Models(model), (model.body_pos.copy(), model.body_quat.copy()), rest)
+    return Scene(xml, model, _copies(model), (model.body_pos.copy(), model.body_quat.copy()), rest)
 
 
 @functools.cache
@@ -92,7 +68,12 @@ def heavier(scene: Scene, mass: float) -> Scene:
     """Return a scene in which all objects are `mass` times as heavy; all its episodes share the copy."""
     free = scene.model.jnt_type == mujoco.mjtJoint.mjJNT_FREE
     model = with_mass(scene.model, scene.model.jnt_bodyid[free].tolist(), mass)
-    return replace(scene, model=model, models=Models(model))
+    return replace(scene, model=model, models=_copies(model))
+
+
+def _copies(model: mujoco.MjModel) -> Copies[mujoco.MjModel]:
+    """Return the model with copies of it, of 65 to 106 MB."""
+    return Copies(model, lambda: copy.copy(model))
 
 
 def _without_textures(xml: str) -> str:

@@ -12,35 +12,12 @@ from metaworld.sawyer_xyz_env import SawyerXYZEnv
 from numpy.typing import NDArray
 
 from clbench.worlds.perturbation import with_mass
+from clbench.worlds.threads import Copies
 
 Vector = NDArray[np.float64]
 
 CAMERA = {"distance": 1.4, "azimuth": 135.0, "elevation": -30.0, "lookat": np.array([0.0, 0.6, 0.15])}
 """A view from the front left, above the table."""
-
-
-class Models:
-    """A model and copies of it: each thread moves bodies in a copy of its own.
-
-    Args:
-        model: Used by the first thread; further threads get copies of 19 MB, made when needed.
-    """
-
-    def __init__(self, model: mujoco.MjModel) -> None:
-        self._model = model
-        self._free = [(model, model.body_pos, model.site_pos)]
-
-    def take(self) -> tuple[mujoco.MjModel, Vector, Vector]:
-        """Return a model that no other thread uses, with views of its body and site places."""
-        try:
-            return self._free.pop()
-        except IndexError:
-            model = copy.copy(self._model)
-            return model, model.body_pos, model.site_pos
-
-    def give_back(self, taken: tuple[mujoco.MjModel, Vector, Vector]) -> None:
-        """Make a model available to other threads."""
-        self._free.append(taken)
 
 
 @dataclass(frozen=True)
@@ -54,11 +31,14 @@ class Scene:
     """Compiled places of the sites, (sites, 3)."""
     start: mujoco.MjData
     """The physics with the hand at its start."""
-    models: Models = field(init=False)
-    """The model, for threads that advance episodes at the same time."""
+    models: Copies[tuple[mujoco.MjModel, Vector, Vector]] = field(init=False)
+    """The model with views of its places, for threads that advance episodes at the same time: each moves the
+    bodies in its own, of 19 MB. A view made in each step would cost time."""
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "models", Models(self.model))
+        model = self.model
+        copies = Copies(_with_views(model), lambda: _with_views(copy.copy(model)))
+        object.__setattr__(self, "models", copies)
 
     def with_mass(self, mass: float) -> Scene:
         """Return the scene with all movable objects `mass` times as heavy."""
@@ -72,6 +52,10 @@ def scene_of(original: type[SawyerXYZEnv]) -> Scene:
     env._reset_hand()
     model = env.model
     return Scene(model, model.body_pos.copy(), model.site_pos.copy(), env.data)
+
+
+def _with_views(model: mujoco.MjModel) -> tuple[mujoco.MjModel, Vector, Vector]:
+    return model, model.body_pos, model.site_pos
 
 
 def _things(model: mujoco.MjModel) -> list[int]:

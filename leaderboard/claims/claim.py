@@ -31,8 +31,8 @@ PREDICATES: Mapping[Verdict, tuple[str, str]] = {
 """Verdicts as predicates: of one claim, and of several."""
 
 BOARDS = ("clbench/Fetch-v1", "clbench/MetaWorld-v1", "clbench/PointMaze-v1")
-"""Scenarios at equal learning, with runs at the published step size and controls: most claims are judged on
-them."""
+"""Scenarios at equal learning, with runs at the published learning rate and controls: most claims are judged
+on them."""
 
 ANYWHERE = BOARDS[:1]
 """Scenario of the claims that do not depend on one, such as the time of a step."""

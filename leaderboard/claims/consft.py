@@ -99,8 +99,9 @@ def sft_degrades(evidence: Evidence) -> Finding:
     rule="An arm (consft with a tuned first temperature, or consft_calibrated) counts if 10 % of its weights "
     "before the last tenth of the schedule are between 0.01 and 0.9. Holds if the lower end of the "
     "difference in retained success to sft, each at its best settings, is at least 0.20 for an arm; holds in "
-    "part if it is so only with both at the published step size; does not hold if all upper ends are below "
-    "0.20. Cannot be shown here if no arm counts, or if sft certainly keeps more than 0.80 at both settings.",
+    "part if it is so only with both at the published learning rate; does not hold if all upper ends are "
+    "below 0.20. Cannot be shown here if no arm counts, or if sft certainly keeps more than 0.80 at both "
+    "settings.",
     margin="0.20 of the retained success, the claim's own",
 )
 def keeps_20_points_more(evidence: Evidence) -> Finding:
@@ -170,17 +171,17 @@ def _controls_of(evidence: Evidence, arm: str) -> tuple[Figure, ...]:
 
 
 def _controls_at_the_published_rate(evidence: Evidence) -> tuple[Figure, ...]:
-    """Return the gains of consft_calibrated over two controls at the published step size, where they ran."""
+    """Return the gains of consft_calibrated over two controls at the published learning rate, if they ran."""
     labels = [f"{name}+step_factor={PUBLISHED}" for name in ("constant_weight", "shuffled_weights")]
     arm = rung("consft_calibrated", PUBLISHED)
     return tuple(kept(evidence, arm, label) for label in labels if label in evidence.runs)
 
 
 def _what_the_published_rate_says(gain: Figure, controls: Sequence[Figure]) -> list[str]:
-    """Return what an arm gains at the published step size, and what the controls say about it."""
+    """Return what an arm gains at the published learning rate, and what the controls say about it."""
     if not gain.low > 0:
         return []
-    said = [f"At the published step size {gain.methods[0]} keeps {gain.value:.2f} more than sft."]
+    said = [f"At the published learning rate {gain.methods[0]} keeps {gain.value:.2f} more than sft."]
     for one in controls:
         explains, does_not = CONTROLS[one.methods[1].partition("+")[0]]
         said.append(not_told_apart(one, explains=explains, does_not=does_not))

@@ -7,16 +7,13 @@ from __future__ import annotations
 
 import io
 import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from rich.console import Console
 
 from clbench.base.dependencies import require
-from clbench.base.entry_points import resolve
 from clbench.base.errors import ClbenchError
 from clbench.base.seeding import derive_seed
 from clbench.base.text import counted
@@ -26,7 +23,7 @@ from clbench.jobs.bars import Bars
 from clbench.spec.scenario import Scenario
 from clbench.spec.task import Task
 from clbench.worlds.gl_backend import choose_back_end
-from clbench.worlds.world import World
+from clbench.worlds.world import opened_worlds
 
 from ..views.format import write_if_changed
 
@@ -121,7 +118,7 @@ def _draw(tasks: Sequence[Task], folder: Path, progress: Progress) -> None:
         return
     from clbench.runs.film import picture  # Pillow is an extra
 
-    with _worlds(render_mode="rgb_array") as world:
+    with opened_worlds(render_mode="rgb_array") as world:
         for task in tasks:
             seed = derive_seed("picture", task.seed_suite, task.name)
             actions = demonstrate(world(task), task, seed, noisy=False).executed
@@ -132,23 +129,6 @@ def _draw(tasks: Sequence[Task], folder: Path, progress: Progress) -> None:
             picture(world(task), WIDTH).save(content, "WEBP", quality=QUALITY, method=6)
             picture_path(folder, task).write_bytes(content.getvalue())
             progress(1)
-
-
-@contextmanager
-def _worlds(**options: Any) -> Iterator[Callable[[Task], World]]:
-    """Yield a function that returns the world of a task; worlds are made on demand and closed at the end."""
-    made: dict[str, World] = {}
-
-    def world(task: Task) -> World:
-        if task.world not in made:
-            made[task.world] = resolve(task.world)(**options)
-        return made[task.world]
-
-    try:
-        yield world
-    finally:
-        for one in made.values():
-            one.close()
 
 
 def _read(folder: Path) -> dict[str, dict[str, int]]:

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from clbench.learning.optimise import MethodError, deterministic, learning_rate_factor, optimise
 
 
-def test_the_step_size_warms_up_and_then_follows_a_cosine_down_to_a_tenth() -> None:
+def test_the_learning_rate_warms_up_and_then_follows_a_cosine_down_to_a_tenth() -> None:
     factors = [learning_rate_factor(step, 400) for step in range(400)]
     assert factors[:20] == pytest.approx(np.arange(1, 21) / 20)
     assert max(factors) == 1.0
@@ -18,7 +18,7 @@ def test_the_step_size_warms_up_and_then_follows_a_cosine_down_to_a_tenth() -> N
     assert factors[-1] == pytest.approx(0.1, abs=1e-3)
 
 
-def test_the_first_step_of_adamw_moves_every_weight_by_the_step_size() -> None:
+def test_the_first_step_of_adamw_moves_every_weight_by_the_learning_rate() -> None:
     weight = nn.Parameter(torch.tensor([1.0, -2.0]))
     steps = optimise([weight], 0.1, 1, lambda _: (weight * torch.tensor([3.0, -0.5])).sum(), Tensor.backward)
     assert steps == 1
@@ -43,7 +43,7 @@ def test_gradients_are_clipped_after_the_method_has_set_them() -> None:
     assert seen == pytest.approx([1.0])
 
 
-def test_a_group_may_have_its_own_step_size() -> None:
+def test_a_group_may_have_its_own_learning_rate() -> None:
     slow, fast = nn.Parameter(torch.zeros(1)), nn.Parameter(torch.zeros(1))
     groups: list[dict[str, Any]] = [{"params": [slow], "lr": 0.01}, {"params": [fast]}]
     optimise(groups, 0.1, 1, lambda _: (slow + fast - 1).square().sum(), Tensor.backward)
@@ -90,7 +90,7 @@ def test_the_deterministic_block_restores_what_was_set(warn_only: bool) -> None:
         torch.use_deterministic_algorithms(False)
 
 
-def test_the_step_size_can_change_at_every_step_once_the_gradient_is_known() -> None:
+def test_the_learning_rate_can_change_at_every_step_once_the_gradient_is_known() -> None:
     weight = nn.Parameter(torch.zeros(1))
     seen: list[tuple[float, int, bool]] = []
 
@@ -104,7 +104,9 @@ def test_the_step_size_can_change_at_every_step_once_the_gradient_is_known() -> 
 
 
 @pytest.mark.parametrize("rate", [-0.1, float("nan"), float("inf"), "0.1"])
-def test_an_invalid_step_size_is_refused(rate: Any) -> None:
+def test_an_invalid_learning_rate_is_refused(rate: Any) -> None:
     weight = nn.Parameter(torch.zeros(1))
-    with pytest.raises(MethodError, match="step 0: the step size must be a finite float of at least 0, not"):
+    with pytest.raises(
+        MethodError, match="step 0: the learning rate must be a finite float of at least 0, not"
+    ):
         optimise([weight], 0.1, 1, lambda _: (weight - 1).square().sum(), rate=lambda *_: rate)

@@ -192,10 +192,10 @@ def test_weight_interpolation_goes_back_to_where_the_stage_began() -> None:
     assert all(weight.equal(before[name]) for name, weight in policy.named_parameters())
 
 
-# ---- step sizes --------------------------------------------------------------------------------------------
+# ---- learning rates ----------------------------------------------------------------------------------------
 
 
-def test_the_step_sizes_of_finch_follow_the_average_of_the_losses() -> None:
+def test_the_learning_rates_of_finch_follow_the_average_of_the_losses() -> None:
     method, policy, source = (
         build_method("finch", {"kappa": 0.9}),
         TransformerPolicy(SMALL),
@@ -246,7 +246,7 @@ def test_the_step_factor_moves_every_weight_by_its_share_of_a_step(factor: float
         _adapt(policy, build_method("sft", changes), steps=1)
         moves.append({name: weight - start[name] for name, weight in _weights(policy).items()})
     plain, slow = moves
-    # the first step of Adam is the step size, up or down
+    # the first step of Adam is the learning rate, up or down
     assert plain["head.embed.weight"].abs().max() == pytest.approx(1e-3, rel=1e-3)
     for name, move in plain.items():
         torch.testing.assert_close(slow[name], factor * move, rtol=0, atol=1e-6)

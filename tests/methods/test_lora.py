@@ -147,7 +147,7 @@ def test_an_adapted_policy_survives_saving_and_goes_on_as_it_would_have(variant:
     assert all(weight.equal(_weights(loaded)[name]) for name, weight in _weights(policy).items())
 
 
-def test_the_step_size_of_the_adapters_is_a_multiple_of_the_scheduled_one() -> None:
+def test_the_learning_rate_of_the_adapters_is_a_multiple_of_the_scheduled_one() -> None:
     method = build_method("lora", {"speed": 2.5})
     assert method.learning_rate(0.01, Progress(3, 10)) == pytest.approx(0.025)
 

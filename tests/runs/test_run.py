@@ -283,7 +283,7 @@ def test_a_method_of_whole_stages_is_evaluated_only_at_their_ends(
     assert set(record.episodes["step"]) == {0, 60}
     other = execute(RunSpec(TOY, "sft", seed=0), tmp_path)
     assert Scores.from_record(record).layout == Scores.from_record(other).layout
-    assert set(record.policy["update_sparsity"]) == {1.0}  # with a step size of 0 nothing moves
+    assert set(record.policy["update_sparsity"]) == {1.0}  # with a learning rate of 0 nothing moves
 
 
 def test_the_steps_of_the_preparation_count(tmp_path: Path, stranger: Callable[[type[Method]], str]) -> None:

@@ -49,7 +49,7 @@ def test_every_method_tries_the_same_number_of_different_settings(name: str) -> 
         new_method(name, cls, one)  # the method accepts them
 
 
-def test_a_method_without_its_own_strength_tries_step_sizes_between_the_rungs() -> None:
+def test_a_method_without_its_own_strength_tries_learning_rates_between_the_rungs() -> None:
     assert refinements(load_method("sft"), {"step_factor": 0.1}) == [
         {"step_factor": 0.055},
         {"step_factor": 0.18},

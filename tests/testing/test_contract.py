@@ -158,7 +158,7 @@ class NoGradients(Method):
 
 @dataclasses.dataclass
 class Whole(Method):
-    """Has an integer as step size."""
+    """Has an integer as learning rate."""
 
     def learning_rate(self, scheduled: float, progress: Progress) -> int:
         return 1
@@ -263,7 +263,7 @@ FAULTS: list[tuple[Any, str, str, str]] = [
         Whole,
         "sound hooks",
         "a finite float of at least 0",
-        "the step size must be a finite float of at least 0, not 1",
+        "the learning rate must be a finite float of at least 0, not 1",
     ),
     (Poisons, "sound hooks", "a policy of finite weights", "head.position is not finite after 'right'"),
     (Breaks, "sound hooks", "end_task() to run without an error", "RuntimeError: cannot merge right"),

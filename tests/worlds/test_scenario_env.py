@@ -23,6 +23,10 @@ def _toy(**options: Any) -> ScenarioEnv:
     return ScenarioEnv("clbench.testing:TOY", **options)
 
 
+def test_a_recorded_episode_has_the_speed_of_its_world() -> None:
+    assert _toy().metadata["render_fps"] == 10  # Gymnasium's RecordVideo reads it; the class says 25
+
+
 def test_the_schedule_goes_from_the_skills_to_each_target_and_stays_at_the_last() -> None:
     env = _toy(episodes_per_stage=3)
     schedule = []

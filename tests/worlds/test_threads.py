@@ -10,7 +10,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from clbench.worlds.threads import Team, cores
+from clbench.worlds.threads import Copies, Team, cores
 
 
 class Owner:
@@ -157,3 +157,22 @@ def test_an_interrupted_call_returns_when_no_thread_works_any_more(
     team.each(done.append, [5, 6, 7])
     assert sorted(done[2:]) == [5, 6, 7]
     team.close()
+
+
+# ---- copies ----------------------------------------------------------------------------------------------
+
+
+def test_nobody_gets_what_another_has_taken_and_a_copy_is_made_only_then() -> None:
+    made: list[str] = []
+
+    def copied() -> str:
+        made.append("copy")
+        return f"copy {len(made)}"
+
+    copies = Copies("first", copied)
+    assert copies.take() == "first"
+    copies.give_back("first")
+    assert [copies.take(), copies.take(), copies.take()] == ["first", "copy 1", "copy 2"]
+    copies.give_back("copy 1")
+    assert copies.take() == "copy 1"
+    assert len(made) == 2

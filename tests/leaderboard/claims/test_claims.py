@@ -92,14 +92,14 @@ def test_a_control_says_whether_it_explains_what_is_kept(bench: Bench) -> None:
     assert "The records cannot show what shuffled_weights says about it." in entry
 
 
-def test_what_keeps_skills_at_the_published_step_size_is_asked_of_controls_there(bench: Bench) -> None:
+def test_what_keeps_skills_at_the_published_learning_rate_is_asked_of_controls_there(bench: Bench) -> None:
     for label in ("sft", "sft@1", "consft", "consft@1", "consft_calibrated"):
         bench.add(label)
     for label in ("consft_calibrated@1", "constant_weight+step_factor=1.0"):
         bench.add(label, kept=0.9)
     bench.add("shuffled_weights+step_factor=1.0", kept=0.2)
     entry = section(bench.page(), "C2")
-    assert "At the published step size consft_calibrated@1 keeps 0.70 more than sft." in entry
+    assert "At the published learning rate consft_calibrated@1 keeps 0.70 more than sft." in entry
     assert "constant_weight+step_factor=1.0 is not told apart from it" in entry
     assert "shuffled_weights+step_factor=1.0 does not reach it" in entry
 

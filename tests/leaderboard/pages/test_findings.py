@@ -69,7 +69,7 @@ def test_a_difference_that_is_certain_only_without_counting_the_comparisons_is_s
     assert f"Lower {alone}: `lora` by 0.0" in text
 
 
-def test_the_ladder_tells_what_a_smaller_step_size_does(
+def test_the_ladder_tells_what_a_smaller_learning_rate_does(
     even_board: Callable[..., Path], page: Callable[[], str]
 ) -> None:
     fill(even_board, sft=0.4)

@@ -123,7 +123,7 @@ def test_targets_of_balanced_seeds_are_numbered_in_the_section_of_a_row(records:
     assert "after target 2" in unpacked(page(read_table(records), {}))
 
 
-def test_the_frontier_has_each_method_at_each_step_size(records: Path) -> None:
+def test_the_frontier_has_each_method_at_each_learning_rate(records: Path) -> None:
     curves = read_table(records).frontiers[SCENARIO]
     assert [curve.method for curve in curves] == ["sft", "finch"]
     assert [(rung.factor, rung.kept.value, len(rung.seeds)) for rung in curves[1].rungs] == [
@@ -147,7 +147,7 @@ def test_without_a_ladder_there_is_no_frontier(even_board: Callable[..., Path]) 
     assert set(pictures(table)) == {"pareto.svg", "pareto-dark.svg"}
 
 
-def test_a_ladder_record_without_a_step_size_is_refused(even_board: Callable[..., Path]) -> None:
+def test_a_ladder_record_without_a_learning_rate_is_refused(even_board: Callable[..., Path]) -> None:
     even_board("finch", 0, 0.4, "ladder", kappa=0.5)
     table = read_table(even_board("sft", 0, 0.2))
     assert not table.frontiers
