@@ -23,10 +23,8 @@ SLICES = 10
 after the schedule."""
 LEARNED_AFTER = 4.0
 """Sum of step factors after which plain fine-tuning has learned a target of MetaWorld-v1: in the median 3.5
-to 4.6, whether the step factor is 1 or 0.0165 (tuning records, seeds 100 and 101). On Fetch-v1 the median is
-7 to 9 below 1, so the temperature reaches its end in the middle of a stage; with `schedule` at 2 the final
-average of these seeds is 0.589, with 1 it is 0.604. On PointMaze-v1 the median is 12.4 to 16, and `schedule`
-is 3.25."""
+to 4.6, whether the step factor is 1 or 0.0165 (tuning records, seeds 100 and 101). The median is 7 to 9 on
+Fetch-v1 below a factor of 1, 16.5 at 1, and 12.4 to 16 on PointMaze-v1: see detail 3 of `consft`."""
 
 
 @dataclass

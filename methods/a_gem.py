@@ -5,7 +5,8 @@ product is negative, the step uses g - (g.r / ||r||^2) r instead of g (Eq. 11). 
 against activations.
 
 Details:
-1. The memory holds all prior demonstrations, as in experience replay. A batch from it has the budget's size.
+1. The memory holds all prior demonstrations, as in experience replay. A batch from it has the budget's size
+   and comes on top of the target's, so a step reads twice the samples of a step of experience replay.
 2. There is one projection for all weights together.
 3. If there is no earlier task, the gradient on the target is not changed.
 4. The projected gradient is clipped and goes through Adam, whose step may still raise the prior loss; the

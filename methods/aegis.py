@@ -18,6 +18,7 @@ Details:
 5. The distance is summed over channels and averaged over layers. Its scale cancels out of the projection.
 6. Projection comes before clipping and before Adam, so the final step need not be orthogonal.
 7. The paper fine-tunes on one data set. In a sequence, the pretrained policy remains the anchor.
+8. The one pass over the questions is no optimiser step: no cost on the board counts it.
 
 `direction="random"` is the control: the same projection against a random direction. (This direction has the
 norm of the anchor's gradient, but the projection does not depend on the norm.)
@@ -89,10 +90,12 @@ class Aegis(Method):
         loss.backward()  # type: ignore[no-untyped-call]
         energy, removed, projected = 0.0, 0.0, 0
         for block in blocks:
-            against = [next(away) for _ in block]
+            directions = [next(away) for _ in block]
             if self.direction == "random":
-                against = random_like(against)
-            gradient = [weight.grad for weight in block if weight.grad is not None]
+                directions = random_like(directions)
+            used = [(weight.grad, one) for weight, one in zip(block, directions, strict=True)]
+            gradient = [grad for grad, _ in used if grad is not None]
+            against = [one for grad, one in used if grad is not None]
             energy += inner(gradient, gradient)
             part = project_out(gradient, against)
             removed, projected = removed + part, projected + (part > 0)

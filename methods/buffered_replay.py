@@ -4,12 +4,14 @@ The buffer sizes come from arXiv 2603.03818, where a few per cent of the data ne
 vision-language-action models.
 
 Details:
-1. Before the first target, single time steps are drawn at random into the buffer; all skills are equally
-   likely. After each target, the same share of its data is added. No other prior data are seen again.
+1. Before the first target, single time steps are drawn at random into the buffer, with replacement; all
+   skills are equally likely. After each target, the same share of its data is added. No other prior data are
+   seen again. The buffer counts in bytes with its share of the last target, which `experience_replay` never
+   reads.
 2. As in `experience_replay`, half of every batch is replayed. Flow time and noise are drawn anew each time.
    While the buffer is empty, because there is no earlier task, the batch holds the target alone.
-3. Unlike there, all steps in the buffer are equally likely, so a task with longer demonstrations is replayed
-   more often. A step keeps the wording of the instruction with which it was drawn.
+3. Unlike there, all steps in the buffer are equally likely, so a target with longer demonstrations is
+   replayed more often than another. A step keeps the wording of the instruction with which it was drawn.
 """
 
 import dataclasses
@@ -24,6 +26,9 @@ from clbench.policy.batch import Batch
 from clbench.policy.policy import Policy
 
 from ._requirements import in_range
+
+DRAWN = ("draw", "noise")
+"""Parts of a batch that are drawn anew whenever a step is replayed."""
 
 
 @dataclass
@@ -69,10 +74,15 @@ class BufferedReplay(Method):
         self.buffer = kept if self.buffer is None else Batch.cat([self.buffer, kept])
 
     def state(self) -> MethodState:
-        """Return the buffer, nothing while it is empty."""
-        return {} if self.buffer is None else {**vars(self.buffer)}
+        """Return the buffer without its draws, which every batch replaces; nothing while it is empty."""
+        columns = {} if self.buffer is None else vars(self.buffer)
+        return {name: value for name, value in columns.items() if name not in DRAWN}
 
     def load_state(self, policy: Policy, state: MethodState) -> None:
         """Restore the buffer."""
         columns = {name: value for name, value in state.items() if isinstance(value, Tensor)}
-        self.buffer = Batch(**columns) if columns else None
+        if not columns:
+            self.buffer = None
+            return
+        draw, noise = torch.zeros(len(columns["action"])), torch.zeros_like(columns["action"])
+        self.buffer = Batch(**columns, draw=draw.to(noise.device), noise=noise)

@@ -1,7 +1,8 @@
 """Constant weight: the loss is scaled by the mean of ConSFT's weights, the same for all samples of a step.
 
-A control. It separates the effect of weighing samples from the effect of a smaller loss: it keeps ConSFT's
-(arXiv 2605.08879) smaller loss, but prefers no sample.
+A control. It separates the effect of weighing samples from the effect of small weights: it keeps the mean of
+ConSFT's weights (arXiv 2605.08879), but prefers no sample. Its loss is therefore larger than ConSFT's, whose
+small weights belong to the large losses.
 
 Details:
 1. The weights are those of `ConSFTCalibrated`, for the losses of the same step. Each sample gets their mean.

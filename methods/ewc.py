@@ -6,13 +6,18 @@ Details:
    a bound, at the demonstrated actions ("empirical Fisher").
 2. It is computed for the retained skills before the first target, from prior demonstrations, and for each
    target after training on it. The sum of these pulls to the weights after the last target ("online" EWC, one
-   anchor).
+   anchor). All skills together have one importance, the mean over a mixture of their samples, and each target
+   has one of its own: with three skills, a skill weighs a third of a target. The paper adds one for each
+   task. It is a mean over 256 samples, and noisy: six estimates for the same policy correlate by 0.70 in the
+   mean, and the five largest samples carry 38 to 55 % of the sum.
 3. The penalty is (strength / 2) sum_i F_i (theta_i - theta*_i)^2. Its gradient is added in closed form.
 4. If nothing is retained, no weight is important during the first target.
 5. The gradient of the penalty is clipped together with the loss's, to a norm of 1, and goes through Adam: a
    strong penalty slows the target down, and `strength` does not mean what it does with plain gradient steps.
 6. The default of `strength` comes from validation episodes of the first Fetch board (docs/history.md). Where
    methods are tuned, `clbench tune` chose again.
+7. The passes for the importance, 256 before the first target and after each, are no optimiser steps: no cost
+   on the board counts them.
 """
 
 from dataclasses import dataclass

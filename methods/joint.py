@@ -1,6 +1,7 @@
-"""Joint: training on all data seen so far, questions included.
+"""Joint: training on the demonstrations of all skills and targets so far, and on the questions.
 
-A reference row: it keeps every demonstration, so it does not solve forgetting. It is no upper bound where
+A reference row: it keeps these demonstrations, so it does not solve forgetting. Like every other method, it
+never sees those of the background, the tasks of pretraining that no score counts. It is no upper bound where
 stages end at a criterion: it is not tuned, its stages end after few steps, and replay ends above it. Its
 success right after a target is a* in intransigence (Chaudhry 2018).
 """

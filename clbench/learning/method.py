@@ -110,7 +110,8 @@ class Method:
     them is refused by name."""
     whole_stages: ClassVar[bool] = False
     """Whether the policy is ready only at the end of a stage, for example because `end_task` merges it. Such
-    a policy is not evaluated within a stage."""
+    a policy is not evaluated within a stage. Where a criterion ends the stage, each check plays the policy
+    that `end_task` would leave then."""
 
     def watch_pretraining(self, policy: Policy, progress: Progress) -> None:
         """Look at the pretraining: before its first step, as step 0, and after each step.

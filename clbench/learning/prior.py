@@ -123,6 +123,12 @@ class Source(Generic[Rows]):
         rows: Rows = self._open.sample(count, self._generator).to(self._device)
         return rows
 
+    def twin(self) -> Source[Rows]:
+        """Return a source of the same data, whose draws begin where this one's are now."""
+        generator = torch.Generator(self._generator.device)
+        generator.set_state(self._generator.get_state())
+        return Source(self._open, generator, self.batch_size, self._device)
+
     def close(self) -> None:
         """End the access."""
         self._data = None
@@ -161,6 +167,10 @@ class Prior:
                 f'set `uses = Uses({name}="prepare")` or "throughout".'
             )
         return self.sources[name]
+
+    def twin(self) -> Prior:
+        """Return the same data, with the draws that come next."""
+        return Prior({name: source.twin() for name, source in self.sources.items()})
 
     def close(self) -> None:
         """End the access."""

@@ -143,6 +143,7 @@ class Trainer:
         prior = self.prior(number, ("throughout",))
         method_seed = derive_seed("method", self.seed, number)
         stage = Stage(number, task, method_seed, budget.adaptation_steps, target, prior)
+        self._stage = stage
 
         def report(step: Step) -> bool | None:
             with outside():
@@ -154,6 +155,22 @@ class Trainer:
         prior.close()
         check_policy(self.policy, self.pretrained)
         return steps
+
+    def finished(self) -> Policy:
+        """Return the policy that the running stage would leave if it ended now; the stage goes on as it was.
+
+        That is the policy in training, unless the method is one of `whole_stages`: then its `end_task` works
+        on copies of the policy and of the method, with the draws that come next.
+        """
+        if not self.method.whole_stages:
+            return self.policy
+        stage = dataclasses.replace(
+            self._stage, target=self._stage.target.twin(), prior=self._stage.prior.twin()
+        )
+        policy, method = copy.deepcopy((self.policy, self.method))
+        with torch.random.fork_rng(), self._hooks(stage.number):
+            method.end_task(policy, stage)
+        return policy
 
     def _hooks(self, number: int) -> AbstractContextManager[None]:
         """Restrict the code inside to what the hooks of stage `number` may know, and may read."""

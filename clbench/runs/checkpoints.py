@@ -112,7 +112,9 @@ def make_stages(run: ResolvedRun, progress: ProgressCallback = no_progress) -> P
         def after(step: Step) -> bool:
             progress(min(step.done, 1))
             point, task = Point(number, step.done), scenario.target[number - 1]
-            return checker.is_due(point) and checker.is_learned(checker.check(trainer.policy, task, point))
+            return checker.is_due(point) and checker.is_learned(
+                checker.check(trainer.finished(), task, point)
+            )
 
         try:
             if number:

@@ -248,7 +248,7 @@ class _Run:
         def is_learned(point: Point) -> bool:
             nonlocal checking
             paused = time.perf_counter()
-            row = self.checker.check(self.trainer.policy, self.run.scenario.target[number - 1], point)
+            row = self.checker.check(self.trainer.finished(), self.run.scenario.target[number - 1], point)
             self.record.add_check(row)
             announce(self.trainer.where, f"{row.successes}/{row.episodes} after {point.step} steps")
             checking += time.perf_counter() - paused

@@ -4,7 +4,8 @@ All methods try the same number of settings, on the same seeds, all targets and 
 
 1. `LADDER`: four factors of the learning rate, with the method's own strength at its default.
 2. At the best of them two more settings: two other values of the own strength that the method declares in
-   `Method.tunes`, or, if it declares none, two learning rates between the rungs.
+   `Method.tunes`, or, if it declares none, two learning rates on both sides of the rung. Those of the lowest
+   and the highest rung lie outside of the ladder: such a method may try 0.0165, which others cannot.
 
 Among the settings that learn at least `LEARNED` of the targets' success the one with the best final average
 wins. A hyper-parameter that the scenario determines, such as the length of a schedule, is fixed: it has the

@@ -7,9 +7,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
 from eager import EAGER
 
 from clbench.evaluation.rollouts import Evaluator
+from clbench.learning.adaptation import Step
+from clbench.learning.trainer import Trainer
 from clbench.records.record import Record
 from clbench.records.writer import write_record
 from clbench.runs.checkpoints import keep_stage, stage_policies
@@ -65,6 +68,40 @@ def test_checks_play_validation_episodes_until_their_outcome_is_certain(
         assert 3 <= last.successes <= last.episodes <= len(outcomes)
         assert sum(one.success for one in outcomes) >= 3
     evaluator.close()
+
+
+def test_a_check_plays_the_policy_that_a_method_of_whole_stages_would_leave(tmp_path: Path) -> None:
+    run = RunSpec(EAGER.id, "weight_interpolation", 0, {"coefficient": 0.7}, targets=1).resolve()
+    record = execute(run.spec, tmp_path / "records", checkpoints=tmp_path / "kept")
+    assert record.status == "success", record.error
+    last = record.check_rows()[-1]
+    assert last.successes >= 3
+    evaluator = Evaluator(run.scenario, seed=0)
+    merged = stage_policies(run, tmp_path / "kept")[1]
+    assert sum(one.success for one in evaluator.evaluate(merged, [run.scenario.target[0]])) >= 3
+    evaluator.close()
+
+
+def test_asking_for_the_policy_that_a_stage_would_leave_changes_nothing(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    run = RunSpec(EAGER.id, "buffered_replay", seed=0).resolve()
+    monkeypatch.setattr(run.method, "whole_stages", True)  # its `end_task` draws from the target
+    left = []
+    for asks in (False, True):
+        trainer = Trainer.open(run.scenario, run.new_method, 0, "cpu")
+        trainer.prepare()
+
+        def after(step: Step, trainer: Trainer = trainer, asks: bool = asks) -> bool:
+            if asks:
+                trainer.finished()
+            return step.done == 20
+
+        trainer.learn(1, after)
+        left.append((trainer.policy.state_dict(), trainer.state(1)))
+    for one, other in zip(*left, strict=True):
+        assert one.keys() == other.keys()
+        assert all(torch.equal(one[name], other[name]) for name in one)
 
 
 @pytest.mark.parametrize(("share", "stage"), [(0.6, 1), (0.8, 2)])
