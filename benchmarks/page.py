@@ -39,21 +39,21 @@ def main() -> None:
         parser.add_argument(f"--{name}", type=int, default=count)
     parser.add_argument("--output", type=Path, help="where to keep the page")
     arguments = parser.parse_args()
-    read_table = resolve("clbench.leaderboard.board.rows:read_table")
-    page, pictures = (resolve(f"clbench.leaderboard.views.page:{name}") for name in ("page", "pictures"))
+    compute_board = resolve("clbench.leaderboard.board.rows:compute_board")
+    page, pictures = (resolve(f"clbench.leaderboard.views.page.html:{name}") for name in ("page", "pictures"))
     with tempfile.TemporaryDirectory() as folder:
         records = Path(folder) / "leaderboard" / "records"
         make_records(records, arguments.methods, arguments.seeds, arguments.scenarios)
         begin = time.monotonic(), time.process_time()
-        table = read_table(records)
+        board = compute_board(records)
         read = time.monotonic(), time.process_time()
-        text = page(table)
-        pictures(table)
+        text = page(board, {})
+        pictures(board)
         end = time.monotonic(), time.process_time()
     if arguments.output:
         arguments.output.write_text(text, encoding="utf-8")
-    print(f"{len(table.rows)} rows, {len(text.encode()) / 1e6:.2f} MB")
-    for part, first, last in (("table", begin, read), ("page and pictures", read, end), ("all", begin, end)):
+    print(f"{len(board.rows)} rows, {len(text.encode()) / 1e6:.2f} MB")
+    for part, first, last in (("board", begin, read), ("page and pictures", read, end), ("all", begin, end)):
         wall, processor = (late - early for early, late in zip(first, last, strict=True))
         print(f"{part}: {wall:.1f} s, {processor:.1f} s of processor time")
 

@@ -32,10 +32,10 @@ from clbench.records.paths import RECORDS, record_path
 from clbench.spec.identifiers import scenario_ids
 from clbench.spec.protocol import DEFAULT_SEEDS
 
-from .board.places import CONTROLS, SCENARIO
+from .board.paths import CONTROLS, SCENARIO
 
 if TYPE_CHECKING:
-    from .board.rows import Table
+    from .board.rows import Board
     from .board.summary import Summary
     from .claims.evidence import Evidence
 
@@ -84,15 +84,15 @@ def show(
         raise SystemExit(2)
     inputs = inputs_of(records)
     board = read_unchanged(records, inputs)
-    table = None
+    computed = None
     if board is None:
-        board = table = _computed(records)
+        board = computed = _computed(records)
     with checked_input():
         shown = _chosen(board, scenario, records)
     if as_json:
         print_json([dict(zip(column_names(), values_of(row), strict=True)) for row in shown.rows])
         return
-    written = [] if table is None else write_site(table, records, inputs)
+    written = [] if computed is None else write_site(computed, records, inputs)
     console = Console()
     console.print(terminal(shown, console.width, sort))
     if written:
@@ -101,12 +101,12 @@ def show(
         console.print(Text(f"Unchanged: {site_of(records)}"), soft_wrap=True)
 
 
-def _computed(records: Path) -> Table:
-    """Return the table of the records; a spinner shows that it takes time."""
-    from .board.rows import read_table
+def _computed(records: Path) -> Board:
+    """Return the board of the records; a spinner shows that it takes time."""
+    from .board.rows import compute_board
 
     with Console(stderr=True).status("Computing the board and its intervals"):
-        return read_table(records)
+        return compute_board(records)
 
 
 def _chosen(board: Summary, scenario: str | None, records: Path) -> Summary:
@@ -166,7 +166,7 @@ def submit(
     check_names([scenario], [method])
     from clbench.runs.spec import RunSpec, check_device
 
-    from .board.rows import read_table
+    from .board.rows import compute_board
     from .publishing import inputs_of, write_site
     from .submission.submit import placement, run_submission
 
@@ -181,9 +181,9 @@ def submit(
         raise SystemExit(1)
     if records.is_dir():
         inputs = inputs_of(records)
-        table = read_table(records)
-        _print_written(write_site(table, records, inputs))
-        lines = placement(table, runs[0], records)
+        board = compute_board(records)
+        _print_written(write_site(board, records, inputs))
+        lines = placement(board, runs[0], records)
         Console().print(Text("\n".join(lines)), soft_wrap=True)
     if not went_well:
         raise SystemExit(1)
@@ -329,9 +329,9 @@ def findings(
     from .pages.findings import page, pictures, sections
     from .views.format import write_all
 
-    table = _table(records)
-    found = sections(table, judge_all(_evidence(None, records, controls)))
-    drawn = {output.parent / "findings" / name: svg for name, svg in pictures(table).items()}
+    board = _board(records)
+    found = sections(board, judge_all(_evidence(None, records, controls)))
+    drawn = {output.parent / "findings" / name: svg for name, svg in pictures(board).items()}
     _print_written(write_all({output: page(found), **drawn}))
 
 
@@ -356,7 +356,7 @@ def method_pages(
     from .views.format import write_if_changed
 
     evidence = _evidence(scenario, records, controls)
-    sources = Sources(evidence(scenario), judge_all(evidence), _table(records).rows)
+    sources = Sources(evidence(scenario), judge_all(evidence), _board(records).rows)
     texts = pages(built_in_methods(), sources)
     output.mkdir(parents=True, exist_ok=True)
     for name, text in texts.items():
@@ -389,7 +389,7 @@ def scenario_card(
 
     add_cwd_to_path()
     with checked_input():
-        board = _table(records)
+        board = _board(records)
         names = scenarios or [
             name
             for name in scenario_ids()
@@ -421,11 +421,11 @@ def _evidence(scenario: str | None, records: Path, controls: Path) -> Callable[[
     return evidence
 
 
-def _table(records: Path) -> Table:
-    """Return the table of the records, an empty one if there is no folder."""
-    from .board.rows import Table, read_table
+def _board(records: Path) -> Board:
+    """Return the board of the records, an empty one if there is no folder."""
+    from .board.rows import Board, compute_board
 
-    return read_table(records) if records.is_dir() else Table()
+    return compute_board(records) if records.is_dir() else Board()
 
 
 def _write(path: Path, text: str) -> None:

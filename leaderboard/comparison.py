@@ -15,7 +15,7 @@ from clbench.spec.policies import DEFAULT_POLICY
 from clbench.spec.protocol import DEFAULT_SEEDS
 from clbench.spec.references import BASELINE
 
-from .board.rows import read_table
+from .board.rows import compute_board
 from .table import frame_of
 
 if TYPE_CHECKING:
@@ -69,9 +69,9 @@ def compare(
         for one in firsts
         for number in range(seeds)
     }
-    table = read_table(Path(records), places)
-    absent = set(names) - {row.method for row in table.rows}
+    board = compute_board(Path(records), places)
+    absent = set(names) - {row.method for row in board.rows}
     if absent:
-        reasons = " ".join(f"{one.path}: {one.reason}" for one in table.not_shown)
+        reasons = " ".join(f"{one.path}: {one.reason}" for one in board.not_shown)
         raise InputError(f"No row for {', '.join(sorted(absent))}. {reasons}")
-    return frame_of(table)
+    return frame_of(board)

@@ -22,14 +22,14 @@ from clbench.records.pinned import pinned_file
 from clbench.spec.identifiers import installed_methods
 
 from .board.frontier import ladder_of
-from .board.places import CARDS, FILM
+from .board.paths import CARDS, FILM
 from .board.summary import Summary
 from .policies.decoders import RESULTS
 from .views.csv import csv_text
 from .views.format import write_all
 
 if TYPE_CHECKING:
-    from .board.rows import Table
+    from .board.rows import Board
 
 PUBLISHED = Path(__file__).parent / "records"
 """Folder of the records that come with clbench."""
@@ -117,27 +117,27 @@ def read_board(records: Path) -> Summary:
     Raises:
         NoRecordsError: The folder does not exist.
     """
-    from .board.rows import read_table
+    from .board.rows import compute_board
 
-    return read_unchanged(records, inputs_of(records)) or read_table(records)
+    return read_unchanged(records, inputs_of(records)) or compute_board(records)
 
 
-def write_site(table: Table, records: Path, inputs: dict[str, str]) -> list[Path]:
-    """Write every form of the table to the folder of the board, and return the paths."""
+def write_site(board: Board, records: Path, inputs: dict[str, str]) -> list[Path]:
+    """Write every form of the board to the folder of the board, and return the paths."""
     # They load the charts, SciPy and PyTorch: 3 s.
     from .policies.compared import by_table
     from .views import page as web_page
     from .views.markdown import markdown
 
-    comparisons = by_table(table.rows)
+    comparisons = by_table(board.rows)
     texts = {
-        "LEADERBOARD.md": markdown(table, comparisons),
-        "leaderboard.csv": csv_text(table),
-        "index.html": web_page.page(table, comparisons),
-        **web_page.pictures(table),
+        "LEADERBOARD.md": markdown(board, comparisons),
+        "leaderboard.csv": csv_text(board),
+        "index.html": web_page.page(board, comparisons),
+        **web_page.pictures(board),
     }
     files = {name: _text_hash(text.encode()) for name, text in texts.items()}
-    kept = {"made_from": inputs, "files": files, "board": table.to_json()}
+    kept = {"made_from": inputs, "files": files, "board": board.to_json()}
     texts[NUMBERS] = json.dumps({**kept, "content": content_hash(kept)}, indent=1) + "\n"
     site = site_of(records)
     sweep(site)

@@ -11,7 +11,7 @@ from clbench.jobs import work
 from clbench.jobs.job import Job
 from clbench.jobs.recorded import has_record
 from clbench.learning.pretraining import is_pretrained, vision_steps
-from clbench.records.paths import place_of
+from clbench.records.paths import table_name
 from clbench.runs.length import point_length, run_length, training_length, watching_length
 from clbench.runs.spec import ResolvedRun
 from clbench.runs.start import is_evaluated
@@ -159,7 +159,7 @@ class Plan:
             self._question_job(name, scenario),
             *self.add_demonstrations(name, scenario, scenario.pretrained),
         )
-        title = _title(place_of(name, scenario.policy), f"pretraining seed {seed}")
+        title = _title(table_name(name, scenario.policy), f"pretraining seed {seed}")
         arguments = {"scenario": name, "policy": scenario.policy, "seed": seed}
         return Job(title, work.pretrain, arguments, steps, needs)
 
@@ -214,7 +214,7 @@ def _pace(run: ResolvedRun) -> float:
 
 
 def _place(run: ResolvedRun) -> str:
-    return place_of(run.spec.scenario, run.spec.policy)
+    return table_name(run.spec.scenario, run.spec.policy)
 
 
 def _title(name: str, text: str) -> str:

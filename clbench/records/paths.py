@@ -36,7 +36,7 @@ def label_of(method: str, changes: Mapping[str, Any]) -> str:
     return "+".join([method, *(f"{name}={value}" for name, value in sorted(changes.items()))])
 
 
-def place_of(scenario: str, policy: str) -> str:
+def table_name(scenario: str, policy: str) -> str:
     """Return the name of a run's table: the scenario, with the kind of policy if it is not the usual one.
 
     Example: "clbench/Fetch-v1+discrete_diffusion". Policies of different kinds never share a table.
@@ -48,9 +48,9 @@ def place_of(scenario: str, policy: str) -> str:
     return scenario if policy == DEFAULT_POLICY else f"{scenario}+{policy}"
 
 
-def parts_of(place: str) -> tuple[str, str]:
-    """Return the scenario and the kind of policy of a table's name, see `place_of`."""
-    scenario, _, policy = place.partition("+")
+def table_parts(table: str) -> tuple[str, str]:
+    """Return the scenario and the kind of policy of a table's name, see `table_name`."""
+    scenario, _, policy = table.partition("+")
     return scenario, policy or DEFAULT_POLICY
 
 
@@ -71,7 +71,7 @@ def record_name(scenario: str, label: str, seed: int, order: int = 0, policy: st
     check_policy_name(policy)
     check_label(label)
     name = f"seed-{seed}-order-{order}.json" if order else f"seed-{seed}.json"
-    return Path(folder_name(place_of(scenario, policy)), folder_name(label), name)
+    return Path(folder_name(table_name(scenario, policy)), folder_name(label), name)
 
 
 def record_path(

@@ -8,11 +8,11 @@ from itertools import groupby
 from pathlib import Path
 
 from clbench.base.text import printable
-from clbench.records.paths import RECORDS, parts_of
+from clbench.records.paths import RECORDS, table_parts
 from clbench.spec.policies import DEFAULT_POLICY
 
 from .frontier import FACTOR
-from .places import CONTROLS, LADDER
+from .paths import CONTROLS, LADDER
 from .runs import Run
 
 
@@ -43,7 +43,7 @@ def commands_of(runs: Iterable[Run]) -> list[str]:
     lines = []
     for (device, perturb), members in groupby(runs, key=_how):
         same = list(members)
-        scenario, policy = parts_of(same[0].place)
+        scenario, policy = table_parts(same[0].table)
         for first, count in _in_a_row([run.seed for run in same]):
             words = ["clbench", "run", scenario, same[0].method, "--seeds", str(count)]
             words += [] if policy == DEFAULT_POLICY else ["--policy", policy]

@@ -18,7 +18,7 @@ from clbench.runs.tuning import rated_best, tuned
 from clbench.scoring.intervals import Estimate, Runs, estimate, row_generator
 from clbench.spec.references import BASELINE
 
-from .places import LADDER
+from .paths import LADDER
 from .runs import ALIKE, Run, Sifted, is_number, no_row, read_run, read_runs
 from .summary import DIVISIONS, GAIN
 
@@ -71,7 +71,7 @@ def read_ladder(folder: Path) -> Sifted:
     Their paths begin with the folder's name. A missing folder counts as empty.
     """
     runs, refused = read_runs(folder, partial(read_run, changed=True), (*ALIKE, on_the_ladder))
-    runs.sort(key=lambda run: run.place)
+    runs.sort(key=lambda run: run.table)
     return runs, [dataclasses.replace(one, path=f"{folder.name}/{one.path}") for one in refused]
 
 
@@ -80,8 +80,8 @@ def frontiers_of(ladder: Sequence[Run]) -> dict[str, tuple[Curve, ...]]:
 
     A scenario with one learning rate has no curves: its runs are for the claims.
     """
-    by_place = {place: list(members) for place, members in groupby(ladder, lambda run: run.place)}
-    return {place: _curves(members) for place, members in by_place.items() if _is_ladder(members)}
+    by_table = {table: list(members) for table, members in groupby(ladder, lambda run: run.table)}
+    return {table: _curves(members) for table, members in by_table.items() if _is_ladder(members)}
 
 
 def _is_ladder(runs: Sequence[Run]) -> bool:
@@ -130,7 +130,7 @@ def _rungs(runs: Sequence[Run]) -> tuple[Rung, ...]:
 
 
 def _rung(factor: float, runs: Sequence[Run]) -> Rung:
-    generator = row_generator(runs[0].place, runs[0].method)
+    generator = row_generator(runs[0].table, runs[0].method)
     found = estimate((LEARNED, KEPT), {run.seed: run.scores for run in runs}, generator)
     return Rung(factor, found[LEARNED], found[KEPT], tuple(run.seed for run in runs))
 
@@ -172,7 +172,7 @@ def tied_gains(
     """
     found = tuned(scenario).get(BASELINE)
     factors = [one.settings[FACTOR] for one in rated_best(found.tried)[1:]] if found else []
-    runs = [run for run in ladder if run.place == scenario and run.record.run.method == BASELINE]
+    runs = [run for run in ladder if run.table == scenario and run.record.run.method == BASELINE]
     tied = {
         factor: {run.seed: run.scores for run in runs if run.record.run.changes == {FACTOR: factor}}
         for factor in factors

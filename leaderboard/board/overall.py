@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
-from clbench.records.paths import parts_of
+from clbench.records.paths import table_parts
 from clbench.scoring.intervals import Estimate
 from clbench.scoring.metrics import METRICS
 from clbench.spec.policies import DEFAULT_POLICY
@@ -39,7 +39,7 @@ def overall(rows: Iterable[RowSummary]) -> tuple[OverallRow, ...]:
     """
     by_method: dict[tuple[str, str], dict[str, RowSummary]] = {}
     for row in rows:
-        if parts_of(row.scenario)[1] != DEFAULT_POLICY:
+        if table_parts(row.scenario)[1] != DEFAULT_POLICY:
             continue
         by_method.setdefault((row.division, row.method), {})[row.scenario] = row
     scenarios = {scenario for found in by_method.values() for scenario in found}

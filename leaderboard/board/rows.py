@@ -58,7 +58,7 @@ class Row(RowSummary):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Table(Summary):
+class Board(Summary):
     """Everything that the leaderboard shows."""
 
     scenarios: Mapping[str, ScenarioInfo] = field(default_factory=dict)
@@ -71,8 +71,8 @@ class Table(Summary):
     method; of a scenario without such a setting, none."""
 
 
-def read_table(records: Path, only: Container[str] | None = None) -> Table:
-    """Return the table of the records anywhere below the folder `records`.
+def compute_board(records: Path, only: Container[str] | None = None) -> Board:
+    """Return the board of the records anywhere below the folder `records`.
 
     Args:
         records: Folder of the records.
@@ -84,13 +84,13 @@ def read_table(records: Path, only: Container[str] | None = None) -> Table:
     check_folder(records)
     runs, not_shown = read_runs(records, read_run, ALIKE, only)
     runs, alone = _beside_rows(runs)
-    by_place = groupby(sorted(runs, key=lambda run: run.place), key=lambda run: run.place)
-    found = [_scenario_rows(list(members)) for _, members in by_place]
+    by_table = groupby(sorted(runs, key=lambda run: run.table), key=lambda run: run.table)
+    found = [_scenario_rows(list(members)) for _, members in by_table]
     found.sort(key=lambda rows: not rows[0].to_criterion)  # stages to a criterion first
     by_name = {rows[0].scenario: rows for rows in found}
     ladder, without = read_ladder(ladder_of(records)) if only is None else ([], [])
-    return Table(
-        scenarios={run.place: run.published for run in runs},
+    return Board(
+        scenarios={run.table: run.published for run in runs},
         rows=tuple(chain.from_iterable(found)),
         starts={name: pretrained_success(rows) for name, rows in by_name.items()},
         agreements={name: agreement(rows) for name, rows in by_name.items()},
@@ -107,9 +107,9 @@ def _rivals(rows: Iterable[Row]) -> dict[str, Runs]:
 
 def _beside_rows(runs: list[Run]) -> Sifted:
     """Keep the runs of methods that have a row: one with the targets in the published order."""
-    with_row = {(run.place, run.method) for run in runs if not run.order}
-    kept = [run for run in runs if (run.place, run.method) in with_row]
-    alone = [run for run in runs if (run.place, run.method) not in with_row]
+    with_row = {(run.table, run.method) for run in runs if not run.order}
+    kept = [run for run in runs if (run.table, run.method) in with_row]
+    alone = [run for run in runs if (run.table, run.method) not in with_row]
     reason = "its method has no run with the targets in the published order, of which rows are made."
     return kept, [no_row(run.path, reason) for run in alone]
 
@@ -157,7 +157,7 @@ def _row(
     first = members[0]
     orders = orders_of(run for run in runs if run.method == method)
     return Row(
-        scenario=first.place,
+        scenario=first.table,
         method=method,
         division=first.division,
         groups=letters,
@@ -167,7 +167,7 @@ def _row(
         estimates=estimates,
         costs=costs_of(members, by_method.get(BASELINE, [])),
         order_sensitivity=orders.sensitivity,
-        tried=_tried(first.place, method),
+        tried=_tried(first.table, method),
         runs=tuple(members),
         orders=orders,
         height=height,
@@ -239,7 +239,7 @@ def _estimates(method: str, by_method: Mapping[str, list[Run]]) -> dict[str, Est
         for name, them in by_method.items()
         if runs[0].division not in ELSEWHERE and (name != method or name not in never_itself)
     }
-    generator = row_generator(runs[0].place, method)
+    generator = row_generator(runs[0].table, method)
     return estimate(METRICS, _scores(runs), generator, references=references)
 
 

@@ -13,7 +13,7 @@ from typing import Any
 
 from clbench.base.errors import ClbenchError
 from clbench.base.text import printable
-from clbench.records.paths import label_of, place_of, record_name
+from clbench.records.paths import label_of, record_name, table_name
 from clbench.records.pinned import LATER, other_parts, pinned
 from clbench.records.reader import RecordError, read_record
 from clbench.records.record import Record, RunInfo, ScenarioInfo
@@ -43,8 +43,8 @@ class Run:
     """The record."""
     scores: Scores
     """Scores of the record."""
-    place: str
-    """Table that it belongs to: the scenario, and the kind of policy if it is another; see `place_of`."""
+    table: str
+    """Board that it belongs to: the scenario, and the kind of policy if it is another; see `table_name`."""
     method: str
     """The method with its changed hyper-parameters, see `label_of`."""
     seed: int
@@ -139,7 +139,7 @@ def read_run(folder: Path, path: Path, changed: bool | None = False) -> Run:
         name,
         record,
         scores,
-        place_of(run.scenario, run.policy),
+        table_name(run.scenario, run.policy),
         label,
         run.seed,
         division,
@@ -257,7 +257,7 @@ def same_scenario(runs: list[Run]) -> Sifted:
             fields = [f"budget ({', '.join(differences(ours, theirs))})"]
         return f"its scenario does not match most records: {', '.join(fields)} differ."
 
-    return _most(runs, lambda run: run.place, lambda run: _text(vars(run.published)), reason)
+    return _most(runs, lambda run: run.table, lambda run: _text(vars(run.published)), reason)
 
 
 def same_simulator(runs: list[Run]) -> Sifted:
@@ -270,7 +270,7 @@ def same_simulator(runs: list[Run]) -> Sifted:
         worlds = ", ".join(differences(rollouts(run), rollouts(other)))
         return f"its simulator does not match most records: the rollouts of {worlds or 'all worlds'} differ."
 
-    return _most(runs, lambda run: run.place, lambda run: _text(rollouts(run)), reason)
+    return _most(runs, lambda run: run.table, lambda run: _text(rollouts(run)), reason)
 
 
 def same_definition(runs: list[Run]) -> Sifted:
@@ -307,7 +307,7 @@ def _same_parts(runs: list[Run], later: bool) -> Sifted:
         return f"its scenario is not that of most records: {names} differ."
 
     told = [run for run in runs if parts(run) is not None]
-    kept, refused = _most(told, lambda run: run.place, lambda run: _text(parts(run)), reason)
+    kept, refused = _most(told, lambda run: run.table, lambda run: _text(parts(run)), reason)
     return [*kept, *(run for run in runs if parts(run) is None)], refused
 
 
@@ -325,7 +325,7 @@ def same_layout(runs: list[Run]) -> Sifted:
         fields = differences(vars(layout(run)), vars(layout(other)))
         return f"it was not evaluated like most records: {', '.join(fields)} differ."
 
-    return _most(runs, lambda run: run.place, layout, reason)
+    return _most(runs, lambda run: run.table, layout, reason)
 
 
 def same_settings(runs: list[Run]) -> Sifted:
@@ -342,7 +342,7 @@ def same_settings(runs: list[Run]) -> Sifted:
         fields = [name for one, another in both for name in differences(one, another)]
         return f"its settings do not match most seeds: {', '.join(fields)} differ."
 
-    return _most(runs, lambda run: (run.place, run.method), lambda run: _text(parts(run)), reason)
+    return _most(runs, lambda run: (run.table, run.method), lambda run: _text(parts(run)), reason)
 
 
 ALIKE: tuple[Sift, ...] = (same_scenario, same_definition, same_simulator, same_layout, same_settings)

@@ -277,7 +277,7 @@ def read_evidence(records: Path, controls: Path) -> Callable[[str], Evidence]:
     def on(scenario: str) -> Evidence:
         runs: dict[str, dict[int, Run]] = {}
         for label, run in labelled:
-            if run.place == scenario and run.scores.layout.target and not run.order:
+            if run.table == scenario and run.scores.layout.target and not run.order:
                 runs.setdefault(label, {})[run.seed] = run
         ordered = {label: dict(sorted(seeds.items())) for label, seeds in sorted(runs.items())}
         return Evidence(scenario, ordered, not_used)
@@ -292,7 +292,7 @@ def rung(method: str, factor: float) -> str:
 
 def _like(scored: Sequence[Run]) -> Sift:
     """Return the sift that keeps runs that were made and evaluated like the board's."""
-    examples = {run.place: run for run in scored}
+    examples = {run.table: run for run in scored}
 
     def traits(run: Run) -> dict[str, Any]:
         return {
@@ -304,7 +304,7 @@ def _like(scored: Sequence[Run]) -> Sift:
     def sift(runs: list[Run]) -> Sifted:
         kept, refused = [], []
         for run in runs:
-            example = examples.get(run.place, run)
+            example = examples.get(run.table, run)
             fields = differences(traits(run), traits(example))
             if fields:
                 reason = f"it cannot be compared with the board: {', '.join(fields)} differ."

@@ -14,14 +14,14 @@ from pathlib import Path
 import numpy as np
 
 from clbench.base.text import counted
-from clbench.records.paths import parts_of
+from clbench.records.paths import table_parts
 from clbench.scoring.intervals import Estimate
 from clbench.spec.policies import DEFAULT_POLICY
 from clbench.spec.references import BASELINE, FROZEN
 
 from ..board.frontier import Curve, TiedGain, is_certain_over
 from ..board.predictors import predictions
-from ..board.rows import Row, Table, apart_from_baseline
+from ..board.rows import Board, Row, apart_from_baseline
 from ..board.summary import METHODS, WITHOUT_DEMONSTRATIONS, tables_of
 from ..claims.claim import PREDICATES, Verdict, tally
 from ..claims.judges import Judged
@@ -59,44 +59,46 @@ def page(found: Sequence[Section]) -> str:
     return template.render(sections=found)
 
 
-def pictures(table: Table) -> dict[str, str]:
+def pictures(board: Board) -> dict[str, str]:
     """Return the pictures as SVG, for a light and a dark page, by the names of their files."""
-    rows = {name: competing(rows) for name, rows in _boards(table).items()}
+    rows = {name: competing(rows) for name, rows in _boards(board).items()}
     if not any(rows.values()):
         return {}
     chart = gains_chart(rows)
     return {f"gains{'-dark' if dark else ''}.svg": themed(chart, dark).svg() for dark in (False, True)}
 
 
-def sections(table: Table, judged: Sequence[Judged]) -> list[Section]:
+def sections(board: Board, judged: Sequence[Judged]) -> list[Section]:
     """Return the sections that the records can fill, at least in part."""
-    boards = _boards(table)
+    boards = _boards(board)
     found = (
-        _gains(boards, table.tied),
+        _gains(boards, board.tied),
         _replay(boards),
-        _learning_rates(table),
+        _learning_rates(board),
         Section("Is a lost skill gone?", tuple(relearning_sentences(boards))),
         _claims(judged),
         Section(
             "Do seeds, scenarios and definitions order the methods alike?",
-            tuple(order_sentences(table, boards)),
+            tuple(order_sentences(board, boards)),
         ),
         _predictors(boards),
-        _knowledge(_usual(table)),
-        _policies(table),
+        _knowledge(_usual(board)),
+        _policies(board),
         _undecided(judged),
     )
     return [section for section in found if section.answers]
 
 
-def _boards(table: Table) -> dict[str, list[Row]]:
+def _boards(board: Board) -> dict[str, list[Row]]:
     """Return the rows of each scenario at equal learning, with the usual policy."""
-    return {name: rows for name, rows in _usual(table).items() if rows[0].to_criterion}
+    return {name: rows for name, rows in _usual(board).items() if rows[0].to_criterion}
 
 
-def _usual(table: Table) -> dict[str, list[Row]]:
+def _usual(board: Board) -> dict[str, list[Row]]:
     """Return the rows of each scenario with the usual policy."""
-    return {name: rows for name, rows in tables_of(table.rows).items() if parts_of(name)[1] == DEFAULT_POLICY}
+    return {
+        name: rows for name, rows in tables_of(board.rows).items() if table_parts(name)[1] == DEFAULT_POLICY
+    }
 
 
 def competing(rows: Iterable[Row]) -> list[Row]:
@@ -232,10 +234,10 @@ def _steps(row: Row) -> Estimate:
     return row.estimates["steps_to_criterion"]
 
 
-def _learning_rates(table: Table) -> Section:
+def _learning_rates(board: Board) -> Section:
     """How much a smaller learning rate does alone."""
     answers, lines = [], []
-    for name, curves in table.frontiers.items():
+    for name, curves in board.frontiers.items():
         for curve in curves:
             lines += [
                 (
@@ -250,7 +252,7 @@ def _learning_rates(table: Table) -> Section:
             if curve.is_baseline:
                 answers.append(_of_the_baseline(name, curve))
                 answers += _at_the_first_rung(name, curve, curves)
-        answers += _of_frozen(name, _usual(table).get(name, []))
+        answers += _of_frozen(name, _usual(board).get(name, []))
     head = ("scenario", "method", "factor", "learned", "kept")
     return Section("How much does a smaller learning rate do alone?", tuple(answers), head, tuple(lines))
 
@@ -360,11 +362,11 @@ def _knowledge(boards: dict[str, list[Row]]) -> Section:
     return Section("Are skills and knowledge lost together?", tuple(answers))
 
 
-def _policies(table: Table) -> Section:
+def _policies(board: Board) -> Section:
     """Whether forgetting depends on the policy: its action head, or its size."""
     answers, lines = [], []
-    for name, comparisons in by_table(table.rows).items():
-        scenario, policy = parts_of(name)
+    for name, comparisons in by_table(board.rows).items():
+        scenario, policy = table_parts(name)
         for one in comparisons:
             three = map(format_interval, one.estimates[FORGOTTEN_BY])
             lines.append((scenario, one.method, policy, *three, str(one.seeds)))

@@ -11,19 +11,19 @@ from clbench.base.text import counted
 from clbench.scoring.metrics import load_metric
 
 from ..board.agreement import Agreement, Concordance, agreement_between
-from ..board.rows import Row, Table, agreement, values_by_seed
+from ..board.rows import Board, Row, agreement, values_by_seed
 from ..board.summary import RANKED_BY, WITHOUT_DEMONSTRATIONS
 from ..views.format import concordance_text, tau_text, title_of
 
 
-def order_sentences(table: Table, boards: Mapping[str, list[Row]]) -> Iterator[str]:
+def order_sentences(board: Board, boards: Mapping[str, list[Row]]) -> Iterator[str]:
     """Yield whether seeds, scenarios and definitions order the methods alike.
 
     Args:
-        table: The table of the records.
+        board: The board of the records.
         boards: Rows of each scenario at a common criterion.
     """
-    for name, found in table.agreements.items():
+    for name, found in board.agreements.items():
         if found is not None and name in boards:
             yield f"On {name}, {_seeds_order(found)}."
             without = [row for row in boards[name] if row.division in WITHOUT_DEMONSTRATIONS]

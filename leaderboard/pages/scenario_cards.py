@@ -29,7 +29,7 @@ from clbench.spec.references import COMPARED
 from clbench.spec.scenario import Scenario
 
 from ..board.commands import run_command
-from ..board.rows import Row, Table
+from ..board.rows import Board, Row
 from ..board.runs import differences
 from ..board.summary import METHODS, RANKED_BY
 from ..views.format import MISSING
@@ -100,7 +100,7 @@ class Card:
 
     scenario: Scenario
     """Scenario in the code."""
-    board: Table
+    board: Board
     """Board of the records."""
     experts: Experts
     """Measured success of the experts."""

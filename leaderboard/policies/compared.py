@@ -8,7 +8,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from clbench.records.paths import parts_of
+from clbench.records.paths import table_parts
 from clbench.scoring.intervals import Estimate, estimate, paired_difference, row_generator
 from clbench.spec.policies import DEFAULT_POLICY
 
@@ -51,7 +51,7 @@ def by_table(rows: Sequence[Row]) -> Comparisons:
     return {
         name: compare_policies(tables.get(scenario, ()), members)
         for name, members in tables.items()
-        for scenario, policy in (parts_of(name),)
+        for scenario, policy in (table_parts(name),)
         if policy != DEFAULT_POLICY
     }
 

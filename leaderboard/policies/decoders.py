@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from clbench.base.strict_json import read_json
-from clbench.records.paths import place_of
+from clbench.records.paths import table_name
 from clbench.scoring.intervals import Estimate
 
 RESULTS = Path(__file__).parents[1] / "decoding.json"
@@ -52,9 +52,9 @@ class Decoding:
     forward of all tokens to one of a block (`forward`), both as ratios of time."""
 
     @property
-    def place(self) -> str:
+    def table(self) -> str:
         """Name of the table of the policy that was decoded."""
-        return place_of(self.scenario, "discrete_diffusion")
+        return table_name(self.scenario, "discrete_diffusion")
 
     @property
     def best_pipeline(self) -> Decoder:

@@ -12,13 +12,13 @@ from clbench.jobs.grid import run_missing
 from clbench.jobs.job import Job, JobError
 from clbench.jobs.processes import Processes
 from clbench.learning.registry import load_method
-from clbench.records.paths import place_of
+from clbench.records.paths import table_name
 from clbench.runs.spec import ResolvedRun
 from clbench.scoring.metrics import METRICS
 from clbench.testing import ContractError, check_method
 
 from ..board.commands import run_command
-from ..board.rows import Row, Table
+from ..board.rows import Board, Row
 from ..views.format import fitting, fitting_names, format_interval, standing_text
 
 CHECK_STEPS = 100.0
@@ -60,13 +60,13 @@ def check_job(method: str, progress: Callable[[float], None]) -> str:
     return "the method keeps the contract"
 
 
-def placement(table: Table, run: ResolvedRun, records: Path) -> list[str]:
+def placement(board: Board, run: ResolvedRun, records: Path) -> list[str]:
     """Return lines with the place of the method of `run` on the board, or why it has no row."""
-    scenario, method = place_of(run.scenario.id, run.spec.policy), run.spec.method
-    rows = [row for row in table.rows if row.scenario == scenario]
+    scenario, method = table_name(run.scenario.id, run.spec.policy), run.spec.method
+    rows = [row for row in board.rows if row.scenario == scenario]
     mine = [row for row in rows if row.method == method]
     folder = run.path(Path()).parent.as_posix()
-    refused = [entry for entry in table.not_shown if entry.path.startswith(f"{folder}/")]
+    refused = [entry for entry in board.not_shown if entry.path.startswith(f"{folder}/")]
     lines = [line for row in mine for line in _row_lines(row, rows, run.spec.scenario, records)]
     if not mine:
         lines.append(f"{method} has no row on the board of {scenario}.")

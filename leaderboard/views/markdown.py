@@ -15,12 +15,12 @@ from typing import Any
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 from clbench.base.text import counted, printable
-from clbench.records.paths import parts_of
+from clbench.records.paths import table_parts
 from clbench.scoring.intervals import Estimate
 from clbench.scoring.metric import Metric
 
 from ..board.overall import overall
-from ..board.rows import Row, Table
+from ..board.rows import Board, Row
 from ..board.summary import tables_of
 from ..policies.compared import Comparisons
 from ..policies.decoders import read_decoding
@@ -46,18 +46,18 @@ class Markdown(str):
     """Text that is Markdown already: templates do not escape it."""
 
 
-def markdown(table: Table, comparisons: Comparisons) -> str:
+def markdown(board: Board, comparisons: Comparisons) -> str:
     """Return the leaderboard as a page of Markdown.
 
     Args:
-        table: The table.
+        board: The board.
         comparisons: What `compared.by_table` says of its rows.
     """
     template = templates(Path(__file__).with_name("templates")).get_template("leaderboard.md.jinja")
-    averages = overall(table.rows)
-    by_scenario = tables_of(table.rows)
+    averages = overall(board.rows)
+    by_scenario = tables_of(board.rows)
     return template.render(
-        table=table,
+        board=board,
         averages=averages,
         by_scenario=by_scenario,
         shown=shown,
@@ -67,7 +67,7 @@ def markdown(table: Table, comparisons: Comparisons) -> str:
         column_title=column_title,
         decoding=read_decoding(),
         counted=counted,
-        policy_of=lambda place: parts_of(place)[1],
+        policy_of=lambda table: table_parts(table)[1],
         start_text=start_text,
         tiers_text=tiers_text,
         prediction_text=prediction_text,

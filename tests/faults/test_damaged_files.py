@@ -219,7 +219,7 @@ def board(tmp_path_factory: pytest.TempPathFactory) -> Path:
     records, spec = folder / "records", RunSpec(TOY, "frozen", 0)
     execute(spec, records)
     verify(spec.path(records), "recomputed", by="Ada")
-    publishing.write_site(rows.read_table(records), records, publishing.inputs_of(records))
+    publishing.write_site(rows.compute_board(records), records, publishing.inputs_of(records))
     return folder
 
 

@@ -78,7 +78,7 @@ def test_unchanged_records_show_the_same_board_without_being_read(
     def fail(_: Path) -> None:
         raise AssertionError("the records were read")
 
-    monkeypatch.setattr("clbench.leaderboard.board.rows.read_table", fail)
+    monkeypatch.setattr("clbench.leaderboard.board.rows.compute_board", fail)
     again, _, unchanged = shown()[0].partition("Unchanged: ")
     assert again == table
     assert "torn.json: cannot be read as JSON" in again

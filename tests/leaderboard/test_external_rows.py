@@ -17,7 +17,7 @@ from clbench.serving.score import score
 
 load = resolve("clbench:load_board")
 show = resolve("clbench.leaderboard.cli:show")
-read_table = resolve("clbench.leaderboard.board.rows:read_table")
+compute_board = resolve("clbench.leaderboard.board.rows:compute_board")
 tier_of = resolve("clbench.leaderboard.board.tiers:tier_of")
 verify = resolve("clbench.leaderboard.submission.verify:verify")
 Request = resolve("clbench.leaderboard.submission.verify:Request")
@@ -89,7 +89,7 @@ def test_a_record_that_also_claims_another_division_is_refused(
     path = tmp_path / RECORD
     path.parent.mkdir(parents=True)
     path.write_text(json.dumps(sealed(values)), encoding="utf-8")
-    table = read_table(tmp_path)
+    table = compute_board(tmp_path)
     assert not table.rows
     reason = "run: uses of a policy that was fine-tuned elsewhere must say nothing else."
     assert table.not_shown[0].reason == reason

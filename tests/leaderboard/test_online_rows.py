@@ -16,7 +16,7 @@ from clbench.runs.spec import RunSpec
 
 load = resolve("clbench:load_board")
 show = resolve("clbench.leaderboard.cli:show")
-read_table = resolve("clbench.leaderboard.board.rows:read_table")
+compute_board = resolve("clbench.leaderboard.board.rows:compute_board")
 tier_of = resolve("clbench.leaderboard.board.tiers:tier_of")
 verify = resolve("clbench.leaderboard.submission.verify:verify")
 Request = resolve("clbench.leaderboard.submission.verify:Request")
@@ -89,6 +89,6 @@ def test_a_record_that_claims_online_learning_and_prior_data_is_refused(
     path = tmp_path / "Toy-v0/me--knows/seed-0.json"
     path.parent.mkdir(parents=True)
     path.write_text(json.dumps(sealed(values)), encoding="utf-8")
-    table = read_table(tmp_path)
+    table = compute_board(tmp_path)
     assert not table.rows
     assert table.not_shown[0].reason == "run: uses of an agent that learned online must be of nothing else."

@@ -17,7 +17,7 @@ from helpers import unpacked
 
 import clbench
 from clbench.learning.registry import load_method, read_changes
-from clbench.records.paths import label_of, parts_of, place_of, record_name
+from clbench.records.paths import label_of, record_name, table_name, table_parts
 from clbench.records.reader import read_record
 from clbench.runs.tuning import tuned
 from clbench.scoring.scores import Scores
@@ -76,7 +76,7 @@ def test_the_records_are_those_of_make_records_and_runs_of_a_seed_share_their_pr
     trained = {path: record for path, record in every.items() if "online" not in record.run.uses}
     assert set(trained) == promised("records")
     records = list(trained.values())
-    tables = [place_of(record.run.scenario, record.run.policy) for record in records]
+    tables = [table_name(record.run.scenario, record.run.policy) for record in records]
     policies = {
         (table, record.run.seed, record.fingerprint["pretrained"])
         for table, record in zip(tables, records, strict=True)
@@ -121,7 +121,7 @@ def test_the_rows_of_methods_have_the_settings_that_tuning_chose(board: Any) -> 
     assert (competing["settings_tried"] == 6).all()
 
 
-@pytest.mark.parametrize("scenario", sorted({parts_of(path.name)[0] for path in RECORDS.glob("*")}))
+@pytest.mark.parametrize("scenario", sorted({table_parts(path.name)[0] for path in RECORDS.glob("*")}))
 def test_a_scenario_on_the_board_misses_no_bar(scenario: str) -> None:
     card = (RECORDS.parents[1] / "docs" / "reference" / "scenarios" / f"{scenario}.md").read_text()
     bars = card.partition("| bar |")[2].partition("\n\n")[0].splitlines()[2:]

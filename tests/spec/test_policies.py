@@ -5,7 +5,7 @@ import pytest
 from clbench.base.errors import UnknownNameError
 from clbench.learning.pretraining import policy_config
 from clbench.policy.kinds import new_policy
-from clbench.records.paths import parts_of, place_of, record_name
+from clbench.records.paths import record_name, table_name, table_parts
 from clbench.spec.policies import (
     POLICIES,
     check_policy_name,
@@ -72,7 +72,7 @@ def test_an_unknown_size_is_refused_with_the_nearest_one() -> None:
     ],
 )
 def test_each_policy_has_a_table_and_a_folder_of_its_own(name: str, folder: str) -> None:
-    assert parts_of(place_of("clbench/Toy-v0", name)) == ("clbench/Toy-v0", name)
+    assert table_parts(table_name("clbench/Toy-v0", name)) == ("clbench/Toy-v0", name)
     assert record_name("clbench/Toy-v0", "sft", 0, policy=name).parts == (folder, "sft", "seed-0.json")
 
 

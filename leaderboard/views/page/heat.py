@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
-from clbench.records.paths import parts_of
+from clbench.records.paths import table_parts
 from clbench.scoring.metrics import METRICS
 from clbench.spec.policies import DEFAULT_POLICY
 
@@ -53,13 +53,15 @@ def heat_maps(tables: Mapping[str, Sequence[Row]]) -> list[HeatMap]:
     Args:
         tables: Rows of each scenario and policy.
     """
-    policies = sorted({parts_of(name)[1] for name in tables}, key=lambda name: (name != DEFAULT_POLICY, name))
+    policies = sorted(
+        {table_parts(name)[1] for name in tables}, key=lambda name: (name != DEFAULT_POLICY, name)
+    )
     found = []
     for policy in policies:
         chosen = {
             name: {row.method: row for row in rows}
             for name, rows in tables.items()
-            if parts_of(name)[1] == policy and sum(row.division in METHODS for row in rows) > 1
+            if table_parts(name)[1] == policy and sum(row.division in METHODS for row in rows) > 1
         }
         if chosen:
             found.append(HeatMap(policy, tuple(chosen), tuple(_rows(chosen))))

@@ -1,4 +1,4 @@
-"""The page as HTML, and its pictures as SVG. The same table gives the same bytes."""
+"""The page as HTML, and its pictures as SVG. The same board gives the same bytes."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
 from clbench.base.text import counted
-from clbench.records.paths import parts_of
+from clbench.records.paths import table_parts
 from clbench.spec.identifiers import built_in_methods, folder_name
 
-from ...board.rows import Table
+from ...board.rows import Board
 from ...board.summary import DIVISIONS
 from ...board.tiers import TIERS
 from ...policies.compared import Comparisons
@@ -35,7 +35,7 @@ from .charts.plot import VEGA_LITE, on_paper
 from .charts.vega import FONT, PALETTE, SHAPES, in_theme
 from .heat import COLUMNS, heat_maps
 from .rows import MAIN, SHADES
-from .view import ScenarioView, scenarios, sorted_tables, title_of_place
+from .view import ScenarioView, scenarios, sorted_tables, table_title
 
 FOLDER = Path(__file__).parent
 """Folder of the templates, the style and the script."""
@@ -73,15 +73,15 @@ CIVIDIS = (
 same to colour-blind readers and rise in lightness, so that numbers on them are legible in both themes."""
 
 
-def page(table: Table, comparisons: Comparisons) -> str:
+def page(board: Board, comparisons: Comparisons) -> str:
     """Return the page.
 
     Args:
-        table: The table.
+        board: The board.
         comparisons: What `compared.by_table` says of its rows.
     """
-    tables = sorted_tables(table)
-    views = scenarios(tables, table, comparisons)
+    tables = sorted_tables(board)
+    views = scenarios(tables, board, comparisons)
     scripts = [_source("page.js"), _library()]  # the page waits for the library only to draw
     style = _source("style.css") + _colours()
     return (
@@ -94,19 +94,19 @@ def page(table: Table, comparisons: Comparisons) -> str:
             data=_packed(_data(views)),
             scenarios=views,
             heat_maps=heat_maps(tables),
-            not_shown=table.not_shown,
+            not_shown=board.not_shown,
         )
     )
 
 
-def pictures(table: Table) -> dict[str, str]:
+def pictures(board: Board) -> dict[str, str]:
     """Return the pictures by file name, each light and dark.
 
     They are the plane of the scenario with the most methods, and the frontier of each scenario that has one.
     """
-    rows = max(sorted_tables(table).values(), key=len, default=[])
+    rows = max(sorted_tables(board).values(), key=len, default=[])
     specs = {"pareto": plane(rows, WIDE)}
-    for scenario, curves in table.frontiers.items():
+    for scenario, curves in board.frontiers.items():
         specs[f"frontier-{folder_name(scenario)}"] = frontier(curves, WIDE_FRONTIER, FONT)
     found = {}
     for name, spec in specs.items():
@@ -132,7 +132,7 @@ def _templates() -> Environment:
         tiers=TIERS,
         tier_rules=TIER_RULES,
         title_of=title_of,
-        policy_of=lambda place: parts_of(place)[1],
+        policy_of=lambda table: table_parts(table)[1],
         counted=counted,
         format_interval=format_interval,
         number_text=number_text,
@@ -143,7 +143,7 @@ def _templates() -> Environment:
         up=UP,
         repository=REPOSITORY,
         method_page=_method_page,
-        title_of_place=title_of_place,
+        table_title=table_title,
         heat_columns=COLUMNS,
         divisions=list(enumerate(DIVISIONS)),
     )

@@ -11,7 +11,7 @@ import numpy as np
 
 from clbench.base.errors import InputError
 from clbench.base.text import printable
-from clbench.records.paths import label_of, place_of
+from clbench.records.paths import label_of, table_name
 from clbench.records.record import Record
 from clbench.scoring.intervals import Estimate, row_generator
 from clbench.scoring.layout import Layout
@@ -55,7 +55,7 @@ class Runs:
 
     @staticmethod
     def _place(record: Record) -> str:
-        return place_of(record.run.scenario, record.run.policy)
+        return table_name(record.run.scenario, record.run.policy)
 
     @cached_property
     def scores(self) -> list[Scores]:

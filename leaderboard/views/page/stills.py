@@ -7,41 +7,41 @@ import re
 from collections.abc import Iterable
 from pathlib import Path
 
-from clbench.records.paths import parts_of
+from clbench.records.paths import table_parts
 from clbench.spec.identifiers import folder_name
 from clbench.spec.policies import DEFAULT_POLICY
 
-from ...board.places import CARDS, FILM
+from ...board.paths import CARDS, FILM
 
 _SCENARIO = re.compile(r"clbench/[A-Za-z0-9_]+-v\d+")
 _NAME = re.compile(r"[A-Za-z0-9_]+")
 
 
-def stills(place: str, tasks: Iterable[str], cards: Path = CARDS) -> dict[str, str]:
+def stills(table: str, tasks: Iterable[str], cards: Path = CARDS) -> dict[str, str]:
     """Return the stills of the tasks that have one, as data addresses by task.
 
     Args:
-        place: Name of a table, of the project's own scenarios or of another one, which has none.
+        table: Name of a table, of the project's own scenarios or of another one, which has none.
         tasks: Names of its tasks; a stranger may have written them.
         cards: Folder of the cards.
     """
-    found = {task: _picture(place, f"{task}.webp", cards) for task in tasks if _NAME.fullmatch(task)}
+    found = {task: _picture(table, f"{task}.webp", cards) for task in tasks if _NAME.fullmatch(task)}
     return {task: still for task, still in found.items() if still}
 
 
-def film(place: str, cards: Path = CARDS) -> str | None:
+def film(table: str, cards: Path = CARDS) -> str | None:
     """Return the film of a scenario as a data address; None if there is none, or for another policy.
 
     Args:
-        place: Name of a table.
+        table: Name of a table.
         cards: Folder of the cards.
     """
-    return _picture(place, FILM, cards) if parts_of(place)[1] == DEFAULT_POLICY else None
+    return _picture(table, FILM, cards) if table_parts(table)[1] == DEFAULT_POLICY else None
 
 
-def _picture(place: str, name: str, cards: Path) -> str | None:
+def _picture(table: str, name: str, cards: Path) -> str | None:
     """Return a file of a scenario's card as a data address; None if there is no such file."""
-    scenario = parts_of(place)[0]
+    scenario = table_parts(table)[0]
     if not _SCENARIO.fullmatch(scenario):
         return None
     path = cards / folder_name(scenario) / name

@@ -7,14 +7,14 @@ from dataclasses import dataclass
 from functools import cached_property
 
 from clbench.base.text import counted, printable
-from clbench.records.paths import parts_of
+from clbench.records.paths import table_parts
 from clbench.scoring.metric import Metric
 from clbench.spec.policies import DEFAULT_POLICY
 from clbench.spec.references import BASELINE
 
 from ...board.frontier import Curve, TiedGain
-from ...board.places import SCENARIO
-from ...board.rows import Row, Table
+from ...board.paths import SCENARIO
+from ...board.rows import Board, Row
 from ...board.summary import DIVISIONS, ELSEWHERE, GAIN, METHODS, RANKED_BY, divisions_of, tables_of
 from ...board.tiers import TIERS
 from ...policies.compared import Comparison, Comparisons
@@ -61,7 +61,7 @@ class ScenarioView:
     @property
     def title(self) -> str:
         """Its short name."""
-        return title_of_place(self.id)
+        return table_title(self.id)
 
     @property
     def headline(self) -> str:
@@ -172,30 +172,30 @@ class ScenarioView:
         return [view for view in self.rows if view.row.division in METHODS]
 
 
-def title_of_place(place: str) -> str:
+def table_title(table: str) -> str:
     """Return the short name of a table: "Fetch-v1, discrete diffusion"."""
-    scenario, policy = parts_of(place)
+    scenario, policy = table_parts(table)
     name = printable(scenario.removeprefix("clbench/"))
     return name if policy == DEFAULT_POLICY else f"{name}, {printable(title_of(policy))}"
 
 
-def sorted_tables(table: Table) -> dict[str, list[Row]]:
+def sorted_tables(board: Board) -> dict[str, list[Row]]:
     """Return the rows by the name of their table: the main scenario first, then stages to a criterion."""
-    found = tables_of(table.rows)
+    found = tables_of(board.rows)
 
     def place(name: str) -> tuple[bool, bool, int, str]:
         competing = sum(row.division in METHODS for row in found[name])
-        return parts_of(name)[0] != SCENARIO, not found[name][0].to_criterion, -competing, name
+        return table_parts(name)[0] != SCENARIO, not found[name][0].to_criterion, -competing, name
 
     return {name: found[name] for name in sorted(found, key=place)}
 
 
-def scenarios(tables: Mapping[str, list[Row]], table: Table, comparisons: Comparisons) -> list[ScenarioView]:
+def scenarios(tables: Mapping[str, list[Row]], board: Board, comparisons: Comparisons) -> list[ScenarioView]:
     """Return the view of each scenario.
 
     Args:
         tables: Rows of each scenario, in the order of the result.
-        table: The table that they are from.
+        board: The board that they are from.
         comparisons: What `compared.by_table` says of its rows.
     """
     found = []
@@ -215,12 +215,12 @@ def scenarios(tables: Mapping[str, list[Row]], table: Table, comparisons: Compar
                 layout.steps,
                 tuple(views),
                 tuple(families(competing)) if len(competing) >= FEWEST else (),
-                table.frontiers.get(scenario, ()),
-                table.tied.get(scenario, {}),
-                start_text(table.starts.get(scenario)),
-                agreement_text(table.agreements.get(scenario)),
+                board.frontiers.get(scenario, ()),
+                board.tied.get(scenario, {}),
+                start_text(board.starts.get(scenario)),
+                agreement_text(board.agreements.get(scenario)),
                 comparisons.get(scenario, ()),
-                decoding if decoding and scenario == decoding.place else None,
+                decoding if decoding and scenario == decoding.table else None,
             )
         )
     return found

@@ -12,7 +12,7 @@ from clbench.base.entry_points import resolve
 from clbench.records.record import Record
 from clbench.records.writer import record_text
 
-read_table = resolve("clbench.leaderboard.board.rows:read_table")
+compute_board = resolve("clbench.leaderboard.board.rows:compute_board")
 standing_of = resolve("clbench.leaderboard.board.rows:standing_of")
 values_by_seed = resolve("clbench.leaderboard.board.rows:values_by_seed")
 
@@ -34,7 +34,7 @@ def board(even_board: Callable[..., Path]) -> Path:
 def test_a_method_with_lucky_seeds_alone_does_not_stand_above_methods_that_beat_it_on_them(
     board: Path,
 ) -> None:
-    rows = read_table(board).rows
+    rows = compute_board(board).rows
     assert [row.method for row in rows] == ["lora", "sft", "finch"]
     finals = {row.method: row.estimates["final_average"].value for row in rows}
     assert finals["finch"] > finals["sft"]
@@ -45,27 +45,27 @@ def test_a_method_with_more_seeds_than_plain_fine_tuning_is_sorted_by_the_common
     board: Path, even_board: Callable[..., Path]
 ) -> None:
     even_board("finch", 4, 0.9)
-    assert [row.method for row in read_table(board).rows] == ["lora", "sft", "finch"]
+    assert [row.method for row in compute_board(board).rows] == ["lora", "sft", "finch"]
 
 
 def test_a_method_without_a_seed_of_plain_fine_tuning_has_its_division_sorted_by_final_average(
     board: Path, even_board: Callable[..., Path]
 ) -> None:
     even_board("l2_sp", 5, 0.45)
-    rows = read_table(board).rows
+    rows = compute_board(board).rows
     finals = [row.estimates["final_average"].value for row in rows]
     assert [row.method for row in rows] == ["l2_sp", "finch", "lora", "sft"]
     assert finals == sorted(finals, reverse=True)
 
 
 def test_a_row_with_fewer_seeds_takes_no_seed_from_the_others(board: Path) -> None:
-    rows = read_table(board).rows
+    rows = compute_board(board).rows
     values = values_by_seed(rows)
     assert {method: len(found) for method, found in values.items()} == {"lora": 4, "sft": 4}
 
 
 def test_values_of_two_metrics_are_of_the_same_methods_and_seeds(board: Path) -> None:
-    rows = read_table(board).rows
+    rows = compute_board(board).rows
     kept, finals = values_by_seed(rows, "kept"), values_by_seed(rows)
     assert {method: len(values) for method, values in kept.items()} == {
         method: len(values) for method, values in finals.items()
@@ -79,7 +79,7 @@ def test_the_relative_cost_compares_equal_seeds(even_board: Callable[..., Path])
         records = even_board("sft", seed, 0.5)
     even_board("lora", 1, 0.5)
     costs_of = resolve("clbench.leaderboard.board.costs:costs_of")
-    runs = {row.method: row.runs for row in read_table(records).rows}
+    runs = {row.method: row.runs for row in compute_board(records).rows}
     for run, steps in zip((*runs["sft"], *runs["lora"]), (10, 40, 20), strict=True):
         run.record.costs.optimiser_steps = steps
         run.record.timing["step_ratio"] = 3.0
@@ -89,7 +89,7 @@ def test_the_relative_cost_compares_equal_seeds(even_board: Callable[..., Path])
 
 
 def test_steps_to_the_criterion_of_one_seed_have_no_interval(even_board: Callable[..., Path]) -> None:
-    (row,) = read_table(even_board("sft", 0, 0.5)).rows
+    (row,) = compute_board(even_board("sft", 0, 0.5)).rows
     steps, success = row.estimates["steps_to_criterion"], row.estimates["final_average"]
     assert steps.value is not None
     assert (steps.low, steps.high) == (None, None)
@@ -126,7 +126,7 @@ def test_a_policy_trained_elsewhere_has_a_row_with_every_seed(
     for seed in range(4):
         even_board("sft", seed, 0.5)
         records = add_elsewhere(seed)
-    table = read_table(records)
+    table = compute_board(records)
     assert table.not_shown == ()
     assert {row.method: row.seeds for row in table.rows} == {
         "sft": (0, 1, 2, 3),
@@ -137,13 +137,13 @@ def test_a_policy_trained_elsewhere_has_a_row_with_every_seed(
 def test_a_policy_trained_elsewhere_has_no_learning_curve_where_stages_end_at_a_criterion(
     add_elsewhere: Callable[..., Path],
 ) -> None:
-    (row,) = read_table(add_elsewhere(0)).rows
+    (row,) = compute_board(add_elsewhere(0)).rows
     assert row.estimates["forward_transfer_libero"].value is None
     assert row.estimates["area_under_curve_libero"].value is None
 
 
 def test_a_policy_trained_elsewhere_cannot_have_checks(add_elsewhere: Callable[..., Path]) -> None:
     checks = {"stage": [99], "step": [1], "successes": ["x"], "episodes": [20]}
-    table = read_table(add_elsewhere(0, checks))
+    table = compute_board(add_elsewhere(0, checks))
     assert table.rows == ()
     assert "a policy that was trained elsewhere is not checked" in table.not_shown[0].reason

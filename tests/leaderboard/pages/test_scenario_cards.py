@@ -159,7 +159,7 @@ def test_where_nothing_is_retained_fine_tuning_must_forget_the_earlier_targets(
     bench: Bench, tmp_path: Path
 ) -> None:
     bare = dataclasses.replace(TOY, retained=(), held_out=TOY.retained, scenes=TOY.retained)
-    table = resolve("clbench.leaderboard.board.rows:Table")()
+    table = resolve("clbench.leaderboard.board.rows:Board")()
     experts = resolve("clbench.leaderboard.pages.scenario_tasks:Experts")(10, dict.fromkeys(NAMES, 9))
     card = resolve("clbench.leaderboard.pages.scenario_cards:Card")(bare, table, experts, frozenset()).page()
     assert list(bars(card))[:2] == ["adaptation of sft", "forgetting of earlier targets by sft"]
@@ -180,7 +180,7 @@ def test_missing_records_are_named_with_the_command_that_makes_them(bench: Bench
 
 def test_stages_to_a_criterion_are_compared_with_replay_as_well() -> None:
     strict = dataclasses.replace(TOY, budget=dataclasses.replace(TOY.budget, criterion=0.9))
-    table = resolve("clbench.leaderboard.board.rows:Table")()
+    table = resolve("clbench.leaderboard.board.rows:Board")()
     experts = resolve("clbench.leaderboard.pages.scenario_tasks:Experts")(10, dict.fromkeys(NAMES, 9))
     card = resolve("clbench.leaderboard.pages.scenario_cards:Card")(
         strict, table, experts, frozenset()
@@ -340,7 +340,7 @@ def test_a_scenario_with_a_criterion_has_bars_and_orders_of_its_own(
             options = {"method": method, "seed": seed, "scenario": scenario.id}
             record = make_record(success, steps=(20,), ends=(8, 20), **options)
             write_record(record, tmp_path / "Even-v1" / method / f"seed-{seed}.json")
-    board = resolve("clbench.leaderboard.board.rows:read_table")(tmp_path)
+    board = resolve("clbench.leaderboard.board.rows:compute_board")(tmp_path)
     experts = resolve("clbench.leaderboard.pages.scenario_tasks:Experts")(3, dict.fromkeys(NAMES, 3))
     card = resolve("clbench.leaderboard.pages.scenario_cards:Card")(scenario, board, experts, frozenset())
     found = bars(card.page().replace("\\", ""))

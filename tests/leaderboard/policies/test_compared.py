@@ -10,7 +10,7 @@ import pytest
 from clbench.base.entry_points import resolve
 from clbench.records.record import Record
 
-read_table = resolve("clbench.leaderboard.board.rows:read_table")
+compute_board = resolve("clbench.leaderboard.board.rows:compute_board")
 by_table = resolve("clbench.leaderboard.policies.compared:by_table")
 markdown = resolve("clbench.leaderboard.views.markdown:markdown")
 PLACE = "clbench/Toy-v0+discrete_diffusion"
@@ -34,7 +34,7 @@ def both(add: Callable[..., Path], matrix: Any, tmp_path: Path) -> Path:
 
 
 def test_methods_are_compared_over_the_seeds_that_both_policies_have(both: Path) -> None:
-    table = read_table(both)
+    table = compute_board(both)
     assert not table.not_shown
     comparisons = by_table(table.rows)
     assert list(comparisons) == [PLACE]
@@ -53,7 +53,7 @@ def test_methods_are_compared_over_the_seeds_that_both_policies_have(both: Path)
 
 
 def test_the_page_shows_both_policies_and_never_ranks_one_against_the_other(both: Path) -> None:
-    table = read_table(both)
+    table = compute_board(both)
     page = markdown(table, by_table(table.rows))
     heading = PLACE.replace("_", "\\_")
     section = page.partition(f"## {heading}")[2].partition("\n## ")[0]
@@ -66,6 +66,6 @@ def test_the_page_shows_both_policies_and_never_ranks_one_against_the_other(both
 
 def test_a_table_of_one_policy_has_no_comparison(add: Callable[..., Path], tmp_path: Path) -> None:
     add("sft", 0)
-    table = read_table(tmp_path / "leaderboard" / "records")
+    table = compute_board(tmp_path / "leaderboard" / "records")
     assert by_table(table.rows) == {}
     assert "Does forgetting depend" not in markdown(table, by_table(table.rows))

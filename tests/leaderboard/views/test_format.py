@@ -15,7 +15,7 @@ tier_text = resolve("clbench.leaderboard.views.format:tier_text")
 tiers_text = resolve("clbench.leaderboard.views.format:tiers_text")
 aligned = resolve("clbench.leaderboard.views.format:aligned")
 standing_text = resolve("clbench.leaderboard.views.format:standing_text")
-read_table = resolve("clbench.leaderboard.board.rows:read_table")
+compute_board = resolve("clbench.leaderboard.board.rows:compute_board")
 
 
 @pytest.fixture
@@ -24,7 +24,7 @@ def rows(add: Callable[..., Path], matrix: Any, tmp_path: Path) -> dict[str, Any
     for number, method in enumerate(("best", "good", "twin", "middle", "worst")):
         add(method, 0, matrix * (1.0, 0.8, 0.8, 0.5, 0.1)[number])
     add("ideal", 0, uses={"demonstrations": "never", "questions": "never", "reference": True})
-    table = read_table(tmp_path / "leaderboard" / "records")
+    table = compute_board(tmp_path / "leaderboard" / "records")
     letters = {"best": "a", "good": "b", "twin": "bc", "middle": "bcd", "worst": "d", "ideal": None}
     return {row.method: dataclasses.replace(row, groups=letters[row.method]) for row in table.rows}
 

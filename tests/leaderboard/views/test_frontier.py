@@ -18,7 +18,7 @@ page = resolve("clbench.leaderboard.views.page:page")
 pictures = resolve("clbench.leaderboard.views.page:pictures")
 markdown = resolve("clbench.leaderboard.views.markdown:markdown")
 overall = resolve("clbench.leaderboard.board.overall:overall")
-read_table = resolve("clbench.leaderboard.board.rows:read_table")
+compute_board = resolve("clbench.leaderboard.board.rows:compute_board")
 show = resolve("clbench.leaderboard.cli:show")
 
 
@@ -41,7 +41,7 @@ def words(element: ElementTree.Element) -> str:
 
 def section_of(records: Path) -> ElementTree.Element:
     document = html5lib.HTMLParser(strict=True, namespaceHTMLElements=False).parse(
-        page(read_table(records), {})
+        page(compute_board(records), {})
     )
     found: ElementTree.Element
     (found,) = (one for one in document.iter() if one.get("id") == SCENARIO)
@@ -52,7 +52,7 @@ def test_the_curves_have_the_seeds_that_all_rungs_have(
     records: Path, even_board: Callable[..., Path]
 ) -> None:
     even_board("sft", 3, 1.0, "ladder", step_factor=0.1)
-    curves = read_table(records).frontiers[SCENARIO]
+    curves = compute_board(records).frontiers[SCENARIO]
     assert [(curve.method, {rung.seeds for rung in curve.rungs}) for curve in curves] == [
         ("sft", {(0, 1)}),
         ("finch", {(0, 1)}),
@@ -66,15 +66,17 @@ def test_scenarios_with_a_criterion_come_first(records: Path, make_record: Calla
     path.write_text(
         record_text(make_record([[1, 0], [1, 1]], scenario=fixed, groups=(1, 1, 0))), encoding="utf-8"
     )
-    rows = read_table(records).rows
+    rows = compute_board(records).rows
     assert list(dict.fromkeys(row.scenario for row in rows)) == [SCENARIO, fixed]
     (whole,) = overall(rows)
     assert whole.groups == tuple(row.groups for row in rows if row.method == "sft") == ("c", "a")
-    assert f"Means over {SCENARIO}, {fixed}, for methods" in markdown(read_table(records), {})
+    assert f"Means over {SCENARIO}, {fixed}, for methods" in markdown(compute_board(records), {})
 
 
 def test_a_scenario_with_a_criterion_has_its_own_columns(records: Path) -> None:
-    head = next(line for line in markdown(read_table(records), {}).splitlines() if line.startswith("| group"))
+    head = next(
+        line for line in markdown(compute_board(records), {}).splitlines() if line.startswith("| group")
+    )
     columns = [cell.strip() for cell in head.strip("|").split("|")][5:]
     assert columns[:6] == ["final average", "gain", "learned", "kept skills", "kept targets", "kept"]
     assert columns[6:9] == ["kept share", "criterion met", "steps to criterion"]
@@ -100,7 +102,7 @@ def test_the_terminal_shows_gain_and_kept(
 def test_settings_tried_are_counted(records: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     tuned = resolve("clbench.runs.tuning:Tuned")({}, (None,) * 6)
     monkeypatch.setattr("clbench.leaderboard.board.rows.tuned", lambda _: {"finch": tuned})
-    text = markdown(read_table(records), {})
+    text = markdown(compute_board(records), {})
     assert "| 6 | - |" in next(line for line in text.splitlines() if "| finch | prior" in line)
     assert "| - | - |" in next(line for line in text.splitlines() if "| lora | prior" in line)
 
@@ -115,33 +117,33 @@ def test_seeds_that_order_the_methods_alike_are_said_to_do_so(
         "The 4 seeds order the 5 methods alike more than chance would explain: Kendall's W 1.00, p = 0.003."
     )
     assert sentence in words(section_of(records))
-    assert sentence in markdown(read_table(records), {}).replace("\\", "")
+    assert sentence in markdown(compute_board(records), {}).replace("\\", "")
 
 
 def test_targets_of_balanced_seeds_are_numbered_in_the_section_of_a_row(records: Path) -> None:
     assert "new tasks, each seed in its own order target_ 0 target_ 1" in words(section_of(records))
-    assert "after target 2" in unpacked(page(read_table(records), {}))
+    assert "after target 2" in unpacked(page(compute_board(records), {}))
 
 
 def test_the_frontier_has_each_method_at_each_learning_rate(records: Path) -> None:
-    curves = read_table(records).frontiers[SCENARIO]
+    curves = compute_board(records).frontiers[SCENARIO]
     assert [curve.method for curve in curves] == ["sft", "finch"]
     assert [(rung.factor, rung.kept.value, len(rung.seeds)) for rung in curves[1].rungs] == [
         (1.0, pytest.approx(0.5), 2),
         (0.1, pytest.approx(0.7), 2),
     ]
-    assert "| finch | 0.1 | 0.90 [" in markdown(read_table(records), {})
+    assert "| finch | 0.1 | 0.90 [" in markdown(compute_board(records), {})
     section = section_of(records)
     assert [one.get("data-frontier") for one in section.iter("figure") if one.get("data-frontier")]
     assert "\N{MULTIPLICATION SIGN} 0.1 0.90 [" in words(section)
-    drawn = pictures(read_table(records))
+    drawn = pictures(compute_board(records))
     assert {"frontier-Even-v1.svg", "frontier-Even-v1-dark.svg"} < set(drawn)
     for picture in drawn.values():
         assert "var(" not in picture
 
 
 def test_without_a_ladder_there_is_no_frontier(even_board: Callable[..., Path]) -> None:
-    table = read_table(even_board("sft", 0, 0.2))
+    table = compute_board(even_board("sft", 0, 0.2))
     assert not table.frontiers
     assert "frontier" not in markdown(table, {})
     assert set(pictures(table)) == {"pareto.svg", "pareto-dark.svg"}
@@ -149,7 +151,7 @@ def test_without_a_ladder_there_is_no_frontier(even_board: Callable[..., Path]) 
 
 def test_a_ladder_record_without_a_learning_rate_is_refused(even_board: Callable[..., Path]) -> None:
     even_board("finch", 0, 0.4, "ladder", kappa=0.5)
-    table = read_table(even_board("sft", 0, 0.2))
+    table = compute_board(even_board("sft", 0, 0.2))
     assert not table.frontiers
     (entry,) = table.not_shown
     assert entry.path.startswith("ladder/Even-v1/finch+kappa=0.5/")

@@ -55,7 +55,7 @@ def test_the_best_of_a_division_is_bold_and_a_lone_row_is_not(
     four_methods: Path, add_full: Callable[..., Path], matrix: Any
 ) -> None:
     add_full("better", 0, np.clip(matrix + 0.2, 0, 1))
-    table = resolve("clbench.leaderboard.board.rows:read_table")(four_methods)
+    table = resolve("clbench.leaderboard.board.rows:compute_board")(four_methods)
     console = Console(record=True, width=108, file=io.StringIO(), force_terminal=True)
     console.print(resolve("clbench.leaderboard.views.terminal:terminal")(table, 108))
     lines = console.export_text(styles=True).splitlines()

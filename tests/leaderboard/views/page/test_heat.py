@@ -10,7 +10,7 @@ from clbench.base.entry_points import resolve
 
 heat_maps = resolve("clbench.leaderboard.views.page.heat:heat_maps")
 tables_of = resolve("clbench.leaderboard.board.summary:tables_of")
-read_table = resolve("clbench.leaderboard.board.rows:read_table")
+compute_board = resolve("clbench.leaderboard.board.rows:compute_board")
 REFERENCE = {"demonstrations": "never", "questions": "never", "reference": True}
 
 
@@ -22,7 +22,7 @@ def maps(add: Callable[..., Path], tmp_path: Path) -> Any:
             add(method, 0, scenario=f"clbench/{scenario}")
     add("sft", 0, scenario="clbench/One-v0")
     add("frozen", 0, scenario="clbench/One-v0", uses=REFERENCE)
-    table = read_table(tmp_path / "leaderboard" / "records")
+    table = compute_board(tmp_path / "leaderboard" / "records")
     rows = tables_of(table.rows)
     return heat_maps(rows | {"clbench/Two-v0+discrete_diffusion": rows["clbench/Two-v0"]})
 

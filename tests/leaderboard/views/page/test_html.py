@@ -27,7 +27,7 @@ page = resolve("clbench.leaderboard.views.page:page")
 pictures = resolve("clbench.leaderboard.views.page:pictures")
 markdown = resolve("clbench.leaderboard.views.markdown:markdown")
 tiers = importlib.import_module("clbench.leaderboard.board.tiers")
-read_table = resolve("clbench.leaderboard.board.rows:read_table")
+compute_board = resolve("clbench.leaderboard.board.rows:compute_board")
 
 HOSTILE = "</script><img src=x onerror=alert(1)>'\"&{{ 1 }}"
 ADDRESS = re.compile(r"https?://[^\s\"'<>`)\\]+")
@@ -73,7 +73,7 @@ def without_library(text: str) -> str:
 
 
 def test_the_page_is_valid_and_has_a_row_and_a_section_for_each_method(records: Path) -> None:
-    text = page(read_table(records), {})
+    text = page(compute_board(records), {})
     section = by_id(parsed(text), "clbench/Toy-v0")
     links = [one.get("href") for one in section.iterfind(".//table/tbody/tr/th/a")]
     assert links[:2] == ["#clbench/Toy-v0/better", "#clbench/Toy-v0/sft"]
@@ -86,7 +86,7 @@ def test_the_page_is_valid_and_has_a_row_and_a_section_for_each_method(records: 
 
 
 def test_rows_show_their_groups_and_what_intervals_do_not_cover(records: Path) -> None:
-    section = by_id(parsed(page(read_table(records), {})), "clbench/Toy-v0")
+    section = by_id(parsed(page(compute_board(records), {})), "clbench/Toy-v0")
     cells = [one for one in section.iter("td") if one.get("class") == "groups"]
     assert [(one.text, one.get("data-order"), one.get("data-note")) for one in cells] == [
         ("a", "1", "place 1 of 2; not told apart from sft"),
@@ -98,10 +98,12 @@ def test_rows_show_their_groups_and_what_intervals_do_not_cover(records: Path) -
 def test_perturbed_retention_has_a_column_only_where_a_row_has_it(
     add: Callable[..., Path], records: Path
 ) -> None:
-    assert "perturbed retention" not in words(by_id(parsed(page(read_table(records), {})), "clbench/Toy-v0"))
+    assert "perturbed retention" not in words(
+        by_id(parsed(page(compute_board(records), {})), "clbench/Toy-v0")
+    )
     for seed in range(2):
         add("sft", seed, perturbed=[[0.9, 0.8], [0.5, 0.7], [0.4, 0.2]])
-    text = page(read_table(records), {})
+    text = page(compute_board(records), {})
     section = by_id(parsed(text), "clbench/Toy-v0")
     heads = [words(one) for one in section.iterfind(".//table/thead/tr/th")]
     assert heads.index("perturbed retention") > heads.index("kept skills")
@@ -116,14 +118,14 @@ def test_perturbed_retention_has_a_column_only_where_a_row_has_it(
 
 def test_a_row_says_what_its_verification_looked_at_and_which_lie_it_could_have_missed(records: Path) -> None:
     method = "clbench/Toy-v0/sft"
-    assert "Checked by others" not in words(row_of(page(read_table(records), {}), method))
+    assert "Checked by others" not in words(row_of(page(compute_board(records), {}), method))
     record = record_path(records, "clbench/Toy-v0", "sft", 0)
     found = "40 of 900 replayed, all ended as recorded; 64 made-up ones would have been found with 95 %"
     checks = [{"name": "episodes", "found": found, "passed": True}, {"name": HOSTILE, "found": "\x1b[2J"}, 7]
     text = record.read_bytes()
     values = {"tier": "replayed", "record": hashlib.sha256(text).hexdigest(), "checks": checks, "by": "Ada"}
     tiers.verification_path(record).write_text(tiers.verification_text(values), encoding="utf-8")
-    own = row_of(page(read_table(records), {}), method)
+    own = row_of(page(compute_board(records), {}), method)
     assert f"seeds 0 tier replayed by Ada episodes {found} " in words(own)
     assert "\x1b" not in words(own)
     assert not list(own.iter("img"))
@@ -133,7 +135,7 @@ def test_a_tier_says_how_many_runs_reached_a_higher_one(records: Path) -> None:
     record = record_path(records, "clbench/Toy-v0", "sft", 0)
     values = {"tier": "retrained", "record": hashlib.sha256(record.read_bytes()).hexdigest()}
     tiers.verification_path(record).write_text(tiers.verification_text(values), encoding="utf-8")
-    text = page(read_table(records), {})
+    text = page(compute_board(records), {})
     assert "self-reported; 1 of 2 runs retrained" in words(row_of(text, "clbench/Toy-v0/sft"))
     section = by_id(parsed(text), "clbench/Toy-v0")
     cells = [one for one in section.iter("td") if (one.get("class") or "").startswith("tier")]
@@ -143,16 +145,16 @@ def test_a_tier_says_how_many_runs_reached_a_higher_one(records: Path) -> None:
     ]
     sentence = "A row has the lowest tier of its runs. Runs with a higher tier: 1 of 4 retrained."
     assert f"4 runs. {sentence}" in words(section)
-    assert sentence in markdown(read_table(records), {})
+    assert sentence in markdown(compute_board(records), {})
     assert "At least one run was checked by its submitter alone." in words(section)
 
 
 def test_a_missing_value_is_a_dash_that_says_why(add: Callable[..., Path], records: Path) -> None:
-    section = by_id(parsed(page(read_table(records), {})), "clbench/Toy-v0")
+    section = by_id(parsed(page(compute_board(records), {})), "clbench/Toy-v0")
     assert "forward transfer" not in [words(one) for one in section.iterfind(".//table/thead/tr/th")]
     add("from_scratch", 0, uses={"demonstrations": "never", "questions": "never", "reference": True})
     add("single", 0)
-    text = words(by_id(parsed(page(read_table(records), {})), "clbench/Toy-v0"))
+    text = words(by_id(parsed(page(compute_board(records), {})), "clbench/Toy-v0"))
     assert "a point of a learning curve is missing, or there is no from_scratch of the same seeds" in text
 
 
@@ -185,7 +187,7 @@ def test_texts_of_strangers_stay_text(add: Callable[..., Path], records: Path) -
     add("hostile", 0, edit=edit, scenario="clbench/Hostile-v0")
     add("failed", 0, edit=fail)
     (records / "<img src=x onerror=alert(2)>.json").write_text("{", encoding="utf-8")
-    text = page(read_table(records), {})
+    text = page(compute_board(records), {})
     document = parsed(text)
     assert not list(document.iter("img"))
     assert len(list(document.iter("script"))) == 3
@@ -204,7 +206,7 @@ def test_a_command_can_be_pasted_with_any_record(add: Callable[..., Path], recor
         record.fingerprint["commit"] = {"id": "; touch /tmp/gone", "dirty": True}
 
     add("careless", 3, edit=edit)
-    text = words(row_of(page(read_table(records), {}), "clbench/Toy-v0/careless"))
+    text = words(row_of(page(compute_board(records), {}), "clbench/Toy-v0/careless"))
     assert (
         "clbench run clbench/Toy-v0 careless --seeds 1 --first-seed 3 --device 'cpu; touch /tmp/gone'" in text
     )
@@ -218,14 +220,14 @@ def test_seeds_of_several_commits_are_made_again_from_each(add: Callable[..., Pa
             seed,
             edit=lambda record, commit=commit: record.fingerprint.update(commit={"id": commit * 40}),
         )
-    text = words(row_of(page(read_table(records), {}), "clbench/Toy-v0/old"))
+    text = words(row_of(page(compute_board(records), {}), "clbench/Toy-v0/old"))
     install, run = "pip install -c constraints.txt -e .", "clbench run clbench/Toy-v0 old --seeds"
     first = f"git checkout {'a' * 40} {install} {run} 1"
     assert f"{first} git checkout {'b' * 40} {install} {run} 2 --first-seed 1 {run} 1 --first-seed 5" in text
 
 
 def test_the_page_asks_no_address_and_allows_no_script_but_its_own(records: Path) -> None:
-    text = page(read_table(records), {})
+    text = page(compute_board(records), {})
     document = parsed(text)
     (policy,) = (one.get("content", "") for one in document.iter("meta") if one.get("http-equiv"))
     assert policy.startswith("default-src 'none';")
@@ -243,7 +245,7 @@ def test_the_page_asks_no_address_and_allows_no_script_but_its_own(records: Path
 
 def test_files_that_make_no_row_are_listed_with_their_reason(records: Path) -> None:
     (records / "torn.json").write_text("{", encoding="utf-8")
-    text = words(by_id(parsed(page(read_table(records), {})), "not-shown"))
+    text = words(by_id(parsed(page(compute_board(records), {})), "not-shown"))
     assert "torn.json cannot be read as JSON" in text
     assert "What to do" in text
 
@@ -255,7 +257,7 @@ def test_definitions_that_rank_in_opposite_orders_are_named(add: Callable[..., P
             add(same, seed, [[1, 1, 0, 0, 0], [1, 1, 1, 0, 0], [1, 1, 1, 1, 0]], scenario="clbench/Two-v0")
         add("skills", seed, [[1, 1, 0, 0, 0], [0, 0, 1, 0, 0], [0, 0, 1, 1, 0]], scenario="clbench/Two-v0")
         add("targets", seed, [[1, 1, 0, 0, 0], [1, 1, 1, 0, 0], [1, 1, 0, 1, 0]], scenario="clbench/Two-v0")
-    document = parsed(page(read_table(records), {}))
+    document = parsed(page(compute_board(records), {}))
     text = words(by_id(document, "clbench/Two-v0"))
     assert "“forgetting” and “backward transfer” disagree most. They put 1 of 6 pairs of methods" in text
     (table,) = (
@@ -268,7 +270,7 @@ def test_definitions_that_rank_in_opposite_orders_are_named(add: Callable[..., P
 
 
 def test_fewer_than_four_methods_have_no_table_of_definitions(records: Path) -> None:
-    section = by_id(parsed(page(read_table(records), {})), "clbench/Toy-v0")
+    section = by_id(parsed(page(compute_board(records), {})), "clbench/Toy-v0")
     assert not [one for one in section.iter("table") if one.get("class") == "definitions"]
 
 
@@ -276,7 +278,7 @@ def test_the_only_method_of_a_division_has_a_dash_instead_of_a_letter(
     add: Callable[..., Path], records: Path
 ) -> None:
     add("alone", 0, scenario="clbench/Other-v0")
-    section = by_id(parsed(page(read_table(records), {})), "clbench/Other-v0")
+    section = by_id(parsed(page(compute_board(records), {})), "clbench/Other-v0")
     cells = [one for one in section.iter("td") if one.get("class") == "groups"]
     assert [(one.text, one.get("data-note")) for one in cells] == [("\N{EN DASH}", "place 1 of 1")]
 
@@ -284,7 +286,7 @@ def test_the_only_method_of_a_division_has_a_dash_instead_of_a_letter(
 def test_the_stages_of_an_agent_begin_after_the_old_skills(add: Callable[..., Path], records: Path) -> None:
     uses = {"demonstrations": "never", "questions": "never", "reference": False, "online": True}
     add("me/agent", 0, uses=uses)
-    text = page(read_table(records), {})
+    text = page(compute_board(records), {})
     assert "after the old skills" in words(row_of(text, "clbench/Toy-v0/me/agent"))
     data = data_of(text)
     chart = json.dumps(data["scenarios"]["clbench/Toy-v0"]["run_elsewhere"])
@@ -296,7 +298,7 @@ def test_the_stages_of_an_agent_begin_after_the_old_skills(add: Callable[..., Pa
 
 def test_the_main_scenario_comes_first_and_names_are_short(add: Callable[..., Path], records: Path) -> None:
     add("sft", 0, scenario="clbench/Fetch-v1")
-    document = parsed(page(read_table(records), {}))
+    document = parsed(page(compute_board(records), {}))
     (tabs,) = (one for one in document.iter("nav") if one.get("class") == "tabs")
     assert [words(one) for one in tabs.iter("a")] == ["Fetch-v1", "Toy-v0", "All scenarios"]
     assert "Every file" not in words(document)
@@ -304,7 +306,7 @@ def test_the_main_scenario_comes_first_and_names_are_short(add: Callable[..., Pa
 
 def test_without_rows_there_is_a_page_that_says_why(tmp_path: Path) -> None:
     (tmp_path / "torn.json").write_text("{", encoding="utf-8")
-    table = read_table(tmp_path)
+    table = compute_board(tmp_path)
     text = words(parsed(page(table, {})))
     assert "There is no row yet" in text
     assert "torn.json" in text
@@ -312,7 +314,7 @@ def test_without_rows_there_is_a_page_that_says_why(tmp_path: Path) -> None:
 
 
 def test_the_pictures_show_every_method_in_both_themes(records: Path) -> None:
-    drawn = pictures(read_table(records))
+    drawn = pictures(compute_board(records))
     for picture in drawn.values():
         texts = [
             "".join(one.itertext())
@@ -345,7 +347,7 @@ def test_15_methods_with_5_seeds_on_4_scenarios_are_less_than_3_megabytes(
         record.diagnostics = {str(stage): diagnosed for stage in range(1, 5)}
         record.fingerprint["versions"] = {f"package-{number}": "1.22.333" for number in range(9)}
         write_record(record, record_path(tmp_path, "clbench/Toy-v0", "method", seed))
-    table = read_table(tmp_path)
+    table = compute_board(tmp_path)
     (row,), (scenario,) = table.rows, table.scenarios.values()
     names = [f"clbench/Scenario{number}-v0" for number in range(4)]
     rows = [

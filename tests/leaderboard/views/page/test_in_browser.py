@@ -53,7 +53,7 @@ def address(make_record: Callable[..., Record], tmp_path_factory: pytest.TempPat
     (records / f"{HOSTILE.replace('/', '')}.json").write_text("{", encoding="utf-8")
     (records / "torn.json").write_text("{", encoding="utf-8")
     page = resolve("clbench.leaderboard.views.page:page")(
-        resolve("clbench.leaderboard.board.rows:read_table")(records), {}
+        resolve("clbench.leaderboard.board.rows:compute_board")(records), {}
     )
     path = records.parent / "index.html"
     path.write_text(page, encoding="utf-8")

@@ -13,7 +13,7 @@ from playwright.sync_api import Browser, Locator, Page
 from clbench.base.entry_points import resolve
 
 make_page = resolve("clbench.leaderboard.views.page:page")
-read_table = resolve("clbench.leaderboard.board.rows:read_table")
+compute_board = resolve("clbench.leaderboard.board.rows:compute_board")
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 
@@ -28,7 +28,7 @@ def phone(even_board: Callable[..., Path], browser: Browser) -> Iterator[Page]:
             even_board(method, 0, 0.4, "ladder", step_factor=factor)
         records = even_board(method, 0, 0.2)
     path = records.parent / "index.html"
-    path.write_text(make_page(read_table(records), {}), encoding="utf-8")
+    path.write_text(make_page(compute_board(records), {}), encoding="utf-8")
     page = browser.new_page(viewport={"width": 390, "height": 420})
     page.goto(path.as_uri())
     page.locator("html[data-ready]").wait_for(timeout=300_000)

@@ -14,7 +14,7 @@ from clbench.scoring.intervals import Estimate
 headline = resolve("clbench.leaderboard.views.page.verdict:headline")
 verdicts = resolve("clbench.leaderboard.views.page.verdict:verdicts")
 TiedGain = resolve("clbench.leaderboard.board.frontier:TiedGain")
-read_table = resolve("clbench.leaderboard.board.rows:read_table")
+compute_board = resolve("clbench.leaderboard.board.rows:compute_board")
 
 REPLAY = {"demonstrations": "throughout", "questions": "never", "reference": False}
 REFERENCE = {"demonstrations": "never", "questions": "never", "reference": True}
@@ -40,7 +40,7 @@ def board(add: Callable[..., Path], tmp_path: Path) -> Callable[..., Any]:
                 uses = {"uses": REPLAY} if "replay" in method else {}
                 uses = {"uses": REFERENCE} if method == "frozen" else uses
                 add(method, seed, success, **uses)
-        return read_table(tmp_path / "leaderboard" / "records").rows
+        return compute_board(tmp_path / "leaderboard" / "records").rows
 
     return board
 

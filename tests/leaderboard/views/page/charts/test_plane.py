@@ -15,7 +15,7 @@ PLANE = "clbench.leaderboard.views.page.charts.plane"
 AXES = "clbench.leaderboard.views.page.charts.axes"
 learned, cost, bytes_kept = resolve(f"{AXES}:ACROSS")
 kept, skills, targets = resolve(f"{AXES}:UP")
-read_table = resolve("clbench.leaderboard.board.rows:read_table")
+compute_board = resolve("clbench.leaderboard.board.rows:compute_board")
 REFERENCE = {"demonstrations": "never", "questions": "never", "reference": True}
 
 
@@ -26,7 +26,7 @@ def rows(add: Callable[..., Path], matrix: Any, tmp_path: Path) -> Any:
         add("sft", seed, edit=lambda record: setattr(record.costs, "bytes_kept", 0))
         add("heavy", seed, matrix * 0.9, edit=lambda record: setattr(record.costs, "bytes_kept", 5_000_000))
         add("frozen", seed, matrix * 0.0, uses=REFERENCE)
-    return read_table(tmp_path / "leaderboard" / "records").rows
+    return compute_board(tmp_path / "leaderboard" / "records").rows
 
 
 def test_less_data_is_further_right(rows: Any) -> None:
