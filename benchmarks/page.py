@@ -27,7 +27,12 @@ GROUPS = {
 }
 STEPS = (37, 75, 150, 300)
 EPISODES, ON_THE_WAY, VALIDATION, KINDS, ASKED = 20, 5, 10, 14, 72
-BUDGET = {"test_episodes": EPISODES, "curve_episodes": ON_THE_WAY, "validation_episodes": VALIDATION}
+BUDGET = {
+    "test_episodes": EPISODES,
+    "curve_episodes": ON_THE_WAY,
+    "validation_episodes": VALIDATION,
+    "test_questions": KINDS * ASKED,
+}
 REFERENCES = ("sft", "joint", "from_scratch", "frozen")
 """Methods with which others are compared."""
 
@@ -47,6 +52,8 @@ def main() -> None:
         begin = time.monotonic(), time.process_time()
         board = compute_board(records)
         read = time.monotonic(), time.process_time()
+        if board.not_shown:  # a page without rows is made in no time
+            raise SystemExit(f"The records are refused: {board.not_shown[0].reason}")
         text = page(board, {})
         pictures(board)
         end = time.monotonic(), time.process_time()
