@@ -17,7 +17,7 @@ from clbench.records.paths import RECORDS
 if TYPE_CHECKING:
     from clbench.records.record import Record
 
-    from .views.page.charts.plot import Plot
+    from .views.page.charts.picture import Plot
 
 __all__ = ["curves", "frontier", "matrix", "plane"]
 
@@ -38,7 +38,7 @@ def matrix(runs: Record | Iterable[Record] | Path | str, *, dark: bool = False) 
         InputError: There is no record, or they are of several methods, or of different scenarios.
         RecordError: A file is no record, or its run failed.
     """
-    from .views.page.charts.plot import themed
+    from .views.page.charts.picture import themed
     from .views.page.runs import Runs, matrix_of
 
     return themed(matrix_of(Runs.of(_records(runs))), dark)
@@ -61,7 +61,7 @@ def curves(
         InputError: There is no record, or they are of several methods, or of different scenarios.
         RecordError: A file is no record, or its run failed.
     """
-    from .views.page.charts.plot import themed
+    from .views.page.charts.picture import themed
     from .views.page.runs import Runs, curves_of
 
     beside = None if sft is None else Runs.of(_records(sft))
@@ -82,9 +82,9 @@ def plane(records: Path | str = RECORDS, scenario: str | None = None, *, dark: b
         UnknownNameError: The scenario has no row.
     """
     from .publishing import read_board
+    from .views.page.charts.picture import themed
     from .views.page.charts.plane import WIDE
     from .views.page.charts.plane import plane as chart
-    from .views.page.charts.plot import themed
     from .views.page.charts.vega import heading
 
     rows = read_board(Path(records)).rows
@@ -111,7 +111,7 @@ def frontier(records: Path | str = RECORDS, scenario: str | None = None, *, dark
     from .board.frontier import frontiers_of, ladder_of, read_ladder
     from .views.page.charts.frontier import WIDE
     from .views.page.charts.frontier import frontier as chart
-    from .views.page.charts.plot import themed
+    from .views.page.charts.picture import themed
     from .views.page.charts.vega import FONT, heading
 
     folder = ladder_of(Path(records))

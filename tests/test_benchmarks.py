@@ -101,6 +101,15 @@ def test_every_quantity_whose_cost_may_grow_is_measured(
 
 
 def test_the_size_of_the_page_is_that_of_a_page_with_all_rows() -> None:
-    command = [sys.executable, BENCHMARKS / "page.py", "--methods", "2", "--seeds", "1", "--scenarios", "1"]
+    command = [
+        sys.executable,
+        os.fspath(BENCHMARKS / "page.py"),
+        "--methods",
+        "2",
+        "--seeds",
+        "1",
+        "--scenarios",
+        "1",
+    ]
     done = subprocess.run(command, check=True, capture_output=True, text=True)
     assert done.stdout.startswith("2 rows, ")

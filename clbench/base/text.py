@@ -35,6 +35,11 @@ def counted(count: int, noun: str, nouns: str = "") -> str:
     return f"{count} {noun if count == 1 else nouns or f'{noun}s'}"
 
 
+def minutes(seconds: float) -> str:
+    """Return a time as minutes and seconds, such as "2:05"."""
+    return f"{int(seconds) // 60}:{int(seconds) % 60:02d}"
+
+
 def did_you_mean(name: str, known: Iterable[str]) -> str:
     """Return the end of a message with the known name that is nearest, empty if none is near."""
     near = difflib.get_close_matches(name, known, n=1)

@@ -66,7 +66,7 @@ def film(
     """
     check_names([scenario], methods)
     from clbench.jobs.bars import Bars
-    from clbench.runs.film import FASTEST, check_format, film_runs, steps_per_second
+    from clbench.runs.film import FASTEST, check_format, film_runs, frames_per_second
     from clbench.runs.spec import RunSpec, check_device
     from clbench.worlds.gl_backend import choose_back_end
 
@@ -92,7 +92,7 @@ def film(
     with Bars(len(shown) * len(policies), console) as bars:
         bars.start("film", len(shown) * len(policies))
         made = film_runs(runs, policies, shown, episode, size, lambda takes: bars.advance("film", takes))
-        made.save(path, fps or steps_per_second(shown[0]))
+        made.save(path, fps or frames_per_second(shown[0]))
         width, height = made.size
         bars.finish("film", f"{path} ({width} x {height} pixels, {path.stat().st_size / 1e6:.1f} MB)")
 

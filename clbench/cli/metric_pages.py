@@ -36,13 +36,6 @@ LEFT_OUT = {
 """Published definitions that clbench leaves out, and why."""
 
 
-def direction(metric: Metric) -> str:
-    """Return whether higher or lower is better."""
-    return {True: "higher is better", False: "lower is better", None: "neither is better"}[
-        metric.higher_is_better
-    ]
-
-
 def span(metric: Metric) -> str:
     """Return the range of possible values."""
     return f"{metric.low:g} to {metric.high:g}"
@@ -55,7 +48,7 @@ def facts(metric: Metric) -> dict[str, str]:
         "Formula": metric.formula,
         "Source": metric.source,
         "Version": str(metric.version),
-        "Direction": direction(metric),
+        "Direction": metric.direction,
         "Range": span(metric),
         "Units": metric.units,
         "References": ", ".join(metric.references) or "none",
@@ -85,7 +78,7 @@ def listing() -> Group:
     """Return all metrics for the terminal, in lines that fit any width."""
     lines: list[RenderableType] = []
     for metric in METRICS.values():
-        lines.append(Text.assemble((metric.name, "bold"), f": {direction(metric)}, {span(metric)}"))
+        lines.append(Text.assemble((metric.name, "bold"), f": {metric.direction}, {span(metric)}"))
         lines.append(Padding(Text(f"{metric.description} Source: {metric.source}."), (0, 0, 0, 4)))
     return Group(*lines)
 

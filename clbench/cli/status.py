@@ -13,7 +13,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from clbench.base.errors import InputError
-from clbench.base.text import counted, printable
+from clbench.base.text import counted, minutes, printable
 from clbench.cli.arguments import (
     AsJson,
     MethodName,
@@ -117,8 +117,8 @@ def _line(state: RunState, records: Path) -> str | None:
         if state.progress is None:
             return f"{name}: begun by {state.owner}"
         left = state.seconds_left
-        rest = "" if left is None else f", about {_minutes(left)} left"
-        spent = _minutes(state.progress.seconds)
+        rest = "" if left is None else f", about {minutes(left)} left"
+        spent = minutes(state.progress.seconds)
         return f"{name}: {state.progress.share:.0%} after {spent}{rest}, {state.owner}"
     if state.reason is not None:
         return f"{name}: {state.state}, {printable(state.reason.partition(chr(10))[0])}"
@@ -130,7 +130,7 @@ def _summary(states: Sequence[RunState]) -> str:
     parts = [f"{counts[name]} {name}" for name in STATES if counts[name]]
     text = f"{counted(len(states), 'run')}: {', '.join(parts)}."
     left = seconds_left(states)
-    return text if left is None else f"{text} About {_minutes(left)} left with {counts['running']} at once."
+    return text if left is None else f"{text} About {minutes(left)} left with {counts['running']} at once."
 
 
 def _values(state: RunState, records: Path) -> dict[str, Any]:
@@ -145,7 +145,3 @@ def _values(state: RunState, records: Path) -> dict[str, Any]:
         "seconds_left": None if state.seconds_left is None else round(state.seconds_left, 1),
         "reason": state.reason,
     }
-
-
-def _minutes(seconds: float) -> str:
-    return f"{int(seconds) // 60}:{int(seconds) % 60:02d}"

@@ -14,6 +14,7 @@ from rich.console import Console
 from rich.table import Table
 
 from clbench.base.errors import InputError
+from clbench.base.text import counted
 from clbench.cli.arguments import (
     MethodName,
     ScenarioId,
@@ -209,7 +210,7 @@ def _table(scenario: str, found: Mapping[str, tuple[Settings | None, Sequence[Tr
         found: For each method the settings that were chosen, None if none were, and all that were tried.
         seeds: Number of tuning seeds.
     """
-    table = Table(title=f"{scenario}, {seeds} tuning seed{'' if seeds == 1 else 's'}, validation episodes")
+    table = Table(title=f"{scenario}, {counted(seeds, 'tuning seed')}, validation episodes")
     for title in ("method", "settings"):
         table.add_column(title, overflow="fold")
     for title in ("learned", "final average"):

@@ -1,1 +1,1 @@
-"""Evaluation: rollouts of a policy, its answers to questions, and probes of its weights and activations."""
+"""Evaluation: rollouts of a policy, episodes of any agent, answers, probes, and the definition of a scenario."""

@@ -123,24 +123,24 @@ def _play(
 
 
 def _observations(lanes: Lanes, live: Sequence[Live]) -> Iterator[Observation]:
-    """Yield what the agent observes in each lane."""
-    tasks = [lane.trial[0] for lane in live]
-    states = np.stack([lane.state for lane in live])
-    numbers, images = lanes.observe([lane.lane for lane in live], tasks, states)
-    for row, lane in enumerate(live):
-        picture = {} if lane.trial[0].camera is None else {"image": images[row]}
-        yield {"state": numbers[row], **picture, "instruction": lane.shown}
+    """Yield what the agent observes in each running episode."""
+    tasks = [one.trial[0] for one in live]
+    states = np.stack([one.state for one in live])
+    numbers, images = lanes.observe([one.lane for one in live], tasks, states)
+    for row, one in enumerate(live):
+        picture = {} if one.trial[0].camera is None else {"image": images[row]}
+        yield {"state": numbers[row], **picture, "instruction": one.shown}
 
 
 def _act(agent: Agent, lanes: Lanes, live: Sequence[Live]) -> NDArray[np.float32]:
     """Return the actions (1, A) of an agent in the only lane, and let it keep its memory."""
-    (lane,), (observation,) = live, _observations(lanes, live)
+    (one,), (observation,) = live, _observations(lanes, live)
     predict = getattr(agent, "predict", None)
     if predict is None:
         action = agent(observation)  # type: ignore[operator]
     else:
-        reminder = {} if lane.memory is None else {"state": lane.memory}
-        action, lane.memory = _predicted(predict(observation, deterministic=True, **reminder))
+        reminder = {} if one.memory is None else {"state": one.memory}
+        action, one.memory = _predicted(predict(observation, deterministic=True, **reminder))
     return _checked(action, lanes, live, ())
 
 
@@ -165,8 +165,8 @@ def _act_in_chunks(
     """Return the actions (lanes, H, A) to execute."""
     rows = list(_observations(lanes, live))
     rows = [
-        {**row, "seed": derive_seed("noise", lane.seed), "step": lane.length}
-        for row, lane in zip(rows, live, strict=True)
+        {**row, "seed": derive_seed("noise", one.seed), "step": one.length}
+        for row, one in zip(rows, live, strict=True)
     ]
     rows += [rows[0]] * (LANES - len(rows))
     columns = {name: [row[name] for row in rows] for name in rows[0]}
@@ -194,7 +194,7 @@ def _checked(action: Any, lanes: Lanes, live: Sequence[Live], rows: tuple[int, .
     Args:
         action: What the agent returned.
         lanes: Running worlds.
-        live: Lanes in use.
+        live: Running episodes.
         rows: Shape of the actions without A; () for a single action, which becomes (1, A).
     """
     space: spaces.Box = lanes.world(live[0].trial[0]).single_action_space

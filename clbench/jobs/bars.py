@@ -13,7 +13,7 @@ from rich.markup import escape
 from rich.progress import BarColumn, Progress, TaskID, TaskProgressColumn, TextColumn, TimeElapsedColumn
 from rich.progress import TimeRemainingColumn as TimeLeftColumn
 
-from clbench.base.text import printable, printable_lines
+from clbench.base.text import minutes, printable, printable_lines
 
 LINE_SECONDS = 30.0
 """Seconds between two lines without a terminal."""
@@ -90,7 +90,7 @@ class Bars:
             self._last_line = now
             share = min(1.0, self._done / self._total)
             # the time left is unknown before any work is done
-            left = f", about {_minutes((now - self._started) * (1 - share) / share)} left" if share else ""
+            left = f", about {minutes((now - self._started) * (1 - share) / share)} left" if share else ""
             self.say(f"{share:4.0%}{left}: {'; '.join(self._text.values())}")
 
     def skip(self, piece: Hashable, length: float, text: str) -> None:
@@ -113,7 +113,3 @@ class Bars:
 def lines_console() -> Console:
     """Return a console for standard error; in a notebook its lines are text, and no pieces of HTML."""
     return Console(stderr=True, force_jupyter=False)
-
-
-def _minutes(seconds: float) -> str:
-    return f"{int(seconds) // 60}:{int(seconds) % 60:02d}"

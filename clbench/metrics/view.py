@@ -74,11 +74,10 @@ def _definition(name: str, values: Mapping[str, Value]) -> Iterator[RenderableTy
     """Yield a definition with the values of all methods, the best first."""
     metric = METRICS[name]
     best_first = sorted(values.items(), key=lambda item: _rank(item[1], metric.higher_is_better))
-    direction = "higher is better" if metric.higher_is_better else "lower is better"
     if list(values) == [""]:
-        yield Text.assemble((name, "bold"), f": {_number(values[''])}, {direction}")
+        yield Text.assemble((name, "bold"), f": {_number(values[''])}, {metric.direction}")
     else:
-        yield Text.assemble((name, "bold"), f": {direction}")
+        yield Text.assemble((name, "bold"), f": {metric.direction}")
         items = [Text(f"{printable(method)} {_number(value)}") for method, value in best_first]
         yield Padding(Columns(items, padding=(0, 3)), (0, 0, 0, 4))
     yield Padding(Text(f"{DEFINITIONS[name].assumption} Source: {metric.source}."), (0, 0, 0, 4))

@@ -37,19 +37,19 @@ def label_of(method: str, changes: Mapping[str, Any]) -> str:
 
 
 def table_name(scenario: str, policy: str) -> str:
-    """Return the name of a run's table: the scenario, with the kind of policy if it is not the usual one.
+    """Return the name of a run's table: the scenario, with the name of the policy if it is not the usual one.
 
-    Example: "clbench/Fetch-v1+discrete_diffusion". Policies of different kinds never share a table.
+    Example: "clbench/Fetch-v1+discrete_diffusion". Policies of different names never share a table.
 
     Args:
         scenario: Gymnasium id.
-        policy: Kind of the policy.
+        policy: Name of the policy, see `clbench.spec.policies`.
     """
     return scenario if policy == DEFAULT_POLICY else f"{scenario}+{policy}"
 
 
 def table_parts(table: str) -> tuple[str, str]:
-    """Return the scenario and the kind of policy of a table's name, see `table_name`."""
+    """Return the scenario and the name of the policy of a table's name, see `table_name`."""
     scenario, _, policy = table.partition("+")
     return scenario, policy or DEFAULT_POLICY
 
@@ -62,7 +62,7 @@ def record_name(scenario: str, label: str, seed: int, order: int = 0, policy: st
         label: The method with its changed hyper-parameters, see `label_of`.
         seed: Seed of the run.
         order: Order in which the targets were learned; 0 is the published one.
-        policy: Kind of the policy.
+        policy: Name of the policy, see `clbench.spec.policies`.
 
     Raises:
         InputError: A name is refused.

@@ -159,7 +159,7 @@ class RunInfo:
     perturb: bool = False
     """Whether the retained skills also met perturbed episodes."""
     policy: str = DEFAULT_POLICY
-    """Kind of the policy."""
+    """Name of the policy."""
 
     @property
     def trained_elsewhere(self) -> bool:

@@ -315,8 +315,8 @@ def column_of(run: ResolvedRun, stage: int, *, alone: bool) -> str:
     return f"{run.label}, {when}" if stage else when
 
 
-def steps_per_second(task: Task) -> int:
-    """Return the steps per second of a task's world, at most `FASTEST`; 25 if the world has no rate."""
+def frames_per_second(task: Task) -> int:
+    """Return the speed of a task's films: that of its world, at most `FASTEST`; 25 if it has none."""
     with closing(resolve(task.world)()) as world:
         return min(int(world.metadata.get("render_fps", 25)), FASTEST)
 

@@ -81,6 +81,10 @@ class Estimate:
     """Upper end of the interval."""
 
 
+NO_ESTIMATE = Estimate(None, None, None)
+"""What cannot be computed."""
+
+
 def row_generator(scenario: str, method: str) -> np.random.Generator:
     """Return the generator of a table row, the same whenever and wherever the row is drawn."""
     digest = hashlib.sha256(f"{scenario}\n{method}".encode(errors="backslashreplace")).digest()
@@ -111,7 +115,7 @@ def estimate(
     """
     wanted = [load_metric(name) for name in metrics]
     if not runs:
-        return {metric.name: Estimate(None, None, None) for metric in wanted}
+        return {metric.name: NO_ESTIMATE for metric in wanted}
     seeds = sorted(runs)
     methods = [[runs[seed] for seed in seeds]]
     # Metrics with the same references share their draws; most have none, and draws of episodes cost most.
@@ -156,7 +160,7 @@ def paired_difference(
     wanted = load_metric(metric)
     seeds = sorted(set(runs) & set(others))
     if not seeds:
-        return Estimate(None, None, None)
+        return NO_ESTIMATE
     methods = [[them[seed] for seed in seeds] for them in (runs, others)]
     samples = _Samples(methods, needed_references([wanted], seeds, references), generator, replicates)
     reach = wanted.high - wanted.low
@@ -205,7 +209,7 @@ def interval(
         span: Least and greatest possible value.
     """
     if not math.isfinite(value):
-        return Estimate(None, None, None)
+        return NO_ESTIMATE
     # A metric that has no value without one of the seeds, or with other episodes, has no honest interval.
     if not np.isfinite(without_one).all():
         return Estimate(value, None, None)

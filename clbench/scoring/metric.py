@@ -59,6 +59,13 @@ class Metric:
             return self.function(rates.mean_over_runs())
         return np.asarray(self.function(rates).mean(axis=-1))
 
+    @property
+    def direction(self) -> str:
+        """Whether higher or lower is better, in words."""
+        if self.higher_is_better is None:
+            return "neither high nor low is better"
+        return "higher is better" if self.higher_is_better else "lower is better"
+
 
 REGISTRY: dict[str, Metric] = {}
 """Metrics by name, in the order of their definition: those whose module was imported."""

@@ -65,7 +65,7 @@ def check_method(cls: type[Method], *, policy: str = DEFAULT_POLICY, **settings:
 
     Args:
         cls: Class of the method.
-        policy: Kind of the policy that it fine-tunes: "flow" or "discrete_diffusion".
+        policy: Name of the policy that it fine-tunes: "flow" or "discrete_diffusion".
         settings: Hyper-parameters that differ from its defaults, to shorten a long preparation.
 
     Raises:
@@ -117,7 +117,7 @@ class Subject:
     Args:
         cls: Class of the method.
         settings: Hyper-parameters that differ from its defaults.
-        policy: Kind of the policy.
+        policy: Name of the policy.
     """
 
     def __init__(self, cls: type[Method], settings: Mapping[str, Any], policy: str) -> None:

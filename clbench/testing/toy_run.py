@@ -82,7 +82,7 @@ class ToyRun:
         seed: Seed of every draw.
         resumed: Whether each stage begins with a new object that loads the state of the last one, as in every
             run, or continues with the old object.
-        policy: Kind of the policy.
+        policy: Name of the policy.
 
     Raises:
         ContractError: A hook does something after which the loop cannot continue.

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from clbench.records.paths import table_parts
-from clbench.scoring.intervals import Estimate
+from clbench.scoring.intervals import NO_ESTIMATE, Estimate
 from clbench.scoring.metrics import METRICS
 from clbench.spec.policies import DEFAULT_POLICY
 
@@ -76,7 +76,7 @@ def mean_estimate(parts: Sequence[Estimate]) -> Estimate:
     """
     values = [one.value for one in parts if one.value is not None]
     if not values or len(values) < len(parts):
-        return Estimate(None, None, None)
+        return NO_ESTIMATE
     mean = math.fsum(values) / len(values)
     low = [one.value - one.low for one in parts if one.value is not None and one.low is not None]
     high = [one.high - one.value for one in parts if one.value is not None and one.high is not None]

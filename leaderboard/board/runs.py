@@ -44,7 +44,7 @@ class Run:
     scores: Scores
     """Scores of the record."""
     table: str
-    """Board that it belongs to: the scenario, and the kind of policy if it is another; see `table_name`."""
+    """Table that it belongs to: the scenario, and the policy if it is another one; see `table_name`."""
     method: str
     """The method with its changed hyper-parameters, see `label_of`."""
     seed: int

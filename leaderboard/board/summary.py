@@ -50,7 +50,7 @@ class RowSummary:
     """The numbers of one method on one scenario."""
 
     scenario: str
-    """Name of its table: the Gymnasium id, with the kind of policy if it is not the usual one."""
+    """Name of its table: the Gymnasium id, with the name of the policy if it is not the usual one."""
     method: str
     """Name or "module:Class"."""
     division: str

@@ -6,6 +6,8 @@ before plain fine-tuning has forgotten any answer.
 
 from __future__ import annotations
 
+import math
+
 from .claim import (
     ANYWHERE,
     KNOWLEDGE,
@@ -25,8 +27,9 @@ NOTHING_TO_KEEP = "sft does not certainly lose 0.01 of the answers: there is not
 LOSES_ANSWERS = "A longer or narrower fine-tuning, after which sft has certainly lost answers."
 
 
-def _loses_answers(evidence: Evidence) -> bool:
-    return question_drop(evidence, "sft").low > 0.01
+def _nothing_to_keep(of_sft: Figure) -> bool:
+    """Return whether fine-tuning was measured, and does not certainly lose answers."""
+    return not math.isnan(of_sft.high) and not of_sft.low > 0.01
 
 
 @claim(
@@ -88,7 +91,7 @@ def stop_gradient_keeps_and_wastes(evidence: Evidence) -> Finding:
     """Stopping the gradient keeps knowledge but throws away supervision."""
     answers, early = question_drop(evidence, "stop_gradient"), early_success(evidence, "stop_gradient", "sft")
     of_sft = question_drop(evidence, "sft")
-    if of_sft.high == of_sft.high and not _loses_answers(evidence):
+    if _nothing_to_keep(of_sft):
         return Finding("cannot be shown here", (early, answers), (of_sft,), (NOTHING_TO_KEEP,), LOSES_ANSWERS)
     return Finding(
         decided(
@@ -155,7 +158,7 @@ def keeps_answers(evidence: Evidence) -> Finding:
         for other in ("sft", "aegis+direction=random")
     )
     of_sft = question_drop(evidence, "sft")
-    if of_sft.high == of_sft.high and not _loses_answers(evidence):
+    if _nothing_to_keep(of_sft):
         return Finding("cannot be shown here", (aegis,), (sft, *gains), (NOTHING_TO_KEEP,), LOSES_ANSWERS)
     return Finding(
         decided(holds=aegis.low >= -0.01, fails=aegis.high < -0.01),

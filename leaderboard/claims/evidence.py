@@ -11,7 +11,15 @@ from typing import Any
 
 import numpy as np
 
-from clbench.scoring.intervals import UNBOUNDED, Estimate, Span, bootstrap, mean_of_seeds, row_generator
+from clbench.scoring.intervals import (
+    NO_ESTIMATE,
+    UNBOUNDED,
+    Estimate,
+    Span,
+    bootstrap,
+    mean_of_seeds,
+    row_generator,
+)
 from clbench.scoring.layout import Array
 from clbench.scoring.metrics import load_metric
 from clbench.scoring.rates import Rates
@@ -34,8 +42,6 @@ from ..board.summary import NotShown
 
 LEAST_SEEDS = 2
 """An interval of one seed does not cover other seeds: it is shown but decides nothing."""
-
-NO_ESTIMATE = Estimate(None, None, None)
 
 SHARE: Span = (0.0, 1.0)
 """Least and greatest value of a share."""
@@ -102,7 +108,7 @@ class Evidence:
         what: str,
         quantity: Quantity,
         *methods: str,
-        span: tuple[float, float] = (-math.inf, math.inf),
+        span: Span = UNBOUNDED,
         **rest: Any,
     ) -> Figure:
         """Return `quantity` with its interval, over the seeds that all methods have.

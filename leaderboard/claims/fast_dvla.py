@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import math
 
-from clbench.scoring.intervals import Estimate
+from clbench.scoring.intervals import NO_ESTIMATE, Estimate
 
 from ..policies.decoders import Decoding, read_decoding
 from .claim import ANYWHERE, Finding, Paper, claim, decided, what_would_change
-from .evidence import NO_ESTIMATE, Evidence, Figure, rung
+from .evidence import Evidence, Figure, rung
 from .figures import PUBLISHED, median_stage, share_of_steps
 
 CAPVECTOR = Paper("CapVector (the abstract of Fast-dVLA)", ("2603.25661", "2605.10903"))

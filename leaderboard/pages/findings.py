@@ -28,10 +28,10 @@ from ..claims.judges import Judged
 from ..policies.compared import by_table
 from ..views.format import MISSING, format_interval, tau_text
 from ..views.markdown import templates
-from ..views.page.charts.plot import themed
+from ..views.page.charts.picture import themed
+from .agreements import agreement_sentences
 from .findings_chart import gains_chart
 from .lost_skills import relearning_sentences
-from .orders import order_sentences
 
 FORGOTTEN_BY = "kept_share"
 """Metric by which policies are compared: the final average also counts what they knew and learned."""
@@ -79,7 +79,7 @@ def sections(board: Board, judged: Sequence[Judged]) -> list[Section]:
         _claims(judged),
         Section(
             "Do seeds, scenarios and definitions order the methods alike?",
-            tuple(order_sentences(board, boards)),
+            tuple(agreement_sentences(board, boards)),
         ),
         _predictors(boards),
         _knowledge(_usual(board)),

@@ -19,7 +19,14 @@ from clbench.base.entry_points import resolve
 from clbench.base.text import field_docstrings, printable
 from clbench.records.paths import RECORDS
 from clbench.scoring.groups import deviation_of_differences
-from clbench.scoring.intervals import Estimate, bootstrap, paired_difference, row_generator, student_quantile
+from clbench.scoring.intervals import (
+    NO_ESTIMATE,
+    Estimate,
+    bootstrap,
+    paired_difference,
+    row_generator,
+    student_quantile,
+)
 from clbench.scoring.layout import Array, average
 from clbench.scoring.rates import Rates
 from clbench.spec.budget import Budget
@@ -68,8 +75,6 @@ SFT, AHEAD, REPLAY, BEFORE, CHECKS = (0.30, 0.85), 0.10, 0.90, 0.30, 8
 """Bars of a scenario whose stages end when the target is learned: the range of the final average of sft; how
 far experience replay must be ahead of it, and how good it must be; the success on a target before its stage;
 and the checks until a target is learned, so that their distance does not decide the result."""
-
-NO_ESTIMATE = Estimate(None, None, None)
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import io
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,6 +15,7 @@ from rich.console import Console
 
 from clbench.base.dependencies import require
 from clbench.base.errors import ClbenchError
+from clbench.base.progress import ProgressCallback
 from clbench.base.seeding import derive_seed
 from clbench.base.text import counted
 from clbench.data.demonstrations import demonstrate
@@ -35,8 +36,6 @@ WIDTH = 240
 
 QUALITY = 80
 """WebP quality of a picture; a picture of Fetch takes 6 kB."""
-
-Progress = Callable[[float], None]
 
 
 @dataclass(frozen=True)
@@ -112,7 +111,7 @@ def make_missing(
     return Experts(episodes, {name: entry["successes"] for name, entry in found.items()})
 
 
-def _draw(tasks: Sequence[Task], folder: Path, progress: Progress) -> None:
+def _draw(tasks: Sequence[Task], folder: Path, progress: ProgressCallback) -> None:
     """Draw each task with its expert halfway through an episode that is the same each time."""
     if not tasks:
         return

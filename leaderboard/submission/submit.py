@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 from rich.console import Console
 
+from clbench.base.progress import ProgressCallback
 from clbench.base.text import counted
 from clbench.jobs.grid import run_missing
 from clbench.jobs.job import Job, JobError
@@ -50,7 +51,7 @@ def run_submission(
     return not failed
 
 
-def check_job(method: str, progress: Callable[[float], None]) -> str:
+def check_job(method: str, progress: ProgressCallback) -> str:
     """Check that a method keeps the contract."""
     try:
         check_method(load_method(method))

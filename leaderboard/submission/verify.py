@@ -272,7 +272,7 @@ def _job(path: Path, records: Path, request: Request) -> Job:
     try:
         subject = Subject(read_run(records, path, changed=None), request)
         scenario = subject.scenario
-        if request.tier in TIERS[2:]:
+        if request.tier != "recomputed":
             length += len(scenario.target) * scenario.budget.adaptation_steps
         if request.tier == "retrained":
             length += run_length(scenario, subject.protocol)

@@ -72,7 +72,6 @@ def markdown(board: Board, comparisons: Comparisons) -> str:
         tiers_text=tiers_text,
         prediction_text=prediction_text,
         group_of=group_of,
-        direction=_direction,
         ends=_ends,
     )
 
@@ -80,11 +79,6 @@ def markdown(board: Board, comparisons: Comparisons) -> str:
 def _all_shown(tables: Iterable[Sequence[Row]]) -> list[Column]:
     """Return the columns of all tables, each once."""
     return list(dict.fromkeys(column for rows in tables for column in shown(rows)))
-
-
-def _direction(metric: Metric) -> str:
-    words = {True: "higher is better", False: "lower is better", None: "neither high nor low is better"}
-    return words[metric.higher_is_better]
 
 
 def _ends(metric: Metric) -> list[str]:

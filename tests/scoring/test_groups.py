@@ -28,7 +28,6 @@ from clbench.scoring.groups import (
 from clbench.scoring.intervals import (
     REPLICATES,
     SEED_DEVIATION,
-    Estimate,
     Runs,
     episodes_needed,
     expected_precision,
@@ -39,7 +38,6 @@ from clbench.scoring.scores import Scores
 from clbench.testing import TOY
 
 ROOT = Path(__file__).parents[2]
-NOTHING = Estimate(None, None, None)
 
 
 def run(final: Any) -> Scores:

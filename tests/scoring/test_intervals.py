@@ -8,6 +8,7 @@ import pytest
 from scipy import optimize, stats
 
 from clbench.scoring.intervals import (
+    NO_ESTIMATE,
     Estimate,
     bootstrap,
     estimate,
@@ -18,8 +19,6 @@ from clbench.scoring.intervals import (
 from clbench.scoring.layout import Layout
 from clbench.scoring.metrics import METRICS, load_metric, measure
 from clbench.scoring.scores import Scores
-
-NOTHING = Estimate(None, None, None)
 
 
 def layout(retained: int, episodes: int, targets: int = 1, held_out: int = 0, points: int = 1) -> Layout:
@@ -301,15 +300,15 @@ def test_the_width_to_expect_agrees_with_simulated_rows(seeds: int, deviation: f
 
 def test_a_metric_without_value_has_no_interval() -> None:
     estimates = estimate(METRICS, {0: scores([[1, 0]])}, np.random.default_rng(0))
-    assert estimates["zero_shot"] == estimates["forward_transfer"] == NOTHING
-    assert estimate(["retention"], {}, np.random.default_rng(0)) == {"retention": NOTHING}
+    assert estimates["zero_shot"] == estimates["forward_transfer"] == NO_ESTIMATE
+    assert estimate(["retention"], {}, np.random.default_rng(0)) == {"retention": NO_ESTIMATE}
 
 
 def test_a_reference_that_lacks_a_seed_is_missing() -> None:
     runs = {seed: scores([[1, 0]]) for seed in range(2)}
     short = {"from_scratch": {0: runs[0]}}
     got = estimate(["forward_transfer"], runs, np.random.default_rng(0), references=short)
-    assert got["forward_transfer"] == NOTHING
+    assert got["forward_transfer"] == NO_ESTIMATE
 
 
 def test_an_unknown_metric_is_a_lookup_error() -> None:
@@ -365,7 +364,7 @@ def test_a_difference_can_need_a_reference() -> None:
     ]
     assert difference.value == pytest.approx((values[0] or 0) - (values[1] or 0))
     assert width(difference) > 0
-    assert paired_difference("forward_transfer", runs, others, generator) == NOTHING
+    assert paired_difference("forward_transfer", runs, others, generator) == NO_ESTIMATE
 
 
 def test_only_seeds_that_both_have_are_compared() -> None:
@@ -374,7 +373,7 @@ def test_only_seeds_that_both_have_are_compared() -> None:
         "retention", {0: good, 1: bad}, {0: bad, 2: good}, np.random.default_rng(0)
     )
     assert difference == Estimate(1.0, 1.0, 1.0)
-    assert paired_difference("retention", {0: good}, {1: bad}, np.random.default_rng(0)) == NOTHING
+    assert paired_difference("retention", {0: good}, {1: bad}, np.random.default_rng(0)) == NO_ESTIMATE
 
 
 def test_methods_that_met_different_episodes_are_not_compared() -> None:

@@ -6,9 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from clbench.scoring.intervals import Estimate, interval, interval_of_seeds
-
-NOTHING = Estimate(None, None, None)
+from clbench.scoring.intervals import NO_ESTIMATE, Estimate, interval, interval_of_seeds
 
 
 def of_means(values: Any, span: tuple[float, float]) -> tuple[float, float]:
@@ -82,6 +80,6 @@ def test_intervals_hold_rates_near_0_and_1_about_as_often_as_they_should(seeds: 
 
 def test_a_quantity_without_value_for_some_seeds_has_no_interval() -> None:
     assert interval(1.0, np.array([1.0, np.nan])) == Estimate(1.0, None, None)
-    assert interval(np.nan, np.array([1.0, 2.0])) == NOTHING
+    assert interval(np.nan, np.array([1.0, 2.0])) == NO_ESTIMATE
     assert interval(1.0, np.zeros(0)) == Estimate(1.0, None, None)
     assert interval(1.0, np.zeros(0), lambda: np.array([1.0, np.nan])) == Estimate(1.0, None, None)

@@ -1,4 +1,4 @@
-"""Methods against scenarios: one table for each kind of policy, since policies do not mix."""
+"""Methods against scenarios: one table for each policy, since policies do not mix."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class HeatRow:
 
 @dataclass(frozen=True)
 class HeatMap:
-    """The table of one kind of policy."""
+    """The table of one policy."""
 
     policy: str
     scenarios: tuple[str, ...]

@@ -30,8 +30,8 @@ from .charts.decoders import decoders
 from .charts.frontier import NARROW as NARROW_FRONTIER
 from .charts.frontier import WIDE as WIDE_FRONTIER
 from .charts.frontier import frontier
+from .charts.picture import VEGA_LITE, on_paper
 from .charts.plane import FULL, NARROW, WIDE, Plane, plane, template
-from .charts.plot import VEGA_LITE, on_paper
 from .charts.vega import FONT, PALETTE, SHAPES, in_theme
 from .heat import COLUMNS, heat_maps
 from .rows import MAIN, SHADES

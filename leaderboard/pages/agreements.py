@@ -16,7 +16,7 @@ from ..board.summary import RANKED_BY, WITHOUT_DEMONSTRATIONS
 from ..views.format import concordance_text, tau_text, title_of
 
 
-def order_sentences(board: Board, boards: Mapping[str, list[Row]]) -> Iterator[str]:
+def agreement_sentences(board: Board, boards: Mapping[str, list[Row]]) -> Iterator[str]:
     """Yield whether seeds, scenarios and definitions order the methods alike.
 
     Args:

@@ -1,4 +1,4 @@
-"""The chart of a scenario's methods as a picture, for notebooks and papers."""
+"""A chart as a picture, for notebooks and papers."""
 
 from __future__ import annotations
 
