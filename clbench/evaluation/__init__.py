@@ -1,1 +1,1 @@
-"""Evaluation: rollouts of a policy, episodes of any agent, answers, probes, and the definition of a scenario."""
+"""Evaluation: rollouts, episodes of any agent, answers, probes of a policy, and the definition of a scenario."""
