@@ -1,1 +1,1 @@
-"""Evaluation: rollouts, episodes of any agent, answers, probes of a policy, and the definition of a scenario."""
+"""Evaluation: rollouts, episodes of any agent, answers and probes of a policy, a scenario's definition."""
