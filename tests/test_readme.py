@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from helpers import blocks_of
 
 from clbench.base.entry_points import resolve
 from clbench.records.reader import read_record
@@ -15,10 +16,6 @@ from clbench.scoring.scores import Scores
 
 README = Path(__file__).parents[1] / "README.md"
 BOARD = README.parent / "docs" / "guide" / "board.md"
-
-
-def _blocks(language: str, page: Path = README) -> list[str]:
-    return re.findall(rf"```{language}\n(.*?)```", page.read_text(encoding="utf-8"), flags=re.DOTALL)
 
 
 def _python(code: str, folder: Path) -> str:
@@ -40,14 +37,14 @@ def _console(block: str, folder: Path) -> str:
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A working directory in which the README's method was saved and run."""
     folder = tmp_path_factory.mktemp("stranger")
-    (folder / "my_method.py").write_text(_blocks("python")[1])
-    _console(_blocks("console")[0], folder)
+    (folder / "my_method.py").write_text(blocks_of(README, "python")[1])
+    _console(blocks_of(README, "console")[0], folder)
     return folder
 
 
 @pytest.mark.slow
 def test_the_first_snippet_steps_through_the_scenario(tmp_path: Path) -> None:
-    lines = _python(_blocks("python")[0], tmp_path).splitlines()
+    lines = _python(blocks_of(README, "python")[0], tmp_path).splitlines()
     assert lines[0].startswith("0 reach - ")
     assert lines[1].startswith("(28,)")
     assert lines[2] == "['push_right', 'press', 'lift', 'carry_back']"
@@ -67,7 +64,7 @@ def test_the_second_snippet_is_a_method_that_keeps_all_answers(folder: Path) -> 
 
 @pytest.mark.slow
 def test_three_commands_lead_from_nothing_to_a_row_on_the_board(tmp_path: Path) -> None:
-    (block,) = _blocks("shell")
+    (block,) = blocks_of(README, "shell")
     new, check, submit = block.strip().splitlines()
     (toy,) = re.findall(
         r"`(--scenario clbench\.testing[^`]*)`", README.read_text(encoding="utf-8").replace("\n", " ")
@@ -91,19 +88,19 @@ def test_three_commands_lead_from_nothing_to_a_row_on_the_board(tmp_path: Path) 
 
 @pytest.mark.slow
 def test_the_third_snippet_draws_the_table(folder: Path) -> None:
-    output = _console(_blocks("console")[1], folder)
+    output = _console(blocks_of(README, "console")[1], folder)
     assert "my_method:HeadOnly" in output
     written = (folder / "leaderboard" / "site" / "LEADERBOARD.md").read_bytes()
-    _console(_blocks("console")[1], folder)
+    _console(blocks_of(README, "console")[1], folder)
     assert (folder / "leaderboard" / "site" / "LEADERBOARD.md").read_bytes() == written
-    printed = _python(_blocks("python")[2].replace("/Fetch-v1", "/Toy-v0"), folder)
+    printed = _python(blocks_of(README, "python")[2].replace("/Fetch-v1", "/Toy-v0"), folder)
     assert "HeadOnly" in printed
     assert "pretrained" in printed
 
 
 @pytest.mark.slow
 def test_the_pictures_of_the_guide_are_drawn(folder: Path) -> None:
-    (code,) = _blocks("python", BOARD)
+    (code,) = blocks_of(BOARD, "python")
     assert "HeadOnly" in _python(code.replace("/Fetch-v1", "/Toy-v0"), folder)
     assert all((folder / name).stat().st_size for name in ("matrix.png", "curves.png", "plane.pdf"))
 

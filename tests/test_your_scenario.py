@@ -8,15 +8,12 @@ import textwrap
 from pathlib import Path
 
 import pytest
+from helpers import blocks_of
 
 from clbench.records.reader import read_record
 from clbench.scoring.scores import Scores
 
 PAGE = Path(__file__).parents[1] / "docs" / "guide" / "your_scenario.md"
-
-
-def _blocks(language: str) -> list[str]:
-    return re.findall(rf"```{language}\n(.*?)```", PAGE.read_text(encoding="utf-8"), flags=re.DOTALL)
 
 
 def _python(folder: Path, *arguments: str) -> str:
@@ -34,12 +31,12 @@ def _python(folder: Path, *arguments: str) -> str:
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A working directory that holds the package of the page."""
     folder = tmp_path_factory.mktemp("stranger")
-    (folder / "mypackage.py").write_text(_blocks("python")[0], encoding="utf-8")
+    (folder / "mypackage.py").write_text(blocks_of(PAGE, "python")[0], encoding="utf-8")
     return folder
 
 
 def test_its_scenario_is_an_environment_and_passes_the_check(folder: Path) -> None:
-    _, environments, check = _blocks("python")
+    _, environments, check = blocks_of(PAGE, "python")
     shown = "\nprint(env.unwrapped.scenario.id, envs.reset(seed=0)[0]['state'].shape)"
     assert _python(folder, "-c", environments + check + shown) == "me/Mine-v0 (4, 4)\n"
 
@@ -47,7 +44,7 @@ def test_its_scenario_is_an_environment_and_passes_the_check(folder: Path) -> No
 def test_its_world_is_perturbed_as_the_page_shows(tmp_path: Path) -> None:
     """Insert the lines of the page into the world, each before or after a line that occurs once."""
     imported, declared, made, drawn, displaced = _fragments()
-    world = _blocks("python")[0].replace("render_mode=None", "render_mode=None, perturbed=False")
+    world = blocks_of(PAGE, "python")[0].replace("render_mode=None", "render_mode=None, perturbed=False")
     for line, lines in (
         ("import clbench\n", f"import clbench\n{imported}\n"),
         ("    def __init__(", f"{declared}\n\n    def __init__("),
@@ -85,7 +82,7 @@ def _fragments() -> list[str]:
 
 @pytest.mark.slow
 def test_its_commands_make_a_row_with_skills_that_are_forgotten(folder: Path) -> None:
-    for line in _blocks("console")[0].strip().splitlines():
+    for line in blocks_of(PAGE, "console")[0].strip().splitlines():
         printed = _python(folder, "-m", *line.split())
     assert "me/Mine-v0" in printed
     scores = Scores.from_record(read_record(folder / "leaderboard/records/me--Mine-v0/sft/seed-0.json"))

@@ -5,21 +5,18 @@ import shlex
 from pathlib import Path
 
 import pytest
+from helpers import blocks_of
 
 from clbench import export_demonstrations
 from clbench.cli.main import app
 from clbench.testing import TOY
 
-PAGE = (Path(__file__).parents[2] / "docs" / "guide" / "data.md").read_text(encoding="utf-8")
+PAGE = Path(__file__).parents[2] / "docs" / "guide" / "data.md"
 TOY_ID = "clbench.testing:clbench/Toy-v0"
 
 
-def _blocks(language: str) -> list[str]:
-    return re.findall(rf"```{language}\n(.*?)```", PAGE, flags=re.DOTALL)
-
-
 def _commands() -> list[list[str]]:
-    return [shlex.split(line)[1:] for block in _blocks("console") for line in block.splitlines()]
+    return [shlex.split(line)[1:] for block in blocks_of(PAGE, "console") for line in block.splitlines()]
 
 
 def test_its_commands_on_a_recording_do_what_it_says(
@@ -39,10 +36,10 @@ def test_its_commands_on_a_recording_do_what_it_says(
     with pytest.raises(SystemExit):
         app(check)
     (told,) = re.findall(r'(expert=".+?")', printed := capsys.readouterr().err)
-    expected = re.sub(r"\W+", " ", on_the_toy(_blocks("text")[0])).replace("clbench testing ", "")
+    expected = re.sub(r"\W+", " ", on_the_toy(blocks_of(PAGE, "text")[0])).replace("clbench testing ", "")
     named = re.sub(r"(?<=demonstrations_)\w+", "0123456789abcdef", printed)
     assert re.sub(r"\W+", " ", named).replace("clbench testing ", "") == expected
-    source = on_the_toy(_blocks("python")[1])
+    source = on_the_toy(blocks_of(PAGE, "python")[1])
     Path("recorded.py").write_text(re.sub('expert=".+?"', told, source), encoding="utf-8")
     app(imported, result_action="return_value")
     assert re.fullmatch(r"clbench/toy/[0-9a-f]{16}/right-v0\n", capsys.readouterr().out)

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas
@@ -103,16 +102,5 @@ def measured(steps: int, ratio: float | str | None) -> Callable[[Record], None]:
     def edit(record: Record) -> None:
         record.costs.optimiser_steps = steps
         record.timing["step_ratio"] = ratio
-
-    return edit
-
-
-def set_in(name: str, key: str, value: Any) -> Callable[[Record], None]:
-    def edit(record: Record) -> None:
-        part = getattr(record, name)
-        if isinstance(part, dict):
-            part[key] = value
-        else:
-            setattr(part, key, value)
 
     return edit

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from helpers import build_method
+from helpers import build_method, weights_of
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -37,10 +37,6 @@ def _stage(steps: int = 5) -> Stage:
 def _adapt(policy: Policy, method: Method, steps: int = 5) -> None:
     method.prepare(policy, _prior())
     adapt(policy, method, _stage(steps), Budget(learning_rate=1e-3))
-
-
-def _weights(policy: Policy) -> dict[str, Tensor]:
-    return {name: weight.detach().clone() for name, weight in policy.named_parameters()}
 
 
 def _gradients(policy: Policy, loss: Tensor) -> dict[str, Tensor]:
@@ -103,7 +99,7 @@ def test_at_the_first_step_of_lwf_there_is_nothing_to_distil() -> None:
 def test_the_teacher_of_lwf_does_not_learn() -> None:
     method: Any = build_method("lwf", {})
     policy = TransformerPolicy(SMALL)
-    before = _weights(policy)
+    before = weights_of(policy)
     _adapt(policy, method)
     assert not policy.get_parameter("head.embed.weight").equal(before["head.embed.weight"])
     assert all(weight.equal(before[name]) for name, weight in method.teacher.named_parameters())
@@ -172,12 +168,12 @@ def test_a_gem_draws_a_full_batch_of_the_target_and_one_of_prior_demonstrations(
 def test_weight_interpolation_goes_its_share_of_the_way(coefficient: float) -> None:
     method = build_method("weight_interpolation", {"coefficient": coefficient})
     policy, plain = TransformerPolicy(SMALL), TransformerPolicy(SMALL)
-    before = _weights(policy)
+    before = weights_of(policy)
     _adapt(policy, method)
     _adapt(plain, build_method("sft", {}))
-    after = _weights(plain)
+    after = weights_of(plain)
     assert not after["head.embed.weight"].equal(before["head.embed.weight"])
-    for name, weight in _weights(policy).items():
+    for name, weight in weights_of(policy).items():
         expected = (1 - coefficient) * before[name].double() + coefficient * after[name].double()
         tolerance = 0.0 if coefficient in (0.0, 1.0) else 1e-7
         torch.testing.assert_close(weight.double(), expected, rtol=0, atol=tolerance)
@@ -187,7 +183,7 @@ def test_weight_interpolation_goes_its_share_of_the_way(coefficient: float) -> N
 def test_weight_interpolation_goes_back_to_where_the_stage_began() -> None:
     policy, method = TransformerPolicy(SMALL), build_method("weight_interpolation", {"coefficient": 0.0})
     _adapt(policy, build_method("sft", {}))
-    before = _weights(policy)
+    before = weights_of(policy)
     _adapt(policy, method)
     assert all(weight.equal(before[name]) for name, weight in policy.named_parameters())
 
@@ -239,12 +235,12 @@ def test_finch_forgets_the_losses_of_the_last_target() -> None:
 
 @pytest.mark.parametrize("factor", [0.2, 0.5])
 def test_the_step_factor_moves_every_weight_by_its_share_of_a_step(factor: float) -> None:
-    start = _weights(TransformerPolicy(SMALL))
+    start = weights_of(TransformerPolicy(SMALL))
     moves = []
     for changes in ({}, {"step_factor": factor}):
         policy = TransformerPolicy(SMALL)
         _adapt(policy, build_method("sft", changes), steps=1)
-        moves.append({name: weight - start[name] for name, weight in _weights(policy).items()})
+        moves.append({name: weight - start[name] for name, weight in weights_of(policy).items()})
     plain, slow = moves
     # the first step of Adam is the learning rate, up or down
     assert plain["head.embed.weight"].abs().max() == pytest.approx(1e-3, rel=1e-3)
@@ -257,7 +253,7 @@ def test_the_step_factor_moves_every_weight_by_its_share_of_a_step(factor: float
 
 def test_stop_gradient_keeps_the_backbone_and_its_answers_to_the_last_bit() -> None:
     policy, questions = TransformerPolicy(SMALL), toy_questions(3).sample(32)
-    before = _weights(policy)
+    before = weights_of(policy)
     answers = policy.answer_logits(questions.state, questions.words)
     _adapt(policy, build_method("stop_gradient", {}), steps=10)
     moved = {name for name, weight in policy.named_parameters() if not weight.equal(before[name])}

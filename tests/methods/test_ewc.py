@@ -4,7 +4,7 @@ from typing import Any
 
 import pytest
 import torch
-from helpers import build_method
+from helpers import build_method, weights_of
 from torch import Tensor
 
 from clbench.learning.adaptation import adapt
@@ -29,10 +29,6 @@ def _prepared(spec: str, policy: Policy, **changes: Any) -> Any:
     method = build_method(spec, changes)
     method.prepare(policy, Prior({"demonstrations": toy_source("left")}))
     return method
-
-
-def _weights(policy: Policy) -> Weights:
-    return {name: weight.detach().clone() for name, weight in policy.named_parameters()}
 
 
 def _moved(policy: Policy) -> None:
@@ -68,7 +64,7 @@ def _set(method: Any, policy: Policy, batch: Batch) -> list[Tensor | None]:
 
 def test_importance_is_the_mean_squared_gradient_of_single_samples() -> None:
     policy = TransformerPolicy(SMALL)
-    before = _weights(policy)
+    before = weights_of(policy)
     method = _prepared("ewc", policy, samples=12)
     _check_close(method.importance, _fisher(policy, toy_source("left"), 12))
     # not the square of the mean gradient, which is near 0 where training has ended
@@ -133,7 +129,7 @@ def test_after_a_target_its_importance_is_added_and_the_anchor_moves_there() -> 
 
 def test_the_anchor_of_l2_sp_stays_where_pretraining_left_it() -> None:
     policy = TransformerPolicy(SMALL)
-    before = _weights(policy)
+    before = weights_of(policy)
     method = _prepared("l2_sp", policy)
     adapt(policy, method, _stage(), Budget(learning_rate=1e-3))
     assert not any(weight.equal(before[name]) for name, weight in policy.head.named_parameters(prefix="head"))
@@ -156,9 +152,9 @@ def test_a_stronger_penalty_leaves_the_weights_nearer_to_where_they_were() -> No
     distances = []
     for strength in (0.0, 100.0):
         policy = TransformerPolicy(SMALL)
-        before = _weights(policy)
+        before = weights_of(policy)
         stage = Stage(1, TOY.task("right"), 0, 30, toy_source("right"), Prior({}))
         adapt(policy, _prepared("l2_sp", policy, strength=strength), stage, Budget(learning_rate=1e-3))
-        moved = [(weight - before[name]).square().sum() for name, weight in _weights(policy).items()]
+        moved = [(weight - before[name]).square().sum() for name, weight in weights_of(policy).items()]
         distances.append(float(torch.stack(moved).sum()))
     assert distances[1] < 0.5 * distances[0]

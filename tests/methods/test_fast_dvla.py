@@ -7,7 +7,7 @@ from typing import Any, NoReturn
 import numpy as np
 import pytest
 import torch
-from helpers import build_method
+from helpers import build_method, weights_of
 from torch import Tensor
 
 from clbench.learning.method import Progress, Stage
@@ -25,10 +25,6 @@ FEW = {"steps": 6, "step_size": 1e-3}
 
 def _prior(seed: int = 0) -> Prior:
     return Prior({"demonstrations": toy_source("left", "up", seed=seed), "questions": toy_questions(seed)})
-
-
-def _weights(policy: Policy) -> dict[str, Tensor]:
-    return {name: weight.detach().clone() for name, weight in policy.named_parameters()}
 
 
 def _prepared(policy: Policy, **changes: Any) -> Any:
@@ -63,16 +59,16 @@ def _fine_tuned(policy: Policy, auxiliary: bool) -> dict[str, Tensor]:
         return loss + 0.5 * copy.answer_loss(asked).mean() if auxiliary else loss
 
     optimise(copy.parameters(), 1e-3, 6, loss_at)
-    return _weights(copy)
+    return weights_of(copy)
 
 
 def test_the_vector_is_the_difference_of_two_fine_tunings_and_alpha_of_it_is_merged() -> None:
     policy = TransformerPolicy(SMALL, seed=3)
-    before = _weights(policy)
+    before = weights_of(policy)
     plain, with_auxiliary = _fine_tuned(policy, False), _fine_tuned(policy, True)
     method = _prepared(policy, auxiliary=0.5, alpha=0.7)
     assert method.vector.keys() == before.keys()
-    after = _weights(policy)
+    after = weights_of(policy)
     for name, value in before.items():
         expected = with_auxiliary[name] - plain[name]
         assert expected.abs().max() > 0, name
@@ -88,7 +84,7 @@ def test_without_an_auxiliary_objective_there_is_no_vector() -> None:
 
 def test_with_alpha_0_the_policy_stays_as_it_was_bit_for_bit() -> None:
     policy = TransformerPolicy(SMALL)
-    before = _weights(policy)
+    before = weights_of(policy)
     method = _prepared(policy, alpha=0.0)
     assert any(value.any() for value in method.vector.values())
     assert all(weight.equal(before[name]) for name, weight in policy.named_parameters())

@@ -1,12 +1,12 @@
 """The guide to online agents: its code runs unchanged."""
 
 import os
-import re
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+from helpers import blocks_of
 
 from clbench.records.reader import read_record
 
@@ -16,11 +16,6 @@ DOCS = Path(__file__).parents[2] / "docs" / "guide"
 
 
 # ---- the page ----------------------------------------------------------------------------------------------
-
-
-def _blocks(language: str) -> list[str]:
-    text = (DOCS / "online.md").read_text(encoding="utf-8")
-    return re.findall(rf"```{language}\n(.*?)```", text, flags=re.DOTALL)
 
 
 SHOW_FLAT = """
@@ -42,7 +37,7 @@ def _output(command: list[str], folder: Path) -> str:
 
 @pytest.mark.slow
 def test_the_code_of_the_page_makes_a_row(tmp_path: Path) -> None:
-    learning, flat = _blocks("python")
+    learning, flat = blocks_of(DOCS / "online.md", "python")
     small = learning.replace("clbench/Fetch-v1", ID).replace("range(5)", "range(3)").replace("5_000", "120")
     command = [sys.executable, "-c", small + flat + SHOW_FLAT]
     output = _output(command, tmp_path)
@@ -52,7 +47,7 @@ def test_the_code_of_the_page_makes_a_row(tmp_path: Path) -> None:
     assert (record.costs.parameters or 0) > 0
     assert record.fingerprint["method"]["class"] == "stable_baselines3.sac.sac:SAC"
     assert record.run.device == "cpu"
-    (shown,) = _blocks("console")
+    (shown,) = blocks_of(DOCS / "online.md", "console")
     command = [sys.executable, "-m", *shown.split()]
     output = _output(command, tmp_path)
     assert "me/sac" in output
@@ -60,7 +55,7 @@ def test_the_code_of_the_page_makes_a_row(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_the_program_of_the_page_makes_a_record_for_each_seed_and_skips_existing_ones(tmp_path: Path) -> None:
-    (line,) = _blocks("shell")
+    (line,) = blocks_of(DOCS / "online.md", "shell")
     python, script, scenario, *seeds = line.split()
     assert (python, script, scenario, seeds) == (
         "python",

@@ -1,27 +1,23 @@
 """The guide to policies from elsewhere: its server and its commands run as they are written."""
 
 import os
-import re
 import shutil
 import subprocess
 import sys
 from pathlib import Path
 
 from agents import ID
+from helpers import blocks_of
 from served import SERVER
 
 PAGE = Path(__file__).parents[2] / "docs" / "guide" / "external.md"
-
-
-def _blocks(language: str) -> list[str]:
-    return re.findall(rf"```{language}\n(.*?)```", PAGE.read_text(encoding="utf-8"), flags=re.DOTALL)
 
 
 def test_the_policy_of_the_page_is_served_and_scored_by_its_commands(
     tmp_path: Path, empty_caches: Path
 ) -> None:
     shutil.copy(SERVER, tmp_path / "server.py")
-    program = _blocks("python")[0].replace("8, 4)", "8, 2)").replace("port=8000", "port=0")
+    program = blocks_of(PAGE, "python")[0].replace("8, 4)", "8, 2)").replace("port=8000", "port=0")
     (tmp_path / "serve_policy.py").write_text(program, encoding="utf-8")
     with subprocess.Popen(
         [sys.executable, "serve_policy.py"], cwd=tmp_path, stdout=subprocess.PIPE, text=True
@@ -29,7 +25,7 @@ def test_the_policy_of_the_page_is_served_and_scored_by_its_commands(
         try:
             assert server.stdout is not None
             address = server.stdout.readline().split()[-1]
-            for stage, shown in enumerate(_blocks("console")):
+            for stage, shown in enumerate(blocks_of(PAGE, "console")):
                 command = shown.replace("clbench/Fetch-v1", ID).replace("ws://localhost:8000", address)
                 done = subprocess.run(
                     f"{sys.executable} -m {command}",

@@ -5,16 +5,19 @@ import dataclasses
 import gzip
 import json
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from torch import Tensor
 
 from clbench.base.entry_points import resolve
 from clbench.data.demonstrations import Demonstration
 from clbench.learning.method import Method
 from clbench.learning.registry import load_method, new_method, read_changes
+from clbench.policy.policy import Policy
 from clbench.records.content import content_hash
 from clbench.records.record import AnswerRow, EpisodeRow, PolicyRow, Record
 from clbench.scoring.reading import read_protocol
@@ -94,3 +97,29 @@ def unpacked(page: str) -> str:
     return re.sub(
         r'(id="data">).*?(</script>)', lambda found: json.dumps(data_of(page)).join(found.groups()), page
     )
+
+
+def blocks_of(page: Path, language: str) -> list[str]:
+    """Return the blocks of code in a language that a page of the documentation shows, in their order."""
+    found: list[str] = re.findall(
+        rf"```{language}\n(.*?)```", page.read_text(encoding="utf-8"), flags=re.DOTALL
+    )
+    return found
+
+
+def set_in(name: str, key: str, value: Any) -> Callable[[Record], None]:
+    """Return a function that sets an entry, or a field, of one part of a record."""
+
+    def edit(record: Record) -> None:
+        part = getattr(record, name)
+        if isinstance(part, dict):
+            part[key] = value
+        else:
+            setattr(part, key, value)
+
+    return edit
+
+
+def weights_of(policy: Policy) -> dict[str, Tensor]:
+    """Return a copy of the parameters of a policy, by name."""
+    return {name: weight.detach().clone() for name, weight in policy.named_parameters()}

@@ -2,11 +2,11 @@
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas
 import pytest
+from helpers import set_in
 
 from clbench.base.entry_points import resolve
 from clbench.records.record import Record
@@ -114,14 +114,3 @@ def test_web_addresses_of_strangers_are_no_links(
     _, page = shown()
     assert "://" not in page
     assert "www." not in page
-
-
-def set_in(name: str, key: str, value: Any) -> Callable[[Record], None]:
-    def edit(record: Record) -> None:
-        part = getattr(record, name)
-        if isinstance(part, dict):
-            part[key] = value
-        else:
-            setattr(part, key, value)
-
-    return edit

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pandas
 import pytest
-from helpers import sealed
+from helpers import sealed, set_in
 
 from clbench.base.entry_points import resolve
 from clbench.records.paths import record_path
@@ -37,17 +37,6 @@ _TABLE: list[bytes] = []
 def flat(text: str) -> str:
     """Return `text` without the line breaks of the terminal and the backslashes of Markdown."""
     return " ".join(text.replace("\\", "").split())
-
-
-def set_in(name: str, key: str, value: Any) -> Callable[[Record], None]:
-    def edit(record: Record) -> None:
-        part = getattr(record, name)
-        if isinstance(part, dict):
-            part[key] = value
-        else:
-            setattr(part, key, value)
-
-    return edit
 
 
 def test_a_record_that_is_not_of_its_schema_is_listed_and_hides_no_other(

@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from helpers import set_in
 from rich.console import Console
 
 from clbench.base.entry_points import resolve
 from clbench.cli.main import app
-from clbench.records.record import Record
 
 
 def test_the_terminal_shows_all_rows_in_108_columns(
@@ -149,14 +149,3 @@ def test_bytes_have_three_digits_and_go_on_to_the_next_unit(
         digits = text.rstrip("kMGT")
         shown = f"{digits} {text.removeprefix(digits)}B" if count else "0"
         assert f'data-note="{count:,} bytes">{shown}<span class="unseen">, {count:,} bytes</span>' in page
-
-
-def set_in(name: str, key: str, value: Any) -> Callable[[Record], None]:
-    def edit(record: Record) -> None:
-        part = getattr(record, name)
-        if isinstance(part, dict):
-            part[key] = value
-        else:
-            setattr(part, key, value)
-
-    return edit
