@@ -28,7 +28,7 @@ CONSFT_CONTROLS := constant_weight shuffled_weights
 RIVALS := a_gem buffered_replay ewc
 # Methods on PointMaze-v1. Of its ladder, the claims need the first rung only.
 SCHEDULED := consft consft_calibrated
-MAZE := aegis $(SCHEDULED) experience_replay fast_dvla l2_sp lora sft stop_gradient
+MAZE := aegis $(SCHEDULED) experience_replay fast_dvla finch l2_sp lora sft stop_gradient
 CLAIMED := $(BOTH),clbench/PointMaze-v1
 
 # The settings of every method, from validation episodes of seeds that no board has. Run it before `make records`.
