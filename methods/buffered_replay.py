@@ -6,12 +6,13 @@ vision-language-action models.
 Details:
 1. Before the first target, single time steps are drawn at random into the buffer, with replacement; all
    skills are equally likely. After each target, the same share of its data is added. No other prior data are
-   seen again. The buffer counts in bytes with its share of the last target, which `experience_replay` never
-   reads.
-2. As in `experience_replay`, half of every batch is replayed. Flow time and noise are drawn anew each time.
-   While the buffer is empty, because there is no earlier task, the batch holds the target alone.
-3. Unlike there, all steps in the buffer are equally likely, so a target with longer demonstrations is
-   replayed more often than another. A step keeps the wording of the instruction with which it was drawn.
+   seen again. The buffer also holds its share of the last target, whose demonstrations `experience_replay`
+   never replays; `bytes kept` counts this share, too.
+2. As in `experience_replay`, half of every batch is replayed by default. Flow time and noise are drawn anew
+   each time. While the buffer is empty, because there is no earlier task, the batch holds the target alone.
+3. Unlike in `experience_replay`, all steps in the buffer are equally likely, so a target with longer
+   demonstrations is replayed more often than another. A step keeps the wording of the instruction with which
+   it was drawn.
 """
 
 import dataclasses

@@ -1,6 +1,6 @@
 """Constant weight: the loss is scaled by the mean of ConSFT's weights, the same for all samples of a step.
 
-A control. It separates the effect of weighing samples from the effect of small weights: it keeps the mean of
+A control. It separates the effect of weighting samples from the effect of small weights: it keeps the mean of
 ConSFT's weights (arXiv 2605.08879), but prefers no sample. Its loss is therefore larger than ConSFT's, whose
 small weights belong to the large losses.
 

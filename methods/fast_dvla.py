@@ -1,19 +1,19 @@
 """FastDVLA: a capability vector is added to the pretrained weights, and an orthogonal regulariser keeps it.
 
 The abstract of "Fast-dVLA" (arXiv 2603.25661) describes another paper by mistake: the method of CapVector
-(arXiv 2605.10903). Its body accelerates discrete-diffusion policies. This is the method of the abstract, with
-CapVector's equations. Two short fine-tunings on known skills, one with an auxiliary objective and one
-without, give two sets of weights; their difference is the capability vector (Eq. 3). It is added to the
-pretrained weights (Eq. 4). Plain fine-tuning follows, with a penalty on moving the weights where the vector
-is large: lambda sum_i |g_i (theta_i - theta_meta_i)| (Eq. 7 and 8).
+(arXiv 2605.10903). The body of Fast-dVLA accelerates discrete-diffusion policies. This class has the method
+of the abstract, with CapVector's equations. Two short fine-tunings on known skills, one with an auxiliary
+objective and one without, give two sets of weights; their difference is the capability vector (Eq. 3). It is
+added to the pretrained weights (Eq. 4). Plain fine-tuning follows, with a penalty on moving the weights where
+the vector is large: lambda sum_i |g_i (theta_i - theta_meta_i)| (Eq. 7 and 8).
 
 Details:
 1. The auxiliary objective is to answer questions. The paper's Spatial Forcing aligns hidden states with those
-   of a vision model instead: both give the backbone a second task besides acting. But the paper's is new to
-   the policy, while questions are a part of the pretraining here. The vector is therefore largely what 150
-   steps without questions cost: on Fetch-v1, seed 0, the two fine-tunings differ by 0.81 in norm, and move
-   from the pretrained policy by 1.04 in directions with a cosine of 0.73. A scenario whose policy has not
-   been pretrained on questions would test the paper's premise more directly.
+   of a vision model instead: both give the backbone a second task besides acting. But the paper's second task
+   is new to the policy, while questions are a part of the pretraining here. The vector is therefore largely
+   what 150 steps without questions cost: on Fetch-v1, seed 0, the two fine-tunings differ by 0.81 in norm,
+   and move from the pretrained policy by 1.04 in directions with a cosine of 0.73. A scenario whose policy
+   has not been pretrained on questions would test the paper's premise more directly.
 2. Both fine-tunings see the same demonstrations of all retained skills, in the same order with the same
    draws. The paper extracts the vector on a small set of tasks; here the number of steps is small.
 3. The vector covers all parameters. None is newly initialised.

@@ -1,4 +1,4 @@
-"""FINCH: the learning rate follows the loss (arXiv 2605.20005), an alternative to weighing samples.
+"""FINCH: the learning rate follows the loss (arXiv 2605.20005), an alternative to weighting samples.
 
 A step can raise the loss on earlier tasks by a bounded amount, which grows with the root of the present loss.
 The learning rate is therefore kappa / sqrt(EMA(L) + eps), capped: steps are small while the loss is high, at

@@ -1,9 +1,10 @@
 """From scratch: a new policy without pretraining for each target.
 
-A reference row: forward transfer (Continual World, arXiv 2105.10919) compares a method with its learning
-curves. The policy keeps the normalisation of the pretrained policy, so that both read the same numbers. It is
-not tuned: the committed rows have the scenario's learning rate, a fifth of pretraining's. Larger steps would
-learn faster, so the speed of other methods, which is relative to this one, looks better than it is.
+A reference row: forward transfer (Continual World, arXiv 2105.10919) compares the learning curves of a method
+with those of this row. The policy keeps the normalisation of the pretrained policy, so that both read the
+same numbers. It is not tuned: the committed rows have the scenario's learning rate, a fifth of pretraining's.
+Larger steps would learn faster, so the speed of other methods, which is relative to this one, looks better
+than it is.
 """
 
 from collections.abc import Iterable

@@ -9,7 +9,8 @@ Details:
 2. One coefficient for all weights. It was chosen on validation episodes of the first Fetch board
    (docs/history.md).
 3. The method's policy exists only after the merge: it is evaluated there alone, and has no learning curve.
-   Where a criterion ends the stage, each check plays the merged policy, and the stage goes on without it.
+   Where a criterion ends the stage, each check plays the merged policy, and the stage goes on with the
+   weights before the merge.
 """
 
 from collections.abc import Iterable
