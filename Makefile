@@ -76,6 +76,7 @@ controls: .venv/installed-dev
 	$(BIN)/clbench run $(CLAIMED) co_training --set.step_factor 1 $(CONTROLS)
 	$(BIN)/clbench run $(CLAIMED) fast_dvla --set.direction random --set.step_factor 1 $(CONTROLS)
 	$(BIN)/clbench run $(CLAIMED) fast_dvla --set.orthogonal 0 --set.step_factor 1 $(CONTROLS)
+	$(BIN)/clbench run clbench/Fetch-v1 $(CONSFT_CONTROLS) --set.step_factor 1 $(CONTROLS)
 	$(BIN)/clbench run $(KNOWLEDGE) aegis --set.direction random $(CONTROLS)
 	$(BIN)/clbench run $(KNOWLEDGE) lora --set.rank 4 $(CONTROLS)
 	$(BIN)/clbench run $(KNOWLEDGE) lora --set.rank 64 $(CONTROLS)
