@@ -166,9 +166,9 @@ def _seeds_for(reach: float, half: float, seeds: int) -> int | None:
     return next(enough, None)
 
 
-def not_told_apart(control: Figure, *, explains: str, does_not: str) -> str:
+def not_told_apart(control: Figure, name: str = "", *, explains: str, does_not: str) -> str:
     """Return what a control says: the figure is the method's gain over the control, higher is better."""
-    name = control.methods[1]
+    name = name or control.methods[1]
     if math.isnan(control.low):
         return f"The records cannot show what {name} says about it."
     if control.low > 0:

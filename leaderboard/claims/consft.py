@@ -178,14 +178,15 @@ def _controls_at_the_published_rate(evidence: Evidence) -> tuple[Figure, ...]:
 
 
 def _what_the_published_rate_says(gain: Figure, controls: Sequence[Figure]) -> list[str]:
-    """Return what an arm gains at the published learning rate, and what the controls say about it."""
+    """Return in a sentence what an arm gains at the published learning rate, and what the controls say."""
     if not gain.low > 0:
         return []
-    said = [f"At the published learning rate {gain.methods[0]} keeps {gain.value:.2f} more than sft."]
+    said = f"At the published learning rate {gain.methods[0]} keeps {gain.value:.2f} more than sft"
     for one in controls:
-        explains, does_not = CONTROLS[one.methods[1].partition("+")[0]]
-        said.append(not_told_apart(one, explains=explains, does_not=does_not))
-    return said
+        name = one.methods[1].partition("+")[0]
+        explains, does_not = CONTROLS[name]
+        said += f"; {not_told_apart(one, name, explains=explains, does_not=does_not).rstrip('.')}"
+    return [f"{said}."]
 
 
 def _what_controls_say(figures: tuple[Figure, ...], arms: Sequence[str]) -> list[str]:
