@@ -101,8 +101,8 @@ def test_what_keeps_skills_at_the_published_learning_rate_is_asked_of_controls_t
     entry = section(bench.page(), "C2")
     assert (
         "At the published learning rate consft_calibrated@1 keeps 0.70 more than sft; constant_weight is not "
-        "told apart from it: weighing single samples need not be what keeps skills; shuffled_weights does not "
-        "reach it: it matters which samples get small weights."
+        "told apart from it: weighing single samples need not be what keeps skills; shuffled_weights does "
+        "not reach it: it matters which samples get small weights."
     ) in entry
 
 
