@@ -109,6 +109,7 @@ benchmark: .venv/installed-dev
 	$(BIN)/python benchmarks/workers.py
 	$(BIN)/python benchmarks/served_policy.py
 	$(BIN)/python benchmarks/scaling.py
+	$(BIN)/python benchmarks/overlap.py
 	$(BIN)/python benchmarks/report.py
 
 test: .venv/installed-dev

@@ -1,18 +1,21 @@
 import importlib
 import itertools
+import json
 import os
 import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
+from types import ModuleType, SimpleNamespace
 
 import pytest
 from tiny import TINY
 
+from clbench.base.entry_points import resolve
 from clbench.data.demonstrations import load_demonstrations
 from clbench.learning.pretraining import policy_config
 from clbench.policy.kinds import new_policy
+from clbench.testing import TOY
 
 BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
 
@@ -113,3 +116,30 @@ def test_the_size_of_the_page_is_that_of_a_page_with_all_rows() -> None:
     ]
     done = subprocess.run(command, check=True, capture_output=True, text=True)
     assert done.stdout.startswith("2 rows, ")
+
+
+# ---- overlap ---------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def overlap(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    monkeypatch.syspath_prepend(BENCHMARKS)
+    return importlib.import_module("overlap")
+
+
+def test_the_page_on_overlap_has_the_committed_results(overlap: ModuleType) -> None:
+    results = json.loads((BENCHMARKS / "results" / "overlap.json").read_text(encoding="utf-8"))
+    assert set(results) == set(overlap.SCENARIOS)
+    assert overlap.PAGE.read_text(encoding="utf-8") == overlap.page(results)
+
+
+def test_rates_are_of_the_actors_that_the_page_names(overlap: ModuleType) -> None:
+    found = overlap.measured(TOY, episodes=6)
+    right = found["tasks"]["right"]
+    assert right["part"] == "target"
+    assert right["nothing"] == 0.0
+    assert right["random"] < 0.5
+    assert "right" not in right["experts"]
+    assert right["experts"]["left"] == 0.0
+    assert overlap.rate(TOY.task("right"), resolve(TOY.task("right").expert)("right"), 6) == 1.0
+    assert max(found["known"].values()) < 0.9  # the toy's tasks begin alike

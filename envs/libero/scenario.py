@@ -229,7 +229,7 @@ step costs seven times as much.
 
 SPATIAL = Scenario(
     id="clbench/LiberoSpatial-v1",
-    description="An arm learns four places of LIBERO's _bowl, and keeps skills of two other suites.",
+    description="An arm learns four places of LIBERO's bowl, and keeps skills of two other suites.",
     retained=(
         _pick("milk"),
         _pick("butter"),
