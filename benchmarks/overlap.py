@@ -62,8 +62,14 @@ def main() -> None:
     for name in parser.parse_args().ids:
         results[name] = measured(clbench.load_scenario(name))
         print(f"{name}: measured")
+    results = {name: results[name] for name in sorted(results, key=_position)}
     path.write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")
     PAGE.write_text(page(results), encoding="utf-8")
+
+
+def _position(name: str) -> tuple[int, str]:
+    """Return the key that sorts the scenarios as `SCENARIOS` lists them, others behind."""
+    return (SCENARIOS.index(name) if name in SCENARIOS else len(SCENARIOS)), name
 
 
 def measured(scenario: Scenario, episodes: int = EPISODES) -> dict[str, Any]:
