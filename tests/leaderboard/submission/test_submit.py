@@ -81,6 +81,7 @@ def test_a_sound_class_gets_a_row_and_a_place(
     assert path.read_bytes() == before
 
 
+@pytest.mark.slow
 def test_a_record_of_older_code_is_set_aside_and_kept(capsys: pytest.CaptureFixture[str]) -> None:
     path = record_path(Path("board/records"), "clbench/Toy-v0", "submitted:Mine", 0)
     submit("submitted:Mine")
