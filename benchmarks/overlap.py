@@ -21,6 +21,7 @@ from result_files import FOLDER
 import clbench
 from clbench.base.entry_points import resolve
 from clbench.base.seeding import derive_seed
+from clbench.learning.pretraining import policy_config
 from clbench.spec.scenario import Scenario
 from clbench.spec.task import Task
 from clbench.worlds.lanes import vector_world
@@ -62,28 +63,24 @@ def main() -> None:
     for name in parser.parse_args().ids:
         results[name] = measured(clbench.load_scenario(name))
         print(f"{name}: measured")
-    results = {name: results[name] for name in sorted(results, key=_position)}
+    ordered = dict.fromkeys([*SCENARIOS, *results])
+    results = {name: results[name] for name in ordered if name in results}
     path.write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")
     PAGE.write_text(page(results), encoding="utf-8")
-
-
-def _position(name: str) -> tuple[int, str]:
-    """Return the key that sorts the scenarios as `SCENARIOS` lists them, others behind."""
-    return (SCENARIOS.index(name) if name in SCENARIOS else len(SCENARIOS)), name
 
 
 def measured(scenario: Scenario, episodes: int = EPISODES) -> dict[str, Any]:
     """Return the rates of a scenario, as JSON."""
     tasks = scenario.tasks + scenario.background
     rows = {}
+    size = policy_config(scenario).action_size
     for task in scenario.tasks:
-        space = vector_world(task.world, 1, 1).single_action_space
         others = {one.name: resolve(one.expert)(one.name) for one in tasks if one.world == task.world}
         others.pop(task.name)
         rows[task.name] = {
             "part": scenario.group(task.name),
-            "nothing": rate(task, _doing_nothing(space.shape[0]), episodes),
-            "random": rate(task, _at_random(space.shape[0]), episodes),
+            "nothing": rate(task, _doing_nothing(size), episodes),
+            "random": rate(task, _at_random(size), episodes),
             "experts": {name: rate(task, expert, episodes) for name, expert in others.items()},
         }
     return {"tasks": rows, "known": known(scenario, episodes)}

@@ -283,5 +283,6 @@ SPATIAL = Scenario(
 """ConSFT's setting: targets of libero_spatial; skills of libero_object and libero_goal to keep.
 
 Only a broad pretraining makes forgetting gradual: with five to seven tasks in it, a target or two erased all
-skills (docs/guide/libero.md). It therefore has 18 tasks that no score counts, and 12,000 steps.
+skills (docs/decisions/0007-broad-pretraining-for-libero.md). It therefore has 18 tasks that no score counts,
+and 12,000 steps.
 """
