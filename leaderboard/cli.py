@@ -29,7 +29,7 @@ from clbench.cli.arguments import (
 )
 from clbench.jobs.folders import check_folders
 from clbench.records.paths import RECORDS, record_path
-from clbench.spec.identifiers import scenario_ids
+from clbench.spec.identifiers import folder_name, scenario_ids
 from clbench.spec.protocol import DEFAULT_SEEDS
 
 from .board.paths import CONTROLS, SCENARIO
@@ -381,7 +381,6 @@ def scenario_card(
         records: Folder of the records.
         output: Folder of the cards.
     """
-    from clbench.spec.identifiers import folder_name, scenario_ids
     from clbench.spec.registry import load_scenario
 
     from .pages.scenario_cards import Card
@@ -412,13 +411,14 @@ def scenario_card(
 
 
 def _evidence(scenario: str | None, records: Path, controls: Path) -> Callable[[str], Evidence]:
-    """Return what gives the evidence on a scenario; refuse `scenario` without any if it is not registered."""
+    """Return what gives the evidence on a scenario; refuse one without records that is not registered."""
     from .claims.evidence import read_evidence
 
-    evidence = read_evidence(records, controls)
-    if scenario is not None and not evidence(scenario).runs:  # one with records may be of a missing package
-        check_names([scenario], [])
-    return evidence
+    if scenario is not None:
+        homes = [home / folder_name(scenario) for home in (records, controls)]
+        if not any(home.is_dir() for home in homes):  # one with records may be of a missing package
+            check_names([scenario], [])  # before all records are read, which takes 10 s
+    return read_evidence(records, controls)
 
 
 def _board(records: Path) -> Board:
