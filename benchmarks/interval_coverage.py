@@ -15,7 +15,7 @@ import argparse
 import itertools
 import json
 import math
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -35,8 +35,8 @@ from clbench.scoring.scores import Scores, rates_of
 RESULTS = Path(__file__).parent / "results" / "coverage.json"
 BOARDS = ("Fetch-v1", "MetaWorld-v1", "PointMaze-v1")
 """Folders of records whose deviations between seeds the page states."""
-EPISODES = 200
-"""Episodes of a run, of all tasks together."""
+EPISODES, FEW_EPISODES = 200, 40
+"""Episodes of a run, of all tasks together, and of the two skills of PointMaze-v1."""
 ROOT = math.sqrt(0.5)
 """Weight of each half of a variance."""
 OTHERS = {0.01: 0.03, 0.03: 0.1, 0.1: 0.5, 0.5: 0.5, 0.9: 0.5, 0.97: 0.03, 0.99: 0.01}
@@ -55,9 +55,10 @@ def main() -> None:
     results = {
         "simulations": arguments.simulations,
         "boards": arguments.boards,
-        "intervals": list(interval_coverage(generator, arguments.simulations)),
+        "intervals": list(interval_coverage(generator, arguments.simulations, SEVERAL)),
         "false_splits": list(false_splits(generator, arguments.boards)),
         "power": list(power(generator, arguments.boards)),
+        "few_episodes": list(few_episodes(arguments.simulations)),
         "records": {name: seed_deviations(RECORDS / name) for name in BOARDS},
     }
     RESULTS.parent.mkdir(exist_ok=True)
@@ -77,7 +78,13 @@ def _json(results: dict[str, Any]) -> str:
 # ---- model -------------------------------------------------------------------------------------------------
 
 
-def outcomes(generator: np.random.Generator, rates: Array, deviations: Array, seeds: int) -> Outcomes:
+def outcomes(
+    generator: np.random.Generator,
+    rates: Array,
+    deviations: Array,
+    seeds: int,
+    episodes: int = EPISODES,
+) -> Outcomes:
     """Return the outcomes of methods.
 
     Args:
@@ -85,6 +92,7 @@ def outcomes(generator: np.random.Generator, rates: Array, deviations: Array, se
         rates: The methods' mean rates, (methods,).
         deviations: Standard deviations of their runs' rates, as if the mean rate were one half, (methods,).
         seeds: Number of seeds.
+        episodes: Number of episodes of a run.
     """
     shape = (len(rates), seeds)
     places = ROOT * (generator.standard_normal(shape) + generator.standard_normal(seeds))
@@ -93,26 +101,41 @@ def outcomes(generator: np.random.Generator, rates: Array, deviations: Array, se
     # A beta distribution of mean p has the variance p (1 - p) / (size + 1).
     mean, size = rates[vary], 0.25 / deviations[vary] ** 2 - 1
     of_runs[vary] = special.betaincinv(mean * size, (1 - mean) * size, special.ndtr(places[vary]))
-    luck = generator.standard_normal((*shape, EPISODES), dtype=np.float32)
-    luck += generator.standard_normal((seeds, EPISODES), dtype=np.float32)
+    luck = generator.standard_normal((*shape, episodes), dtype=np.float32)
+    luck += generator.standard_normal((seeds, episodes), dtype=np.float32)
     return np.asarray(ROOT * luck < special.ndtri(of_runs)[..., None])
 
 
 # ---- intervals ---------------------------------------------------------------------------------------------
 
 
-def interval_coverage(generator: np.random.Generator, simulations: int) -> Iterator[dict[str, Any]]:
+Cell = tuple[int, float, float]
+"""Number of seeds, deviation and mean rate."""
+SEVERAL: list[Cell] = [
+    *itertools.product((1,), (0.0,), OTHERS),
+    *itertools.product((2, 3, 4, 5, 8), (0.0, 0.05, 0.1), OTHERS),
+]
+
+
+def few_episodes(simulations: int) -> Iterator[dict[str, Any]]:
+    """Yield the coverage with few episodes and the deviations of retention on MetaWorld and PointMaze."""
+    cells = list(itertools.product((4, 8), (0.12, 0.18), OTHERS))
+    return interval_coverage(np.random.default_rng(1), simulations, cells, FEW_EPISODES)
+
+
+def interval_coverage(
+    generator: np.random.Generator, simulations: int, cells: Sequence[Cell], episodes: int = EPISODES
+) -> Iterator[dict[str, Any]]:
     """Yield the coverage of the intervals of a rate, and of its difference to another rate.
 
     With one seed the truth is the rate of this run, so that seeds do not differ.
     """
-    several = itertools.product((2, 3, 4, 5, 8), (0.0, 0.05, 0.1), OTHERS)
-    cells = [*itertools.product((1,), (0.0,), OTHERS), *several]
     for seeds, deviation, rate in track(cells, "intervals"):
         other = OTHERS[rate]
         # Seeds are independent: the seeds of all simulations are drawn at once.
-        both = outcomes(generator, np.array([rate, other]), np.full(2, deviation), simulations * seeds)
-        first, second = both.astype(np.int8).reshape(2, simulations, seeds, EPISODES)
+        rates, deviations = np.array([rate, other]), np.full(2, deviation)
+        both = outcomes(generator, rates, deviations, simulations * seeds, episodes)
+        first, second = both.astype(np.int8).reshape(2, simulations, seeds, episodes)
         for name, success, truth, span in (
             ("rate", first, rate, (0.0, 1.0)),
             ("difference", first - second, rate - other, (-1.0, 1.0)),
@@ -140,8 +163,9 @@ def _interval(
         # Draws with replacement from each run's outcomes -1, 0 and 1.
         kinds = np.array([-1, 0, 1])
         shares = (success[..., None] == kinds).mean(axis=1)
-        drawn = generator.multinomial(EPISODES, shares, (500, seeds)) @ kinds
-        return np.asarray(drawn.mean(axis=1) / EPISODES)
+        episodes = success.shape[1]
+        drawn = generator.multinomial(episodes, shares, (500, seeds)) @ kinds
+        return np.asarray(drawn.mean(axis=1) / episodes)
 
     without_one = (total - of_runs) / (seeds - 1) if seeds > 1 else np.zeros(0)
     return interval(float(total / seeds), without_one, other_episodes, span)
@@ -256,7 +280,7 @@ Lines = dict[str, Row]
 
 
 def tables(results: Row) -> list[str]:
-    """Return the tables of docs/guide/statistics.md: coverage twice, widths, false splits twice, power."""
+    """Return the tables of docs/guide/statistics.md: coverage thrice, widths, false splits twice, power."""
     equal: Lines = {f"{count} methods": {"kind": "equal", "methods": count} for count in (5, 10, 15)}
     harder: Lines = {
         "runs of every second method differ, others do not": {"kind": "unequal"},
@@ -267,12 +291,14 @@ def tables(results: Row) -> list[str]:
     differences = {f"difference {size:.1f}": {"difference": size} for size in (0.1, 0.2, 0.3)}
     rates, minus = ([row for row in results["intervals"] if row["quantity"] == name] for name in QUANTITIES)
     middle = [row for row in rates if row["rate"] == 0.5]
+    few = [row for row in results["few_episodes"] if row["quantity"] == "rate"]
     splits, pairs = results["false_splits"], results["power"]
     of_rates: Lines = {f"{rate:g}": {"rate": rate} for rate in OTHERS}
     of_pairs: Lines = {f"{rate:g} - {other:g}": {"rate": rate} for rate, other in OTHERS.items()}
     return [
         _table("%", rates, _kinds(rates), of_rates, _coverage),
         _table("%", minus, _kinds(minus), of_pairs, _coverage),
+        _table("%", few, _kinds(few), of_rates, _coverage),
         _table("width", middle, _seeds(rates), _deviations(rates), lambda row: f"{row['width']:.2f}"),
         _table("%", splits, equal, _kinds(splits, "equal"), _split),
         _table("%", splits, harder, _kinds(splits, "unequal", "single"), _split),

@@ -36,7 +36,7 @@ def test_its_command_prints_what_the_page_shows(tmp_path: Path) -> None:
 def test_its_script_prints_a_value_a_reason_and_the_flips(tmp_path: Path) -> None:
     value, reason, *flips = _run(tmp_path, "-c", _block("python")).splitlines()
     assert float(value) == pytest.approx(0.45)
-    assert reason == "No method is called joint, or it lacks seeds."
+    assert reason == "No method is called joint, or it has other seeds."
     assert any(line.startswith("average sft") for line in flips)
 
 

@@ -97,7 +97,7 @@ def run(
     check_names(scenarios.split(","), methods)
     from clbench.runs.spec import RunSpec, check_device
     from clbench.runs.tensorboard import require_tensorboard
-    from clbench.scoring.intervals import expected_precision
+    from clbench.scoring.expected_precision import expected_precision
 
     add_cwd_to_path()
     with checked_input():

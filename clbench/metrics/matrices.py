@@ -20,6 +20,8 @@ Unit = Literal["share", "percent"]
 """Unit of success rates: from 0 to 1, or from 0 to 100."""
 MOST: dict[Unit, float] = {"share": 1.0, "percent": 100.0}
 """The greatest success rate in each unit."""
+ROUNDING = 1e-9
+"""Share by which a mean of rates may exceed the greatest one: the last bits of a sum."""
 
 Names = Sequence[str]
 
@@ -146,7 +148,7 @@ def matrices_of(
         raise InputError(f"{where}{found} {_expected_stages(layout)}")
     known = {cell: rate for cell, rate in cells.items() if not math.isnan(rate)}
     largest = max(known.values(), default=0.0)
-    chosen: Unit = unit or ("percent" if largest > 1 else "share")
+    chosen: Unit = unit or ("percent" if largest > 1 + ROUNDING else "share")
     _check_range(known, chosen, where)
     places = {name: place for place, name in enumerate(layout.tasks)}
     success: dict[str, dict[str, Array]] = {}
@@ -154,14 +156,14 @@ def matrices_of(
         of_method = success.setdefault(cell.method, {})
         if cell.seed not in of_method:
             of_method[cell.seed] = np.full((len(layout.target) + 1, len(tasks)), np.nan)
-        of_method[cell.seed][cell.stage, places[cell.task]] = rate / MOST[chosen]
+        of_method[cell.seed][cell.stage, places[cell.task]] = min(rate / MOST[chosen], 1.0)
     return Matrices(layout, success, chosen, unit is not None, largest)
 
 
 def _check_range(known: Mapping[Cell, float], unit: Unit, where: str) -> None:
     """Refuse a rate that is impossible in its unit."""
     for cell, rate in known.items():
-        if not 0 <= rate <= MOST[unit]:
+        if not 0 <= rate <= MOST[unit] * (1 + ROUNDING):
             words = {"share": "a share from 0 to 1", "percent": "per cent from 0 to 100"}[unit]
             raise InputError(f"{where}{cell}: expected {words}, found {rate:g}.")
 

@@ -214,7 +214,7 @@ def _reason(metric: Metric, layout: Layout, runs: Mapping[str, Array], absent: l
     if needed is None:
         return metric.missing
     if absent:
-        return f"No method is called {absent[0]}, or it lacks seeds."
+        return f"No method is called {absent[0]}, or it has other seeds."
     places = [
         f"{f'seed {quoted(seed)}, ' if len(runs) > 1 else ''}stage {stage}, {layout.tasks[task]}"
         for seed, matrix in runs.items()

@@ -19,16 +19,17 @@ from clbench.scoring.metrics import METRICS, load_metric, measure
 from clbench.scoring.scores import rates_of
 
 UNKNOWN_DEVIATION = 0.2
-"""Standard deviation between seeds, assumed where no row has a second seed. To be on the safe side it is
-above the greatest of the final average in the committed records, 0.13."""
+"""Standard deviation between seeds as a share of the range of a metric, assumed where no row has a second
+seed. To be on the safe side it is above the greatest of the final average in the committed records, 0.13. A
+metric without two bounds then tells no rows apart."""
 
 
 def deviation_of_differences(metric: str, rows: Iterable[Runs]) -> float | None:
     """Return the standard deviation of the difference of two rows from seed to seed.
 
     It is the root mean square over all pairs of rows, each over its common seeds. With it,
-    `student_quantile(n - 1) * deviation / sqrt(n)` is half of the expected width of the interval of a
-    difference over n seeds: rows that are nearer cannot be told apart.
+    `student_quantile(n - 1) * deviation / sqrt(n)` is half of the expected width of the interval of one
+    difference over n seeds. To tell two of several rows apart takes more, see `least_difference`.
 
     Args:
         metric: Name of a metric that needs no reference.
@@ -36,7 +37,14 @@ def deviation_of_differences(metric: str, rows: Iterable[Runs]) -> float | None:
 
     Returns:
         None if no two rows have two common seeds.
+
+    Raises:
+        UnknownNameError: The metric is unknown.
+        InputError: It needs a reference, or the runs are of different tasks, episodes, evaluation points or
+            questions.
     """
+    rows = list(rows)
+    _check(load_metric(metric), rows)
     values = [{seed: measure(metric, run) for seed, run in runs.items()} for runs in rows]
     total, degrees = 0.0, 0
     for one, other in combinations(values, 2):
@@ -46,6 +54,35 @@ def deviation_of_differences(metric: str, rows: Iterable[Runs]) -> float | None:
             total += float(((differences - differences.mean()) ** 2).sum())
             degrees += len(differences) - 1
     return math.sqrt(total / degrees) if degrees else None
+
+
+def least_difference(deviation: float, rows: int, seeds: int) -> float:
+    """Return the difference beyond which Tukey's test tells two of several equally noisy rows apart.
+
+    A true difference of this size shows in about half of the boards.
+
+    Args:
+        deviation: Standard deviation of the difference of two rows, see `deviation_of_differences`.
+        rows: Number of rows, two or more.
+        seeds: Number of seeds that all rows have, two or more.
+    """
+    factor = studentised_range_quantile(rows, (rows - 1) * (seeds - 1)) / math.sqrt(2)
+    return factor * deviation / math.sqrt(seeds)
+
+
+def _check(metric: Metric, rows: Iterable[Runs]) -> None:
+    """Refuse a metric that needs a reference, and rows that cannot be compared.
+
+    Raises:
+        InputError: One of these.
+    """
+    if metric.references:
+        raise InputError(
+            f"{metric.name} compares a row with {' and '.join(metric.references)}, so that rows are not "
+            "compared by it. Take a metric that needs no reference, such as final_average."
+        )
+    if len({run.layout for runs in rows for run in runs.values()}) > 1:
+        raise InputError("Only runs of the same tasks, episodes, evaluation points and questions compare.")
 
 
 # ---- groups ------------------------------------------------------------------------------------------------
@@ -72,33 +109,63 @@ def groups(metric: str, rows: Mapping[str, Runs]) -> dict[str, str]:
 
     So about 5 % of the boards of equal methods have more than one group, and up to 9 % where one method
     varies far more than the others: `docs/guide/statistics.md` has the figures. Rows without a common seed
-    are compared by the variation of runs around the mean of their row. Where no row has a second seed, a
-    deviation of `UNKNOWN_DEVIATION` is assumed: only distant rows are told apart.
+    are compared by the variation of runs around the mean of their row, and so are all rows if no two have
+    two common seeds. Where no row has a second seed, a deviation of `UNKNOWN_DEVIATION` is assumed: only
+    distant rows are told apart.
 
     Args:
         metric: Name of a metric.
         rows: Runs by seed of each row.
 
     Returns:
-        Letters by row, the best row first; it is in group a. Rows without a value have none, and neither has
-        any row if the metric needs a reference.
+        Letters by row, the best row first; it is in group a. Rows without a value have none.
 
     Raises:
         UnknownNameError: The metric is unknown.
-        InputError: It says nothing of better or worse, or the runs are of different tasks, episodes,
-            evaluation points or questions.
+        InputError: It needs a reference or says nothing of better or worse, or the runs are of different
+            tasks, episodes, evaluation points or questions.
     """
+    names, board = _board_of(metric, rows)
+    return dict(zip(names, letter_display(board.apart()), strict=True)) if names else {}
+
+
+def differences_needed(metric: str, rows: Mapping[str, Runs], base: str) -> dict[str, float]:
+    """Return by how much each other row would have to differ from row `base` to be told apart from it.
+
+    Args:
+        metric: Name of a metric.
+        rows: Runs by seed of each row.
+        base: Name of one of the rows.
+
+    Returns:
+        The differences of the rows that have a value, none if `base` has no value.
+
+    Raises:
+        UnknownNameError: The metric is unknown.
+        InputError: As for `groups`.
+    """
+    names, board = _board_of(metric, rows)
+    if base not in names:
+        return {}
+    place = names.index(base)
+    pairs = {name: sorted((place, other)) for other, name in enumerate(names) if other != place}
+    return {name: board.compare(*pair)[1] for name, pair in pairs.items()}
+
+
+def _board_of(metric: str, rows: Mapping[str, Runs]) -> tuple[list[str], _Board]:
+    """Return the names of the rows with a value, the best first, and what compares them in this order."""
     wanted = load_metric(metric)
     if wanted.higher_is_better is None:
-        known = ", ".join(name for name, one in METRICS.items() if one.higher_is_better is not None)
+        known = ", ".join(
+            name for name, one in METRICS.items() if one.higher_is_better is not None and not one.references
+        )
         raise InputError(
             f"Rows cannot be ordered by {metric}, of which neither more nor less is better. Metrics that "
             f"order rows: {known}."
         )
+    _check(wanted, rows.values())
     sign = 1.0 if wanted.higher_is_better else -1.0
     seeds = sorted({seed for runs in rows.values() for seed in runs})
-    if len({run.layout for runs in rows.values() for run in runs.values()}) > 1:
-        raise InputError("Only runs of the same tasks, episodes, evaluation points and questions compare.")
     entries = []
     for name, runs in rows.items():
         if not runs:
@@ -107,10 +174,8 @@ def groups(metric: str, rows: Mapping[str, Runs]) -> dict[str, str]:
         if math.isfinite(value):
             entries.append((-sign * value, name, sign * of_seeds, sign * without_episode))
     entries.sort(key=lambda entry: entry[:2])
-    if not entries:
-        return {}
-    apart = told_apart(np.stack([entry[2] for entry in entries]), np.stack([entry[3] for entry in entries]))
-    return {entry[1]: letters for entry, letters in zip(entries, letter_display(apart), strict=True)}
+    values, without_episode = (np.array([entry[number] for entry in entries]) for number in (2, 3))
+    return [entry[1] for entry in entries], _Board(values, without_episode, wanted.high - wanted.low)
 
 
 def told_apart(values: Array, without_episode: Array) -> NDArray[np.bool_]:
@@ -124,11 +189,7 @@ def told_apart(values: Array, without_episode: Array) -> NDArray[np.bool_]:
         without_episode: The same if the first, the second, ... episode of all tasks is left out,
             (rows, seeds, episodes).
     """
-    board = _Board(values, without_episode)
-    apart = np.zeros((len(values), len(values)), dtype=np.bool_)
-    for better, worse in combinations(range(len(values)), 2):
-        apart[better, worse] = apart[worse, better] = board.tells_apart(better, worse)
-    return apart
+    return _Board(values, without_episode).apart()
 
 
 def letter_display(apart: NDArray[np.bool_]) -> list[str]:
@@ -164,9 +225,20 @@ class _Board:
 
     values: Array
     without_episode: Array
+    reach: float = 1.0
+    """Difference between the greatest and the least value of the metric."""
 
-    def tells_apart(self, better: int, worse: int) -> bool:
-        """Return whether one row is certainly better than another."""
+    def apart(self) -> NDArray[np.bool_]:
+        """Return which rows are told apart, (rows, rows), symmetric."""
+        found = np.zeros((len(self.values), len(self.values)), dtype=np.bool_)
+        for better, worse in combinations(range(len(self.values)), 2):
+            difference, needed = self.compare(better, worse)
+            # Values are quotients of whole numbers: equal ones may differ in the last bit.
+            found[better, worse] = found[worse, better] = difference > needed + 1e-9
+        return found
+
+    def compare(self, better: int, worse: int) -> tuple[float, float]:
+        """Return the difference of two rows, and the one beyond which the test tells them apart."""
         known = np.isfinite(self.values)
         common = known[better] & known[worse]
         number = np.count_nonzero(common)
@@ -182,8 +254,7 @@ class _Board:
             variance = of_all * (1 / known[better].sum() + 1 / known[worse].sum())
             difference = np.nanmean(self.values[better]) - np.nanmean(self.values[worse])
         factor = studentised_range_quantile(len(self.values), degrees) / math.sqrt(2)
-        # Values are quotients of whole numbers: equal ones may differ in the last bit.
-        return bool(difference > factor * math.sqrt(variance) + 1e-9)
+        return float(difference), factor * math.sqrt(variance)
 
     @cached_property
     def paired(self) -> tuple[float, int]:
@@ -192,7 +263,8 @@ class _Board:
         values = self.values[rows, seeds]
         design = np.concatenate([np.eye(len(self.values))[rows], np.eye(self.values.shape[1])[seeds]], axis=1)
         effects, _, rank, _ = np.linalg.lstsq(design, values)
-        return self._pooled(values - design @ effects, len(values) - int(rank))
+        degrees = len(values) - int(rank)
+        return self._pooled(values - design @ effects, degrees) if degrees else self.unpaired
 
     @cached_property
     def unpaired(self) -> tuple[float, int]:
@@ -205,7 +277,8 @@ class _Board:
         if degrees:
             return float((deviations**2).sum()) / degrees, degrees
         known = np.isfinite(self.values)
-        return UNKNOWN_DEVIATION**2 + float(_jackknife(self.without_episode[known]).mean()), MANY
+        unknown = (UNKNOWN_DEVIATION * self.reach) ** 2
+        return unknown + float(_jackknife(self.without_episode[known]).mean()), MANY
 
 
 def _jackknife(without_episode: Array) -> Array:

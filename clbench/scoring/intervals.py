@@ -7,14 +7,18 @@ several seeds vary for both reasons. Therefore:
 1. With two or more seeds the interval is Student's over the seeds. Its standard error comes from the
    jackknife, which leaves out one whole seed at a time. Its degrees of freedom are the seeds less one. For a
    quantity with a least and a greatest value it is Wilson's score interval: see `interval_of_seeds`.
-2. With one seed, or where the seeds agree exactly, the variation between seeds is unknown, and the interval
-   covers episodes alone. It holds the percentiles of replicates in which every run keeps its policy and meets
-   episodes drawn with replacement, for each task. All stages and evaluation points of a run get the same
-   draws, and so do runs of other methods with this seed: they met the same initial states. Fewer episodes are
-   run before the end of a stage. There the rate is the mean over the drawn ones among them. Right answers are
-   drawn from a binomial for each stage and kind of question, since records hold counts only. With one
-   seed, metrics of `OF_WHOLE_RUNS`, such as the steps to the criterion, have no interval. Neither has the
-   share of targets that met the criterion if seeds agree: it has few values, so they agree by chance.
+2. With one seed the variation between seeds is unknown, and the interval covers episodes alone. It holds the
+   percentiles of replicates in which every run keeps its policy and meets episodes drawn with replacement,
+   for each task. All stages and evaluation points of a run get the same draws, and so do runs of other
+   methods with this seed: they met the same initial states. Fewer episodes are run before the end of a stage.
+   There the rate is the mean over the drawn ones among them. Right answers are drawn from a binomial for each
+   stage and kind of question, since records hold counts only. Such an interval says nothing of other seeds:
+   `Estimate.of_seeds` is False, and nothing is concluded from it.
+3. Where several seeds agree exactly, they may do so by chance. The standard error is then that of these
+   replicates, with Student's quantile of the seeds; it is 0 if all outcomes are equal.
+
+Metrics of `OF_WHOLE_RUNS`, such as the steps to the criterion, do not depend on the drawn episodes. Unless
+seeds differ, they have no interval.
 
 Tasks are fixed: a scenario consists of them. All seeds share demonstrations, scenes and questions: intervals
 do not cover other ones. Choices on a run's validation episodes are fixed too: the interval does not cover the
@@ -38,7 +42,6 @@ from clbench.scoring.metric import Metric
 from clbench.scoring.metrics import load_metric
 from clbench.scoring.rates import Rates, combine
 from clbench.scoring.scores import Scores, rates_of
-from clbench.spec.scenario import Scenario
 
 Runs = Mapping[int, Scores]
 """Runs of one method on one scenario, by seed."""
@@ -61,10 +64,8 @@ OF_WHOLE_RUNS = (
     "met",
     "relearning_steps",
 )
-"""Arrays of `Rates` that no draw of test episodes changes: one seed tells nothing of how much they vary."""
-SEED_DEVIATION = 0.1
-"""Standard deviation of a success rate between seeds, assumed where none is measured.
-`docs/guide/statistics.md` has what is measured in the committed records."""
+"""Arrays of `Rates` that no draw of test episodes changes. Unless seeds differ, nothing is known of how much
+they vary: seeds may agree by chance, or at a least value."""
 MANY = 10**6
 """Degrees of freedom of a standard deviation that is known."""
 
@@ -79,6 +80,16 @@ class Estimate:
     """Lower end of the interval."""
     high: float | None
     """Upper end of the interval."""
+    of_seeds: bool = True
+    """Whether the interval describes other seeds; with one seed it does not."""
+
+    def is_above(self, bar: float) -> bool:
+        """Return whether the interval describes other seeds and is above `bar`."""
+        return self.of_seeds and self.low is not None and self.low > bar
+
+    def is_below(self, bar: float) -> bool:
+        """Return whether the interval describes other seeds and is below `bar`."""
+        return self.of_seeds and self.high is not None and self.high < bar
 
 
 NO_ESTIMATE = Estimate(None, None, None)
@@ -127,7 +138,10 @@ def estimate(
     def over_runs(metric: Metric) -> _Quantity:
         return lambda rates: metric.over_runs(rates[0])
 
-    return {one.name: samples[one.references].estimate(over_runs(one), (one.low, one.high)) for one in wanted}
+    return {
+        one.name: samples[one.references].estimate(over_runs(one), (one.low, one.high), ratio=one.ratio)
+        for one in wanted
+    }
 
 
 def paired_difference(
@@ -175,6 +189,7 @@ def bootstrap(
     generator: np.random.Generator,
     *,
     span: Span = UNBOUNDED,
+    ratio: bool = False,
     replicates: int = REPLICATES,
 ) -> Estimate:
     """Return any quantity of the success rates of several methods, with its interval.
@@ -184,13 +199,15 @@ def bootstrap(
         runs: Runs of each method: the same seeds in the same order. All get the same draws.
         generator: Source of the draws.
         span: Least and greatest possible value.
+        ratio: Whether the values are positive ratios, see `interval`.
         replicates: Number of draws.
 
     Raises:
-        InputError: The runs are of different tasks, episodes, evaluation points or questions.
+        InputError: A method has no run or another number of runs than the others, or the runs are of
+            different tasks, episodes, evaluation points or questions.
     """
     samples = _Samples(list(runs.values()), {}, generator, replicates)
-    return samples.estimate(lambda rates: quantity(dict(zip(runs, rates, strict=True))), span)
+    return samples.estimate(lambda rates: quantity(dict(zip(runs, rates, strict=True))), span, ratio=ratio)
 
 
 def interval(
@@ -198,6 +215,8 @@ def interval(
     without_one: Array,
     other_episodes: Callable[[], Array] | None = None,
     span: Span = UNBOUNDED,
+    *,
+    ratio: bool = False,
 ) -> Estimate:
     """Return a value with its interval.
 
@@ -207,26 +226,38 @@ def interval(
         other_episodes: Returns the values with episodes drawn anew, (replicates,). It is called only if the
             seeds do not vary; without it there is then no interval.
         span: Least and greatest possible value.
+        ratio: Whether the values are positive ratios, of which 2 is as far from 1 as 1/2. The interval is
+            then that of their logarithm, and `span` does not count. Values of 0 have no logarithm: with
+            one, the interval is that of the values.
     """
+    if ratio and min([value, *without_one]) > 0:
+        found = interval(
+            math.log(value), np.log(without_one), other_episodes and (lambda: np.log(other_episodes()))
+        )
+        low, high = (None if end is None else math.exp(end) for end in (found.low, found.high))
+        return Estimate(value, low, high, found.of_seeds)
     if not math.isfinite(value):
         return NO_ESTIMATE
     # A metric that has no value without one of the seeds, or with other episodes, has no honest interval.
     if not np.isfinite(without_one).all():
         return Estimate(value, None, None)
+    degrees = len(without_one) - 1
     # Equal values may differ in the last bits.
     if np.abs(without_one - value).max(initial=0.0) > 1e-12 * max(1.0, abs(value)):
-        degrees = len(without_one) - 1
         low, high = interval_of_seeds(value, math.sqrt(degrees) * float(without_one.std()), degrees, span)
     else:
         replicates = other_episodes() if other_episodes else np.array([math.nan])
         if not np.isfinite(replicates).all():
             return Estimate(value, None, None)
-        low, high = np.percentile(replicates, [50 - LEVEL / 2, 50 + LEVEL / 2])
-    return Estimate(value, min(float(low), value), max(float(high), value))
+        if degrees < 1:
+            low, high = np.percentile(replicates, [50 - LEVEL / 2, 50 + LEVEL / 2])
+        else:
+            low, high = interval_of_seeds(value, float(replicates.std()), degrees, span)
+    return Estimate(value, min(float(low), value), max(float(high), value), of_seeds=degrees > 0)
 
 
 def mean_of_seeds(values: Sequence[float], span: Span = UNBOUNDED) -> Estimate:
-    """Return the mean of the values of the seeds, one for each, with its interval; none with one seed."""
+    """Return the mean of one or more values, one for each seed, with its interval; none with one seed."""
     mean = math.fsum(values) / len(values)
     rest = [[*values[:place], *values[place + 1 :]] for place in range(len(values))]
     without_one = [math.fsum(part) / len(part) for part in rest if part]
@@ -246,7 +277,7 @@ def interval_of_seeds(value: float, error: float, degrees: int, span: Span = UNB
 
     Args:
         value: The value, within the span.
-        error: Its standard error, above 0.
+        error: Its standard error; with 0 the interval has no width.
         degrees: Degrees of freedom of the standard error.
         span: Least and greatest possible value.
     """
@@ -254,6 +285,8 @@ def interval_of_seeds(value: float, error: float, degrees: int, span: Span = UNB
     reach = student_quantile(degrees) * error
     if not math.isfinite(high - low):
         return max(value - reach, low), min(value + reach, high)
+    if reach == 0:
+        return value, value
     place, reach = min(max((value - low) / (high - low), 0.0), 1.0), reach / (high - low)
     spread = place * (1 - place)
     # The ends are the roots x of spread (x - place)^2 = reach^2 x (1 - x).
@@ -307,18 +340,23 @@ class _Samples:
 
     def __post_init__(self) -> None:
         every = (*self.methods, *self.references.values())
+        if len({len(runs) for runs in every}) != 1 or not self.methods[0]:
+            raise InputError(
+                "Every method needs a run of each seed, in the same order, and there must be one."
+            )
         if len({run.layout for runs in every for run in runs}) != 1:
             raise InputError(
                 "Only runs of the same tasks, episodes, evaluation points and questions compare."
             )
 
-    def estimate(self, quantity: _Quantity, span: Span) -> Estimate:
-        """Return a quantity with its interval."""
+    def estimate(self, quantity: _Quantity, span: Span, *, ratio: bool = False) -> Estimate:
+        """Return a quantity with its interval; `ratio` is that of `interval`."""
         return interval(
             float(quantity(self.whole)),
             quantity(self.without_one) if len(self.methods[0]) > 1 else np.zeros(0),
             lambda: quantity(self.other_episodes),
             span,
+            ratio=ratio,
         )
 
     @cached_property
@@ -349,8 +387,7 @@ class _Samples:
         rates = combine(parts, lambda arrays: np.stack(arrays, axis=1))
         share = rates.correct / np.maximum(rates.asked, 1)
         correct = self.generator.binomial(rates.asked.astype(np.int64), share)
-        unknown = OF_WHOLE_RUNS if len(runs) == 1 else ("met",)
-        of_runs = {name: np.full_like(getattr(rates, name), np.nan) for name in unknown}
+        of_runs = {name: np.full_like(getattr(rates, name), np.nan) for name in OF_WHOLE_RUNS}
         return replace(rates, correct=correct.astype(np.float64), **of_runs)
 
 
@@ -383,61 +420,3 @@ def studentised_range_quantile(count: int, degrees: int) -> float:
     from scipy import stats
 
     return float(stats.studentized_range.ppf(LEVEL / 100, count, degrees))
-
-
-# ---- before a run ------------------------------------------------------------------------------------------
-
-
-def half_width(seeds: int, episodes: int, tasks: int, *, seed_deviation: float = SEED_DEVIATION) -> float:
-    """Return half of the expected width of the interval of a mean success rate.
-
-    The rate is assumed to be one half, the worst case. With one seed the interval covers its episodes alone.
-
-    Args:
-        seeds: Number of seeds.
-        episodes: Scored episodes of a task.
-        tasks: Number of tasks in the mean.
-        seed_deviation: Standard deviation of the rate between seeds.
-    """
-    of_seeds = seed_deviation**2 if seeds > 1 else 0.0
-    error = math.sqrt((of_seeds + 0.25 / (episodes * tasks)) / seeds)
-    reach = _quantile(seeds) * error
-    return reach / math.sqrt(1 + 4 * reach**2)  # `interval_of_seeds` at one half
-
-
-def episodes_needed(
-    wished: float, seeds: int, tasks: int, *, seed_deviation: float = SEED_DEVIATION
-) -> int | None:
-    """Return the number of episodes of a task for which `half_width` is as `wished`.
-
-    Args:
-        wished: Half of the width of the interval, above 0.
-        seeds: Number of seeds.
-        tasks: Number of tasks in the mean.
-        seed_deviation: Standard deviation of the rate between seeds.
-
-    Returns:
-        None if no number of episodes is enough: more seeds are needed.
-    """
-    if wished >= 0.5:
-        return 1  # half of any interval
-    of_seeds = seed_deviation**2 if seeds > 1 else 0.0
-    error = wished / math.sqrt(1 - 4 * wished**2) / _quantile(seeds)
-    of_episodes = seeds * error**2 - of_seeds
-    # A number of episodes that gives the half-width exactly needs no further one.
-    return math.ceil(0.25 / (tasks * of_episodes) - 1e-6) if of_episodes > 0 else None
-
-
-def _quantile(seeds: int) -> float:
-    return student_quantile(seeds - 1 if seeds > 1 else MANY)
-
-
-def expected_precision(scenario: Scenario, seeds: int) -> str:
-    """Return a sentence on the expected width of the intervals of a run of `scenario`."""
-    episodes = scenario.budget.test_episodes
-    retained, target = len(scenario.retained), len(scenario.target)
-    counts = {"retention": retained, "adaptation": target, "final average": retained + target}
-    widths = {name: half_width(seeds, episodes, tasks) for name, tasks in counts.items() if tasks}
-    parts = ", ".join(f"± {width:.2f} for {name}" for name, width in widths.items())
-    what, of = (f"{seeds} seeds", "95 %") if seeds > 1 else ("1 seed", "95 %, of this seed alone")
-    return f"{what} x {episodes} episodes: near a rate of one half expect about {parts} ({of})."

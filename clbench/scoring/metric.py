@@ -17,6 +17,9 @@ from clbench.scoring.rates import Rates
 
 Function = Callable[[Rates], Array]
 
+DIFFERENCE = "difference of success rates"
+"""Unit of a metric that can be negative."""
+
 
 @dataclass(frozen=True)
 class Metric:
@@ -48,6 +51,8 @@ class Metric:
     """Whether a reference method has a value too, compared with itself."""
     pooled: bool
     """Whether the rates are averaged over seeds first; if not, the value is the mean of the seeds' values."""
+    ratio: bool
+    """Whether the value is a positive ratio: its mean over seeds is geometric, and so is its interval."""
     version: int
     """Number of the definition."""
 
@@ -57,7 +62,8 @@ class Metric:
             return np.full(rates.success.shape[:-3], np.nan)
         if self.pooled:
             return self.function(rates.mean_over_runs())
-        return np.asarray(self.function(rates).mean(axis=-1))
+        values = self.function(rates)
+        return np.asarray(np.exp(np.log(values).mean(axis=-1)) if self.ratio else values.mean(axis=-1))
 
     @property
     def direction(self) -> str:
@@ -83,6 +89,7 @@ def metric(
     references: tuple[str, ...] = (),
     compares_itself: bool = False,
     pooled: bool = False,
+    ratio: bool = False,
     version: int = 0,
 ) -> Callable[[Function], Function]:
     """Return a decorator that registers a function as a metric, with its name and its docstring's first line.
@@ -105,6 +112,7 @@ def metric(
             references=references,
             compares_itself=compares_itself,
             pooled=pooled,
+            ratio=ratio,
             version=version,
         )
         return function

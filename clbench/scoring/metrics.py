@@ -11,7 +11,7 @@ from clbench.scoring.metric import REGISTRY, Metric
 from clbench.scoring.scores import Scores, rates_of
 
 METRICS: Mapping[str, Metric] = REGISTRY
-"""All metrics by name, in the order of the table."""
+"""All metrics by name, in the order of the columns of leaderboard.csv."""
 
 TITLES = {"adaptation": "learned", "retention": "kept skills"}
 """Titles of metrics on boards with a criterion, where they are beside `kept` and `kept_targets`."""

@@ -11,14 +11,14 @@ import math
 import numpy as np
 
 from clbench.scoring.layout import Array, average
-from clbench.scoring.metric import metric
+from clbench.scoring.metric import DIFFERENCE, metric
 from clbench.scoring.rates import Rates
 from clbench.spec.references import BASELINE, FROM_SCRATCH
 
 
 @metric(
     formula="mean of R[K][s] over the retained skills and the targets",
-    source="GEM, arXiv 1706.08840 (ACC)",
+    source="clbench; ACC of GEM, arXiv 1706.08840, with the retained skills counted in",
     missing="A success after the last target on a retained skill or a target is missing.",
 )
 def final_average(rates: Rates) -> Array:
@@ -145,7 +145,7 @@ def _where(chosen: Array, values: Array) -> Array:
     formula="final_average less the final_average of sft with the same seed",
     source="clbench",
     low=-1.0,
-    units="difference of success rates",
+    units=DIFFERENCE,
     references=(BASELINE,),
     compares_itself=True,
     missing=f"There is no {BASELINE} of the same seeds, or a final average is missing.",
@@ -172,6 +172,7 @@ def steps_to_criterion(rates: Rates) -> Array:
 @metric(
     formula="share of the targets whose stage met the criterion within the budget's steps",
     source="clbench",
+    units="share of the targets",
     missing="The scenario has no criterion.",
 )
 def criterion_met(rates: Rates) -> Array:
@@ -180,22 +181,25 @@ def criterion_met(rates: Rates) -> Array:
 
 
 @metric(
-    formula="geometric mean over the targets of the steps that from_scratch takes to the criterion divided "
-    "by the steps that the method takes, at least 1",
+    formula="geometric mean over targets and seeds of the steps that from_scratch takes to the criterion "
+    "divided by the steps that the method takes, each at least 1",
     source="clbench; the speed of forward transfer, arXiv 2105.10919, without a ceiling",
     high=math.inf,
     units="times as fast",
     references=(FROM_SCRATCH,),
-    missing=f"The scenario has no criterion, or there is no {FROM_SCRATCH} of the same seeds.",
+    ratio=True,
+    missing="The scenario has no criterion, no stage of a run met it, or there is no "
+    f"{FROM_SCRATCH} of the same seeds.",
+    version=1,
 )
 def speed(rates: Rates) -> Array:
     """How many times as fast as from scratch targets are learned.
 
-    A stage that never meets its criterion counts with all steps of the budget: where that is from_scratch,
-    the value is too low.
+    A stage that never meets its criterion counts with all steps of the budget. The value is too low where
+    that is a stage of from_scratch, and too high where it is one of the method.
     """
     ratios = np.maximum(rates.references[FROM_SCRATCH].steps, 1.0) / np.maximum(rates.steps, 1.0)
-    return np.exp(average(np.log(ratios)))
+    return np.where(average(rates.met) > 0, np.exp(average(np.log(ratios))), np.nan)
 
 
 @metric(
@@ -233,6 +237,7 @@ def perturbed_adaptation(rates: Rates) -> Array:
     "is known (stage 0 for skills, stage k for target k) to stage K-1, minus R[K][s]",
     source="Chaudhry et al. 2018, arXiv 1801.10112; the retained skills counted in",
     low=-1.0,
+    units=DIFFERENCE,
     higher_is_better=False,
     missing="A success that it needs is missing, or nothing is known before the last stage.",
 )
@@ -256,6 +261,7 @@ def forgetting(rates: Rates) -> Array:
     formula="mean of R[K][k] - R[k][k] over all targets k but the last",
     source="GEM, arXiv 1706.08840 (BWT)",
     low=-1.0,
+    units=DIFFERENCE,
     missing="There are fewer than two targets, or a success on an earlier one is missing.",
 )
 def backward_transfer(rates: Rates) -> Array:

@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from clbench.scoring.layout import Array, average
-from clbench.scoring.metric import metric
+from clbench.scoring.metric import DIFFERENCE, metric
 from clbench.scoring.rates import Rates
 from clbench.spec.references import JOINT
 
@@ -79,6 +79,7 @@ def average_incremental_accuracy(rates: Rates) -> Array:
     source="Chaudhry et al. 2018, arXiv 1801.10112 (F)",
     missing=TWO_TARGETS,
     low=-1.0,
+    units=DIFFERENCE,
     higher_is_better=False,
 )
 def forgetting_chaudhry(rates: Rates) -> Array:
@@ -110,6 +111,7 @@ def forgetting_mammoth(rates: Rates) -> Array:
     source="Avalanche 0.6.0 (stream forgetting); also F of COOM and NBT of arXiv 2603.11653",
     missing=TWO_TARGETS,
     low=-1.0,
+    units=DIFFERENCE,
     higher_is_better=False,
 )
 def forgetting_avalanche(rates: Rates) -> Array:
@@ -122,6 +124,7 @@ def forgetting_avalanche(rates: Rates) -> Array:
     source="Continual World, arXiv 2105.10919 (F), whose code averages five evaluations for both terms",
     missing=TWO_TARGETS,
     low=-1.0,
+    units=DIFFERENCE,
     higher_is_better=False,
 )
 def forgetting_continual_world(rates: Rates) -> Array:
@@ -137,6 +140,7 @@ def forgetting_continual_world(rates: Rates) -> Array:
     missing=f"There is no {JOINT} of the same seeds, or the success on a target right after learning it is "
     "missing.",
     low=-1.0,
+    units=DIFFERENCE,
     higher_is_better=False,
     references=(JOINT,),
 )
@@ -164,6 +168,7 @@ def _backward_transfer(rates: Rates) -> Array:
     source="Diaz-Rodriguez et al. 2018, arXiv 1810.13166 (BWT)",
     missing=TWO_TARGETS,
     low=-1.0,
+    units=DIFFERENCE,
 )
 def backward_transfer_diaz_rodriguez(rates: Rates) -> Array:
     """Change of the success on earlier targets, over all later stages and not the last alone."""
@@ -304,6 +309,7 @@ def _own_curves(rates: Rates) -> Array:
     "LifeLong-RFT, arXiv 2602.10503",
     missing=TWO_TARGETS,
     low=-1.0,
+    units=DIFFERENCE,
     higher_is_better=False,
 )
 def negative_backward_transfer_libero(rates: Rates) -> Array:
@@ -316,6 +322,7 @@ def negative_backward_transfer_libero(rates: Rates) -> Array:
     source="CLARE, arXiv 2601.09512 (NBT)",
     missing=TWO_TARGETS,
     low=-1.0,
+    units=DIFFERENCE,
     higher_is_better=False,
 )
 def negative_backward_transfer_clare(rates: Rates) -> Array:
@@ -366,6 +373,7 @@ def area_under_curve_libero(rates: Rates) -> Array:
     source="clbench; the change of ZS of arXiv 2603.11653",
     missing="There are no held-out tasks or no targets, or a success on a held-out task is missing.",
     low=-1.0,
+    units=DIFFERENCE,
 )
 def zero_shot_change(rates: Rates) -> Array:
     """Change of the success on tasks that were never trained, from the pretrained policy to the end."""

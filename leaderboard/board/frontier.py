@@ -152,7 +152,7 @@ class TiedGain:
     @property
     def is_certain(self) -> bool:
         """Whether the interval is above 0."""
-        return (self.gain.low or 0.0) > 0
+        return self.gain.is_above(0)
 
 
 def is_certain_over(tied: Iterable[TiedGain]) -> bool:

@@ -12,12 +12,9 @@ from clbench.scoring.metrics import measure
 from clbench.scoring.scores import Scores
 from clbench.spec.references import BASELINE
 
-from .agreement import REPLICATES, Agreement, chance_of, kendall_tau
+from .agreement import LEAST_ROWS, LEAST_SEEDS, REPLICATES, Agreement, chance_of, kendall_tau
 from .rows import Row
 from .summary import METHODS
-
-LEAST_SEEDS, LEAST_ROWS = 2, 6
-"""Fewest seeds and rows: the interval draws seeds, and five rows have few orders."""
 
 Quantity = Callable[[Scores], float | None]
 
@@ -49,7 +46,7 @@ LOST = _less("kept_share")
 
 @dataclass(frozen=True)
 class Prediction(Agreement):
-    """Kendall's tau between a predictor and forgetting over the methods, with its 95 % interval."""
+    """Kendall's tau between a predictor and forgetting over the methods, with its range over drawn seeds."""
 
     predictor: str
     """Its name in a sentence: a key of `PREDICTORS`."""
@@ -76,7 +73,7 @@ def predictions(rows: Iterable[Row]) -> list[Prediction]:
 def prediction_of(name: str, values: Array, replicates: int = REPLICATES) -> Prediction | None:
     """Return Kendall's tau between the means over seeds of a predictor and of forgetting.
 
-    The interval holds the percentiles of `replicates` draws of seeds with replacement. All rows and both
+    The range holds the percentiles of `replicates` draws of seeds with replacement. All rows and both
     quantities share the draws.
 
     Args:

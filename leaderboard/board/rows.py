@@ -199,7 +199,7 @@ def mean_difference(metric: str, runs: Runs, others: Runs) -> float | None:
     Args:
         metric: Name of a metric that needs no reference.
         runs: Runs of one method by seed.
-        others: Runs of the other method by seed.
+        others: Runs of the other method by seed, on the same tasks and episodes.
     """
     pairs = [
         [measure(metric, them[seed]) for them in (runs, others)]

@@ -47,7 +47,7 @@ def action_loss_erodes_answers(evidence: Evidence) -> Finding:
     drop, stopped = (question_drop(evidence, method) for method in ("sft", "stop_gradient"))
     curve = answer_curve(evidence, "sft")
     sentences = _how_rapid(evidence, curve)
-    if stopped.high < drop.low:
+    if evidence.difference("question_retention", "stop_gradient", "sft").low > 0:
         sentences.append("Without that gradient in the backbone less is lost: the gradient is the cause.")
     return Finding(
         decided(

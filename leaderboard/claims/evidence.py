@@ -78,16 +78,16 @@ class Figure:
 
     @property
     def low(self) -> float:
-        """Lower end of the interval, NaN if no interval counts."""
+        """Lower end of the interval, NaN if none describes other seeds."""
         return self._end(self.estimate.low)
 
     @property
     def high(self) -> float:
-        """Upper end of the interval, NaN if no interval counts."""
+        """Upper end of the interval, NaN if none describes other seeds."""
         return self._end(self.estimate.high)
 
     def _end(self, end: float | None) -> float:
-        return math.nan if end is None or 0 < len(self.seeds) < LEAST_SEEDS else end
+        return math.nan if end is None or not self.estimate.of_seeds else end
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,6 +109,7 @@ class Evidence:
         quantity: Quantity,
         *methods: str,
         span: Span = UNBOUNDED,
+        ratio: bool = False,
         **rest: Any,
     ) -> Figure:
         """Return `quantity` with its interval, over the seeds that all methods have.
@@ -118,6 +119,7 @@ class Evidence:
             quantity: Function of the rates.
             methods: Labels of all methods that `quantity` reads, the subject first.
             span: Smallest and largest possible value.
+            ratio: Whether the values are positive ratios, see `clbench.scoring.intervals.interval`.
             rest: Further fields of the figure.
         """
         methods = tuple(dict.fromkeys(methods))
@@ -126,7 +128,8 @@ class Evidence:
         found = NO_ESTIMATE
         if common and not missing:
             generator = row_generator(self.scenario, what)
-            found = bootstrap(quantity, self._scores(methods, common), generator, span=span)
+            scores = self._scores(methods, common)
+            found = bootstrap(quantity, scores, generator, span=span, ratio=ratio)
         if not missing and not common:
             rest.setdefault("note", "the methods have no seed in common")
         elif not missing and found.value is None:

@@ -38,7 +38,8 @@ def kept(evidence: Evidence, method: str, other: str) -> Figure:
         return average(first - second)
 
     what, note = f"retained success, {method} - {other}", _settings(evidence, method, other)
-    return evidence.figure(what, difference, method, other, span=(-1, 1), **({"note": note} if note else {}))
+    rest: dict[str, Any] = {"note": note} if note else {}
+    return evidence.figure(what, difference, method, other, span=(-1, 1), **rest)
 
 
 TOLD = ("replay", "tau_start", "loss_scale", "step_factor")
@@ -57,7 +58,9 @@ def _settings(evidence: Evidence, *methods: str) -> str:
 
 
 def share_of_steps(evidence: Evidence, method: str, other: str) -> Figure:
-    """Return the steps to the criterion of `method` divided by those of `other`, geometric mean over targets.
+    """Return the steps to the criterion of `method` divided by those of `other`.
+
+    It is the geometric mean over targets and seeds.
 
     A target that is never learned counts with the budget's steps, and one that was known with one step.
     """
@@ -66,7 +69,7 @@ def share_of_steps(evidence: Evidence, method: str, other: str) -> Figure:
         first, second = (np.log(np.maximum(of[label].steps, 1.0)) for label in (method, other))
         return np.exp(average(average(first - second)))
 
-    return evidence.figure(f"steps to the criterion, {method} / {other}", ratio, method, other)
+    return evidence.figure(f"steps to the criterion, {method} / {other}", ratio, method, other, ratio=True)
 
 
 def question_drop(evidence: Evidence, method: str) -> Figure:
@@ -154,13 +157,14 @@ def sparsity(evidence: Evidence, method: str, other: str) -> Figure:
 
 
 def drift_ratio(evidence: Evidence, method: str) -> Figure:
-    """Return the activation drift divided by sft's, seed by seed."""
+    """Return the activation drift divided by sft's, geometric mean over seeds."""
 
     def ratio(of: Of) -> Array:
         part, whole = (of[label].activation_drift[..., -1, -1] for label in (method, "sft"))
-        return average(part / np.where(whole > 0, whole, np.nan))
+        with np.errstate(divide="ignore"):  # a policy that stays the same has a drift of 0
+            return np.exp(average(np.log(part / np.where(whole > 0, whole, np.nan))))
 
-    return evidence.figure(f"activation drift, {method} / sft", ratio, method, "sft")
+    return evidence.figure(f"activation drift, {method} / sft", ratio, method, "sft", ratio=True)
 
 
 def median_stage(evidence: Evidence, method: str) -> Figure:

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import combinations
 
 import numpy as np
 
 from clbench.base.text import counted
+from clbench.scoring.layout import Array
 from clbench.scoring.metrics import load_metric
 
-from ..board.agreement import Agreement, Concordance, agreement_between
+from ..board.agreement import LEAST_ROWS, Agreement, Concordance, agreement_between, kendall_tau
 from ..board.rows import Board, Row, agreement, values_by_seed
 from ..board.summary import RANKED_BY, WITHOUT_DEMONSTRATIONS
 from ..views.format import concordance_text, tau_text, title_of
@@ -26,26 +27,60 @@ def agreement_sentences(board: Board, boards: Mapping[str, list[Row]]) -> Iterat
     for name, found in board.agreements.items():
         if found is not None and name in boards:
             yield f"On {name}, {_seeds_order(found)}."
-            without = [row for row in boards[name] if row.division in WITHOUT_DEMONSTRATIONS]
+            without = _without_demonstrations(boards[name])
             alone = agreement(without)
             if alone is not None:  # replay is far above the others
                 yield f"On {name}, without methods that read prior demonstrations, {_seeds_order(alone)}."
             yield from _shares_of_variance(name, without)
     for (one, rows), (other, others) in combinations(boards.items(), 2):
-        across = _between(rows, others, RANKED_BY, RANKED_BY)
+        across = _between(rows, others)
         if across is not None:
             yield f"{one} and {other} {_order(across, counted(across.rows, 'method'))}."
-    for name, rows in boards.items():
-        for metric in ("kept_share", "forgetting", "backward_transfer"):
-            same = _between(rows, rows, RANKED_BY, metric, paired=True)
-            if same is not None:
-                yield f"On {name}, final average and {title_of(metric)} {_order(same)}."
+        rest = _between(*(_without_demonstrations(them) for them in (rows, others)))
+        if across is not None and rest is not None:
+            methods = f"{counted(rest.rows, 'method')} without prior demonstrations"
+            yield f"{one} and {other} {_order(rest, methods)}."
+    yield from _definitions(boards)
+
+
+DEFINITIONS = ("kept_share", "forgetting", "backward_transfer")
+"""Metrics whose order of the methods is compared with that of the final average."""
+
+
+def _definitions(boards: Mapping[str, list[Row]]) -> Iterator[str]:
+    """Yield how alike metrics order the methods. They share episodes: chance is not the question."""
+    found = {name: _taus(rows) for name, rows in boards.items()}
+    for name, taus in found.items():
+        if taus:
+            listed = ", ".join(f"{title_of(metric)} {tau:.2f}" for metric, tau in taus.items())
+            yield f"On {name}, Kendall's tau between the final average and other definitions is: {listed}."
+    if any(found.values()):
+        yield (
+            "Definitions count the same episodes, so that even equal methods would be ordered alike by them: "
+            "these figures describe the board, and test nothing."
+        )
+
+
+def _taus(rows: Sequence[Row]) -> dict[str, float]:
+    """Return Kendall's tau between the final average and each of `DEFINITIONS` that the rows have."""
+    found = {}
+    for metric in DEFINITIONS:
+        one, other = _common(rows, rows, RANKED_BY, metric)
+        tau = float(kendall_tau(one.mean(axis=1), other.mean(axis=1))) if len(one) >= LEAST_ROWS else np.nan
+        if np.isfinite(tau):
+            found[metric] = tau
+    return found
+
+
+def _without_demonstrations(rows: Iterable[Row]) -> list[Row]:
+    return [row for row in rows if row.division in WITHOUT_DEMONSTRATIONS]
 
 
 def _shares_of_variance(name: str, rows: Sequence[Row]) -> Iterator[str]:
     """Yield which share of the variance of the final average the method explains, and which the seed.
 
-    They are the sums of squares of the table of methods and seeds.
+    It is omega squared of the table of methods and seeds: sums of squares less what noise alone adds to them
+    (Hays 1963). Equal methods explain 0 % in the mean.
 
     Args:
         name: Name of the scenario.
@@ -54,38 +89,47 @@ def _shares_of_variance(name: str, rows: Sequence[Row]) -> Iterator[str]:
     values = np.array(list(values_by_seed(rows).values()), ndmin=2)
     if min(values.shape) < 2 or values.std() == 0:
         return
-    mean = values.mean()
+    (methods, seeds), mean = values.shape, values.mean()
     total = ((values - mean) ** 2).sum()
-    of_methods = values.shape[1] * ((values.mean(axis=1) - mean) ** 2).sum() / total
-    of_seeds = values.shape[0] * ((values.mean(axis=0) - mean) ** 2).sum() / total
+    by_method = seeds * ((values.mean(axis=1) - mean) ** 2).sum()
+    by_seed = methods * ((values.mean(axis=0) - mean) ** 2).sum()
+    noise = (total - by_method - by_seed) / ((methods - 1) * (seeds - 1))
+    of_methods, of_seeds = (
+        max(squares - degrees * noise, 0.0) / (total + noise)
+        for squares, degrees in ((by_method, methods - 1), (by_seed, seeds - 1))
+    )
     yield (
-        f"On {name}, of the variance of the final average over {values.shape[0]} methods without prior "
-        f"demonstrations and {values.shape[1]} seeds, the method explains {of_methods:.0%}, and the seed "
-        f"with its order of the targets {of_seeds:.0%}."
+        f"On {name}, of the variance of the final average over {methods} methods without prior "
+        f"demonstrations and {seeds} seeds, the method explains {of_methods:.0%}, and the seed "
+        f"with its order of the targets {of_seeds:.0%} (omega squared)."
     )
 
 
-def _between(
-    rows: Sequence[Row], others: Sequence[Row], metric: str, other_metric: str, *, paired: bool = False
-) -> Agreement | None:
-    """Return the agreement of two metrics on the order of the methods that both lists have.
+def _between(rows: Sequence[Row], others: Sequence[Row]) -> Agreement | None:
+    """Return the agreement of two scenarios on the order of the methods that both have."""
+    one, other = _common(rows, others, RANKED_BY, RANKED_BY)
+    return agreement_between(one, other) if len(one) else None
+
+
+def _common(
+    rows: Sequence[Row], others: Sequence[Row], metric: str, other_metric: str
+) -> tuple[Array, Array]:
+    """Return two metrics of the methods that both lists have, higher is better, (methods, seeds).
 
     Args:
         rows: Rows of a scenario.
         others: Rows of another one, or the same.
         metric: Metric of the first rows.
         other_metric: Metric of the others.
-        paired: Whether both are of the same runs.
     """
     ours, theirs = values_by_seed(rows, metric), values_by_seed(others, other_metric)
     both = [method for method in ours if method in theirs]
-    if not both:
-        return None
     one, other = (
-        (1.0 if load_metric(name).higher_is_better else -1.0) * np.array([values[method] for method in both])
+        (1.0 if load_metric(name).higher_is_better else -1.0)
+        * np.array([values[method] for method in both]).reshape(len(both), -1)
         for name, values in ((metric, ours), (other_metric, theirs))
     )
-    return agreement_between(one, other, paired=paired)
+    return one, other
 
 
 def _seeds_order(found: Concordance) -> str:

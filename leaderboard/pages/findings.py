@@ -6,15 +6,15 @@ the last section says what the records cannot tell.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+import math
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
 
-import numpy as np
-
 from clbench.base.text import counted
 from clbench.records.paths import table_parts
+from clbench.scoring.groups import differences_needed
 from clbench.scoring.intervals import Estimate
 from clbench.spec.policies import DEFAULT_POLICY
 from clbench.spec.references import BASELINE, FROZEN
@@ -22,7 +22,7 @@ from clbench.spec.references import BASELINE, FROZEN
 from ..board.frontier import Curve, TiedGain, is_certain_over
 from ..board.predictors import predictions
 from ..board.rows import Board, Row, apart_from_baseline
-from ..board.summary import METHODS, WITHOUT_DEMONSTRATIONS, tables_of
+from ..board.summary import METHODS, RANKED_BY, WITHOUT_DEMONSTRATIONS, tables_of
 from ..claims.claim import PREDICATES, Verdict, tally
 from ..claims.judges import Judged
 from ..policies.compared import by_table
@@ -119,7 +119,8 @@ def _gains(boards: dict[str, list[Row]], tied: Mapping[str, Mapping[str, Sequenc
             (
                 name,
                 row.method,
-                *(format_interval(row.estimates[one]) for one in ("gain", "adaptation", "kept")),
+                format_interval(row.estimates["gain"], ".3f"),
+                *(format_interval(row.estimates[one]) for one in ("adaptation", "kept")),
                 str(len(row.seeds)),
             )
             for row in others
@@ -153,12 +154,12 @@ def _gain_sentences(name: str, rows: Sequence[Row], tied: Mapping[str, Sequence[
             which = f"the largest gain of {len(gains)} methods, that of `{best}`,"
         yield (
             f"On {name}, none is told apart from it as better: {which} is "
-            f"{format_interval(gains[best], '.3f')}. {_power(gains.values())}"
+            f"{format_interval(gains[best], '.3f')}. {_power(rows, gains)}"
         )
     alone = "by its own interval alone"
     if len(gains) > 1:
         alone += f", without correction for {len(gains)} comparisons"
-    higher = {method: gain for method, gain in gains.items() if (gain.low or 0) > 0 and method not in better}
+    higher = {method: gain for method, gain in gains.items() if gain.is_above(0) and method not in better}
     over_both = {method: gain for method, gain in higher.items() if is_certain_over(tied.get(method, ()))}
     if over_both:
         yield f"Higher {alone}: {_listed(over_both)}."
@@ -168,7 +169,7 @@ def _gain_sentences(name: str, rows: Sequence[Row], tied: Mapping[str, Sequence[
     lower = {
         method: Estimate(-gain.value, -gain.high, -gain.low)
         for method, gain in gains.items()
-        if gain.value is not None and gain.low is not None and gain.high is not None and gain.high < 0
+        if gain.value is not None and gain.low is not None and gain.high is not None and gain.is_below(0)
     }
     worse = {method: loss for method, loss in lower.items() if method in apart}
     if worse:
@@ -190,13 +191,15 @@ def _over_tied(name: str, method: str, gain: Estimate, tied: Sequence[TiedGain])
         )
 
 
-def _power(gains: Iterable[Estimate]) -> str:
-    """Return the sentence on the differences that the records cannot show."""
-    halves = [(one.high - one.low) / 2 for one in gains if one.low is not None and one.high is not None]
-    if not halves:
+def _power(rows: Iterable[Row], methods: Collection[str]) -> str:
+    """Return the sentence on the differences that the test of these methods cannot show."""
+    family = {row.method: row.scores for row in rows if row.method in methods or row.method == BASELINE}
+    needed = differences_needed(RANKED_BY, family, BASELINE)
+    if not needed or not math.isfinite(max(needed.values())):
         return ""
-    half = float(np.median(halves))
-    return f"A difference below {half:.2f}, half the width of the median interval, would not show."
+    ends = [f"{end:.3f}" for end in (min(needed.values()), max(needed.values()))]
+    between = ends[0] if ends[0] == ends[1] else f"{ends[0]} to {ends[1]}, depending on the method"
+    return f"To be told apart, a gain must exceed {between}."
 
 
 def _listed(estimates: dict[str, Estimate]) -> str:
@@ -365,15 +368,16 @@ def _knowledge(boards: dict[str, list[Row]]) -> Section:
 def _policies(board: Board) -> Section:
     """Whether forgetting depends on the policy: its action head, or its size."""
     answers, lines = [], []
-    for name, comparisons in by_table(board.rows).items():
+    for name, every in by_table(board.rows).items():
         scenario, policy = table_parts(name)
+        comparisons = [one for one in every if one.method != FROZEN]  # a policy that is not trained keeps all
         for one in comparisons:
             three = map(format_interval, one.estimates[FORGOTTEN_BY])
             lines.append((scenario, one.method, policy, *three, str(one.seeds)))
         apart = [one.estimates[FORGOTTEN_BY][2] for one in comparisons if one.seeds > 1]
         if apart:
-            lower = sum(one.high is not None and one.high < 0 for one in apart)
-            higher = sum(one.low is not None and one.low > 0 for one in apart)
+            lower = sum(one.is_below(0) for one in apart)
+            higher = sum(one.is_above(0) for one in apart)
             answers.append(
                 f"On {scenario} with {policy}, the kept share of {lower} of "
                 f"{counted(len(apart), 'method')} is lower than with the flow policy, and that of {higher} "

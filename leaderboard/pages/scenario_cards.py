@@ -18,14 +18,13 @@ import numpy as np
 from clbench.base.entry_points import resolve
 from clbench.base.text import field_docstrings, printable
 from clbench.records.paths import RECORDS
-from clbench.scoring.groups import deviation_of_differences
+from clbench.scoring.groups import deviation_of_differences, least_difference
 from clbench.scoring.intervals import (
     NO_ESTIMATE,
     Estimate,
     bootstrap,
     paired_difference,
     row_generator,
-    student_quantile,
 )
 from clbench.scoring.layout import Array, average
 from clbench.scoring.rates import Rates
@@ -130,6 +129,7 @@ class Card:
         needed = COMPARED if self.scenario.budget.criterion is None else (*COMPARED, "experience_replay")
         missing = [name for name in needed if name not in self.rows]
         competing = [row for row in self.rows.values() if row.division in METHODS]
+        largest = _largest_division(competing)
         meanings, values = field_docstrings(Budget), dataclasses.asdict(self.scenario.budget)
         references = [
             (row.method, [row.estimates[name] for name in COLUMNS], len(row.seeds)) for row in present
@@ -154,8 +154,8 @@ class Card:
             missing_command=self._command(missing) if missing else "",
             other_version=self._other_version(),
             seed_counts=SEEDS,
-            competing=len(competing),
-            resolution=_resolution(competing),
+            largest=largest,
+            resolution=_resolution(largest) if len(largest) > 1 else {},
             group_counts=_group_counts(competing),
             orders=[row for row in self.rows.values() if len(row.orders.orders) > 1],
             task_versions=self._task_versions(),
@@ -256,14 +256,24 @@ class Card:
 
 
 def _resolution(competing: Sequence[Row]) -> dict[str, list[float]]:
-    """Return by metric the deviation of a difference, then the smallest difference for each of `SEEDS`."""
+    """Return by metric the deviation of a difference, then the smallest difference for each of `SEEDS`.
+
+    Args:
+        competing: The rows of a division, which the test of the board compares with each other.
+    """
     found = {}
     for metric in TELLING:
         deviation = deviation_of_differences(metric, [row.scores for row in competing])
         if deviation:  # equal differences for all seeds tell nothing
-            widths = [student_quantile(n - 1) * deviation / math.sqrt(n) for n in SEEDS]
-            found[metric] = [deviation, *widths]
+            needed = [least_difference(deviation, len(competing), seeds) for seeds in SEEDS]
+            found[metric] = [deviation, *needed]
     return found
+
+
+def _largest_division(rows: Sequence[Row]) -> list[Row]:
+    """Return the rows of the division with the most rows."""
+    by_division = [[row for row in rows if row.division == division] for division in METHODS]
+    return max(by_division, key=len)
 
 
 def _group_counts(competing: Sequence[Row]) -> list[tuple[str, int, int]]:

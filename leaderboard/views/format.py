@@ -144,8 +144,11 @@ def agreement_text(found: Concordance | None) -> str:
 
 def concordance_text(found: Concordance) -> str:
     """Return Kendall's W with the probability of chance."""
-    chance = f"p = {found.chance:.2g}" if found.chance >= 0.001 else "p < 0.001"
-    return f"Kendall's W {found.w:.2f}, {chance}"
+    return f"Kendall's W {found.w:.2f}, {_chance_text(found.chance)}"
+
+
+def _chance_text(chance: float) -> str:
+    return f"p = {chance:.2g}" if chance >= 0.001 else "p < 0.001"
 
 
 def prediction_text(rows: Iterable[Row]) -> str:
@@ -155,14 +158,15 @@ def prediction_text(rows: Iterable[Row]) -> str:
         return ""
     words = {1: "", 0: " (not certain)", -1: ", the other way round"}
     parts = [
-        f"{one.predictor} {tau_text(one)} over {one.rows} methods{words[one.direction]}" for one in found
+        f"{one.predictor} {tau_text(one)}, {one.rows} methods{words[one.direction]}" for one in found
     ]
     return f"Rank correlation with the share that a stage forgets (Kendall's tau): {'; '.join(parts)}."
 
 
 def tau_text(found: Agreement) -> str:
-    """Return Kendall's tau with its interval."""
-    return format_interval(Estimate(found.tau, found.low, found.high))
+    """Return Kendall's tau with its range over redrawn seeds and the probability of chance."""
+    ends = " to ".join(number_text(end, ".2f") for end in (found.low, found.high))
+    return f"{number_text(found.tau, '.2f')}, {ends} with redrawn seeds, {_chance_text(found.chance)}"
 
 
 def title_of(name: str) -> str:

@@ -108,7 +108,7 @@ def test_a_tie_is_no_flip() -> None:
 
 
 def test_a_reference_needs_its_own_name_and_the_same_seeds() -> None:
-    assert from_matrix({"mine": TRIANGLE})["gain"].reason == "No method is called sft, or it lacks seeds."
+    assert from_matrix({"mine": TRIANGLE})["gain"].reason == "No method is called sft, or it has other seeds."
     report = from_matrix({"mine": [TRIANGLE, TRIANGLE], "sft": TRIANGLE, "joint": [TRIANGLE, TRIANGLE]})
     assert report.of("gain", "mine").value is None
     assert report.of("intransigence", "mine").value == pytest.approx(0)
@@ -163,3 +163,10 @@ def test_an_unknown_task_metric_or_method_is_refused_with_the_nearest_name() -> 
 
 def test_the_front_door_leads_here() -> None:
     assert clbench.metrics.from_matrix is from_matrix
+
+
+def test_a_mean_that_exceeds_1_in_its_last_bit_is_a_share() -> None:
+    above = [[1.0, 0.5], [0.8, 1.0000000000000002]]
+    assert from_matrix(above)["performance_continual_world"].value == pytest.approx(0.9)
+    with pytest.raises(InputError, match="per cent"):
+        from_matrix([[1.0, 0.5], [0.8, -0.1]], unit="percent")

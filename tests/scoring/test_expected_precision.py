@@ -4,14 +4,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from clbench.scoring.intervals import (
-    MANY,
-    episodes_needed,
-    expected_precision,
-    half_width,
-    student_quantile,
-    studentised_range_quantile,
-)
+from clbench.scoring.expected_precision import episodes_needed, expected_precision, half_width
+from clbench.scoring.intervals import MANY, student_quantile, studentised_range_quantile
 from clbench.testing import TOY
 
 

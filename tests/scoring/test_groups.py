@@ -6,6 +6,7 @@ import json
 import re
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from itertools import combinations, product
 from pathlib import Path
 from types import ModuleType
@@ -15,25 +16,28 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from clbench.base.errors import InputError
 from clbench.cli.runs import run as run_command
 from clbench.runs.run import execute
 from clbench.runs.spec import RunSpec
-from clbench.scoring.groups import (
-    UNKNOWN_DEVIATION,
-    deviation_of_differences,
-    groups,
-    letter_display,
-    told_apart,
-)
-from clbench.scoring.intervals import (
-    REPLICATES,
+from clbench.scoring.expected_precision import (
     SEED_DEVIATION,
-    Runs,
     episodes_needed,
     expected_precision,
     half_width,
 )
+from clbench.scoring.groups import (
+    UNKNOWN_DEVIATION,
+    deviation_of_differences,
+    differences_needed,
+    groups,
+    least_difference,
+    letter_display,
+    told_apart,
+)
+from clbench.scoring.intervals import REPLICATES, Runs
 from clbench.scoring.layout import Layout
+from clbench.scoring.metrics import measure
 from clbench.scoring.scores import Scores
 from clbench.testing import TOY
 
@@ -203,7 +207,6 @@ def test_rows_without_value_are_in_no_group() -> None:
     broken.success[-1, 0, 0] = np.nan
     rows = {"whole": row(5, 6), "broken": {0: broken, 1: equal_run(5)}, "empty": {}}
     assert groups("final_average", rows) == {"whole": "a"}
-    assert groups("forward_transfer", {"whole": row(5, 6)}) == {}
     assert groups("final_average", {}) == {}
 
 
@@ -282,6 +285,58 @@ def test_the_deviation_of_differences_is_the_residual_after_row_and_seed_means()
 def test_rows_that_move_together_from_seed_to_seed_differ_by_the_same() -> None:
     together = [of_rates(0.5, 0.9), of_rates(0.1, 0.5)]
     assert deviation_of_differences("final_average", together) == pytest.approx(0, abs=1e-12)
+
+
+def test_the_least_difference_is_tukeys_for_all_rows() -> None:
+    expected = stats.studentized_range.ppf(0.95, 10, 27) * 0.06 / np.sqrt(2 * 4)
+    assert least_difference(0.06, 10, 4) == pytest.approx(expected)
+    # of two rows it is half of the width of the interval of their difference
+    assert least_difference(0.06, 2, 4) == pytest.approx(stats.t.ppf(0.975, 3) * 0.06 / 2)
+
+
+def test_rows_are_told_apart_beyond_the_difference_that_is_needed() -> None:
+    rows = board(np.random.default_rng(0), [0.8, 0.7, 0.65, 0.5, 0.45], 4, 0.05)
+    letters = groups("final_average", rows)
+    base = "method_2"
+    needed = differences_needed("final_average", rows, base)
+    assert needed.keys() == rows.keys() - {base}
+    values = {
+        name: np.mean([measure("final_average", run) or 0.0 for run in runs.values()])
+        for name, runs in rows.items()
+    }
+    for name, least in needed.items():
+        apart = not set(letters[name]) & set(letters[base])
+        assert apart == (abs(values[name] - values[base]) > least)
+    assert differences_needed("final_average", {"alone": row(5, 6)}, "other") == {}
+
+
+def test_metrics_that_compare_with_a_reference_do_not_order_rows() -> None:
+    rows = {"one": row(5, 6), "other": row(7, 8)}
+    with pytest.raises(InputError, match="gain compares a row with sft"):
+        groups("gain", rows)
+    with pytest.raises(InputError, match="gain compares a row with sft"):
+        deviation_of_differences("gain", rows.values())
+
+
+def test_rows_of_other_tasks_have_no_deviation() -> None:
+    others = {0: equal_run(5, tasks=2), 1: equal_run(6, tasks=2)}
+    with pytest.raises(InputError, match="same tasks"):
+        deviation_of_differences("final_average", [row(5, 6), others])
+
+
+def test_with_one_seed_a_number_of_steps_tells_nothing_apart() -> None:
+    quick, slow = (replace(equal_run(5), relearning_steps=np.asarray(steps)) for steps in (1.0, 900.0))
+    assert groups("relearning_steps", {"quick": {0: quick}, "slow": {0: slow}}) == {"quick": "a", "slow": "a"}
+
+
+def test_without_two_rows_with_two_common_seeds_runs_vary_around_their_row() -> None:
+    # one row with four seeds, the others with one: the four tell how much runs vary
+    successes = {"four": (50, 52, 50, 52), "best": (100,), "worst": (0,)}
+    rows = {
+        name: {seed: equal_run(count, episodes=100) for seed, count in enumerate(counts)}
+        for name, counts in successes.items()
+    }
+    assert groups("final_average", rows) == {"best": "a", "four": "b", "worst": "c"}
 
 
 def test_without_two_common_seeds_of_two_rows_no_deviation_is_known() -> None:

@@ -7,18 +7,25 @@ import numpy as np
 import pytest
 from scipy import optimize, stats
 
+from clbench.base.errors import InputError
+from clbench.scoring.expected_precision import half_width
 from clbench.scoring.intervals import (
     NO_ESTIMATE,
     Estimate,
     bootstrap,
     estimate,
-    half_width,
+    interval,
     paired_difference,
     row_generator,
 )
 from clbench.scoring.layout import Layout
 from clbench.scoring.metrics import METRICS, load_metric, measure
 from clbench.scoring.scores import Scores
+
+
+def of_episodes(value: float, low: float, high: float) -> Estimate:
+    """Return an estimate whose interval says nothing of other seeds."""
+    return Estimate(value, low, high, of_seeds=False)
 
 
 def layout(retained: int, episodes: int, targets: int = 1, held_out: int = 0, points: int = 1) -> Layout:
@@ -174,7 +181,7 @@ def test_the_episodes_of_a_run_are_the_same_at_all_stages() -> None:
     run = scores(final)
     run.success[0] = run.success[1]
     got = estimate(["retention", "forgetting"], {0: run}, np.random.default_rng(0))
-    assert got["forgetting"] == Estimate(0.0, 0.0, 0.0)
+    assert got["forgetting"] == of_episodes(0.0, 0.0, 0.0)
     assert width(got["retention"]) > 0.1
 
 
@@ -248,23 +255,64 @@ def test_intervals_stay_in_the_range_of_their_metric_and_hold_their_value() -> N
                     assert METRICS[name].low <= one.low <= one.value <= one.high <= METRICS[name].high
 
 
-def test_seeds_that_agree_exactly_have_an_interval_of_episodes() -> None:
+def test_seeds_that_agree_exactly_have_the_error_of_episodes_and_the_quantile_of_seeds() -> None:
     half = scores(np.tile([1, 0], (4, 10)))
     got, alone = (
         estimate(["retention"], dict.fromkeys(range(seeds), half), np.random.default_rng(0))["retention"]
         for seeds in (4, 1)
     )
     assert got.value == 0.5
-    assert width(got) == pytest.approx(2 * 1.96 * 0.5 / np.sqrt(4 * 4 * 20), rel=0.15)
-    assert width(alone) == pytest.approx(2 * width(got), rel=0.15)
+    error = 0.5 / np.sqrt(4 * 20)
+    assert width(got) == pytest.approx(2 * stats.t.ppf(0.975, 3) * error / np.sqrt(4), rel=0.15)
+    assert width(alone) == pytest.approx(2 * 1.96 * error, rel=0.15)
+    assert got.of_seeds
+    assert not alone.of_seeds
 
 
-def test_seeds_that_agree_on_the_share_of_learned_targets_have_no_interval_of_it() -> None:
+def test_seeds_that_agree_on_a_quantity_of_whole_runs_have_no_interval_of_it() -> None:
     run = random_run(np.random.default_rng(0), layout(5, 20, targets=4))
-    run = replace(run, met=np.array([1.0, 1.0, 0.0, 1.0]))
+    run = replace(run, met=np.array([1.0, 1.0, 0.0, 1.0]), relearning_steps=np.asarray(0.0))
     for seeds in (4, 1):
-        got = estimate(["criterion_met"], dict.fromkeys(range(seeds), run), np.random.default_rng(0))
+        runs = dict.fromkeys(range(seeds), run)
+        got = estimate(["criterion_met", "relearning_steps"], runs, np.random.default_rng(0))
         assert got["criterion_met"] == Estimate(0.75, None, None)
+        assert got["relearning_steps"] == Estimate(0.0, None, None)
+
+
+def test_only_an_interval_of_seeds_is_above_or_below_a_bar() -> None:
+    for estimate_, above, below in (
+        (Estimate(0.2, 0.1, 0.3), True, False),
+        (Estimate(-0.2, -0.3, -0.1), False, True),
+        (Estimate(0.1, 0.0, 0.2), False, False),
+        (Estimate(0.2, None, None), False, False),
+        (of_episodes(0.2, 0.1, 0.3), False, False),
+        (of_episodes(-0.2, -0.3, -0.1), False, False),
+    ):
+        assert (estimate_.is_above(0), estimate_.is_below(0)) == (above, below)
+
+
+def test_a_ratio_has_the_interval_of_its_logarithm() -> None:
+    # by hand: mean and Student's interval of the logarithms
+    values = np.array([0.12, 0.36, 0.24, 1.31])
+    logs = np.log(values)
+    reach = stats.t.ppf(0.975, 3) * logs.std(ddof=1) / 2
+    without_one = np.exp((logs.sum() - logs) / 3)
+    got = interval(float(np.exp(logs.mean())), without_one, ratio=True)
+    expected = np.exp([logs.mean() - reach, logs.mean() + reach])
+    assert [got.low, got.high] == pytest.approx(expected)
+    assert got.of_seeds
+    assert interval(0.0, np.array([0.0, 0.0]), ratio=True) == Estimate(0.0, None, None)  # no logarithm
+
+
+def test_methods_with_other_numbers_of_runs_are_not_compared() -> None:
+    runs = [scores(np.ones((4, 20))) for _ in range(3)]
+    for first, second in ((runs, runs[:2]), (runs[:2], runs), ([], [])):
+        with pytest.raises(InputError, match="a run of each seed"):
+            bootstrap(
+                lambda rates: rates["one"].success.mean(axis=(-1, -2, -3)),
+                {"one": first, "two": second},
+                np.random.default_rng(0),
+            )
 
 
 def test_an_exactly_known_quantity_has_no_width() -> None:
@@ -274,9 +322,10 @@ def test_an_exactly_known_quantity_has_no_width() -> None:
     for seed in range(3):
         outcomes = (generator.random((1, 5, 10)) < 0.5).astype(float)
         frozen[seed] = whole_run(shape, np.repeat(outcomes, 3, axis=0))
-    for runs in (frozen, {0: frozen[0]}):
+    for runs, of_seeds in ((frozen, True), ({0: frozen[0]}, False)):
         got = estimate(["forgetting", "backward_transfer", "retention"], runs, generator)
-        assert got["forgetting"] == got["backward_transfer"] == Estimate(0.0, 0.0, 0.0)
+        expected = Estimate(0.0, 0.0, 0.0, of_seeds=of_seeds)
+        assert got["forgetting"] == got["backward_transfer"] == expected
         assert width(got["retention"]) > 0
 
 
@@ -372,7 +421,7 @@ def test_only_seeds_that_both_have_are_compared() -> None:
     difference = paired_difference(
         "retention", {0: good, 1: bad}, {0: bad, 2: good}, np.random.default_rng(0)
     )
-    assert difference == Estimate(1.0, 1.0, 1.0)
+    assert difference == of_episodes(1.0, 1.0, 1.0)
     assert paired_difference("retention", {0: good}, {1: bad}, np.random.default_rng(0)) == NO_ESTIMATE
 
 

@@ -48,14 +48,21 @@ def test_w_is_that_of_its_definition_and_its_chance_that_of_random_orders() -> N
 
 
 def test_the_chance_is_that_of_a_random_order_of_the_rows() -> None:
-    # of the 120 orders of five rows, 2 are as far from chance as equal ones, and 10 as far as one swap
-    five = np.arange(5)[:, None] + np.zeros((5, 4))
-    assert agreement_between(five, five).chance == pytest.approx(2 / 120)
-    assert agreement_between(five, 5 - five).direction == -1
-    swapped = agreement_between(five, five[[1, 0, 2, 3, 4]])
-    assert swapped.chance == pytest.approx(10 / 120)
-    assert swapped.low > 0
-    assert swapped.direction == 0
+    # of the 720 orders of six rows, 2 are as far from chance as equal ones, and 12 as far as one swap
+    six = np.arange(6)[:, None] + np.zeros((6, 4))
+    assert agreement_between(six, six).chance == pytest.approx(2 / 720)
+    assert agreement_between(six, 6 - six).direction == -1
+    assert agreement_between(six, six[[1, 0, 2, 3, 4, 5]]).chance == pytest.approx(12 / 720)
+    farther = agreement_between(six, six[[2, 1, 0, 3, 5, 4]])  # 98 orders have up to 4 inversions
+    assert farther.chance == pytest.approx(2 * 98 / 720)
+    assert farther.low > 0
+    assert farther.direction == 0
+
+
+def test_one_seed_of_a_board_shows_no_agreement() -> None:
+    six = np.arange(6)[:, None] + np.zeros((6, 4))
+    assert agreement_between(six, six[:, :3]) is None
+    assert agreement_between(six[:5], six[:5]) is None
 
 
 def test_boards_whose_orders_have_nothing_in_common_rarely_agree() -> None:
