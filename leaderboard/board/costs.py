@@ -20,6 +20,12 @@ def step_ratio(run: Run) -> float | None:
     return float(value) if is_number(value) and value > 0 else None
 
 
+def mean_step_ratio(runs: Sequence[Run]) -> float | None:
+    """Return the mean of `step_ratio` over the runs that measured it, None without one."""
+    times = [ratio for run in runs if (ratio := step_ratio(run)) is not None]
+    return math.fsum(times) / len(times) if times else None
+
+
 def costs_of(runs: Sequence[Run], baseline: Sequence[Run]) -> dict[str, float | None]:
     """Return the costs of the runs of a method, each a mean over seeds.
 
@@ -36,12 +42,12 @@ def costs_of(runs: Sequence[Run], baseline: Sequence[Run]) -> dict[str, float | 
     common = {run.seed for run in runs} & {run.seed for run in baseline}
     same, usual = ([run for run in members if run.seed in common] for members in (runs, baseline))
     taken, theirs = (_mean(members, "optimiser_steps") for members in (same, usual))
-    times = [ratio for run in same if (ratio := step_ratio(run)) is not None]
+    step = mean_step_ratio(same)
     relative = None
     if costs["steps"] == 0:
         relative = 0.0
-    elif taken is not None and theirs and times:
-        relative = taken / theirs * math.fsum(times) / len(times)
+    elif taken is not None and theirs and step is not None:
+        relative = taken / theirs * step
     return {"relative_cost": relative, **costs}
 
 

@@ -157,9 +157,7 @@ def prediction_text(rows: Iterable[Row]) -> str:
     if not found:
         return ""
     words = {1: "", 0: " (not certain)", -1: ", the other way round"}
-    parts = [
-        f"{one.predictor} {tau_text(one)}, {one.rows} methods{words[one.direction]}" for one in found
-    ]
+    parts = [f"{one.predictor} {tau_text(one)}, {one.rows} methods{words[one.direction]}" for one in found]
     return f"Rank correlation with the share that a stage forgets (Kendall's tau): {'; '.join(parts)}."
 
 

@@ -31,7 +31,7 @@ def number(one: Estimate, column: Column) -> Number:
     """Return the cell of a metric."""
     metric, form = column.metric, column.form
     if one.value is None:
-        return Number(MISSING, note=f"missing: {metric.missing}")
+        return Number(MISSING, note=f"missing: {metric.missing.replace('`', '')}")
     text, order = number_text(one.value, form), number_text(one.value, ".6f")
     if one.low is None or one.high is None:
         return Number(text, order, "without an interval")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from clbench.base.text import counted, printable
@@ -10,6 +10,7 @@ from clbench.scoring.groups import groups
 from clbench.scoring.intervals import Estimate
 from clbench.spec.references import BASELINE
 
+from ...board.costs import mean_step_ratio
 from ...board.frontier import TiedGain, is_certain_over
 from ...board.rows import Row, apart_from_baseline, mean_difference, standing_of
 from ...board.summary import (
@@ -21,7 +22,7 @@ from ...board.summary import (
     divisions_of,
 )
 from ..descriptions import RULES
-from ..format import number_text
+from ..format import format_interval, number_text
 from .numbers import MISSING, cost, size
 
 NAMED = 3
@@ -50,6 +51,8 @@ class Verdict:
     """The first row of the division."""
     standing: str
     """How surely it leads."""
+    doubt: str
+    """Why its gain is not certain although the interval of the gain is above 0; empty otherwise."""
     keeping: str
     """Sentence on the method that keeps most among those that learn like plain fine-tuning, empty if there is
     nothing to compare."""
@@ -120,8 +123,14 @@ def _above(ahead: Sequence[Row], gains: Mapping[str, float]) -> str:
     return "; ".join([first, *rest]) + "."
 
 
-def verdicts(rows: Sequence[Row]) -> list[Verdict]:
-    """Return the verdict on each division of methods with a final average."""
+def verdicts(rows: Sequence[Row], tied: Mapping[str, Sequence[TiedGain]] | None = None) -> list[Verdict]:
+    """Return the verdict on each division of methods with a final average.
+
+    Args:
+        rows: The rows.
+        tied: As for `headline`.
+    """
+    apart = apart_from_baseline(rows)
     found = []
     baseline = next((row for row in rows if row.method == BASELINE), None)
     for division, members in divisions_of(rows).items():
@@ -136,6 +145,7 @@ def verdicts(rows: Sequence[Row]) -> list[Verdict]:
                 RULES[division],
                 leader,
                 _standing(leader, rows),
+                _doubt(leader, rows, apart, (tied or {}).get(leader.method, ())),
                 _keeping(known, baseline),
                 tuple(_facts(leader, baseline)),
             )
@@ -159,6 +169,28 @@ def _standing(leader: Row, rows: Iterable[Row]) -> str:
     return f"{first}, told apart from all others of its division."
 
 
+def _doubt(leader: Row, rows: Sequence[Row], apart: Container[str], tied: Sequence[TiedGain]) -> str:
+    """Return why a gain whose interval is above 0 is not certain, empty if it is or the interval is not."""
+    if leader.method == BASELINE or not leader.estimates["gain"].is_above(0):
+        return ""
+    if leader.method not in apart:
+        family = next(
+            kind for kind in (WITHOUT_DEMONSTRATIONS, WITH_DEMONSTRATIONS) if leader.division in kind
+        )
+        count = sum(row.division in family and row.method != BASELINE for row in rows)
+        return (
+            "Its gain is above 0 by its own interval alone, but not told apart from 0 when all "
+            f"{count} such methods are compared with sft."
+        )
+    unsure = [one for one in tied if not one.is_certain]
+    if not unsure:
+        return ""
+    return (
+        f"Tuning rated sft at {number_text(unsure[0].factor, 'g')} times the learning rate as high; over "
+        f"that setting, the gain is {format_interval(unsure[0].gain)} and not certain."
+    )
+
+
 def _alike_text(count: int) -> str:
     return f"{'one is' if count == 1 else f'{count} are'} not told apart from it"
 
@@ -169,7 +201,7 @@ def _keeping(members: Sequence[Row], baseline: Row | None) -> str:
     pool = {row.method: row for row in (baseline, *members)}
     equal = [row for row in members if row.method in _alike("adaptation", baseline.method, pool)]
     if not equal:
-        return _other_learning(members[0], baseline)
+        return f"{_other_learning(members[0], baseline)} {_training(members[0])}"
     leader = members[0]
     slower = "" if leader in equal else f"{_other_learning(leader, baseline)} "
     keeper = max(equal, key=lambda row: mean_difference("kept", row.scores, baseline.scores) or 0.0)
@@ -177,11 +209,13 @@ def _keeping(members: Sequence[Row], baseline: Row | None) -> str:
     if len(equal) == 1 and keeper.method != BASELINE:
         which = "It" if keeper is leader else f"Of the others, {name}"
         return f"{slower}{which} {_beside(keeper, baseline)} {_training(keeper)}"
-    kept, like = _value("kept", keeper), "Of the methods not shown to learn more or less than sft"
+    kept, like = _value("kept", keeper), "Of the methods that learn about as much as sft"
     if keeper.method == BASELINE:
         return f"{slower}{like}, none keeps more than sft itself ({kept})."
     peers = _alike("kept", keeper.method, {row.method: row for row in equal})
     sure = f"; in this, {_alike_text(len(peers) - 1)}" if len(peers) > 1 else ""
+    if BASELINE in peers:
+        sure = f", but is not told apart from sft ({_value('kept', baseline)}) in this"
     return f"{slower}{like}, {name} keeps the most ({kept}){sure}. {_training(keeper)}"
 
 
@@ -204,7 +238,12 @@ def _training(row: Row) -> str:
         return "Its training time was not measured."
     if relative == 0:
         return "It takes no training."
-    return f"Its training takes {number_text(relative, '.2f')} times as long as sft's."
+    step = mean_step_ratio(row.runs)
+    parts = ""
+    if step:
+        steps, step_text = (number_text(one, ".1f") for one in (relative / step, step))
+        parts = f": {steps} times the steps, each {step_text} times as long"
+    return f"Its training takes {number_text(relative, '.1f')} times as long as sft's{parts}."
 
 
 def _value(metric: str, row: Row) -> str:

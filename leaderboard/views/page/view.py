@@ -71,7 +71,7 @@ class ScenarioView:
     @cached_property
     def verdicts(self) -> list[Verdict]:
         """What its rows say of each division of methods."""
-        return verdicts(self.table)
+        return verdicts(self.table, self.tied)
 
     @property
     def sorted_by(self) -> str:
@@ -95,7 +95,7 @@ class ScenarioView:
         turns = ", one after another" if targets > 1 else ""
         sentences = [
             f"{policy} is fine-tuned on {counted(targets, 'new task')}{turns}.",
-            "The final average is its success on all of them at the end.",
+            f"The final average is its success on {_all(skills, targets)} at the end.",
             f"{numbers}, with 95 % confidence intervals.",
         ]
         if any(row.method == BASELINE for row in self.table):
@@ -126,6 +126,11 @@ class ScenarioView:
     def has_agents(self) -> bool:
         """Whether it has rows of policies that another program trained."""
         return any(view.row.division in ELSEWHERE for view in self.rows)
+
+    @property
+    def has_single_seeds(self) -> bool:
+        """Whether a row has one seed alone."""
+        return any(len(view.row.seeds) == 1 for view in self.rows)
 
     @property
     def table(self) -> list[Row]:
@@ -228,3 +233,9 @@ def scenarios(tables: Mapping[str, list[Row]], board: Board, comparisons: Compar
 
 def _printable(groups: Mapping[str, Iterable[str]]) -> dict[str, tuple[str, ...]]:
     return {group: tuple(map(printable, names)) for group, names in groups.items()}
+
+
+def _all(skills: int, targets: int) -> str:
+    """Return what the final average counts, in words."""
+    new = "the new task" if targets == 1 else "all new tasks"
+    return f"the skills and {new}" if skills else new

@@ -117,21 +117,21 @@ def test_a_leader_that_is_not_told_apart_is_said_to_be_so(board: Callable[..., A
         f"In final average ({final:.2f}) it is first of 3; 2 are not told apart from it: lora and sft."
     )
     assert verdict.keeping == (
-        "Of the methods not shown to learn more or less than sft, it keeps the most (0.60); in this, 2 are "
-        "not told apart from it. Its training time was not measured."
+        "Of the methods that learn about as much as sft, it keeps the most (0.60), but is not told "
+        "apart from sft (0.50) in this. Its training time was not measured."
     )
 
 
 def test_the_one_method_that_is_not_told_apart_from_a_leader_is_named(board: Callable[..., Any]) -> None:
     (verdict,) = verdicts(board(sft=matrix(0.5), lora=matrix(0.6)))
     assert verdict.standing.endswith("it is first of 2; sft is not told apart from it.")
-    assert "; in this, one is not told apart from it." in verdict.keeping
+    assert "it keeps the most (0.60), but is not told apart from sft (0.50) in this." in verdict.keeping
 
 
 def test_no_method_keeps_more_than_plain_fine_tuning(board: Callable[..., Any]) -> None:
     (verdict,) = verdicts(board(sft=matrix(0.9), lora=matrix(0.2), finch=matrix(0.1)))
     assert verdict.keeping == (
-        "Of the methods not shown to learn more or less than sft, none keeps more than sft itself (0.90)."
+        "Of the methods that learn about as much as sft, none keeps more than sft itself (0.90)."
     )
 
 
@@ -140,7 +140,7 @@ def test_a_leader_that_is_told_apart_from_all_is_said_to_be_so(board: Callable[.
     assert verdict.leader.method == "lora"
     assert verdict.standing.endswith("it is first of 3, told apart from all others of its division.")
     assert verdict.keeping == (
-        "Of the methods not shown to learn more or less than sft, it keeps the most (0.90). Its training "
+        "Of the methods that learn about as much as sft, it keeps the most (0.90). Its training "
         "time was not measured."
     )
 
@@ -148,7 +148,7 @@ def test_a_leader_that_is_told_apart_from_all_is_said_to_be_so(board: Callable[.
 def test_a_training_time_is_a_multiple_of_that_of_plain_fine_tuning(board: Callable[..., Any]) -> None:
     rows = board(sft=matrix(0.1), lora=matrix(0.9))
     for relative, sentence in (
-        (2.371, "Its training takes 2.37 times as long as sft's."),
+        (2.371, "Its training takes 2.4 times as long as sft's."),
         (0.0, "It takes no training."),
     ):
         priced = [dataclasses.replace(row, costs=row.costs | {"relative_cost": relative}) for row in rows]
@@ -167,7 +167,7 @@ def test_a_leader_that_learns_less_does_not_keep_most_of_those_that_learn_alike(
     (verdict,) = verdicts(board(sft=matrix(0.1), lora=matrix(1.0, 0.3), finch=matrix(0.2)))
     assert verdict.leader.method == "lora"
     assert (
-        "It learns less than sft: 0.30 against 1.00. Of the methods not shown to learn more or less than "
+        "It learns less than sft: 0.30 against 1.00. Of the methods that learn about as much as "
         "sft, finch keeps the most (0.20)" in verdict.keeping
     )
 
@@ -218,3 +218,22 @@ def test_a_gain_that_is_not_certain_over_a_tied_setting_is_not_in_the_headline(
     assert headline(rows, tied).startswith("With prior demonstrations, replay ends ")
     tied = {"lora": (TiedGain(0.1, Estimate(0.02, 0.01, 0.03), 4),)}
     assert headline(rows, tied) == headline(rows)
+
+
+def test_a_card_says_why_the_gain_of_its_leader_is_not_certain(board: Callable[..., Any]) -> None:
+    rows = board(sft=matrix(0.2), lora=matrix(0.6), finch=matrix(0.2))
+    assert verdicts(rows)[0].doubt == ""
+    tied = {"lora": (TiedGain(0.1, Estimate(0.01, -0.01, 0.03), 4),)}
+    assert verdicts(rows, tied)[0].doubt == (
+        "Tuning rated sft at 0.1 times the learning rate as high; over that setting, the gain is "
+        "0.01 [-0.01, 0.03] and not certain."
+    )
+    alike = board(sft=matrix(0.2), lora=matrix(0.25), finch=matrix(0.2))
+    leader = alike[0]
+    estimates = {**leader.estimates, "gain": Estimate(0.03, 0.01, 0.05)}
+    rows = [dataclasses.replace(leader, estimates=estimates), *alike[1:]]
+    (verdict,) = verdicts(rows)
+    assert verdict.doubt == (
+        "Its gain is above 0 by its own interval alone, but not told apart from 0 when all 2 such methods "
+        "are compared with sft."
+    )
