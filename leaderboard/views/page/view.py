@@ -9,7 +9,7 @@ from functools import cached_property
 from clbench.base.text import counted, printable
 from clbench.records.paths import table_parts
 from clbench.scoring.metric import Metric
-from clbench.spec.policies import DEFAULT_POLICY
+from clbench.spec.policies import DEFAULT_POLICY, POLICIES, is_built_in, kind_of, size_of
 from clbench.spec.references import BASELINE
 
 from ...board.frontier import Curve, TiedGain
@@ -98,6 +98,7 @@ class ScenarioView:
             f"The final average is its success on {_all(skills, targets)} at the end.",
             f"{numbers}, with 95 % confidence intervals.",
         ]
+        sentences += _other_policy(table_parts(self.id)[1])
         if any(row.method == BASELINE for row in self.table):
             sentences.append(f"Plain fine-tuning is called {BASELINE}.")
         return " ".join(sentences)
@@ -233,6 +234,15 @@ def scenarios(tables: Mapping[str, list[Row]], board: Board, comparisons: Compar
 
 def _printable(groups: Mapping[str, Iterable[str]]) -> dict[str, tuple[str, ...]]:
     return {group: tuple(map(printable, names)) for group, names in groups.items()}
+
+
+def _other_policy(policy: str) -> list[str]:
+    """Return a sentence on a policy other than the default one, none for this or one that is not built in."""
+    if policy == DEFAULT_POLICY or not is_built_in(policy):
+        return []
+    size = size_of(policy)
+    layers = f", with {size[0]} channels of a token and {counted(size[1], 'layer')}" if size else ""
+    return [f"The policy is {title_of(policy)}{layers}: {POLICIES[kind_of(policy)]}."]
 
 
 def _all(skills: int, targets: int) -> str:

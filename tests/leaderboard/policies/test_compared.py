@@ -12,6 +12,7 @@ from clbench.records.record import Record
 
 compute_board = resolve("clbench.leaderboard.board.rows:compute_board")
 by_table = resolve("clbench.leaderboard.policies.compared:by_table")
+html = resolve("clbench.leaderboard.views.page.html:page")
 markdown = resolve("clbench.leaderboard.views.markdown:markdown")
 PLACE = "clbench/Toy-v0+discrete_diffusion"
 
@@ -69,3 +70,10 @@ def test_a_table_of_one_policy_has_no_comparison(add: Callable[..., Path], tmp_p
     table = compute_board(tmp_path / "leaderboard" / "records")
     assert by_table(table.rows) == {}
     assert "Does forgetting depend" not in markdown(table, by_table(table.rows))
+
+
+def test_the_section_of_another_policy_says_what_it_is(both: Path) -> None:
+    board = compute_board(both)
+    text = " ".join(html(board, by_table(board.rows)).split())
+    assert "The final average is its success on the skills and all new tasks at the end." in text
+    assert "The policy is discrete diffusion: masked action tokens are filled in, the surest first" in text
