@@ -14,7 +14,6 @@ from clbench.scoring.intervals import (
     Estimate,
     bootstrap,
     estimate,
-    interval,
     paired_difference,
     row_generator,
 )
@@ -289,19 +288,6 @@ def test_only_an_interval_of_seeds_is_above_or_below_a_bar() -> None:
         (of_episodes(-0.2, -0.3, -0.1), False, False),
     ):
         assert (estimate_.is_above(0), estimate_.is_below(0)) == (above, below)
-
-
-def test_a_ratio_has_the_interval_of_its_logarithm() -> None:
-    # by hand: mean and Student's interval of the logarithms
-    values = np.array([0.12, 0.36, 0.24, 1.31])
-    logs = np.log(values)
-    reach = stats.t.ppf(0.975, 3) * logs.std(ddof=1) / 2
-    without_one = np.exp((logs.sum() - logs) / 3)
-    got = interval(float(np.exp(logs.mean())), without_one, ratio=True)
-    expected = np.exp([logs.mean() - reach, logs.mean() + reach])
-    assert [got.low, got.high] == pytest.approx(expected)
-    assert got.of_seeds
-    assert interval(0.0, np.array([0.0, 0.0]), ratio=True) == Estimate(0.0, None, None)  # no logarithm
 
 
 def test_methods_with_other_numbers_of_runs_are_not_compared() -> None:

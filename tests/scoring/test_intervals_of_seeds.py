@@ -83,3 +83,16 @@ def test_a_quantity_without_value_for_some_seeds_has_no_interval() -> None:
     assert interval(np.nan, np.array([1.0, 2.0])) == NO_ESTIMATE
     assert interval(1.0, np.zeros(0)) == Estimate(1.0, None, None)
     assert interval(1.0, np.zeros(0), lambda: np.array([1.0, np.nan])) == Estimate(1.0, None, None)
+
+
+def test_a_ratio_has_the_interval_of_its_logarithm() -> None:
+    # by hand: mean and Student's interval of the logarithms
+    values = np.array([0.12, 0.36, 0.24, 1.31])
+    logs = np.log(values)
+    reach = stats.t.ppf(0.975, 3) * logs.std(ddof=1) / 2
+    without_one = np.exp((logs.sum() - logs) / 3)
+    got = interval(float(np.exp(logs.mean())), without_one, ratio=True)
+    expected = np.exp([logs.mean() - reach, logs.mean() + reach])
+    assert [got.low, got.high] == pytest.approx(expected)
+    assert got.of_seeds
+    assert interval(0.0, np.array([0.0, 0.0]), ratio=True) == Estimate(0.0, None, None)  # no logarithm
