@@ -2,12 +2,16 @@
 (async () => {
   const root = document.documentElement;
   const narrow = () => window.innerWidth < 720;
+  const forNewTab = (event) => event.ctrlKey || event.metaKey || event.shiftKey;
 
   // ---- parts: one is open, and the others are text until the reader opens them ------------------------------
-
   const parts = [...document.querySelectorAll(".part")];
-  const tabs = document.querySelector(".tabs");
-  const place = () => decodeURIComponent(location.hash.slice(1));
+  const tabs = document.querySelector(".tabs"), { title } = document;
+
+  /* The part or row that the address names. */
+  function place() {
+    try { return decodeURIComponent(location.hash.slice(1)); } catch { return ""; /* "%" alone is no text */ }
+  }
 
   /* Make the elements of a part from its text, in which the templates escaped what strangers wrote. */
   function build(part) {
@@ -15,17 +19,16 @@
     if (text !== undefined) part.innerHTML = text;
   }
 
-  /* Open the part of the address, #scenario or #scenario/method. */
+  /* Open the part of the address, #scenario or #scenario/method; an address without a place opens the first. */
   function openPart() {
     const name = place();
     const wanted = parts.find((one) => name === one.id || name.startsWith(`${one.id}/`));
-    const part = wanted ?? parts.find((one) => !one.hidden);
+    const part = wanted ?? (name ? parts.find((one) => !one.hidden) : parts[0]);
     const moved = part?.hidden;
     for (const one of parts) one.hidden = one !== part;
     for (const link of tabs.querySelectorAll("a")) {
       const here = part && link.hash.slice(1) === part.id;
-      if (here) link.setAttribute("aria-current", "true");
-      else link.removeAttribute("aria-current");
+      link.ariaCurrent = here ? "true" : null;
       if (here) link.parentElement.scrollLeft = link.offsetLeft - 40;
     }
     if (part) build(part);
@@ -35,21 +38,16 @@
   }
 
   const measureTabs = () => root.style.setProperty("--tabs", `${tabs.offsetHeight}px`);
-
   root.classList.remove("no-script");
   parts.slice(1).forEach((part) => { part.hidden = true; });
   openPart(); // before the data are unpacked: no other part flashes up
   measureTabs();
 
   // ---- theme: the reader's choice, otherwise the system's ---------------------------------------------------
-
   const dark = matchMedia("(prefers-color-scheme: dark)");
   const button = document.getElementById("theme");
   const theme = () => root.dataset.theme || (dark.matches ? "dark" : "light");
-
-  function nameTheme() {
-    button.textContent = theme() === "dark" ? "Light theme" : "Dark theme";
-  }
+  const nameTheme = () => { button.textContent = theme() === "dark" ? "Light theme" : "Dark theme"; };
 
   // A file opened from disk may have no storage.
   try { root.dataset.theme = localStorage.getItem("theme") || ""; } catch { /* the system's theme */ }
@@ -62,40 +60,45 @@
   nameTheme();
 
   // ---- data, and the library that draws charts ---------------------------------------------------------------
-
   const packed = Uint8Array.from(atob(document.getElementById("data").textContent), (one) => one.charCodeAt(0));
   const unpacked = new Blob([packed]).stream().pipeThrough(new DecompressionStream("gzip"));
   const library = new Promise((done) => { document.addEventListener("DOMContentLoaded", done); }); // it comes last
   const [data] = await Promise.all([new Response(unpacked).json(), library]);
 
   // ---- the tip: what is behind a number, by mouse, by tap and by key ----------------------------------------
-
   const tip = document.getElementById("tip");
+  let leaving;
 
-  function showTip(text, left, top, bottom) {
+  function showTip(text, { left, top, bottom }) {
+    clearTimeout(leaving);
     tip.textContent = text;
     (document.querySelector("dialog[open]") ?? document.body).append(tip); // above an open dialog
     tip.showPopover();
-    const below = bottom + 6 + tip.offsetHeight < window.innerHeight;
+    const above = top - 6 - tip.offsetHeight > 0; // below, it would catch a pointer that goes down a column
     tip.style.left = `${Math.max(Math.min(left, window.innerWidth - tip.offsetWidth - 8), 8)}px`;
-    tip.style.top = `${below ? bottom + 6 : top - 6 - tip.offsetHeight}px`;
+    tip.style.top = `${above ? top - 6 - tip.offsetHeight : bottom + 6}px`;
   }
 
   const hideTip = () => tip.hidePopover();
-
-  function showNote(element) {
-    const { left, top, bottom } = element.getBoundingClientRect();
-    showTip(element.dataset.note, left, top, bottom);
-  }
-
+  /* Hide the tip unless the pointer goes to it. */
+  const leaveTip = () => { clearTimeout(leaving); leaving = setTimeout(hideTip, 200); };
+  const showNote = (element) => showTip(element.dataset.note, element.getBoundingClientRect());
   const noted = (event) => event.target.closest?.("[data-note]");
   for (const [begin, end] of [["focusin", "focusout"], ["mouseover", "mouseout"]]) {
     document.addEventListener(begin, (event) => { if (noted(event)) showNote(noted(event)); });
-    document.addEventListener(end, (event) => { if (noted(event)) hideTip(); });
+    document.addEventListener(end, (event) => { if (noted(event)) leaveTip(); });
   }
+  tip.addEventListener("mouseenter", () => clearTimeout(leaving));
+  tip.addEventListener("mouseleave", leaveTip);
+  document.addEventListener("keydown", (event) => {
+    if (event.key !== "Escape" || !tip.matches(":popover-open")) return;
+    event.preventDefault(); // an open row stays open
+    hideTip();
+  });
   document.addEventListener("scroll", () => {
-    const focused = document.activeElement.closest("[data-note]"); // the focus may have moved the page
-    if (focused?.matches(":focus-visible")) showNote(focused);
+    if (!tip.matches(":popover-open")) return;
+    const focused = document.activeElement.closest("[data-note]:focus-visible"); // it may have moved the page
+    if (focused) showNote(focused);
     else hideTip();
   }, { capture: true, passive: true });
 
@@ -124,15 +127,13 @@
   }
 
   // ---- a scenario: its filters, its table and its picture ---------------------------------------------------
-
   function prepare(part) {
     const table = part.querySelector(".board");
     const heads = [...table.tHead.rows[0].cells];
     const bodies = [...table.tBodies];
     const rows = bodies.flatMap((body) => [...body.rows].slice(1).map((row) => ({ row, body })));
     const form = part.querySelector(".filters");
-    const { all, grouped } = Object.fromEntries(
-      [...part.querySelectorAll(".choices input")].map((box) => [box.name, box]));
+    const [all, grouped] = part.querySelectorAll(".choices input");
     const sorted = heads.find((head) => head.ariaSort !== "none");
     let column = heads.indexOf(sorted), direction = sorted.ariaSort;
 
@@ -161,34 +162,27 @@
           || (tier?.value && row.dataset.tier !== tier.value);
         if (!row.hidden) methods.add(name);
       }
-      for (const body of bodies) {
-        body.rows[0].hidden = rows.every((one) => one.body !== body || one.row.hidden);
-      }
+      for (const body of bodies) body.rows[0].hidden = rows.every((one) => one.body !== body || one.row.hidden);
       form.elements.count.value = `${methods.size} of ${rows.length} ${rows.length === 1 ? "method" : "methods"}`;
       return methods;
     }
 
-    function picture() {
-      drawPlane(part, form.elements.across.value, form.elements.up.value, filter());
-    }
-
+    part.picture = () => drawPlane(part, form.elements.across.value, form.elements.up.value, filter());
     table.tHead.addEventListener("click", (event) => {
-      const head = event.target.closest("th");
-      if (!event.target.closest("button")) return;
-      const first = event.target.closest("button").dataset.first;
+      const button = event.target.closest("button");
+      if (!button) return;
+      const chosen = heads.indexOf(button.parentElement);
       const other = { ascending: "descending", descending: "ascending" };
-      direction = heads.indexOf(head) === column ? other[direction] : first;
-      column = heads.indexOf(head);
+      direction = chosen === column ? other[direction] : button.dataset.first;
+      column = chosen;
       arrange();
     });
     part.querySelector(".choices").addEventListener("input", arrange);
-    form.addEventListener("input", picture);
-    form.addEventListener("submit", (event) => event.preventDefault());
+    form.addEventListener("input", part.picture);
     form.reset();
     all.checked = false;
     grouped.checked = true;
     roam(table);
-    part.picture = picture;
   }
 
   function prepareFiles(part) {
@@ -199,16 +193,14 @@
       for (const row of rows) row.hidden = !row.textContent.toLowerCase().includes(wanted);
       form.elements.count.value = `${rows.filter((row) => !row.hidden).length} of ${rows.length} ${rows.length === 1 ? "file" : "files"}`;
     });
-    form.addEventListener("submit", (event) => event.preventDefault());
   }
 
   // ---- charts ----------------------------------------------------------------------------------------------
-
   function showPoint(handler, event, item, value) {
-    if (!value) return hideTip();
-    const known = new Set(["across", "up"]); // their texts have their names
-    const lines = Object.entries(value).map(([name, text]) => (known.has(name) ? text : `${name}: ${text}`));
-    showTip(lines.join("\n"), event.clientX + 12, event.clientY, event.clientY + 8);
+    if (!value) return leaveTip();
+    const isNamed = (name) => ["across", "up"].includes(name); // in its own text
+    const lines = Object.entries(value).map(([name, text]) => (isNamed(name) ? text : `${name}: ${text}`));
+    showTip(lines.join("\n"), { left: event.clientX + 12, top: event.clientY, bottom: event.clientY + 8 });
   }
 
   async function draw(element, spec) {
@@ -217,13 +209,19 @@
     // Vega sets its own class names on the element that it draws in, and asks for its width.
     const place = element.latest = element.appendChild(document.createElement("div"));
     const { view } = await vegaEmbed(place, spec, options);
-    view.addEventListener("click", (event, item) => {
-      if (item?.datum?.anchor) location.hash = `#${item.datum.anchor}`;
-    });
+    view.addEventListener("click", (event, item) => { if (item?.datum?.anchor) location.hash = item.datum.anchor; });
     if (element.latest === place) element.replaceChildren(place); // the reader may have chosen again meanwhile
   }
 
   const sizeOfPlane = () => (narrow() ? "narrow" : window.innerWidth < 1340 ? "wide" : "full");
+
+  /* The note on methods outside a picture without those that are hidden. */
+  function noteOf(note, methods) {
+    const start = note.indexOf(": ") + 2;
+    const isShown = (text) => [...methods].some((name) => text.startsWith(`${name} (`));
+    const left = note.slice(start, -1).split("; ").filter(isShown);
+    return left.length ? `${note.slice(0, start)}${left.join("; ")}.` : "";
+  }
 
   /* The template with its places filled by points, axes and labels; hidden methods have neither. */
   function drawPlane(part, across, up, methods) {
@@ -237,22 +235,23 @@
     // A front holds for all methods of its division.
     const whole = new Set(plane.places["@points"].filter((one) => !methods.has(one.method)).map((one) => one.division));
     places["@corners"] = places["@corners"].filter((one) => !whole.has(one.division));
-    const empty = plane.places["@points"].length === 0;
+    const empty = places["@points"].length === 0;
     element.classList.toggle("empty", empty);
-    part.querySelector("[data-plane-note]").textContent = (empty ? `No method here has both ${up} and ${across}. ` : "") + plane.note;
+    const none = plane.places["@points"].length ? "" : `No method here has both ${up} and ${across}. `;
+    part.querySelector("[data-plane-note]").textContent =
+      methods.size ? none + noteOf(plane.note, methods) : "No method matches the filters.";
+    element.latest = null; // a drawing under way is out of date
     if (empty) return element.replaceChildren();
     const fill = (name, value) => (typeof value === "string" && value in places ? places[value] : value);
     draw(element, JSON.parse(JSON.stringify(data.planes[size]), fill));
   }
 
-  function drawFrontier(element) {
-    const one = data.scenarios[element.dataset.frontier];
-    draw(element, narrow() ? one.narrow_frontier : one.wide_frontier);
-  }
-
-  function drawDecoders(element) {
-    const one = data.scenarios[element.dataset.decoders];
-    draw(element, narrow() ? one.narrow_decoders : one.wide_decoders);
+  /* Draw the charts of a part that have two sizes. */
+  function drawOthers(part) {
+    const size = narrow() ? "narrow" : "wide";
+    for (const name of ["frontier", "decoders"]) {
+      for (const one of part.querySelectorAll(`[data-${name}]`)) draw(one, data.scenarios[part.id][`${size}_${name}`]);
+    }
   }
 
   const words = ([value, low, high]) =>
@@ -285,10 +284,8 @@
     const one = data.scenarios[row.scenario];
     const at = places(one);
     const [retained, target, beside] = data.series;
-    const all = [
-      ...points(retained, row.retained, at.retained, row, one, false),
-      ...points(target, row.target, at.target, row, one, true),
-    ];
+    const all = points(retained, row.retained, at.retained, row, one, false);
+    all.push(...points(target, row.target, at.target, row, one, true));
     if (one.sft && one.sft !== element.dataset.run && !row.elsewhere) {
       const values = data.rows[one.sft].retained.map(([value]) => [value, null, null]);
       all.push(...points(beside, values, at.retained, row, one, false));
@@ -299,70 +296,72 @@
   }
 
   // ---- tables that are long and made when they open -------------------------------------------------
-
   function table(label, heads, rows) {
-    const region = document.createElement("div");
-    Object.assign(region, { className: "scroll", tabIndex: 0, role: "region", ariaLabel: label });
-    const made = region.appendChild(document.createElement("table"));
-    made.className = "plain";
-    const cell = (row, name, text, numeric) => {
-      const one = row.appendChild(document.createElement(name));
-      if (name === "th") one.scope = row.parentElement.tagName === "THEAD" ? "col" : "row";
-      one.className = numeric ? "numeric" : "";
-      one.textContent = text;
-      return one;
+    const region = Object.assign(document.createElement("div"),
+      { className: "scroll", tabIndex: 0, role: "region", ariaLabel: label });
+    const add = (place, name, values) => Object.assign(place.appendChild(document.createElement(name)), values);
+    const made = add(region, "table", { className: "plain" });
+    const line = (section, texts, scope) => {
+      const row = section.insertRow();
+      texts.forEach((textContent, number) => {
+        const [name, more] = scope === "col" || !number ? ["th", { scope }] : ["td"];
+        add(row, name, { textContent, className: number ? "numeric" : "", ...more });
+      });
+      return row;
     };
-    const head = made.createTHead().insertRow();
-    heads.forEach((text, number) => cell(head, "th", text, number > 0));
+    line(made.createTHead(), heads, "col");
     const body = made.createTBody();
     for (const { texts, meaning } of rows) {
-      const row = body.insertRow();
-      texts.forEach((text, number) => cell(row, number ? "td" : "th", text, number > 0));
-      if (!meaning) continue;
-      const more = row.cells[0].appendChild(document.createElement("span"));
-      more.className = "meaning";
-      more.textContent = meaning;
+      const row = line(body, texts, "row");
+      if (meaning) add(row.cells[0], "span", { className: "meaning", textContent: meaning });
     }
     return region;
   }
 
   const tables = {
     curves(row) {
-      const one = data.scenarios[row.scenario], count = one.steps.length;
+      const one = data.scenarios[row.scenario];
       const rows = places(one).target.map(([stage, step], index) => {
-        const place = index - stage * (count + 1);
-        const texts = [words(row.target[index]), words(row.retained[stage * count + place])];
-        return { texts: [one.targets[stage], when(row, one, step), ...texts] };
+        const old = row.retained[index - stage]; // the end of a stage is the start of the next
+        return { texts: [one.targets[stage], when(row, one, step), words(row.target[index]), words(old)] };
       });
       return table("The curves", ["target", "step", "success on the target", "on the old skills"], rows);
     },
     metrics(row) {
-      const seeds = Object.keys(row.seeds);
-      const rows = row.metrics.map((numbers, index) => {
+      const rows = row.metrics.map(([value, low, high, ...each], index) => {
         const [name, description, missing] = data.scenarios[row.scenario].metrics[index];
-        const [value, low, high, ...each] = numbers;
         const texts = [name, words([value, low, high]), ...each.map((one) => words([one, null, null]))];
         return { texts, meaning: value === null ? `Missing: ${missing}` : description };
       });
-      const heads = ["metric", "value [95 % interval]", ...seeds.map((seed) => `seed ${seed}`)];
+      const heads = ["metric", "value [95 % interval]", ...Object.keys(row.seeds).map((seed) => `seed ${seed}`)];
       return table("All other metrics and definitions", heads, rows);
     },
   };
 
   // ---- the section of a row, made when it opens -------------------------------------------------------------
-
   const dialog = document.getElementById("row");
-  let opened = "";
+  let opened, opener;
 
   document.addEventListener("toggle", ({ target }) => {
     const make = tables[target.dataset?.table];
     if (make && target.open && target.children.length < 2) target.append(make(data.rows[opened]));
   }, true);
 
+  /* On the way back the browser scrolls to the part and takes the focus away: undo both. */
+  function stay(link) {
+    const top = window.scrollY;
+    const undo = () => { window.scrollTo({ top, behavior: "instant" }); link?.focus({ preventScroll: true }); };
+    window.addEventListener("hashchange", undo, { once: true });
+  }
+
   function openRow(anchor) {
     opened = anchor;
     dialog.innerHTML = data.rows[anchor].html; // the templates of the page escaped what strangers wrote
-    if (!dialog.open) dialog.showModal();
+    if (!dialog.open) {
+      opener = document.activeElement;
+      if (!history.state) history.replaceState("followed", "");
+      dialog.showModal();
+    }
     dialog.querySelector("h2").focus();
     dialog.scrollTop = 0;
     drawRun(dialog.querySelector("[data-run]"));
@@ -384,34 +383,39 @@
   });
 
   dialog.addEventListener("click", (event) => {
-    const close = event.target.closest(".close");
+    const link = event.target.closest(".bar-top a");
     const outside = event.target === dialog && event.clientX < dialog.getBoundingClientRect().left; // the backdrop
-    if (!close && !outside) return;
+    if ((!link && !outside) || forNewTab(event)) return;
     event.preventDefault();
-    dialog.close();
+    if (outside || link.matches(".close")) return dialog.close();
+    history.replaceState(history.state, "", link.hash); // Back leads out of the rows
+    go();
   });
 
   dialog.addEventListener("close", () => {
-    document.body.append(tip);
-    hideTip();
     dialog.replaceChildren();
-    if (!opened) return;
-    // Closed by a key or a click: restore the address of the scenario, and the focus on the row.
-    const { scenario } = data.rows[opened];
-    history.replaceState(null, "", `#${scenario}`);
-    const links = [...document.getElementById(scenario).querySelectorAll(".board .name a")];
-    links.find((link) => link.hash === `#${opened}`)?.focus({ preventScroll: true });
-    opened = "";
+    const own = document.querySelector(`.board .name a[href="#${CSS.escape(opened)}"]`);
+    const link = opener.matches("a") && opener.checkVisibility() ? opener : own; // a mark of a chart takes no focus
+    const here = place() === opened; // otherwise Back has closed it
+    const landed = here && history.state !== "followed";
+    link?.focus({ preventScroll: !landed });
+    if (landed) {
+      history.replaceState(history.state, "", `#${data.rows[opened].scenario}`);
+      go();
+    } else if (here) {
+      stay(link);
+      history.back();
+    }
   });
 
   // ---- places: #scenario shows a scenario, #scenario/method opens a row ------------------------------------
-
   function go() {
-    const part = openPart(), name = place();
+    const part = openPart(), name = place(), isRow = Object.hasOwn(data.rows, name);
+    const tab = tabs.querySelector("[aria-current]")?.textContent;
+    document.title = [isRow && name.slice(part.id.length + 1), tab, title].filter(Boolean).join(" · ");
     if (part) show(part);
-    if (data.rows[name]) return openRow(name);
-    opened = "";
-    if (dialog.open) dialog.close();
+    if (isRow) return openRow(name);
+    if (dialog.open) { stay(); dialog.close(); }
   }
 
   /* Give a part its behaviour and its pictures, once. */
@@ -422,23 +426,25 @@
     if (part.id === "not-shown") prepareFiles(part);
     part.querySelectorAll(".heat, .definitions").forEach(roam);
     part.picture?.();
-    part.querySelectorAll("[data-frontier]").forEach(drawFrontier);
-    part.querySelectorAll("[data-decoders]").forEach(drawDecoders);
+    drawOthers(part);
   }
 
   tabs.addEventListener("click", (event) => {
     const link = event.target.closest("a");
-    if (!link) return;
+    if (!link || forNewTab(event)) return;
     event.preventDefault(); // the browser would scroll
     history.pushState(null, "", link.hash);
     go();
   });
+  document.addEventListener("submit", (event) => event.preventDefault());
   // Back and forward change the address, too.
   window.addEventListener("popstate", go);
   window.addEventListener("resize", () => {
     measureTabs();
     for (const part of parts) if (part.picture && part.size !== sizeOfPlane()) part.picture();
   });
+  // An entry of the history that this page made for a row is "followed": closing the row leads back.
+  if (!history.state) history.replaceState("landed", "");
   go();
   root.dataset.ready = ""; // for tests
 })();

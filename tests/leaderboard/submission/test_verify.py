@@ -306,10 +306,12 @@ def test_the_command_prints_json_of_good_and_bad_records(
     records = next(folder for folder in mine.parents if folder.name == "records")
     bad = mine.with_name("seed-1.json")
     bad.write_text("{}")
+    mine.with_name("seed-2.json").mkdir()
     with pytest.raises(SystemExit) as stopped:
-        command(mine, bad, tier="recomputed", scenario=TOY, records=records, workers=1, as_json=True)
+        command(mine.parent, tier="recomputed", scenario=TOY, records=records, workers=1, as_json=True)
     assert stopped.value.code == 1
-    good, bad_one = json.loads(capsys.readouterr().out)
+    good, bad_one, folder = json.loads(capsys.readouterr().out)
+    assert "seed-2.json: cannot be read (Is a directory)" in folder["failure"]
     assert good["path"] == str(mine)
     assert (good["passed"], good["tier"], good["failure"]) == (True, "recomputed", None)
     assert good["checks"]

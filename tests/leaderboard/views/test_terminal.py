@@ -109,8 +109,11 @@ def test_a_wrong_scenario_or_metric_is_named_and_nothing_is_written(
 def test_the_rows_come_as_json_with_null_for_what_is_missing(
     four_methods: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    (four_methods / "torn.json").write_text("{", encoding="utf-8")
     app(["leaderboard", "--json", "--records", str(four_methods)], result_action="return_value")
-    rows = {row["method"]: row for row in json.loads(capsys.readouterr().out)}
+    printed = capsys.readouterr()
+    assert "Not shown: torn.json: " in printed.err
+    rows = {row["method"]: row for row in json.loads(printed.out)}
     assert rows["sft"]["retention"] == pytest.approx(0.45)
     assert rows["sft"]["perturbed_retention"] is None
     assert not (four_methods.parent / "site").exists()

@@ -109,7 +109,7 @@ def test_it_opens_from_disk_and_draws_its_charts(open_page: Callable[..., Page])
     page = open_page("clbench/Toy-v0")
     expect(page.locator("figure[data-plane]:visible svg")).to_have_count(1)
     expect(page.locator("figure[data-plane]:visible")).to_contain_text("other")
-    assert page.title() == "clbench leaderboard"
+    assert page.title() == "Toy-v0 · clbench leaderboard"
 
 
 def test_a_click_on_a_head_sorts_and_a_second_one_the_other_way(open_page: Callable[..., Page]) -> None:
@@ -333,14 +333,17 @@ def test_printing_shows_the_open_part_and_the_whole_of_its_table(open_page: Call
     ]
 
 
-def test_tabs_that_do_not_fit_into_one_line_take_another(open_page: Callable[..., Page]) -> None:
-    page = open_page("clbench/Toy-v0", viewport={"width": 660, "height": 700})
-    links = page.locator(".tabs a")
-    links.evaluate_all("all => all.forEach((one) => { one.textContent += ' with a long name'; })")
-    page.set_viewport_size({"width": 700, "height": 700})
+def test_tabs_that_do_not_fit_take_another_line_in_a_large_window(open_page: Callable[..., Page]) -> None:
+    page = open_page("clbench/Toy-v0", viewport={"width": 1200, "height": 700})
+    links, tabs = page.locator(".tabs a"), page.locator(".tabs")
+    links.evaluate_all("all => all.forEach((one) => { one.textContent += ' with a long, long name'; })")
     boxes = links.evaluate_all("all => all.map((one) => one.getBoundingClientRect().right)")
-    assert max(boxes) <= 700
-    assert page.evaluate("document.documentElement.scrollWidth") <= 700
+    assert max(boxes) <= 1200
+    lines = tabs.evaluate("one => one.offsetHeight")
+    for width, height in ((720, 700), (1200, 450)):
+        page.set_viewport_size({"width": width, "height": height})
+        assert tabs.evaluate("one => one.offsetHeight") < lines
+        assert page.evaluate("document.documentElement.scrollWidth") <= width
 
 
 def test_without_scripts_the_verdicts_and_tables_are_there(open_page: Callable[..., Page]) -> None:
@@ -349,6 +352,8 @@ def test_without_scripts_the_verdicts_and_tables_are_there(open_page: Callable[.
     expect(page.locator(".heat:visible")).to_have_count(1)
     expect(page.locator("td.extra").first).to_be_visible()
     expect(page.get_by_role("button", name="Dark theme")).to_be_hidden()
+    expect(page.locator(".filters:visible, .choices:visible, figure:visible")).to_have_count(0)
+    assert page.evaluate("document.documentElement.scrollWidth") <= DESKTOP["width"]
 
 
 def cells(page: Page) -> Locator:
