@@ -15,12 +15,14 @@ from rich.text import Text
 
 from clbench.base.entry_points import unknown
 from clbench.base.errors import InputError, UnknownNameError
-from clbench.base.text import counted
+from clbench.base.text import counted, printable
 from clbench.cli.arguments import (
     AsJson,
     MethodName,
     PolicyName,
     ScenarioId,
+    Seed,
+    Seeds,
     add_cwd_to_path,
     check_names,
     checked_input,
@@ -63,7 +65,8 @@ def show(
         records: Folder of the records.
         published: First copy the records that come with clbench to the folder, where it lacks them: your rows
             then stand beside the published ones.
-        as_json: Print JSON, one object for each row with every metric and cost, and write no files.
+        as_json: Print JSON, one object for each row with every metric and cost, and write no files. Standard
+            error says which records are not shown.
     """
     from clbench.scoring.metrics import load_metric
 
@@ -91,6 +94,8 @@ def show(
         shown = _chosen(board, scenario, records)
     if as_json:
         print_json([dict(zip(column_names(), values_of(row), strict=True)) for row in shown.rows])
+        for entry in shown.not_shown:
+            messages.print(Text(printable(f"Not shown: {entry.path}: {entry.reason}")))
         return
     written = [] if computed is None else write_site(computed, records, inputs)
     console = Console()
@@ -134,9 +139,9 @@ def submit(
     /,
     *,
     scenario: ScenarioId = SCENARIO,
-    seeds: Annotated[int, whole_number(1)] = DEFAULT_SEEDS,
-    first_seed: Annotated[int, whole_number(0)] = 0,
-    order: Annotated[int, whole_number(0)] = 0,
+    seeds: Seeds = DEFAULT_SEEDS,
+    first_seed: Seed = 0,
+    order: Seed = 0,
     workers: Annotated[int | None, whole_number(1)] = None,
     records: Path = RECORDS,
     device: str = "cpu",
@@ -193,7 +198,7 @@ def verify(
     *paths: Path,
     tier: str = "replayed",
     episodes: Annotated[int, whole_number(1)] = 40,
-    seed: Annotated[int | None, whole_number(0)] = None,
+    seed: Seed | None = None,
     method: MethodName | None = None,
     policy: PolicyName | None = None,
     scenario: ScenarioId | None = None,
@@ -262,7 +267,7 @@ def verify(
 def _found(paths: Sequence[Path], records: Path) -> list[Path]:
     """Return the records at `paths`, including those in folders."""
     found = [one for path in paths for one in (sorted(path.rglob("*.json")) if path.is_dir() else [path])]
-    absent = [path for path in found if not path.is_file()]
+    absent = [path for path in found if not os.path.lexists(path)]
     if absent or not found:
         what = f"There is no record at {absent[0]}." if absent else "There is no record to verify."
         raise InputError(f"{what} Give paths, for example {record_path(records, SCENARIO, 'sft', 0)}.")

@@ -41,7 +41,7 @@ def cache_folder() -> Path:
     """Return the folder of the cache: `CLBENCH_CACHE`, or clbench below the user's own cache folder."""
     if os.environ.get("CLBENCH_CACHE"):
         return Path(os.path.realpath(Path(os.environ["CLBENCH_CACHE"]).expanduser()))
-    return Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser() / "clbench"
+    return Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser().absolute() / "clbench"
 
 
 def hash_of(values: Any) -> str:

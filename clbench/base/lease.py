@@ -111,6 +111,9 @@ class Lease:
     def clear(self) -> bool:
         """Remove the lease of a dead process, and its report; return whether nobody holds the lease."""
         if self._lock.owner is None:  # no lease, or a file that someone else put there
+            if not self._file.exists():
+                with contextlib.suppress(OSError):
+                    _report_path(self._path).unlink(missing_ok=True)
             return True
         if self.take():
             self.release()

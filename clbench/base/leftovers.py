@@ -24,7 +24,8 @@ than a second. Folders have leases, which tell whether their maker lives."""
 
 _MAKER = r"(?P<host>[0-9a-f]{8})(?P<process>[0-9a-f]{8})[0-9a-f]{16}"
 _UNFINISHED = re.compile(rf"\.(?P<name>.+)\.{_MAKER}\.(?:partial|old)")
-_LEASE = re.compile(r"\.(?P<name>.+)\.lease")
+_LEASE = re.compile(r"\.(?P<name>.+)\.lease|\.(?P<record>seed-.+\.json)\.progress")
+"""Names of leases, and of the reports that the leases of records have."""
 
 
 def unfinished(path: Path) -> Path:
@@ -73,7 +74,7 @@ def sweep(*roots: Path) -> int:
     for path in [path for root in roots for path in _found(root)]:
         lease = _LEASE.fullmatch(path.name)
         if lease is not None:
-            Lease(path.with_name(lease["name"])).clear()
+            Lease(path.with_name(lease["name"] or lease["record"])).clear()
         elif is_left_behind(path):
             _remove(path)
         count += not path.exists()

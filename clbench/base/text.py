@@ -13,6 +13,9 @@ T = TypeVar("T")
 
 _HEADING = "Attributes:"
 
+LONGEST_SHOWN = 500
+"""Characters of an error's message that a terminal shows."""
+
 
 def quoted(text: str) -> str:
     """Return a stranger's text as a Python literal, cut to 60 characters."""
@@ -28,6 +31,11 @@ def printable(text: str) -> str:
 def printable_lines(text: str) -> str:
     """Return a stranger's text with its lines, but without characters that control a terminal."""
     return "\n".join(map(printable, text.splitlines()))
+
+
+def shortened(text: str, whole: str) -> str:
+    """Return a text of at most `LONGEST_SHOWN` characters, or its beginning and where the whole text is."""
+    return text if len(text) <= LONGEST_SHOWN else f"{text[:LONGEST_SHOWN]} [... {whole} has the rest]"
 
 
 def counted(count: int, noun: str, nouns: str = "") -> str:

@@ -7,9 +7,18 @@ import os
 import sys
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import Annotated
+from pathlib import Path
+from typing import Annotated, get_args
 
-from cyclopts import CoercionError, CycloptsError, Parameter, Token, UnknownCommandError
+from cyclopts import (
+    App,
+    ArgumentCollection,
+    CoercionError,
+    CycloptsError,
+    Parameter,
+    Token,
+    UnknownCommandError,
+)
 from cyclopts.validators import Number
 from rich.console import Console
 from rich.text import Text
@@ -18,13 +27,14 @@ from clbench.base.entry_points import unknown
 from clbench.base.errors import ClbenchError
 from clbench.base.text import printable
 from clbench.spec.policies import SIZES, policy_names
+from clbench.spec.protocol import LARGEST_SEED, MOST_SEEDS
 
 
-def whole_number(least: int) -> Parameter:
-    """Return the annotation of a whole number that is at least `least`; `--help` shows the limit."""
+def whole_number(least: int, most: int | None = None) -> Parameter:
+    """Return the annotation of a whole number from `least` to `most`; `--help` shows the lower limit."""
     return Parameter(
         converter=_whole_number,
-        validator=Number(gte=least),
+        validator=Number(gte=least, lte=most),
         metavar=f"INT>={least}",
     )
 
@@ -35,6 +45,13 @@ def _whole_number(_: object, tokens: Sequence[Token]) -> int:
         return int(tokens[0].value)
     except ValueError:
         raise ValueError(f"it must be a whole number, not {tokens[0].value!r}") from None
+
+
+Seed = Annotated[int, whole_number(0, LARGEST_SEED)]
+"""Seed of a run, or the order of its targets, on the command line."""
+
+Seeds = Annotated[int, whole_number(1, MOST_SEEDS)]
+"""Number of seeds on the command line."""
 
 
 def _known_scenarios(_: object) -> tuple[str, ...]:
@@ -90,6 +107,15 @@ def check_names(scenarios: Iterable[str], methods: Iterable[str]) -> None:
 def error_line(message: object) -> Text:
     """Return an error message as one line."""
     return Text(f"error: {printable(' '.join(str(message).split()))}", style="bold red")
+
+
+def expand_home(_: App, __: Sequence[str], arguments: ArgumentCollection) -> None:
+    """Replace ~ at the beginning of each path: no shell does so inside quotes, or in --records=~/x."""
+    for argument in arguments:
+        if Path in (argument.hint, *get_args(argument.hint)):
+            argument.tokens[:] = [
+                token.evolve(value=os.path.expanduser(token.value)) for token in argument.tokens
+            ]
 
 
 def parsing_error(error: CycloptsError) -> Text:

@@ -20,6 +20,7 @@ from clbench.cli.arguments import (
     PolicyName,
     PolicySize,
     ScenarioId,
+    Seed,
     add_cwd_to_path,
     checked_input,
     whole_number,
@@ -151,7 +152,7 @@ def pretrain(
     *,
     policy: PolicyName = DEFAULT_POLICY,
     policy_size: PolicySize = SMALL,
-    seed: Annotated[int, whole_number(0)] = 0,
+    seed: Seed = 0,
     ship: Annotated[bool, Parameter(negative="")] = False,
 ) -> None:
     """Pretrain the policy that every method starts from on SCENARIO, unless it is in the cache.

@@ -15,6 +15,9 @@ from clbench.base import interrupts
 INTERRUPTED = 128 + signal.SIGINT
 """Exit code after Ctrl-C, as shells report it."""
 
+_STOPS = [signal.SIGTERM, *([signal.SIGHUP] if hasattr(signal, "SIGHUP") else [])]
+"""Signals of a scheduler that ends the command, and of a terminal that closes: workers do not get them."""
+
 
 def main() -> None:
     """Run the command line.
@@ -32,8 +35,8 @@ def main() -> None:
         try:
             if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
                 interrupts.install()
-            # a scheduler's SIGTERM ends the workers too, as Ctrl-C does
-            _handle(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
+            for stop in _STOPS:  # they end the workers too, as Ctrl-C does
+                _handle(stop, lambda number, _: sys.exit(128 + number))
             run_command()
         finally:
             with contextlib.suppress(OSError, ValueError):  # a closed pipe
@@ -66,5 +69,5 @@ def _handle(number: signal.Signals, handler: Callable[[int, FrameType | None], o
 
 def _end_at_once_when_stopped() -> None:
     """Let Ctrl-C and SIGTERM end the process at once, without Python's clean-up at the end."""
-    for number in (signal.SIGINT, signal.SIGTERM):
+    for number in (signal.SIGINT, *_STOPS):
         _handle(number, lambda number, _: os._exit(128 + number))

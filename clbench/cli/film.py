@@ -14,6 +14,7 @@ from clbench.base.errors import InputError
 from clbench.cli.arguments import (
     MethodName,
     ScenarioId,
+    Seed,
     add_cwd_to_path,
     check_names,
     checked_input,
@@ -32,7 +33,7 @@ def film(
     scenario: ScenarioId,
     /,
     *methods: MethodName,
-    seed: Annotated[int, whole_number(0)] = 0,
+    seed: Seed = 0,
     tasks: str | None = None,
     stages: str | None = None,
     episode: int = 0,

@@ -13,17 +13,18 @@ from rich.markup import escape
 from rich.table import Table
 
 from clbench.base.errors import InputError
-from clbench.base.text import counted, minutes, printable
+from clbench.base.text import counted, minutes, printable, shortened
 from clbench.cli.arguments import (
     AsJson,
     MethodName,
     PolicyName,
     PolicySize,
     ScenarioId,
+    Seed,
+    Seeds,
     add_cwd_to_path,
     checked_input,
     print_json,
-    whole_number,
 )
 from clbench.cli.runs import requested
 from clbench.records.paths import RECORDS
@@ -39,9 +40,9 @@ def status(
     /,
     *methods: MethodName,
     every: Annotated[bool, Parameter(name="--all", negative="")] = False,
-    seeds: Annotated[int, whole_number(1)] = DEFAULT_SEEDS,
-    first_seed: Annotated[int, whole_number(0)] = 0,
-    order: Annotated[int, whole_number(0)] = 0,
+    seeds: Seeds = DEFAULT_SEEDS,
+    first_seed: Seed = 0,
+    order: Seed = 0,
     policy: PolicyName = DEFAULT_POLICY,
     policy_size: PolicySize = SMALL,
     records: Path = RECORDS,
@@ -121,7 +122,8 @@ def _line(state: RunState, records: Path) -> str | None:
         spent = minutes(state.progress.seconds)
         return f"{name}: {state.progress.share:.0%} after {spent}{rest}, {state.owner}"
     if state.reason is not None:
-        return f"{name}: {state.state}, {printable(state.reason.partition(chr(10))[0])}"
+        reason = shortened(state.reason.partition("\n")[0], f"{name}.json")
+        return f"{name}: {state.state}, {printable(reason)}"
     return None
 
 

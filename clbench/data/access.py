@@ -11,6 +11,8 @@ These checks find mistakes. They do not stop a method that avoids the functions 
 
 from __future__ import annotations
 
+import signal
+import threading
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
@@ -61,19 +63,26 @@ def hooks(known: Iterable[str], readable: Iterable[str]) -> Iterator[None]:
         readable: Names of those whose demonstrations it may read.
 
     Raises:
-        HookExitError: The code raises what is no `Exception`, such as `SystemExit`.
+        HookExitError: The code raises what is no `Exception`, such as `SystemExit`, or `KeyboardInterrupt`
+            where no Ctrl-C can have come.
     """
     token = _rights.set(_Rights(frozenset(known), frozenset(readable)))
     try:
         yield
-    except (Exception, KeyboardInterrupt):  # Ctrl-C is the user's, not the method's
+    except Exception:
         raise
     except BaseException as error:
-        if error is _ours.get():
+        if error is _ours.get() or (isinstance(error, KeyboardInterrupt) and _ctrl_c_comes_here()):
             raise
         raise HookExitError(f"The hook raised {type(error).__name__}({error}).") from error
     finally:
         _rights.reset(token)
+
+
+def _ctrl_c_comes_here() -> bool:
+    """Return whether a KeyboardInterrupt may be the user's: workers ignore Ctrl-C, threads never get it."""
+    is_main = threading.current_thread() is threading.main_thread()
+    return is_main and signal.getsignal(signal.SIGINT) is not signal.SIG_IGN
 
 
 @contextmanager

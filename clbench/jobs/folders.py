@@ -10,10 +10,20 @@ from clbench.base.cache import cache_folder
 from clbench.base.errors import InputError
 from clbench.base.leftovers import unfinished
 
+PLACES = ("CLBENCH_CACHE", "XDG_CACHE_HOME", "MINARI_DATASETS_PATH")
+"""Variables that name folders of data."""
+
 
 def minari_folder() -> Path:
     """Return the folder of all Minari datasets."""
-    return Path(os.environ.get("MINARI_DATASETS_PATH") or "~/.minari/datasets").expanduser()
+    return Path(os.environ.get("MINARI_DATASETS_PATH") or "~/.minari/datasets").expanduser().absolute()
+
+
+def absolute_places() -> dict[str, str]:
+    """Return the variables that name folders of data, absolute: a job may change its working directory."""
+    return {
+        name: str(Path(os.environ[name]).expanduser().absolute()) for name in PLACES if os.environ.get(name)
+    }
 
 
 def check_folders(folders: Mapping[str, Path | None]) -> None:

@@ -25,7 +25,7 @@ from clbench.records.reader import read_record
 from clbench.runs.spec import ResolvedRun, RunSpec, check_device
 from clbench.spec.identifiers import check_known, installed_methods
 from clbench.spec.policies import DEFAULT_POLICY
-from clbench.spec.protocol import DEFAULT_SEEDS
+from clbench.spec.protocol import DEFAULT_SEEDS, MOST_SEEDS
 
 if TYPE_CHECKING:
     from clbench.jobs.plan import Plan
@@ -109,22 +109,42 @@ def run_missing(
         return {}
     begin = time.monotonic()
     check_folders({"--records": records, "--checkpoints": checkpoints, "--tensorboard": tensorboard})
+    plan = to_do.plan(records, checkpoints, tensorboard, check)  # refuses a camera where nothing can render
+    pool = workers()  # refuses a cluster that does not answer
     for one in to_do.runs:
         fault = set_aside(one, records)
         if fault is not None:
-            console.print(printable(fault), highlight=False, markup=False, soft_wrap=True)
-    plan = to_do.plan(records, checkpoints, tensorboard, check)  # refuses a camera where nothing can render
-    failed = run_with_bars(plan.jobs, workers(), console)
+            _print(console, fault)
+    failed = run_with_bars(plan.jobs, pool, console)
     if check in failed:
         return failed
     seconds = time.monotonic() - begin
-    good = sum(has_record(run, records) for run in to_do.runs)
+    lost = _without_record(plan.jobs, failed, records)
+    for job, reason in lost.items():
+        _print(console, f"{job}: {reason}")
+    failed |= lost
+    good = len(to_do.runs) - sum(job.is_done is not None for job in failed)
     done = f"{good} of " if good < len(to_do.runs) else ""
     done += counted(len(to_do.runs), "run")
     done += f" and the policies of {len(to_do.stages)}" if to_do.stages else ""
-    line = f"{done} in {seconds / 60:.1f} minutes; records in {records}."
-    console.print(line, highlight=False, markup=False, soft_wrap=True)
+    _print(console, f"{done} in {seconds / 60:.1f} minutes; records in {records}.")
     return failed
+
+
+def _without_record(jobs: Sequence[Job], failed: Mapping[Job, str], records: Path) -> dict[Job, str]:
+    """Return the reason of each run that went well by its own words and has no record that counts."""
+    lost = {}
+    for job in jobs:
+        if job.makes is None or job.is_done is None or job in failed or job.is_done():
+            continue
+        path = records / job.makes.relative_to(records.absolute())
+        lost[job] = f"it ended without a record of this run at {path}."
+    return lost
+
+
+def _print(console: Console, line: str) -> None:
+    """Print one line without markup, wrapping or characters that control the terminal."""
+    console.print(printable(line), highlight=False, markup=False, soft_wrap=True)
 
 
 def run(
@@ -183,6 +203,8 @@ def run_specs(firsts: Sequence[RunSpec], seeds: int, records: Path, workers: int
     for name, value in (("seeds", seeds), ("workers", workers)):
         if value is not None and (type(value) is not int or value < 1):
             raise InputError(f"{name} must be a whole number from 1, not {value!r}.")
+    if seeds > MOST_SEEDS:
+        raise InputError(f"seeds must be at most {MOST_SEEDS:,}, not {seeds}.")
     check_known([one.scenario for one in firsts], [one.method for one in firsts])
     for device in {one.device for one in firsts}:
         check_device(device)

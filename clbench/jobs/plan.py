@@ -37,7 +37,7 @@ class Plan:
     always there, and read the cache.
 
     Scenarios are named by their ids, which travel to the processes of the jobs: "module:id" imports the
-    module there.
+    module there. Folders travel as absolute paths: a method may change the working directory of its process.
 
     Args:
         first: A job that all others wait for.
@@ -80,7 +80,12 @@ class Plan:
             checkpoints: Folder below which the policies of all stages are kept; None keeps none.
             tensorboard: Folder below which the run is logged for TensorBoard; None logs nothing.
         """
-        folders = {"records": records, "checkpoints": checkpoints, "tensorboard": tensorboard}
+        records = records.absolute()
+        folders = {
+            "records": records,
+            "checkpoints": checkpoints and checkpoints.absolute(),
+            "tensorboard": tensorboard and tensorboard.absolute(),
+        }
         start = self._start(run)
         return self._add(
             run,
@@ -100,7 +105,7 @@ class Plan:
             run: The run.
             checkpoints: Folder below which the policies are kept; None leaves them in the cache alone.
         """
-        arguments = {"spec": run.spec, "checkpoints": checkpoints}
+        arguments = {"spec": run.spec, "checkpoints": checkpoints and checkpoints.absolute()}
         title = f"stages of {_label(run)}"
         length = training_length(run.scenario) + watching_length(run.method, run.scenario)
         return self._add(run, title, work.make_policies, arguments, length, self._needs(run))

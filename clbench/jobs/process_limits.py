@@ -1,8 +1,10 @@
-"""Compare the memory and the writes of a process with its limits, and kill it with its children."""
+"""Compare the memory and the writes of a process with its limits, and kill it with all that it started."""
 
 from __future__ import annotations
 
 import contextlib
+import os
+import signal
 
 from clbench.spec.limits import Limits
 
@@ -40,7 +42,7 @@ def usage(process: int) -> tuple[int, int]:
 
 
 def end(process: int) -> None:
-    """Kill a process and its children."""
+    """Kill a process and its children, and end its group."""
     import psutil
 
     with contextlib.suppress(psutil.NoSuchProcess):
@@ -48,3 +50,11 @@ def end(process: int) -> None:
         for one in (*parent.children(recursive=True), parent):
             with contextlib.suppress(psutil.NoSuchProcess):
                 one.kill()
+    end_group(process)
+
+
+def end_group(leader: int) -> None:
+    """Kill what is left of the group of a process that leads one: children outlive their parent."""
+    if hasattr(os, "killpg"):
+        with contextlib.suppress(ProcessLookupError, PermissionError):
+            os.killpg(leader, signal.SIGKILL)

@@ -22,8 +22,9 @@ from typing import Any, Literal
 from clbench.base.errors import ClbenchError
 from clbench.base.lease import LeaseLostError
 from clbench.base.progress import ProgressCallback, listen
+from clbench.jobs.folders import absolute_places
 from clbench.jobs.job import Event, Job
-from clbench.jobs.process_limits import end, exceeded
+from clbench.jobs.process_limits import end, end_group, exceeded
 from clbench.worlds.threads import cores
 
 SEND_SECONDS = 0.2
@@ -31,6 +32,7 @@ SEND_SECONDS = 0.2
 
 _LOOK_SECONDS = 0.5
 _LEAVE_SECONDS = 5.0
+_CLOSE_SECONDS = 3.0
 
 
 @dataclass
@@ -70,10 +72,16 @@ class Processes:
     def events(self) -> Iterator[Event]:
         """Yield the events since the last call; wait at most a second for one."""
         self._hold_to_limits()
-        for connection in wait(list(self._running), timeout=1.0):
-            assert isinstance(connection, Connection)
-            worker = self._running[connection]
-            kind, value = _receive(worker)
+        # a child that a job forked may keep the connection open after the end of its process
+        wait([*self._running, *(one.process.sentinel for one in self._running.values())], timeout=1.0)
+        for connection, worker in list(self._running.items()):
+            ended = not worker.process.is_alive()
+            if connection.poll():
+                kind, value = _receive(worker)
+            elif ended:
+                kind, value = _lost(worker)
+            else:
+                continue
             if kind == "at":
                 worker.place, remark = value
                 value = f"{worker.place} {remark}".strip()
@@ -84,11 +92,18 @@ class Processes:
             yield event
 
     def close(self) -> None:
-        """End all processes."""
-        for worker in self._running.values():
-            worker.process.terminate()
-            worker.process.join()
-        self._running.clear()
+        """End all processes and what they started, also those that ignore SIGTERM."""
+        processes = [worker.process for worker in self._running.values()]
+        try:
+            for process in processes:
+                process.terminate()
+            deadline = time.monotonic() + _CLOSE_SECONDS
+            for process in processes:
+                process.join(max(0.0, deadline - time.monotonic()))
+        finally:  # a second signal may interrupt the wait
+            for process in processes:
+                _end(process)
+            self._running.clear()
 
     def _hold_to_limits(self) -> None:
         """End the processes that exceed their limits."""
@@ -158,12 +173,18 @@ class Here:
 
 
 def _leave(process: BaseProcess) -> None:
-    """Wait until a process that has sent its outcome is gone; kill it if one of its threads keeps running."""
+    """Wait until a process that has sent its outcome is gone, and kill what still runs of all it began."""
     process.join(_LEAVE_SECONDS)
+    _end(process)
+
+
+def _end(process: BaseProcess) -> None:
+    """Kill a process, if it still runs, and all that it started."""
+    assert process.pid is not None
     if process.is_alive():
-        assert process.pid is not None
         end(process.pid)
         process.join()
+    end_group(process.pid)
 
 
 @contextmanager
@@ -219,8 +240,9 @@ def _context() -> Any:
 def _start(job: Job) -> _Worker:
     context = _context()
     ours, theirs = context.Pipe(duplex=False)
+    environment = {**os.environ, **absolute_places()}
     process = context.Process(
-        target=_work, args=(theirs, job.function, job.arguments, dict(os.environ)), daemon=True
+        target=_work, args=(theirs, job.function, job.arguments, environment), daemon=True
     )
     with _script_hidden():
         process.start()
@@ -231,13 +253,18 @@ def _start(job: Job) -> _Worker:
 def _receive(worker: _Worker) -> tuple[Any, Any]:
     try:
         kind, value = worker.connection.recv()
-    except EOFError:
-        worker.process.join()
-        if worker.broken:
-            return "failed", f"stopped, because {worker.broken}"
-        place = f" in {worker.place}" if worker.place else ""
-        return "lost", f"its process ended{place} without a result ({_exit(worker.process.exitcode)})"
+    except (EOFError, OSError):  # closed, or torn in the middle of a message
+        return _lost(worker)
     return kind, value
+
+
+def _lost(worker: _Worker) -> tuple[str, str]:
+    """Return the event of a worker that has closed its connection or died."""
+    _leave(worker.process)
+    if worker.broken:
+        return "failed", f"stopped, because {worker.broken}"
+    place = f" in {worker.place}" if worker.place else ""
+    return "lost", f"its process ended{place} without a result ({_exit(worker.process.exitcode)})"
 
 
 def _exit(code: int | None) -> str:
@@ -257,7 +284,10 @@ def _work(
     # this process may be forked from one with an older environment
     os.environ.clear()
     os.environ.update(environment)
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the parent, which ends its workers
+    multiprocessing.current_process().daemon = False  # else a method could not have processes of its own
+    if hasattr(os, "setpgid"):
+        os.setpgid(0, 0)  # so that the parent can end them with this process
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends its workers when Ctrl-C reaches it
     if hasattr(signal, "pthread_sigmask"):  # children of a job must not inherit the mask of the server
         signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
 
@@ -297,6 +327,6 @@ def _do_job(
         return "taken", str(error)
     except ClbenchError as error:  # its message says all
         return "failed", str(error)
-    except Exception as error:
+    except (Exception, KeyboardInterrupt) as error:  # Ctrl-C reaches neither a worker nor a thread
         return "failed", f"{type(error).__name__}: {error}\n{traceback.format_exc()}"
     return "done", text

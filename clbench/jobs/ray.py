@@ -10,12 +10,12 @@ import time
 from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import replace
-from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 from clbench.base.cache import cache_folder, hash_of
 from clbench.base.dependencies import require
-from clbench.base.errors import UnknownNameError
+from clbench.base.errors import InputError, UnknownNameError
+from clbench.jobs.folders import absolute_places
 from clbench.jobs.job import Event, Job
 from clbench.jobs.processes import Processes
 from clbench.records.reader import read_record
@@ -34,7 +34,7 @@ _INSTRUCTIONS = (
 """Variables that select the instructions of the processor, and so affect the bits of trained weights."""
 Outcome = Literal["done", "failed", "taken"]
 """How a job ended."""
-_PASSED_ON = ("CLBENCH_CACHE", "MINARI_DATASETS_PATH", "MUJOCO_GL", *_INSTRUCTIONS)
+_PASSED_ON = ("MUJOCO_GL", *_INSTRUCTIONS)
 
 
 class LostProcessError(Exception):
@@ -55,6 +55,7 @@ class RayWorkers:
 
     Raises:
         MissingPackageError: Ray is not installed.
+        InputError: The address has another form.
         UnknownNameError: No cluster answers at the address.
     """
 
@@ -74,7 +75,9 @@ class RayWorkers:
             }
         try:
             ray.init(address, log_to_driver=False, logging_level=logging.ERROR, **options)
-        except ConnectionError as error:
+        except ValueError as error:
+            raise InputError(f"--ray must be auto, local or host:port, not {address!r}.") from error
+        except (ConnectionError, RuntimeError) as error:
             raise UnknownNameError(
                 f"No Ray cluster answers at {address!r}; --ray local starts one."
             ) from error
@@ -92,12 +95,8 @@ class RayWorkers:
         gpus = 0 if job.device == "cpu" else 1
         options = {"max_retries": RETRIES, "retry_exceptions": [LostProcessError]}
         task = self._ray.remote(num_cpus=1, num_gpus=gpus, **options)(_do)
-        arguments = {
-            name: value.absolute() if isinstance(value, Path) else value
-            for name, value in job.arguments.items()
-        }
         # the driver has the lease
-        bare = replace(job, arguments=arguments, needs=(), makes=None, is_done=None)
+        bare = replace(job, needs=(), makes=None, is_done=None)
         self._running[task.remote(self._progress_actor, bare)] = job
 
     def events(self) -> Iterator[Event]:
@@ -224,4 +223,4 @@ def _environment() -> dict[str, str]:
     installed = (sys.prefix, sys.base_prefix)
     paths = [path for path in sys.path if path and not path.startswith(installed)]
     passed_on = {name: os.environ[name] for name in _PASSED_ON if name in os.environ}
-    return {"PYTHONPATH": os.pathsep.join(paths), **passed_on}
+    return {"PYTHONPATH": os.pathsep.join(paths), **passed_on, **absolute_places()}

@@ -65,8 +65,10 @@ def run_jobs(jobs: Sequence[Job], workers: Workers, bars: Bars) -> dict[Job, str
                     failed[job] = value
                 bars.finish(job, f"{value} ({time.monotonic() - started.pop(job):.0f} s)")
     finally:
-        workers.close()
-        leases.close()
+        try:
+            workers.close()
+        finally:  # a second signal may interrupt it
+            leases.close()
     return failed
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from clbench.base.progress import ProgressCallback
-from clbench.base.text import counted
+from clbench.base.text import counted, shortened
 from clbench.jobs.job import JobError
 from clbench.runs.spec import RunSpec
 from clbench.spec.registry import load_scenario
@@ -91,9 +91,8 @@ def do_run(
 
     record = execute(spec, records, progress, checkpoints=checkpoints, tensorboard=tensorboard)
     if record.error is not None:
-        raise JobError(
-            f"failed in {record.error['where']}: {record.error['type']}: {record.error['message']}"
-        )
+        reason = f"failed in {record.error['where']}: {record.error['type']}: {record.error['message']}"
+        raise JobError(shortened(reason, spec.path(records).relative_to(records).as_posix()))
     scores = Scores.from_record(record)
     names = ["adaptation", "retention", "question_retention"]
     names[2:2] = ["perturbed_retention"] if spec.perturb else []

@@ -7,14 +7,17 @@ itself bit for bit, so policies that are made again equal the original ones.
 from __future__ import annotations
 
 import dataclasses
+import errno
 import functools
 import logging
 import shutil
-from contextlib import closing
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from clbench.base.cache import CacheError, cache_folder, cached, hash_of, is_cached
+from clbench.base.errors import ClbenchError
 from clbench.base.lease import LeaseLostError
 from clbench.base.progress import ProgressCallback, no_progress
 from clbench.evaluation.checks import Checker
@@ -33,8 +36,34 @@ if TYPE_CHECKING:
 
 LOG = logging.getLogger("clbench")
 
-NOT_THE_METHOD = (CacheError, CheckpointError, LeaseLostError, RenderingError)
+_NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EMFILE, errno.ENFILE)
+"""Errors of a machine that has no room for a file, or none for an open one."""
+
+
+class NoRoomError(ClbenchError, OSError):
+    """The machine had no room for a file, or too many open files, while a method ran."""
+
+
+NOT_THE_METHOD = (CacheError, CheckpointError, LeaseLostError, NoRoomError, RenderingError)
 """Failures of the machine: a run can be done again, and leaves no record that blames its method."""
+
+
+@contextmanager
+def room_needed() -> Iterator[None]:
+    """Tell a machine without room apart from what a method inside does wrong.
+
+    Raises:
+        NoRoomError: The machine has no room.
+    """
+    try:
+        yield
+    except OSError as error:
+        if error.errno not in _NO_ROOM:
+            raise
+        raise NoRoomError(
+            f"The machine has no room: {error}. The method is not to blame, and the run leaves no record: "
+            "make room, and repeat the command."
+        ) from error
 
 
 def stage_policies(
@@ -117,13 +146,14 @@ def make_stages(run: ResolvedRun, progress: ProgressCallback = no_progress) -> P
             )
 
         try:
-            if number:
-                trainer.load(stage_folder(root, number - 1), number - 1)
-                steps = trainer.learn(number, after)
-                progress(scenario.budget.adaptation_steps - steps if scenario.budget.criterion else 0)
-            else:
-                trainer.prepare(progress)
-            trainer.save(folder, trainer.state(number))
+            with room_needed():
+                if number:
+                    trainer.load(stage_folder(root, number - 1), number - 1)
+                    steps = trainer.learn(number, after)
+                    progress(scenario.budget.adaptation_steps - steps if scenario.budget.criterion else 0)
+                else:
+                    trainer.prepare(progress)
+                trainer.save(folder, trainer.state(number))
         except NOT_THE_METHOD:
             raise
         except Exception as error:

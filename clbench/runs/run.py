@@ -29,7 +29,7 @@ from clbench.records.paths import stage_folder
 from clbench.records.reader import read_record
 from clbench.records.record import Costs, Record
 from clbench.records.writer import check_diagnostics, write_record, write_result
-from clbench.runs.checkpoints import NOT_THE_METHOD, drop_stages, has_stages, keep_stage
+from clbench.runs.checkpoints import NOT_THE_METHOD, drop_stages, has_stages, keep_stage, room_needed
 from clbench.runs.fingerprint import fingerprint
 from clbench.runs.length import relearning_length, relearns, run_length
 from clbench.runs.relearning import relearn
@@ -67,19 +67,22 @@ def execute(
             record.
         CheckpointError: A checkpoint of this run cannot be read.
         LeaseLostError: Another process took the run over.
+        NoRoomError: The machine has no room for a file of the method, or too many open files.
     """
     if tensorboard is not None:
         require_tensorboard()
     resolved = run.resolve() if isinstance(run, RunSpec) else run
+    # a method may change the working directory
+    path = resolved.path(Path(records).absolute())
     folder = _checkpoints(resolved, Path(records))
-    kept, log = (None if one is None else Path(one) for one in (checkpoints, tensorboard))
+    kept, log = (None if one is None else Path(one).absolute() for one in (checkpoints, tensorboard))
     lease = Lease(folder)
     with lease.held():
         with deterministic(resolved.spec.device):
             under_way = _Run.start(resolved, folder, lease, progress, kept, log)
             record = under_way.go()
         lease.check()
-        write_result(record, resolved.path(Path(records)))
+        write_result(record, path)
         under_way.forget()
     return record
 
@@ -171,7 +174,8 @@ class _Run:
         """Go through all stages without a checkpoint, and return the record."""
         self.record.timing["started"] = datetime.now(UTC).isoformat(timespec="seconds")
         try:
-            self._go_through()
+            with room_needed():
+                self._go_through()
         except NOT_THE_METHOD:
             raise
         except Exception as error:

@@ -16,7 +16,7 @@ from clbench.records.record import RunInfo, ScenarioInfo
 from clbench.runs.tuning import tuned_settings
 from clbench.spec.fields import check_whole
 from clbench.spec.policies import DEFAULT_POLICY, kind_of
-from clbench.spec.protocol import Protocol, ScoredSplit
+from clbench.spec.protocol import LARGEST_SEED, Protocol, ScoredSplit
 from clbench.spec.registry import load_scenario
 from clbench.spec.scenario import Scenario
 from clbench.worlds.lanes import check_perturbable
@@ -60,6 +60,9 @@ class RunSpec:
             if not isinstance(value, str):
                 raise WrongTypeError(f"{name} of a run must be a text, {hint}, not {value!r}.")
         check_whole(self, 0, "seed", "order")
+        for name in ("seed", "order"):
+            if getattr(self, name) > LARGEST_SEED:
+                raise InputError(f"{name} of a run must be below 2^64, not {getattr(self, name)}.")
         if self.targets is not None:
             check_whole(self, 1, "targets")
 

@@ -29,6 +29,12 @@ DEFAULT_SEEDS = 4
 """Seeds of a method where no number is given. Four balance the orders of a balanced scenario of four targets;
 eight separate similar methods (docs/guide/statistics.md)."""
 
+MOST_SEEDS = 10_000
+"""Most seeds of one command: a typing error must not plan for hours."""
+
+LARGEST_SEED = 2**64 - 1
+"""The largest seed: PyTorch takes no larger one, and records hold no larger number."""
+
 EPISODE_WEIGHT = 0.3
 """Duration of an evaluation episode in optimiser steps, for the time left that a progress bar shows."""
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from copy import copy
+from numbers import Integral
 from typing import Any
 
 import gymnasium
@@ -15,7 +16,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from clbench.base.errors import InputError
+from clbench.base.errors import InputError, WrongTypeError
 from clbench.spec.registry import opened_scenario
 from clbench.spec.scenario import Scenario
 from clbench.spec.task import Task
@@ -28,11 +29,16 @@ Flags = NDArray[np.bool_]
 Outcome = tuple[Observation, NDArray[np.float64], Flags, Flags, dict[str, Any]]
 
 
+def _is_whole(seed: object) -> bool:
+    return isinstance(seed, Integral) and not isinstance(seed, bool)
+
+
 class ScenarioVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]]):
     """Many `ScenarioEnv`, each with its own schedule, stepped together by the suite's vector world.
 
     It equals a `gymnasium.vector.SyncVectorEnv` of them bit for bit: an environment whose episode has ended
-    begins the next one at the next step, which ignores its action.
+    begins the next one at the next step, which ignores its action. A copy made by pickle is a new vector,
+    which begins with its own first `reset()`.
 
     Args:
         scenario: Scenario, or its entry point "module:attribute".
@@ -61,6 +67,7 @@ class ScenarioVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]
         threads: int | None = None,
         render_mode: str | None = None,
     ) -> None:
+        self._arguments = (scenario, num_envs, instruction, episodes_per_stage, stage, order, threads)
         if render_mode is not None:
             raise InputError(
                 "Many environments side by side cannot be drawn. Draw one with gymnasium.make(...), or give "
@@ -100,6 +107,13 @@ class ScenarioVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]
         self._steps_left = np.zeros(num_envs, np.int64)
         self._ended = np.zeros(num_envs, np.bool_)
 
+    def __getstate__(self) -> dict[str, Any]:  # as ScenarioEnv does
+        return {"arguments": self._arguments, "spec": self.spec}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        ScenarioVectorEnv.__init__(self, *state["arguments"])
+        self.spec = state["spec"]
+
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
@@ -112,6 +126,7 @@ class ScenarioVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]
         Raises:
             UnknownNameError: The scenario has no such task.
             InputError: It has no such stage, an option is unknown, or the number of seeds is wrong.
+            WrongTypeError: A seed is no whole number.
         """
         self.begun_at = self.begun_at or time.perf_counter()
         seeds = self._seeds(seed)
@@ -125,14 +140,17 @@ class ScenarioVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]
         self._ended = np.zeros(self.num_envs, np.bool_)
         return self._observation(), self._info(self._ended)
 
-    def _seeds(self, seed: int | Sequence[int | None] | None) -> Sequence[int | None]:
+    def _seeds(self, seed: Any) -> Sequence[int | None]:
         if seed is None:
             return [None] * self.num_envs
-        if isinstance(seed, int):
-            return range(seed, seed + self.num_envs)
-        if len(seed) != self.num_envs:
-            raise InputError(f"{self.num_envs} environments need as many seeds, not {len(seed)}.")
-        return seed
+        if _is_whole(seed):
+            return range(int(seed), int(seed) + self.num_envs)
+        seeds = list(seed) if np.iterable(seed) else [seed]
+        if not all(one is None or _is_whole(one) for one in seeds):
+            raise WrongTypeError(f"seed must be a whole number, or one per environment, not {seed!r}.")
+        if len(seeds) != self.num_envs:
+            raise InputError(f"{self.num_envs} environments need as many seeds, not {len(seeds)}.")
+        return [None if one is None else int(one) for one in seeds]
 
     def step(self, actions: NDArray[np.float32]) -> Outcome:
         """Take one step in every environment; where the last one ended an episode, begin the next instead.

@@ -38,6 +38,16 @@ def test_a_lease_goes_with_its_report_once_its_process_is_dead(tmp_path: Path) -
     assert list(tmp_path.iterdir()) == []
 
 
+def test_the_report_of_a_record_goes_if_its_lease_is_gone(tmp_path: Path) -> None:
+    orphan, owned = tmp_path / ".seed-0.json.progress", Lease(tmp_path / "seed-1.json")
+    orphan.write_text("")
+    assert owned.take()
+    owned.report(0.5)
+    assert sweep(tmp_path) == 1
+    assert sorted(path.name for path in tmp_path.iterdir()) == [".seed-1.json.lease", ".seed-1.json.progress"]
+    owned.release()
+
+
 def test_what_is_being_made_stays(tmp_path: Path) -> None:
     lease = Lease(tmp_path / "x")
     assert lease.take()

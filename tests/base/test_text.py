@@ -2,7 +2,15 @@
 
 import pytest
 
-from clbench.base.text import counted, did_you_mean, html_table, printable, printable_lines, quoted
+from clbench.base.text import (
+    counted,
+    did_you_mean,
+    html_table,
+    printable,
+    printable_lines,
+    quoted,
+    shortened,
+)
 
 
 @pytest.mark.parametrize(
@@ -44,3 +52,8 @@ def test_an_html_table_has_every_cell_and_no_markup_of_its_texts() -> None:
         "<tr><td>a</td><td>1</td></tr><tr><td>x &amp; y<br>&lt;script&gt;</td><td>None</td></tr>"
         "</tbody></table>"
     )
+
+
+def test_a_long_text_is_cut_with_where_the_whole_one_is() -> None:
+    assert shortened("x" * 500, "seed-0.json") == "x" * 500
+    assert shortened("x" * 501, "seed-0.json") == f"{'x' * 500} [... seed-0.json has the rest]"

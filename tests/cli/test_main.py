@@ -175,16 +175,21 @@ def test_the_shards_of_a_command_do_each_of_its_runs_once(
     done: list[str] = []
 
     def note(jobs: Sequence[Job], *_: object) -> dict[Job, str]:
-        done.extend(job.title for job in jobs if job.function is do_run)
-        return {}
+        found = [job for job in jobs if job.function is do_run]
+        done.extend(job.title for job in found)
+        return dict.fromkeys(found, "not done here")
+
+    def run(*words: str) -> None:
+        with pytest.raises(SystemExit):
+            app([*runs, *words], result_action="return_value")
 
     monkeypatch.setattr("clbench.jobs.grid.run_with_bars", note)
     runs = ["run", f"{TOY},clbench/Fetch-v1", "sft", "frozen", "lora", "--seeds", "3"]
-    app(runs, result_action="return_value")
+    run()
     whole, parts = sorted(done), []
     for part in range(1, 6):
         done.clear()
-        app([*runs, "--shard", f"{part}/5"], result_action="return_value")
+        run("--shard", f"{part}/5")
         parts.append(list(done))
     assert len(whole) == 18
     assert sorted(name for part in parts for name in part) == whole
@@ -220,8 +225,12 @@ def test_a_folder_with_markup_in_its_name_is_shown_as_it_is(
     monkeypatch.setenv("COLUMNS", "200")
     monkeypatch.setattr("clbench.jobs.grid.run_with_bars", lambda *_: {})
     records = tmp_path / "[" / "red]x"
-    app(["run", TOY, "sft", "--seeds", "1", "--records", str(records)], result_action="return_value")
-    assert f"records in {records}." in capsys.readouterr().err.replace("\n", "")
+    with pytest.raises(SystemExit) as ended:
+        app(["run", TOY, "sft", "--seeds", "1", "--records", str(records)], result_action="return_value")
+    said = capsys.readouterr().err.replace("\n", "")
+    assert f"records in {records}." in said
+    assert f"it ended without a record of this run at {records}/Toy-v0/sft/seed-0.json." in said
+    assert ended.value.code == 1
 
 
 def test_help_shows_every_command_with_its_summary_and_imports_none() -> None:

@@ -1,5 +1,6 @@
 """`clbench status`: what is done, running, failed and to do."""
 
+import dataclasses
 import json
 import re
 from pathlib import Path
@@ -74,3 +75,15 @@ def test_an_empty_folder_is_said_to_be_empty(tmp_path: Path, capsys: pytest.Capt
         resolve("clbench.cli.status:status")(records=tmp_path)
     assert stopped.value.code == 2
     assert "There are no runs in" in capsys.readouterr().err
+
+
+def test_a_long_reason_is_cut_and_names_the_record(
+    done: Record, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    error = {"where": "stage 1", "type": "ValueError", "message": "x" * 3000, "traceback": ""}
+    path = RunSpec(TOY, "frozen", seed=0).path(tmp_path)
+    write_record(dataclasses.replace(done, status="failed", error=error), path)
+    resolve("clbench.cli.status:status")(records=tmp_path)
+    (line,) = (line for line in capsys.readouterr().out.splitlines() if "failed, stage 1" in line)
+    assert len(line) < 600
+    assert line.endswith("xxx [... Toy-v0/frozen/seed-0.json has the rest]")

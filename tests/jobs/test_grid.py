@@ -95,6 +95,22 @@ def test_a_failed_run_raises_with_its_reason(
         clbench.run(TOY, "lossless:Slow", seeds=1, records=tmp_path / "records")
 
 
+def test_a_method_that_changes_the_folder_leaves_its_record_where_it_was_asked_for(
+    tmp_path: Path, write_module: Callable[[str, str], None], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    start_task = """
+    def start_task(self, policy, stage):
+        import os
+        os.chdir("/")
+        return policy.parameters()
+"""
+    write_module("moving", METHOD + start_task)
+    monkeypatch.chdir(tmp_path)
+    (record,) = clbench.run(TOY, "moving:Slow", seeds=1, records="records", workers=1)
+    assert record.status == "success"
+    assert (tmp_path / "records/Toy-v0/moving.Slow/seed-0.json").is_file()
+
+
 def test_a_class_inside_a_function_is_refused(tmp_path: Path) -> None:
     class Hidden(clbench.Method):
         pass
@@ -108,6 +124,8 @@ def test_a_class_inside_a_function_is_refused(tmp_path: Path) -> None:
     [
         ({"seeds": 1.5}, "seeds must be a whole number from 1, not 1.5"),
         ({"seeds": 0}, "seeds must be a whole number from 1, not 0"),
+        ({"seeds": 10_001}, "seeds must be at most 10,000, not 10001"),
+        ({"first_seed": 2**64}, "seed of a run must be below 2.64, not 18446744073709551616"),
         ({"workers": True}, "workers must be a whole number from 1, not True"),
         ({"first_seed": 0.7}, "seed must be a whole number, not 0.7"),
         ({"first_seed": -1}, "seed must be at least 0, not -1"),

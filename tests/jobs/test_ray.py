@@ -158,3 +158,9 @@ def test_a_job_on_this_machine_has_normal_priority(bars: Bars) -> None:
 def test_a_cluster_that_does_not_run_is_refused() -> None:
     with pytest.raises(LookupError, match="No Ray cluster answers at 'auto'; --ray local starts one"):
         RayWorkers("auto")
+
+
+@pytest.mark.parametrize("address", ["foo", "foo:bar"])
+def test_an_address_of_another_form_is_refused(address: str) -> None:
+    with pytest.raises(ValueError, match=f"--ray must be auto, local or host:port, not '{address}'"):
+        RayWorkers(address)

@@ -1,5 +1,6 @@
 """What the jobs of a run say when they are done."""
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -7,6 +8,7 @@ import pytest
 from eager import EAGER
 from tiny import TINY
 
+from clbench.jobs.job import JobError
 from clbench.jobs.work import (
     collect_demonstrations,
     collect_scenes,
@@ -14,8 +16,19 @@ from clbench.jobs.work import (
     evaluate_policy,
     pretrain,
 )
+from clbench.records.reader import read_record
 from clbench.records.record import Record
 from clbench.runs.spec import RunSpec
+
+WORDY = """
+from dataclasses import dataclass
+import clbench
+
+@dataclass
+class Wordy(clbench.Method):
+    def start_task(self, policy, stage):
+        raise ValueError("x" * 3000)
+"""
 
 SPEC = RunSpec("clbench.testing:clbench/Toy-v0", "frozen", 0)
 
@@ -46,3 +59,18 @@ def test_what_is_in_the_cache_is_not_said_to_be_made(empty_caches: Path) -> None
         assert collect_scenes(TINY.id, nothing).endswith(end)
     for end in ("parameters", "parameters, from the cache"):
         assert pretrain(TINY.id, "flow", 0, nothing).endswith(end)
+
+
+def test_a_long_message_is_cut_where_it_is_said_and_whole_in_the_record(
+    tmp_path: Path, write_module: Callable[[str, str], None]
+) -> None:
+    write_module("wordy", WORDY)
+    spec = RunSpec(SPEC.scenario, "wordy:Wordy", 0)
+    with pytest.raises(JobError) as failed:
+        do_run(spec, tmp_path, lambda _: None)
+    said = str(failed.value)
+    assert len(said) < 600
+    assert said.endswith("xxx [... Toy-v0/wordy.Wordy/seed-0.json has the rest]")
+    error = read_record(spec.path(tmp_path)).error
+    assert error is not None
+    assert error["message"] == "x" * 3000

@@ -2,7 +2,10 @@
 
 import contextlib
 import dataclasses
+import errno
+import os
 import resource
+import signal
 import subprocess
 import sys
 import time
@@ -21,6 +24,7 @@ from clbench.learning.method import Method
 from clbench.policy.policy import Policy
 from clbench.records.reader import read_record
 from clbench.records.writer import write_record
+from clbench.runs.checkpoints import NoRoomError, make_stages
 from clbench.runs.run import execute
 from clbench.runs.spec import RunSpec
 from clbench.scoring.scores import Scores
@@ -124,6 +128,50 @@ class _Exits(Method):
 
     def end_task(self, policy: Policy, stage: Any) -> None:
         raise SystemExit(3)
+
+
+@dataclasses.dataclass
+class _Interrupts(Method):
+    """A method that raises what Ctrl-C would."""
+
+    def end_task(self, policy: Policy, stage: Any) -> None:
+        raise KeyboardInterrupt
+
+
+def test_an_interrupt_is_the_methods_where_ctrl_c_is_ignored_and_the_users_elsewhere(
+    tmp_path: Path, stranger: Callable[[type[Method]], str]
+) -> None:
+    spec = RunSpec(TOY, stranger(_Interrupts), seed=0)
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        record = execute(spec, tmp_path)
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        with pytest.raises(KeyboardInterrupt):
+            execute(spec, tmp_path)
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert record.error is not None
+    assert record.error["message"] == "The hook raised KeyboardInterrupt()."
+
+
+@dataclasses.dataclass
+class _Writes(Method):
+    """A method that writes where there is no room."""
+
+    def end_task(self, policy: Policy, stage: Any) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "notes.txt")
+
+
+def test_a_full_disk_is_not_the_methods_fault_and_leaves_no_record(
+    tmp_path: Path, stranger: Callable[[type[Method]], str]
+) -> None:
+    spec = RunSpec(TOY, stranger(_Writes), seed=0)
+    match = "The machine has no room: .*No space left on device: 'notes.txt'. The method is not to blame"
+    with pytest.raises(NoRoomError, match=match):
+        execute(spec, tmp_path)
+    with pytest.raises(NoRoomError, match=match):
+        make_stages(spec.resolve())
+    assert not list(tmp_path.rglob("*.json"))
 
 
 def test_a_method_that_exits_is_named_with_its_hook(

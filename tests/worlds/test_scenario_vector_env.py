@@ -1,5 +1,6 @@
 """The vector environments of scenarios, against Gymnasium's own vector of plain environments."""
 
+import pickle
 from typing import Any
 
 import gymnasium
@@ -75,6 +76,28 @@ def test_options_choose_for_all_and_seeds_for_each() -> None:
     third, info = env.reset(options={"stage": 2})
     assert list(info["stage"]) == [2, 2]
     assert not np.array_equal(third["state"], first["state"])
+
+
+@pytest.mark.parametrize("seed", [np.int64(4), [np.int32(4), 5], np.array([4, 5])])
+def test_a_seed_may_be_any_whole_number(seed: Any) -> None:
+    env = _toy()
+    _same(env.reset(seed=seed), env.reset(seed=4))
+
+
+@pytest.mark.parametrize("seed", [1.5, True, "ab", [1, 1.5], [1, True], np.array(1.5)])
+def test_a_seed_that_is_no_whole_number_is_refused(seed: Any) -> None:
+    with pytest.raises(TypeError, match="seed must be a whole number, or one per environment, not "):
+        _toy().reset(seed=seed)
+
+
+def test_a_copy_by_pickle_is_a_new_vector_with_the_same_arguments() -> None:
+    env: Any = gymnasium.make_vec(TOY, num_envs=2, instruction="tokens", stage=1)
+    first = env.reset(seed=3)
+    copy = pickle.loads(pickle.dumps(env))
+    assert (copy.spec, copy.num_envs, copy.stage) == (env.spec, 2, 1)
+    with pytest.raises(gymnasium.error.ResetNeeded):
+        copy.step(copy.action_space.sample())
+    _same(copy.reset(seed=3), first)
 
 
 def test_drawing_many_environments_is_refused_with_what_draws() -> None:

@@ -1,0 +1,150 @@
+"""Processes of jobs: what a job does to its process and begins beside it ends with the job."""
+
+import importlib
+import io
+import os
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import psutil
+import pytest
+
+from clbench.base.cache import cache_folder
+from clbench.jobs.bars import Bars
+from clbench.jobs.folders import minari_folder
+from clbench.jobs.job import Job
+from clbench.jobs.processes import Here, Processes
+from clbench.jobs.scheduler import run_jobs
+
+JOBS = """
+import multiprocessing, os, signal, subprocess, time
+from pathlib import Path
+
+def leaves_a_child(progress, path):
+    child = subprocess.Popen(["sleep", "600"])
+    Path(path).write_text(str(child.pid))
+    return "went well"
+
+def dies_beside_a_fork(progress, path):
+    child = os.fork()
+    if child == 0:
+        time.sleep(600)
+    Path(path).write_text(str(child))
+    os.kill(os.getpid(), signal.SIGKILL)
+
+def stubborn(progress, path):
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    child = subprocess.Popen(["sleep", "600"])
+    Path(path).write_text(f"{os.getpid()} {child.pid}")
+    time.sleep(600)
+
+def has_a_helper(progress):
+    helper = multiprocessing.Process(target=time.sleep, args=(0,))
+    helper.start()
+    helper.join()
+    return f"its helper ended with {helper.exitcode}"
+
+def interrupts(progress):
+    raise KeyboardInterrupt("of its own")
+
+def moves(progress, folder):
+    from clbench.base.cache import cache_folder
+    from clbench.jobs.folders import minari_folder
+    os.chdir(folder)
+    return f"{cache_folder()} and {minari_folder()}"
+"""
+
+
+@pytest.fixture(autouse=True)
+def _jobs_module(write_module: Callable[[str, str], None]) -> None:
+    write_module("jobs_with_children", JOBS)
+
+
+def _job(function: str, **arguments: Any) -> Job:
+    return Job(function, getattr(importlib.import_module("jobs_with_children"), function), arguments, 1)
+
+
+def _is_gone(process: int) -> bool:
+    """Return whether a process ends within a minute; a zombie has ended."""
+    for _ in range(600):
+        try:
+            if psutil.Process(process).status() == psutil.STATUS_ZOMBIE:
+                return True
+        except psutil.NoSuchProcess:
+            return True
+        time.sleep(0.1)
+    return False
+
+
+def _printed(bars: Bars) -> str:
+    assert isinstance(bars.console.file, io.StringIO)
+    return bars.console.file.getvalue()
+
+
+def test_the_children_of_a_job_end_with_it(tmp_path: Path, bars: Bars) -> None:
+    path = tmp_path / "child"
+    assert run_jobs([_job("leaves_a_child", path=str(path))], Processes(1), bars) == {}
+    assert _is_gone(int(path.read_text()))
+
+
+def test_a_job_whose_forked_child_lives_on_is_lost_at_once(tmp_path: Path, bars: Bars) -> None:
+    path, begin = tmp_path / "child", time.monotonic()
+    (reason,) = run_jobs([_job("dies_beside_a_fork", path=str(path))], Processes(1), bars).values()
+    assert reason == "its process ended without a result (exit code -9, SIGKILL)"
+    assert time.monotonic() - begin < 300
+    assert _is_gone(int(path.read_text()))
+
+
+def test_closing_ends_a_job_that_ignores_it_and_its_children(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("clbench.jobs.processes._CLOSE_SECONDS", 0.2)
+    path, workers = tmp_path / "pids", Processes(1)
+    workers.start(_job("stubborn", path=str(path)))
+    while not (path.exists() and path.read_text()):
+        time.sleep(0.05)
+    workers.close()
+    assert all(_is_gone(int(pid)) for pid in path.read_text().split())
+
+
+def test_a_job_may_start_processes_of_its_own(bars: Bars) -> None:
+    assert run_jobs([_job("has_a_helper")], Processes(1), bars) == {}
+    assert "its helper ended with 0" in _printed(bars)
+
+
+@pytest.mark.parametrize("workers", [Processes, Here])
+def test_a_keyboard_interrupt_that_a_job_raises_is_its_failure(
+    workers: Callable[[], Processes | Here], bars: Bars
+) -> None:
+    (reason,) = run_jobs([_job("interrupts")], workers(), bars).values()
+    assert reason.startswith("KeyboardInterrupt: of its own")
+
+
+def test_a_job_that_moves_finds_the_folders_of_data_where_they_were(
+    tmp_path: Path, bars: Bars, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("CLBENCH_CACHE", raising=False)
+    monkeypatch.setenv("XDG_CACHE_HOME", "caches")
+    monkeypatch.setenv("MINARI_DATASETS_PATH", "data")
+    assert (cache_folder(), minari_folder()) == (tmp_path / "caches/clbench", tmp_path / "data")
+    assert run_jobs([_job("moves", folder=os.sep)], Processes(1), bars) == {}
+    assert f"{tmp_path}/caches/clbench and {tmp_path}/data" in _printed(bars)
+
+
+def test_leases_are_given_back_if_closing_is_interrupted(tmp_path: Path, bars: Bars) -> None:
+    class Interrupted(Processes):
+        def events(self) -> Any:
+            raise KeyboardInterrupt
+
+        def close(self) -> None:
+            super().close()
+            raise SystemExit
+
+    job = _job("has_a_helper")
+    claimed = Job(job.title, job.function, {}, 1, makes=tmp_path / "made", is_done=lambda: False)
+    with pytest.raises(SystemExit):
+        run_jobs([claimed], Interrupted(1), bars)
+    assert not list(tmp_path.glob(".made.*"))
