@@ -11,7 +11,7 @@ import sys
 import threading
 import time
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from multiprocessing.connection import Connection, wait
@@ -58,6 +58,9 @@ class Processes:
     def __init__(self, count: int | None = None) -> None:
         self._count = count or cores()
         self._running: dict[Connection, _Worker] = {}
+        self._handles_suspension = _handles_suspension()
+        if self._handles_suspension:
+            signal.signal(signal.SIGTSTP, self._suspend)
 
     def free(self) -> int:
         """Return the number of jobs that can start now."""
@@ -104,6 +107,15 @@ class Processes:
             for process in processes:
                 _end(process)
             self._running.clear()
+            if self._handles_suspension:
+                signal.signal(signal.SIGTSTP, signal.SIG_DFL)
+
+    def _suspend(self, *_: object) -> None:
+        """Stop with all workers on Ctrl-Z, and go on with them: a terminal does not reach their groups."""
+        groups = [worker.process.pid for worker in self._running.values() if worker.process.pid]
+        _signal_groups(groups, signal.SIGSTOP)
+        os.kill(os.getpid(), signal.SIGSTOP)
+        _signal_groups(groups, signal.SIGCONT)
 
     def _hold_to_limits(self) -> None:
         """End the processes that exceed their limits."""
@@ -170,6 +182,19 @@ class Here:
         self._stopped.set()
         if self._thread.is_alive():
             self._thread.join()
+
+
+def _handles_suspension() -> bool:
+    """Return whether Ctrl-Z would stop this process and can be handled here."""
+    if not hasattr(signal, "SIGTSTP") or threading.current_thread() is not threading.main_thread():
+        return False
+    return signal.getsignal(signal.SIGTSTP) is signal.SIG_DFL
+
+
+def _signal_groups(leaders: Iterable[int], number: signal.Signals) -> None:
+    for leader in leaders:
+        with suppress(ProcessLookupError, PermissionError):
+            os.killpg(leader, number)
 
 
 def _leave(process: BaseProcess) -> None:

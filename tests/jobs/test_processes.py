@@ -3,6 +3,9 @@
 import importlib
 import io
 import os
+import signal
+import subprocess
+import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -38,6 +41,10 @@ def stubborn(progress, path):
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
     child = subprocess.Popen(["sleep", "600"])
     Path(path).write_text(f"{os.getpid()} {child.pid}")
+    time.sleep(600)
+
+def waits(progress, path):
+    Path(path).write_text(str(os.getpid()))
     time.sleep(600)
 
 def has_a_helper(progress):
@@ -148,3 +155,57 @@ def test_leases_are_given_back_if_closing_is_interrupted(tmp_path: Path, bars: B
     with pytest.raises(SystemExit):
         run_jobs([claimed], Interrupted(1), bars)
     assert not list(tmp_path.glob(".made.*"))
+
+
+SUSPENDED = """
+from jobs_with_children import waits
+from clbench.jobs.job import Job
+from clbench.jobs.processes import Processes
+
+if __name__ == "__main__":
+    workers = Processes(1)
+    workers.start(Job("waits", waits, {"path": "worker"}, 1))
+    try:
+        while True:
+            list(workers.events())
+    finally:
+        workers.close()
+"""
+
+
+def test_ctrl_z_stops_the_workers_with_the_command_and_they_go_on_with_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "command.py").write_text(SUSPENDED, encoding="utf-8")
+    (tmp_path / "jobs_with_children.py").write_text(JOBS, encoding="utf-8")
+    command = subprocess.Popen([sys.executable, "command.py"], start_new_session=True)
+    try:
+        processes = [command.pid, _read_number(tmp_path / "worker")]
+        command.send_signal(signal.SIGTSTP)
+        assert _all_become(processes, stopped=True)
+        command.send_signal(signal.SIGCONT)
+        assert _all_become(processes, stopped=False)
+    finally:
+        command.send_signal(signal.SIGINT)
+        command.wait(60)
+    assert _is_gone(processes[1])
+
+
+def _read_number(path: Path) -> int:
+    """Return the number in a file, as soon as it is there."""
+    for _ in range(600):
+        if path.is_file() and path.read_text():
+            return int(path.read_text())
+        time.sleep(0.1)
+    raise AssertionError(f"{path} did not appear within a minute")
+
+
+def _all_become(processes: list[int], *, stopped: bool) -> bool:
+    """Return whether all processes are stopped, or none is, within a minute."""
+    for _ in range(600):
+        states = [psutil.Process(one).status() == psutil.STATUS_STOPPED for one in processes]
+        if set(states) == {stopped}:
+            return True
+        time.sleep(0.1)
+    return False
