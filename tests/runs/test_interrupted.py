@@ -1,7 +1,8 @@
 """Ctrl-C while a hook runs: the run ends, and no record blames the method."""
 
 import dataclasses
-from collections.abc import Callable
+import signal
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -14,6 +15,14 @@ from clbench.runs.run import execute
 from clbench.runs.spec import RunSpec
 
 TOY = "clbench.testing:clbench/Toy-v0"
+
+
+@pytest.fixture(autouse=True)
+def _ctrl_c_comes_here() -> Iterator[None]:
+    """Let Ctrl-C raise: a shell lets what it starts in the background ignore it, and tests inherit that."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
 
 
 @dataclasses.dataclass
