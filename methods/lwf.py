@@ -20,8 +20,7 @@ import torch
 from torch import Tensor, nn
 
 from clbench.learning.method import Metadata, Method, Progress, Stage
-from clbench.policy.batch import Batch
-from clbench.policy.flow import mean_over_valid
+from clbench.policy.batch import Batch, mean_over_valid
 from clbench.policy.policy import Policy
 
 from ._requirements import in_range

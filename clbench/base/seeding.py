@@ -40,12 +40,21 @@ def seeded(*parts: str | int) -> Iterator[None]:
     """
     import torch
 
-    python, numpy_state = random.getstate(), np.random.get_state()  # noqa: NPY002 - to restore it
     seed = derive_seed(*parts)
-    with torch.random.fork_rng():
+    with draws_restored():
         random.seed(seed)
         np.random.seed(seed)  # noqa: NPY002
         torch.manual_seed(seed)
+        yield
+
+
+@contextmanager
+def draws_restored() -> Iterator[None]:
+    """Restore the global generators of Python, NumPy and PyTorch after the block: its draws come again."""
+    import torch
+
+    python, numpy_state = random.getstate(), np.random.get_state()  # noqa: NPY002 - to restore it
+    with torch.random.fork_rng():
         try:
             yield
         finally:

@@ -9,7 +9,7 @@ import torch
 from clbench.data.questions import QuestionKind
 from clbench.evaluation.episodes import LANES
 from clbench.policy.batch import QuestionBatch
-from clbench.policy.policy import Policy
+from clbench.policy.policy import Policy, evaluating
 
 
 @torch.inference_mode()
@@ -28,6 +28,16 @@ def answer(
     """
     if "answers" not in policy.abilities:
         return [(entry.name, 0, 0) for entry in kinds]
+    with evaluating(policy):
+        correct = _correct(policy, questions)
+    return [
+        (entry.name, int((kind == index).sum()), int(correct[kind == index].sum()))
+        for index, entry in enumerate(kinds)
+    ]
+
+
+def _correct(policy: Policy, questions: QuestionBatch) -> torch.Tensor:
+    """Return which questions a policy answers rightly, (B,)."""
     right = []
     device = policy.device
     for start in range(0, len(questions), LANES):
@@ -38,8 +48,4 @@ def answer(
         image = torch.nn.functional.pad(questions.image[rows], (0, 0, 0, 0, 0, 0, 0, padding))
         word = policy.answer_logits(state.to(device), words.to(device), image.to(device)).argmax(dim=1).cpu()
         right.append(word[: LANES - padding] == questions.answer[rows])
-    correct = torch.cat(right)
-    return [
-        (entry.name, int((kind == index).sum()), int(correct[kind == index].sum()))
-        for index, entry in enumerate(kinds)
-    ]
+    return torch.cat(right)

@@ -45,11 +45,9 @@ class Checker:
             successes, failures = successes + episode.success, failures + (not episode.success)
             return successes >= goal or failures > count - goal
 
-        policy.eval()
         episodes = self._evaluator.play(
             policy, [(task, "validation", number) for number in range(count)], enough=certain
         )
-        policy.train()
         return CheckRow(*point, len(episodes), successes)
 
     def is_learned(self, row: CheckRow) -> bool:

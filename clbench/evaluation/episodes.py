@@ -27,7 +27,7 @@ Watch = Callable[[Trial, NDArray[np.float32]], None]
 
 LANES = 40
 """Episodes that are stepped together, and rows of every forward pass. Another number may change the
-last bits of scores (docs/decisions/0005-forty-lanes.md)."""
+last bits of scores (docs/decisions/0005-forty-lanes.md). Checks of a criterion have fewer lanes."""
 
 
 @dataclass(frozen=True)

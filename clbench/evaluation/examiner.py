@@ -105,10 +105,7 @@ class Examiner:
         return found
 
     def _play(self, policy: Policy, trials: Sequence[Trial]) -> list[Episode]:
-        policy.eval()
-        episodes = self._evaluator.play(policy, trials, lambda count: self._progress(EPISODE_WEIGHT * count))
-        policy.train()
-        return episodes
+        return self._evaluator.play(policy, trials, lambda count: self._progress(EPISODE_WEIGHT * count))
 
     def _drift(self, policy: Policy) -> float | None:
         """Return how far the hidden states are from the pretrained ones, None for a policy without any."""

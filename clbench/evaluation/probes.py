@@ -6,9 +6,8 @@ import torch
 from torch import Tensor
 
 from clbench.policy.activations import Gaussian
-from clbench.policy.batch import Batch, QuestionBatch
-from clbench.policy.flow import mean_over_valid
-from clbench.policy.policy import Policy
+from clbench.policy.batch import Batch, QuestionBatch, mean_over_valid
+from clbench.policy.policy import Policy, evaluating
 
 SPARSITY_THRESHOLD = 1e-3
 """Relative change below which a weight counts as unchanged: ConSFT (arXiv 2605.08879), Eq. 8."""
@@ -17,7 +16,8 @@ SPARSITY_THRESHOLD = 1e-3
 @torch.no_grad()
 def activations(policy: Policy, questions: QuestionBatch) -> Gaussian:
     """Return a Gaussian of the policy's hidden states on `questions`, given on the policy's device."""
-    hidden = policy.hidden_states(questions.state, questions.words, questions.image)
+    with evaluating(policy):
+        hidden = policy.hidden_states(questions.state, questions.words, questions.image)
     return Gaussian.of(hidden, policy.token_mask(questions.words))
 
 
@@ -40,10 +40,8 @@ def update_sparsity(policy: Policy, pretrained: Policy) -> float | None:
 @torch.no_grad()
 def predictions(policy: Policy, batch: Batch) -> Tensor:
     """Return the predictions (B, H, A) of `policy` on `batch`, given on the policy's device."""
-    policy.eval()
-    predicted = policy.predict(batch)
-    policy.train()
-    return predicted
+    with evaluating(policy):
+        return policy.predict(batch)
 
 
 def shift(before: Tensor, after: Tensor, valid: Tensor) -> float:

@@ -1,8 +1,8 @@
 """Rollouts of policies: many evaluation episodes in lock-step.
 
-The outcome of an episode depends only on the policy, the task, the number of the episode and the seed of the
-run. Every forward pass of an evaluator has the same number of rows, with padding in unused ones, because a
-matrix product may round differently for another number of rows.
+The outcome of an episode depends only on the policy, the task, the number of the episode, the seed of the run
+and the number of lanes. Every forward pass of an evaluator has the same number of rows, with padding in
+unused ones, because a matrix product may round differently for another number of rows.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from clbench.base.progress import ProgressCallback, no_progress
 from clbench.base.seeding import torch_generator
 from clbench.evaluation.episodes import LANES, Episode, Live, Trial, Watch, play_in_lanes
-from clbench.policy.policy import Policy
+from clbench.policy.policy import Policy, evaluating
 from clbench.spec.language import encode
 from clbench.spec.protocol import Split
 from clbench.spec.scenario import Scenario
@@ -87,17 +87,18 @@ class Evaluator:
         Raises:
             LeakError: A hook asks for other episodes than validation episodes of tasks that it knows.
         """
-        return play_in_lanes(
-            self._lanes,
-            self._count,
-            trials,
-            self.seed,
-            partial(_begin, policy),
-            partial(self._act, policy),
-            progress=progress,
-            watch=watch,
-            enough=enough,
-        )
+        with evaluating(policy):
+            return play_in_lanes(
+                self._lanes,
+                self._count,
+                trials,
+                self.seed,
+                partial(_begin, policy),
+                partial(self._act, policy),
+                progress=progress,
+                watch=watch,
+                enough=enough,
+            )
 
     def _act(self, policy: Policy, live: Sequence[Live]) -> NDArray[np.float32]:
         """Return the actions to execute, (len(live), executed, A)."""

@@ -70,6 +70,10 @@ def adapt(
         loss = method.loss(policy, batch, progress(step))
         return loss
 
+    def gradients(loss: Tensor) -> None:
+        policy.zero_grad()  # also of parameters that are not trained: they would add up over the stage
+        method.gradients(policy, loss)
+
     def rate(scheduled: float, step: int) -> float:
         nonlocal learning_rate
         learning_rate = method.learning_rate(method.step_factor * scheduled, progress(step))
@@ -82,7 +86,7 @@ def adapt(
             budget.learning_rate,
             0 if learned or (to_criterion and not parameters) else stage.steps,
             loss_at,
-            lambda loss: method.gradients(policy, loss),
+            gradients,
             lambda done: after(Step(done, loss, learning_rate)),
             rate,
             warm_up if to_criterion else None,

@@ -44,11 +44,11 @@ def warm_up(step: int) -> float:
 
 
 def learning_rate_factor(step: int, steps: int) -> float:
-    """Return the learning rate at `step` as a share of its peak: 5 % warm-up, then a cosine to a tenth."""
-    warm_up = max(1, round(0.05 * steps))
-    if step < warm_up:
-        return (step + 1) / warm_up
-    fraction = (step - warm_up) / max(1, steps - warm_up)
+    """Return the learning rate at `step` as a share of its peak: 5 % warm-up, a cosine toward a tenth."""
+    rising = max(1, round(0.05 * steps))
+    if step < rising:
+        return (step + 1) / rising
+    fraction = (step - rising) / max(1, steps - rising)
     return 0.1 + 0.9 * 0.5 * (1 + math.cos(math.pi * fraction))
 
 

@@ -226,12 +226,11 @@ def _pretrain_vision(
     entry_point = scenario.scene_tasks[0].camera
     assert entry_point is not None
     kinds = resolve(scenario.questions)
-    with deterministic():
-        pretrain_vision(
-            vision,
-            pictures_of([(part.scenes, part.image) for part in data], load_camera(entry_point), kinds),
-            kinds,
-            vision_steps(scenario),
-            torch_generator("vision", seed),
-            lambda _: progress(1),
-        )
+    pretrain_vision(
+        vision,
+        pictures_of([(part.scenes, part.image) for part in data], load_camera(entry_point), kinds),
+        kinds,
+        vision_steps(scenario),
+        torch_generator("vision", seed),
+        lambda _: progress(1),
+    )

@@ -13,7 +13,7 @@ import torch
 from safetensors import SafetensorError
 
 from clbench.base.progress import ProgressCallback, announce, no_progress
-from clbench.base.seeding import derive_seed, seeded, torch_generator
+from clbench.base.seeding import derive_seed, draws_restored, seeded, torch_generator
 from clbench.base.source import RUN_SOURCES, source_hash
 from clbench.data.access import check_policy, hooks, outside
 from clbench.data.demonstrations import Demonstrations
@@ -168,7 +168,7 @@ class Trainer:
             self._stage, target=self._stage.target.twin(), prior=self._stage.prior.twin()
         )
         policy, method = copy.deepcopy((self.policy, self.method))
-        with torch.random.fork_rng(), self._hooks(stage.number):
+        with draws_restored(), self._hooks(stage.number):
             method.end_task(policy, stage)
         return policy
 

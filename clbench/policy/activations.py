@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-VARIANCE_FLOOR = 1e-6
-"""Addend to variances before the root, whose slope is infinite at 0."""
+VARIANCE_OFFSET = 1e-6
+"""Added to each variance before its root, whose slope is infinite at 0."""
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class Gaussian:
         states = torch.stack(list(hidden))
         mean = (states * weight).sum(dim=(1, 2))
         variance = ((states - mean[:, None, None]).square() * weight).sum(dim=(1, 2))
-        return cls(mean, (variance + VARIANCE_FLOOR).sqrt())
+        return cls(mean, (variance + VARIANCE_OFFSET).sqrt())
 
     def distance(self, other: Gaussian) -> Tensor:
         """Return the squared 2-Wasserstein distance to `other`, layer by layer, (L,).

@@ -22,7 +22,7 @@ class Attention(nn.Module):
         self.out = nn.Linear(width, width)
 
     def forward(self, tokens: Tensor, memory: Tensor, mask: Tensor) -> Tensor:
-        """Map tokens (B, Q, W), memory (B, P, W) and mask (B, 1, Q, P), True where read, to (B, Q, W)."""
+        """Map tokens (B, Q, W), memory (B, P, W) and mask (B, 1, Q or 1, P) to (B, Q, W)."""
         return self.attend(tokens, self.keys_and_values(memory), mask)
 
     def keys_and_values(self, memory: Tensor) -> Tensor:
@@ -63,7 +63,7 @@ class Layer(nn.Module):
         return self.attention.keys_and_values(self.attention_norm(tokens))
 
     def go_on(self, tokens: Tensor, mask: Tensor, before: Tensor) -> tuple[Tensor, Tensor]:
-        """Map tokens (B, Q, W) to (B, Q, W) like `forward`, with what earlier tokens offer in place of them.
+        """Map tokens (B, Q, W) to (B, Q, W) like `forward`, given the keys and values of the tokens before.
 
         Args:
             tokens: Tokens that follow the earlier ones.

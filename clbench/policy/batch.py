@@ -94,3 +94,8 @@ class QuestionBatch(_Rows):
     """Word id of the right answer, (B,)."""
     image: Tensor = NO_IMAGE
     """Pictures of the camera, uint8 (B, N, N, 3); N is 0 where the policy sees none."""
+
+
+def mean_over_valid(errors: Tensor, valid: Tensor) -> Tensor:
+    """Return the mean (B,) of errors (B, H, A) over action dimensions and the valid steps (B, H)."""
+    return (errors.mean(dim=2) * valid).sum(dim=1) / valid.sum(dim=1)

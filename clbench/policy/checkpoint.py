@@ -17,6 +17,7 @@ from clbench.base.errors import ClbenchError
 from clbench.base.strict_json import read_json
 from clbench.policy.kinds import new_policy
 from clbench.policy.policy import Policy, PolicyConfig
+from clbench.policy.vision import PATCH, TOKENS
 from clbench.spec.policies import POLICIES, kind_of
 
 LARGEST = 65_536
@@ -93,6 +94,10 @@ def _fault(config: PolicyConfig, tensors: Mapping[str, Tensor], kind: str | None
         return f"width {config.width} cannot be shared among {config.heads} heads"
     if config.block and config.chunk % config.block:
         return f"a chunk of {config.chunk} steps cannot be cut into blocks of {config.block}"
+    if config.image_size % PATCH:
+        return f"pictures of {config.image_size} pixels cannot be cut into patches of {PATCH}"
+    if config.executed > config.chunk:
+        return f"a chunk of {config.chunk} steps has no {config.executed} to execute"
     if config.kind not in POLICIES:  # its sizes mean what its class makes of them
         return None
     if config.layers > len(tensors):
@@ -100,6 +105,7 @@ def _fault(config: PolicyConfig, tensors: Mapping[str, Tensor], kind: str | None
     held = sum(value.numel() for value in tensors.values())
     # one square matrix per layer and one vector per number, word and action: a tenth of a policy
     rows = config.layers * config.width + config.state_size + config.vocabulary_size
+    rows += (config.image_size // PATCH) ** 2 * (config.width // 2) * TOKENS  # the vision's last layer
     least = config.width * (rows + config.action_size + config.chunk)
     if least > held:
         return f"a policy of its sizes has at least {least:,} numbers, but the file has {held:,}"

@@ -117,8 +117,8 @@ def easy_first(
         confidence, best = head.logits(tokens, hidden, mask).softmax(dim=2).max(dim=2)
         hides = tokens == head.bins
         keep = math.floor(length * math.cos(math.pi / 2 * step / steps))
-        rank = confidence.masked_fill(~hides, math.inf).argsort(dim=1, descending=True, stable=True)
-        tokens = torch.where(hides & (rank.argsort(dim=1) < length - keep), best, tokens)
+        order = confidence.masked_fill(~hides, math.inf).argsort(dim=1, descending=True, stable=True)
+        tokens = torch.where(hides & (order.argsort(dim=1) < length - keep), best, tokens)
         if work is not None:
             work.spans.append((0, length))
     return tokens

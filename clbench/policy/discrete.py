@@ -14,6 +14,8 @@ Deviations from the paper:
 4. Bins reach as far to both sides of 0 as the 1st and the 99th percentile of the skills' actions, whichever
    is further, and to -1 and 1 in a dimension that no skill uses. Between the percentiles alone, a target that
    needs the other direction could not be learned.
+5. No secondary re-masking: a token that was taken stays. The paper masks tokens again that are, or become,
+   unsure.
 """
 
 from __future__ import annotations

@@ -2,6 +2,13 @@
 
 Rectified flow as in pi0 (arXiv 2410.24164): x_t = t * noise + (1 - t) * action, velocity u = noise - action,
 flow time t ~ Beta(1.5, 1), integrated from t = 1 to t = 0 by Euler steps.
+
+Two things differ from pi0:
+
+1. Flow times are not cut off near the action: t = 0 occurs.
+2. Steps of a chunk that do not count, after the end of an episode and after action noise, have no loss. But
+   in training the others attend to them, noisy as all are: the last action repeated, or actions for other
+   states than the chunk leads to. When the policy acts, no step is of this kind.
 """
 
 from __future__ import annotations
@@ -14,6 +21,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from clbench.policy.backbone import Layer
+from clbench.policy.batch import mean_over_valid
 from clbench.policy.head import ActionHead
 
 
@@ -80,8 +88,3 @@ class FlowHead(ActionHead):
             time = torch.full((len(noise),), step / self.euler_steps, device=noise.device)
             chunk = chunk - self.velocity(chunk, time, hidden, mask) / self.euler_steps
         return chunk
-
-
-def mean_over_valid(errors: Tensor, valid: Tensor) -> Tensor:
-    """Return the mean (B,) of errors (B, H, A) over action dimensions and the valid steps (B, H)."""
-    return (errors.mean(dim=2) * valid).sum(dim=1) / valid.sum(dim=1)

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -179,3 +180,14 @@ class Policy(nn.Module, ABC):
 
     def _lacks(self, ability: str) -> MissingAbilityError:
         return MissingAbilityError(f"{type(self).__name__} does not have the ability {ability!r}.")
+
+
+@contextmanager
+def evaluating(policy: Policy) -> Iterator[None]:
+    """Put a policy into evaluation mode inside the block: no dropout draws, and no batch norm learns."""
+    training = policy.training
+    policy.eval()
+    try:
+        yield
+    finally:
+        policy.train(training)

@@ -16,6 +16,9 @@ from clbench.policy.head import ActionHead
 from clbench.policy.policy import Policy, PolicyConfig
 from clbench.policy.vision import Vision
 
+LARGEST_STATE = 10.0
+"""Normalised numbers of a state are clipped at this many deviations of the demonstrations, on both sides."""
+
 
 def new_head(config: PolicyConfig) -> ActionHead:
     """Return the action head of the policy's kind, with initial weights."""
@@ -68,7 +71,7 @@ class TransformerPolicy(Policy):
 
     def hidden_states(self, state: Tensor, words: Tensor, image: Tensor | None = None) -> list[Tensor]:
         """Return the hidden state (B, P, W) of every backbone layer for states (B, S) and words (B, L)."""
-        normalised = ((state - self.state_mean) / self.state_std).clamp(-10, 10)
+        normalised = ((state - self.state_mean) / self.state_std).clamp(-LARGEST_STATE, LARGEST_STATE)
         return cast(list[Tensor], self.backbone(normalised, words, image))
 
     def token_mask(self, words: Tensor) -> Tensor:

@@ -115,7 +115,7 @@ def _act(
 ) -> tuple[list[Episode], dict[Trial, list[NDArray[np.float32]]]]:
     """Return the outcomes of the trials, and the actions (A,) taken in each."""
     actions: dict[Trial, list[NDArray[np.float32]]] = defaultdict(list)
-    episodes = evaluator.play(policy.eval(), trials, watch=lambda trial, act: actions[trial].append(act))
+    episodes = evaluator.play(policy, trials, watch=lambda trial, act: actions[trial].append(act))
     return episodes, actions
 
 

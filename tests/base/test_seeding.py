@@ -3,7 +3,7 @@ import random
 import numpy as np
 import torch
 
-from clbench.base.seeding import derive_seed, numpy_generator, seeded, torch_generator
+from clbench.base.seeding import derive_seed, draws_restored, numpy_generator, seeded, torch_generator
 
 
 def test_the_same_name_gives_the_same_stream_and_another_name_another() -> None:
@@ -27,3 +27,10 @@ def test_a_seeded_block_repeats_its_draws_and_leaves_the_global_generators_as_th
     with seeded("block", 3):
         assert _draws() == inside
     assert _draws() == expected
+
+
+def test_draws_inside_a_block_that_restores_them_come_again() -> None:
+    with seeded("block", 3):
+        with draws_restored():
+            first = _draws()
+        assert _draws() == first

@@ -1,4 +1,5 @@
 import dataclasses
+from typing import Any
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ from clbench.base.seeding import derive_seed, torch_generator
 from clbench.data.questions import load_questions, scored_questions
 from clbench.evaluation.answers import answer
 from clbench.evaluation.episodes import LANES, Episode, Trial, start_of
+from clbench.evaluation.probes import activations
 from clbench.evaluation.rollouts import Evaluator
 from clbench.learning.optimise import deterministic
 from clbench.learning.pretraining import policy_config, pretrained_policy
@@ -170,3 +172,25 @@ def test_answers_are_counted_by_kind() -> None:
     assert sum(correct for _, _, correct in counts) > 75
     swapped = dataclasses.replace(questions, answer=questions.answer.roll(1))
     assert sum(c for _, _, c in answer(policy, test.kinds, kind, swapped)) < 75
+
+
+def test_nothing_is_measured_of_a_policy_in_training_mode() -> None:
+    class Watched(TransformerPolicy):
+        def hidden_states(self, *arguments: Any) -> list[torch.Tensor]:
+            modes.append(self.training)
+            return super().hidden_states(*arguments)
+
+    modes: list[bool] = []
+    policy = Watched(policy_config(TOY)).train()
+    _, test = load_questions(TOY)
+    kind, questions = scored_questions(test, 10)
+    for measure in (
+        lambda: answer(policy, test.kinds, kind, questions),
+        lambda: activations(policy, questions),
+        lambda: Evaluator(TOY, 0).evaluate(policy, [TOY.task("left")]),
+    ):
+        modes.clear()
+        measure()
+        assert modes
+        assert not any(modes)
+        assert policy.training

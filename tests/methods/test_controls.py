@@ -313,3 +313,34 @@ def test_half_as_many_questions_as_demonstrations_are_asked(spec: str) -> None:
     assert (len(batch), len(questions)) == (16, 8)
     assert batch.state.equal(toy_source("right").sample(16).state)
     assert questions.answer.equal(toy_questions().sample(8).answer)
+
+
+# ---- adaptation --------------------------------------------------------------------------------------------
+
+
+def test_gradients_of_weights_that_are_not_trained_do_not_add_up_over_a_stage() -> None:
+    found: list[Tensor] = []
+
+    @dataclasses.dataclass
+    class HeadOnly(Method):
+        def start_task(self, policy: Policy, stage: Stage) -> Any:
+            return [parameter for name, parameter in policy.named_parameters() if name.startswith("head.")]
+
+        def batch(self, target: Any, prior: Prior) -> Batch:
+            return batch
+
+        def gradients(self, policy: Policy, loss: Tensor) -> None:
+            super().gradients(policy, loss)
+            gradient = next(policy.get_submodule("backbone").parameters()).grad
+            assert gradient is not None
+            found.append(gradient.clone())
+
+        def learning_rate(self, scheduled: float, progress: Progress) -> float:
+            return 0.0
+
+    batch = toy_source("right").sample(8)
+    _adapt(TransformerPolicy(SMALL), HeadOnly(), steps=3)
+    assert len(found) == 3
+    assert found[0].abs().max() > 0
+    assert found[0].equal(found[1])
+    assert found[1].equal(found[2])

@@ -5,7 +5,7 @@ import pytest
 import torch
 from scipy import linalg
 
-from clbench.policy.activations import VARIANCE_FLOOR, Gaussian
+from clbench.policy.activations import VARIANCE_OFFSET, Gaussian
 from clbench.policy.policy import PolicyConfig
 from clbench.policy.transformer import TransformerPolicy
 from clbench.spec.language import encode
@@ -55,7 +55,7 @@ def test_mean_and_deviation_cover_all_tokens_that_are_read() -> None:
         )
         assert len(rows) == 3 * 5 + 2 + 8 + 7
         np.testing.assert_allclose(found.mean[layer].numpy(), rows.mean(axis=0), rtol=1e-4, atol=1e-6)
-        deviation = np.sqrt(rows.var(axis=0) + VARIANCE_FLOOR)
+        deviation = np.sqrt(rows.var(axis=0) + VARIANCE_OFFSET)
         np.testing.assert_allclose(found.deviation[layer].numpy(), deviation, rtol=1e-4)
 
 
@@ -73,7 +73,7 @@ def test_channels_that_do_not_vary_have_a_finite_gradient() -> None:
     states = torch.ones(2, 7, 4, requires_grad=True)
     mask = torch.ones(2, 1, 1, 7, dtype=torch.bool)
     gaussian = Gaussian.of([states], mask)
-    assert gaussian.deviation.detach().numpy() == pytest.approx(VARIANCE_FLOOR**0.5)
+    assert gaussian.deviation.detach().numpy() == pytest.approx(VARIANCE_OFFSET**0.5)
     other = Gaussian(torch.zeros(1, 4), torch.ones(1, 4))
     (gradient,) = torch.autograd.grad(gaussian.distance(other).sum(), states)
     assert torch.isfinite(gradient).all()

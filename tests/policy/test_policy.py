@@ -1,6 +1,7 @@
 import dataclasses
 import json
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ from clbench.learning.optimise import deterministic
 from clbench.policy.batch import Batch, QuestionBatch
 from clbench.policy.checkpoint import CheckpointError, load_policy, save_policy
 from clbench.policy.flow import FlowHead
-from clbench.policy.policy import PolicyConfig
+from clbench.policy.policy import PolicyConfig, evaluating
 from clbench.policy.transformer import TransformerPolicy
 
 CONFIG = PolicyConfig(state_size=5, action_size=3, width=32, layers=2)
@@ -184,6 +185,9 @@ def _poison(folder: Path) -> None:
         (_set(heads=5), "width 32 cannot be shared among 5 heads"),
         (_set(width=1, heads=1, layers=65_536), "65,536 layers cannot have"),
         (_set(width=65_536), "a policy of its sizes has at least .* numbers, but the file has"),
+        (_set(image_size=65_536), "a policy of its sizes has at least .* numbers, but the file has"),
+        (_set(image_size=20), "pictures of 20 pixels cannot be cut into patches of 16"),
+        (_set(executed=9), "a chunk of 8 steps has no 9 to execute"),
         (_edit(lambda them: them.pop("state_std")), "tensors that do not fit the policy: state_std"),
         (_edit(lambda them: them.update(more=torch.zeros(1))), "do not fit the policy: more"),
         (_edit(lambda them: them.update(state_std=them["state_std"].half())), "do not fit .*: state_std"),
@@ -198,6 +202,15 @@ def test_a_damaged_checkpoint_is_refused_by_name(
     with pytest.raises(CheckpointError, match=message) as error:
         load_policy(tmp_path)
     assert str(tmp_path) in str(error.value)
+
+
+@pytest.mark.parametrize("training", [True, False])
+def test_a_policy_is_evaluated_without_dropout_and_then_as_it_was(training: bool) -> None:
+    policy = TransformerPolicy(CONFIG).train(training)
+    with suppress(KeyError), evaluating(policy):
+        assert not any(module.training for module in policy.modules())
+        raise KeyError
+    assert all(module.training == training for module in policy.modules())
 
 
 # ---- images ------------------------------------------------------------------------------------------------
