@@ -125,7 +125,8 @@ class Examiner:
     def _captured(self, policy: Policy, stage: int) -> float | None:
         """Return the share of episodes in which `policy` does a stage's target though told to do a skill.
 
-        The episodes begin as the scored ones of the target do; the instructions of the skills take turns.
+        The episodes begin as the scored ones of the target do. Skills take turns, and so do wordings: where
+        their numbers have a common factor, a skill is told in some of its wordings only.
         """
         if not self._protocol.captured_episodes:
             return None
