@@ -158,11 +158,13 @@ def test_leases_are_given_back_if_closing_is_interrupted(tmp_path: Path, bars: B
 
 
 SUSPENDED = """
+import signal
 from jobs_with_children import waits
 from clbench.jobs.job import Job
 from clbench.jobs.processes import Processes
 
 if __name__ == "__main__":
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored where a shell began the tests with &
     workers = Processes(1)
     workers.start(Job("waits", waits, {"path": "worker"}, 1))
     try:
@@ -179,16 +181,19 @@ def test_ctrl_z_stops_the_workers_with_the_command_and_they_go_on_with_it(
     monkeypatch.chdir(tmp_path)
     (tmp_path / "command.py").write_text(SUSPENDED, encoding="utf-8")
     (tmp_path / "jobs_with_children.py").write_text(JOBS, encoding="utf-8")
-    command = subprocess.Popen([sys.executable, "command.py"], start_new_session=True)
+    quiet = subprocess.DEVNULL
+    command = subprocess.Popen([sys.executable, "command.py"], start_new_session=True, stderr=quiet)
     try:
         processes = [command.pid, _read_number(tmp_path / "worker")]
         command.send_signal(signal.SIGTSTP)
         assert _all_become(processes, stopped=True)
         command.send_signal(signal.SIGCONT)
         assert _all_become(processes, stopped=False)
-    finally:
         command.send_signal(signal.SIGINT)
         command.wait(60)
+    finally:
+        command.kill()
+        command.wait()
     assert _is_gone(processes[1])
 
 
