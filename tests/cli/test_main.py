@@ -12,7 +12,6 @@ from typing import Any
 import pytest
 
 from clbench import __version__
-from clbench.cli.arguments import checked_input
 from clbench.cli.main import COMMANDS, app
 from clbench.jobs.job import Job
 from clbench.jobs.work import do_run
@@ -113,6 +112,14 @@ def _clbench(*arguments: str, folder: Path | None = None) -> subprocess.Complete
         (["experts", "train", "cartpole_left", "--steps", "1500"], "for a multiple of 1,000 steps"),
         (["experts", "measure", "clbench/Fetch"], "Did you mean 'clbench/Fetch-v"),
         (["experts", "measure", "clbench/Fetch-v1", "pres"], "Did you mean 'press'?"),
+        (["run", "clbench/Fetch-v1", "sft", "--seeds", "10001"], "--seeds. Must be <= 10000."),
+        (["run", "clbench/Fetch-v1", "sft", "--first-seed", str(2**64)], f"Must be <= {2**64 - 1}."),
+        (["run", "clbench/Fetch-v1", "sft", "--order", str(2**64)], f"Must be <= {2**64 - 1}."),
+        (
+            ["run", "clbench/Fetch-v1", "sft", "--seeds", "2", "--first-seed", str(2**64 - 1)],
+            f"seed of a run must be below 2^64, not {2**64}.",
+        ),
+        (["pretrain", "clbench/Fetch-v1", "--seed", str(2**64)], f"Must be <= {2**64 - 1}."),
     ],
 )
 def test_bad_input_ends_with_exit_code_2_and_the_nearest_right_name(
@@ -153,11 +160,6 @@ for command in {commands}:
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.splitlines() == ["2 False"] * len(commands)
     assert done.stderr.count("Did you mean") == len(commands)
-
-
-def test_a_bug_inside_checked_input_is_not_taken_for_wrong_input() -> None:
-    with pytest.raises(KeyError, match="no such key"), checked_input():
-        raise KeyError("no such key")
 
 
 def test_a_wrong_name_ends_the_process_without_a_traceback(tmp_path: Path) -> None:
