@@ -56,5 +56,10 @@ def end(process: int) -> None:
 def end_group(leader: int) -> None:
     """Kill what is left of the group of a process that leads one: children outlive their parent."""
     if hasattr(os, "killpg"):
-        with contextlib.suppress(ProcessLookupError, PermissionError):
-            os.killpg(leader, signal.SIGKILL)
+        signal_group(leader, signal.SIGKILL)
+
+
+def signal_group(leader: int, number: signal.Signals) -> None:
+    """Send a signal to the group of a process that leads one, if there is such a group."""
+    with contextlib.suppress(ProcessLookupError, PermissionError):
+        os.killpg(leader, number)

@@ -11,7 +11,7 @@ import sys
 import threading
 import time
 import traceback
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from multiprocessing.connection import Connection, wait
@@ -24,7 +24,7 @@ from clbench.base.lease import LeaseLostError
 from clbench.base.progress import ProgressCallback, listen
 from clbench.jobs.folders import absolute_places
 from clbench.jobs.job import Event, Job
-from clbench.jobs.process_limits import end, end_group, exceeded
+from clbench.jobs.process_limits import end, end_group, exceeded, signal_group
 from clbench.worlds.threads import cores
 
 SEND_SECONDS = 0.2
@@ -113,9 +113,11 @@ class Processes:
     def _suspend(self, *_: object) -> None:
         """Stop with all workers on Ctrl-Z, and go on with them: a terminal does not reach their groups."""
         groups = [worker.process.pid for worker in self._running.values() if worker.process.pid]
-        _signal_groups(groups, signal.SIGSTOP)
+        for group in groups:
+            signal_group(group, signal.SIGSTOP)
         os.kill(os.getpid(), signal.SIGSTOP)
-        _signal_groups(groups, signal.SIGCONT)
+        for group in groups:
+            signal_group(group, signal.SIGCONT)
 
     def _hold_to_limits(self) -> None:
         """End the processes that exceed their limits."""
@@ -189,12 +191,6 @@ def _handles_suspension() -> bool:
     if not hasattr(signal, "SIGTSTP") or threading.current_thread() is not threading.main_thread():
         return False
     return signal.getsignal(signal.SIGTSTP) is signal.SIG_DFL
-
-
-def _signal_groups(leaders: Iterable[int], number: signal.Signals) -> None:
-    for leader in leaders:
-        with suppress(ProcessLookupError, PermissionError):
-            os.killpg(leader, number)
 
 
 def _leave(process: BaseProcess) -> None:

@@ -126,7 +126,7 @@ def groups(metric: str, rows: Mapping[str, Runs]) -> dict[str, str]:
             tasks, episodes, evaluation points or questions.
     """
     names, board = _board_of(metric, rows)
-    return dict(zip(names, letter_display(board.apart()), strict=True)) if names else {}
+    return dict(zip(names, letter_display(board.apart()), strict=True))
 
 
 def differences_needed(metric: str, rows: Mapping[str, Runs], base: str) -> dict[str, float]:
