@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import shutil
+import socket
 import sys
 import time
 from collections import defaultdict
@@ -35,6 +36,8 @@ _INSTRUCTIONS = (
 Outcome = Literal["done", "failed", "taken"]
 """How a job ended."""
 _PASSED_ON = ("MUJOCO_GL", *_INSTRUCTIONS)
+_PATIENCE = 10.0
+"""Seconds in which the machine of a cluster must accept a connection."""
 
 
 class LostProcessError(Exception):
@@ -63,6 +66,8 @@ class RayWorkers:
         require("ray", "ray", "--ray")
         import ray
 
+        if not _answers(address):
+            raise _no_cluster(address)
         self._ray: Any = ray
         self._count = count
         options: dict[str, Any] = {"runtime_env": {"env_vars": _environment()}}
@@ -78,9 +83,7 @@ class RayWorkers:
         except ValueError as error:
             raise InputError(f"--ray must be auto, local or host:port, not {address!r}.") from error
         except (ConnectionError, RuntimeError) as error:
-            raise UnknownNameError(
-                f"No Ray cluster answers at {address!r}; --ray local starts one."
-            ) from error
+            raise _no_cluster(address) from error
         self._progress_actor: Any = ray.remote(num_cpus=0)(_ProgressActor).remote()
         self._running: dict[Any, Job] = {}
         self._shown: defaultdict[Job, float] = defaultdict(float)
@@ -145,6 +148,22 @@ class RayWorkers:
         for path, record in result.records.items():
             write_result(record, job.arguments["records"] / path)
         return result.kind, result.value
+
+
+def _answers(address: str) -> bool:
+    """Return False if the address has a host and a port where nothing listens: Ray would try for minutes."""
+    host, _, port = address.removeprefix("ray://").rpartition(":")
+    if not host or not port.isdecimal() or int(port) > 65_535:
+        return True
+    try:
+        socket.create_connection((host.strip("[]"), int(port)), timeout=_PATIENCE).close()
+    except OSError:
+        return False
+    return True
+
+
+def _no_cluster(address: str) -> UnknownNameError:
+    return UnknownNameError(f"No Ray cluster answers at {address!r}; --ray local starts one.")
 
 
 class _Result(NamedTuple):

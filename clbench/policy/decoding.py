@@ -1,14 +1,16 @@
 """Decoders of a masked chunk: easy first, and the pipeline of blocks of Fast-dVLA.
 
 Fast-dVLA (Song et al., arXiv 2603.25661, section 3.4 and Algorithm 1): the chunk grows block by block. The
-next block begins before the last one is complete, all active blocks share each forward, and the keys and
-values of the observation and of complete blocks are kept.
+next block begins before the last one is complete, all blocks that have begun share each forward, and the keys
+and values of the observation and of complete blocks are kept. A block is complete when none of its tokens is
+masked. It is fully activated (D2F's word, arXiv 2508.09192) when it takes tokens however sure they are.
 
 Details that the paper leaves open:
 
-1. A complete block takes at least one token of each forward. The paper's floor(R / n) is 0 for a last token.
+1. A fully activated block takes at least one token of each forward. The paper's floor(R / n) is 0 for a last
+   token.
 2. Keys of a complete block are kept by the forward after the one that completed it, which no longer reads its
-   masks (as in the code of D2F, arXiv 2508.09192, whose recipe the paper follows).
+   masks (as in the code of D2F, whose recipe the paper follows).
 3. Many chunks at a time are decoded without kept keys. No token reads a later block, so the tokens are equal.
 """
 
@@ -210,8 +212,8 @@ class Blocks:
         self.number = torch.arange(count, device=device)
         self.begun = torch.ones(batch, 1, dtype=torch.int64, device=device)
         """Number of blocks that have begun, (B, 1)."""
-        self.active = (self.number == 0).expand(batch, -1).clone()
-        """Whether a block takes tokens however sure they are, (B, N); the first one does from the start."""
+        self.activated = (self.number == 0).expand(batch, -1).clone()
+        """Whether a block is fully activated, (B, N); the first one is from the start."""
         self._look()
 
     def _look(self) -> None:
@@ -234,9 +236,11 @@ class Blocks:
         return int(self.begun.max()) * self.shape[1]
 
     def add(self) -> None:
-        """Begin the next block of each chunk whose last one is decoded far enough."""
+        """Begin the next block of each chunk whose last one is far enough, and fully activate blocks."""
         last = self.share.gather(1, self.begun - 1)
         self.begun += (last > self.thresholds.add) & (self.begun < self.shape[0])
+        follows = self.share[:, :-1] > self.thresholds.activate
+        self.activated[:, 1:] |= follows & (self.number < self.begun)[:, 1:]
 
     def take(self, logits: Tensor, first: int) -> None:
         """Take the sure tokens, given the logits (B, n, K) of the tokens from `first` on."""
@@ -244,14 +248,12 @@ class Blocks:
         confidence = confidence.nan_to_num()  # a diverged policy is sure of nothing, and must come to an end
         rest = self.tokens.shape[1] - first - logits.shape[1]
         sure = F.pad(confidence, (first, rest)).view(-1, *self.shape)
-        has_begun = self.number < self.begun
-        masked = self.masked & has_begun[:, :, None]
+        masked = self.masked & (self.number < self.begun)[:, :, None]
         sure = sure.masked_fill(~masked, -math.inf)
         least = (self.left // self.thresholds.part).clamp(min=1)[:, :, None]
         bar = sure.sort(dim=2, descending=True).values.gather(2, least - 1)
         bar = bar.clamp(max=self.thresholds.confidence)
-        bar = torch.where(self.active[:, :, None], bar, self.thresholds.confidence)
+        bar = torch.where(self.activated[:, :, None], bar, self.thresholds.confidence)
         taken = (masked & (sure >= bar)).flatten(1)
         self.tokens = torch.where(taken, F.pad(best, (first, rest)), self.tokens)
         self._look()
-        self.active[:, 1:] |= (self.share[:, :-1] > self.thresholds.activate) & has_begun[:, 1:]

@@ -59,10 +59,7 @@ class RunSpec:
             value = getattr(self, name)
             if not isinstance(value, str):
                 raise WrongTypeError(f"{name} of a run must be a text, {hint}, not {value!r}.")
-        check_whole(self, 0, "seed", "order")
-        for name in ("seed", "order"):
-            if getattr(self, name) > LARGEST_SEED:
-                raise InputError(f"{name} of a run must be below 2^64, not {getattr(self, name)}.")
+        check_whole(self, 0, "seed", "order", most=LARGEST_SEED)
         if self.targets is not None:
             check_whole(self, 1, "targets")
 

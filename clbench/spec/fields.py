@@ -8,12 +8,12 @@ from clbench.base.entry_points import is_entry_point
 from clbench.base.errors import InputError, WrongTypeError
 
 
-def check_whole(part: object, least: int, *fields: str) -> None:
-    """Check that fields of `part` are whole numbers that are at least `least`.
+def check_whole(part: object, least: int, *fields: str, most: int | None = None) -> None:
+    """Check that fields of `part` are whole numbers from `least` to `most`, or without an upper bound.
 
     Raises:
         WrongTypeError: A field is no whole number.
-        InputError: A field is too small.
+        InputError: A field is too small or too large.
     """
     for name in fields:
         value = getattr(part, name)
@@ -21,6 +21,8 @@ def check_whole(part: object, least: int, *fields: str) -> None:
             raise WrongTypeError(f"{_place(part, name)} must be a whole number, not {value!r}.")
         if value < least:
             raise InputError(f"{_place(part, name)} must be at least {least}, not {value}.")
+        if most is not None and value > most:
+            raise InputError(f"{_place(part, name)} must be at most {most}, not {value}.")
 
 
 def check_positive(part: object, *fields: str) -> None:

@@ -117,7 +117,7 @@ def _clbench(*arguments: str, folder: Path | None = None) -> subprocess.Complete
         (["run", "clbench/Fetch-v1", "sft", "--order", str(2**64)], f"Must be <= {2**64 - 1}."),
         (
             ["run", "clbench/Fetch-v1", "sft", "--seeds", "2", "--first-seed", str(2**64 - 1)],
-            f"seed of a run must be below 2^64, not {2**64}.",
+            f"RunSpec.seed must be at most {2**64 - 1}, not {2**64}.",
         ),
         (["pretrain", "clbench/Fetch-v1", "--seed", str(2**64)], f"Must be <= {2**64 - 1}."),
     ],

@@ -3,6 +3,7 @@
 import importlib
 import io
 import os
+import re
 import threading
 import time
 from collections.abc import Callable
@@ -155,9 +156,13 @@ def test_a_job_on_this_machine_has_normal_priority(bars: Bars) -> None:
     assert f"niceness: nicer by {os.nice(0)} (" in bars.console.file.getvalue()
 
 
-def test_a_cluster_that_does_not_run_is_refused() -> None:
-    with pytest.raises(LookupError, match="No Ray cluster answers at 'auto'; --ray local starts one"):
-        RayWorkers("auto")
+@pytest.mark.parametrize("address", ["auto", "localhost:1", "ray://127.0.0.1:1", "[::1]:1"])
+def test_a_cluster_that_does_not_run_is_refused_at_once(address: str) -> None:
+    begin = time.monotonic()
+    message = f"No Ray cluster answers at '{re.escape(address)}'; --ray local starts one"
+    with pytest.raises(LookupError, match=message):
+        RayWorkers(address)
+    assert time.monotonic() - begin < 60  # Ray itself tries for minutes
 
 
 @pytest.mark.parametrize("address", ["foo", "foo:bar"])
