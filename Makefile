@@ -125,18 +125,21 @@ libero-test: .venv/installed-dev
 	$(BIN)/pytest tests/envs/test_libero.py tests/envs/test_libero_physics.py tests/envs/test_libero_scenario.py
 	$(BIN)/pytest tests/envs/test_every_scenario.py -k Libero
 
-# Besides style and types: whether the committed board and pages are those of the committed records, and every scenario
-# is what its definition says.
+# Besides style and types: whether the committed board and pages are those of the committed records, whether every scenario
+# is what its definition says, and the slow tests of what few change: the page in a browser, and the benchmarks.
+CHECKED := tests/leaderboard/test_records.py tests/evaluation/test_definition.py tests/test_benchmarks.py \
+	$(addprefix tests/leaderboard/views/page/,test_in_browser.py test_on_a_phone.py test_ways.py)
 check: .venv/installed-dev
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/mypy
-	$(BIN)/pytest -m slow tests/leaderboard/test_records.py tests/evaluation/test_definition.py
+	$(BIN)/pytest -m slow $(CHECKED)
 
 # Tests of the built wheel outside the checkout, where it could differ from the checkout: its files, the parts that are
 # found by name, the commands, and all that strangers type. It has an environment of its own, which sees the packages of
 # .venv but not the checkout: to install PyTorch a second time took 90 s.
-WALKS := tests/cli tests/test_readme.py tests/test_submission.py tests/test_your_scenario.py tests/runs/test_agents_guide.py
+WALKS := tests/cli tests/test_readme.py tests/test_submission.py tests/test_your_scenario.py tests/runs/test_agents_guide.py \
+	tests/serving/test_guide.py
 WHEEL_TESTS := $(WALKS) tests/test_package.py \
 	$(addprefix tests/leaderboard/,views/page/test_html.py views/test_markdown.py submission/test_submit.py) \
 	tests/leaderboard/claims/test_claims.py tests/leaderboard/pages \

@@ -4,6 +4,7 @@ from .evaluation.episodes import Episode as Episode
 from .evaluation.rollouts import Evaluator as Evaluator
 from .exchange.demonstrations import export_demonstrations as export_demonstrations
 from .exchange.demonstrations import import_demonstrations as import_demonstrations
+from .exchange.frames import load_records as load_records
 from .jobs.grid import RunsFailedError as RunsFailedError
 from .jobs.grid import run as run
 from .leaderboard import plot as plot  # type: ignore[import-not-found]  # in a checkout it is elsewhere
@@ -22,7 +23,6 @@ from .policy.batch import Batch as Batch
 from .policy.batch import QuestionBatch as QuestionBatch
 from .policy.policy import Policy as Policy
 from .policy.policy import PolicyConfig as PolicyConfig
-from .records.frames import load_records as load_records
 from .records.reader import read_record as read_record
 from .records.record import Record as Record
 from .runs.agents import evaluate_agent as evaluate_agent

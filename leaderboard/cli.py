@@ -212,9 +212,9 @@ def verify(
     """Check the records at PATHS, and write the tier that each reaches into a file next to it.
 
     recomputed: the record is intact, matches its method and scenario, and its metrics follow from its
-    episodes. replayed: the policies of its stages give the same results in randomly chosen test episodes and
-    on all questions. retrained: the whole run gives the same record again. Each tier includes the tiers
-    before it. The file of a higher tier stays unless a check fails.
+    episodes. replayed: the policies of its stages give the same results in randomly chosen episodes at the
+    ends of stages, and the same answers there. retrained: the whole run gives the same record again. Each
+    tier includes the tiers before it. The file of a higher tier stays unless a check fails.
 
     Args:
         paths: Records, or folders of records.
@@ -231,7 +231,7 @@ def verify(
         records: Folder of the records.
         as_json: Print JSON: of each record whether it passed, its tier, the checks and the failure.
     """
-    from .board.tiers import TIERS, checks_of, tier_of
+    from .board.tiers import TIERS, tier_of
     from .submission.subject import Request
     from .submission.verify import run_verifications
 
@@ -243,30 +243,36 @@ def verify(
             raise InputError(
                 "--pretrain repeats the pretraining at the tier retrained: add --tier retrained."
             )
+        if checkpoints is not None and not checkpoints.is_dir():
+            raise InputError(
+                f"There is no folder {checkpoints}. --checkpoints names the folder of policies that "
+                "`clbench run --checkpoints` filled."
+            )
         found, records = _placed(_found(paths, records), records)
     seed = secrets.randbits(48) if seed is None else seed
     request = Request(tier, episodes, seed, method, scenario, checkpoints, pretrain, by, policy)
-    failures = run_verifications(found, records, request, workers, Console(stderr=as_json))
+    done = run_verifications(found, records, request, workers, Console(stderr=as_json))
     if as_json:
         print_json(
             [
                 {
-                    "path": str(path),
-                    "passed": path not in failures,
-                    "tier": tier_of(path),
-                    "checks": checks_of(path),
-                    "failure": failures.get(path),
+                    "path": str(one.path),
+                    "passed": one.failure is None,
+                    "tier": tier_of(one.path),
+                    "checks": one.checks,
+                    "failure": one.failure,
                 }
-                for path in found
+                for one in done
             ]
         )
-    if failures:
+    if any(one.failure for one in done):
         raise SystemExit(1)
 
 
 def _found(paths: Sequence[Path], records: Path) -> list[Path]:
-    """Return the records at `paths`, including those in folders."""
-    found = [one for path in paths for one in (sorted(path.rglob("*.json")) if path.is_dir() else [path])]
+    """Return the records at `paths`, including those in folders, each once."""
+    each = [one for path in paths for one in (sorted(path.rglob("*.json")) if path.is_dir() else [path])]
+    found = [*{os.path.abspath(one): one for one in each}.values()]
     absent = [path for path in found if not os.path.lexists(path)]
     if absent or not found:
         what = f"There is no record at {absent[0]}." if absent else "There is no record to verify."

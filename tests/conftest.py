@@ -22,6 +22,7 @@ from clbench.learning.optimise import deterministic
 from clbench.learning.prior import Uses
 from clbench.learning.registry import load_method
 from clbench.records.paths import record_path
+from clbench.records.pinned import pinned
 from clbench.records.record import (
     AnswerRow,
     CheckRow,
@@ -312,7 +313,10 @@ def _make_record(
             budget=budget,
         ),
         costs=Costs(optimiser_steps=stages * steps[-1], parameters=1000, parameters_added=0, bytes_kept=0),
-        fingerprint={"rollouts": {"toy:world": "0123"}},
+        fingerprint={
+            "rollouts": {"toy:world": "0123"},
+            "definition": dict(pinned().get(run["scenario"], {"questions": "0123"})),
+        },
         relearning=relearning,
     )
     for row in rows:

@@ -17,6 +17,8 @@ from clbench.learning.pretraining import policy_config
 from clbench.policy.kinds import new_policy
 from clbench.testing import TOY
 
+pytestmark = pytest.mark.slow
+
 BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
 
 COMPARISON = """

@@ -12,6 +12,7 @@ from clbench.base.text import quoted
 from clbench.records.content import content_hash
 from clbench.records.fields import load_fields
 from clbench.records.history import to_present
+from clbench.records.paths import label_of, record_name
 from clbench.records.record import (
     ANSWER_COLUMNS,
     CHECK_COLUMNS,
@@ -20,6 +21,7 @@ from clbench.records.record import (
     SCHEMA,
     Costs,
     Record,
+    RunInfo,
 )
 from clbench.spec.identifiers import check_plain
 
@@ -28,6 +30,9 @@ MOST_ROWS = 200_000
 
 FIRST_HASHED = 3
 """Schema whose records, and those of later ones, have a hash of their content."""
+
+FIRST_DEFINED = 4
+"""Schema whose records, and those of later ones, have the definition of their scenario."""
 
 ERROR_FIELDS = ("where", "type", "message", "traceback")
 """Names of the texts in `Record.error`."""
@@ -54,6 +59,20 @@ def read_record(path: Path | str) -> Record:
         raise RecordError(f"{path}: {error}") from error
 
 
+def home_of(run: RunInfo) -> Path:
+    """Return the path that the record of a run has below its folder of records.
+
+    Raises:
+        RecordError: A name, the seed or the order is impossible.
+    """
+    if run.seed < 0:
+        raise RecordError(f"run: {run.seed} cannot be a seed.")
+    try:
+        return record_name(run.scenario, label_of(run.method, run.changes), run.seed, run.order, run.policy)
+    except ClbenchError as error:
+        raise RecordError(f"run: {error}") from error
+
+
 def _record(values: Any) -> Record:
     """Return the record in `values`, which `json` read from its file."""
     schema = values.get("schema") if isinstance(values, dict) else None
@@ -74,6 +93,8 @@ def _record(values: Any) -> Record:
     assert isinstance(record, Record)
     _check_costs(record.costs)
     _check_error(record)
+    if schema >= FIRST_DEFINED and record.status == "success":
+        _check_definition(record, schema)
     _check_columns("episodes", record.episodes, EPISODE_COLUMNS)
     _check_columns("answers", record.answers, ANSWER_COLUMNS)
     _check_columns("policy", record.policy, POLICY_COLUMNS)
@@ -95,6 +116,14 @@ def _check_content(values: dict[str, Any], schema: int) -> None:
         raise RecordError(f"a record of schema {schema}: content is missing.")
     if values["content"] != content_hash(values):
         raise RecordError("its content does not match its hash: the file was changed or damaged.")
+
+
+def _check_definition(record: Record, schema: int) -> None:
+    if not isinstance(record.fingerprint.get("definition"), dict):
+        raise RecordError(
+            f"a record of schema {schema}: fingerprint.definition must be an object, the parts of its "
+            "scenario."
+        )
 
 
 def _check_costs(costs: Costs) -> None:

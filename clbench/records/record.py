@@ -10,6 +10,7 @@ import html
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
+from clbench.base.text import printable
 from clbench.spec.policies import DEFAULT_POLICY
 from clbench.spec.protocol import Point, Protocol, ScoredSplit, Split
 
@@ -256,7 +257,9 @@ class Record:
     """For a failed run: `where` (the hook and stage), `type`, `message`, `traceback`."""
 
     def __repr__(self) -> str:
-        name = f"{self.run.method} on {self.run.scenario}, seed {self.run.seed}"
+        run = self.run
+        policy = "" if run.policy == DEFAULT_POLICY else f", {run.policy}"
+        name = printable(f"{run.method} on {run.scenario}{policy}, seed {run.seed}")
         return f"<Record of {name}: {self.status}, {len(self.episodes['task']):,} episodes>"
 
     def _repr_html_(self) -> str:

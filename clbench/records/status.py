@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Literal, NamedTuple
 
 from clbench.base.lease import Lease, Owner, Report, lease_path
-from clbench.records.reader import RecordError, read_record
+from clbench.records.reader import RecordError, home_of, read_record
 from clbench.records.record import Record
 
 State = Literal["done", "running", "failed", "damaged", "to do"]
@@ -53,6 +53,9 @@ def run_state(path: Path, check: Callable[[Record], object]) -> RunState:
         return RunState(path, "to do")
     try:
         record = read_record(path)
+        home = home_of(record.run)
+        if home.parts != path.parts[-len(home.parts) :]:
+            raise RecordError(f"{path}: it is the record of {home}, and must be there.")
         if record.error is None:
             check(record)
     except RecordError as error:

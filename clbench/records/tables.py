@@ -16,6 +16,7 @@ GROUPS = get_args(Group)
 
 TYPES = {
     "scenario": "str",
+    "policy": "str",
     "method": "str",
     "seed": "int64",
     "order": "int64",
@@ -40,6 +41,7 @@ def frame(record: Record) -> pandas.DataFrame:
     found = pandas.DataFrame(
         {
             "scenario": run.scenario,
+            "policy": run.policy,
             "method": label_of(run.method, run.changes),
             "seed": run.seed,
             "order": run.order,

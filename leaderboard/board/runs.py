@@ -11,11 +11,10 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from clbench.base.errors import ClbenchError
 from clbench.base.text import printable
-from clbench.records.paths import label_of, record_name, table_name
+from clbench.records.paths import label_of, table_name
 from clbench.records.pinned import LATER, other_parts, pinned
-from clbench.records.reader import RecordError, read_record
+from clbench.records.reader import RecordError, home_of, read_record
 from clbench.records.record import Record, RunInfo, ScenarioInfo
 from clbench.runs.tuning import tuned_settings
 from clbench.scoring.layout import Layout
@@ -127,7 +126,7 @@ def read_run(folder: Path, path: Path, changed: bool | None = False) -> Run:
     run, name = record.run, path.relative_to(folder).as_posix()
     _check_kind(run, changed)
     label = label_of(run.method, run.changes)
-    home = _home(run, label)
+    home = home_of(run).as_posix()
     if record.scenario.id != run.scenario:
         raise RecordError(f"scenario: its id is {record.scenario.id!r}, but {run.scenario!r} was run.")
     _check_settings(run)
@@ -162,16 +161,6 @@ def _published(record: Record) -> ScenarioInfo:
         raise RecordError(f"run: {error}") from error
     target = [name for _, name in sorted(zip(places, targets, strict=True))]
     return dataclasses.replace(record.scenario, target=target)
-
-
-def _home(run: RunInfo, label: str) -> str:
-    """Return the path of the record of `run` from the folder of records."""
-    if run.seed < 0:
-        raise RecordError(f"run: {run.seed} cannot be a seed.")
-    try:
-        return record_name(run.scenario, label, run.seed, run.order, run.policy).as_posix()
-    except ClbenchError as error:
-        raise RecordError(f"run: {error}") from error
 
 
 def _check_settings(run: RunInfo) -> None:

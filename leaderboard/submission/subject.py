@@ -30,8 +30,8 @@ class Check:
     """Subject of the check."""
     found: str
     """Result in words."""
-    passed: bool
-    """Whether the record passed."""
+    passed: bool | None
+    """Whether the record passed; None if this machine, or the command, cannot tell."""
 
 
 @dataclass(frozen=True)

@@ -8,9 +8,10 @@ time, and the fingerprint of the machine; the record is never changed.
 from __future__ import annotations
 
 import hashlib
+import json
 import tempfile
 from collections.abc import Sequence
-from dataclasses import asdict, is_dataclass
+from dataclasses import asdict, dataclass, is_dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -25,7 +26,7 @@ from clbench.jobs.processes import Processes
 from clbench.jobs.scheduler import run_with_bars
 from clbench.learning.pretraining import pretrain
 from clbench.policy.checkpoint import save_policy
-from clbench.records.pinned import other_parts
+from clbench.records.pinned import LATER, other_parts
 from clbench.records.reader import RecordError
 from clbench.records.record import Record
 from clbench.runs.length import run_length
@@ -34,6 +35,7 @@ from clbench.scoring.metrics import measure
 from clbench.spec.scenario import Scenario
 
 from ..board.runs import differences, read_run
+from ..board.summary import ELSEWHERE
 from ..board.tiers import TIERS, tier_of, verification_path, verification_text
 from ..views.format import write_if_changed
 from .replay import replay
@@ -52,6 +54,9 @@ PARTS = (
 )
 """Parts that two records of one run share to the last bit."""
 
+_ACTORS = {"online": "an agent that learned online", "external": "a policy served from elsewhere"}
+"""What acted in the runs of `ELSEWHERE`."""
+
 ORIGIN = {
     "versions": (),
     "hardware": ("machine", "system", "instructions"),
@@ -65,8 +70,8 @@ def verify(
 ) -> list[Check]:
     """Check the record at `path`, write its tier into a file next to it, and return the checks.
 
-    The first tier with a failed check is the last one. The file of an earlier verification stays if it has a
-    higher tier than `request` and no check fails; otherwise it is deleted.
+    The first tier with a check that does not pass is the last one. A failed check deletes the file of an
+    earlier verification. A check that cannot be made here leaves it as it is, and so does a lower tier.
 
     Args:
         path: Path of the record.
@@ -74,26 +79,28 @@ def verify(
         request: Options of the verification.
         progress: Called with the work done since its last call, in optimiser steps.
     """
-    earlier = verification_path(path)
-    is_higher = TIERS.index(tier_of(path)) > TIERS.index(request.tier)
-    if not is_higher:
-        earlier.unlink(missing_ok=True)
     try:
         run = read_run(records, path, changed=None)
     except RecordError as error:
-        earlier.unlink(missing_ok=True)
+        verification_path(path).unlink(missing_ok=True)
         return [Check("record", str(error), False)]
     subject = Subject(run, request)
-    checks: list[Check] = []
     looks = {"recomputed": _recompute, "replayed": replay, "retrained": _retrain}
+    reached, checks = TIERS[0], list[Check]()
     for tier in TIERS[1 : TIERS.index(request.tier) + 1]:
-        checks += looks[tier](subject, progress)
-        if not all(check.passed for check in checks):
-            if is_higher:
-                earlier.unlink()
-            break
-        if not is_higher:
-            _write(path, subject, tier, checks)
+        if tier == "replayed" and run.division in ELSEWHERE:
+            none = f"{_ACTORS[run.division]} has none, so its highest tier is recomputed"
+            return [*checks, Check("policies", none, True)]
+        found = looks[tier](subject, progress)
+        if any(check.passed is False for check in found):
+            verification_path(path).unlink(missing_ok=True)
+        passed = all(check.passed for check in found)
+        if passed:
+            reached, checks = tier, checks + found
+        if reached != TIERS[0] and TIERS.index(reached) >= TIERS.index(tier_of(path)):
+            _write(path, subject, reached, checks)
+        if not passed:
+            return checks + found
     return checks
 
 
@@ -124,11 +131,13 @@ def _recompute(subject: Subject, _: ProgressCallback) -> list[Check]:
         scenario = subject.scenario
         described = None if subject.strange else subject.resolved
     except UnknownNameError as error:
-        name = subject.run.record.scenario.id
-        result = f"{error.args[0].partition('.')[0]}. Name its module: --scenario module:{name}"
-        return [*checks, Check("what was run", result, False)]
+        result = str(error.args[0])
+        if subject.request.scenario is None:
+            name = subject.run.record.scenario.id
+            result = f"{result.partition('.')[0]}. Name its module: --scenario module:{name}"
+        return [*checks, Check("what was run", result, None)]
     except ClbenchError as error:
-        return [*checks, Check("what was run", str(error.args[0]), False)]
+        return [*checks, Check("what was run", str(error.args[0]), None)]
     checks.append(_check_horizons(run.record, scenario))
     if described is None:
         names = " and ".join(subject.strange)
@@ -160,12 +169,11 @@ def _check_definition(subject: Subject) -> Check:
     if recorded is None:
         return Check("definition", "the record is older than definitions: not compared", True)
     other = other_parts(recorded, subject.here["definition"])
-    result = (
-        f"{', '.join(other)} differ from the installed code"
-        if other
-        else "tasks and questions are those here"
-    )
-    return Check("definition", result, not other)
+    if other:
+        return Check("definition", f"{', '.join(other)} differ from the installed code", False)
+    later = [name for name in subject.here["definition"] if name.startswith(LATER) and name not in recorded]
+    missing = f"; the record says nothing of {', '.join(later)}: not compared" if later else ""
+    return Check("definition", f"tasks and questions are those here{missing}", True)
 
 
 def _check_horizons(record: Record, scenario: Scenario) -> Check:
@@ -257,16 +265,35 @@ def _as_dictionary(part: Any) -> Any:
 # ---- the job -----------------------------------------------------------------------------------------------
 
 
+@dataclass(frozen=True)
+class Verification:
+    """What came of the verification of a record."""
+
+    path: Path
+    """Path of the record."""
+    checks: list[dict[str, Any]]
+    """The checks that were made: of each its name, what it found, and whether the record passed."""
+    failure: str | None
+    """Why it did not reach the tier, None if it did."""
+
+
 def run_verifications(
     paths: Sequence[Path], records: Path, request: Request, workers: int | None, console: Console
-) -> dict[Path, str]:
-    """Verify records, each in its own process, and return why those failed that did."""
-    jobs = {_job(path, records, request): path for path in paths}
-    failed = run_with_bars([*jobs], Processes(workers), console)
-    return {jobs[job]: reason for job, reason in failed.items()}
+) -> list[Verification]:
+    """Verify records, each in its own process."""
+    with tempfile.TemporaryDirectory() as folder:
+        reports = {path: Path(folder) / f"{number}.json" for number, path in enumerate(paths)}
+        jobs = {path: _job(path, records, request, report) for path, report in reports.items()}
+        failed = run_with_bars([*jobs.values()], Processes(workers), console)
+        return [Verification(path, _read(reports[path]), failed.get(job)) for path, job in jobs.items()]
 
 
-def _job(path: Path, records: Path, request: Request) -> Job:
+def _read(report: Path) -> list[dict[str, Any]]:
+    """Return the checks in a report, none if the job died before it wrote one."""
+    return json.loads(report.read_text(encoding="utf-8")) if report.exists() else []
+
+
+def _job(path: Path, records: Path, request: Request, report: Path) -> Job:
     """Return the job that verifies a record; its length is known if the record can be read."""
     length = 1.0
     try:
@@ -279,14 +306,16 @@ def _job(path: Path, records: Path, request: Request) -> Job:
             length += scenario.budget.pretraining_steps * request.pretrain
     except ClbenchError:
         pass  # the job itself reports the error
-    arguments = {"path": str(path), "records": str(records), "request": request}
+    arguments = {"path": str(path), "records": str(records), "request": request, "report": str(report)}
     return Job(str(path), verify_job, arguments, length)
 
 
-def verify_job(path: str, records: str, request: Request, progress: ProgressCallback) -> str:
-    """Verify a record, and return its tier with the results of the checks."""
+def verify_job(path: str, records: str, request: Request, report: str, progress: ProgressCallback) -> str:
+    """Verify a record, write its checks to `report`, and return its tier with the checks in words."""
     checks = verify(Path(path), Path(records), request, progress)
-    text = "\n".join(f"  {'ok ' if check.passed else 'NOT'} {check.name}: {check.found}" for check in checks)
+    Path(report).write_text(json.dumps([asdict(check) for check in checks]), encoding="utf-8")
+    marks = {True: "ok ", False: "NOT", None: "?  "}
+    text = "\n".join(f"  {marks[check.passed]} {check.name}: {check.found}" for check in checks)
     progress(1.0)
     tier = tier_of(Path(path))
     if not all(check.passed for check in checks):

@@ -21,7 +21,7 @@ from ..board.agreement import Agreement, Concordance
 from ..board.overall import OverallRow
 from ..board.predictors import predictions
 from ..board.rows import Row, standing_of
-from ..board.summary import DIVISIONS, RowSummary
+from ..board.summary import DIVISIONS, GAIN, RowSummary
 from ..board.tiers import TIERS
 
 FIXED = (
@@ -78,7 +78,9 @@ class Column:
 
     @property
     def form(self) -> str:
-        """Format of its values."""
+        """Format of its values. A gain, which is a difference, has its sign."""
+        if self.metric.name == GAIN:
+            return "+.2f"
         return ".0f" if self.metric.units == "optimiser steps" else ".2f"
 
 
@@ -177,7 +179,7 @@ def number_text(value: float | None, form: str, missing: str = MISSING) -> str:
     if value is None:
         return missing
     text = format(round(value, 9), form)
-    return text if text.strip("-0.") else text.lstrip("-")
+    return text if text.strip("+-0.") else text.lstrip("+-")
 
 
 def format_interval(estimate: Estimate, form: str = ".2f") -> str:

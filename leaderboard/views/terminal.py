@@ -213,5 +213,5 @@ def _compact(estimate: Estimate, column: Column) -> str:
     value = number_text(estimate.value, column.form)
     if estimate.low is None or estimate.high is None:
         return value
-    half = number_text((estimate.high - estimate.low) / 2, column.form)
+    half = number_text((estimate.high - estimate.low) / 2, column.form.removeprefix("+"))
     return f"{value}±{half.removeprefix('0') or '0'}"

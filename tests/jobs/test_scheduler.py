@@ -320,9 +320,10 @@ def _is_gone(group: int) -> bool:
     ("send", "stop", "code", "said"),
     [
         pytest.param(os.killpg, signal.SIGINT, 130, "Finished records are kept", id="ctrl-c"),
-        pytest.param(os.kill, signal.SIGTERM, 143, "", id="scheduler", marks=pytest.mark.slow),
+        pytest.param(os.kill, signal.SIGTERM, 143, "", id="scheduler"),
     ],
 )
+@pytest.mark.slow
 def test_stopping_the_command_ends_its_workers_and_keeps_finished_records(
     tmp_path: Path,
     lasting_records: Callable[[Path], dict[str, Any]],

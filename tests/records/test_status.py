@@ -22,7 +22,8 @@ def test_every_state_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     record = execute(spec, tmp_path)
     paths = [spec.path(tmp_path).with_name(f"seed-{seed}.json") for seed in range(5)]
     error = {"where": "stage 1", "type": "ValueError", "message": "went wrong", "traceback": ""}
-    write_record(dataclasses.replace(record, status="failed", error=error, costs=Costs()), paths[1])
+    failed = dataclasses.replace(record, status="failed", error=error, costs=Costs())
+    write_record(dataclasses.replace(failed, run=dataclasses.replace(record.run, seed=1)), paths[1])
     paths[2].write_text("{")
     lease = Lease(paths[3])
     assert lease.take()
@@ -40,6 +41,17 @@ def test_every_state_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.setattr(leases, "REPORT_SECONDS", 0.0)
     lease.release()
     assert [path.name for path in paths[3].parent.glob(".*")] == []
+
+
+def test_a_copy_of_a_record_under_another_name_is_not_another_run(tmp_path: Path) -> None:
+    path = RunSpec(TOY, "frozen", seed=0).path(tmp_path)
+    execute(RunSpec(TOY, "frozen", seed=0), tmp_path)
+    copy = path.with_name("seed-5.json")
+    copy.write_bytes(path.read_bytes())
+    state = run_state(copy, Scores.from_record)
+    assert state.state == "damaged"
+    assert state.reason is not None
+    assert "it is the record of Toy-v0/frozen/seed-0.json, and must be there" in state.reason
 
 
 def test_the_time_left_counts_what_runs_and_what_nobody_has_begun() -> None:

@@ -6,6 +6,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
 from agents import ID
 from helpers import blocks_of
 from served import SERVER
@@ -13,6 +14,7 @@ from served import SERVER
 PAGE = Path(__file__).parents[2] / "docs" / "guide" / "external.md"
 
 
+@pytest.mark.slow
 def test_the_policy_of_the_page_is_served_and_scored_by_its_commands(
     tmp_path: Path, empty_caches: Path
 ) -> None:

@@ -41,6 +41,12 @@ def keep(values: dict[str, Any], table: str, kept: Any) -> None:
     values[table] = {name: [row[name] for row in rows if kept(row)] for name in columns}
 
 
+def keep_entries(values: dict[str, Any], kept: Any) -> None:
+    """Leave out the entries for which `kept(name)` is false."""
+    for name in [name for name in values if not kept(name)]:
+        del values[name]
+
+
 def shorten(values: dict[str, Any], split: str, step: int) -> None:
     """Let the first success of a split at a step of a stage come a step earlier."""
     episodes = values["episodes"]
@@ -121,6 +127,11 @@ FORGERIES = {
         "definition: task left, questions differ from the installed code",
         set_in("fingerprint.definition", **{"task left": "0", "questions": "1"}),
     ),
+    "no definition": Forgery(
+        "recomputed",
+        "record: ",
+        lambda values: values["fingerprint"].pop("definition"),
+    ),
     "a larger budget": Forgery(
         "recomputed", "what was run: scenario.budget", set_in("scenario.budget", adaptation_steps=61)
     ),
@@ -158,6 +169,9 @@ FORGERIES = {
     ),
     "a correct answer at the end": Forgery(
         "replayed", "answers: different counts", lambda values: answer_more(values, 60)
+    ),
+    "another pretrained policy": Forgery(
+        "replayed", "pretraining does not give the same policy", set_in("fingerprint", pretrained="0" * 16)
     ),
     # ---- what only the whole run says
     "a success on the way": Forgery(
@@ -198,15 +212,17 @@ FORGERIES = {
         "origin: the record states what is not so here: method authors somebody is None here",
         set_in("fingerprint.method", authors="somebody"),
     ),
-    "another pretrained policy": Forgery(
-        "retrained", "pretrained 0000000000000000 is ", set_in("fingerprint", pretrained="0" * 16)
-    ),
     # ---- what no repetition can see: the reasons are in docs/guide/security.md
     "another commit": Forgery(None, "", set_in("fingerprint.commit", id="0" * 40)),
     "another version of Python": Forgery(None, "", set_in("fingerprint", python="3.12.0")),
     "another processor": Forgery(None, "", set_in("fingerprint.hardware", processor="Abacus")),
     "another time of day": Forgery(None, "", set_in("timing", started="2001-01-01T00:00:00+00:00")),
     "a faster run": Forgery(None, "", set_in("timing", seconds=0.01)),
+    "no success rules": Forgery(
+        None,
+        "",
+        lambda values: keep_entries(values["fingerprint"]["definition"], lambda name: "rule" not in name),
+    ),
     "another source of the method": Forgery(None, "", set_in("fingerprint.method", source="0" * 16)),
 }
 """Lies of one record, by what they claim."""

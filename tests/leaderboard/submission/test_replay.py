@@ -1,14 +1,17 @@
-"""Replaying: the policies that a run kept on a machine whose last bits differ."""
+"""Replaying: the policies that a run kept must begin where pretraining ends."""
 
+import importlib
 import json
 import shutil
 from pathlib import Path
 
 import pytest
 from safetensors.torch import load_file, save_file
-from verification import verify
+from verification import edit, verify
 
 from clbench.base.cache import MANIFEST, cached
+
+tiers = importlib.import_module("clbench.leaderboard.board.tiers")
 
 
 @pytest.fixture
@@ -29,8 +32,23 @@ def elsewhere(honest: Path, tmp_path: Path) -> Path:
     return tmp_path / "elsewhere"
 
 
-def test_policies_of_another_processor_are_trained_on_from_their_own_normalisation(
+def test_policies_that_follow_from_another_start_than_pretraining_gives_are_refused(
     mine: Path, elsewhere: Path
 ) -> None:
     checks = verify(mine, "replayed", elsewhere)
-    assert [check.passed for check in checks if check.name == "from stage to stage"] == [True]
+    found = {check.name: check.passed for check in checks}
+    assert found["from stage to stage"] is True
+    assert found["start"] is False
+    assert tiers.tier_of(mine) == "recomputed"
+
+
+def test_the_record_of_a_machine_that_pretrains_otherwise_cannot_be_replayed_here(
+    mine: Path, honest: Path
+) -> None:
+    edit(
+        mine,
+        lambda values: values["fingerprint"].update(pretrained="0" * 16, hardware={"instructions": "NEON"}),
+    )
+    (check,) = (check for check in verify(mine, "replayed", honest) if check.passed is None)
+    assert "(instructions of its processor: NEON, here: " in check.found
+    assert tiers.tier_of(mine) == "recomputed"

@@ -233,6 +233,35 @@ def test_the_file_of_a_higher_tier_stays_unless_a_check_fails(mine: Path, honest
     assert not file.exists()
 
 
+@pytest.mark.parametrize("typo", [{"scenario": "typo:clbench/Toy-v0"}, {"scenario": f"{TOY}x"}], ids=str)
+def test_a_wrong_name_of_the_verifier_takes_no_tier_back(
+    typo: dict[str, str], mine: Path, honest: Path
+) -> None:
+    verify(mine, "replayed", honest)
+    stored = tiers.verification_path(mine).read_bytes()
+    checks = verify(mine, "replayed", honest, **typo)
+    assert not any(check.passed is False for check in checks)
+    assert tiers.verification_path(mine).read_bytes() == stored
+
+
+def test_a_check_that_fails_leaves_the_tier_below(mine: Path, honest: Path) -> None:
+    edit(mine, lambda values: flip(values, 0, 60))
+    claimed = {"tier": "retrained", "record": hashlib.sha256(mine.read_bytes()).hexdigest()}
+    tiers.verification_path(mine).write_text(tiers.verification_text(claimed), encoding="utf-8")
+    assert "episodes: 1 of" in failures(verify(mine, "replayed", honest))
+    assert tiers.tier_of(mine) == "recomputed"
+
+
+def test_a_record_that_is_named_twice_is_verified_once(
+    mine: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = importlib.import_module("clbench.leaderboard.cli").verify
+    records = next(folder for folder in mine.parents if folder.name == "records")
+    options: dict[str, Any] = {"tier": "recomputed", "scenario": TOY, "records": records, "workers": 1}
+    command(mine.parent, mine, as_json=True, **options)
+    assert len(json.loads(capsys.readouterr().out)) == 1
+
+
 def test_a_module_that_a_record_names_is_not_imported_unless_the_verifier_allows_it(
     mine: Path, honest: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -316,7 +345,8 @@ def test_the_command_prints_json_of_good_and_bad_records(
     assert (good["passed"], good["tier"], good["failure"]) == (True, "recomputed", None)
     assert good["checks"]
     assert all(check["passed"] for check in good["checks"])
-    assert (bad_one["passed"], bad_one["tier"], bad_one["checks"]) == (False, "self-reported", [])
+    assert (bad_one["passed"], bad_one["tier"]) == (False, "self-reported")
+    assert [(check["name"], check["passed"]) for check in bad_one["checks"]] == [("record", False)]
     assert str(bad) in bad_one["path"]
     assert bad_one["failure"]
 
@@ -326,6 +356,7 @@ def test_the_command_prints_json_of_good_and_bad_records(
     [
         ({"pretrain": True}, "add --tier retrained"),
         ({"tier": "replay"}, "Did you mean 'replayed'?"),
+        ({"checkpoints": Path("nowhere")}, "There is no folder nowhere. --checkpoints names the folder"),
         ({"paths": ["nowhere.json"]}, "There is no record at nowhere.json"),
         ({"paths": []}, "There is no record to verify"),
         ({"records": Path("elsewhere/records")}, "elsewhere/records: name its folder of records"),

@@ -95,7 +95,7 @@ def test_the_terminal_shows_gain_and_kept(
     assert max(map(len, lines)) <= 108
     row = next(line.split() for line in lines if " finch " in line)
     assert row[3].startswith("0.60±")  # skills and first target at .5, the last at .9
-    assert row[4].startswith("0.30±")  # sft: skills and first target at .1
+    assert row[4].startswith("+0.30±")  # sft: skills and first target at .1
     assert row[-4:] == ["-", "-", "0", "0"]
 
 

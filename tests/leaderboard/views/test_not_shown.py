@@ -157,7 +157,8 @@ def test_a_record_of_another_definition_of_a_scenario_of_the_project_is_not_show
         edit = set_in("fingerprint", "definition", definition)
         add_full("sft", seed, edit=edit, scenario="clbench/Fetch-v1", place=f"Fetch-v1/sft/seed-{seed}.json")
     for text in shown():
-        assert "Fetch-v1/sft/seed-0.json" not in flat(text)  # older than definitions
+        words = "fingerprint.definition must be an object, the parts of its scenario."
+        assert f"Fetch-v1/sft/seed-0.json: a record of schema 5: {words}" in flat(text)
         assert "Fetch-v1/sft/seed-1.json" not in flat(text)
         words = "it was made with another clbench/Fetch-v1"
         assert f"Fetch-v1/sft/seed-2.json: {words}: task press, questions differ." in flat(text)

@@ -21,7 +21,10 @@ REPLAY = {"demonstrations": "throughout", "questions": "never", "reference": Fal
 MATRIX = np.array([[1.0, 0.8, 0.1, 0.0, 0.2], [0.6, 0.9, 0.9, 0.2, 0.3], [0.5, 0.4, 0.3, 0.8, 0.1]])
 DESKTOP, PHONE = {"width": 1280, "height": 860}, {"width": 390, "height": 844}
 
-pytestmark = pytest.mark.skipif(not CHROMIUM, reason="there is no chromium: apt-get install chromium")
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(not CHROMIUM, reason="there is no chromium: apt-get install chromium"),
+]
 
 
 @pytest.fixture(scope="module")
@@ -255,7 +258,6 @@ def test_on_a_phone_nothing_is_wider_than_the_screen(open_page: Callable[..., Pa
     assert page.evaluate(width) == PHONE["width"]
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("color_scheme", ["light", "dark"])
 @pytest.mark.parametrize("place", ["overall", "clbench/Toy-v0", "clbench/Toy-v0/l2"])
 def test_axe_finds_nothing_serious(place: str, color_scheme: str, open_page: Callable[..., Page]) -> None:

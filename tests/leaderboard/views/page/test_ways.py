@@ -16,7 +16,10 @@ compute_board = resolve("clbench.leaderboard.board.rows:compute_board")
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 EVEN = "clbench/Even-v1"
 
-pytestmark = pytest.mark.skipif(not CHROMIUM, reason="there is no chromium: apt-get install chromium")
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(not CHROMIUM, reason="there is no chromium: apt-get install chromium"),
+]
 
 
 @pytest.fixture

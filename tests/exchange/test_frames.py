@@ -1,19 +1,19 @@
-"""Records as tables of pandas."""
+"""Records as one table: what it has, and which files it leaves out."""
 
+import json
 import logging
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-import pandas
 import pytest
+from helpers import sealed
 
 import clbench
 from clbench.base.errors import NoRecordsError
 from clbench.records.paths import record_path
 from clbench.records.record import Record
 from clbench.records.writer import write_record
-from clbench.scoring.scores import Scores
 
 RATES = [[1.0, 0.5, 0.0, 0.0, 0.25], [0.5, 0.25, 1.0, 0.0, 0.0], [0.0, 0.5, 0.75, 1.0, 0.0]]
 
@@ -49,43 +49,36 @@ def test_an_empty_folder_gives_an_empty_table_and_a_missing_one_an_error(tmp_pat
         clbench.load_records(tmp_path / "nowhere")
 
 
-def test_a_record_has_a_labelled_matrix_that_equals_its_scores(records: Path) -> None:
-    record = clbench.read_record(str(next(records.rglob("seed-0.json"))))
-    matrix = record.matrix()
-    assert list(matrix.index) == ["pretrained", *record.scenario.target]
-    assert matrix.columns.names == ["group", "task"]
-    np.testing.assert_allclose(matrix.to_numpy(), RATES)
-    np.testing.assert_allclose(matrix.to_numpy(), Scores.from_record(record).success.mean(axis=-1))
-    assert matrix["retained"].shape == (3, 2)
-    assert len(record.frame()) == len(record.episodes["task"])
+def test_a_policy_of_another_name_is_told_apart(tmp_path: Path, make_record: Callable[..., Record]) -> None:
+    for policy in ("flow", "discrete_diffusion"):
+        record = make_record(RATES, episodes=4, policy=policy)
+        write_record(record, record_path(tmp_path, "clbench/Toy-v0", "sft", 0, policy=policy))
+    found = clbench.load_records(tmp_path)
+    assert set(found.policy) == {"flow", "discrete_diffusion"}
+    assert not found.duplicated(["policy", "stage", "step", "task", "split", "episode"]).any()
 
 
-def test_records_and_scenarios_say_in_a_line_what_they_are(records: Path) -> None:
-    record = clbench.read_record(next(records.rglob("seed-0.json")))
-    assert repr(record).startswith("<Record of sft on clbench/Toy-v0, seed 0: success, ")
-    assert len(repr(record)) < 100
-    html = record._repr_html_()
-    assert "&lt;Record of sft" in html
-    assert "<table" in html
-    text = repr(clbench.load_scenario("clbench.testing:clbench/Toy-v0"))
-    assert text == "<Scenario clbench/Toy-v0: retained left, up; targets right, down; held out up_left>"
+def test_a_second_record_of_a_run_is_left_out(records: Path, caplog: pytest.LogCaptureFixture) -> None:
+    before = clbench.load_records(records)
+    path = record_path(records, "clbench/Toy-v0", "sft", 0)
+    path.with_name("seed-0 again.json").write_bytes(path.read_bytes())
+    with caplog.at_level(logging.WARNING):
+        assert len(clbench.load_records(records)) == len(before)
+    assert "its run has another record" in caplog.text
 
 
-def test_notebooks_show_scenarios_and_tasks_as_tables() -> None:
-    scenario = clbench.load_scenario("clbench.testing:clbench/Toy-v0")
-    shown = scenario._repr_html_()
-    assert shown.count("<tr>") == 1 + len(scenario.tasks)
-    assert "<td>held out</td><td>up_left</td>" in shown
-    task = scenario.task("right")
-    shown = task._repr_html_()
-    assert "<br>".join(task.instructions) in shown
-    assert f"<td>horizon</td><td>{task.horizon}</td>" in shown
-    assert "<td>camera</td>" not in shown
-
-
-def test_the_table_of_a_run_that_failed_at_once_is_empty(make_record: Callable[..., Record]) -> None:
-    record = make_record(RATES, episodes=4)
-    for column in record.episodes.values():
-        column.clear()
-    assert isinstance(record.frame(), pandas.DataFrame)
-    assert record.frame().empty
+@pytest.mark.parametrize(
+    ("column", "value"),
+    [("stage", "abc"), ("stage", 99), ("success", 5), ("episode", 1.7), ("task", "x")],
+)
+def test_a_record_with_an_impossible_value_is_left_out_by_name(
+    column: str, value: object, records: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = record_path(records, "clbench/Toy-v0", "sft", 0)
+    values = json.loads(path.read_text(encoding="utf-8"))
+    values["episodes"][column][0] = value
+    path.write_text(json.dumps(sealed(values)), encoding="utf-8")
+    with caplog.at_level(logging.WARNING):
+        found = clbench.load_records(records)
+    assert set(found.method) == {"lora+rank=4"}
+    assert f"{path}: episodes: row 0" in caplog.text

@@ -1,0 +1,69 @@
+"""Records as tables of pandas."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pandas
+import pytest
+
+import clbench
+from clbench.records.paths import record_path
+from clbench.records.record import Record
+from clbench.records.writer import write_record
+from clbench.scoring.scores import Scores
+
+RATES = [[1.0, 0.5, 0.0, 0.0, 0.25], [0.5, 0.25, 1.0, 0.0, 0.0], [0.0, 0.5, 0.75, 1.0, 0.0]]
+
+
+@pytest.fixture
+def records(tmp_path: Path, make_record: Callable[..., Record]) -> Path:
+    """Return a folder with two records, one of them with changed settings, and a file that is none."""
+    for method, seed, changes in (("sft", 0, {}), ("lora", 3, {"rank": 4})):
+        record = make_record(RATES, episodes=4, method=method, seed=seed, changes=changes, settings=changes)
+        name = "lora+rank=4" if changes else method
+        write_record(record, record_path(tmp_path, "clbench/Toy-v0", name, seed))
+    (tmp_path / "notes.json").write_text("{}")
+    return tmp_path
+
+
+def test_a_record_has_a_labelled_matrix_that_equals_its_scores(records: Path) -> None:
+    record = clbench.read_record(str(next(records.rglob("seed-0.json"))))
+    matrix = record.matrix()
+    assert list(matrix.index) == ["pretrained", *record.scenario.target]
+    assert matrix.columns.names == ["group", "task"]
+    np.testing.assert_allclose(matrix.to_numpy(), RATES)
+    np.testing.assert_allclose(matrix.to_numpy(), Scores.from_record(record).success.mean(axis=-1))
+    assert matrix["retained"].shape == (3, 2)
+    assert len(record.frame()) == len(record.episodes["task"])
+
+
+def test_records_and_scenarios_say_in_a_line_what_they_are(records: Path) -> None:
+    record = clbench.read_record(next(records.rglob("seed-0.json")))
+    assert repr(record).startswith("<Record of sft on clbench/Toy-v0, seed 0: success, ")
+    assert len(repr(record)) < 100
+    html = record._repr_html_()
+    assert "&lt;Record of sft" in html
+    assert "<table" in html
+    text = repr(clbench.load_scenario("clbench.testing:clbench/Toy-v0"))
+    assert text == "<Scenario clbench/Toy-v0: retained left, up; targets right, down; held out up_left>"
+
+
+def test_notebooks_show_scenarios_and_tasks_as_tables() -> None:
+    scenario = clbench.load_scenario("clbench.testing:clbench/Toy-v0")
+    shown = scenario._repr_html_()
+    assert shown.count("<tr>") == 1 + len(scenario.tasks)
+    assert "<td>held out</td><td>up_left</td>" in shown
+    task = scenario.task("right")
+    shown = task._repr_html_()
+    assert "<br>".join(task.instructions) in shown
+    assert f"<td>horizon</td><td>{task.horizon}</td>" in shown
+    assert "<td>camera</td>" not in shown
+
+
+def test_the_table_of_a_run_that_failed_at_once_is_empty(make_record: Callable[..., Record]) -> None:
+    record = make_record(RATES, episodes=4)
+    for column in record.episodes.values():
+        column.clear()
+    assert isinstance(record.frame(), pandas.DataFrame)
+    assert record.frame().empty
