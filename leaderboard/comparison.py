@@ -52,8 +52,8 @@ def compare(
         device: Device on which policies are computed, for example "cpu" or "cuda".
 
     Returns:
-        One row for each method, by division, the best first, with the columns of `clbench.load_board`:
-        each metric with its interval, the costs, and in `groups` which methods are not told apart.
+        One row for each method, by division, the best first. The columns are those of `clbench.load_board`,
+        such as each metric with its interval, the costs, and in `groups` which methods are not told apart.
 
     Raises:
         UnknownNameError: There is no such scenario or method.

@@ -43,6 +43,7 @@ PARTS = ("envs", "methods", "leaderboard")
 USERS_OF_THE_COMMAND_LINE = (
     "clbench.cli",
     "clbench.leaderboard.cli",
+    "clbench.leaderboard.pages.cli",
     "clbench.envs.dm_control.expert_training.cli",
 )
 """The modules and packages that define commands: nothing else imports `clbench.cli`."""

@@ -18,13 +18,14 @@ from cyclopts import (
     Parameter,
     Token,
     UnknownCommandError,
+    UnusedCliTokensError,
 )
 from cyclopts.validators import Number
 from rich.console import Console
 from rich.text import Text
 
 from clbench.base.entry_points import unknown
-from clbench.base.errors import ClbenchError
+from clbench.base.errors import ClbenchError, InputError
 from clbench.base.text import printable
 from clbench.spec.policies import SIZES, policy_names
 from clbench.spec.protocol import LARGEST_SEED, MOST_SEEDS
@@ -96,6 +97,22 @@ def print_json(values: object) -> None:
     sys.stdout.write(f"{json.dumps(values, indent=1, allow_nan=False)}\n")
 
 
+def listed(option: str, text: str) -> list[str]:
+    """Return the items of a list with commas, each once and without the space around it.
+
+    Args:
+        option: Name of the option or argument.
+        text: The list.
+
+    Raises:
+        InputError: An item is empty.
+    """
+    items = [item.strip() for item in text.split(",")]
+    if "" in items:
+        raise InputError(f"{option} has an empty item: {text!r}. Write names with a comma between them.")
+    return list(dict.fromkeys(items))
+
+
 def check_names(scenarios: Iterable[str], methods: Iterable[str]) -> None:
     """End with exit code 2 if a name is not known, before anything heavy is imported."""
     from clbench.spec.identifiers import check_known
@@ -124,6 +141,9 @@ def parsing_error(error: CycloptsError) -> Text:
         # the message of cyclopts imports every command
         commands = [name for name in error.app if not name.startswith("-")]
         return error_line(unknown("command", error.unused_tokens[0], commands))
+    if isinstance(error, UnusedCliTokensError) and error.unused_tokens and error.command_chain:
+        command, words = " ".join(error.command_chain), " ".join(error.unused_tokens)
+        return error_line(f"{command} does not take {words!r}: see clbench {command} --help.")
     token = error.token if isinstance(error, CoercionError) else None
     if token is not None and token.keyword in BY_NAME:
         name, _, value = token.value.partition("=")

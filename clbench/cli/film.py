@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 from rich.console import Console
 
+from clbench.base.cache import hash_of
 from clbench.base.errors import InputError
 from clbench.cli.arguments import (
     MethodName,
@@ -18,9 +19,13 @@ from clbench.cli.arguments import (
     add_cwd_to_path,
     check_names,
     checked_input,
+    listed,
     whole_number,
 )
 from clbench.jobs.folders import check_folders
+
+LONGEST_NAME = 120
+"""Characters of a film's name before a hash; file systems take 255 bytes."""
 
 if TYPE_CHECKING:
     from clbench.policy.policy import Policy
@@ -80,11 +85,13 @@ def film(
         check_device(device)
         runs = [RunSpec(scenario, name, seed, changes or {}, device).resolve() for name in methods]
         loaded = runs[0].scenario
-        shown = [loaded.task(name) for name in tasks.split(",")] if tasks else loaded.retained + loaded.target
+        shown = loaded.retained + loaded.target
+        if tasks is not None:
+            shown = tuple(loaded.task(name) for name in listed("--tasks", tasks))
         last = len(loaded.target)
         numbers = [0, last] if stages is None and len(runs) > 1 else _numbers("--stages", stages, last)
         (episode,) = _numbers("--episode", str(episode), loaded.budget.validation_episodes - 1)
-        path = output or _path(runs)
+        path = output or _path(runs, tasks, stages, episode)
         check_format(path)
         check_folders({"--output": path.parent})
         choose_back_end(task.world for task in shown)
@@ -98,12 +105,18 @@ def film(
         bars.finish("film", f"{path} ({width} x {height} pixels, {path.stat().st_size / 1e6:.1f} MB)")
 
 
-def _path(runs: Sequence[ResolvedRun]) -> Path:
-    """Return the path of a film without --output."""
+def _path(runs: Sequence[ResolvedRun], tasks: str | None, stages: str | None, episode: int) -> Path:
+    """Return the path of a film without --output. Films of other tasks, stages or episodes have others."""
     from clbench.runs.film import FILMS
 
     path = runs[0].path(FILMS)
-    return path.parents[1] / ",".join(run.path(FILMS).parent.name for run in runs) / f"{path.stem}.gif"
+    lists = {"tasks": tasks, "stages": stages}
+    chosen = {name: None if text is None else ",".join(listed(name, text)) for name, text in lists.items()}
+    chosen["episode"] = str(episode) if episode else None
+    name = "+".join([path.stem, *(f"{name}={value}" for name, value in chosen.items() if value is not None)])
+    if len(name) > LONGEST_NAME:
+        name = f"{name[:LONGEST_NAME]}+{hash_of(name)}"
+    return path.parents[1] / ",".join(run.path(FILMS).parent.name for run in runs) / f"{name}.gif"
 
 
 def _policies(
@@ -125,7 +138,7 @@ def _numbers(option: str, text: str | None, last: int) -> list[int]:
     """Return the numbers from 0 to `last` that an option lists; all if it was not given."""
     if text is None:
         return list(range(last + 1))
-    words = text.split(",")
+    words = listed(option, text)
     if not all(word.isdecimal() and int(word) <= last for word in words):
         raise InputError(f"{option} takes numbers from 0 to {last}, not {text}.")
     return [int(word) for word in words]

@@ -44,10 +44,10 @@ COMMANDS = {
         "cache": "clbench.cli.cache:cache",
     },
     "Pages": {
-        "claims": "clbench.leaderboard.cli:claims",
-        "findings": "clbench.leaderboard.cli:findings",
-        "method-pages": "clbench.leaderboard.cli:method_pages",
-        "scenario-card": "clbench.leaderboard.cli:scenario_card",
+        "claims": "clbench.leaderboard.pages.cli:claims",
+        "findings": "clbench.leaderboard.pages.cli:findings",
+        "method-pages": "clbench.leaderboard.pages.cli:method_pages",
+        "scenario-card": "clbench.leaderboard.pages.cli:scenario_card",
     },
 }
 """Entry points of the commands, in the groups of `clbench --help`."""
@@ -63,6 +63,7 @@ NAMES = {
     "verify": "PATHS...",
     "scenario-card": "[SCENARIOS...]",
     "export": "SCENARIO [TASKS...]",
+    "measure": "SCENARIO [TASKS...]",
 }
 """Arguments in the first line of a command's help, where Cyclopts would show [ARGS...]."""
 

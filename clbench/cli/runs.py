@@ -7,7 +7,7 @@ import sys
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 from rich.console import Console
@@ -25,8 +25,10 @@ from clbench.cli.arguments import (
     add_cwd_to_path,
     check_names,
     checked_input,
+    listed,
     whole_number,
 )
+from clbench.jobs.folders import check_folders
 from clbench.records.paths import RECORDS, record_path
 from clbench.spec.policies import DEFAULT_POLICY, SMALL, policy_name
 from clbench.spec.protocol import DEFAULT_SEEDS
@@ -96,7 +98,9 @@ def run(
         dry_run: Only say what would be done, with the time and the disk to expect.
         quiet: Print nothing but failures.
     """
-    check_names(scenarios.split(","), methods)
+    with checked_input():
+        ids = listed("SCENARIOS", scenarios)
+    check_names(ids, methods)
     from clbench.runs.spec import RunSpec, check_device
     from clbench.runs.tensorboard import require_tensorboard
     from clbench.scoring.expected_precision import expected_precision
@@ -110,6 +114,7 @@ def run(
         spec = RunSpec("", "", first_seed, changes or {}, device, order=order, perturb=perturb, policy=name)
         runs = requested(scenarios, methods, every, seeds, spec, records)
         chosen = _part(shard, runs)
+        check_folders({"--records": records, "--checkpoints": checkpoints, "--tensorboard": tensorboard})
     console = Console(stderr=True, quiet=quiet)
     for scenario in {run.spec.scenario: run.scenario for run in runs}.values():
         console.print(expected_precision(scenario, seeds), highlight=False)
@@ -135,12 +140,14 @@ def score(
     data: str | None = None,
     steps: Annotated[int | None, whole_number(0)] = None,
     timeout: Annotated[int, whole_number(1)] = 300,
+    restart: Annotated[bool, Parameter(negative="")] = False,
     records: Path = RECORDS,
 ) -> None:
     """Score a policy that a server offers on SCENARIO, after each stage of its fine-tuning elsewhere.
 
     Score each stage once and in order: 0 before the first target, k after fine-tuning on target k. A stage
-    that is done is skipped. The last stage writes the record.
+    that is done is skipped. The last stage writes the record. If the server is not up yet, the command waits
+    for it for 10 minutes.
 
     Args:
         scenario: Gymnasium id of the scenario.
@@ -148,11 +155,13 @@ def score(
         stage: Stage after whose fine-tuning the policy is evaluated.
         method: Name of the row on the leaderboard, for example me/lora.
         seed: Seed of the run. It chooses the initial states, the same for all methods.
-        execute: Actions of each chunk that are executed before the policy acts again (default: all). It
-            is the same in all stages.
+        execute: Actions of each chunk that are executed before the policy acts again (default: all). The
+            number is the same in all stages.
         data: What the policy was trained on in this stage, in words. The record keeps it.
         steps: Optimiser steps of the stage. The record keeps them.
         timeout: Seconds that a reply may take; a first one may include compilation.
+        restart: Score the stage although it is done: it is dropped, and later stages with it. A finished
+            record stays.
         records: Folder of the records.
     """
     check_names([scenario], [])
@@ -160,40 +169,42 @@ def score(
         require("websockets", "serve", "A policy of another program")
         require("msgpack", "serve", "A policy of another program")
     from clbench.jobs.bars import Bars
+    from clbench.runs.agents import UNFINISHED
     from clbench.serving.client import ServedPolicy
-    from clbench.serving.score import is_scored
+    from clbench.serving.score import described, is_scored
     from clbench.serving.score import score as evaluate
 
     add_cwd_to_path()
     console, piece = Console(stderr=True), f"stage {stage}"
+    options: dict[str, Any] = {
+        "stage": stage,
+        "method": method,
+        "seed": seed,
+        "executed": execute,
+        "data": data,
+        "steps": steps,
+        "restart": restart,
+        "records": records,
+    }
     with checked_input():
-        if is_scored(scenario, stage=stage, method=method, seed=seed, records=records):
+        if is_scored(scenario, **options):
             console.print(f"Stage {stage} of {method}, seed {seed}, is done.", highlight=False, markup=False)
             return
         served = ServedPolicy(policy, timeout)
         with Bars(1.0, console) as bars:
             bars.start(piece, 1.0)
-            record = evaluate(
-                scenario,
-                served,
-                stage=stage,
-                method=method,
-                seed=seed,
-                executed=execute,
-                data=data,
-                steps=steps,
-                records=records,
-                progress=lambda share: bars.advance(piece, share),
-            )
-            bars.finish(piece, _rates(record))
+            record = evaluate(scenario, served, **options, progress=lambda share: bars.advance(piece, share))
+            server = record.diagnostics[str(stage)].get("server")
+            bars.finish(piece, _rates(record) + (f" (server: {described(server)})" if server else ""))
         served.close()
-    targets = record.scenario.target
+    targets, path = record.scenario.target, record_path(records, record.run.scenario, method, seed)
     if stage < len(targets):
         then = (
+            f"Stages so far: {path}{UNFINISHED}\n"
             f"Next: fine-tune on {targets[stage]}, serve the policy, and score it with --stage {stage + 1}."
         )
     else:
-        then = f"Record: {record_path(records, record.run.scenario, method, seed)}\n{_next(records)}"
+        then = f"Record: {path}\n{_next(records)}"
     console.print(then, highlight=False, markup=False, soft_wrap=True)
 
 
@@ -227,7 +238,7 @@ def requested(
         raise InputError("Name at least one method, or --all; `clbench list` shows them.")
     runs = [
         replace(first, scenario=scenario, method=name, seed=seed).resolve()
-        for scenario in dict.fromkeys(scenarios.split(","))
+        for scenario in listed("SCENARIOS", scenarios)
         for seed in range(first.seed, first.seed + seeds)
         for name in names
     ]

@@ -23,6 +23,7 @@ from clbench.cli.arguments import (
     add_cwd_to_path,
     check_names,
     checked_input,
+    listed,
     whole_number,
 )
 from clbench.cli.runs import do_runs
@@ -103,6 +104,11 @@ def tune(
             raise InputError("--targets goes with --values: settings are chosen on all targets.")
         if write is not None and values:
             raise InputError("--write goes without --values: with them nothing is chosen.")
+        if write is not None and first_seed < FIRST_SEED:
+            raise InputError(
+                f"--write needs seeds that no board has: --first-seed must be at least {FIRST_SEED}, not "
+                f"{first_seed}."
+            )
         if fixed and values:
             raise InputError("--set goes without --values: give the value as --values.NAME.")
         if not values:  # their runs would choose settings that no run reads
@@ -113,8 +119,8 @@ def tune(
         if write is not None:
             check_tuned(write, numbers, names)
         ladder = {name: rungs(cls, fixed) for name, cls in classes.items()}
+        combinations = _combinations(values or {})
     if values:
-        combinations = _combinations(values)
         found = run({BASELINE: [{}], **dict.fromkeys(names, combinations)})
         Console().print(_table(scenario, {name: (None, one) for name, one in found.items()}, seeds))
         return
@@ -156,7 +162,7 @@ def _without_controls(names: list[str], controls: Mapping[str, str], every: bool
 
 def _combinations(values: Mapping[str, str]) -> list[dict[str, str]]:
     """Return every combination of the values that are separated by commas."""
-    lists = [[(name, value) for value in text.split(",")] for name, text in values.items()]
+    lists = [[(name, value) for value in listed(f"--values.{name}", text)] for name, text in values.items()]
     return [dict(combination) for combination in itertools.product(*lists)]
 
 

@@ -11,6 +11,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeAlias
 
+from rich.console import Console
+from rich.text import Text
+
 from clbench.base.leftovers import unfinished
 from clbench.scoring.intervals import Estimate
 from clbench.scoring.metric import Metric
@@ -280,3 +283,10 @@ def write_all(texts: Mapping[Path, str]) -> list[Path]:
         for partial in partials.values():
             partial.unlink(missing_ok=True)
     return list(texts)
+
+
+def print_written(paths: Iterable[Path]) -> None:
+    """Print the paths of files that were written."""
+    console = Console()
+    for path in paths:
+        console.print(Text(f"Written: {path}"), soft_wrap=True)

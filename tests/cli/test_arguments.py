@@ -20,6 +20,132 @@ def test_a_path_may_begin_with_the_home_folder(
     assert f"There are no runs in {tmp_path}/somewhere" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (
+            ["run", "clbench/Fecth-v1", "sft"],
+            "No scenario is called 'clbench/Fecth-v1'. Did you mean 'clbench/Fetch-v1'",
+        ),
+        (["run", "clbench/Fetch-v1", "stf"], "No method is called 'stf'. Did you mean 'sft'?"),
+        (["run", "clbench/Fetch-v1"], "Name at least one method"),
+        (
+            ["run", "clbench/Fetch-v1", "sft", "--sedes", "3"],
+            "Unknown option: --sedes. Did you mean --seeds?",
+        ),
+        (["run", "clbench/Fetch-v1", "sft", "--seeds", "0"], 'Invalid value "0" for --seeds. Must be >= 1.'),
+        (["run", "clbench/Fetch-v1", "sft", "--seeds", "many"], "--seeds"),
+        (
+            ["run", "clbench/Fetch-v1", "sft", "--seeds", "1.5"],
+            "--seeds: it must be a whole number, not '1.5'",
+        ),
+        (["run", "clbench/Fetch-v1", "sft", "--workers", "1.4"], "it must be a whole number, not '1.4'"),
+        (["run", "../../etc:clbench/X-v0", "sft"], "No module '../../etc' can be imported for"),
+        (
+            ["run", "clbench/Fetch-v1", "sft", "--workers", "0"],
+            'Invalid value "0" for --workers. Must be >= 1.',
+        ),
+        (["run", "clbench/Fetch-v1", "sft", "--set.rate", "1"], "sft has no hyper-parameter 'rate'"),
+        (
+            ["run", "clbench/Fetch-v1", "experience_replay", "--set.replay", "x"],
+            "replay must be a number, not 'x'",
+        ),
+        (
+            ["run", "clbench/Fetch-v1", "experience_replay", "--set.replay", "7"],
+            "replay must be from 0 to 1, not 7.0",
+        ),
+        (["run", "clbench/Fetch-v1", "sft", "--device", "gpu"], "The device 'gpu' cannot be used"),
+        (["run", "clbench/Fetch-v1", "sft", "--device", "mps"], "from the 'MPS' backend.\n"),
+        (["tune", "clbench/Fetch-v1", "sft", "--device", "gpu"], "The device 'gpu' cannot be used"),
+        (["submit", "sft", "--device", "gpu"], "The device 'gpu' cannot be used"),
+        (["run", "clbench/Fetch-v1,clbench/PointMase-v1", "sft"], "Did you mean 'clbench/PointMaze-v1'?"),
+        (["run", "clbench/Fetch-v1", "sft", "--shard", "0/8"], "--shard must be i/n with i from 1 to n"),
+        (["run", "clbench/Fetch-v1", "sft", "--shard", "9/8"], "--shard must be i/n with i from 1 to n"),
+        (["run", "clbench/Fetch-v1", "sft", "--shard", "half"], "for example 2/8, not 'half'"),
+        (["demonstrations", "clbench/Fetch"], "Did you mean 'clbench/Fetch-v"),
+        (["demonstrations", "clbench/Fetch-v1", "--workers", "0"], "Must be >= 1."),
+        (["pretrain", "clbench/Fetch"], "Did you mean 'clbench/Fetch-v"),
+        (["pretrain", "clbench/Fetch-v1", "--seed", "-1"], "Must be >= 0."),
+        (["submit", "sft", "--seeds", "0"], 'Invalid value "0" for --seeds. Must be >= 1.'),
+        (["submit", "sft", "--first-seed", "-1"], "Must be >= 0."),
+        (["verify", "x.json", "--episodes", "0"], 'Invalid value "0" for --episodes. Must be >= 1.'),
+        (["scenario-card", "--episodes", "0"], 'Invalid value "0" for --episodes. Must be >= 1.'),
+        (["cache", "--older-than", "-1"], "Must be >= 0."),
+        (
+            ["film", "clbench/Fetch-v1", "sft", "--size", "20"],
+            'Invalid value "20" for --size. Must be >= 96.',
+        ),
+        (["tune", "clbench/Fetch-v1", "sft", "--values.x", "1", "--targets", "0"], "Must be >= 1."),
+        (["tune", "clbench/Fetch-v1", "sft", "--targets", "1"], "--targets goes with --values"),
+        (
+            ["tune", "clbench/Fetch-v1", "sft", "--values.step_factor", "1", "--write", "chosen.json"],
+            "--write goes without --values",
+        ),
+        (["tune", "clbench/Fetch-v1", "consft", "--set.tau_start", "1"], "Tuning ConSFT sets tau_start"),
+        (["tune", "clbench/Fetch-v1", "sft", "--values.x", "1", "--set.y", "1"], "--set goes without"),
+        (
+            ["tune", "clbench/Fetch-v1", "sft", "shuffled_weights"],
+            "has its settings: tune consft_calibrated.",
+        ),
+        (
+            ["tune", "clbench/Fetch-v1", "consft", "--values.kapa", "1,2"],
+            "consft has no hyper-parameter 'kapa'. Did you mean 'kappa'?",
+        ),
+        (
+            ["tune", "clbench/Fetch-v1", "consft", "--values.omega_min", "0.1,2"],
+            "omega_min must be from 0 to 1, not 2.0",
+        ),
+        (
+            ["tune", "clbench/Fetch-v1", "sft", "--first-seed", "0", "--write", "chosen.json"],
+            "--write needs seeds that no board has: --first-seed must be at least 100, not 0.",
+        ),
+        (["tune", "clbench/Fetch-v1", "sft", "--values.x", "1,,2"], "--values.x has an empty item: '1,,2'."),
+        (["run", "clbench/Fetch-v1, ", "sft"], "SCENARIOS has an empty item: 'clbench/Fetch-v1, '."),
+        (
+            ["run", "clbench/Fetch-v1", "sft", "--records", "/proc/x", "--dry-run"],
+            "/proc/x cannot be written",
+        ),
+        (["status", "--seeds", "99"], "Such options choose among the runs of a scenario: name it."),
+        (["list", "foo"], "list does not take 'foo': see clbench list --help."),
+        (["claims", "--records", "nowhere"], "There is no folder of records at nowhere."),
+        (["findings", "--records", "nowhere"], "There is no folder of records at nowhere."),
+        (["metrics", "forgeting"], "No metric is called 'forgeting'. Did you mean 'forgetting'?"),
+        (["leaderbord"], "No command is called 'leaderbord'. Did you mean 'leaderboard'?"),
+        (["run"], "SCENARIOS requires an argument"),
+        (["experts", "mesure"], "No command is called 'mesure'. Did you mean 'measure'?"),
+        (["experts", "train", "cartpole_lft"], "Did you mean 'cartpole_left'?"),
+        (["experts", "train", "cartpole_left", "--steps", "1500"], "for a multiple of 1,000 steps"),
+        (["experts", "measure", "clbench/Fetch"], "Did you mean 'clbench/Fetch-v"),
+        (["experts", "measure", "clbench/Fetch-v1", "pres"], "Did you mean 'press'?"),
+        (["run", "clbench/Fetch-v1", "sft", "--seeds", "10001"], "--seeds. Must be <= 10000."),
+        (["run", "clbench/Fetch-v1", "sft", "--first-seed", str(2**64)], f"Must be <= {2**64 - 1}."),
+        (["run", "clbench/Fetch-v1", "sft", "--order", str(2**64)], f"Must be <= {2**64 - 1}."),
+        (
+            ["run", "clbench/Fetch-v1", "sft", "--seeds", "2", "--first-seed", str(2**64 - 1)],
+            f"RunSpec.seed must be at most {2**64 - 1}, not {2**64}.",
+        ),
+        (["pretrain", "clbench/Fetch-v1", "--seed", str(2**64)], f"Must be <= {2**64 - 1}."),
+    ],
+)
+def test_bad_input_ends_with_exit_code_2_and_the_nearest_right_name(
+    arguments: list[str],
+    message: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)  # and take back what the command puts there
+    with pytest.raises(SystemExit) as ended:
+        app(arguments)
+    printed = "".join(capsys.readouterr())
+    assert ended.value.code == 2
+    assert printed.startswith("error: ")
+    assert len(printed.splitlines()) == 1
+    assert message in printed
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_a_bug_inside_checked_input_is_not_taken_for_wrong_input() -> None:
     with pytest.raises(KeyError, match="no such key"), checked_input():
         raise KeyError("no such key")

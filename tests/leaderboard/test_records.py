@@ -188,7 +188,7 @@ def test_the_committed_pages_show_the_committed_records(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     checkout = RECORDS.parents[1]
-    cli = importlib.import_module("clbench.leaderboard.cli")
+    cli = importlib.import_module("clbench.leaderboard.pages.cli")
     monkeypatch.chdir(checkout)
     cli.claims(output=tmp_path / "claims.md")
     cli.findings(output=tmp_path / "findings.md")

@@ -238,6 +238,7 @@ def test_a_film_of_several_methods_shows_each_after_the_last_target(
     ("options", "message"),
     [
         ({"tasks": "left,doun"}, "No task of clbench/Toy-v0 is called 'doun'. Did you mean 'down'?"),
+        ({"tasks": ""}, "--tasks has an empty item: ''."),
         ({"stages": "0,3"}, "--stages takes numbers from 0 to 2, not 0,3."),
         ({"stages": "last"}, "--stages takes numbers from 0 to 2, not last."),
         ({"episode": 4}, "--episode takes numbers from 0 to 3, not 4."),
@@ -254,6 +255,24 @@ def test_bad_input_ends_with_exit_code_2_before_any_work(
         film(TOY, "sft", **options)
     assert left.value.code == 2
     assert message in capsys.readouterr().err
+
+
+def test_films_of_other_tasks_stages_or_episodes_have_other_names(
+    recorded: tuple[Record, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    chosen: list[dict[str, Any]] = [
+        {"tasks": "left, up", "stages": "0"},
+        {"tasks": "left", "stages": "0", "episode": 1},
+        {"tasks": "left", "stages": "0,1,2", "episode": 3},
+    ]
+    for options in chosen:
+        film(TOY, "sft", checkpoints=recorded[1], **options)
+    assert {path.name for path in tmp_path.rglob("*.gif")} == {
+        "seed-0+tasks=left,up+stages=0.gif",
+        "seed-0+tasks=left+stages=0+episode=1.gif",
+        "seed-0+tasks=left+stages=0,1,2+episode=3.gif",
+    }
 
 
 def test_a_film_needs_a_method(capsys: pytest.CaptureFixture[str]) -> None:

@@ -130,8 +130,9 @@ class Bench:
 
     def page(self) -> str:
         """Return the page."""
+        (self.folder / "records").mkdir(parents=True, exist_ok=True)
         output = self.folder / "docs" / "claims.md"
-        resolve("clbench.leaderboard.cli:claims")(
+        resolve("clbench.leaderboard.pages.cli:claims")(
             records=self.folder / "records",
             controls=self.folder / "controls",
             scenario=SCENARIO,

@@ -164,7 +164,7 @@ def test_a_record_that_is_not_of_its_order_is_not_counted(
 def test_claims_are_judged_in_the_published_order_alone(
     add: Callable[..., Path], records: Path, tmp_path: Path
 ) -> None:
-    claims = resolve("clbench.leaderboard.cli:claims")
+    claims = resolve("clbench.leaderboard.pages.cli:claims")
     folders = {"controls": tmp_path / "none", "scenario": SCENARIO}
     add(0.5)
     claims(records=records, output=tmp_path / "before.md", **folders)

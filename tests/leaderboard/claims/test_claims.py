@@ -129,7 +129,7 @@ def test_an_undecided_claim_says_how_many_seeds_would_decide(bench: Bench) -> No
 def test_a_verdict_belongs_to_its_scenario(bench: Bench) -> None:
     bench.add("sft")
     output = bench.folder / "claims.md"
-    resolve("clbench.leaderboard.cli:claims")(
+    resolve("clbench.leaderboard.pages.cli:claims")(
         records=bench.folder / "records", controls=bench.folder / "controls", output=output
     )
     page = output.read_text(encoding="utf-8")

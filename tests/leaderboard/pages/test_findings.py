@@ -11,7 +11,7 @@ from clbench.records.paths import record_path
 from clbench.records.record import Record, Relearning
 from clbench.records.writer import write_record
 
-findings = resolve("clbench.leaderboard.cli:findings")
+findings = resolve("clbench.leaderboard.pages.cli:findings")
 
 
 @pytest.fixture

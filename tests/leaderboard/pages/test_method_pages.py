@@ -67,7 +67,7 @@ class Bench:
     def pages(self) -> dict[str, str]:
         """Return the pages by the name of the method."""
         output = self.folder / "docs" / "methods"
-        resolve("clbench.leaderboard.cli:method_pages")(
+        resolve("clbench.leaderboard.pages.cli:method_pages")(
             records=self.folder / "records",
             controls=self.folder / "controls",
             scenario=SCENARIO,

@@ -20,6 +20,8 @@ from clbench.records.writer import write_record
 from clbench.runs.spec import RunSpec
 from clbench.testing import TOY
 
+scenario_card = resolve("clbench.leaderboard.pages.cli:scenario_card")
+
 GROUPS = ("retained", "target", "held_out")
 ONLINE = {"demonstrations": "never", "questions": "never", "reference": False, "online": True}
 NAMES = [task.name for task in TOY.tasks]
@@ -77,7 +79,7 @@ class Bench:
     def card(self, *scenarios: str, **options: Any) -> str:
         """Return the card, without the backslashes of Markdown."""
         options = {"episodes": 3, "records": self.records, "output": self.output, **options}
-        resolve("clbench.leaderboard.cli:scenario_card")(*(scenarios or (TOY.id,)), **options)
+        scenario_card(*(scenarios or (TOY.id,)), **options)
         return (self.output / "Toy-v0.md").read_text(encoding="utf-8").replace("\\", "")
 
 
@@ -291,17 +293,17 @@ def test_without_a_name_cards_that_are_there_are_made_again_without_pictures_of_
     new, picture = bench.card(), bench.output / "Toy-v0" / "former.webp"
     picture.write_bytes((bench.output / "Toy-v0" / "up.webp").read_bytes())
     (bench.output / "Toy-v0.md").write_text("old")
-    resolve("clbench.leaderboard.cli:scenario_card")(records=bench.records, output=bench.output, episodes=3)
+    scenario_card(records=bench.records, output=bench.output, episodes=3)
     assert (bench.output / "Toy-v0.md").read_text().replace("\\", "") == new
     assert not picture.exists()
 
 
 def test_without_a_name_the_scenarios_with_records_have_cards(bench: Bench) -> None:
     with pytest.raises(SystemExit) as stopped:
-        resolve("clbench.leaderboard.cli:scenario_card")(records=bench.records, output=bench.output)
+        scenario_card(records=bench.records, output=bench.output)
     assert stopped.value.code == 2
     bench.add("sft", FORGETS)
-    resolve("clbench.leaderboard.cli:scenario_card")(records=bench.records, output=bench.output, episodes=1)
+    scenario_card(records=bench.records, output=bench.output, episodes=1)
     assert sorted(path.name for path in bench.output.iterdir()) == ["Toy-v0", "Toy-v0.md"]
 
 

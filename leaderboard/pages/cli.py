@@ -1,0 +1,179 @@
+"""The commands that write pages: `claims`, `findings`, `method-pages` and `scenario-card`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from rich.console import Console
+from rich.text import Text
+
+from clbench.base.errors import InputError
+from clbench.cli.arguments import ScenarioId, add_cwd_to_path, check_names, checked_input, whole_number
+from clbench.records.paths import RECORDS, check_folder
+from clbench.spec.identifiers import folder_name, scenario_ids
+
+from ..board.paths import CONTROLS, SCENARIO
+
+if TYPE_CHECKING:
+    from ..board.rows import Board
+    from ..claims.evidence import Evidence
+
+# Whatever imports PyTorch, SciPy or the charts is imported where it is needed: `--help` does not wait for it.
+
+
+def claims(
+    *,
+    records: Path = RECORDS,
+    controls: Path = CONTROLS,
+    scenario: ScenarioId | None = None,
+    output: Path = Path("docs/reference/claims.md"),
+) -> None:
+    """Judge the claims of the papers by the records, and write a page with the verdicts and figures.
+
+    Args:
+        records: Folder of the records of the leaderboard.
+        controls: Folder of the records of changed settings.
+        scenario: Gymnasium id of the scenario on which all claims are judged (default: each names its own).
+        output: Path of the page.
+    """
+    from ..claims.judges import judge_all
+    from .claims_page import page, terminal
+
+    with checked_input():
+        check_folder(records)
+    judged = judge_all(_evidence(scenario, records, controls), scenario)
+    console = Console()
+    console.print(terminal(judged))
+    _write(output, page(judged))
+
+
+def findings(
+    *,
+    records: Path = RECORDS,
+    controls: Path = CONTROLS,
+    output: Path = Path("docs/reference/findings.md"),
+) -> None:
+    """Say what the records show together, and write a page with every figure, its interval and pictures.
+
+    Args:
+        records: Folder of the records of the leaderboard.
+        controls: Folder of the records of changed settings.
+        output: Path of the page; pictures go to the folder `findings` beside it.
+    """
+    from ..claims.judges import judge_all
+    from ..views.format import print_written, write_all
+    from .findings import page, pictures, sections
+
+    with checked_input():
+        check_folder(records)
+    evidence = _evidence(None, records, controls)
+    board = _board(records)
+    found = sections(board, judge_all(evidence))
+    drawn = {output.parent / "findings" / name: svg for name, svg in pictures(board).items()}
+    print_written(write_all({output: page(found), **drawn}))
+
+
+def method_pages(
+    *,
+    records: Path = RECORDS,
+    controls: Path = CONTROLS,
+    scenario: ScenarioId = SCENARIO,
+    output: Path = Path("docs/reference/methods"),
+) -> None:
+    """Write a page for each built-in method, from its code and its records.
+
+    Args:
+        records: Folder of the records of the leaderboard.
+        controls: Folder of the records of changed settings.
+        scenario: Gymnasium id of the scenario.
+        output: Folder of the pages.
+    """
+    from ..claims.judges import judge_all
+    from ..views.descriptions import built_in_methods
+    from ..views.format import write_if_changed
+    from .method_pages import Sources, pages
+
+    evidence = _evidence(scenario, records, controls)
+    sources = Sources(evidence(scenario), judge_all(evidence), _board(records).rows)
+    texts = pages(built_in_methods(), sources)
+    output.mkdir(parents=True, exist_ok=True)
+    for name, text in texts.items():
+        write_if_changed(output / name, text)
+    Console().print(Text(f"Written: {len(texts)} pages in {output}"), soft_wrap=True)
+
+
+def scenario_card(
+    *scenarios: ScenarioId,
+    episodes: Annotated[int, whole_number(1)] = 100,
+    records: Path = RECORDS,
+    output: Path = Path("docs/reference/scenarios"),
+) -> None:
+    """Write the card of each of SCENARIOS: its tasks with pictures, and whether it tells methods apart.
+
+    The command measures experts and draws pictures only where they are missing from the folder of the card.
+    Where no renderer works, a card lacks the missing pictures and reports it.
+
+    Args:
+        scenarios: Gymnasium ids (default: all scenarios with records, or with a card in the folder).
+        episodes: Number of episodes of each task for measuring the experts.
+        records: Folder of the records.
+        output: Folder of the cards.
+    """
+    from clbench.spec.registry import load_scenario
+
+    from .scenario_cards import Card
+    from .scenario_tasks import choose_renderer, make_missing, picture_path, undrawn
+
+    add_cwd_to_path()
+    with checked_input():
+        board = _board(records)
+        names = scenarios or [
+            name
+            for name in scenario_ids()
+            if name in board.scenarios or (output / f"{folder_name(name)}.md").is_file()
+        ]
+        if not names:
+            raise InputError(f"No scenario has records in {records}. Name one, for example {SCENARIO}.")
+        loaded = [load_scenario(name) for name in names]
+    typed = {scenario.id: name for name, scenario in zip(names, loaded, strict=True)}
+    homes = {output / folder_name(scenario.id): scenario for scenario in loaded}
+    console = Console(stderr=True, soft_wrap=True)
+    fault = choose_renderer([task for home, scenario in homes.items() for task in undrawn(scenario, home)])
+    if fault is not None:
+        console.print(Text(f"No pictures are drawn; existing ones are kept. {fault}"))
+    for home, scenario in homes.items():
+        experts = make_missing(scenario, home, episodes, drawing=fault is None, console=console)
+        drawn = {task.name for task in scenario.tasks if picture_path(home, task).is_file()}
+        card = Card(scenario, board, experts, frozenset(drawn), typed[scenario.id], records)
+        _write(output / f"{home.name}.md", card.page())
+
+
+def _evidence(scenario: str | None, records: Path, controls: Path) -> Callable[[str], Evidence]:
+    """Return what gives the evidence on a scenario; refuse one without records that is not registered."""
+    from ..board.frontier import ladder_of
+    from ..claims.evidence import read_evidence
+
+    for folder in (records, controls, ladder_of(records)):
+        if not folder.is_dir():
+            text = f"There is no folder {folder}: verdicts may differ from the published ones."
+            Console(stderr=True, soft_wrap=True).print(Text(text, style="yellow"))
+    if scenario is not None:
+        homes = [home / folder_name(scenario) for home in (records, controls)]
+        if not any(home.is_dir() for home in homes):  # one with records may be of a missing package
+            check_names([scenario], [])  # before all records are read, which takes 10 s
+    return read_evidence(records, controls)
+
+
+def _board(records: Path) -> Board:
+    """Return the board of the records, an empty one if there is no folder."""
+    from ..board.rows import Board, compute_board
+
+    return compute_board(records) if records.is_dir() else Board()
+
+
+def _write(path: Path, text: str) -> None:
+    from ..views.format import print_written, write_all
+
+    print_written(write_all({path: text}))
