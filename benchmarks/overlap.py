@@ -21,6 +21,7 @@ from result_files import FOLDER
 import clbench
 from clbench.base.entry_points import resolve
 from clbench.base.seeding import derive_seed
+from clbench.cli.arguments import checked_input
 from clbench.learning.pretraining import policy_config
 from clbench.spec.scenario import Scenario
 from clbench.spec.task import Task
@@ -156,4 +157,5 @@ def _section(name: str, result: dict[str, Any]) -> Iterator[str]:
 
 
 if __name__ == "__main__":
-    main()
+    with checked_input():
+        main()

@@ -24,6 +24,7 @@ from result_files import read_results, write_results
 from rich.progress import Progress
 
 from clbench.base.cache import cache_folder
+from clbench.cli.arguments import checked_input
 from clbench.data.demonstrations import load_demonstrations
 from clbench.data.questions import load_questions
 from clbench.learning.pretraining import pretrained_policy
@@ -134,4 +135,5 @@ def _gigaflops() -> float:
 
 
 if __name__ == "__main__":
-    main()
+    with checked_input():
+        main()
