@@ -4,7 +4,28 @@ BIN := .venv/bin
 SCENARIO := clbench/Fetch-v1
 QUICK := build/quick
 
-.PHONY: leaderboard tuning records ladder controls docs site benchmark test test-slow libero-test check wheel-test clean
+.PHONY: help leaderboard tuning records ladder controls docs site benchmark test test-slow libero-test check wheel-test clean
+
+define HELP
+make leaderboard  from nothing to a table in minutes: install, run two methods with one seed
+make test         the tests
+make test-slow    the tests that take minutes each
+make check        format, lint, types, committed pages and definitions, the page in a browser, the benchmarks
+make libero-test  install LIBERO (340 MB), and compare our world with it
+make wheel-test   build the wheel, and test it outside the clone
+make site         the documentation as a site: build/site/index.html
+make docs         the pages of docs/reference, from the code and the records
+make tuning       missing tuning runs, and the settings of the methods
+make records      missing records of the boards, then the leaderboard
+make ladder       missing records of the ladder of learning rates
+make controls     missing records that only the claims need
+make benchmark    speed, in an hour of a quiet machine
+make clean        delete .venv, build and dist
+endef
+
+# The first target is what `make` alone does.
+help:
+	@: $(info $(HELP))
 
 # The main job: from nothing to a table in minutes, with one seed. The full board takes `make records`.
 leaderboard:

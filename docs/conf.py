@@ -21,14 +21,15 @@ extensions = [
     "sphinx.ext.autodoc",  # the reference of the Python names, from docstrings
     "sphinx.ext.napoleon",  # ... which have Google's layout
     "sphinx_copybutton",  # a button that copies a command
-    "sphinxcontrib.mermaid",  # the diagram in architecture.md
 ]
 external_toc_path = "_toc.yml"
 
 myst_enable_extensions = ["dollarmath"]
-myst_fence_as_directive = ["mermaid"]
 myst_heading_anchors = 4
-nb_execution_mode = "off"  # tests/test_notebooks.py executes them
+nb_execution_mode = "auto"  # the notebooks are committed without results
+nb_execution_excludepatterns = ["first_method.ipynb"]  # it trains
+nb_execution_timeout = -1  # no limit: a busy machine may take minutes
+nb_execution_raise_on_error = True
 
 suppress_warnings = [
     "ref.python",  # two fields are called `bytes`, like the type of others
@@ -40,13 +41,15 @@ autodoc_member_order = "bysource"
 
 html_theme = "furo"
 html_title = "clbench"
+html_static_path = ["notebooks/outputs.css"]
+html_css_files = ["outputs.css"]
 html_theme_options = {
     "source_repository": "https://github.com/clbench/clbench",
     "source_branch": "main",
     "source_directory": "docs/",
 }
 
-_LINK = re.compile(r"\[([^\]]+)\]\(((?:\.\./)+[^)#\s]+)\)")
+_LINK = re.compile(r"\[([^\]]+)\]\(((?:\.\./)+[^)#\s]+)(#[^)\s]*)?\)")
 _BOARD = DOCS.parent / "leaderboard" / "site" / "index.html"
 
 
@@ -55,22 +58,55 @@ def lead_out(_app: Any, page: str, source: list[str]) -> None:
     folder = (DOCS / page).parent
 
     def link(found: re.Match[str]) -> str:
-        text, path = found[1], (folder / found[2]).resolve()
+        text, target, heading = found.groups(default="")
+        path = (folder / target).resolve()
         if path == _BOARD:
-            return f'<a href="{"../" * page.count("/")}leaderboard/index.html">{text}</a>'
+            return f'<a href="{"../" * page.count("/")}leaderboard/index.html{heading}">{text}</a>'
         if path.is_relative_to(DOCS):
             return found[0]
         if not path.exists():
-            raise FileNotFoundError(f"docs/{page}: the link {found[2]} leads to no file")
-        return f"[{text}]({REPOSITORY}/{path.relative_to(DOCS.parent).as_posix()})"
+            raise FileNotFoundError(f"docs/{page}: the link {target} leads to no file")
+        return f"[{text}]({REPOSITORY}/{path.relative_to(DOCS.parent).as_posix()}{heading})"
 
     source[0] = _LINK.sub(link, source[0])
 
 
-def add_leaderboard(app: Any, error: Exception | None) -> None:
-    """Copy the interactive page of the leaderboard into the site."""
+def help_of_commands() -> str:
+    """Return what `--help` says of every command, as Markdown."""
+    from cyclopts.docs import generate_markdown_docs
+
+    from clbench.cli.main import app
+
+    for command in app.resolved_commands().values():
+        command.resolved_commands()  # one that is not imported has no summary in its list
+    text = generate_markdown_docs(
+        app,
+        heading_level=2,
+        no_root_title=True,
+        generate_toc=False,
+        exclude_commands=["--install-completion"],  # its heading has no anchor that a link finds
+    )
+    text = re.sub(r"^clbench (.+) \1 ", r"clbench \1 ", text, flags=re.MULTILINE)  # Cyclopts says it twice
+    # an option in a sentence becomes code: as text, Sphinx makes a dash of its hyphens
+    text = re.sub(r"(`[^`\n]*`)|(--[a-z][\w.-]*\w)", lambda found: found[1] or f"`{found[2]}`", text)
+    return text.replace(f"{DOCS.parent}/", "")  # in defaults
+
+
+def complete(app: Any, page: str, source: list[str]) -> None:
+    """Add what the site makes to a page, and read pages again whose contents are not in their files alone."""
+    if page == "reference/commands":
+        source[0] += f"\n{help_of_commands()}"
+        app.env.note_reread()
+    elif page == "notebooks/reading_the_board":
+        app.env.note_dependency(_BOARD)  # newer records have a newer board
+
+
+def add_files(app: Any, error: Exception | None) -> None:
+    """Copy the interactive page of the leaderboard into the site, and pictures that a page has in HTML."""
     if error is None and app.builder.format == "html":
         shutil.copytree(_BOARD.parent, app.outdir / "leaderboard", dirs_exist_ok=True)
+        findings = Path("reference", "findings")
+        shutil.copytree(DOCS / findings, app.outdir / findings, dirs_exist_ok=True)
 
 
 def show_fields_once(_app: Any, what: str, _name: str, _what: Any, _options: Any, lines: list[str]) -> None:
@@ -78,11 +114,13 @@ def show_fields_once(_app: Any, what: str, _name: str, _what: Any, _options: Any
     if what == "class" and "Attributes:" in lines:
         del lines[lines.index("Attributes:") :]  # they follow as members
     elif what in ("attribute", "property"):
-        lines.insert(0, "")  # otherwise napoleon takes what is before a colon for a type
+        # an empty comment: napoleon takes what is before a colon in the first line for a type
+        lines[:0] = ["..", ""]
 
 
 def setup(app: Any) -> None:
     """Connect what Sphinx calls."""
     app.connect("source-read", lead_out)
+    app.connect("source-read", complete)
     app.connect("autodoc-process-docstring", show_fields_once, priority=400)  # before napoleon
-    app.connect("build-finished", add_leaderboard)
+    app.connect("build-finished", add_files)
