@@ -8,12 +8,13 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
-from cyclopts import Parameter
+from cyclopts import CycloptsError, Parameter
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from clbench.base.entry_points import unknown
 from clbench.base.errors import InputError
 from clbench.base.text import counted
 from clbench.cli.arguments import (
@@ -36,8 +37,23 @@ if TYPE_CHECKING:
 # PyTorch and the simulators are imported where they are needed: `--help` does not wait for them.
 
 
+_COMMANDS = ("export", "import")
+"""Commands of `clbench demonstrations`; a test compares them with those of `clbench.cli.main`."""
+
+
+def _no_command(_: object, name: str) -> None:
+    """Refuse a word that cannot be a scenario, and so is a command with a typing error."""
+    from clbench.spec.identifiers import scenario_ids
+
+    if not {"/", ":"} & set(name):
+        raise CycloptsError(msg=str(unknown("command or scenario", name, [*_COMMANDS, *scenario_ids()])))
+
+
 def demonstrations(
-    scenario: ScenarioId, /, *, workers: Annotated[int | None, whole_number(1)] = None
+    scenario: Annotated[ScenarioId, Parameter(validator=_no_command)],
+    /,
+    *,
+    workers: Annotated[int | None, whole_number(1)] = None,
 ) -> None:
     """Collect the expert demonstrations of SCENARIO as Minari datasets, and list these.
 
@@ -198,6 +214,8 @@ def measure(scenario: str, /, *tasks: str, episodes: Annotated[int, whole_number
         episodes: Number of episodes of each task.
     """
     from clbench.data import expert_rates
+    from clbench.evaluation.definition import recording_of
+    from clbench.exchange.recorded import no_expert
     from clbench.jobs.bars import Bars
     from clbench.spec.registry import load_scenario
 
@@ -205,9 +223,12 @@ def measure(scenario: str, /, *tasks: str, episodes: Annotated[int, whole_number
     with checked_input():
         loaded = load_scenario(scenario)
         chosen = [loaded.task(name) for name in tasks] or list(loaded.tasks)
+        for task in chosen:
+            if (recording := recording_of(task)) is not None:
+                raise InputError(f"{no_expert(task.name, recording)}.")
     with Bars(len(chosen) * episodes) as bars:
         bars.start(loaded.id, len(chosen) * episodes)
-        with checked_input():  # a task may have no expert
+        with checked_input():  # an expert may refuse its task
             rows = expert_rates.measure(loaded, chosen, episodes, lambda done: bars.advance(loaded.id, done))
     Console().print(_table(loaded, rows, episodes))
     found = [expert_rates.complaint(task, row) for task, row in zip(chosen, rows, strict=True)]

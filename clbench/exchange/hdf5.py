@@ -15,6 +15,8 @@ import re
 from collections.abc import Sequence
 from contextlib import closing
 from importlib.metadata import version
+from itertools import pairwise
+from numbers import Real
 from pathlib import Path
 from typing import Any
 
@@ -37,6 +39,9 @@ FARTHEST_RATE = 0.01
 """Largest relative difference between the control rates of a file and of a world: rates are often rounded."""
 
 _NAME = re.compile(r"demo_([0-9]+)")
+
+_DAMAGE = (OSError, RuntimeError, KeyError, ValueError, TypeError, OverflowError, MemoryError)
+"""Errors that h5py raises where the bytes of a file make no sense."""
 
 
 # ---- out ---------------------------------------------------------------------------------------------------
@@ -109,11 +114,32 @@ def read_hdf5(path: Path, task: Task, state: Sequence[str] = ("states",)) -> lis
         InputError: The file cannot be read, has another layout, or does not fit the task. The message names
             the demonstration and the dataset.
     """
+    if not state or any(not name or name.startswith("/") for name in state):
+        raise InputError(
+            "The state must name datasets of a demonstration, such as states or obs/ee_states, not "
+            f"{list(state)}."
+        )
+    _check_readable(path)
+    with closing(resolve(task.world)()) as world:
+        try:
+            with h5py.File(path, "r") as file:
+                return _File(path, file, task, world, state).demonstrations()
+        except InputError:  # a ValueError, too
+            raise
+        except _DAMAGE as error:
+            raise InputError(f"{path} cannot be read as HDF5: it is damaged ({error}).") from error
+
+
+def _check_readable(path: Path) -> None:
+    """Check that a path is a file that can be read: HDF5 would answer with flags and addresses."""
     try:
-        with h5py.File(path, "r") as file, closing(resolve(task.world)()) as world:
-            return _File(path, file, task, world, state).demonstrations()
+        if path.is_dir():
+            raise InputError(f"{path} is a folder, not an HDF5 file.")
+        path.open("rb").close()
+    except FileNotFoundError as error:
+        raise InputError(f"There is no file {path}.") from error
     except OSError as error:
-        raise InputError(f"{path} cannot be read as HDF5: {error}.") from error
+        raise InputError(f"{path} cannot be read: {error.strerror}.") from error
 
 
 class _File:
@@ -127,22 +153,30 @@ class _File:
     def demonstrations(self) -> list[Demonstration]:
         """Return all demonstrations, in the order of their numbers."""
         data = self._file.get("data")
-        found = data if isinstance(data, h5py.Group) else ()
-        names = {int(one[1]): name for name in found if (one := _NAME.fullmatch(name)) is not None}
-        if not names:
+        names = data if isinstance(data, h5py.Group) else ()
+        found = sorted((int(one[1]), name) for name in names if (one := _NAME.fullmatch(name)) is not None)
+        if not found:
             raise self._error("it has no demonstrations: the layout of robomimic and LIBERO has data/demo_0")
+        for (number, name), (following, other) in pairwise(found):
+            if number == following:
+                raise self._error(f"data has both {name} and {other}: each number may occur once")
         self._check_attributes(data)
-        episodes = [self._demonstration(data, names[number]) for number in sorted(names)]
-        steps, total = sum(len(episode.executed) for episode in episodes), data.attrs.get("total")
-        if total is not None and int(total) != steps:
-            raise self._error(f"data has total {total}, but its demonstrations have {steps} steps")
+        self._check_count(data, "num_demos", "data", len(found), counted(len(found), "demonstration"))
+        episodes = [self._demonstration(data, name) for _, name in found]
+        steps = sum(len(episode.executed) for episode in episodes)
+        self._check_count(data, "total", "data", steps, f"its demonstrations have {counted(steps, 'step')}")
         return episodes
 
     def _check_attributes(self, data: h5py.Group) -> None:
         """Check the instruction and the control rate, where the file gives them."""
-        words = _json(data.attrs.get("problem_info")).get("language_instruction")
-        words = "".join(words) if isinstance(words, list) else words  # LIBERO joins it, too
-        if isinstance(words, str) and words.strip('" \n') not in self._task.instructions:
+        words = _json(data.attrs.get("problem_info")).get("language_instruction") or []
+        parts = words if isinstance(words, list) else [words]
+        if not all(isinstance(part, str) for part in parts):
+            raise self._error(
+                f"language_instruction in problem_info must be a text, not {quoted(str(words))}"
+            )
+        words = "".join(parts)  # LIBERO joins it, too
+        if parts and words.strip('" \n') not in self._task.instructions:
             raise self._error(
                 f"its instruction is {quoted(words)}, which the task {self._task.name} does not have: add it "
                 f"to the instructions of the task if it means the same. It has {self._task.instructions}"
@@ -158,17 +192,17 @@ class _File:
             )
 
     def _demonstration(self, data: h5py.Group, name: str) -> Demonstration:
-        group, where = data[name], f"data/{name}"
+        group, where = data.get(name), f"data/{name}"
+        if not isinstance(group, h5py.Group):
+            raise self._error(f"{where} must be a group, not another object or a broken link")
         expert = self._rows(group, "actions", where)
         steps = len(expert)
         if not 1 <= steps <= self._task.horizon:
             raise self._error(
-                f"{where} has {counted(steps, 'step')}, but the task {self._task.name} ends after "
-                f"{self._task.horizon}"
+                f"{where} has {counted(steps, 'step')}: it must have 1 to {self._task.horizon}, because the "
+                f"task {self._task.name} ends then"
             )
-        samples = group.attrs.get("num_samples", steps)
-        if int(samples) != steps:
-            raise self._error(f"{where} has num_samples {samples}, but {steps} rows of actions")
+        self._check_count(group, "num_samples", where, steps, f"{counted(steps, 'row')} of actions")
         executed = self._rows(group, "executed", where, steps) if "executed" in group else expert
         parts = [self._rows(group, one, where, steps) for one in self._names]
         states, rewards = np.concatenate(parts, axis=1), self._column(group, "rewards", where, steps)
@@ -180,54 +214,71 @@ class _File:
             ("executed", executed, self._actions),
             (" and ".join(self._names), states, self._states),
         ):
-            self._check_range(f"{where}: {what}", values, space)
+            self._check_range(f"{where}/{what}", values, space)
         return Demonstration(
-            np.vstack([states, self._final(group, "final_state", where, states)]).astype(np.float32),
+            np.vstack([states, self._final(group, "final_state", where, self._states)]).astype(np.float32),
             executed.astype(np.float32),
-            np.vstack([expert, self._final(group, "final_action", where, expert)]).astype(np.float32),
+            np.vstack([expert, self._final(group, "final_action", where, self._actions)]).astype(np.float32),
             np.append(noisy != 0, False),
             rewards.astype(np.float64),
             True,
         )
 
-    def _rows(self, group: Any, name: str, where: str, steps: int | None = None) -> NDArray[Any]:
+    def _check_count(self, group: h5py.Group, name: str, where: str, count: int, found: str) -> None:
+        """Check a number in the attributes of a group, where the file gives it."""
+        number = group.attrs.get(name, count)
+        if not isinstance(number, Real):
+            raise self._error(f"{name} of {where} must be a whole number, not {quoted(str(number))}")
+        if number != count:
+            raise self._error(f"{where} has {name} {number}, but {found}")
+
+    def _rows(self, group: h5py.Group, name: str, where: str, steps: int | None = None) -> NDArray[Any]:
         """Return a dataset with one row of numbers for each step, (T, N)."""
-        return self._dataset(group, name, where, 2, steps)
+        return self._steps(group, name, where, ("T", "N"), steps)
 
-    def _column(self, group: Any, name: str, where: str, steps: int) -> NDArray[Any]:
+    def _column(self, group: h5py.Group, name: str, where: str, steps: int) -> NDArray[Any]:
         """Return a dataset with one number for each step, (T,)."""
-        return self._dataset(group, name, where, 1, steps)
+        return self._steps(group, name, where, ("T",), steps)
 
-    def _dataset(self, group: Any, name: str, where: str, axes: int, steps: int | None) -> NDArray[Any]:
-        known: list[str] = []
-        if isinstance(group, h5py.Group):
-            group.visititems(lambda key, one: known.append(key) if isinstance(one, h5py.Dataset) else None)
-        if name not in known:
-            raise self._error(f"{where} has no {name!r}.{did_you_mean(name, known)} It has {sorted(known)}")
-        values = np.asarray(group[name])
-        if values.ndim != axes or values.dtype.kind not in "biuf":
-            shape = "(T,)" if axes == 1 else "(T, N)"
-            raise self._error(f"{where}/{name} must be numbers {shape}, not {values.dtype} {values.shape}")
+    def _steps(
+        self, group: h5py.Group, name: str, where: str, axes: tuple[str, ...], steps: int | None
+    ) -> NDArray[Any]:
+        """Return a dataset with a row for each step."""
+        values = self._numbers(group, name, where, axes)
         if steps is not None and len(values) != steps:
             raise self._error(f"{where}/{name} has {len(values)} rows, but there are {steps} actions")
         if not np.isfinite(values).all():
             raise self._error(f"{where}/{name} holds numbers that are not finite")
         return values
 
-    def _final(self, group: h5py.Group, name: str, where: str, rows: NDArray[Any]) -> NDArray[Any]:
-        """Return the row after the last step, NaN if the file has none."""
+    def _numbers(self, group: h5py.Group, name: str, where: str, axes: tuple[str, ...]) -> NDArray[Any]:
+        """Return a dataset of numbers with some axes, which the message names."""
+        if not (name in group and isinstance(group[name], h5py.Dataset)):
+            known: list[str] = []
+            group.visititems(lambda key, one: known.append(key) if isinstance(one, h5py.Dataset) else None)
+            raise self._error(f"{where} has no {name!r}.{did_you_mean(name, known)} It has {sorted(known)}")
+        found = group[name]
+        if found.ndim != len(axes) or found.dtype.kind not in "biuf":
+            shape = str(axes).replace("'", "")
+            raise self._error(f"{where}/{name} must be numbers {shape}, not {found.dtype} {found.shape}")
+        return np.asarray(found)
+
+    def _final(self, group: h5py.Group, name: str, where: str, space: Any) -> NDArray[Any]:
+        """Return the row after the last step, NaN if it is missing."""
+        missing = np.full(space.shape, np.nan, np.float32)
         if name not in group:
-            return np.full(rows.shape[1], np.nan, np.float32)
-        values = np.asarray(group[name])
-        if values.shape != rows.shape[1:]:
-            raise self._error(f"{where}/{name} has the shape {values.shape}, not {rows.shape[1:]}")
+            return missing
+        values = self._numbers(group, name, where, ("N",))
+        if values.shape == space.shape and np.isnan(values).all():
+            return missing
+        self._check_range(f"{where}/{name}", values[None], space)
         return values
 
     def _check_range(self, what: str, values: NDArray[Any], space: Any) -> None:
         """Check that rows of numbers have the width and the range of a space of the world."""
         if values.shape[1:] != space.shape:
             raise self._error(
-                f"{what} have the width {values.shape[1]}, but the world {self._task.world} needs "
+                f"the width of {what} is {values.shape[1]}, but the world {self._task.world} needs "
                 f"{space.shape[0]}"
             )
         with np.errstate(over="ignore"):
@@ -236,7 +287,7 @@ class _File:
         if outside.any():
             row, column = np.argwhere(outside)[0]
             raise self._error(
-                f"{what} hold {values[row, column]:g} in row {row}, column {column}: the world "
+                f"row {row}, column {column} of {what} is {values[row, column]:g}: the world "
                 f"{self._task.world} takes float32 numbers from {space.low[column]:g} to "
                 f"{space.high[column]:g}"
             )

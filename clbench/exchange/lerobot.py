@@ -62,7 +62,7 @@ def write_lerobot(folder: Path, tasks: Mapping[Task, Sequence[Demonstration]]) -
             f"A LeRobotDataset has one rate, but the tasks have {sorted(rates)} steps per second."
         )
     (rate,) = rates
-    texts = [words for task in tasks for words in task.instructions]
+    texts = list(dict.fromkeys(words for task in tasks for words in task.instructions))
     episodes = list(_episodes(tasks, texts, rate))
     features = {name: _feature(values) for name, values in episodes[0].items()}
     _write_table(folder / "data" / FILE, pa.concat_tables(_table(episode, features) for episode in episodes))

@@ -38,9 +38,9 @@ class Recording:
             InputError: Always.
         """
         raise InputError(
-            f"The task {task} has no expert: it learns from the recording {self.recording}, which is not "
-            "kept for this version of the task and of clbench. Import it with `clbench demonstrations "
-            "import`. If questions need states, let the `scenes` of the scenario name other tasks."
+            f"{no_expert(task, self.recording)}, which is not kept for this version of the task and of "
+            "clbench. Import it with `clbench demonstrations import`. If questions need states, let the "
+            "`scenes` of the scenario name other tasks."
         )
 
 
@@ -49,6 +49,16 @@ def __getattr__(name: str) -> Recording:
     if found is None:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return Recording(found[1])
+
+
+def no_expert(task: str, recording: str) -> str:
+    """Return the beginning of a message about a task without an expert.
+
+    Args:
+        task: Name of the task.
+        recording: Hash of the demonstrations that it learns from.
+    """
+    return f"The task {task} has no expert: it learns from the recording {recording}"
 
 
 def recording_hash(episodes: Iterable[Demonstration]) -> str:

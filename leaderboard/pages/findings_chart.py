@@ -11,13 +11,17 @@ from ..views.page.charts.vega import FONT, Spec, axis, colour, heading, layer, r
 WIDTH = 520
 """Width of the plot in pixels."""
 
+PADDING = {"left": 24, "right": 8, "top": 5, "bottom": 5}
+"""Pixels around the picture: browsers draw the names of methods wider than the fonts that measure them."""
+
 ROW_HEIGHT = 18
 """Height of a method's line in pixels."""
 
 
 def gains_chart(boards: Mapping[str, Sequence[Row]]) -> Spec:
     """Return the chart: one panel for each scenario, one line for each method, the largest gain on top."""
-    return specification(FONT, vconcat=[_panel(name, rows) for name, rows in boards.items() if rows])
+    panels = [_panel(name, rows) for name, rows in boards.items() if rows]
+    return specification(FONT, padding=PADDING, vconcat=panels)
 
 
 def _panel(name: str, rows: Sequence[Row]) -> Spec:
@@ -40,12 +44,13 @@ def _panel(name: str, rows: Sequence[Row]) -> Spec:
     hue = {
         "field": "division",
         "type": "nominal",
+        "legend": {"columnPadding": 28},
         "scale": {
             "domain": divisions,
             "range": [colour(f"mark-{DIVISIONS.index(division)}") for division in divisions],
         },
     }
-    gain = axis("value", "gain over plain fine-tuning, with 95 % interval", axis={"format": ".2~f"})
+    gain = axis("value", "gain over plain fine-tuning, with 95 % interval", axis={"format": ".2~f", "tickCount": 6})
     ends = {"x": {"field": "low", "type": "quantitative"}, "x2": {"field": "high"}}
     line = {"type": "rule", "color": colour("edge"), "strokeDash": [4, 3]}
     zero = layer([{"zero": 0}], line, x={"field": "zero", "type": "quantitative"})

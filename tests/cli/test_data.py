@@ -1,11 +1,12 @@
-"""`clbench demonstrations` with its export, and `clbench pretrain`."""
+"""`clbench demonstrations` with its export, `clbench pretrain`, and `clbench experts measure`."""
 
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 from clbench.base.cache import cache_folder
-from clbench.cli.main import app
+from clbench.cli.main import DEMONSTRATIONS, app
 from clbench.learning import pretraining
 from clbench.spec.registry import load_scenario
 
@@ -96,7 +97,8 @@ def test_demonstrations_are_exported_after_those_that_are_missing_are_collected(
         (["export", TOY, "lft", "--format", "hdf5", "--output", "x"], "Did you mean 'left'?"),
         (["export", TOY, "--format", "hdf", "--output", "x"], 'Invalid value "hdf" for --format'),
         (["export", TOY, "--format", "hdf5"], "--output requires an argument"),
-        (["import", TOY, "left", "x.hdf5"], "x.hdf5 cannot be read as HDF5"),
+        (["import", TOY, "left", "x.hdf5"], "There is no file x.hdf5."),
+        (["import", TOY, "left", "x.hdf5", "--state"], "The state must name datasets of a demonstration"),
     ],
 )
 def test_an_export_or_import_of_bad_input_ends_with_exit_code_2_and_one_line(
@@ -108,3 +110,40 @@ def test_an_export_or_import_of_bad_input_ends_with_exit_code_2_and_one_line(
     assert ended.value.code == 2
     assert message in printed
     assert len(printed.splitlines()) == 1
+
+
+@pytest.mark.parametrize("command", DEMONSTRATIONS)
+@pytest.mark.parametrize("rest", [[], [TOY], [TOY, "--format", "hdf5"]])
+def test_a_command_of_demonstrations_with_a_typing_error_is_named_with_the_right_one(
+    command: str, rest: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    wrong = command.replace("o", "")
+    with pytest.raises(SystemExit) as ended:
+        app(["demonstrations", wrong, *rest])
+    assert ended.value.code == 2
+    printed = capsys.readouterr().err
+    assert f"error: No command or scenario is called {wrong!r}. Did you mean {command!r}?" in printed
+
+
+def test_a_task_that_learns_from_a_recording_has_no_expert_to_measure(
+    write_module: Callable[[str, str], None], capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_module(
+        "recorded_right",
+        """
+import dataclasses
+import clbench
+from clbench.exchange.recorded import expert_of
+from clbench.testing import TOY
+
+RIGHT = dataclasses.replace(TOY.task("right"), expert=expert_of("0123456789abcdef"))
+SCENARIO = dataclasses.replace(TOY, id="me/Shown-v0", target=(RIGHT,))
+clbench.register("me/Shown-v0", "recorded_right:SCENARIO")
+""",
+    )
+    with pytest.raises(SystemExit) as ended:
+        _clbench("experts", "measure", "recorded_right:me/Shown-v0", "right")
+    assert ended.value.code == 2
+    assert " ".join(capsys.readouterr().err.split()) == (
+        "error: The task right has no expert: it learns from the recording 0123456789abcdef."
+    )

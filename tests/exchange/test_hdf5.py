@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -157,26 +158,51 @@ def _last(value: float) -> Callable[[h5py.Group], None]:
         (_all, r"no demonstrations: the layout of robomimic and LIBERO has data/demo_0"),
         (_remove("demo_1/actions"), r"data/demo_1 has no 'actions'\..* It has \['dones', 'executed', "),
         (_remove("demo_1/dones"), r"data/demo_1 has no 'dones'"),
-        (_set("demo_1/actions", np.zeros((4, 3))), "actions have the width 3, but the world .* needs 2"),
-        (_set("demo_1/states", np.zeros((4, 47))), "states have the width 47, but the world .* needs 4"),
+        (
+            _set("demo_1/actions", np.zeros((4, 3))),
+            "width of data/demo_1/actions is 3, but the world .* needs 2",
+        ),
+        (
+            _set("demo_1/states", np.zeros((4, 47))),
+            "width of data/demo_1/states is 47, but the world .* needs 4",
+        ),
         (_set("demo_1/actions", np.zeros(4)), r"demo_1/actions must be numbers \(T, N\), not float64 \(4,\)"),
         (_set("demo_1/dones", ["no"] * 4), r"demo_1/dones must be numbers \(T,\), not object \(4,\)"),
         (_set("demo_1/rewards", np.zeros(3)), "demo_1/rewards has 3 rows, but there are 4 actions"),
-        (_set("demo_1/final_state", np.zeros(3)), r"final_state has the shape \(3,\), not \(4,\)"),
+        (
+            _set("demo_1/final_state", np.zeros(3)),
+            "width of data/demo_1/final_state is 3, but the world .* needs 4",
+        ),
+        (_set("demo_1/final_state", [0, np.inf, 0, 0]), "column 1 of data/demo_1/final_state is inf"),
+        (_set("demo_1/final_state", [np.nan, 0, 0, 0]), "column 0 of data/demo_1/final_state is nan"),
+        (_set("demo_1/final_state", ["no"] * 4), r"final_state must be numbers \(N,\), not object \(4,\)"),
+        (_set("demo_1/final_action", [0, 1.5]), "column 1 of data/demo_1/final_action is 1.5"),
         (
             _set("demo_1/dones", np.zeros(4)),
             "data/demo_1 does not end in success: the last of its dones is 0",
         ),
         (_set("demo_1/states", np.full((4, 4), np.nan)), "demo_1/states holds numbers that are not finite"),
-        (_set("demo_1/states", np.full((4, 4), 1e300)), r"states hold 1e\+300 in row 0, column 0"),
-        (_last(1.5), r"demo_1: actions hold 1.5 in row 1, column 0: the world .* numbers from -1 to 1"),
+        (_set("demo_1/states", np.full((4, 4), 1e300)), r"row 0, column 0 of data/demo_1/states is 1e\+300"),
+        (_last(1.5), r"row 1, column 0 of data/demo_1/actions is 1.5: the world .* from -1 to 1"),
         (
             _set("demo_1/actions", np.zeros((0, 2))),
-            "data/demo_1 has 0 steps, but the task right ends after 12",
+            "data/demo_1 has 0 steps: it must have 1 to 12, because the task right ends then",
         ),
-        (_longer, "data/demo_0 has 13 steps, but the task right ends after 12"),
+        (_longer, "data/demo_0 has 13 steps: it must have 1 to 12"),
         (_attribute("num_samples", 3, "demo_1"), "demo_1 has num_samples 3, but 4 rows of actions"),
+        (_attribute("num_samples", "abc", "demo_1"), "num_samples of data/demo_1 must be a whole number"),
+        (_attribute("num_samples", [4, 4], "demo_1"), r"must be a whole number, not '\[4 4\]'"),
+        (_attribute("num_samples", np.nan, "demo_1"), "demo_1 has num_samples nan, but 4 rows of actions"),
         (_attribute("total", 1), "data has total 1, but its demonstrations have 47 steps"),
+        (_attribute("total", "unknown"), "total of data must be a whole number, not 'unknown'"),
+        (_attribute("num_demos", 9), "data has num_demos 9, but 10 demonstrations"),
+        (lambda data: data.copy("demo_0", "demo_00"), "data has both demo_0 and demo_00"),
+        (_set("demo_0", h5py.SoftLink("/nowhere")), "data/demo_0 must be a group, not .* a broken link"),
+        (_set("demo_0", h5py.ExternalLink("none.hdf5", "/data/demo_0")), "data/demo_0 must be a group"),
+        (
+            _attribute("problem_info", '{"language_instruction": [1, 2]}'),
+            r"language_instruction in problem_info must be a text, not '\[1, 2\]'",
+        ),
         (
             _attribute("problem_info", '{"language_instruction": "go down"}'),
             "its instruction is 'go down', which the task right does not have",
@@ -197,16 +223,65 @@ def test_what_does_not_fit_is_named(edit: Callable[[h5py.Group], None], message:
 def test_the_datasets_of_the_state_are_named_with_the_nearest_one(libero: Path) -> None:
     with pytest.raises(InputError, match=r"data/demo_0 has no 'obs/ee_ps'\. Did you mean 'obs/ee_pos'\?"):
         read_hdf5(libero, TASK, ["obs/ee_ps"])
-    with pytest.raises(InputError, match="obs/ee_pos and robot_states have the width 12"):
+    with pytest.raises(InputError, match="width of data/demo_0/obs/ee_pos and robot_states is 12"):
         read_hdf5(libero, TASK, ["obs/ee_pos", "robot_states"])
 
 
-@pytest.mark.parametrize("content", [None, b"no HDF5"])
-def test_a_file_that_is_missing_or_no_hdf5_is_named(content: bytes | None, tmp_path: Path) -> None:
+@pytest.mark.parametrize("state", [(), ("states", ""), ("/data/demo_0/states",)])
+def test_the_state_needs_the_names_of_datasets_of_a_demonstration(
+    state: tuple[str, ...], exported: Path
+) -> None:
+    with pytest.raises(InputError, match="The state must name datasets of a demonstration, such as states"):
+        read_hdf5(exported, TASK, state)
+
+
+def test_a_dataset_may_be_a_link_to_another(exported: Path) -> None:
+    before = read_hdf5(exported, TASK)
+    with h5py.File(exported, "r+") as file:
+        file.move("data/demo_1/states", "elsewhere")
+        file["data/demo_1/states"] = h5py.SoftLink("/elsewhere")
+    assert same_demonstrations(read_hdf5(exported, TASK), before)
+
+
+def test_a_final_row_that_is_nan_throughout_is_missing(exported: Path) -> None:
+    with h5py.File(exported, "r+") as file:
+        file["data/demo_1/final_state"][...] = np.nan
+        file["data/demo_1/final_action"][...] = np.nan
+    episode = read_hdf5(exported, TASK)[1]
+    assert np.isnan(episode.state[-1]).all()
+    assert np.isnan(episode.expert[-1]).all()
+
+
+def test_a_path_without_a_file_that_can_be_read_is_named(tmp_path: Path) -> None:
+    long = tmp_path / ("x" * 300)
+    for path, message in (
+        (tmp_path / "x.hdf5", f"There is no file {tmp_path / 'x.hdf5'}."),
+        (tmp_path, f"{tmp_path} is a folder, not an HDF5 file."),
+        (long, f"{long} cannot be read: File name too long."),
+    ):
+        with pytest.raises(InputError, match=f"^{re.escape(message)}$"):
+            read_hdf5(path, TASK)
+
+
+def test_a_damaged_file_is_named_wherever_the_damage_is(exported: Path) -> None:
+    whole = exported.read_bytes()
+    generator = np.random.default_rng(0)
+    messages = []
+    for place in generator.integers(len(whole), size=60):
+        for damaged in (whole[:place], whole[:place] + generator.bytes(64) + whole[place + 64 :]):
+            exported.write_bytes(damaged)
+            try:
+                read_hdf5(exported, TASK)  # which may succeed: not every bit matters
+            except InputError as error:
+                messages.append(str(error))
+    assert all(message.startswith(f"{exported}") for message in messages)
+    assert sum("cannot be read as HDF5: it is damaged (" in message for message in messages) > 60
+
+
+def test_a_file_of_another_format_is_named(tmp_path: Path) -> None:
     path = tmp_path / "x.hdf5"
-    if content is not None:
-        path.write_bytes(content)
-    with pytest.raises(InputError, match=f"{path} cannot be read as HDF5"):
+    path.write_bytes(b"no HDF5")
+    with pytest.raises(InputError, match=rf"{path} cannot be read as HDF5: it is damaged \(.* signature"):
         read_hdf5(path, TASK)
 
 

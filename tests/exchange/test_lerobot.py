@@ -15,6 +15,7 @@ import pytest
 from clbench import export_demonstrations
 from clbench.base.errors import InputError, MissingPackageError
 from clbench.data.demonstrations import Demonstration, dataset_folder, read_dataset
+from clbench.exchange.lerobot import write_lerobot
 from clbench.spec.scenario import Scenario
 from clbench.testing import TOY
 from clbench.worlds.observation import observed
@@ -128,6 +129,20 @@ def test_the_episodes_of_a_task_have_its_wordings_in_turn(folder: Path) -> None:
         assert {tasks.index[number] for number in rows["task_index"][frames]} == set(fact["tasks"])
 
 
+def test_tasks_with_the_same_instruction_share_its_entry(tmp_path: Path) -> None:
+    left, up = TOY.retained
+    found = {
+        left: read_dataset(dataset_folder(left, TOY.budget)),
+        dataclasses.replace(up, instructions=left.instructions): read_dataset(dataset_folder(up, TOY.budget)),
+    }
+    write_lerobot(tmp_path, found)
+    tasks = parquet.read_table(tmp_path / "meta" / "tasks.parquet").to_pandas()
+    assert list(tasks.index) == ["go left", "move to the left"]
+    assert _info(tmp_path)["total_tasks"] == 2
+    rows = _rows(tmp_path / "data" / "chunk-000" / "file-000.parquet")
+    assert set(rows["task_index"]) == {0, 1}
+
+
 def test_its_statistics_are_those_of_its_frames(folder: Path) -> None:
     stats = json.loads((folder / "meta" / "stats.json").read_text())
     rows = _rows(folder / "data" / "chunk-000" / "file-000.parquet")
@@ -220,8 +235,6 @@ class Faster(Rateless):
 def test_a_world_without_the_rate_of_the_others_is_an_error_that_leaves_nothing(
     world: type, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from clbench.exchange import lerobot
-
     left, up = TOY.retained
     found = {
         left: read_dataset(dataset_folder(left, TOY.budget)),
@@ -231,7 +244,7 @@ def test_a_world_without_the_rate_of_the_others_is_an_error_that_leaves_nothing(
     module.World = world  # type: ignore[attr-defined]
     monkeypatch.setitem(sys.modules, "worlds", module)
     with pytest.raises(InputError, match=message):
-        lerobot.write_lerobot(tmp_path, found)
+        write_lerobot(tmp_path, found)
     assert list(tmp_path.iterdir()) == []
 
 
