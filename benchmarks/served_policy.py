@@ -54,7 +54,7 @@ def main() -> None:
         outcomes: list[list[Episode]] = []
         for name in generator.permutation(list(taken)).tolist():
             begin = time.perf_counter()
-            outcomes.append(play_chunks(taken[name], scenario, trials, 0))
+            outcomes.append(play_chunks(taken[name], scenario, trials, 0).episodes)
             found[name] = len(trials) / (time.perf_counter() - begin)
         if outcomes[0] != outcomes[1]:
             raise SystemExit("The served policy has other outcomes.")

@@ -40,7 +40,6 @@ KINDS = {
     "reports": "evaluations of pretrained policies",
     "runs": "checkpoints of unfinished runs",
     "stages": "policies of finished runs, made again",
-    "online": "agents and served policies between two stages",
     "ray": "records of runs on a Ray cluster",
     "experts": "checkpoints of expert training",
     "vectors": "capability vectors of fast_dvla",

@@ -5,8 +5,9 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
+from dataclasses import dataclass, field
 from functools import partial
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 from typing import Protocol as Interface
 
 import numpy as np
@@ -17,6 +18,7 @@ from clbench.base.errors import InputError
 from clbench.base.progress import ProgressCallback, no_progress
 from clbench.base.seeding import derive_seed
 from clbench.evaluation.episodes import LANES, Episode, Live, Trial, play_in_lanes
+from clbench.spec.protocol import Split
 from clbench.spec.scenario import Scenario
 from clbench.worlds.lanes import Lanes
 from clbench.worlds.scenario_env import Observation
@@ -76,15 +78,29 @@ def play(
     return _play(single, scenario, trials, seed, instruction, count)
 
 
+class ChunkPlay(NamedTuple):
+    """What a policy that acts in chunks did."""
+
+    episodes: list[Episode]
+    """Outcomes of the trials, in their order."""
+    executed: int
+    """Actions of each chunk that were executed, at most: an episode may end before."""
+    not_finite: float
+    """Share of the steps whose action was NaN or infinite somewhere, and was replaced."""
+    clipped: float
+    """Share of the steps whose action was finite and outside of the action space, and was clipped."""
+
+
 def play_chunks(
     policy: ChunkPolicy,
     scenario: Scenario,
     trials: Sequence[Trial],
     seed: int,
     executed: int | None = None,
+    whole: bool = True,
     progress: ProgressCallback = no_progress,
-) -> list[Episode]:
-    """Return the outcome of each of `trials`, in their order.
+) -> ChunkPlay:
+    """Return the outcome of each of `trials`.
 
     The policy observes `state`, float32 (LANES, S), `image`, uint8 (LANES, N, N, 3), where the tasks have a
     camera, `instruction`, texts, and what noise may be drawn from: `seed`, int64 (LANES,), different for each
@@ -92,16 +108,21 @@ def play_chunks(
 
     Args:
         policy: Policy that acts.
-        scenario: Scenario of the trials.
+        scenario: Scenario of the trials, at least one.
         trials: Episodes by task, split and number.
         seed: Seed of the run; it chooses the initial states.
-        executed: Actions of a chunk that are executed before the policy acts again; all if None.
+        executed: Actions of a chunk that are executed before the policy acts again; if None, the length of
+            the first chunk.
+        whole: Whether all chunks must have exactly that length, or may be longer.
         progress: Called with the number of episodes that have ended since its last call.
 
     Raises:
-        InputError: The actions have the wrong shape, or a chunk has fewer than `executed`.
+        InputError: The actions have the wrong shape, or a chunk has another length.
     """
-    return _play(partial(_act_in_chunks, policy, executed), scenario, trials, seed, "text", LANES, progress)
+    player = _ChunkPlayer(policy, executed, whole)
+    episodes = _play(player.act, scenario, trials, seed, "text", LANES, progress)
+    assert player.executed is not None
+    return ChunkPlay(episodes, player.executed, *player.shares(episodes))
 
 
 def _play(
@@ -159,27 +180,62 @@ def _act_on_batch(agent: Agent, lanes: Lanes, live: Sequence[Live]) -> NDArray[n
     return _checked(actions, lanes, live, (LANES,))[: len(live)]
 
 
-def _act_in_chunks(
-    policy: ChunkPolicy, executed: int | None, lanes: Lanes, live: Sequence[Live]
-) -> NDArray[np.float32]:
-    """Return the actions (lanes, H, A) to execute."""
-    rows = list(_observations(lanes, live))
-    rows = [
-        {**row, "seed": derive_seed("noise", one.seed), "step": one.length}
-        for row, one in zip(rows, live, strict=True)
-    ]
-    rows += [rows[0]] * (LANES - len(rows))
-    columns = {name: [row[name] for row in rows] for name in rows[0]}
-    texts = {"instruction": columns.pop("instruction")}
-    chunks = policy({**{name: np.stack(values) for name, values in columns.items()}, **texts})
-    length = np.shape(chunks)[1] if np.ndim(chunks) == 3 else 0
-    if length < (executed or 1):
-        wanted = f"at least {executed}" if executed else "any number of"
-        raise InputError(
-            f"The policy's actions have the shape {np.shape(chunks)}, not ({LANES}, H, A): for each episode "
-            f"{wanted} actions."
-        )
-    return _checked(chunks, lanes, live, (LANES, length))[: len(live), :executed]
+@dataclass
+class _ChunkPlayer:
+    """A policy that acts in chunks, and what was wrong with its actions."""
+
+    policy: ChunkPolicy
+    executed: int | None
+    whole: bool
+    faults: dict[tuple[str, Split, int], list[NDArray[np.bool_]]] = field(default_factory=dict)
+    """For each episode, chunk after chunk, whether an action was not finite or was clipped, (H, 2)."""
+
+    def act(self, lanes: Lanes, live: Sequence[Live]) -> NDArray[np.float32]:
+        """Return the actions (lanes, H, A) to execute."""
+        rows = list(_observations(lanes, live))
+        rows = [
+            {**row, "seed": derive_seed("noise", one.seed), "step": one.length}
+            for row, one in zip(rows, live, strict=True)
+        ]
+        rows += [rows[0]] * (LANES - len(rows))
+        columns = {name: [row[name] for row in rows] for name in rows[0]}
+        texts = {"instruction": columns.pop("instruction")}
+        chunks = self.policy({**{name: np.stack(values) for name, values in columns.items()}, **texts})
+        length = self._length(chunks)
+        space = _space(lanes, live)
+        actions = _numbers(chunks, space, (LANES, length))[: len(live), : self.executed]
+        finite = np.isfinite(actions).all(axis=-1)
+        outside = finite & ((actions < space.low) | (actions > space.high)).any(axis=-1)
+        for one, found in zip(live, np.stack([~finite, outside], axis=-1), strict=True):
+            task, split, number = one.trial
+            self.faults.setdefault((task.name, split, number), []).append(found)
+        return _within(actions, space)
+
+    def _length(self, chunks: Any) -> int:
+        """Return the length of chunks, and remember that of the first ones.
+
+        Raises:
+            InputError: They are no chunks, or have another length.
+        """
+        length = int(np.shape(chunks)[1]) if np.ndim(chunks) == 3 else 0
+        known = self.executed
+        if length < (known or 1) or (self.whole and known not in (None, length)):
+            wanted = "any number of" if known is None else f"{'' if self.whole else 'at least '}{known}"
+            hint = f" as before; --execute {known} executes the first {known} of more" if self.whole else ""
+            raise InputError(
+                f"The policy's actions have the shape {np.shape(chunks)}, not ({LANES}, H, A): for each "
+                f"episode {wanted} actions{hint if known else ''}."
+            )
+        self.executed = known or length
+        return length
+
+    def shares(self, episodes: Sequence[Episode]) -> tuple[float, float]:
+        """Return the shares of the steps of all episodes whose actions were not finite, and were clipped."""
+        found = [
+            np.concatenate(self.faults[one.task, one.split, one.number])[: one.length] for one in episodes
+        ]
+        not_finite, clipped = np.concatenate(found).mean(axis=0)
+        return float(not_finite), float(clipped)
 
 
 def _predicted(found: Any) -> tuple[Any, Any]:
@@ -189,7 +245,7 @@ def _predicted(found: Any) -> tuple[Any, Any]:
 
 
 def _checked(action: Any, lanes: Lanes, live: Sequence[Live], rows: tuple[int, ...]) -> NDArray[np.float32]:
-    """Return actions (N, ..., A) within the space of the first lane; all tasks of a scenario share it.
+    """Return actions (N, ..., A) within the space of the running worlds.
 
     Args:
         action: What the agent returned.
@@ -197,7 +253,19 @@ def _checked(action: Any, lanes: Lanes, live: Sequence[Live], rows: tuple[int, .
         live: Running episodes.
         rows: Shape of the actions without A; () for a single action, which becomes (1, A).
     """
+    space = _space(lanes, live)
+    numbers = _numbers(action, space, rows)
+    return _within(numbers if rows else numbers[None], space)
+
+
+def _space(lanes: Lanes, live: Sequence[Live]) -> spaces.Box:
+    """Return the action space of the first lane; all tasks of a scenario share it."""
     space: spaces.Box = lanes.world(live[0].trial[0]).single_action_space
+    return space
+
+
+def _numbers(action: Any, space: spaces.Box, rows: tuple[int, ...]) -> NDArray[np.float64]:
+    """Return actions as numbers of the shape (*rows, A)."""
     shape = (*rows, *space.shape)
     try:
         numbers = np.asarray(action, np.float64)
@@ -207,6 +275,9 @@ def _checked(action: Any, lanes: Lanes, live: Sequence[Live], rows: tuple[int, .
         ) from error
     if numbers.shape != shape:
         raise InputError(f"The agent's action has the shape {numbers.shape}, not {shape}.")
-    # a diverged agent acts with zeros and fails, like a diverged policy
-    numbers = np.nan_to_num(numbers if rows else numbers[None])
-    return numbers.clip(space.low, space.high).astype(np.float32)
+    return numbers
+
+
+def _within(numbers: NDArray[np.float64], space: spaces.Box) -> NDArray[np.float32]:
+    """Return actions within a space: a diverged agent acts with zeros and fails, like a diverged policy."""
+    return np.nan_to_num(numbers).clip(space.low, space.high).astype(np.float32)

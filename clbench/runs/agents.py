@@ -3,21 +3,20 @@
 The agent brings its own loop: it trains in the environment of one stage after another, and is evaluated after
 each, on the same test episodes from the same initial states as every run. Its record has no answers to
 questions, no evaluation points within a stage, and no count of optimiser steps. Until the last stage the
-record is kept in the cache: an interrupted program loses only the stage that was running.
+record is kept beside its final place: an interrupted program loses only the stage that was running.
 """
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import logging
-import shutil
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import cached_property
 from importlib.metadata import packages_distributions, version
+from itertools import compress
 from pathlib import Path
 from typing import Any
 
@@ -25,17 +24,17 @@ import gymnasium
 import torch
 from gymnasium.vector import VectorEnv
 
-from clbench.base.cache import cache_folder, cached, hash_of, is_cached
 from clbench.base.entry_points import resolve
 from clbench.base.errors import InputError, WrongTypeError
 from clbench.base.lease import Lease
 from clbench.base.seeding import seeded
 from clbench.base.strict_json import check_json
+from clbench.data.demonstrations import simulator_versions
 from clbench.evaluation.episodes import Episode, Trial
 from clbench.evaluation.examiner import episode_row
 from clbench.evaluation.players import Agent, acts_on_batches, play
-from clbench.learning.trainer import sources
-from clbench.records.paths import RECORDS, record_path, stage_folder
+from clbench.records.paths import RECORDS, record_path
+from clbench.records.pinned import other_parts
 from clbench.records.reader import read_record
 from clbench.records.record import AnswerRow, Record, RunInfo
 from clbench.records.writer import write_record
@@ -53,8 +52,11 @@ LOG = logging.getLogger("clbench")
 USES = {"demonstrations": "never", "questions": "never", "reference": False, "online": True}
 """`RunInfo.uses` of an agent: it uses no prior data of clbench, and another program trains it."""
 
+UNFINISHED = ".unfinished"
+"""Ending of the name of a record, after .json, until its last stage: it is no record yet."""
+
 _LEASES: dict[Path, Lease] = {}
-"""Leases of the runs that this process has begun, by the folder of the unfinished record.
+"""Leases of the runs that this process has begun, by the path of the unfinished record.
 
 A program trains much longer than it evaluates: it keeps the lease from its first stage until the record is
 written or it ends, so that no other program drops or continues the stages of its agent.
@@ -91,13 +93,14 @@ def evaluate_agent(
         records: Folder of the records.
 
     Returns:
-        The record so far. Its scores come from test episodes: base no choice on them.
+        The record so far. Its scores come from test episodes, so base no choice on them.
 
     Raises:
         WrongTypeError: `env` is not an environment of a scenario, or `agent` cannot act.
         InputError: Another stage comes next, the targets are in another order, a record exists already,
-            another program evaluates an agent of this name and seed, an action has the wrong shape, or the
-            name, the seed, the steps or the settings are invalid.
+            another program evaluates an agent of this name and seed, earlier stages had another version of
+            the scenario or its simulator, an action has the wrong shape, or the name, the seed, the steps or
+            the settings are invalid.
         LeaseLostError: Another program took the run over, because this one did not answer.
     """
     world = getattr(env, "unwrapped", None)
@@ -118,17 +121,16 @@ def evaluate_agent(
         )
     if steps is not None and (type(steps) is not int or steps < 0):
         raise InputError(f"steps must be a whole number from 0, not {steps!r}.")
-    run = StagedRun(world.scenario, method, seed, Path(records))
+    run = StagedRun(world.scenario, method, seed, Path(records), USES)
     begin = time.perf_counter()
     trained = begin - world.begun_at if steps is None and world.begun_at is not None else None
-    record = run.begin(world.stage, _plain(settings or {}), USES, agent)
+    record = run.begin(world.stage, _plain(settings or {}), agent, again=world.stage == 0)
     form = world.instruction
     if batched is None:
         batched = acts_on_batches(agent, form)
     with seeded("online evaluation", seed, world.stage):
-        run.report(
-            record, world.stage, lambda trials: play(agent, world.scenario, trials, seed, form, batched)
-        )
+        episodes = play(agent, world.scenario, run.trials(world.stage), seed, form, batched)
+    run.report(record, world.stage, episodes)
     run.count(record, world.stage, steps if steps is not None else world.steps_taken or None)
     run.time(record, trained, time.perf_counter() - begin)
     run.keep(record, world.stage)
@@ -146,15 +148,19 @@ def next_stage(scenario: str, *, method: str, seed: int = 0, records: Path | str
 
     Returns:
         0 if no stage has been evaluated, the last stage plus one if there is a record.
+
+    Raises:
+        InputError: The record is of a served policy, or its scenario or simulator is another version.
     """
-    return StagedRun(load_scenario(scenario), method, seed, Path(records)).next
+    run = StagedRun(load_scenario(scenario), method, seed, Path(records), USES)
+    return run.next_after(run.kept())
 
 
 @dataclass(frozen=True)
 class StagedRun:
     """A run whose policy another program trains, an agent or a policy that is served.
 
-    It is evaluated stage by stage; its record is in the cache until the last one.
+    It is evaluated stage by stage. Its record so far decides with which stage it goes on.
     """
 
     scenario: Scenario
@@ -165,14 +171,21 @@ class StagedRun:
     """Seed of the run."""
     records: Path
     """Folder of the records."""
+    uses: Mapping[str, Any]
+    """`RunInfo.uses`: the kind of run."""
 
     def __post_init__(self) -> None:
         if not self.scenario.retained:
             raise InputError(
-                f"{self.scenario.id} retains nothing: agents are evaluated from stage 0 on, which trains the "
-                "retained skills. Choose a scenario with retained skills."
+                f"{self.scenario.id} retains nothing: it lacks stage 0, the retained skills, with which the "
+                "evaluations of agents and of served policies begin. Choose a scenario with retained skills."
             )
         check_method_name(self.method)
+        if ":" in self.method:
+            raise InputError(
+                f"{self.method!r} is the name of a class that clbench imports: give your row a name of its "
+                "own, for example 'me/lora'."
+            )
         if self.method in built_in_methods():
             raise InputError(
                 f"{self.method!r} is a method of clbench: give your row its own name, "
@@ -189,45 +202,106 @@ class StagedRun:
     @cached_property
     def path(self) -> Path:
         """Path of the finished record."""
-        return record_path(self.records, self.scenario.id, self.method, self.seed)
-
-    @cached_property
-    def folder(self) -> Path:
-        """Folder of the unfinished record in the cache."""
-        return cache_folder() / "online" / hash_of(str(self.path.resolve()))
-
-    def _stage_folder(self, stage: int) -> Path:
-        return stage_folder(self.folder, stage)
-
-    @cached_property
-    def _sources(self) -> dict[str, Any]:
-        scenario = dataclasses.asdict(describe_scenario(self.scenario))
-        return {"scenario": scenario, **sources(self.scenario, self.seed)}
-
-    def _inputs(self, stage: int) -> dict[str, Any]:
-        """Return everything that the unfinished record depends on, except the agent."""
-        return {"method": self.method, "seed": self.seed, "stage": stage, **self._sources}
-
-    def done(self) -> int | None:
-        """Return the last stage that this version of the code evaluated, None if there is none."""
-        stages = range(self.last, -1, -1)
-        return next((k for k in stages if is_cached(self._stage_folder(k), self._inputs(k))), None)
+        return record_path(self.records.absolute(), self.scenario.id, self.method, self.seed)
 
     @property
-    def next(self) -> int:
-        """The stage that is evaluated next; the last one plus one if there is a record."""
-        if self.path.exists():
-            return self.last + 1
-        done = self.done()
-        return 0 if done is None else done + 1
+    def unfinished(self) -> Path:
+        """Path of the record until the last stage."""
+        return self.path.with_name(self.path.name + UNFINISHED)
+
+    @cached_property
+    def _fingerprint(self) -> dict[str, Any]:
+        return fingerprint(self.scenario)
 
     def __str__(self) -> str:
         return f"{self.method}, seed {self.seed}, on {self.scenario.id}"
 
+    def kept(self, stale: bool = False) -> Record | None:
+        """Return the record so far, None if no stage has been evaluated.
+
+        Args:
+            stale: Return also stages of another version of the scenario or its simulator.
+
+        Raises:
+            InputError: The record is of another kind of run, or of another version and not finished.
+            RecordError: The file is damaged.
+        """
+        finished = self.path.exists()
+        path = self.path if finished else self.unfinished
+        if not path.exists():
+            return None
+        record = read_record(path)
+        if record.run.uses != self.uses:
+            raise InputError(
+                f"{path} was begun as another kind of run: evaluate all stages of agents that learn by trial "
+                "with evaluate_agent(), and all stages of served policies with `clbench score`. Each needs a "
+                "name of its own."
+            )
+        if not (finished or stale):
+            self._check_version(record)
+        return record
+
+    def _check_version(self, record: Record) -> None:
+        """Refuse stages whose episodes were not those of the present scenario and simulator."""
+        then, now = record.fingerprint, self._fingerprint
+        other = [
+            *other_parts(vars(record.scenario), vars(describe_scenario(self.scenario))),
+            *other_parts(then.get("definition"), now["definition"]),
+            *other_parts(then.get("rollouts"), now["rollouts"]),
+        ]
+        if not other:
+            return
+        before = then.get("versions")
+        versions = [
+            f", {name} was {before[name]} and is {version} now"
+            for name, version in simulator_versions(self.scenario.tasks).items()
+            if isinstance(before, dict) and before.get(name, version) != version
+        ]
+        raise InputError(
+            f"Stage {self.next_after(record) - 1} of {self} was evaluated with another version of the "
+            f"scenario or its simulator: {', '.join(other)} differ{''.join(versions)}. Go back to it, or "
+            "evaluate all stages again (`clbench score` needs --restart). The stages so far are in "
+            f"{self.unfinished}."
+        )
+
+    def next_after(self, record: Record | None) -> int:
+        """Return the stage that follows on those of a record; the last one plus one if it has all."""
+        return 0 if record is None else 1 + max(record.episodes["stage"], default=-1)
+
+    def check_unfinished(self) -> None:
+        """Refuse to evaluate a stage of a run that has a record, with an `InputError`."""
+        if self.path.exists():
+            raise InputError(
+                f"{self} has a record already, {self.path}, which is never edited: "
+                "choose another seed or name, or remove it."
+            )
+
+    def plan(self, stage: int, again: bool) -> Record | None:
+        """Return the record so far, if a stage comes next or has been evaluated.
+
+        Args:
+            stage: Stage that shall be evaluated.
+            again: Whether it shall replace the same stage; stage 0 replaces those of other versions, too.
+
+        Raises:
+            InputError: There is no such stage, or an earlier one comes next; and as for `kept`.
+            RecordError: The file is damaged.
+        """
+        if type(stage) is not int or not 0 <= stage <= self.last:
+            raise InputError(f"{self.scenario.id} has stages 0 to {self.last}, not {stage!r}.")
+        record = self.kept(stale=again and stage == 0)
+        following = self.next_after(record)
+        if stage > following:
+            found = "does not exist" if record is None else f"ends with stage {following - 1}"
+            raise InputError(
+                f"Stage {following} of {self} comes next, not {stage}: {self.unfinished} {found}."
+            )
+        return record
+
     def _own(self) -> None:
         """Take the run for this process, unless it has it."""
-        if self.folder not in _LEASES:
-            lease = Lease(self.folder)
+        if self.unfinished not in _LEASES:
+            lease = Lease(self.unfinished)
             while not lease.take():
                 if (owner := lease.owner) is not None:
                     raise InputError(
@@ -235,59 +309,50 @@ class StagedRun:
                         "seed, or wait until that process has ended."
                     )
                 time.sleep(0.1)  # the lease of a dead process on another machine is watched for a while
-            _LEASES[self.folder] = lease
-        _LEASES[self.folder].check()
+            _LEASES[self.unfinished] = lease
+        _LEASES[self.unfinished].check()
 
-    def begin(self, stage: int, settings: dict[str, Any], uses: Mapping[str, Any], agent: Any) -> Record:
+    def begin(self, stage: int, settings: dict[str, Any] | None, agent: Any, again: bool) -> Record:
         """Take the run for this process, and return the record of the earlier stages.
 
         Args:
             stage: Stage that is evaluated.
-            settings: Settings that readers should know, the same in all stages.
-            uses: `RunInfo.uses`, the same in all stages.
+            settings: Settings that readers should know, the same in all stages; None for those of stage 0.
             agent: The agent or policy.
+            again: Whether to drop the stage and all later ones if it has been evaluated; earlier ones stay.
 
         Raises:
-            InputError: Another stage comes next, settings or uses differ from those in stage 0, or another
-                process has taken the run.
+            InputError: Another stage comes next, settings differ from those in stage 0, or another process
+                has taken the run; and as for `plan`.
             LeaseLostError: Another process took the run over.
         """
-        name = str(self)
-        if self.path.exists():
+        if not self.path.exists():
+            self._own()
+        self.check_unfinished()  # also for a process that has just finished the run
+        record = self.plan(stage, again)
+        following = self.next_after(record)
+        if stage < following and not again:
             raise InputError(
-                f"{name} has a record already, {self.path}, which is never edited: "
-                "choose another seed or name, or remove it."
+                f"Stage {following} of {self} comes next, not {stage}: it was evaluated up to stage "
+                f"{following - 1}."
             )
-        self._own()
-        done = self.done()
         if stage == 0:
-            if done is not None:
-                LOG.warning("%s starts over: its evaluations up to stage %d are dropped.", name, done)
-                shutil.rmtree(self.folder, ignore_errors=True)
-            return self._new_record(settings, uses, agent)
-        if done is None:
+            if record is not None:
+                LOG.warning("%s starts over: its stages 0 to %d are dropped.", self, following - 1)
+                self.unfinished.unlink()
+            return self._new_record(settings or {}, agent)
+        assert record is not None  # some stage precedes
+        if settings not in (None, record.run.settings):
             raise InputError(
-                f"Stage 0 of {name} comes first, not {stage}: "
-                "this version of clbench has not evaluated any stage."
+                f"The settings of {self} are {settings}, but were {record.run.settings} in stage 0."
             )
-        if stage != done + 1:
-            raise InputError(
-                f"Stage {done + 1} of {name} comes next, not {stage}: it was evaluated up to stage {done}. "
-                "Evaluating stage 0 starts over."
-            )
-        record = read_record(self._stage_folder(done) / "record.json")
-        if record.run.settings != settings:
-            raise InputError(
-                f"The settings of {name} are {settings}, but were {record.run.settings} in stage 0."
-            )
-        if record.run.uses != uses:
-            raise InputError(
-                f"{name} was begun as another kind of run: evaluate all stages of agents that learn by trial "
-                "with evaluate_agent(), and all stages of served policies with `clbench score`."
-            )
+        if stage < following:
+            LOG.warning("%s: its stages %d to %d are dropped.", self, stage, following - 1)
+            _drop(record, stage)
+            write_record(record, self.unfinished)
         return record
 
-    def _new_record(self, settings: dict[str, Any], uses: Mapping[str, Any], agent: Any) -> Record:
+    def _new_record(self, settings: dict[str, Any], agent: Any) -> Record:
         run = RunInfo(
             scenario=self.scenario.id,
             method=self.method,
@@ -296,22 +361,26 @@ class StagedRun:
             split="test",
             settings=settings,
             changes={},
-            uses=dict(uses),
+            uses=dict(self.uses),
         )
         record = Record("success", run, describe_scenario(self.scenario))
-        record.fingerprint = {**fingerprint(self.scenario), "method": _describe(agent)}
+        record.fingerprint = {**self._fingerprint, "method": _describe(agent)}
         record.timing = {"started": datetime.now(UTC).isoformat(timespec="seconds"), "stages": []}
         network = getattr(agent, "policy", None)
         if isinstance(network, torch.nn.Module):
             record.costs.parameters = sum(parameter.numel() for parameter in network.parameters())
         return record
 
-    def report(self, record: Record, stage: int, play: Callable[[list[Trial]], list[Episode]]) -> None:
-        """Add the episodes of every run at the end of a stage, and answers to no questions."""
+    def trials(self, stage: int) -> list[Trial]:
+        """Return the episodes that every run plays at the end of a stage."""
         protocol = Protocol.of(self.scenario)
-        point = protocol.end(stage)  # in optimiser steps, as if a method had trained
-        trials = [(self.scenario.task(key.task), key.split, key.number) for key in protocol.episodes(point)]
-        for episode in play(trials):
+        keys = protocol.episodes(protocol.end(stage))
+        return [(self.scenario.task(key.task), key.split, key.number) for key in keys]
+
+    def report(self, record: Record, stage: int, episodes: Iterable[Episode]) -> None:
+        """Add the outcomes of the trials of a stage, and answers to no questions."""
+        point = Protocol.of(self.scenario).end(stage)  # in optimiser steps, as if a method had trained
+        for episode in episodes:
             record.add_episode(episode_row(point, episode))
         for kind in resolve(self.scenario.questions):
             record.add_answers(AnswerRow(*point, kind.name, 0, 0))
@@ -330,21 +399,28 @@ class StagedRun:
         record.timing["seconds"] = None if None in parts else round(sum(parts), 2)
 
     def keep(self, record: Record, stage: int) -> None:
-        """Write the record: to its final path after the last stage, which ends the run, to the cache before.
+        """Write the record: to its final path after the last stage, which ends the run, beside it before.
 
         Raises:
             LeaseLostError: Another process took the run over.
         """
-        _LEASES[self.folder].check()
-        if stage == self.last:
-            write_record(record, self.path)
-            shutil.rmtree(self.folder, ignore_errors=True)
-            _LEASES.pop(self.folder).release()
+        _LEASES[self.unfinished].check()
+        if stage < self.last:
+            write_record(record, self.unfinished)
             return
-        folder = self._stage_folder(stage)
-        cached(folder, self._inputs(stage), lambda partial: write_record(record, partial / "record.json"))
-        if stage:
-            shutil.rmtree(self._stage_folder(stage - 1), ignore_errors=True)
+        write_record(record, self.path)
+        self.unfinished.unlink(missing_ok=True)
+        _LEASES.pop(self.unfinished).release()
+
+
+def _drop(record: Record, stage: int) -> None:
+    """Remove a stage and all later ones from a record."""
+    for table in (record.episodes, record.answers):
+        stays = [number < stage for number in table["stage"]]
+        for column in table.values():
+            column[:] = compress(column, stays)
+    record.diagnostics = {name: found for name, found in record.diagnostics.items() if int(name) < stage}
+    del record.timing["stages"][stage:]
 
 
 def _describe(agent: Any) -> dict[str, Any]:

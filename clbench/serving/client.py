@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import time
 from contextlib import ExitStack
+from itertools import dropwhile
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -14,13 +15,16 @@ from websockets.exceptions import ConnectionClosed, InvalidHandshake
 from websockets.sync.client import ClientConnection, connect
 
 from clbench.base.errors import InputError
-from clbench.base.text import printable
+from clbench.base.text import printable, shortened
 from clbench.serving.server import LARGEST_MESSAGE, Observations, pack, unpack
 
 LOG = logging.getLogger("clbench")
 
 ATTEMPTS = 5
 """Connections that one request may lose: a request that ends the server would do so forever."""
+
+REMINDER_SECONDS = 60.0
+"""Seconds between two messages about a server that does not answer."""
 
 _LOST = (ConnectionClosed, InvalidHandshake, OSError)
 """Errors of a connection that another attempt may not have; a handshake out of time is an OSError."""
@@ -34,13 +38,13 @@ class ServedPolicy:
     Args:
         address: Address of the server, for example "ws://localhost:8000".
         timeout: Seconds that a reply may take; a first one may include compilation.
-        patience: Seconds to wait for a server that cannot be reached.
+        patience: Seconds to wait for a server that cannot be reached; loading a large policy takes minutes.
 
     Raises:
         InputError: The address is no address, no server answers in time, or it speaks another protocol.
     """
 
-    def __init__(self, address: str, timeout: float = 300.0, patience: float = 30.0) -> None:
+    def __init__(self, address: str, timeout: float = 300.0, patience: float = 600.0) -> None:
         if not _is_address(address):
             raise InputError(f"The address of a policy is ws://host:port, not {address!r}.")
         self.address, self._timeout, self._patience = address, timeout, patience
@@ -79,18 +83,23 @@ class ServedPolicy:
 
     def _connected(self) -> ClientConnection:
         """Return the connection; if there is none, make one as soon as the server can be reached."""
-        begin, pause = time.monotonic(), 0.1
+        begin, pause, reminder = time.monotonic(), 0.1, 0.0
         while self._connection is None:
             try:
                 self._connection = self._connect()
             except _LOST as error:
-                if time.monotonic() - begin + pause > self._patience:
+                waited = time.monotonic() - begin
+                if waited + pause > self._patience:
                     raise InputError(
                         f"No policy answers at {self.address}: {_reason(error)}. Start its server, for "
                         "example with serve() of clbench/serving/server.py."
                     ) from error
-                if pause == 0.1:
-                    LOG.warning("Waiting for the policy at %s: %s", self.address, _reason(error))
+                if waited >= reminder:
+                    LOG.warning(
+                        "Waiting for the policy at %s, for %.0f of %.0f seconds: %s",
+                        *(self.address, waited, self._patience, _reason(error)),
+                    )
+                    reminder += REMINDER_SECONDS
                 time.sleep(pause)
                 pause = min(2 * pause, 2.0)
         return self._connection
@@ -129,7 +138,7 @@ class ServedPolicy:
             ) from error
         if isinstance(message, str):  # openpi's servers send their traceback, and end the connection
             self.close()
-            raise InputError(f"The policy at {self.address} failed: {printable(_last_line(message))}")
+            raise InputError(f"The policy at {self.address} failed: {_error_of(message)}")
         try:
             return unpack(message)
         except ValueError as error:
@@ -141,7 +150,10 @@ class ServedPolicy:
         """Return the actions of a reply."""
         actions = reply.get("actions") if isinstance(reply, dict) else None
         if not isinstance(actions, np.ndarray) or actions.dtype.kind not in "fiub":
-            found = ", ".join(map(str, reply)) if isinstance(reply, dict) else type(reply).__name__
+            if isinstance(actions, np.ndarray):
+                found = f"actions of the type {actions.dtype}, {actions.shape}"
+            else:
+                found = ", ".join(map(str, reply)) if isinstance(reply, dict) else type(reply).__name__
             raise InputError(
                 f"The policy at {self.address} must reply with a dictionary that has an array of numbers "
                 f"called actions; it sent: {printable(found)}."
@@ -161,7 +173,8 @@ def _reason(error: BaseException) -> str:
     return printable(str(error).rstrip(".")) or type(error).__name__
 
 
-def _last_line(text: str) -> str:
-    """Return the line of a traceback that names the error."""
-    lines = [line for line in text.splitlines() if line and not line.startswith(" ")]
-    return lines[-1] if lines else text.strip()
+def _error_of(text: str) -> str:
+    """Return the error that a traceback ends with, with its name and all lines of its message."""
+    lines = text.rpartition("Traceback (most recent call last):")[2].splitlines()
+    shown = " ".join(line.strip() for line in dropwhile(lambda line: not line or line[0] == " ", lines))
+    return shortened(printable(shown or text.strip()), "the output of the server")

@@ -5,39 +5,74 @@ Its record has the division `external`: how the policy was trained is declared b
 
 from __future__ import annotations
 
+import logging
+import math
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from clbench.base.errors import InputError
 from clbench.base.progress import ProgressCallback, no_progress
 from clbench.base.seeding import seeded
-from clbench.evaluation.episodes import Episode, Trial
-from clbench.evaluation.players import ChunkPolicy, play_chunks
+from clbench.base.text import printable
+from clbench.evaluation.players import ChunkPlay, ChunkPolicy, play_chunks
 from clbench.records.paths import RECORDS
 from clbench.records.record import Record
 from clbench.runs.agents import StagedRun
 from clbench.spec.registry import load_scenario
 
+LOG = logging.getLogger("clbench")
+
 USES = {"external": True}
 """`RunInfo.uses` of a policy that was trained elsewhere. Nothing is known of its data: it may even have
 learned from the demonstrations of clbench, which can be exported."""
 
+MOST_METADATA = 20
+"""Entries of a server's metadata that a record keeps."""
+
+LONGEST_METADATA = 200
+"""Characters of a name or text in them."""
+
 
 def is_scored(
-    scenario: str, *, stage: int, method: str, seed: int = 0, records: Path | str = RECORDS
+    scenario: str,
+    *,
+    stage: int,
+    method: str,
+    seed: int = 0,
+    executed: int | None = None,
+    data: str | None = None,
+    steps: int | None = None,
+    restart: bool = False,
+    records: Path | str = RECORDS,
 ) -> bool:
-    """Return whether a stage has been scored; the arguments are those of `score`.
+    """Return whether a stage has been scored and need not be; the arguments are those of `score`.
 
     Raises:
-        InputError: An earlier stage comes first, there is no such stage, or the name or the seed is invalid.
+        InputError: An earlier stage comes first, there is no such stage, the stage was scored with other
+            `executed`, `data` or `steps`, or `score` would refuse it for another reason.
     """
-    run = StagedRun(load_scenario(scenario), method, seed, Path(records))
-    if not 0 <= stage <= run.last:
-        raise InputError(f"{run.scenario.id} has stages 0 to {run.last}, not {stage}.")
-    if stage > run.next:
-        raise InputError(f"Stage {run.next} of {run} comes next, not {stage}.")
-    return stage < run.next
+    run = StagedRun(load_scenario(scenario), method, seed, Path(records), USES)
+    if restart:
+        run.check_unfinished()
+    record = run.plan(stage, restart)
+    if restart or record is None or stage == run.next_after(record):
+        return False
+    kept = {**record.run.settings, **record.diagnostics.get(str(stage), {})}
+    for name, value in {"executed": executed, "data": data, "steps": steps}.items():
+        if value is not None and kept.get(name) != value:
+            hint = (
+                "Its record is finished, and never edited"
+                if run.path.exists()
+                else "Score it again with --restart, which drops it and later stages, or leave the option out"
+            )
+            raise InputError(
+                f"Stage {stage} of {run} was scored with {name} {kept.get(name)!r}, not {value!r}. {hint}."
+            )
+    return True
 
 
 def score(
@@ -50,23 +85,28 @@ def score(
     executed: int | None = None,
     data: str | None = None,
     steps: int | None = None,
+    restart: bool = False,
     records: Path | str = RECORDS,
     progress: ProgressCallback = no_progress,
 ) -> Record:
     """Evaluate a policy at the end of a stage, and write the record after the last stage.
 
-    Until then the record is kept in the cache: an interrupted program loses only the stage that was running.
+    Until then the record is beside its final place, in a file that ends with `.json.unfinished`: an
+    interrupted program loses only the stage that was running.
 
     Args:
         scenario: Gymnasium id of the scenario.
         policy: Function from the observations of 40 episodes to chunks of actions, see `play_chunks`. It
-            should not draw at random, except from the seeds that it observes.
+            should not draw at random, except from the seeds that it observes. The record keeps the texts and
+            numbers of its attribute `metadata`, which a `ServedPolicy` has from its server.
         stage: Stage after whose fine-tuning the policy is evaluated; 0 is before the first target.
         method: Name of the row on the leaderboard, for example "me/lora".
         seed: Seed of the run; it chooses the initial states, the same for all methods.
-        executed: Actions of a chunk that are executed before the policy acts again; all if None.
+        executed: Actions of a chunk that are executed before the policy acts again, the same number in all
+            stages. If None, all: chunks must then have one length in all stages.
         data: What the policy was trained on in this stage, in words.
         steps: Optimiser steps of the stage.
+        restart: Score the stage although it was scored: it is dropped, and later ones with it.
         records: Folder of the records.
         progress: Called with the share of the stage's episodes that have ended since its last call.
 
@@ -74,23 +114,75 @@ def score(
         The record so far. Its scores come from test episodes: base no choice on them.
 
     Raises:
-        InputError: Another stage comes next, a record exists already, `executed` is not that of stage 0, or
-            the actions have the wrong shape.
+        InputError: Another stage comes next, a record exists already, `executed` is not that of stage 0, the
+            earlier stages had another version of the scenario or its simulator, the actions have the wrong
+            shape, or the name, the seed or the stage is invalid.
     """
-    run = StagedRun(load_scenario(scenario), method, seed, Path(records))
-    settings = {} if executed is None else {"executed": executed}
+    run = StagedRun(load_scenario(scenario), method, seed, Path(records), USES)
     begin = time.perf_counter()
-    record = run.begin(stage, settings, USES, policy)
-
-    def play(trials: Sequence[Trial]) -> list[Episode]:
-        return play_chunks(
-            policy, run.scenario, trials, seed, executed, lambda count: progress(count / len(trials))
+    record = run.begin(stage, None if executed is None else {"executed": executed}, policy, restart)
+    server = _plain(getattr(policy, "metadata", {}))
+    if server and server == record.diagnostics.get(str(stage - 1), {}).get("server"):
+        LOG.warning(
+            "The server says the same about itself as in stage %d (%s): does it have the new checkpoint?",
+            stage - 1,
+            described(server),
         )
-
+    trials = run.trials(stage)
     with seeded("external evaluation", seed, stage):
-        run.report(record, stage, play)
-    declared = {"data": data, "steps": steps}
-    record.diagnostics[str(stage)] = {name: value for name, value in declared.items() if value is not None}
+        played = play_chunks(
+            policy,
+            run.scenario,
+            trials,
+            seed,
+            record.run.settings.get("executed"),
+            whole=executed is None,
+            progress=lambda count: progress(count / len(trials)),
+        )
+    _warn(stage, played)
+    run.report(record, stage, played.episodes)
+    record.run.settings = {"executed": played.executed}
+    declared = {"data": data, "steps": steps, "server": server or None}
+    record.diagnostics[str(stage)] = {
+        **{name: value for name, value in declared.items() if value is not None},
+        "not_finite_actions": round(played.not_finite, 6),
+        "clipped_actions": round(played.clipped, 6),
+    }
     run.time(record, None, time.perf_counter() - begin)
     run.keep(record, stage)
     return record
+
+
+def described(server: Mapping[str, Any]) -> str:
+    """Return metadata that a record keeps in one line."""
+    return ", ".join(f"{name} {value}" for name, value in server.items())
+
+
+def _plain(metadata: object) -> dict[str, Any]:
+    """Return what a record keeps of metadata: texts and finite numbers, without control characters."""
+    plain: dict[str, Any] = {}
+    for name, value in metadata.items() if isinstance(metadata, Mapping) else ():
+        found = value.item() if isinstance(value, np.generic) else value
+        if isinstance(found, str):
+            found = printable(found)[:LONGEST_METADATA]
+        elif not isinstance(found, int | float) or not math.isfinite(found) or abs(found) >= 2**63:
+            continue
+        plain[printable(str(name))[:LONGEST_METADATA]] = found
+    return dict(list(plain.items())[:MOST_METADATA])
+
+
+def _warn(stage: int, played: ChunkPlay) -> None:
+    """Name the actions that were replaced: they are most often a fault of the program, not of the policy."""
+    found = [
+        f"{100 * share:.2g} % of the steps had an action {what}"
+        for share, what in (
+            (
+                played.not_finite,
+                "with NaN or an infinite number, which is replaced by 0 or the nearest bound",
+            ),
+            (played.clipped, "outside of the action space, which is clipped"),
+        )
+        if share
+    ]
+    if found:
+        LOG.warning("Stage %d: %s.", stage, "; ".join(found))

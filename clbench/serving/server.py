@@ -19,11 +19,13 @@ Rows are independent: an episode has no fixed row, and unused rows repeat the fi
 
 The protocol is openpi's. The first message is the metadata of the server. Then each request is a dictionary
 of observations, and each reply one with `actions`. All are msgpack, with arrays as in openpi's
-`msgpack_numpy`. An error is sent as text, and ends the connection. `GET /healthz` answers OK.
+`msgpack_numpy`. An error is sent as text, and ends the connection. `GET /healthz` answers OK. Unlike openpi's
+own client, a client sends batches.
 """
 
 from __future__ import annotations
 
+import socket
 import sys
 import threading
 import traceback
@@ -48,6 +50,9 @@ Observations = dict[str, Any]
 Policy = Callable[[Observations], Any]
 """A function from observations to chunks of actions (B, H, A)."""
 
+_WILDCARDS = ("", "0.0.0.0", "::")
+"""Hosts that stand for all addresses of this machine."""
+
 LARGEST_MESSAGE = 256 * 2**20
 """Bytes of the largest request that is read: 40 episodes with pictures of 1,400 x 1,400 pixels."""
 
@@ -64,14 +69,15 @@ def lerobot_policy(
     and with a camera `observation.images.<camera>`, float32 (B, 3, N, N) from 0 to 1. Without a camera it has
     the state as `observation.environment_state`, too: ACT refuses to go without both. `postprocess` receives
     the actions (B, A) of one step after another, as in LeRobot's own server. Noise is drawn from PyTorch's
-    generator, which is seeded before each call.
+    generator, which is seeded before each call by all seeds and steps together: the same request has the same
+    reply, but the noise of an episode depends on the other ones in its request.
 
     Args:
         policy: A `PreTrainedPolicy` whose `predict_action_chunk` needs no earlier observations: ACT, SmolVLA,
             pi0 and others, but not the diffusion policy with its history.
         preprocess: The preprocessor of `lerobot.policies.factory.make_pre_post_processors`.
         postprocess: The postprocessor of the same function.
-        camera: Name of the camera in the policy's features.
+        camera: Name of the camera in the policy's features, "image" in demonstrations that clbench exported.
     """
     import torch  # LeRobot brings it
 
@@ -94,7 +100,7 @@ def lerobot_policy(
 
 
 def _openpi_observation(row: Observations) -> Observations:
-    """Return one observation with the names of openpi's LIBERO policies."""
+    """Return one observation with names as in openpi's examples."""
     image = {"observation/image": row["image"]} if "image" in row else {}
     return {"observation/state": row["state"], **image, "prompt": row["instruction"]}
 
@@ -106,10 +112,13 @@ def openpi_policy(
 ) -> Policy:
     """Return a policy of openpi as a function of observations; it infers one episode after another.
 
+    There is one camera at most, and the state is that of the scenario. The policy's input transform must not
+    ask for more: openpi's `LiberoInputs` does, for a picture of the wrist.
+
     Args:
         policy: A policy whose `infer(observation)` returns a dictionary with `actions`, (H, A).
         observation: Function from one row of the observations to what the policy expects. By default
-            `observation/state`, `observation/image` and `prompt`, as openpi's LIBERO policies have them.
+            `observation/state`, `prompt`, and with a camera `observation/image`.
         noise: Shape of the noise that `infer(observation, noise=...)` starts from: the horizon and the size
             of an action inside the model. It is drawn from seed and step, so that outcomes repeat themselves.
             None lets the policy draw its own.
@@ -125,7 +134,9 @@ def openpi_policy(
     def act(observations: Observations) -> NDArray[Any]:
         count = len(observations["state"])
         rows = [{name: values[row] for name, values in observations.items()} for row in range(count)]
-        return np.stack([np.asarray(infer(row)) for row in rows])
+        keys = [pack(row) for row in rows]  # unused rows repeat the first one, and need no inference
+        found = {key: np.asarray(infer(row)) for key, row in dict(zip(keys, rows, strict=True)).items()}
+        return np.stack([found[key] for key in keys])
 
     return act
 
@@ -142,10 +153,18 @@ def serve(
         policy: The policy. It is called by one request at a time.
         host: Address to listen on. "0.0.0.0" lets any machine that reaches this one use the policy.
         port: Port to listen on; 0 lets the system choose one, which is printed.
-        metadata: What clients receive first, for example the name of a checkpoint.
+        metadata: What clients receive first, texts and numbers, for example the name of a checkpoint.
+
+    Raises:
+        SystemExit: The address cannot be listened on, for example because another program does.
     """
-    with open_server(policy, host, port, metadata) as server:
-        sys.stdout.write(f"Serving a policy on ws://{host}:{server.socket.getsockname()[1]}\n")
+    try:
+        server = open_server(policy, host, port, metadata)
+    except OSError as error:
+        raise SystemExit(f"Cannot listen on {host or 'any address'}, port {port}: {error}.") from error
+    with server:
+        name = socket.gethostname() if host in _WILDCARDS else f"[{host}]" if ":" in host else host
+        sys.stdout.write(f"Serving a policy on ws://{name}:{server.socket.getsockname()[1]}\n")
         sys.stdout.flush()
         with suppress(KeyboardInterrupt):
             server.serve_forever()
@@ -168,13 +187,18 @@ def open_server(
                     with lock:
                         reply = _answer(policy, message)
                 except Exception:  # whatever the policy raises: the client shows it
+                    traceback.print_exc()
                     connection.send(traceback.format_exc())
                     connection.close(1011, "The policy failed: the last message says why.")
                     return
                 connection.send(reply)
 
     return listen(
-        handle, host, port, compression=None, max_size=LARGEST_MESSAGE, process_request=_answer_health_check
+        handle,
+        sock=socket.create_server((host, port), family=socket.AF_INET6 if ":" in host else socket.AF_INET),
+        compression=None,
+        max_size=LARGEST_MESSAGE,
+        process_request=_answer_health_check,
     )
 
 
@@ -183,7 +207,20 @@ def _answer(policy: Policy, message: str | bytes) -> bytes:
     observations = None if isinstance(message, str) else unpack(message)
     if not isinstance(observations, dict):
         raise ValueError("A request must be a dictionary of observations, packed by msgpack.")
-    return pack({"actions": np.asarray(policy(observations))})
+    if np.ndim(observations.get("state", 0)) != 2:
+        names = ", ".join(map(str, observations))
+        raise ValueError(
+            f"A request must hold a batch: `state` (B, S) and others, see server.py, not {names}."
+        )
+    actions = policy(observations)
+    if not hasattr(actions, "__array__") and not isinstance(actions, (list, tuple)):
+        hint = ": return its 'actions'" if isinstance(actions, Mapping) else ""
+        kind = type(actions).__name__
+        raise TypeError(f"The policy must return an array (B, H, A), not a value of the type {kind}{hint}.")
+    numbers = np.asarray(actions)
+    if numbers.dtype.kind not in "fiub":
+        raise TypeError(f"The policy must return numbers, not {numbers.shape} of the type {numbers.dtype}.")
+    return pack({"actions": numbers})
 
 
 def _answer_health_check(connection: ServerConnection, request: Request) -> Response | None:

@@ -1,8 +1,5 @@
 """Agents that learn by trial and error: their observations and their records."""
 
-import os
-import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -12,11 +9,10 @@ import numpy as np
 import pytest
 from agents import ID, LEARNED, TOY, Knowing, stage_env, trained
 
-from clbench.base.errors import InputError
 from clbench.policy.transformer import TransformerPolicy
 from clbench.records.reader import read_record
 from clbench.records.record import Costs
-from clbench.runs.agents import evaluate_agent, next_stage
+from clbench.runs.agents import evaluate_agent
 from clbench.scoring.metrics import measure
 from clbench.scoring.scores import Scores
 from clbench.worlds.scenario_env import Observation, ScenarioEnv
@@ -274,26 +270,6 @@ def test_a_prediction_without_a_state_is_refused(evaluate: Callable[..., Any]) -
         evaluate(Plain(), stage_env(0))
 
 
-def test_stages_are_evaluated_once_and_in_order(evaluate: Callable[..., Any]) -> None:
-    with pytest.raises(ValueError, match="Stage 0 of me/knows, seed 0, on clbench/Toy-v0 comes first, not 1"):
-        evaluate(Knowing(), stage_env(1))
-    evaluate(Knowing(), stage_env(0))
-    evaluate(Knowing(), stage_env(1))
-    with pytest.raises(ValueError, match=r"Stage 2 of .* comes next, not 1: it was evaluated up to stage 1"):
-        evaluate(Knowing(), stage_env(1))
-    with pytest.raises(ValueError, match=r"settings of .* are \{'speed': 4\}, but were \{\} in stage 0"):
-        evaluate(Knowing(), stage_env(2), settings={"speed": 4})
-
-
-def test_a_finished_record_is_never_edited(evaluate: Callable[..., Any]) -> None:
-    for stage in range(3):
-        evaluate(Knowing(), stage_env(stage))
-    for stage in (0, 2):
-        with pytest.raises(ValueError, match=r"has a record already, .*seed-0\.json, which is never edited"):
-            evaluate(Knowing(), stage_env(stage))
-    evaluate(Knowing(), stage_env(0), seed=1)
-
-
 @pytest.mark.parametrize(
     ("options", "message"),
     [
@@ -303,6 +279,7 @@ def test_a_finished_record_is_never_edited(evaluate: Callable[..., Any]) -> None
         ),
         ({"method": "SFT"}, "would take for 'sft'"),
         ({"method": "../sac"}, "cannot be the name of a method"),
+        ({"method": "my_agents:Sac"}, "'my_agents:Sac' is the name of a class that clbench imports"),
         ({"steps": -1}, "steps must be a whole number from 0, not -1"),
         ({"seed": -1}, "seed must be a whole number from 0, not -1"),
         ({"settings": {"speed": float("nan")}}, "record cannot hold the settings"),
@@ -341,62 +318,3 @@ def test_an_environment_of_a_stage_never_leaves_it() -> None:
         env.reset(options={"stage": 1})
     env = ScenarioEnv(TOY, stage=2)
     assert env.reset(seed=0)[1]["task"] == env.reset()[1]["task"] == "down"
-
-
-KILLED = """
-import os, sys, gymnasium, clbench
-for stage in range(clbench.next_stage("{id}", method="me/still", records="records"), 3):
-    if stage == {last}:
-        os._exit(9)
-    env = gymnasium.make("{id}", stage=stage)
-    clbench.evaluate_agent(lambda _: [0, 0], env, method="me/still", steps=stage, records="records")
-"""
-
-
-def test_a_killed_program_continues_with_the_stage_that_was_running(empty_caches: Path) -> None:
-    environment = {**os.environ, "CLBENCH_CACHE": str(empty_caches / "cache")}
-
-    def run(last: int) -> int:
-        command = [sys.executable, "-c", KILLED.format(id=ID, last=last)]
-        return subprocess.run(command, cwd=empty_caches, env=environment, check=False).returncode
-
-    records = empty_caches / "records"
-    assert run(last=2) == 9
-    assert not records.exists()
-    assert next_stage(ID, method="me/still", records=records) == 2
-    assert next_stage(ID, method="me/still", seed=1, records=records) == 0
-    assert run(last=9) == 0
-    assert next_stage(ID, method="me/still", records=records) == 3
-    record = read_record(records / "Toy-v0/me--still/seed-0.json")
-    assert record.costs == Costs(environment_steps=3)
-    assert not list((empty_caches / "cache" / "online").iterdir())
-
-
-OTHER = """
-import gymnasium, clbench
-for stage in range(3):
-    env = gymnasium.make("{id}", stage=stage)
-    clbench.evaluate_agent(lambda _: [0, 0], env, method="me/knows", steps=7, records="records")
-    print(stage, flush=True)
-    input()
-"""
-
-
-def test_two_programs_do_not_mix_their_stages(evaluate: Callable[..., Any], empty_caches: Path) -> None:
-    command = [sys.executable, "-c", OTHER.format(id=ID)]
-    pipes: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
-    with subprocess.Popen(command, cwd=empty_caches, **pipes) as other:
-        assert other.stdin is not None
-        assert other.stdout is not None
-        for stage in range(3):
-            assert other.stdout.readline() == f"{stage}\n"
-            message = f"belongs to process {other.pid} on " if stage < 2 else "has a record already"
-            for mine in range(3):  # while the other one trains for its next stage
-                with pytest.raises(InputError, match=message):
-                    evaluate(Knowing(), stage_env(mine))
-            print(file=other.stdin, flush=True)
-    assert other.returncode == 0
-    assert read_record(empty_caches / "records/Toy-v0/me--knows/seed-0.json").costs.environment_steps == 21
-    for stage in range(3):
-        evaluate(Knowing(), stage_env(stage), seed=1)
-    assert not list((empty_caches / "cache" / "online").iterdir())

@@ -78,6 +78,25 @@ def test_nobody_at_the_address_is_an_error_that_says_what_to_do() -> None:
         ServedPolicy(f"ws://localhost:{port}", patience=0.3)
 
 
+def test_a_server_that_is_still_loading_is_waited_for_with_a_message_now_and_then(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("clbench.serving.client.REMINDER_SECONDS", 0.2)
+    write_policy(tmp_path)
+    with socket.create_server(("localhost", 0)) as free:
+        port = free.getsockname()[1]
+    address = f"ws://localhost:{port}"
+    found: list[ServedPolicy] = []
+    thread = threading.Thread(target=lambda: found.append(ServedPolicy(address)))
+    thread.start()
+    time.sleep(1.0)
+    assert f"Waiting for the policy at {address}, for 0 of 600 seconds: " in caplog.messages[0]
+    assert len(caplog.messages) >= 2
+    with serving(tmp_path, 0, port):
+        thread.join()
+    found[0].close()
+
+
 @pytest.mark.parametrize("address", ["localhost:8000", "http://localhost", "ws://", "ws://host:port"])
 def test_another_address_is_refused(address: str) -> None:
     with pytest.raises(InputError, match=r"The address of a policy is ws://host:port, not "):
@@ -97,6 +116,9 @@ def sending(reply: Any) -> Callable[[ServerConnection], None]:
     return handle
 
 
+TRACEBACK = 'Traceback (most recent call last):\n  File "policy.py", line 1, in act\n    return state\n'
+
+
 def silent(connection: ServerConnection) -> None:
     greet(connection)
     for _ in connection:
@@ -112,9 +134,18 @@ def ending(connection: ServerConnection) -> None:
 @pytest.mark.parametrize(
     ("handle", "message"),
     [
-        (sending("Traceback:\n  File\nKeyError: 'st\x1bate'\n"), r"failed: KeyError: 'st\\x1bate'"),
+        (sending(f"{TRACEBACK}KeyError: 'st\x1bate'\n"), r"failed: KeyError: 'st\\x1bate'"),
+        (
+            sending(f"{TRACEBACK}RuntimeError: sizes differ:\n\tsize 3\nnot 4\n"),
+            "failed: RuntimeError: sizes differ: size 3 not 4",
+        ),
+        (
+            sending(f"{TRACEBACK}KeyError: 1\n\nDuring it:\n\n{TRACEBACK}ValueError: no\nkey\n"),
+            "failed: ValueError: no key",
+        ),
         (sending(pack({"action": np.zeros(2)})), r"array of numbers called actions; it sent: action"),
         (sending(pack({"actions": "left"})), "array of numbers called actions"),
+        (sending(pack({"actions": np.array([["left"]])})), r"it sent: actions of the type <U4, \(1, 1\)"),
         (sending(pack([1])), "array of numbers called actions; it sent: list"),
         (sending(b"\xc1"), "does not speak openpi's protocol"),
         (silent, r"did not answer within 0\.2 seconds: a slower one needs a larger --timeout"),

@@ -4,6 +4,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Callable
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,6 @@ import torch
 from agents import ID, LEARNED, TOY, Knowing, stage_env
 from served import serving, write_policy
 
-from clbench.base.entry_points import resolve
 from clbench.base.errors import InputError
 from clbench.evaluation.rollouts import Evaluator
 from clbench.learning.pretraining import policy_config
@@ -146,7 +146,7 @@ def test_a_killed_program_loses_only_the_stage_that_was_running(
             assert codes == [*[9 for _ in KILLS[stage]], 0, 0]
     found = read_record(tmp_path / "records/Toy-v0/me--elsewhere/seed-0.json")
     assert outcomes(found) == outcomes(expected)
-    assert not list((empty_caches / "cache" / "online").iterdir())
+    assert [path.name for path in (tmp_path / "records").rglob("*") if path.is_file()] == ["seed-0.json"]
 
 
 def test_chunks_are_executed_to_their_end_or_to_the_number_asked_for(
@@ -164,7 +164,7 @@ def test_chunks_are_executed_to_their_end_or_to_the_number_asked_for(
         folder = tmp_path / f"{length}-{executed}"
         record = run(act, 0, executed=executed, records=folder)
         assert outcomes(record) == outcomes(agent)
-        assert record.run.settings == ({} if executed is None else {"executed": executed})
+        assert record.run.settings == {"executed": executed or length}
         counts[length, executed] = steps
     assert counts[1, None] == counts[4, 1] == list(range(12))
     assert counts[4, None] == [0, 4, 8]
@@ -207,10 +207,11 @@ def test_the_record_keeps_what_its_authors_declare(run: Callable[..., Record], t
     record = run(knowing(2), 2, steps=500)
     assert record.run.uses == {"external": True}
     assert record.run.trained_elsewhere
+    shares = {"not_finite_actions": 0.0, "clipped_actions": 0.0}
     assert record.diagnostics == {
-        "0": {},
-        "1": {"data": "100 demonstrations of right, by hand", "steps": 2000},
-        "2": {"steps": 500},
+        "0": shares,
+        "1": {"data": "100 demonstrations of right, by hand", "steps": 2000, **shares},
+        "2": {"steps": 500, **shares},
     }
     assert (record.costs.optimiser_steps, record.timing["seconds"]) == (None, None)
     assert read_record(tmp_path / "records/Toy-v0/me--elsewhere/seed-0.json") == record
@@ -229,8 +230,12 @@ def test_stages_come_in_order_and_each_is_scored_once(run: Callable[..., Record]
         InputError, match="Stage 0 of me/elsewhere, seed 0, on clbench/Toy-v0 comes next, not 1"
     ):
         done(1)
-    with pytest.raises(InputError, match="clbench/Toy-v0 has stages 0 to 2, not 3"):
-        done(3)
+    wrong: list[Any] = [3, -1, "1", 1.0, True]
+    for missing in wrong:
+        with pytest.raises(InputError, match=f"clbench/Toy-v0 has stages 0 to 2, not {missing!r}"):
+            done(missing)
+        with pytest.raises(InputError, match=f"clbench/Toy-v0 has stages 0 to 2, not {missing!r}"):
+            run(knowing(0), missing)
     assert not done(0)
     run(knowing(0), 0)
     assert (done(0), done(1)) == (True, False)
@@ -239,9 +244,134 @@ def test_stages_come_in_order_and_each_is_scored_once(run: Callable[..., Record]
         run(knowing(1, 4), 1, executed=2)
     with pytest.raises(InputError, match="begun as another kind of run"):
         evaluate_agent(Knowing(), stage_env(1), method="me/elsewhere", records=tmp_path / "records")
+    with pytest.raises(InputError, match=r"Stage 1 of .* comes next, not 0"):
+        run(knowing(0), 0)
     for stage in (1, 2):
         run(knowing(stage), stage)
     assert all(map(done, STAGES))
+
+
+def test_a_run_of_another_kind_with_the_same_name_does_not_count(
+    run: Callable[..., Record], tmp_path: Path
+) -> None:
+    records = tmp_path / "records"
+    for stage in STAGES:
+        with pytest.raises(InputError, match="begun as another kind of run") if stage else nullcontext():
+            is_scored(ID, stage=0, method="me/agent", records=records)
+        evaluate_agent(Knowing(), stage_env(stage), method="me/agent", records=records)
+    with pytest.raises(InputError, match="begun as another kind of run"):
+        is_scored(ID, stage=2, method="me/agent", records=records)
+
+
+def test_a_scenario_that_retains_nothing_is_refused_with_the_reason(tmp_path: Path) -> None:
+    message = r"clbench/MetaWorldCW-v0 retains nothing: it lacks stage 0, .* served policies begin"
+    with pytest.raises(InputError, match=message):
+        is_scored("clbench/MetaWorldCW-v0", stage=0, method="me/elsewhere", records=tmp_path)
+
+
+def test_a_stage_that_was_scored_wrongly_is_scored_again(run: Callable[..., Record], tmp_path: Path) -> None:
+    expected = [run(knowing(stage), stage, records=tmp_path / "other") for stage in STAGES][-1]
+    for stage, policy in ((0, knowing(0)), (1, knowing(0)), (1, knowing(1)), (2, knowing(2))):
+        record = run(policy, stage, restart=stage == 1, steps=stage)
+    assert outcomes(record) == outcomes(expected)
+    assert record.answers == expected.answers
+    assert [found["steps"] for found in record.diagnostics.values()] == [0, 1, 2]
+    assert len(record.timing["stages"]) == 3
+    with pytest.raises(InputError, match=r"has a record already, .*, which is never edited"):
+        run(knowing(2), 2, restart=True)
+
+
+def test_a_restart_at_stage_0_drops_all_stages(run: Callable[..., Record], tmp_path: Path) -> None:
+    for stage in (0, 1):
+        run(knowing(stage, 4), stage)
+    record = run(knowing(0, 2), 0, restart=True)
+    assert set(record.episodes["stage"]) == {0}
+    assert record.run.settings == {"executed": 2}
+    assert not is_scored(ID, stage=1, method="me/elsewhere", records=tmp_path / "records")
+
+
+def test_actions_that_are_not_finite_or_out_of_range_are_counted_and_named_once(
+    run: Callable[..., Record], tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    chunk = np.zeros((40, 12, 2))
+    chunk[:, :3, 1] = np.nan
+    chunk[:, 3, 0] = np.inf
+    chunk[:, 4:9, 0] = 5.0
+    record = run(lambda _: chunk, 0)
+    lengths = np.array(record.episodes["length"])
+    assert len(set(lengths)) > 1  # the rest of a chunk does not count
+    bad, steps = np.minimum(lengths, 4).sum(), lengths.sum()
+    assert record.diagnostics["0"] == {
+        "not_finite_actions": pytest.approx(bad / steps, abs=1e-6),
+        "clipped_actions": pytest.approx((np.minimum(lengths, 9).sum() - bad) / steps, abs=1e-6),
+    }
+    (message,) = (text for text in caplog.messages if "of the steps had an action" in text)
+    assert "NaN" in message
+    assert "outside of the action space" in message
+    caplog.clear()
+    replaced = run(lambda _: np.nan_to_num(chunk).clip(-1, 1), 0, records=tmp_path / "replaced")
+    assert outcomes(replaced) == outcomes(record)
+    assert not caplog.messages
+
+
+def test_chunks_of_another_length_are_refused_unless_the_number_executed_is_given(
+    run: Callable[..., Record], tmp_path: Path
+) -> None:
+    lengths = iter([4, 6])
+    with pytest.raises(
+        InputError, match=r"\(40, 6, 2\), not \(40, H, A\): .* 4 actions as before; --execute 4"
+    ):
+        run(lambda shown: knowing(0, next(lengths))(shown), 0)
+    run(knowing(0, 4), 0)
+    with pytest.raises(
+        InputError, match=r"\(40, 6, 2\), not \(40, H, A\): .* 4 actions as before; --execute 4"
+    ):
+        run(knowing(1, 6), 1)
+    with pytest.raises(InputError, match=r"settings of .* are \{'executed': 6\}, but were \{'executed': 4\}"):
+        run(knowing(1, 6), 1, executed=6)
+    assert run(knowing(1, 6), 1, executed=4).run.settings == {"executed": 4}
+
+
+class Describing:
+    """A policy with the metadata of a server."""
+
+    def __init__(self, stage: int, metadata: dict[str, Any]) -> None:
+        self.act, self.metadata = knowing(stage), metadata
+
+    def __call__(self, observations: dict[str, Any]) -> Any:
+        return self.act(observations)
+
+
+def test_metadata_of_the_server_are_kept_if_they_are_texts_and_numbers(run: Callable[..., Record]) -> None:
+    metadata = {
+        "checkpoint": "step\x1b[31m 100",
+        "steps": np.int64(100),
+        "rate": 1e-4,
+        "nan": float("nan"),
+        "weights": np.zeros(1000),
+        "nested": {"a": 1},
+        "long": "x" * 1000,
+        **{f"more {number}": number for number in range(100)},
+    }
+    server = run(Describing(0, metadata), 0).diagnostics["0"]["server"]
+    assert dict(list(server.items())[:4]) == {
+        "checkpoint": "step\\x1b[31m 100",
+        "steps": 100,
+        "rate": 1e-4,
+        "long": "x" * 200,
+    }
+    assert len(server) == 20
+
+
+def test_a_server_that_says_the_same_as_in_the_stage_before_is_suspected(
+    run: Callable[..., Record], caplog: pytest.LogCaptureFixture
+) -> None:
+    for stage, checkpoint in ((0, "a"), (1, "b"), (2, "b")):
+        assert not caplog.messages
+        run(Describing(stage, {"checkpoint": checkpoint}), stage)
+    assert caplog.messages == [
+        "The server says the same about itself as in stage 1 (checkpoint b): does it have the new checkpoint?"
+    ]
 
 
 @pytest.mark.parametrize(
@@ -290,51 +420,3 @@ def test_a_policy_of_clbench_has_the_outcomes_that_a_run_gives_it(run: Callable[
         (one.task, one.number, one.success, one.length) for one in expected
     ]
     assert [row.total_reward for row in found] == [round(one.total_reward, 4) for one in expected]
-
-
-# ---- the command -------------------------------------------------------------------------------------------
-
-
-def test_the_command_scores_stage_after_stage_and_skips_what_is_done(
-    tmp_path: Path, empty_caches: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    write_policy(tmp_path)
-    command, records = resolve("clbench.cli.runs:score"), tmp_path / "records"
-    for stage in STAGES:
-        with serving(tmp_path, stage) as (address, _):
-            options = {"policy": address, "stage": stage, "method": "me/elsewhere", "records": records}
-            command(ID, **options, data="by hand")
-    shown = capsys.readouterr().err
-    assert "stage 0: left 1.00, up " in shown
-    assert "Next: fine-tune on right, serve the policy, and score it with --stage 1." in shown
-    assert f"Record: {records / 'Toy-v0/me--elsewhere/seed-0.json'}" in shown
-    assert f"Next: clbench leaderboard --records {records}" in shown
-    command(ID, **options)  # nobody serves the policy any more
-    assert capsys.readouterr().err == "Stage 2 of me/elsewhere, seed 0, is done.\n"
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"policy": "localhost:8000"}, "error: The address of a policy is ws://host:port, not"),
-        ({"stage": 1}, "error: Stage 0 of me/elsewhere, seed 0, on clbench/Toy-v0 comes next, not 1."),
-        ({"method": "sft"}, "error: 'sft' is a method of clbench"),
-    ],
-)
-def test_the_command_explains_a_wrong_value_in_one_line(
-    options: dict[str, Any],
-    message: str,
-    tmp_path: Path,
-    empty_caches: Path,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    given = {
-        "policy": "ws://localhost:1",
-        "stage": 0,
-        "method": "me/elsewhere",
-        "records": tmp_path,
-        **options,
-    }
-    with pytest.raises(SystemExit, match="2"):
-        resolve("clbench.cli.runs:score")(ID, **given)
-    assert message in capsys.readouterr().err

@@ -1,5 +1,6 @@
 """The server of a policy: its messages, and its adapters for policies of other libraries."""
 
+import socket
 import subprocess
 import sys
 import threading
@@ -17,7 +18,7 @@ from served import SERVER
 from websockets.exceptions import ConnectionClosedError
 from websockets.sync.client import ClientConnection, connect
 
-from clbench.serving.server import lerobot_policy, open_server, openpi_policy, pack, unpack
+from clbench.serving.server import lerobot_policy, open_server, openpi_policy, pack, serve, unpack
 
 ARRAYS = [
     np.array([[1.5, np.nan], [np.inf, -0.0]], np.float32),
@@ -129,6 +130,8 @@ def received(connection: ClientConnection) -> Any:
 
 
 def twice(observations: dict[str, Any]) -> Any:
+    if "fail" in observations:
+        raise KeyError("this policy fails")
     return 2 * observations["state"][:, None]
 
 
@@ -146,13 +149,17 @@ def test_the_metadata_come_first_and_each_request_has_a_reply() -> None:
 @pytest.mark.parametrize(
     ("request_", "message"),
     [
-        (pack({"velocity": 1}), "KeyError: 'state'"),
+        (pack({"velocity": 1}), "must hold a batch: `state` (B, S) and others, see server.py, not velocity"),
+        (pack({"state": np.zeros(4, np.float32)}), "must hold a batch"),
+        (pack({"state": np.zeros((1, 4)), "fail": 1}), "KeyError: 'this policy fails'"),
         (pack([1, 2]), "must be a dictionary of observations"),
         ("state", "must be a dictionary of observations"),
         (b"\xc1", "no message of a policy"),
     ],
 )
-def test_an_error_is_sent_as_text_and_ends_the_connection_alone(request_: Any, message: str) -> None:
+def test_an_error_is_printed_sent_as_text_and_ends_the_connection_alone(
+    request_: Any, message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     with connected(twice) as (connection, port):
         assert received(connection) == {}
         connection.send(request_)
@@ -160,10 +167,63 @@ def test_an_error_is_sent_as_text_and_ends_the_connection_alone(request_: Any, m
         assert isinstance(found, str)
         assert "Traceback" in found
         assert message in found
+        assert found in capsys.readouterr().err
         with pytest.raises(ConnectionClosedError, match="1011"):
             connection.recv()
         with connect(f"ws://localhost:{port}", proxy=None) as another:
             assert received(another) == {}
+
+
+@pytest.mark.parametrize(
+    ("actions", "message"),
+    [
+        ({"actions": np.zeros((1, 8, 2))}, "not a value of the type dict: return its 'actions'."),
+        (None, "not a value of the type NoneType."),
+        ("left", "not a value of the type str."),
+        ([["left"]], "must return numbers, not (1, 1) of the type <U4."),
+    ],
+)
+def test_a_policy_that_returns_no_array_of_numbers_is_told_so(actions: Any, message: str) -> None:
+    with connected(lambda _: actions) as (connection, _):
+        received(connection)
+        connection.send(pack({"state": np.zeros((1, 4), np.float32)}))
+        assert message in str(connection.recv())
+
+
+def has_ipv6() -> bool:
+    try:
+        socket.create_server(("::1", 0), family=socket.AF_INET6).close()
+    except OSError:
+        return False
+    return True
+
+
+@pytest.mark.parametrize(
+    ("host", "name"),
+    [
+        ("localhost", "localhost"),
+        ("0.0.0.0", socket.gethostname()),
+        pytest.param("::1", "[::1]", marks=pytest.mark.skipif(not has_ipv6(), reason="needs IPv6")),
+    ],
+)
+def test_the_address_that_is_printed_is_one_that_clients_can_use(host: str, name: str) -> None:
+    program = f"from server import serve; serve(print, {host!r}, 0)"
+    command = [sys.executable, "-c", program]
+    with subprocess.Popen(command, cwd=SERVER.parent, stdout=subprocess.PIPE, text=True) as process:
+        try:
+            assert process.stdout is not None
+            assert process.stdout.readline().startswith(f"Serving a policy on ws://{name}:")
+        finally:
+            process.kill()
+
+
+def test_an_address_that_cannot_be_listened_on_ends_the_program_with_one_line() -> None:
+    with socket.create_server(("localhost", 0)) as taken:
+        port = taken.getsockname()[1]
+        with pytest.raises(SystemExit, match=rf"^Cannot listen on localhost, port {port}: .*in use.*\.$"):
+            serve(twice, port=port)
+    with pytest.raises(SystemExit, match=r"Cannot listen on no-such-host\.invalid, port 0: "):
+        serve(twice, "no-such-host.invalid", 0)
 
 
 # ---- policies of other libraries ---------------------------------------------------------------------------
@@ -260,3 +320,13 @@ def test_a_policy_of_openpi_may_have_other_names_and_noise_that_repeats_itself()
     assert (one.shape, one.dtype) == ((4, 8), np.float32)
     assert np.array_equal(one, again)
     assert not np.array_equal(one, two)
+
+
+def test_a_policy_of_openpi_infers_unused_rows_not_again() -> None:
+    policy = OpenpiShaped()
+    rows = [0, 1, 0, 0]
+    padded = {name: [values[row] for row in rows] for name, values in OBSERVATIONS.items()}
+    arrays = {name: values if name == "instruction" else np.array(values) for name, values in padded.items()}
+    found = openpi_policy(policy)(arrays)
+    assert len(policy.seen) == 2
+    assert np.array_equal(found, openpi_policy(policy)(OBSERVATIONS)[rows])
