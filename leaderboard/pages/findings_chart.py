@@ -50,7 +50,9 @@ def _panel(name: str, rows: Sequence[Row]) -> Spec:
             "range": [colour(f"mark-{DIVISIONS.index(division)}") for division in divisions],
         },
     }
-    gain = axis("value", "gain over plain fine-tuning, with 95 % interval", axis={"format": ".2~f", "tickCount": 6})
+    gain = axis(
+        "value", "gain over plain fine-tuning, with 95 % interval", axis={"format": ".2~f", "tickCount": 6}
+    )
     ends = {"x": {"field": "low", "type": "quantitative"}, "x2": {"field": "high"}}
     line = {"type": "rule", "color": colour("edge"), "strokeDash": [4, 3]}
     zero = layer([{"zero": 0}], line, x={"field": "zero", "type": "quantitative"})
