@@ -58,7 +58,8 @@ def curves(
         dark: Whether to use the colours for a dark page.
 
     Raises:
-        InputError: There is no record, or they are of several methods, or of different scenarios.
+        InputError: There is no record, or they are of several methods, or of different scenarios; or `sft`
+            has runs of another method.
         RecordError: A file is no record, or its run failed.
     """
     from .views.page.charts.picture import themed
@@ -71,6 +72,8 @@ def curves(
 def plane(records: Path | str = RECORDS, scenario: str | None = None, *, dark: bool = False) -> Plot:
     """Return the methods of a scenario: kept skills against learned targets, with intervals.
 
+    The line below the title names the methods that are far from the others, or have no such values.
+
     Args:
         records: Folder of the records.
         scenario: Gymnasium id of the scenario (default: the one with most rows).
@@ -78,20 +81,21 @@ def plane(records: Path | str = RECORDS, scenario: str | None = None, *, dark: b
 
     Raises:
         NoRecordsError: The folder does not exist.
-        InputError: No record makes a row.
+        InputError: No record makes a row, or no row has both values.
         UnknownNameError: The scenario has no row.
     """
     from .publishing import read_board
     from .views.page.charts.picture import themed
     from .views.page.charts.plane import WIDE
     from .views.page.charts.plane import plane as chart
-    from .views.page.charts.vega import heading
 
     rows = read_board(Path(records)).rows
     names = [row.scenario for row in rows]
     chosen = _chosen(scenario, {name: names.count(name) for name in names}, "row", records)
-    drawn = chart([row for row in rows if row.scenario == chosen], WIDE)
-    return themed({**drawn, "title": heading(chosen)}, dark)
+    drawn = chart([row for row in rows if row.scenario == chosen], WIDE, title=chosen)
+    if not drawn["datasets"]["points"]:
+        raise InputError(f"No row of {chosen} has both kept skills and learned targets.")
+    return themed(drawn, dark)
 
 
 def frontier(records: Path | str = RECORDS, scenario: str | None = None, *, dark: bool = False) -> Plot:

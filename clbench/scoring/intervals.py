@@ -275,6 +275,10 @@ def interval_of_seeds(value: float, error: float, degrees: int, span: Span = UNB
     inside the span without clipping. Wilson's interval with an error between clusters, here seeds, is
     recommended by Franco et al. 2019, doi 10.1093/jssam/smy019, after simulations.
 
+    A mean of seeds varies at most as much as one episode: e(x)^2 <= (x - low) (high - x). If the error is
+    larger, as that of a metric whose values are cut at a bound may be, the interval is Student's, cut at the
+    bounds.
+
     Args:
         value: The value, within the span.
         error: Its standard error; with 0 the interval has no width.
@@ -282,17 +286,18 @@ def interval_of_seeds(value: float, error: float, degrees: int, span: Span = UNB
         span: Least and greatest possible value.
     """
     low, high = span
-    reach = student_quantile(degrees) * error
-    if not math.isfinite(high - low):
-        return max(value - reach, low), min(value + reach, high)
-    if reach == 0:
+    width, reach = high - low, student_quantile(degrees) * error
+    if reach <= 1e-12 * width < math.inf:  # 0 but for the last bits
         return value, value
-    place, reach = min(max((value - low) / (high - low), 0.0), 1.0), reach / (high - low)
+    place = min(max((value - low) / width, 0.0), 1.0)
     spread = place * (1 - place)
+    if width == math.inf or (error / width) ** 2 > spread * (1 + 1e-9):
+        return max(value - reach, low), min(value + reach, high)
+    reach /= width
     # The ends are the roots x of spread (x - place)^2 = reach^2 x (1 - x).
     middle, half = 2 * spread * place + reach**2, reach * math.hypot(reach, 2 * spread)
     below, above = ((middle + side) / (2 * (spread + reach**2)) for side in (-half, half))
-    return low + (high - low) * below, low + (high - low) * above
+    return low + width * below, low + width * above
 
 
 def needed_references(

@@ -76,6 +76,12 @@ def test_curves_are_compared_with_those_of_plain_fine_tuning(record: Callable[..
     assert ">old skills under sft</text>" in plot.curves(method, sft).svg()
 
 
+def test_curves_of_another_method_do_not_pass_for_plain_fine_tuning(record: Callable[..., Record]) -> None:
+    with pytest.raises(InputError, match="must be of sft, not of lora"):
+        plot.curves(record(), sft=record(method="lora"))
+    assert "seed 0; sft: 2 runs" in plot.curves(record(), sft=[record(), record(seed=1)]).svg()
+
+
 def test_runs_that_do_not_belong_together_are_refused(
     record: Callable[..., Record], make_record: Callable[..., Record], tmp_path: Path
 ) -> None:
@@ -95,9 +101,17 @@ def test_a_plane_shows_every_method_in_the_colours_of_the_theme(four_methods: Pa
     )
     for text in ("clbench/Toy-v0", "sft", "replay", "asks", "from_scratch"):
         assert f">{text}</text>" in light
+    assert "Thin lines: 95 % intervals, as far as they fit." in light
     assert "var(--" not in light + dark
     assert light != dark
     assert plot.plane(str(four_methods)).svg() == light  # the scenario with most rows
+
+
+def test_a_plane_without_kept_skills_is_refused(make_record: Callable[..., Record], tmp_path: Path) -> None:
+    record = make_record([[0.0, 0.0, 0.25], [1.0, 0.0, 0.0], [0.75, 1.0, 0.0]], episodes=4, groups=(0, 2, 1))
+    write_record(record, record_path(tmp_path, "clbench/Toy-v0", "sft", 0))
+    with pytest.raises(InputError, match="No row of clbench/Toy-v0 has both kept skills and learned targets"):
+        plot.plane(tmp_path)
 
 
 def test_a_frontier_shows_the_methods_of_the_ladder(record: Callable[..., Record], tmp_path: Path) -> None:

@@ -59,10 +59,22 @@ def test_a_bound_on_one_side_cuts_students_interval_there() -> None:
     assert of_means(values, (-np.inf, 1.0)) == pytest.approx((expected[0], 1.0))
 
 
-def test_a_value_at_a_bound_whose_seeds_vary_may_be_anything() -> None:
+@pytest.mark.parametrize("other", [0.5, 0.99])
+def test_a_value_at_a_bound_whose_seeds_vary_has_students_interval_cut_there(other: float) -> None:
     # Not a mean: the value without one seed can be inside though the value is at the bound.
-    got = interval(1.0, np.array([1.0, 0.5, 1.0]), span=(0.0, 1.0))
-    assert (got.low, got.high) == (0.0, 1.0)
+    got = interval(1.0, np.array([1.0, other, 1.0]), span=(0.0, 1.0))
+    error = np.sqrt(2) * np.std([1.0, other, 1.0])
+    assert (got.low, got.high) == pytest.approx((max(0.0, 1.0 - stats.t.ppf(0.975, 2) * error), 1.0))
+
+
+def test_seeds_that_differ_in_the_last_bits_have_no_width() -> None:
+    assert interval_of_seeds(1.0, 1e-17, 11, (0.0, 1.0)) == (1.0, 1.0)
+
+
+def test_a_mean_of_two_seeds_at_both_bounds_keeps_wilsons_interval() -> None:
+    low, high = of_means(np.array([0.0, 1.0]), (0.0, 1.0))  # the largest error that a mean can have
+    assert 0 < low < 0.01
+    assert 0.99 < high < 1
 
 
 @pytest.mark.parametrize("seeds", [3, 4, 5, 8])

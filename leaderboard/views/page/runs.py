@@ -10,13 +10,14 @@ from typing import Any
 import numpy as np
 
 from clbench.base.errors import InputError
-from clbench.base.text import printable
+from clbench.base.text import counted, printable
 from clbench.records.paths import label_of, table_name
 from clbench.records.record import Record
 from clbench.scoring.intervals import Estimate, row_generator
 from clbench.scoring.layout import Layout
 from clbench.scoring.rates import check_same
 from clbench.scoring.scores import Scores
+from clbench.spec.references import BASELINE
 
 from ..format import format_interval
 from .charts.along import SERIES, along_a_run, with_points
@@ -66,6 +67,11 @@ class Runs:
     def layout(self) -> Layout:
         """The layout of their scores, the targets as the first run learned them."""
         return self.scores[0].layout
+
+    @property
+    def method(self) -> str:
+        """Name of their method."""
+        return self.records[0].run.method
 
     @property
     def title(self) -> str:
@@ -121,8 +127,12 @@ def curves_of(runs: Runs, sft: Runs | None) -> Spec:
     }
     at[SERIES[2]] = at[SERIES[0]]
     found = dict(runs.curves())
+    title = runs.title
     if sft is not None:
         check_same((runs.layout, sft.layout))
+        if sft.method != BASELINE:
+            raise InputError(f"The runs to compare with must be of {BASELINE}, not of {sft.method}.")
+        title += f"; {BASELINE}: {counted(len(sft.records), 'run')}"
         found[SERIES[2]] = [Estimate(one.value, None, None) for one in sft.curves()[SERIES[0]]]
     points = [
         _point(series, place, steps[-1], one)
@@ -132,7 +142,7 @@ def curves_of(runs: Runs, sft: Runs | None) -> Spec:
     ]
     names = runs.targets if runs.numbered else [f"{n} {name}" for n, name in enumerate(runs.targets, 1)]
     chart = along_a_run(names, None if runs.to_criterion else steps[-1], WIDE.width, FONT)
-    return {**with_points(chart, points), "title": heading(runs.title)}
+    return {**with_points(chart, points), "title": heading(title)}
 
 
 def _point(series: str, place: tuple[int, int], length: int, one: Estimate) -> dict[str, Any]:

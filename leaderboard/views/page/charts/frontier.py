@@ -38,6 +38,7 @@ LETTER = 6
 MEANINGS = (
     "to the right: learned, success on each target right after learning it",
     "upwards: kept, success at the end on all that was known before the last target",
+    "thin lines: 95 % intervals of what is kept, cut at the ends of the axis",
 )
 """What the axes show."""
 
