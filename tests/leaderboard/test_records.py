@@ -170,7 +170,7 @@ def test_the_readme_shows_the_committed_board() -> None:
     names = ("final average", "gain", "learned", "kept skills", "kept targets")
     published = {cells[head.index("method")]: [cells[head.index(name)] for name in names] for cells in rows}
     lines = README.read_text(encoding="utf-8").splitlines()
-    shown = [_cells(line) for line in lines if len(re.findall(r"\d \[-?\d", line)) == len(names)]
+    shown = [_cells(line) for line in lines if len(re.findall(r"\d \[[+-]?\d", line)) == len(names)]
     assert len(shown) == 7
     for method, reads, *values in shown:
         assert values == published[method], f"README.md: the row of {method} is another on the board"
