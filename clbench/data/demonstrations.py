@@ -119,7 +119,9 @@ def collect(task: Task, budget: Budget) -> list[Demonstration]:
 
     Raises:
         InputError: The expert fails more often than it succeeds.
+        LeakError: The running hooks of a method must not read them.
     """
+    check_demonstrations(task.name)
     with contextlib.closing(_world(task)) as world:
         return _collect(world, task, budget, no_progress)
 

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from clbench.learning.method import Method, Progress, Stage
 from clbench.learning.optimise import GradientError, MethodError, optimise, warm_up
+from clbench.learning.prior import begin_step, end_steps
 from clbench.policy.policy import Policy
 from clbench.spec.budget import Budget
 
@@ -66,6 +67,7 @@ def adapt(
 
     def loss_at(step: int) -> Tensor:
         nonlocal loss
+        begin_step(stage.target)
         batch = method.batch(stage.target, stage.prior)
         loss = method.loss(policy, batch, progress(step))
         return loss
@@ -93,11 +95,26 @@ def adapt(
         )
     except GradientError as error:
         raise GradientError(f"{str(error).rstrip('.')}: {_not_finite(policy)}.") from error
+    end_steps(stage.target)
     method.end_task(policy, stage)
-    for name, parameter in policy.named_parameters():
-        if not torch.isfinite(parameter).all():
-            raise MethodError(f"The parameter {name} is not finite after {stage.task.name!r}.")
+    check_finite(policy, repr(stage.task.name))
     return steps
+
+
+def check_finite(policy: Policy, after: str) -> None:
+    """Refuse a policy that no checkpoint can hold.
+
+    Args:
+        policy: The policy.
+        after: What the method has just done.
+
+    Raises:
+        MethodError: A parameter or a buffer is not finite.
+    """
+    for kind, tensors in (("parameter", policy.named_parameters()), ("buffer", policy.named_buffers())):
+        for name, value in tensors:
+            if not torch.isfinite(value).all():
+                raise MethodError(f"The {kind} {name} is not finite after {after}.")
 
 
 def _not_finite(policy: Policy) -> str:

@@ -10,6 +10,7 @@ from typing import Any
 
 import torch
 from torch import Tensor, nn
+from torch.optim.optimizer import register_optimizer_step_post_hook
 
 from clbench.base.errors import ClbenchError
 
@@ -67,6 +68,22 @@ def deterministic(device: str = "cpu") -> Iterator[None]:
     finally:
         torch.set_num_threads(threads)
         torch.use_deterministic_algorithms(algorithms, warn_only=warn_only)
+
+
+@contextmanager
+def steps_counted() -> Iterator[Callable[[], int]]:
+    """Count the steps of all optimisers of PyTorch; yield a function that returns their number so far."""
+    taken = 0
+
+    def add(*_: Any) -> None:
+        nonlocal taken
+        taken += 1
+
+    handle = register_optimizer_step_post_hook(add)
+    try:
+        yield lambda: taken
+    finally:
+        handle.remove()
 
 
 def optimise(

@@ -100,6 +100,9 @@ class Source(Generic[Rows]):
         self._data: Samples[Rows] | None = data
         self._generator = generator
         self._device = device
+        self._left: int | None = None
+        """Samples that the running step may still draw, None outside of steps."""
+        self._twins: list[Source[Rows]] = []
 
     def __len__(self) -> int:
         """Return the number of different moments, or of states for questions; 0 if there is no data."""
@@ -118,20 +121,24 @@ class Source(Generic[Rows]):
 
         Raises:
             MissingDataError: There is no data.
-            UndeclaredAccessError: The hooks that received the source have ended.
+            UndeclaredAccessError: The hooks that received the source have ended, or a step draws more samples
+                of the target than `batch_size`.
         """
+        if self._left is not None:
+            self._left -= count
+            if self._left < 0:
+                raise UndeclaredAccessError(
+                    f"The method draws {self.batch_size - self._left} samples of the target in a step: "
+                    f"{self.batch_size}, its `batch_size`, are the budget of all methods."
+                )
         rows: Rows = self._open.sample(count, self._generator).to(self._device)
         return rows
-
-    def twin(self) -> Source[Rows]:
-        """Return a source of the same data, whose draws begin where this one's are now."""
-        generator = torch.Generator(self._generator.device)
-        generator.set_state(self._generator.get_state())
-        return Source(self._open, generator, self.batch_size, self._device)
 
     def close(self) -> None:
         """End the access."""
         self._data = None
+        for twin in self._twins:
+            twin.close()
 
     @property
     def _open(self) -> Samples[Rows]:
@@ -141,6 +148,28 @@ class Source(Generic[Rows]):
                 'need in `state()`, or declare it with "throughout" in `uses`.'
             )
         return self._data
+
+
+def begin_step(source: Source[Any]) -> None:
+    """Let the step that begins draw no more than `batch_size` samples."""
+    source._left = source.batch_size
+
+
+def end_steps(source: Source[Any]) -> None:
+    """Let the hooks after the last step draw as many samples as they need."""
+    source._left = None
+
+
+def twin_of(source: Source[Rows]) -> Source[Rows]:
+    """Return a source of the same data, whose draws begin where those of `source` are now.
+
+    It closes with `source`.
+    """
+    generator = torch.Generator(source._generator.device)
+    generator.set_state(source._generator.get_state())
+    twin = Source(source._open, generator, source.batch_size, source._device)
+    source._twins.append(twin)
+    return twin
 
 
 @dataclass(frozen=True)
@@ -167,10 +196,6 @@ class Prior:
                 f'set `uses = Uses({name}="prepare")` or "throughout".'
             )
         return self.sources[name]
-
-    def twin(self) -> Prior:
-        """Return the same data, with the draws that come next."""
-        return Prior({name: source.twin() for name, source in self.sources.items()})
 
     def close(self) -> None:
         """End the access."""

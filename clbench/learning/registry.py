@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import json
 import math
 from collections.abc import Iterable, Mapping
 from types import NoneType, UnionType
-from typing import Any, Union, get_args, get_origin, get_type_hints
+from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
 
@@ -125,6 +126,9 @@ def _held(name: str, value: Any, hint: Any) -> Any:
         value = value.item()
     if type(value) is int and float in kinds and int not in kinds:
         return float(value)
+    choices = _choices(kinds)
+    if choices and value not in choices and (NoneType not in kinds or value is not None):
+        raise InputError(f"{name} must be {_words(kinds)}, not {value!r}.")
     if all(kind in WORDS for kind in kinds) and type(value) not in kinds:
         raise InputError(f"{name} must be {_words(kinds)}, not {value!r}.")
     return value
@@ -134,7 +138,13 @@ WORDS = {int: "a whole number", float: "a number", bool: "true or false", str: "
 
 
 def _words(kinds: Iterable[Any]) -> str:
-    return " or ".join(WORDS.get(kind, str(kind)) for kind in kinds)
+    named = [WORDS.get(kind, str(kind)) for kind in kinds if get_origin(kind) is not Literal]
+    return " or ".join([*map(repr, _choices(kinds)), *named])
+
+
+def _choices(kinds: Iterable[Any]) -> list[Any]:
+    """Return the values of the `Literal`s among types."""
+    return [choice for kind in kinds if get_origin(kind) is Literal for choice in get_args(kind)]
 
 
 def _kinds(hint: Any) -> tuple[Any, ...]:
@@ -143,10 +153,20 @@ def _kinds(hint: Any) -> tuple[Any, ...]:
 
 
 def _read(name: str, text: str, hint: Any) -> Any:
-    """Return `text` as a value of the type `hint`: str, int, float, bool, or a union of these and None."""
+    """Return `text` as a value of the type `hint`.
+
+    It is str, int, float, bool, a `Literal`, a list, whose text is JSON, or a union of these and None.
+    """
     kinds = _kinds(hint)
     if text.lower() == "none" and NoneType in kinds:
         return None
+    for choice in _choices(kinds):
+        if str(choice) == text:
+            return choice
+    if any(get_origin(kind) is list for kind in kinds):
+        with contextlib.suppress(ValueError):
+            if isinstance(found := json.loads(text), list):
+                return found
     for kind in (bool, int, float, str):
         if kind not in kinds:
             continue

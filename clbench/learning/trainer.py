@@ -18,13 +18,14 @@ from clbench.base.source import RUN_SOURCES, source_hash
 from clbench.data.access import check_policy, hooks, outside
 from clbench.data.demonstrations import Demonstrations
 from clbench.data.training_data import TrainingData
-from clbench.learning.adaptation import Step, adapt
+from clbench.learning.adaptation import Step, adapt, check_finite
 from clbench.learning.method import Method, MethodState, Stage
 from clbench.learning.method_state import read_state, write_state
+from clbench.learning.optimise import MethodError, steps_counted
 from clbench.learning.pretraining import pretrained_policy, pretraining_inputs
-from clbench.learning.prior import Access, Nothing, Prior, Source
+from clbench.learning.prior import Access, Nothing, Prior, Source, twin_of
 from clbench.learning.watching import watch, watches
-from clbench.policy.checkpoint import CheckpointError, load_policy, save_policy
+from clbench.policy.checkpoint import CheckpointError, MisfitError, load_policy, save_policy
 from clbench.policy.policy import Policy
 from clbench.spec.policies import policy_packages
 from clbench.spec.scenario import Scenario
@@ -63,6 +64,8 @@ class Trainer:
         self.pretrained, self.new_method = pretrained, new_method
         self.policy, self.method = copy.deepcopy(pretrained), new_method()
         self.where = "start"
+        self.extra_steps = 0
+        """Optimiser steps that the method took in the hooks of the last stage, besides those of the loop."""
 
     @property
     def where(self) -> str:
@@ -102,10 +105,12 @@ class Trainer:
         watched = self._watch(progress) if watches(type(self.method)) else 0
         self.where = "prepare"
         prior = self.prior(0, ("prepare", "throughout"))
-        with seeded("method", self.seed, 0), self._hooks(0):
-            steps = self.method.prepare(self.policy, prior) or 0
+        with seeded("method", self.seed, 0), self._hooks(0), steps_counted() as taken:
+            declared = self.method.prepare(self.policy, prior) or 0
+            steps = max(declared, taken())  # a result from the cache took its steps earlier
         prior.close()
         check_policy(self.policy, self.pretrained)
+        check_finite(self.policy, "prepare()")
         return watched + steps
 
     def _watch(self, progress: ProgressCallback) -> int:
@@ -133,6 +138,8 @@ class Trainer:
     def learn(self, number: int, after: Callable[[Step], bool | None]) -> int:
         """Adapt to a target, and return the number of optimiser steps done.
 
+        `extra_steps` is then the number of other optimiser steps that the method took in its hooks.
+
         Args:
             number: Number of the target, from 1.
             after: Called after each step, as by `adapt`; the stage ends if it returns True.
@@ -145,12 +152,19 @@ class Trainer:
         stage = Stage(number, task, method_seed, budget.adaptation_steps, target, prior)
         self._stage = stage
 
-        def report(step: Step) -> bool | None:
-            with outside():
-                return after(step)
+        aside = 0
 
-        with seeded("method", self.seed, number), self._hooks(number):
+        def report(step: Step) -> bool | None:
+            nonlocal aside
+            before = taken()
+            with outside():
+                ends = after(step)
+            aside += taken() - before  # a check lets a method of `whole_stages` end the stage on copies
+            return ends
+
+        with seeded("method", self.seed, number), self._hooks(number), steps_counted() as taken:
             steps = adapt(self.policy, self.method, stage, budget, report)
+            self.extra_steps = max(0, taken() - aside - steps)
         target.close()
         prior.close()
         check_policy(self.policy, self.pretrained)
@@ -164,9 +178,8 @@ class Trainer:
         """
         if not self.method.whole_stages:
             return self.policy
-        stage = dataclasses.replace(
-            self._stage, target=self._stage.target.twin(), prior=self._stage.prior.twin()
-        )
+        prior = Prior({name: twin_of(source) for name, source in self._stage.prior.sources.items()})
+        stage = dataclasses.replace(self._stage, target=twin_of(self._stage.target), prior=prior)
         policy, method = copy.deepcopy((self.policy, self.method))
         with draws_restored(), self._hooks(stage.number):
             method.end_task(policy, stage)
@@ -220,7 +233,13 @@ class Trainer:
         self.method = self.new_method()
         # adapters are drawn before they are filled
         with seeded("method", self.seed, number), self._hooks(number):
-            self.policy = load_stage(folder, self.method, self.device, self.scenario.policy)
+            try:
+                self.policy = load_stage(folder, self.method, self.device, self.scenario.policy)
+            except MisfitError as error:
+                raise MethodError(
+                    f"load_state() must give a new policy the parameters and buffers that the method had "
+                    f"added: {', '.join(error.names)} differ."
+                ) from error
         check_policy(self.policy, self.pretrained)
 
 

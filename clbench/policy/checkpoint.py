@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +26,19 @@ LARGEST = 65_536
 
 class CheckpointError(ClbenchError, ValueError):
     """A file is not a readable checkpoint."""
+
+
+class MisfitError(CheckpointError):
+    """The tensors of a checkpoint do not fit the policy that is built for them.
+
+    Args:
+        folder: Folder of the checkpoint.
+        names: Names of the tensors that one of the two lacks, or has in another shape or type.
+    """
+
+    def __init__(self, folder: Path, names: Sequence[str]) -> None:
+        super().__init__(f"{folder}: tensors that do not fit the policy: {', '.join(names)}.")
+        self.names = tuple(names)
 
 
 def save_policy(policy: Policy, folder: Path) -> None:
@@ -69,7 +82,7 @@ def load_policy(
     expected, found = _kinds(policy.state_dict()), _kinds(tensors)
     if expected != found:
         wrong = sorted(name for name in expected | found if expected.get(name) != found.get(name))
-        raise CheckpointError(f"{folder}: tensors that do not fit the policy: {', '.join(wrong)}.")
+        raise MisfitError(folder, wrong)
     if not all(bool(torch.isfinite(value).all()) for value in tensors.values()):
         raise CheckpointError(f"{folder}: holds values that are not finite.")
     policy.load_state_dict(tensors)

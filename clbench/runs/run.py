@@ -120,6 +120,12 @@ def _parameters(trainer: Trainer) -> int:
     return sum(parameter.numel() for parameter in trainer.policy.parameters())
 
 
+def _added_buffers(trainer: Trainer) -> list[torch.Tensor]:
+    """Return the buffers that the method added to the policy: they keep data as its state does."""
+    usual = dict(trainer.pretrained.named_buffers())
+    return [value for name, value in trainer.policy.named_buffers() if name not in usual]
+
+
 @dataclasses.dataclass
 class _Run:
     """A run in progress: the trainer, the examiner, and the record so far.
@@ -272,7 +278,7 @@ class _Run:
         evaluate(Point(number, steps) if protocol.criterion else protocol.end(number), predictions)
         self._diagnose(number)
         training = time.perf_counter() - begin - evaluating - checking
-        self._count_steps(steps)
+        self._count_steps(steps + self.trainer.extra_steps)
         seconds = {"training": training, "checks": checking, "evaluation": evaluating}
         self.record.timing["stages"].append({name: round(value, 2) for name, value in seconds.items()})
 
@@ -307,7 +313,7 @@ class _Run:
         tensors = [value for value in state.values() if isinstance(value, torch.Tensor)]
         costs.parameters_added = _parameters(self.trainer) - (costs.parameters or 0)
         kept = self.trainer.prior(len(self.run.scenario.target), ("throughout",)).bytes
-        costs.bytes_kept = kept + sum(tensor.nbytes for tensor in tensors)
+        costs.bytes_kept = kept + sum(tensor.nbytes for tensor in (*tensors, *_added_buffers(self.trainer)))
 
     # ---- checkpoints -------------------------------------------------------------------------------
 

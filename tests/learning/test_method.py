@@ -3,12 +3,13 @@ import sys
 import types
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import pytest
 import torch
 from helpers import build_method
 
+from clbench.base.errors import InputError
 from clbench.data.demonstrations import Demonstrations
 from clbench.learning.method import Metadata, Method
 from clbench.learning.prior import Prior, Source, UndeclaredAccessError
@@ -82,6 +83,27 @@ def test_changes_from_the_command_line_take_the_types_of_the_fields() -> None:
         "rounds": 7,
         "gentle": True,
     }
+
+
+@dataclasses.dataclass
+class Chooses(Method):
+    """A method with a choice and a list."""
+
+    mode: Literal["slow", "fast"] = "slow"
+    layers: list[int] = dataclasses.field(default_factory=list)
+
+
+def test_a_choice_and_a_list_are_read_from_the_command_line(stranger: Callable[[type[Method]], str]) -> None:
+    method = build_method(stranger(Chooses), {"mode": "fast", "layers": "[1, 2]"})
+    assert dataclasses.asdict(method) == {"step_factor": 1.0, "mode": "fast", "layers": [1, 2]}
+
+
+@pytest.mark.parametrize(("name", "value"), [("mode", "quick"), ("mode", 3)])
+def test_a_choice_that_is_none_names_the_choices(
+    name: str, value: Any, stranger: Callable[[type[Method]], str]
+) -> None:
+    with pytest.raises(InputError, match=f"{name} must be 'slow' or 'fast', not {value!r}"):
+        build_method(stranger(Chooses), {name: value})
 
 
 @pytest.mark.parametrize(

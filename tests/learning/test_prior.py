@@ -1,0 +1,41 @@
+"""Sources of data: a twin draws what comes next, and closes with its source."""
+
+from typing import Any
+
+import pytest
+import torch
+
+from clbench.learning.prior import Source, UndeclaredAccessError, twin_of
+
+
+class Numbers:
+    """Data whose samples are random numbers."""
+
+    bytes = 8
+
+    def __len__(self) -> int:
+        return 1
+
+    def sample(self, count: int, generator: torch.Generator) -> torch.Tensor:
+        """Return `count` numbers."""
+        return torch.rand(count, generator=generator)
+
+
+def numbers() -> Any:
+    """Return the data, which are no batches."""
+    return Numbers()
+
+
+def test_a_twin_draws_what_its_source_would_draw_next_and_leaves_it_alone() -> None:
+    source = Source(numbers(), torch.Generator().manual_seed(1), 4)
+    source.sample(3)
+    twin = twin_of(source)
+    assert twin.sample(5).equal(source.sample(5))
+
+
+def test_a_twin_closes_with_its_source() -> None:
+    source = Source(numbers(), torch.Generator(), 4)
+    twin = twin_of(source)
+    source.close()
+    with pytest.raises(UndeclaredAccessError, match="after the hooks that received it"):
+        twin.sample(1)
