@@ -5,6 +5,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy
 import pytest
 
 from clbench.metrics import from_csv
@@ -36,8 +37,15 @@ def test_its_command_prints_what_the_page_shows(tmp_path: Path) -> None:
 def test_its_script_prints_a_value_a_reason_and_the_flips(tmp_path: Path) -> None:
     value, reason, *flips = _run(tmp_path, "-c", _block("python")).splitlines()
     assert float(value) == pytest.approx(0.45)
-    assert reason == "No method is called joint, or it has other seeds."
+    assert reason == "No method is called joint."
     assert any(line.startswith("average sft") for line in flips)
+
+
+def test_its_forward_transfer_of_gem_is_the_mean_gain_over_stage_0_just_before_learning() -> None:
+    (formula,) = re.findall(r"`(numpy\.mean\(.*?)`", PAGE.read_text(encoding="utf-8"))
+    matrix = numpy.random.default_rng(0).random((5, 4))
+    gains = [matrix[k - 1][k - 1] - matrix[0][k - 1] for k in range(2, 5)]  # target k is column k - 1
+    assert eval(formula, {"numpy": numpy, "R": matrix}) == pytest.approx(sum(gains) / 3)
 
 
 def test_it_states_what_robocasa365_gives() -> None:

@@ -15,8 +15,9 @@ from clbench.scoring.metrics import METRICS
 
 LEFT_OUT = {
     "Continual World's RT": "it needs a run for every pair of tasks",
-    "the FWT of GEM, Mammoth and Avalanche": "it needs the success of an untrained network, which is "
-    "not evaluated",
+    "the FWT of GEM, Mammoth and Avalanche": "it needs the success of an untrained policy, and stage 0 of a "
+    "run of clbench is a pretrained one; if stage 0 of your own table is untrained, it is the mean over the "
+    "targets k from 2 of R[k-1][k] - R[0][k]",
     "min-ACC and WC-ACC at every step": "earlier targets are evaluated at the ends of the stages only, and "
     "`minimum_accuracy` and `worst_case_accuracy` say so",
     "windowed forgetting and windowed plasticity": "their window counts evaluations after each step",
@@ -43,7 +44,7 @@ def span(metric: Metric) -> str:
 
 def facts(metric: Metric) -> dict[str, str]:
     """Return the facts about a metric by title."""
-    seeds = "averaged before it is computed" if metric.pooled else "the mean of their values"
+    seeds = "the geometric mean of their values" if metric.ratio else "the mean of their values"
     return {
         "Formula": metric.formula,
         "Source": metric.source,
@@ -51,8 +52,8 @@ def facts(metric: Metric) -> dict[str, str]:
         "Direction": metric.direction,
         "Range": span(metric),
         "Units": metric.units,
-        "References": ", ".join(metric.references) or "none",
-        "Seeds": seeds,
+        "Compared with": ", ".join(metric.references) or "nothing",
+        "Seeds": "averaged before it is computed" if metric.pooled else seeds,
         "None means": metric.missing,
     }
 

@@ -81,3 +81,9 @@ DEFINITIONS = {
     ),
 }
 """The metrics that a success matrix allows, by name."""
+
+INSTEAD = {
+    "forgetting_chaudhry": "`forgetting` is the same over the stages since a target was learned, with the "
+    "retained skills counted in.",
+}
+"""What stands in for a definition where a table lacks cells that few tables have."""

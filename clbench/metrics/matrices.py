@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from clbench.base.entry_points import unknown
 from clbench.base.errors import InputError
-from clbench.base.text import counted, quoted
+from clbench.base.text import counted, did_you_mean, quoted
 from clbench.metrics.report import Matrices, Report, measure
 from clbench.scoring.layout import Array, Layout
 
@@ -22,8 +22,13 @@ MOST: dict[Unit, float] = {"share": 1.0, "percent": 100.0}
 """The greatest success rate in each unit."""
 ROUNDING = 1e-9
 """Share by which a mean of rates may exceed the greatest one: the last bits of a sum."""
+DOUBTFUL = 2.0
+"""Greatest rate, above 1, that may well be a wrong share."""
+MIXED = 0.25
+"""Share of a method's rates other than 0 that are at most 1, from which on they may be shares."""
 
 Names = Sequence[str]
+"""Names of tasks; a text is one name."""
 
 
 class Cell(NamedTuple):
@@ -55,6 +60,15 @@ class Groups:
     held_out: Names = ()
     """Tasks that are never trained."""
 
+    def __post_init__(self) -> None:
+        for group, names in vars(self).items():
+            object.__setattr__(self, group, None if names is None else _names(names))
+
+
+def _names(names: Names) -> tuple[str, ...]:
+    """Return names as a tuple; a text alone is one name, and not its letters."""
+    return (names,) if isinstance(names, str) else tuple(names)
+
 
 def from_matrix(
     matrix: ArrayLike | Mapping[str, ArrayLike],
@@ -70,10 +84,11 @@ def from_matrix(
     Args:
         matrix: Success rates, (stages, tasks) or (seeds, stages, tasks), NaN where missing; or several of
             them by the name of the method. Row k is the end of stage k, in which target k is learned. A row
-            more than there are targets is stage 0, before the first target. A method called sft, joint or
-            from_scratch is the reference of the metrics that need one.
+            more than there are targets is stage 0, before the first target. The metric gain compares with a
+            method called sft, intransigence with one called joint.
         tasks: Names of the columns. Without them, they are "task 1", "task 2" and so on.
-        retained: Names of the tasks that are known before the first target and never trained again.
+        retained: Names of the tasks that are known before the first target and never trained again; a text
+            is one name, here and below.
         target: Names of the tasks that are learned, in their order. Without them, they are all tasks that are
             neither retained nor held out, in the order of the columns.
         held_out: Names of the tasks that are never trained.
@@ -81,7 +96,8 @@ def from_matrix(
             shares unless one is above 1; `Report.unit` says what was assumed.
 
     Raises:
-        InputError: The shape does not fit the tasks, or a rate is out of range.
+        InputError: The shape does not fit the tasks, a rate is no number or out of range, there is no such
+            unit, or the rates leave in doubt which it is.
         UnknownNameError: There is no such task.
     """
     given = matrix if isinstance(matrix, Mapping) else {"": matrix}
@@ -89,7 +105,7 @@ def from_matrix(
     if not arrays:
         raise InputError("There is no matrix: expected at least one method.")
     rows, columns = _shape(arrays)
-    names = tuple(tasks) if tasks is not None else tuple(f"task {n}" for n in range(1, columns + 1))
+    names = _names(tasks) if tasks is not None else tuple(f"task {n}" for n in range(1, columns + 1))
     if len(names) != columns:
         raise InputError(f"There are {counted(len(names), 'name')} for {counted(columns, 'task')}.")
     groups = Groups(retained, target, held_out)
@@ -109,9 +125,15 @@ def from_matrix(
 
 def _array(values: ArrayLike, method: str) -> Array:
     """Return success rates as an array, (seeds, stages, tasks)."""
-    array = np.asarray(values, dtype=np.float64)
+    name = f" of method {quoted(method)}" if method else ""
+    try:
+        array = np.asarray(values, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise InputError(
+            f"The matrix{name} is no array of numbers: expected rows of equal length, NaN where a rate is "
+            f"missing ({error})."
+        ) from None
     if array.ndim not in (2, 3) or not array.size:
-        name = f" of method {quoted(method)}" if method else ""
         raise InputError(
             f"The matrix{name} has the shape {array.shape}: expected (stages, tasks) or (seeds, stages, "
             "tasks)."
@@ -138,7 +160,7 @@ def matrices_of(
         cells: The success rates that are there, NaN where missing.
         tasks: Names of all tasks, in the order of the table.
         groups: The groups of the tasks.
-        unit: Unit of the rates; None to choose it by the greatest one.
+        unit: Unit of the rates; None to choose it by the rates.
         where: Place of the table for messages, such as "table.csv: ".
     """
     layout = layout_of(tasks, groups)
@@ -147,8 +169,10 @@ def matrices_of(
         found = f"The stages are {stages[0]} to {stages[-1]}." if stages else "The table has no rows."
         raise InputError(f"{where}{found} {_expected_stages(layout)}")
     known = {cell: rate for cell, rate in cells.items() if not math.isnan(rate)}
-    largest = max(known.values(), default=0.0)
-    chosen: Unit = unit or ("percent" if largest > 1 + ROUNDING else "share")
+    chosen = _likely_unit(known, where) if unit is None else unit
+    if chosen not in MOST:
+        hint = did_you_mean(str(chosen), MOST)
+        raise InputError(f"The unit must be 'share' or 'percent', not {chosen!r}.{hint}")
     _check_range(known, chosen, where)
     places = {name: place for place, name in enumerate(layout.tasks)}
     success: dict[str, dict[str, Array]] = {}
@@ -157,7 +181,25 @@ def matrices_of(
         if cell.seed not in of_method:
             of_method[cell.seed] = np.full((len(layout.target) + 1, len(tasks)), np.nan)
         of_method[cell.seed][cell.stage, places[cell.task]] = min(rate / MOST[chosen], 1.0)
-    return Matrices(layout, success, chosen, unit is not None, largest)
+    return Matrices(layout, success, chosen, unit is not None, max(known.values(), default=0.0))
+
+
+def _likely_unit(known: Mapping[Cell, float], where: str) -> Unit:
+    """Return the unit that the rates show, and refuse rates that leave it in doubt."""
+    cell = max(known, key=known.__getitem__, default=None)
+    if cell is None or known[cell] <= 1 + ROUNDING:
+        return "share"
+    by_method: dict[str, list[bool]] = {}
+    for one, rate in known.items():
+        if rate > 0:
+            by_method.setdefault(one.method, []).append(rate <= 1 + ROUNDING)
+    if known[cell] <= DOUBTFUL or any(sum(small) >= MIXED * len(small) for small in by_method.values()):
+        others = "" if known[cell] <= DOUBTFUL else ", and other rates are at most 1"
+        raise InputError(
+            f"{where}{cell}: found {known[cell]:g}{others}: is it a share above 1, or per cent? Correct it, "
+            'or say --unit percent, in Python unit="percent".'
+        )
+    return "percent"
 
 
 def _check_range(known: Mapping[Cell, float], unit: Unit, where: str) -> None:

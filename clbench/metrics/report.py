@@ -1,8 +1,8 @@
 """The metrics of success matrices: values, the reasons of missing ones, and where the order of methods flips.
 
 All values come from the functions of the registry (`clbench.scoring.metrics`). What a metric needs is found
-by trying: it is computed for a complete matrix without one cell, for each cell in turn. If it then has no
-value, it needs this cell.
+by trying: it is computed for a complete matrix without one cell, for each missing cell in turn. If it then
+has no value, it needs this cell.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from clbench.base.entry_points import unknown
 from clbench.base.text import counted, quoted
-from clbench.metrics.definitions import DEFINITIONS, FAMILIES
+from clbench.metrics.definitions import DEFINITIONS, FAMILIES, INSTEAD
 from clbench.scoring.intervals import interval
 from clbench.scoring.layout import Array, Layout
 from clbench.scoring.metric import Metric
@@ -31,6 +31,10 @@ if TYPE_CHECKING:
 
 TIE = 1e-9
 """Greatest difference of two values that count as equal: they differ by rounding."""
+PROBES = 64
+"""Matrices that are tried at once; more are hardly faster, and take more memory."""
+REPEATED = "gain"
+"""Metric that counts in no flip: it repeats final_average, less that of sft."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,12 +158,11 @@ def _value(metric: Metric, method: str, matrices: Matrices) -> Value:
         for name in metric.references
         if set(runs) <= set(matrices.success.get(name, ()))
     }
-    absent = [name for name in metric.references if name not in references]
     rates = _rates(np.stack(list(runs.values())), matrices.layout)
     rates = replace(rates, references=references)
     value = float(metric.over_runs(rates))
     if not math.isfinite(value):
-        return Value(None, reason=_reason(metric, matrices.layout, runs, absent))
+        return Value(None, reason=_reason(metric, method, matrices))
     # without one seed each: none of them with one seed
     others = [
         float(metric.over_runs(rates.each(functools.partial(np.delete, obj=place, axis=0))))
@@ -174,7 +177,7 @@ def _rates(success: Array, layout: Layout) -> Rates:
     batch, count, tasks = success.shape[:-2], len(layout.target), len(layout.tasks)
 
     def missing(*shape: int) -> Array:
-        return np.full((*batch, *shape), np.nan)
+        return np.broadcast_to(np.nan, (*batch, *shape))
 
     points = len(layout.steps)
     of_points = ("answer_curves", "update_sparsity", "activation_drift")
@@ -197,33 +200,74 @@ def _rates(success: Array, layout: Layout) -> Rates:
 # ---- reasons -----------------------------------------------------------------------------------------------
 
 
-def needed_cells(metric: Metric, layout: Layout) -> NDArray[np.bool_] | None:
-    """Return which cells of a matrix a metric needs, (stages + 1, tasks); None if it needs other things."""
+def needed_cells(
+    metric: Metric, layout: Layout, among: NDArray[np.bool_] | None = None, of: str | None = None
+) -> NDArray[np.bool_] | None:
+    """Return which cells of a matrix a metric needs, (stages + 1, tasks); None if it needs other things.
+
+    Args:
+        metric: The metric.
+        layout: Layout of the matrix.
+        among: The cells that are tried, (stages + 1, tasks); the others count as not needed. None tries all.
+        of: Name of the reference whose matrix it is, None for the method's own.
+    """
     shape = len(layout.target) + 1, len(layout.tasks)
-    complete = np.full((1 + math.prod(shape), *shape), 0.5)
-    complete[1:].reshape(math.prod(shape), -1)[np.diag_indices(math.prod(shape))] = np.nan
-    references = {name: _rates(np.full(complete.shape, 0.5), layout) for name in metric.references}
-    found = metric.function(replace(_rates(complete, layout), references=references))
-    whole, without_one = found[0], found[1:]
-    return None if np.isnan(whole) else np.isnan(without_one).reshape(shape)
+    if _without_value(metric, layout, np.full((1, *shape), 0.5), of).any():
+        return None
+    cells = np.argwhere(np.ones(shape) if among is None else among)
+    needed = np.zeros(shape, dtype=bool)
+    for start in range(0, len(cells), PROBES):
+        stages, tasks = cells[start : start + PROBES].T
+        matrices = np.full((len(stages), *shape), 0.5)
+        matrices[np.arange(len(stages)), stages, tasks] = np.nan
+        needed[stages, tasks] = _without_value(metric, layout, matrices, of)
+    return needed
 
 
-def _reason(metric: Metric, layout: Layout, runs: Mapping[str, Array], absent: list[str]) -> str:
-    """Return why a metric has no value."""
-    needed = needed_cells(metric, layout)
-    if needed is None:
+def _without_value(metric: Metric, layout: Layout, matrices: Array, of: str | None) -> NDArray[np.bool_]:
+    """Return which of `matrices`, (n, stages + 1, tasks), leave a metric without a value, all else given."""
+    given, complete = _rates(matrices, layout), _rates(np.full_like(matrices, 0.5), layout)
+    references = {name: given if name == of else complete for name in metric.references}
+    return np.isnan(metric.function(replace(given if of is None else complete, references=references)))
+
+
+def _reason(metric: Metric, method: str, matrices: Matrices) -> str:
+    """Return why a metric has no value for a method."""
+    layout, runs = matrices.layout, matrices.success[method]
+    places = _lacking(metric, layout, runs)
+    if places is None:
         return metric.missing
-    if absent:
-        return f"No method is called {absent[0]}, or it has other seeds."
-    places = [
+    for name in metric.references:
+        found = matrices.success.get(name)
+        if found is None:
+            return f"No method is called {name}."
+        absent = [seed for seed in runs if seed not in found]
+        if absent:
+            words = (f"seed {quoted(seed)}" if seed else "matrix without a seed" for seed in absent)
+            return f"Method {name} has no {', no '.join(words)}."
+        if name != method:
+            others = _lacking(metric, layout, {seed: found[seed] for seed in runs}, name) or ()
+            places += [f"method {name}, {place}" for place in others]
+    if not places:
+        return metric.missing
+    more = f" and {counted(len(places) - 1, 'other cell')}" if places[1:] else ""
+    instead = f" {INSTEAD[metric.name]}" if metric.name in INSTEAD else ""
+    return f"The table lacks {places[0]}{more}.{instead}"
+
+
+def _lacking(
+    metric: Metric, layout: Layout, runs: Mapping[str, Array], of: str | None = None
+) -> list[str] | None:
+    """Return the missing cells of `runs` that a metric needs, in words; the rest as for `needed_cells`."""
+    success = np.stack(list(runs.values()))
+    needed = needed_cells(metric, layout, np.isnan(success.mean(axis=0)), of)
+    if needed is None:
+        return None
+    return [
         f"{f'seed {quoted(seed)}, ' if len(runs) > 1 else ''}stage {stage}, {layout.tasks[task]}"
         for seed, matrix in runs.items()
         for stage, task in np.argwhere(needed & np.isnan(matrix))
     ]
-    if not places:
-        return metric.missing
-    more = f" and {counted(len(places) - 1, 'other cell')}" if places[1:] else ""
-    return f"The table lacks {places[0]}{more}."
 
 
 # ---- the order of the methods ------------------------------------------------------------------------------
@@ -234,7 +278,8 @@ def _flips(values: Mapping[str, Mapping[str, Value]]) -> Iterator[Flip]:
     methods = list(next(iter(values.values())))
     for family, (first, second) in itertools.product(FAMILIES, itertools.combinations(methods, 2)):
         better: dict[bool, list[str]] = {True: [], False: []}
-        for name in (name for name, one in DEFINITIONS.items() if one.family == family):
+        names = (name for name, one in DEFINITIONS.items() if one.family == family)
+        for name in (name for name in names if name != REPEATED):
             sides = values[name][first].value, values[name][second].value
             ahead = _ahead(METRICS[name], *sides)
             if ahead is not None:

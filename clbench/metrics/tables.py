@@ -31,6 +31,8 @@ RATES = ("task", "success")
 """The other columns of a long table."""
 MISSING = ("", "-", "nan")
 """Texts of a cell without a rate, in small letters."""
+OTHER_MARKS = {";": "semicolons", "\t": "tabs"}
+"""What other programs put between the cells."""
 
 
 @dataclass(frozen=True)
@@ -142,10 +144,16 @@ def _read(path: Path) -> tuple[dict[Cell, float], list[str]]:
 
 def _check_header(header: Sequence[str], name: str) -> bool:
     """Return whether a table is long; refuse columns that make it neither long nor wide."""
-    doubled = next((column for column in header if header.count(column) > 1), None)
-    if doubled is not None or "" in header:
-        fault = "a column has no name" if "" in header else f"there are two columns {quoted(doubled or '')}"
-        raise InputError(f"{name}: {fault}.")
+    for mark, marks in OTHER_MARKS.items():
+        if "stage" not in header and mark in "".join(header):
+            raise InputError(f"{name}: expected commas between the cells, found {marks}.")
+    for column in header:
+        if not column or column.startswith("Unnamed: "):
+            raise InputError(f"{name}: a column has no name; if it is pandas' index, write with index=False.")
+        if header.count(column) > 1:
+            raise InputError(f"{name}: there are two columns {quoted(column)}.")
+        if column not in (*KEYS, *RATES) and column.lower() in (*KEYS, *RATES):
+            raise InputError(f"{name}: rename the column {column!r} to {column.lower()!r}.")
     long = any(column in header for column in RATES)
     for column in ("stage", *(RATES if long else ())):
         if column not in header:
@@ -168,6 +176,9 @@ def _check_header(header: Sequence[str], name: str) -> bool:
 
 def _cells(row: dict[str, str], long: bool, where: str) -> list[tuple[Cell, str]]:
     """Return the cells of a row with their texts."""
+    for key in ("method", "task") if long else ("method",):
+        if row.get(key) == "":
+            raise InputError(f"{where}: the {key} has no name.")
     method, seed, stage = (row.pop(key, "") for key in KEYS)
     if not stage.isascii() or not stage.isdigit():
         raise InputError(

@@ -51,10 +51,18 @@ def _facts(matrices: Matrices) -> Iterator[Text]:
     ):
         if tasks:
             yield Text(f"{title}: {printable(', '.join(tasks))}.")
-    seeds = {len(runs) for runs in matrices.success.values()}
-    if max(seeds) > 1:
-        counts = " to ".join(map(str, sorted({min(seeds), max(seeds)})))
-        yield Text(f"Seeds: {counts}; the mean of their values, and its 95 % interval.")
+    if _most_seeds(matrices) > 1:
+        yield Text(f"Seeds: {_seeds(matrices)}; the mean of their values, and its 95 % interval.")
+
+
+def _most_seeds(matrices: Matrices) -> int:
+    return max(map(len, matrices.success.values()))
+
+
+def _seeds(matrices: Matrices) -> str:
+    """Return how many seeds the methods have, such as "2" or "1 to 3"."""
+    counts = {len(runs) for runs in matrices.success.values()}
+    return " to ".join(map(str, sorted({min(counts), max(counts)})))
 
 
 def _family(report: Report, family: str) -> Iterator[RenderableType]:
@@ -67,18 +75,19 @@ def _family(report: Report, family: str) -> Iterator[RenderableType]:
     if found:
         yield Text(f"\n{family.capitalize()}: {FAMILIES[family]}", style="bold")
     for name in found:
-        yield from _definition(name, report.values[name])
+        yield from _definition(name, report.values[name], report.matrices)
 
 
-def _definition(name: str, values: Mapping[str, Value]) -> Iterator[RenderableType]:
+def _definition(name: str, values: Mapping[str, Value], matrices: Matrices) -> Iterator[RenderableType]:
     """Yield a definition with the values of all methods, the best first."""
     metric = METRICS[name]
+    numbers = {method: _number(value, method, matrices) for method, value in values.items()}
     best_first = sorted(values.items(), key=lambda item: _rank(item[1], metric.higher_is_better))
     if list(values) == [""]:
-        yield Text.assemble((name, "bold"), f": {_number(values[''])}, {metric.direction}")
+        yield Text.assemble((name, "bold"), f": {numbers['']}, {metric.direction}")
     else:
         yield Text.assemble((name, "bold"), f": {metric.direction}")
-        items = [Text(f"{printable(method)} {_number(value)}") for method, value in best_first]
+        items = [Text(f"{printable(method)} {numbers[method]}") for method, _ in best_first]
         yield Padding(Columns(items, padding=(0, 3)), (0, 0, 0, 4))
     yield Padding(Text(f"{DEFINITIONS[name].assumption} Source: {metric.source}."), (0, 0, 0, 4))
 
@@ -89,11 +98,14 @@ def _rank(value: Value, higher_is_better: bool | None) -> tuple[bool, float]:
     return value.value is None, -number if higher_is_better else number
 
 
-def _number(value: Value) -> str:
+def _number(value: Value, method: str, matrices: Matrices) -> str:
+    """Return a value with its interval, or with the reason why there is none beside others that have one."""
     if value.value is None:
         return "-"
-    interval = "" if value.low is None else f" [{value.low:.3f}, {value.high:.3f}]"
-    return f"{value.value:.3f}{interval}"
+    if value.low is not None:
+        return f"{value.value:.3f} [{value.low:.3f}, {value.high:.3f}]"
+    why = " (seeds agree)" if len(matrices.success[method]) > 1 else " (one seed)"
+    return f"{value.value:.3f}{why if _most_seeds(matrices) > 1 else ''}"
 
 
 def _order(report: Report) -> Iterator[RenderableType]:
@@ -103,6 +115,10 @@ def _order(report: Report) -> Iterator[RenderableType]:
     yield Text("\nWhere the order of methods flips", style="bold")
     if not report.flips:
         yield Text("Nowhere: within each family, all definitions agree.")
+    elif _most_seeds(report.matrices) > 1:
+        yield Text(f"With {_seeds(report.matrices)} seeds a difference may be noise: look at the intervals.")
+    else:
+        yield Text("With one seed a difference may be noise: there are no intervals.")
     for flip in report.flips:
         first, second = printable(flip.first or UNNAMED), printable(flip.second or UNNAMED)
         yield Text(f"{flip.family}: {first} or {second}?")

@@ -18,7 +18,7 @@ from clbench.scoring.rates import Rates
 Function = Callable[[Rates], Array]
 
 DIFFERENCE = "difference of success rates"
-"""Unit of a metric that can be negative."""
+"""Unit of a metric that takes success rates from each other."""
 
 
 @dataclass(frozen=True)

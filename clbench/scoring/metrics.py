@@ -6,6 +6,7 @@ import math
 from collections.abc import Mapping
 
 from clbench.base.entry_points import unknown
+from clbench.base.errors import UnknownNameError
 from clbench.scoring import ours, published  # noqa: F401 - each enters its metrics into the registry
 from clbench.scoring.metric import REGISTRY, Metric
 from clbench.scoring.scores import Scores, rates_of
@@ -16,19 +17,67 @@ METRICS: Mapping[str, Metric] = REGISTRY
 TITLES = {"adaptation": "learned", "retention": "kept skills"}
 """Titles of metrics on boards with a criterion, where they are beside `kept` and `kept_targets`."""
 
+_AVERAGES = ("final_average", "performance_continual_world", "average_incremental_accuracy")
+_FORGETTING = (
+    "forgetting",
+    "forgetting_chaudhry",
+    "forgetting_mammoth",
+    "forgetting_avalanche",
+    "forgetting_continual_world",
+)
+_FORWARD = ("forward_transfer", "forward_transfer_libero", "forward_transfer_diaz_rodriguez")
+_NEGATIVE = (
+    "negative_backward_transfer_libero",
+    "negative_backward_transfer_clare",
+    "negative_backward_transfer_arfm",
+    "forgetting_avalanche",
+)
+USUAL_NAMES: Mapping[str, tuple[str, ...]] = {
+    "acc": ("performance_continual_world",),
+    "average_accuracy": ("performance_continual_world",),
+    "final_average_accuracy": ("performance_continual_world",),
+    "accuracy": (*_AVERAGES, "accuracy_diaz_rodriguez"),
+    "aia": ("average_incremental_accuracy",),
+    "auc": ("area_under_curve_libero",),
+    "average_forgetting": _FORGETTING,
+    "forgetting_measure": ("forgetting_chaudhry",),
+    "fm": ("forgetting_chaudhry",),
+    "bwt": ("backward_transfer",),
+    "bwt+": ("positive_backward_transfer_diaz_rodriguez",),
+    "fwt": _FORWARD,
+    "nbt": _NEGATIVE,
+    "negative_backward_transfer": _NEGATIVE,
+    "learning_accuracy": ("adaptation",),
+    "plasticity": ("adaptation", "intransigence"),
+    "min_acc": ("minimum_accuracy",),
+    "wc_acc": ("worst_case_accuracy",),
+    "rem": ("remembering_diaz_rodriguez",),
+    "zs": ("zero_shot",),
+}
+"""Names that papers use, in small letters, with the metrics that they may mean."""
+
 
 def load_metric(name: str) -> Metric:
-    """Return the metric with this name, or with this title on the board.
+    """Return the metric with this name, with this title on the board, or with this name in papers.
 
     Raises:
-        UnknownNameError: No metric has this name; the message names the nearest one.
+        UnknownNameError: No metric has this name, and the message names the nearest one; or papers give the
+            name to several, and it names them.
     """
-    names = {title.replace(" ", "_"): one for one, title in TITLES.items()}
+    titles = {title.replace(" ", "_"): one for one, title in TITLES.items()}
     wanted = name.replace(" ", "_")
-    wanted = names.get(wanted, wanted)
-    if wanted not in METRICS:
+    wanted = titles.get(wanted, wanted)
+    if wanted in METRICS:
+        return METRICS[wanted]
+    candidates = USUAL_NAMES.get(wanted.lower().replace("-", "_"), ())
+    if len(candidates) > 1:
+        raise UnknownNameError(
+            f"{name!r} has several definitions: {', '.join(candidates)}. Name one of them; "
+            "docs/reference/metrics.md says what each is, and which are left out."
+        )
+    if not candidates:
         raise unknown("metric", name, METRICS)
-    return METRICS[wanted]
+    return METRICS[candidates[0]]
 
 
 def measure(name: str, scores: Scores, references: Mapping[str, Scores] | None = None) -> float | None:

@@ -29,7 +29,7 @@ def final_average(rates: Rates) -> Array:
 @metric(
     formula="mean of R[k][k] over the targets k",
     source="the diagonal of the matrix of arXiv 1706.08840",
-    missing="The success on a target right after it was learned is missing.",
+    missing="There are no targets, or the success on one right after it was learned is missing.",
 )
 def adaptation(rates: Rates) -> Array:
     """Success on each target right after it was learned."""
@@ -39,7 +39,7 @@ def adaptation(rates: Rates) -> Array:
 @metric(
     formula="mean of R[K][s] over the retained skills s",
     source="clbench",
-    missing="The success on a retained skill after the last target is missing.",
+    missing="There are no retained skills, or the success on one after the last target is missing.",
 )
 def retention(rates: Rates) -> Array:
     """Success on the retained skills after the last target."""
@@ -59,7 +59,8 @@ def kept_targets(rates: Rates) -> Array:
 @metric(
     formula="mean of R[K][s] over the retained skills and all targets but the last",
     source="clbench",
-    missing="A success after the last target on a retained skill or an earlier target is missing.",
+    missing="There is neither a retained skill nor an earlier target, or a success on one after the last "
+    "target is missing.",
 )
 def kept(rates: Rates) -> Array:
     """Success on the retained skills and the earlier targets after the last one."""
@@ -69,7 +70,8 @@ def kept(rates: Rates) -> Array:
 @metric(
     formula="mean over the stages l from 1 of the mean of R[l][s] over the retained skills s",
     source="clbench",
-    missing="A success on a retained skill at the end of a stage is missing.",
+    missing="There are no retained skills or no targets, or a success on a skill at the end of a stage is "
+    "missing.",
 )
 def kept_skills_over_stages(rates: Rates) -> Array:
     """Success on the retained skills at the ends of all stages."""
@@ -96,7 +98,8 @@ def kept_targets_over_stages(rates: Rates) -> Array:
     "retained skills and the targets before l",
     source="clbench",
     version=1,
-    missing="A success on something known before a stage is missing at its end.",
+    missing="Nothing is known before any stage, neither a retained skill nor an earlier target, or a success "
+    "on it at the end of the stage is missing.",
 )
 def kept_over_stages(rates: Rates) -> Array:
     """Success at the ends of all stages on everything that was known before the stage."""
@@ -111,7 +114,8 @@ def kept_over_stages(rates: Rates) -> Array:
     version=1,
     high=math.inf,
     units="share of what was known",
-    missing="A success on something known before a stage is missing, or nothing was known.",
+    missing="Nothing is known before any stage, neither a retained skill nor an earlier target, or a success "
+    "on it is missing, or all are 0 before a stage.",
 )
 def kept_share(rates: Rates) -> Array:
     """Share of what was known before a stage that is left at its end, averaged over the stages."""

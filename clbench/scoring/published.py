@@ -77,7 +77,9 @@ def average_incremental_accuracy(rates: Rates) -> Array:
     formula="mean over all targets k but the last of the highest R[l][k] of the stages l from 1 to K-1, "
     "minus R[K][k]",
     source="Chaudhry et al. 2018, arXiv 1801.10112 (F)",
-    missing=TWO_TARGETS,
+    missing="There are fewer than two targets, or a success on one at the end of a stage is missing, stages "
+    "before it was learned included; `forgetting` is the same over the stages since, with the retained "
+    "skills counted in.",
     low=-1.0,
     units=DIFFERENCE,
     higher_is_better=False,
@@ -95,6 +97,7 @@ def forgetting_chaudhry(rates: Rates) -> Array:
     "R[K][k]",
     source="Mammoth, utils/metrics.py at 07bd157 (forgetting)",
     missing=TWO_TARGETS,
+    units=DIFFERENCE,
     higher_is_better=False,
 )
 def forgetting_mammoth(rates: Rates) -> Array:
@@ -179,6 +182,7 @@ def backward_transfer_diaz_rodriguez(rates: Rates) -> Array:
     formula="1 - |min(B, 0)|; B is backward_transfer_diaz_rodriguez",
     source="Diaz-Rodriguez et al. 2018, arXiv 1810.13166 (REM)",
     missing=TWO_TARGETS,
+    units=f"1 less a {DIFFERENCE}",
 )
 def remembering_diaz_rodriguez(rates: Rates) -> Array:
     """1 less the size of the negative part of backward transfer."""
@@ -189,6 +193,7 @@ def remembering_diaz_rodriguez(rates: Rates) -> Array:
     formula="max(B, 0); B is backward_transfer_diaz_rodriguez",
     source="Diaz-Rodriguez et al. 2018, arXiv 1810.13166 (BWT+)",
     missing=TWO_TARGETS,
+    units=DIFFERENCE,
 )
 def positive_backward_transfer_diaz_rodriguez(rates: Rates) -> Array:
     """The positive part of backward transfer."""
@@ -338,8 +343,9 @@ def _over_later(rates: Rates) -> Array:
 
 @metric(
     formula="mean over all targets k but the last of max(0, R[k][k] - R[K][k])",
-    source="ARFM (NBT)",
+    source="ARFM, arXiv 2509.04063 (NBT), read in notes on the paper, not in the paper itself",
     missing=TWO_TARGETS,
+    units=DIFFERENCE,
     higher_is_better=False,
 )
 def negative_backward_transfer_arfm(rates: Rates) -> Array:

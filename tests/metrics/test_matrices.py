@@ -1,5 +1,6 @@
 """Metrics of arrays: one implementation, honest gaps, and where the order of methods flips."""
 
+import tracemalloc
 from collections.abc import Callable, Mapping
 
 import numpy as np
@@ -57,14 +58,18 @@ def test_a_metric_has_no_value_exactly_if_a_cell_that_it_needs_is_missing() -> N
             value = report.of(name, "")
             assert (value.value is None) == needed[stage, task] == (value.reason is not None)
             if value.reason:
-                assert value.reason == f"The table lacks stage {stage}, task {task + 1}."
+                assert value.reason.startswith(f"The table lacks stage {stage}, task {task + 1}.")
 
 
 def test_a_triangle_has_every_drop_but_those_that_need_targets_before_they_are_learned() -> None:
     report = from_matrix(TRIANGLE)
     assert report["forgetting_avalanche"].value == pytest.approx((0.3 + 0.5) / 2)
     assert report["forgetting_chaudhry"].value is None
-    assert report["forgetting_chaudhry"].reason == "The table lacks stage 1, task 2."
+    assert report["forgetting_chaudhry"].reason == (
+        "The table lacks stage 1, task 2. `forgetting` is the same over the stages since a target was "
+        "learned, with the retained skills counted in."
+    )
+    assert report["forgetting"].value == pytest.approx((0.3 + 0.5) / 2)
     assert report["isolated_forgetting_cora"].reason == "The table lacks stage 0, task 1 and 2 other cells."
     assert report["question_retention"].reason == METRICS["question_retention"].missing
 
@@ -89,6 +94,35 @@ def test_per_cent_are_recognised_and_can_be_declared() -> None:
     assert from_matrix([[0.5, 0.1], [0.2, 0.9]]).unit == "share"
 
 
+@pytest.mark.parametrize(
+    ("matrix", "where"),
+    [
+        ([[0.9, 0.1, 0.1], [0.5, 1.05, 0.1], [0.4, 0.5, 0.9]], "stage 2, task 'task 2': found 1.05"),
+        ([[0.9, 0.0, 0.0], [0.5, 85, 0.0], [0.4, 0.5, 0.9]], "stage 2, task 'task 2': found 85, and other"),
+        ({"a": [[0.9, 0.0], [0.5, 1.0]], "b": [[90, 0], [50, 100]]}, "method 'b', stage 2, task 'task 2': f"),
+        ([[1.5, 0.5], [0.5, 1.8]], "stage 2, task 'task 2': found 1.8: is it a share above 1, or per cent"),
+    ],
+)
+def test_rates_that_leave_their_unit_in_doubt_are_refused_unless_it_is_named(
+    matrix: ArrayLike, where: str
+) -> None:
+    with pytest.raises(InputError, match=f'{where}.*say --unit percent, in Python unit="percent"'):
+        from_matrix(matrix)
+    assert from_matrix(matrix, unit="percent").unit == "percent"
+
+
+def test_low_rates_in_per_cent_are_recognised_beside_higher_ones() -> None:
+    assert from_matrix([[41.5, 0, 0], [13.9, 24.5, 0.8], [4.8, 0, 11.3]]).unit == "percent"
+
+
+def test_a_text_is_one_name_and_not_its_letters() -> None:
+    names = ["reach", "push"]
+    report = from_matrix([[0.5, 0.7]], tasks=names, retained="reach", target="push")
+    assert report.matrices.layout.retained == ("reach",)
+    assert report.matrices.layout.target == ("push",)
+    assert from_matrix([[0.5]], tasks="reach").matrices.layout.target == ("reach",)
+
+
 def test_the_order_of_two_methods_flips_between_definitions_and_both_sides_are_named() -> None:
     # the first keeps a little more in the end, the second falls later
     report = from_matrix(
@@ -103,16 +137,62 @@ def test_the_order_of_two_methods_flips_between_definitions_and_both_sides_are_n
     assert "negative_backward_transfer_libero" in flip.second_is_better
 
 
+def test_the_gain_counts_in_no_flip_since_it_repeats_the_final_average() -> None:
+    keeps, learns = [[1.0, 0.0], [0.9, 0.5]], [[1.0, 0.0], [0.1, 0.9]]
+    report = from_matrix({"keeps": keeps, "sft": learns}, retained="task 1")
+    assert report.of("gain", "keeps").value == pytest.approx(0.2)
+    (flip,) = (flip for flip in report.flips if flip.family == "average")
+    assert flip.first_is_better == ("final_average",)
+
+
 def test_a_tie_is_no_flip() -> None:
     assert from_matrix({"one": TRIANGLE, "other": TRIANGLE}).flips == ()
 
 
 def test_a_reference_needs_its_own_name_and_the_same_seeds() -> None:
-    assert from_matrix({"mine": TRIANGLE})["gain"].reason == "No method is called sft, or it has other seeds."
+    assert from_matrix({"mine": TRIANGLE})["gain"].reason == "No method is called sft."
     report = from_matrix({"mine": [TRIANGLE, TRIANGLE], "sft": TRIANGLE, "joint": [TRIANGLE, TRIANGLE]})
-    assert report.of("gain", "mine").value is None
+    assert report.of("gain", "mine").reason == "Method sft has no seed '0', no seed '1'."
+    assert report.of("gain", "joint").value is None
     assert report.of("intransigence", "mine").value == pytest.approx(0)
     assert report.of("intransigence", "joint").reason == "joint is what the others are compared with."
+
+
+def test_a_reason_names_the_missing_cells_of_a_reference() -> None:
+    holed = np.array(JOINT)
+    holed[2, 2] = np.nan
+    reason = "The table lacks method joint, stage 2, task 3."
+    assert _report({"mine": MATRIX, "joint": holed}).of("intransigence", "mine").reason == reason
+    report = _report({"mine": [MATRIX, MATRIX], "joint": np.array([JOINT, holed])})
+    assert report.of("intransigence", "mine").reason == reason.replace("joint, ", "joint, seed '1', ")
+    holed = np.array(JOINT)
+    holed[3, 0] = np.nan
+    report = _report({"mine": MATRIX, "sft": holed})
+    assert report.of("gain", "mine").reason == "The table lacks method sft, stage 3, task 1."
+    assert report.of("gain", "sft").reason == "The table lacks stage 3, task 1."
+
+
+def test_without_retained_skills_no_reason_says_that_a_success_on_one_is_missing() -> None:
+    report = from_matrix([[0.5]])
+    for name in ("retention", "kept_skills_over_stages"):
+        assert str(report[name].reason).startswith("There are no retained skills")
+    for name in ("kept", "kept_over_stages", "kept_share"):
+        assert "neither a retained skill nor an earlier target" in str(report[name].reason)
+    assert str(from_matrix([[0.5]], retained="task 1")["adaptation"].reason).startswith(
+        "There are no targets"
+    )
+
+
+def test_what_a_large_table_lacks_is_found_without_much_memory() -> None:
+    size = 40
+    triangle = np.where(np.tri(size) > 0, 0.5, np.nan)
+    tracemalloc.start()
+    report = from_matrix(triangle)
+    _, most = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert most < 50e6
+    reason = f"The table lacks stage 1, task 2 and {size * (size - 1) // 2 - 1} other cells."
+    assert report["forward_transfer_diaz_rodriguez"].reason == reason
 
 
 def test_the_targets_can_be_put_in_the_order_in_which_they_were_learned() -> None:
@@ -143,6 +223,12 @@ def test_a_table_of_pandas_has_a_row_for_every_metric_and_method() -> None:
         ({"matrix": [[0.5]], "tasks": ["a", "b"]}, "There are 2 names for 1 task"),
         ({"matrix": {"a": [[0.5]], "b": TRIANGLE}}, r"'a' \(1, 1\), 'b' \(3, 3\)"),
         ({"matrix": {}}, "expected at least one method"),
+        ({"matrix": [[0.5, 0.5], [0.5]]}, "The matrix is no array of numbers: expected rows of equal length"),
+        ({"matrix": {"a": [["high"]]}}, "The matrix of method 'a' is no array of numbers"),
+        (
+            {"matrix": [[0.5]], "unit": "percentage"},
+            r"must be 'share' or 'percent', not 'percentage'\. Did you mean 'percent'",
+        ),
         ({"matrix": TRIANGLE, "target": ["task 1"]}, "Task 'task 2' is in no group"),
         ({"matrix": TRIANGLE, "target": ["task 1"] * 2}, "Task 'task 1' is named twice"),
     ],

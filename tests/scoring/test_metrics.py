@@ -1,5 +1,6 @@
 """The registry of metrics: every metric describes itself, and keeps to its range and to batch axes."""
 
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -8,7 +9,7 @@ import pytest
 
 from clbench.cli import metric_pages
 from clbench.records.record import Relearning
-from clbench.scoring.metrics import METRICS, load_metric, measure
+from clbench.scoring.metrics import METRICS, USUAL_NAMES, load_metric, measure
 from clbench.scoring.scores import Scores, rates_of
 from clbench.spec.protocol import check_steps
 
@@ -22,6 +23,35 @@ def test_a_metric_is_found_by_its_title_on_the_board() -> None:
     assert load_metric("learned") is METRICS["adaptation"]
     assert load_metric("kept skills") is load_metric("kept_skills") is METRICS["retention"]
     assert load_metric("final average") is METRICS["final_average"]
+
+
+@pytest.mark.parametrize(
+    ("usual", "name"),
+    [
+        ("acc", "performance_continual_world"),
+        ("average_accuracy", "performance_continual_world"),
+        ("BWT", "backward_transfer"),
+        ("AIA", "average_incremental_accuracy"),
+        ("WC-ACC", "worst_case_accuracy"),
+        ("min ACC", "minimum_accuracy"),
+        ("REM", "remembering_diaz_rodriguez"),
+        ("forgetting measure", "forgetting_chaudhry"),
+    ],
+)
+def test_a_metric_is_found_by_the_name_that_papers_use(usual: str, name: str) -> None:
+    assert load_metric(usual) is METRICS[name]
+
+
+@pytest.mark.parametrize("usual", ["FWT", "NBT", "average forgetting"])
+def test_a_name_that_papers_use_for_several_metrics_lists_these_alone(usual: str) -> None:
+    with pytest.raises(LookupError, match=f"'{usual}' has several definitions: ") as raised:
+        load_metric(usual)
+    assert 2 <= sum(name in str(raised.value).replace(",", "").split() for name in METRICS) < 6
+
+
+def test_every_name_that_papers_use_leads_to_metrics_and_hides_none() -> None:
+    assert {name for names in USUAL_NAMES.values() for name in names} <= METRICS.keys()
+    assert not USUAL_NAMES.keys() & METRICS.keys()
 
 
 @pytest.mark.parametrize("name", METRICS)
@@ -123,6 +153,23 @@ def test_the_description_of_a_metric_has_its_formula_source_direction_and_missin
         assert part in text
 
 
+def test_a_ratio_and_a_pooled_metric_say_how_seeds_are_averaged() -> None:
+    assert "Seeds: the geometric mean of their values\n" in metric_pages.text(METRICS["speed"])
+    assert "Seeds: averaged before it is computed\n" in metric_pages.text(METRICS["forward_transfer"])
+
+
+def test_every_drop_is_a_difference_of_success_rates_whether_or_not_it_can_be_negative() -> None:
+    units = {name: metric.units for name, metric in METRICS.items()}
+    drops = {name for name in units if name.startswith(("forgetting", "negative_", "backward_", "positive_"))}
+    assert {units[name] for name in drops} == {"difference of success rates"}
+    assert units["remembering_diaz_rodriguez"] == "1 less a difference of success rates"
+
+
+def test_every_source_is_ours_or_can_be_looked_up() -> None:
+    for name, metric in METRICS.items():
+        assert re.search(r"arXiv \d{4}\.\d{4,5}|clbench|Mammoth, .* at|Avalanche 0", metric.source), name
+
+
 def test_all_about_a_metric_is_exact() -> None:
     assert metric_pages.text(METRICS["retention"]) == (
         "retention\n"
@@ -134,7 +181,7 @@ def test_all_about_a_metric_is_exact() -> None:
         "Direction: higher is better\n"
         "Range: 0 to 1\n"
         "Units: success rate\n"
-        "References: none\n"
+        "Compared with: nothing\n"
         "Seeds: the mean of their values\n"
-        "None means: The success on a retained skill after the last target is missing.\n"
+        "None means: There are no retained skills, or the success on one after the last target is missing.\n"
     )
