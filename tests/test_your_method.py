@@ -1,5 +1,6 @@
 """The worked examples of `docs/guide/your_method.md`, run unchanged, as a stranger would."""
 
+import copy
 import importlib
 import re
 import sys
@@ -15,7 +16,7 @@ import clbench
 from clbench.learning.method import Progress, Stage
 from clbench.learning.prior import Nothing, Prior, Source
 from clbench.policy.transformer import TransformerPolicy
-from clbench.testing import TOY
+from clbench.testing import TOY, check_method
 from clbench.testing.small import SMALL, toy_source
 
 PAGE = Path(__file__).parents[1] / "docs" / "guide" / "your_method.md"
@@ -25,10 +26,11 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 @pytest.fixture
 def blocks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """Return the Python of the page; its methods can be imported as `der` and `si`."""
+    """Return the Python of the page; its methods can be imported under the names that it gives them."""
     found = re.findall(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), flags=re.DOTALL)
     monkeypatch.syspath_prepend(tmp_path)
-    for name, text in (("der", found[0]), ("si", found[2])):
+    names = {"der": 0, "si": 2, "prompt": 4, "teacher": 5}
+    for name, text in ((name, found[number]) for name, number in names.items()):
         (tmp_path / f"{name}.py").write_text(text, encoding="utf-8")
         monkeypatch.delitem(sys.modules, name, raising=False)
     return found
@@ -43,6 +45,39 @@ def der(blocks: list[str]) -> Any:
 @pytest.mark.parametrize("block", [1, 3])
 def test_its_methods_keep_the_contract(block: int, blocks: list[str]) -> None:
     exec(blocks[block], {})
+
+
+@pytest.mark.parametrize(("module", "name"), [("prompt", "Prompt"), ("teacher", "Teacher")])
+@pytest.mark.usefixtures("blocks")
+def test_its_shorter_methods_keep_the_contract_too(module: str, name: str) -> None:
+    check_method(getattr(importlib.import_module(module), name))
+
+
+@pytest.mark.usefixtures("blocks")
+def test_its_prompt_acts_in_the_policy_and_in_copies_of_it() -> None:
+    method, policy = importlib.import_module("prompt").Prompt(), TransformerPolicy(SMALL)
+    batch = toy_source("right").sample(4)
+
+    def act(policy: Any) -> torch.Tensor:
+        return policy.act(batch.state, batch.words, batch.noise, batch.image)  # type: ignore[no-any-return]
+
+    plain = act(policy)
+    method.prepare(policy, Prior({}))
+    assert act(policy).equal(plain)
+    twin: Any = copy.deepcopy(policy)
+    with torch.no_grad():
+        twin.backbone_layers[0].prompt.fill_(1.0)
+    assert act(policy).equal(plain)
+    assert not act(twin).equal(plain)
+
+
+@pytest.mark.usefixtures("blocks")
+def test_its_teacher_follows_the_policy_to_its_device() -> None:
+    method, policy = importlib.import_module("teacher").Teacher(), TransformerPolicy(SMALL)
+    method.load_state(policy, policy.state_dict())
+    stage = Stage(1, TOY.task("right"), 0, 10, toy_source("right"), Prior({}))
+    method.start_task(policy.to("meta"), stage)
+    assert method.teacher.device.type == "meta"
 
 
 def test_its_loss_is_that_of_der_plus_plus(der: Any) -> None:

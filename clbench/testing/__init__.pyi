@@ -1,6 +1,6 @@
-from .contract import Check as Check
 from .contract import check_method as check_method
 from .contract import method_checks as method_checks
+from .error import Check as Check
 from .error import ContractError as ContractError
 from .policy_contract import check_policy as check_policy
 from .policy_contract import policy_checks as policy_checks

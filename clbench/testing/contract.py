@@ -13,31 +13,29 @@ or, for a test of each clause,
 from __future__ import annotations
 
 import dataclasses
-import functools
 import inspect
 import json
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, get_args
+from typing import Any, get_args, get_type_hints
 
-from torch import Tensor
-
+from clbench.base.errors import InputError
 from clbench.base.seeding import seeded
 from clbench.base.text import did_you_mean
-from clbench.evaluation.rollouts import Evaluator
 from clbench.learning.method import Metadata, Method
-from clbench.learning.optimise import deterministic
 from clbench.learning.prior import Access, Uses
-from clbench.policy.policy import ABILITIES, Policy
+from clbench.learning.registry import read_changes
+from clbench.policy.policy import ABILITIES
 from clbench.spec.policies import DEFAULT_POLICY
-from clbench.testing.error import ContractError
-from clbench.testing.global_state import GENERATORS, same, watched
-from clbench.testing.toy import TOY
-from clbench.testing.toy_run import HOOKS, ToyRun, toy_data
+from clbench.testing.error import Check, ContractError
+from clbench.testing.global_state import GENERATORS, functions_of, names_in, own_classes, same, watched
+from clbench.testing.toy_run import HOOKS, ToyRun, frozen_return, mean_return
 
 TARGETS, STEPS = 2, 2
 """Number of targets, and of optimiser steps on each, in runs whose learning does not matter."""
+
+STEPS_TO_CRITERION = 4
+"""Number of steps of a stage with a criterion: it is checked before the first, after two, and after all."""
 
 LEARNING_STEPS = 60
 """Number of optimiser steps within which a method must learn the toy's first target. FINCH with a discrete
@@ -90,27 +88,6 @@ def method_checks(cls: type[Method], *, policy: str = DEFAULT_POLICY, **settings
     return [Check(clause, subject) for clause in CLAUSES]
 
 
-@dataclass(frozen=True, eq=False)
-class Check:
-    """One clause of a contract for one subject; call it to check."""
-
-    clause: Callable[[Any], None]
-    """Clause, one of the contract's `CLAUSES`."""
-    subject: Any
-    """Method or policy to check."""
-
-    def __call__(self) -> None:
-        """Check the clause.
-
-        Raises:
-            ContractError: The subject breaks the clause.
-        """
-        self.clause(self.subject)
-
-    def __str__(self) -> str:
-        return self.clause.__name__
-
-
 class Subject:
     """A method with its runs, which several clauses share.
 
@@ -124,8 +101,18 @@ class Subject:
         self.cls, self.settings, self.policy = cls, settings, policy
 
     def build(self) -> Method:
-        """Return a new object of the method."""
-        return self.cls(**self.settings)
+        """Return a new object of the method.
+
+        Raises:
+            ContractError: The class refuses its defaults, or the settings.
+        """
+        try:
+            return self.cls(**self.settings)
+        except Exception as error:
+            found = f"{type(error).__name__}: {error}"
+            raise _misbuilt(
+                "the defaults, and the settings of the check, to make an object", found
+            ) from error
 
     @cached_property
     def first(self) -> ToyRun:
@@ -142,6 +129,11 @@ class Subject:
     def kept(self) -> ToyRun:
         """The same run with one object of the method for all stages."""
         return ToyRun(self.build, TARGETS, STEPS, resumed=False, policy=self.policy)
+
+    @cached_property
+    def to_criterion(self) -> ToyRun:
+        """A run whose stages end early, as in most scenarios."""
+        return ToyRun(self.build, TARGETS, STEPS_TO_CRITERION, policy=self.policy, to_criterion=True)
 
     @cached_property
     def longer(self) -> ToyRun:
@@ -164,6 +156,9 @@ def declaration(subject: Subject) -> None:
         expected = "a class docstring whose first line describes the method"
         raise _breach(declaration, expected, "none", "the class")
     _check_declared(cls)
+    _check_annotated(cls)
+    _check_tunes(cls)
+    _check_names(cls)
     _check_signatures(cls)
 
 
@@ -187,15 +182,56 @@ def _check_declared(cls: type[Method]) -> None:
             raise _breach(declaration, expected, repr(access), "uses")
 
 
-def _check_signatures(cls: type[Method]) -> None:
-    """Check that the loop can call every hook, and that no hook is misspelt."""
-    for name, value in vars(cls).items():
-        if callable(value) and name not in HOOKS and not name.startswith("_"):
-            if any(hasattr(base, name) for base in cls.__bases__):
-                continue  # a base of its own calls it
+def _check_tunes(cls: type[Method]) -> None:
+    """Check that tuning can try the values that `tunes` names."""
+    match cls.tunes:
+        case None:
+            return
+        case (str(name), (_, _) as values) if name in (field.name for field in dataclasses.fields(cls)):
+            try:
+                read_changes(cls.__name__, cls, {name: values[0]})
+                read_changes(cls.__name__, cls, {name: values[1]})
+            except InputError as error:
+                raise _breach(
+                    declaration, "values in tunes that the class takes", str(error), "tunes"
+                ) from error
+        case _:
+            expected = "tunes to be the name of a field and two values of it, (name, (a, b))"
+            raise _breach(declaration, expected, repr(cls.tunes), "tunes")
+
+
+def _check_annotated(cls: type[Method]) -> None:
+    """Check that every plain value of the class is a hyper-parameter, or says that it is none."""
+    try:
+        hints = get_type_hints(cls)
+    except NameError as error:
+        raise _breach(declaration, "annotations of names that exist", str(error), "the fields") from error
+    constants = hints.keys() - {field.name for field in dataclasses.fields(cls)}
+    for base in own_classes(cls):
+        for name, value in vars(base).items():
+            if name in inspect.get_annotations(base) or name in constants or name.startswith("_"):
+                continue
+            if name in hints or (isinstance(value, bool | int | float | str | tuple) and not name.isupper()):
+                expected = (
+                    f"hyper-parameters with an annotation, `{name}: {type(value).__name__} = {value!r}`, and "
+                    f"constants that begin with _ or are a ClassVar: no run could change {name}"
+                )
+                raise _breach(declaration, expected, f"`{name} = {value!r}`", name)
+
+
+def _check_names(cls: type[Method]) -> None:
+    """Check that no hook is misspelt: something calls each public function."""
+    functions = [function for base in own_classes(cls) for function in functions_of(base).items()]
+    used = set(HOOKS).union(*(names_in(function.__code__) for _, function in functions))
+    for name, _ in functions:
+        if not name.startswith("_") and name not in used:
             hint = did_you_mean(f"{name}()", [f"{hook}()" for hook in HOOKS])
             expected = f"hooks that the loop calls.{hint} Names of helpers begin with _"
             raise _breach(declaration, expected, f"{name}() is never called", f"{name}()")
+
+
+def _check_signatures(cls: type[Method]) -> None:
+    """Check that the loop can call every hook."""
     for hook in HOOKS:
         given, taken = (inspect.signature(getattr(one, hook)) for one in (Method, cls))
         try:
@@ -251,6 +287,7 @@ def _check_stored(cls: type[Method]) -> None:
     for field in dataclasses.fields(cls):
         name = field.name
         default = getattr(method, name) if field.default is dataclasses.MISSING else field.default
+        _check_type(cls, name, default)
         given = [default]
         if type(default) in (bool, int, float):
             given.append(not default if type(default) is bool else type(default)(default / 2 + 1))
@@ -266,18 +303,23 @@ def _check_stored(cls: type[Method]) -> None:
                 raise _misbuilt(expected, f"{name}={value!r} becomes {kept!r}")
 
 
+def _check_type(cls: type[Method], name: str, default: Any) -> None:
+    """Check that a default is of the annotated type, as a run reads other values."""
+    try:
+        read = read_changes(cls.__name__, cls, {name: default})[name]
+    except InputError as error:
+        raise _misbuilt("a default of the annotated type", str(error)) from error
+    if isinstance(default, str) and read != default:
+        raise _misbuilt("a default of the annotated type", f"{name}={default!r} is a text, not {read!r}")
+
+
 def _misbuilt(expected: str, found: str) -> ContractError:
     return _breach(constructor, expected, found, "the fields, __init__ and __post_init__")
 
 
 def sound_hooks(subject: Subject) -> None:
-    """Hooks return values that the loop can use, and draw at most a batch of the target per step."""
-    size, drawn = TOY.budget.batch_size, subject.first.target_rows
-    if drawn > size:
-        expected = (
-            f"at most target.batch_size = {size} samples of the target in a step: the budget of all methods"
-        )
-        raise _breach(sound_hooks, expected, f"{drawn} samples", "batch()")
+    """Hooks run without an error, and return values that the loop can use."""
+    _ = subject.first, subject.longer
 
 
 def declared_data(subject: Subject) -> None:
@@ -303,27 +345,44 @@ def _drawn_as(access: Access, hooks: set[str]) -> bool:
 
 def same_numbers(subject: Subject) -> None:
     """Two runs with the same seed are equal, bit for bit."""
-    difference = _difference(subject.first, subject.second)
+    difference = subject.first.difference(subject.second)
     if difference:
         raise _breach(
             same_numbers,
             "two runs with one seed to be equal: draw from the sources, from the global generators, which "
             "are seeded for each hook, or from a generator seeded with stage.seed",
             difference,
-            "every hook that draws, measures time, or iterates over a set",
+            "every hook that draws, measures time, or iterates over a set of objects",
         )
 
 
 def state(subject: Subject) -> None:
     """The state is complete: an object that loads it continues like the object that returned it."""
-    difference = _difference(subject.second, subject.kept)
+    difference = subject.second.difference(subject.kept)
     if difference:
         raise _breach(
             state,
-            "state() to return everything that later stages need, and load_state() to restore it",
+            "state() to return everything that later stages need, and load_state() to restore it: an "
+            "interrupted run loses attributes of the class and global variables",
             f"a run with a new object for each stage differs from a run with one object: {difference}",
             "state() and load_state()",
         )
+
+
+def criterion(subject: Subject) -> None:
+    """The hooks run in stages that end early: at a check, or before the first step."""
+    _ = subject.first  # its faults have nothing to do with the criterion
+    try:
+        _ = subject.to_criterion
+    except ContractError as error:
+        if error.clause == "criterion":
+            raise
+        expected = (
+            "hooks that run in a stage that ends after any number of steps, also after none; with "
+            "`whole_stages` each check calls end_task() on a copy, the first check before the first step"
+        )
+        look = "end_task() and state(), and the attributes that the hooks of a step set for them"
+        raise _breach(criterion, expected, error.found, look) from error
 
 
 def global_state(subject: Subject) -> None:
@@ -348,7 +407,7 @@ def learning(subject: Subject) -> None:
     """The method learns a target: the policy acts better than the pretrained one. References are exempt."""
     if subject.cls.uses.reference:
         return
-    before, after = _frozen_return(subject.policy), _mean_return(subject.longer.trainer.policy)
+    before, after = frozen_return(subject.policy), mean_return(subject.longer.trainer.policy)
     if not after - before >= LEAST_GAIN:
         raise _breach(
             learning,
@@ -367,6 +426,7 @@ CLAUSES = (
     same_numbers,
     global_state,
     state,
+    criterion,
     seeding,
     learning,
 )
@@ -384,34 +444,3 @@ def _is_plain(value: Any) -> bool:
     except (TypeError, ValueError):
         return False
     return True
-
-
-def _difference(one: ToyRun, other: ToyRun) -> str | None:
-    """Return a description of the first outcome that differs, or None."""
-    for stage, name in {**one.outcomes, **other.outcomes}:
-        values = [run.outcomes.get((stage, name)) for run in (one, other)]
-        if same(*values):
-            continue
-        words = f"{name} differs in {stage}"
-        first, second = values
-        if isinstance(first, Tensor) and isinstance(second, Tensor) and first.shape == second.shape:
-            words += f" by up to {float((first - second).abs().max()):.2g}"
-        return words
-    return None
-
-
-@functools.cache
-def _frozen_return(policy: str) -> float:
-    _, pretrained = toy_data(policy)
-    return _mean_return(pretrained)
-
-
-def _mean_return(policy: Policy) -> float:
-    """Return the mean return of the policy on the toy's first target, over its validation episodes."""
-    evaluator = Evaluator(TOY, 0)
-    policy.eval()
-    with deterministic():
-        episodes = evaluator.evaluate(policy, TOY.target[:1])
-    policy.train()
-    evaluator.close()
-    return sum(episode.total_reward for episode in episodes) / len(episodes)

@@ -1,6 +1,10 @@
-"""The error of the contract: it shows the expectation, the finding, and the place to look at."""
+"""What both contracts share: the check of a clause, and the error that names the place to look at."""
 
 from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
 
 PAGE = "docs/guide/contract.md"
 """Page that describes the contract of a method, with a heading for each clause."""
@@ -32,3 +36,24 @@ class ContractError(AssertionError):
             f"  found:    {self.found}\n"
             f"  look at:  {self.look}; {self.page}#{self.clause.replace(' ', '-')}"
         )
+
+
+@dataclass(frozen=True, eq=False)
+class Check:
+    """One clause of a contract for one subject; call it to check."""
+
+    clause: Callable[[Any], None]
+    """Clause, one of the contract's `CLAUSES`."""
+    subject: Any
+    """Method or policy to check."""
+
+    def __call__(self) -> None:
+        """Check the clause.
+
+        Raises:
+            ContractError: The subject breaks the clause.
+        """
+        self.clause(self.subject)
+
+    def __str__(self) -> str:
+        return self.clause.__name__

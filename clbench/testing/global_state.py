@@ -1,15 +1,21 @@
-"""Side effects of code: settings of the process that it changes, and files that it writes."""
+"""Side effects of code: settings of the process that it changes, files that it writes, global variables."""
 
 from __future__ import annotations
 
+import contextlib
+import copy
+import inspect
 import os
 import random
 import sys
 import threading
 import warnings
+from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from itertools import takewhile
 from pathlib import Path
+from types import CodeType, FunctionType, ModuleType
 from typing import Any
 
 import numpy as np
@@ -17,6 +23,8 @@ import torch
 from torch import Tensor
 
 from clbench.base.cache import cache_folder
+from clbench.base.source import package_of
+from clbench.learning.method import Method
 from clbench.policy.policy import Policy
 from clbench.policy.transformer import TransformerPolicy
 
@@ -63,9 +71,11 @@ def read(settings: Mapping[str, _Setting]) -> dict[str, Any]:
 
 
 def same(one: Any, other: Any) -> bool:
-    """Return whether two values are equal, including arrays and tensors inside them."""
+    """Return whether two values are equal, including arrays and tensors inside them; NaN equals NaN."""
     if isinstance(one, Tensor):
-        return isinstance(other, Tensor) and torch.equal(one, other)
+        if not isinstance(other, Tensor) or (one.shape, one.dtype) != (other.shape, other.dtype):
+            return False
+        return bool(((one == other) | ((one != one) & (other != other))).all())
     if isinstance(one, np.ndarray):
         return np.array_equal(one, other)
     if isinstance(one, tuple) and isinstance(other, tuple):
@@ -121,6 +131,97 @@ def _set_attributes(cls: type, values: Mapping[str, Any]) -> None:
     for name, value in values.items():
         if vars(cls).get(name) is not value:
             setattr(cls, name, value)
+
+
+# ---- memory outside of objects -----------------------------------------------------------------------------
+
+
+def own_classes(cls: type[Method]) -> list[type]:
+    """Return a method's class and its bases before `Method`, in the order in which Python looks them up."""
+    return list(takewhile(lambda base: base is not Method, cls.__mro__))
+
+
+def functions_of(cls: type) -> dict[str, FunctionType]:
+    """Return the functions that a class itself defines, without their decorators, by name."""
+    plain = {name: getattr(value, "__func__", value) for name, value in vars(cls).items()}
+    return {name: inspect.unwrap(one) for name, one in plain.items() if isinstance(one, FunctionType)}
+
+
+def names_in(code: CodeType) -> set[str]:
+    """Return the names of attributes and global variables that code uses, with the functions inside it."""
+    inside = (names_in(constant) for constant in code.co_consts if isinstance(constant, CodeType))
+    return set(code.co_names).union(*inside)
+
+
+@contextmanager
+def forgetting(cls: type[Method]) -> Iterator[Callable[[], None]]:
+    """Yield a function that resets what a method keeps outside of its objects, as a new process would.
+
+    It resets the attributes of the class, and the global variables of the class's package that its functions
+    use, to copies of their values at the start. What cannot be copied is left. At the end each variable holds
+    the object that it held at the start.
+    """
+    places: list[tuple[Any, set[str] | None]] = [(one, None) for one in own_classes(cls)]
+    places += [(sys.modules[module], names) for module, names in _used_globals(cls).items()]
+    start = [_variables(owner, names) for owner, names in places]
+    copies = [_copied(values) for values in start]
+
+    def reset(values: list[dict[str, Any]]) -> None:
+        for (owner, names), known, wanted in zip(places, start, values, strict=True):
+            for name in _variables(owner, names).keys() - known.keys():
+                delattr(owner, name)
+            for name, value in wanted.items():
+                if vars(owner).get(name) is not value:
+                    setattr(owner, name, value)
+
+    try:
+        yield lambda: reset([_copied(values) for values in copies])
+    finally:
+        reset(start)
+
+
+def _used_globals(cls: type[Method]) -> dict[str, set[str]]:
+    """Return the names that a method's functions use, by module, also those of its package that they call."""
+    found: dict[str, set[str]] = {}
+    pending = [function for one in own_classes(cls) for function in functions_of(one).values()]
+    packages = {package_of(one.__module__) for one in own_classes(cls)}
+    seen: set[FunctionType] = set()
+    while pending:
+        function = pending.pop()
+        module = sys.modules.get(function.__module__)
+        if function in seen or module is None or vars(module) is not function.__globals__:
+            continue
+        seen.add(function)
+        names = names_in(function.__code__)
+        found.setdefault(function.__module__, set()).update(names)
+        called = [inspect.unwrap(one) for name in names if inspect.isfunction(one := vars(module).get(name))]
+        pending += [one for one in called if package_of(one.__module__) in packages]
+    return found
+
+
+def _variables(owner: Any, names: set[str] | None) -> dict[str, Any]:
+    """Return the variables of a class or a module that hold data: all, or those with one of some names."""
+    return {
+        name: value
+        for name, value in vars(owner).items()
+        if not (name.startswith("__") or isinstance(value, ModuleType | type) or inspect.isroutine(value))
+        and not hasattr(type(value), "__get__")  # properties and the like
+        and (names is None or name in names)
+    }
+
+
+_CONTAINERS = (dict, list, set, bytearray, deque, np.ndarray, Tensor)
+
+
+def _copied(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the values, as copies where they can change, without those that cannot be copied."""
+    copies = {}
+    for name, value in values.items():
+        # a copy of a plain `object()` would no longer be the mark that it is
+        changes = isinstance(value, _CONTAINERS) or bool(getattr(value, "__dict__", None))
+        with contextlib.suppress(Exception):
+            copies[name] = copy.deepcopy(value) if changes else value
+    return copies
 
 
 # ---- files -------------------------------------------------------------------------------------------------

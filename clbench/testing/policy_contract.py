@@ -10,7 +10,9 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+import functools
 import tempfile
+import traceback
 from collections.abc import Callable
 from functools import cached_property
 from pathlib import Path
@@ -24,8 +26,7 @@ from clbench.policy.batch import Batch
 from clbench.policy.checkpoint import load_policy, save_policy
 from clbench.policy.kinds import new_policy, policy_class
 from clbench.policy.policy import ABILITIES, Policy, PolicyConfig
-from clbench.testing.contract import Check
-from clbench.testing.error import ContractError
+from clbench.testing.error import Check, ContractError
 from clbench.testing.global_state import GENERATORS, read, same
 from clbench.testing.small import SMALL, toy_questions, toy_source
 
@@ -60,7 +61,27 @@ def check_policy(kind: str) -> None:
 def policy_checks(kind: str) -> list[Check]:
     """Return a check for each clause of the contract, for `pytest.mark.parametrize(..., ids=str)`."""
     subject = Subject(kind)
-    return [Check(deterministic()(clause), subject) for clause in CLAUSES]
+    return [Check(deterministic()(_named(clause)), subject) for clause in CLAUSES]
+
+
+def _named(clause: Callable[[Subject], None]) -> Callable[[Subject], None]:
+    """Return a clause that turns an error of the policy into a breach of the contract."""
+
+    @functools.wraps(clause)
+    def check(subject: Subject) -> None:
+        try:
+            clause(subject)
+        except ContractError:
+            raise
+        except Exception as error:
+            frames = [frame for frame, _ in traceback.walk_tb(error.__traceback__)]
+            module = subject.cls.__module__
+            own = [frame.f_code.co_name for frame in frames if frame.f_globals.get("__name__") == module]
+            look = f"{own[-1]}()" if own else "the arguments of its functions"
+            words = f"{type(error).__name__}: {error}"
+            raise _breach(clause, "the policy to run without an error", words, look) from error
+
+    return check
 
 
 class Subject:
@@ -154,10 +175,10 @@ def actions(subject: Subject) -> None:
     policy, batch = subject.build().eval(), subject.batch
     size = (SAMPLES, subject.config.chunk, subject.config.action_size)
     before = read(GENERATORS)
-    chunk = policy.act(batch.state, batch.words, batch.noise)
+    chunk = _act(policy, batch)
     _check_shape(actions, chunk, size, "act()")
     _check_shape(actions, policy.predict(batch), size, "predict()")
-    again = policy.act(batch.state, batch.words, batch.noise)
+    again = _act(policy, batch)
     untouched = all(same(value, before[name]) for name, value in read(GENERATORS).items())
     if not (chunk.equal(again) and untouched):
         expected = "the same actions for the same arguments: `noise` is the only source of chance"
@@ -165,7 +186,7 @@ def actions(subject: Subject) -> None:
     if chunk.requires_grad:
         raise _breach(actions, "no gradient: use @torch.inference_mode()", "a tensor with one", "act()")
     for row in range(SAMPLES):
-        alone = policy.act(batch.state[row : row + 1], batch.words[row : row + 1], batch.noise[row : row + 1])
+        alone = _act(policy, batch[row : row + 1])
         if not torch.allclose(alone, chunk[row : row + 1], rtol=1e-3, atol=1e-3):
             found = f"sample {row} gets other actions alone"
             raise _breach(actions, "actions that do not depend on the other samples", found, "act()")
@@ -190,10 +211,13 @@ def learning(subject: Subject) -> None:
         raise _breach(learning, expected, f"{after:.3g}, with {before:.3g} before", "action_loss()")
     words = toy_source("left").sample(SAMPLES).words, toy_source("up").sample(SAMPLES).words
     seen = batch[:SAMPLES]
-    left, up = (policy.act(seen.state, told, seen.noise).mean(dim=(0, 1)) for told in words)
+    left, up = (_act(policy, dataclasses.replace(seen, words=told)).mean(dim=(0, 1)) for told in words)
     if not (left[0] < up[0] and left[1] < up[1]):
         found = f"mean actions {left.tolist()} for `go left` and {up.tolist()} for `go up`"
         raise _breach(learning, "actions that follow the instruction", found, "act()")
+    elsewhere = dataclasses.replace(seen, state=seen.state.flip(0))
+    if _act(policy, elsewhere).equal(_act(policy, seen)):
+        raise _breach(learning, "actions that depend on the state", "the same ones in other states", "act()")
 
 
 def checkpoints(subject: Subject) -> None:
@@ -203,9 +227,7 @@ def checkpoints(subject: Subject) -> None:
         save_policy(policy, Path(folder))
         loaded = load_policy(Path(folder), name=subject.config.kind).eval()
     for name, other in (("loaded", loaded), ("copied", copy.deepcopy(policy))):
-        if not other.act(batch.state, batch.words, batch.noise).equal(
-            policy.act(batch.state, batch.words, batch.noise)
-        ):
+        if not _act(other, batch).equal(_act(policy, batch)):
             expected = "all that `act` needs in parameters and buffers"
             raise _breach(checkpoints, expected, f"a {name} policy acts otherwise", "register_buffer()")
 
@@ -225,7 +247,7 @@ def abilities(subject: Subject) -> None:
 
 def _check_hidden_states(policy: Policy, batch: Batch) -> None:
     """The hidden states are what the head reads."""
-    hidden, mask = policy.hidden_states(batch.state, batch.words), policy.token_mask(batch.words)
+    hidden, mask = policy.hidden_states(batch.state, batch.words, batch.image), policy.token_mask(batch.words)
     _check_shape(abilities, mask, (SAMPLES, 1, 1, hidden[0].shape[1]), "token_mask()")
     if len(hidden) != len(policy.backbone_layers):
         found = f"{len(hidden)} hidden states, {len(policy.backbone_layers)} layers"
@@ -246,7 +268,7 @@ def _check_hidden_states(policy: Policy, batch: Batch) -> None:
 def _check_answers(policy: Policy) -> None:
     """The policy answers questions with a word of its vocabulary."""
     questions = toy_questions().sample(SAMPLES)
-    logits = policy.answer_logits(questions.state, questions.words)
+    logits = policy.answer_logits(questions.state, questions.words, questions.image)
     _check_shape(abilities, logits, (SAMPLES, policy.config.vocabulary_size), "answer_logits()")
     loss = policy.answer_loss(questions)
     if not torch.allclose(loss, F.cross_entropy(logits, questions.answer, reduction="none"), rtol=1e-4):
@@ -260,6 +282,11 @@ CLAUSES = (initial_weights, losses, gradients, actions, learning, checkpoints, a
 def _breach(clause: Callable[[Subject], None], expected: str, found: str, look: str) -> ContractError:
     name = clause.__name__.replace("_", " ")
     return ContractError(name, expected, found, look, subject="policy", page=PAGE)
+
+
+def _act(policy: Policy, batch: Batch) -> Tensor:
+    """Return the actions (B, H, A) of a policy, asked as every run asks for them."""
+    return policy.act(batch.state, batch.words, batch.noise, batch.image)
 
 
 def _check_shape(clause: Callable[[Subject], None], value: object, shape: tuple[int, ...], look: str) -> None:

@@ -24,7 +24,7 @@ from clbench.data.demonstrations import demonstrate
 from clbench.data.questions import QuestionKind
 from clbench.evaluation.definition import recording_of
 from clbench.spec.identifiers import check_plain, check_scenario_id
-from clbench.spec.language import fitting_length, word_id
+from clbench.spec.language import LENGTHS, fitting_length, word_id, word_ids
 from clbench.spec.scenario import Scenario
 from clbench.spec.task import Task
 from clbench.worlds.lanes import Lanes
@@ -66,13 +66,14 @@ def check_scenario(scenario: Scenario, *, episodes: int = 10, success: float = 0
             fitting_length(task.instructions + task.test_instructions)
     except ValueError as error:
         raise ScenarioError(f"{scenario.id}: {error}") from error
-    wordings: dict[str, str] = {}
+    wordings: dict[tuple[int, ...], str] = {}
     for task in tasks:
-        for words in task.instructions + task.test_instructions:
-            if wordings.setdefault(words, task.name) != task.name:
+        texts = task.instructions + task.test_instructions
+        for words, ids in zip(texts, word_ids(texts, LENGTHS[-1]), strict=True):
+            if (other := wordings.setdefault(tuple(ids), task.name)) != task.name:
                 raise ScenarioError(
-                    f"{scenario.id}: {wordings[words]} and {task.name} share the instruction {words!r}: a "
-                    "policy could not tell them apart."
+                    f"{scenario.id}: {other} and {task.name} share the instruction {words!r}: a policy could "
+                    "not tell them apart. Case, accents and punctuation do not count."
                 )
     if not scenario.target:
         raise ScenarioError(f"{scenario.id}: there is no target to learn.")

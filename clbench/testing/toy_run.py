@@ -13,10 +13,16 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import torch
 from torch import Tensor, nn
 
 from clbench.base.seeding import seeded
+from clbench.base.strict_json import StrictJSONError, check_json
+from clbench.base.text import did_you_mean
 from clbench.data.training_data import TrainingData
+from clbench.evaluation.rollouts import Evaluator
+from clbench.learning.adaptation import Step
 from clbench.learning.method import Method, Stage
 from clbench.learning.optimise import MethodError, deterministic
 from clbench.learning.pretraining import pretrained_policy
@@ -28,7 +34,7 @@ from clbench.policy.checkpoint import CheckpointError
 from clbench.policy.policy import Policy
 from clbench.spec.policies import DEFAULT_POLICY
 from clbench.testing.error import ContractError
-from clbench.testing.global_state import GENERATORS, read, watched
+from clbench.testing.global_state import GENERATORS, forgetting, read, same, watched
 from clbench.testing.toy import TOY
 
 HOOKS = (
@@ -45,9 +51,6 @@ HOOKS = (
     "diagnostics",
 )
 """Hooks of `Method`."""
-
-IN_A_STEP = ("batch", "loss", "gradients", "learning_rate")
-"""Hooks of one optimiser step, in their order."""
 
 UNSEEDED = ("state", "diagnostics")
 """Hooks that may not draw at random."""
@@ -72,6 +75,24 @@ def toy_data(policy: str = DEFAULT_POLICY) -> tuple[TrainingData, Policy]:
     return TrainingData.open(TOY, pretrained.config), pretrained
 
 
+@functools.cache
+def frozen_return(policy: str) -> float:
+    """Return the mean return of a pretrained policy, as `mean_return`."""
+    _, pretrained = toy_data(policy)
+    return mean_return(pretrained)
+
+
+def mean_return(policy: Policy) -> float:
+    """Return the mean return of the policy on the toy's first target, over its validation episodes."""
+    evaluator = Evaluator(TOY, 0)
+    policy.eval()
+    with deterministic():
+        episodes = evaluator.evaluate(policy, TOY.target[:1])
+    policy.train()
+    evaluator.close()
+    return sum(episode.total_reward for episode in episodes) / len(episodes)
+
+
 class ToyRun:
     """A run of a method on the toy, with the observed behaviour of its hooks.
 
@@ -83,6 +104,8 @@ class ToyRun:
         resumed: Whether each stage begins with a new object that loads the state of the last one, as in every
             run, or continues with the old object.
         policy: Name of the policy.
+        to_criterion: Whether the stages have a criterion. The first one then meets it at its first check
+            after a step, each later one at the check before its first step.
 
     Raises:
         ContractError: A hook does something after which the loop cannot continue.
@@ -96,19 +119,21 @@ class ToyRun:
         seed: int = 0,
         resumed: bool = True,
         policy: str = DEFAULT_POLICY,
+        to_criterion: bool = False,
     ) -> None:
         self.draws: set[tuple[str, str]] = set()
         """Source and hook of all draws."""
-        self.target_rows = 0
-        """Largest number of samples of the target drawn in one step."""
         self.changes: dict[tuple[str, str], None] = {}
         """Hooks with descriptions of their side effects."""
         self.outcomes: dict[tuple[str, str], Any] = {}
         """Weights, state and diagnostics, by stage and name."""
         self.generators: dict[str, dict[str, Any]] = {}
         """Global random generators after the first call of each hook for which a run seeds them."""
-        self._build, self._hook, self._running, self._step_rows = build, "prepare", False, 0
-        budget = dataclasses.replace(TOY.budget, adaptation_steps=steps)
+        self._build, self._hook, self._running = build, "prepare", False
+        self._earlier: list[Method | Policy] = []
+        """Objects of the method, and policies, that the run has had."""
+        criterion = 1.0 if to_criterion else None
+        budget = dataclasses.replace(TOY.budget, adaptation_steps=steps, criterion=criterion)
         scenario = dataclasses.replace(TOY.with_policy(policy), target=TOY.target[:targets], budget=budget)
         data, pretrained = toy_data(policy)
         # no two runs begin with the same global generators: results that depend on them differ
@@ -117,19 +142,52 @@ class ToyRun:
             self._go(Path(folder), resumed)
 
     def _go(self, folder: Path, resumed: bool) -> None:
-        for number in range(len(self.trainer.scenario.target) + 1):
-            with self._named_faults():
-                if number:
-                    self.trainer.learn(number, lambda _: None)
-                else:
-                    self.outcomes["prepare", "steps"] = self.trainer.prepare()
-                stage = self.trainer.where
-                self._keep(stage, "diagnostics", self.trainer.diagnostics(number))
-                self.trainer.save(folder, self.trainer.state(number))
-                for name, value in self.trainer.policy.state_dict().items():
-                    self._keep(stage, name, value)
-                if resumed:
-                    self.trainer.load(folder, number)
+        with forgetting(type(self.trainer.method)) as forget:
+            for number in range(len(self.trainer.scenario.target) + 1):
+                with self._named_faults():
+                    if number:
+                        self.trainer.learn(number, functools.partial(self._is_learned, number))
+                    else:
+                        self.outcomes["prepare", "steps"] = self.trainer.prepare()
+                    stage = self.trainer.where
+                    self._keep(stage, "diagnostics", self.trainer.diagnostics(number))
+                    self.trainer.save(folder, self.trainer.state(number))
+                    for name, value in self.trainer.policy.state_dict().items():
+                        self._keep(stage, name, value)
+                    if resumed:
+                        self._earlier.append(self.trainer.policy)
+                        forget()
+                        self.trainer.load(folder, number)
+
+    def _is_learned(self, number: int, step: Step) -> bool:
+        """Return whether a stage ends after a step; each check asks for the policy that it would leave."""
+        if step.done not in self.trainer.scenario.budget.check_steps:
+            return False
+        try:
+            self.trainer.finished()
+        except ContractError:
+            raise
+        except Exception as error:
+            expected = "a method that copy.deepcopy() can copy: detach the tensors that it keeps"
+            found = f"{type(error).__name__}: {error}"
+            raise ContractError("criterion", expected, found, "whole_stages") from error
+        return number > 1 or step.done > 0
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> ToyRun:
+        """Return the run itself: it watches the copies of its method too."""
+        return self
+
+    def difference(self, other: ToyRun) -> str | None:
+        """Return a description of the first outcome that differs in another run, or None."""
+        for stage, name in {**self.outcomes, **other.outcomes}:
+            first, second = (run.outcomes.get((stage, name)) for run in (self, other))
+            if same(first, second):
+                continue
+            words = f"{name} differs in {stage}"
+            if isinstance(first, Tensor) and isinstance(second, Tensor) and first.shape == second.shape:
+                words += f" by up to {float((1.0 * first - 1.0 * second).abs().max()):.2g}"
+            return words
+        return None
 
     def hooks_that_draw(self, source: str) -> set[str]:
         """Return the hooks that draw samples from a source."""
@@ -144,17 +202,13 @@ class ToyRun:
         """Turn an error inside, but outside all hooks, into a fault of the last hook."""
         try:
             yield
-        except CheckpointError as error:
-            raise ContractError(
-                "state",
-                "load_state() to add to a plain policy what prepare() added",
-                str(error).partition(": ")[2],
-                "load_state()",
-            ) from error
         except ContractError:
             raise
         except Exception as error:
             found = str(error) if isinstance(error, MethodError) else f"{type(error).__name__}: {error}"
+            if isinstance(error.__cause__ or error, CheckpointError):
+                expected = "load_state() to add to a plain policy what prepare() added"
+                raise ContractError("state", expected, found, "load_state()") from error
             expected = SOUND.get(self._hook, f"{self._hook}() to run without an error")
             raise ContractError("sound hooks", expected, found, f"{self._hook}()") from error
 
@@ -162,6 +216,7 @@ class ToyRun:
 
     def _watched_method(self) -> Method:
         method = self._build()
+        self._earlier.append(method)
         self.uses = method.uses
         if watches(type(method)):  # in the cache after the first run
             if method.uses.demonstrations == "never":
@@ -179,11 +234,10 @@ class ToyRun:
         if self._running:  # the method calls one of its own hooks
             return function(*arguments, **named)
         self._hook, self._running = hook, True
-        self._step_rows = 0 if hook == "batch" else self._step_rows
         changes: list[str] = []
         try:
             with watched(changes, generators=hook in UNSEEDED):
-                result = function(*map(self._counted, arguments), **named)
+                result = function(*map(self._watched_data, arguments), **named)
         except Exception as error:
             raise self._fault(hook, error) from error
         finally:
@@ -200,14 +254,26 @@ class ToyRun:
         expected, found = f"{hook}() to run without an error", f"{type(error).__name__}: {error}"
         if isinstance(error, UndeclaredAccessError):
             clause, found = "declared data", str(error)
-            expected = f"{hook}() to draw from its arguments, and only from prior data that `uses` declares"
-        elif isinstance(error, AttributeError) and error.obj is self.trainer.method and hook != "prepare":
-            clause, look = "state", "state() and load_state()"
-            found = f"{hook}() finds no attribute {error.name!r}"
-            expected = "every stage to begin with a new object that has only what load_state() sets"
+            expected = (
+                f"{hook}() to draw from its arguments: at most a batch of the target in a step, and only the "
+                "prior data that `uses` declares"
+            )
+        elif isinstance(error, AttributeError) and error.name and isinstance(error.obj, Method | nn.Module):
+            found = f"{hook}() finds no attribute {error.name!r} in the {type(error.obj).__name__}"
+            if self._had(type(error.obj), error.name):
+                clause, look = "state", "state() and load_state()"
+                expected = "every stage to begin with a new object that has only what load_state() sets"
+            else:
+                hint = did_you_mean(error.name, dir(error.obj))
+                found += f".{hint}" if hint else ""
         elif hook in ("state", "load_state"):
             clause = "state"
         return ContractError(clause, expected, found, look)
+
+    def _had(self, kind: type, name: str) -> bool:
+        """Return whether an earlier object of this type had an attribute: a method, or a part of a policy."""
+        earlier = (one.modules() if isinstance(one, nn.Module) else [one] for one in self._earlier)
+        return any(type(one) is kind and hasattr(one, name) for one in itertools.chain(*earlier))
 
     def _checked_prepare(self, steps: Any) -> Any:
         if steps is not None and not (type(steps) is int and steps >= 0):
@@ -216,19 +282,19 @@ class ToyRun:
 
     def _checked_start_task(self, parameters: Any) -> list[Any]:
         try:
-            groups = list(parameters)
-        except TypeError as error:
-            raise _unsound("start_task", SOUND["start_task"], type(parameters).__name__) from error
-        members = [group["params"] if isinstance(group, dict) else [group] for group in groups]
-        self._trained = list(itertools.chain.from_iterable(members))
+            groups = [_listed(one) for one in parameters]
+            # copies, since an optimiser writes to its groups
+            copies = [dict(one) if isinstance(one, dict) else one for one in groups]
+            made = torch.optim.AdamW(copies).param_groups if copies else []
+        except (TypeError, ValueError, KeyError) as error:
+            found = type(parameters).__name__ if parameters is None else str(error)
+            raise _unsound("start_task", SOUND["start_task"], found) from error
+        self._trained = [parameter for group in made for parameter in group["params"]]
         if not self._trained and not self.uses.reference:
             expected = "parameters to train; only a reference, `uses = Uses(reference=True)`, may train none"
             raise _unsound("start_task", expected, "none")
-        for one in self._trained:
-            if not isinstance(one, nn.Parameter):
-                raise _unsound("start_task", SOUND["start_task"], f"a {type(one).__name__} among them")
-            if not one.requires_grad:
-                raise _unsound("start_task", "parameters that require a gradient", "one that does not")
+        if not all(one.requires_grad for one in self._trained):
+            raise _unsound("start_task", "parameters that require a gradient", "one that does not")
         return groups
 
     def _checked_gradients(self, result: Any) -> Any:
@@ -247,7 +313,18 @@ class ToyRun:
                 found = f"a {type(value).__name__}, {name!r}"
                 if isinstance(value, Batch | QuestionBatch):
                     found += "; store its tensors, {**vars(batch)}, and restore them, Batch(**state)"
+                elif isinstance(value, np.generic | np.ndarray):
+                    found += f"; store {name}.item(), or torch.from_numpy({name})"
                 raise _bad_state("a flat dictionary of tensors, texts, numbers, truth values and None", found)
+            if isinstance(value, Tensor):
+                if value.layout is not torch.strided:
+                    raise _bad_state("dense tensors", f"{name!r} is sparse; store {name}.to_dense()")
+            else:
+                try:
+                    check_json(json.loads(json.dumps(value)), repr(name))  # as a run does
+                except StrictJSONError as error:
+                    expected = "finite numbers and short texts; a tensor may hold any number"
+                    raise _bad_state(expected, str(error)) from error
             if self.trainer.where != "watch_pretraining":  # a later run has it from the cache
                 self._keep(self.trainer.where, f"state {name!r}", value)
         return state
@@ -263,38 +340,35 @@ class ToyRun:
 
     # ---- arguments of the hooks --------------------------------------------------------------------
 
-    def _counted(self, argument: Any) -> Any:
-        """Return an argument of a hook with counted sources."""
+    def _watched_data(self, argument: Any) -> Any:
+        """Return an argument of a hook with watched sources."""
         if isinstance(argument, Stage):
-            counted = {"target": self._counted(argument.target), "prior": self._counted(argument.prior)}
-            return dataclasses.replace(argument, **counted)
+            return dataclasses.replace(
+                argument,
+                target=self._watched_data(argument.target),
+                prior=self._watched_data(argument.prior),
+            )
         if isinstance(argument, Prior):
             return Prior(
-                {name: CountedSource(one, self._counter(name)) for name, one in argument.sources.items()}
+                {name: WatchedSource(one, self._recorder(name)) for name, one in argument.sources.items()}
             )
         if isinstance(argument, Source):
-            return CountedSource(argument, self._counter("target"))
+            return WatchedSource(argument, self._recorder("target"))
         return argument
 
-    def _counter(self, source: str) -> Callable[[int], None]:
-        def count(samples: int) -> None:
-            self.draws.add((source, self._hook))
-            if source == "target" and self._hook in IN_A_STEP:
-                self._step_rows += samples
-                self.target_rows = max(self.target_rows, self._step_rows)
-
-        return count
+    def _recorder(self, source: str) -> Callable[[], None]:
+        return lambda: self.draws.add((source, self._hook))
 
 
-class CountedSource(Source[Any]):
-    """A source that counts the samples drawn from it.
+class WatchedSource(Source[Any]):
+    """A source that reports each draw.
 
     Args:
         source: Source of the samples.
-        drew: Called with the number of samples of each draw.
+        drew: Called after each draw.
     """
 
-    def __init__(self, source: Source[Any], drew: Callable[[int], None]) -> None:
+    def __init__(self, source: Source[Any], drew: Callable[[], None]) -> None:
         self.batch_size = source.batch_size
         self._source, self._drew = source, drew
 
@@ -309,12 +383,19 @@ class CountedSource(Source[Any]):
     def sample(self, count: int) -> Any:
         """Return `count` samples."""
         rows = self._source.sample(count)
-        self._drew(count)
+        self._drew()
         return rows
 
     def close(self) -> None:
         """End the access."""
         self._source.close()
+
+
+def _listed(group: Any) -> Any:
+    """Return a parameter group with a list of parameters: the optimiser must find them again."""
+    if not isinstance(group, dict) or isinstance(group["params"], Tensor):
+        return group
+    return {**group, "params": list(group["params"])}
 
 
 def _unsound(hook: str, expected: str, found: str) -> ContractError:

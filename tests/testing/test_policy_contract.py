@@ -196,6 +196,32 @@ class Mute(Base):
         return F.pad(super().answer_logits(state, words, image), (0, 1))
 
 
+class ImageBlind(Base):
+    """Takes no picture."""
+
+    @torch.inference_mode()
+    def act(self, state: Tensor, words: Tensor, noise: Tensor) -> Tensor:  # type: ignore[override] # the fault
+        return super().act(state, words, noise)
+
+
+class Stateless(Plain):
+    """Does not read the state."""
+
+    def chunk(self, state: Tensor, words: Tensor) -> Tensor:
+        return super().chunk(0 * state + self.state_mean, words)
+
+
+class Batched(Plain):
+    """Normalises over the batch."""
+
+    def __init__(self, config: PolicyConfig, seed: int = 0) -> None:
+        super().__init__(config, seed)
+        self.norm = torch.nn.BatchNorm1d(config.state_size, affine=False)
+
+    def chunk(self, state: Tensor, words: Tensor) -> Tensor:
+        return super().chunk(self.norm(state), words)
+
+
 BROKEN: list[tuple[type[Policy], str, str]] = [
     (Careless, "initial weights", "torch's random changed"),
     (Constant, "initial weights", "seeds 1 and 2 give the same weights"),
@@ -206,6 +232,9 @@ BROKEN: list[tuple[type[Policy], str, str]] = [
     (Detached, "gradients", "none that is not 0"),
     (Restless, "actions", "draws from a global generator"),
     (Short, "actions", r"\(6, 8, 2\)\n  found:    \(6, 4, 2\)"),
+    (ImageBlind, "actions", "TypeError: .*act.* takes 4 positional arguments but 5 were given"),
+    (Batched, "losses", r"ValueError: Expected more than 1 value(.|\n)*look at:  chunk\(\)"),
+    (Stateless, "learning", "actions that depend on the state"),
     (Deaf, "learning", "for `go left`"),
     (Stubborn, "learning", "a loss of at most"),
     (Forgetful, "checkpoints", "a loaded policy acts otherwise"),

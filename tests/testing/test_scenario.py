@@ -223,6 +223,12 @@ def test_two_tasks_that_no_instruction_tells_apart_are_named() -> None:
         check_scenario(dataclasses.replace(TOY, target=(alike, *TOY.target[1:])))
 
 
+def test_instructions_that_differ_in_case_and_punctuation_alone_are_the_same() -> None:
+    alike = dataclasses.replace(TOY.target[0], instructions=("Go left!",))
+    with pytest.raises(ScenarioError, match="left and right share the instruction 'Go left!'"):
+        check_scenario(dataclasses.replace(TOY, target=(alike, *TOY.target[1:])))
+
+
 def test_a_scenario_without_a_target_is_named() -> None:
     with pytest.raises(ScenarioError, match="no target to learn"):
         check_scenario(dataclasses.replace(TOY, target=()))
