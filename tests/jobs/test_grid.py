@@ -125,7 +125,10 @@ def test_a_class_inside_a_function_is_refused(tmp_path: Path) -> None:
         ({"seeds": 1.5}, "seeds must be a whole number from 1, not 1.5"),
         ({"seeds": 0}, "seeds must be a whole number from 1, not 0"),
         ({"seeds": 10_001}, "seeds must be at most 10,000, not 10001"),
-        ({"first_seed": 2**64}, "RunSpec.seed must be at most 18446744073709551615, not 18446744073709551616"),
+        (
+            {"first_seed": 2**64},
+            "RunSpec.seed must be at most 18446744073709551615, not 18446744073709551616",
+        ),
         ({"workers": True}, "workers must be a whole number from 1, not True"),
         ({"first_seed": 0.7}, "seed must be a whole number, not 0.7"),
         ({"first_seed": -1}, "seed must be at least 0, not -1"),
