@@ -1,5 +1,6 @@
 """The guide to policies from elsewhere: its server and its commands run as they are written."""
 
+import contextlib
 import os
 import re
 import shutil
@@ -17,7 +18,7 @@ from agents import ID
 from helpers import blocks_of
 from served import SERVER
 
-from clbench.base.errors import ClbenchError
+from clbench.base.errors import ClbenchError, MissingPackageError
 from clbench.records.pinned import pinned
 from clbench.serving.client import ServedPolicy
 from clbench.spec.protocol import Protocol
@@ -68,15 +69,18 @@ def test_the_policy_of_the_page_is_served_and_scored_by_its_commands(
 
 
 def test_the_page_lists_the_sizes_of_all_scenarios_that_retain_skills() -> None:
-    every = map(load_scenario, pinned())
-    assert {f"clbench/{name}" for name, *_ in ROWS} == {one.id for one in every if one.retained}
+    shown = {f"clbench/{name}" for name, *_ in ROWS}
+    assert shown <= pinned().keys()
+    for name in pinned():
+        with contextlib.suppress(MissingPackageError):
+            assert (name in shown) == bool(load_scenario(name).retained)
 
 
 @pytest.mark.parametrize("row", ROWS, ids=lambda row: str(row[0]))
 def test_the_sizes_on_the_page_are_those_of_the_scenario(row: tuple[str, ...]) -> None:
     name, state, action, picture, fewest, most = row
-    scenario = load_scenario(f"clbench/{name}")
     try:
+        scenario = load_scenario(f"clbench/{name}")
         scenario.require_packages()
     except ClbenchError as error:
         pytest.skip(str(error))
