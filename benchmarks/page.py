@@ -111,6 +111,7 @@ def made_record(
             for stage in range(1, 5)
         },
         fingerprint={
+            "definition": {"questions": "0123456789abcdef"},
             "versions": {f"package-{number}": f"{number}.4.2" for number in range(8)},
             "python": "3.11.7",
             "commit": {"id": "0123456789" * 4, "dirty": False},

@@ -106,6 +106,7 @@ def _check_run(
     assert lasting_records(folder / "records") == lasting_records(finished / "records")
 
 
+@pytest.mark.slow
 def test_a_run_whose_cached_files_are_all_damaged_gives_the_same_record(
     runs: Runs, finished: Path, tmp_path: Path, lasting_records: Callable[[Path], dict[str, Any]]
 ) -> None:

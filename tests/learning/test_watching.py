@@ -99,6 +99,7 @@ def test_only_a_method_that_overrides_the_hook_watches() -> None:
     assert not watches(clbench.load_method("sft"))
 
 
+@pytest.mark.slow
 def test_a_method_that_only_looks_keeps_the_contract() -> None:
     check_method(Careful)
 

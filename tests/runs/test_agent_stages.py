@@ -140,6 +140,7 @@ for stage in range(clbench.next_stage("{id}", method="me/still", records="record
 """
 
 
+@pytest.mark.slow
 def test_a_killed_program_continues_with_the_stage_that_was_running(empty_caches: Path) -> None:
     environment = {**os.environ, "CLBENCH_CACHE": str(empty_caches / "cache")}
 

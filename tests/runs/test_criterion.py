@@ -195,6 +195,7 @@ def test_a_record_whose_last_check_does_not_repeat_itself_stays_recomputed(
     assert [check.name for check in found if not check.passed] == ["ends of stages"]
 
 
+@pytest.mark.slow
 def test_kept_policies_of_other_settings_under_this_name_are_found_by_going_on_from_them(
     tmp_path: Path,
 ) -> None:

@@ -61,6 +61,7 @@ def test_the_page_has_the_figures_of_the_simulations(coverage: ModuleType, resul
         assert stated in page.replace("\n", " ")
 
 
+@pytest.mark.slow
 def test_the_deviations_between_seeds_are_those_of_the_committed_records(
     coverage: ModuleType, results: Any
 ) -> None:

@@ -108,6 +108,7 @@ def test_a_class_that_breaks_the_contract_is_not_run(capsys: pytest.CaptureFixtu
     assert not Path("board").exists()
 
 
+@pytest.mark.slow
 def test_a_method_that_goes_beyond_the_limits_of_its_scenario_is_stopped(
     capsys: pytest.CaptureFixture[str],
 ) -> None:

@@ -144,6 +144,7 @@ def test_the_file_says_who_verified_when_and_with_which_versions(mine: Path, hon
     assert found["verifier"]["versions"] == read_record(mine).fingerprint["versions"]
 
 
+@pytest.mark.slow
 def test_a_fault_that_only_the_whole_run_shows_is_found_by_doing_it_again(mine: Path, honest: Path) -> None:
     edit(mine, lambda values: flip(values, 0, 30))  # on the way: no policy of that moment is kept
     edit(mine, lambda values: values["costs"].update(bytes_kept=1))
