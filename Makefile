@@ -149,7 +149,8 @@ libero-test: .venv/installed-dev
 # Besides style and types: whether the committed board and pages are those of the committed records, whether every scenario
 # is what its definition says, and the slow tests of what few change: the page in a browser, and the benchmarks.
 CHECKED := tests/leaderboard/test_records.py tests/evaluation/test_definition.py tests/test_benchmarks.py \
-	tests/scoring/test_statistics_page.py $(addprefix tests/leaderboard/views/page/,test_in_browser.py test_on_a_phone.py test_ways.py)
+	tests/scoring/test_statistics_page.py tests/base/test_source.py \
+	$(addprefix tests/leaderboard/views/page/,test_in_browser.py test_on_a_phone.py test_ways.py)
 check: .venv/installed-dev
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .

@@ -61,6 +61,7 @@ def imported(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[str]]:
     return {stage: names for stage, *names in lines if stage in STAGES}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stage", STAGES)
 def test_a_key_names_every_package_that_its_stage_imports(stage: str, imported: dict[str, list[str]]) -> None:
     packages, _ = STAGES[stage]

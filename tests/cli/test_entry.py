@@ -75,7 +75,7 @@ def _exit_code(process: subprocess.Popen[str]) -> tuple[int, str, str]:
 
 
 @pytest.mark.parametrize(
-    "number", [pytest.param(number, marks=[pytest.mark.slow] if number > 3 else []) for number in range(10)]
+    "number", [pytest.param(number, marks=[pytest.mark.slow] if number > 1 else []) for number in range(10)]
 )
 def test_ctrl_c_at_any_moment_ends_the_command(number: int) -> None:
     process = _start(STARTED + RUN, "list")

@@ -114,6 +114,7 @@ def test_the_table_shows_the_least_tier_of_a_row(mine: Path, honest: Path) -> No
     assert list(load(records).tier) == ["self-reported"]
 
 
+@pytest.mark.slow
 def test_the_pretraining_is_repeated_on_request_and_its_policy_compared(mine: Path, honest: Path) -> None:
     checks = verify(mine, "retrained", honest, pretrain=True)
     assert not failures(checks)
