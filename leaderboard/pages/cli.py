@@ -41,8 +41,6 @@ def claims(
     from ..claims.judges import judge_all
     from .claims_page import page, terminal
 
-    with checked_input():
-        check_folder(records)
     judged = judge_all(_evidence(scenario, records, controls), scenario)
     console = Console()
     console.print(terminal(judged))
@@ -66,8 +64,6 @@ def findings(
     from ..views.format import print_written, write_all
     from .findings import page, pictures, sections
 
-    with checked_input():
-        check_folder(records)
     evidence = _evidence(None, records, controls)
     board = _board(records)
     found = sections(board, judge_all(evidence))
@@ -95,7 +91,7 @@ def method_pages(
     from ..views.format import write_if_changed
     from .method_pages import Sources, pages
 
-    evidence = _evidence(scenario, records, controls)
+    evidence = _evidence(scenario, records, controls, optional=True)
     sources = Sources(evidence(scenario), judge_all(evidence), _board(records).rows)
     texts = pages(built_in_methods(), sources)
     output.mkdir(parents=True, exist_ok=True)
@@ -150,19 +146,28 @@ def scenario_card(
         _write(output / f"{home.name}.md", card.page())
 
 
-def _evidence(scenario: str | None, records: Path, controls: Path) -> Callable[[str], Evidence]:
-    """Return what gives the evidence on a scenario; refuse one without records that is not registered."""
+def _evidence(
+    scenario: str | None, records: Path, controls: Path, optional: bool = False
+) -> Callable[[str], Evidence]:
+    """Return what gives the evidence on a scenario.
+
+    A scenario without records that is not registered is refused, and so is a missing folder of records unless
+    it is optional.
+    """
     from ..board.frontier import ladder_of
     from ..claims.evidence import read_evidence
 
-    for folder in (records, controls, ladder_of(records)):
-        if not folder.is_dir():
-            text = f"There is no folder {folder}: verdicts may differ from the published ones."
-            Console(stderr=True, soft_wrap=True).print(Text(text, style="yellow"))
     if scenario is not None:
         homes = [home / folder_name(scenario) for home in (records, controls)]
         if not any(home.is_dir() for home in homes):  # one with records may be of a missing package
             check_names([scenario], [])  # before all records are read, which takes 10 s
+    if not optional:
+        with checked_input():
+            check_folder(records)
+    for folder in (records, controls, ladder_of(records)):
+        if not folder.is_dir():
+            text = f"There is no folder {folder}: verdicts may differ from the published ones."
+            Console(stderr=True, soft_wrap=True).print(Text(text, style="yellow"))
     return read_evidence(records, controls)
 
 
