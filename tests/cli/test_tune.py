@@ -11,7 +11,7 @@ TOY = "clbench.testing:clbench/Toy-v0"
 
 
 def _tune(folder: Path, *arguments: str, method: str = "l2_sp") -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "clbench", "tune", TOY, method, "--first-seed", "3", "--seeds", "1"]
+    command = [sys.executable, "-m", "clbench", "tune", TOY, method, "--first-seed", "103", "--seeds", "1"]
     command += arguments
     done = subprocess.run(command, capture_output=True, text=True, cwd=folder, timeout=600, check=False)
     assert done.returncode == 0, done.stderr
@@ -25,7 +25,7 @@ def test_tune_compares_settings_without_test_episodes(tmp_path: Path) -> None:
     settings = [row[1:4:2] for row in rows]
     assert settings == [["sft", "unchanged"], ["l2_sp", "strength=0.0"], ["l2_sp", "strength=1.0"]]
     assert rows[0][4:] == rows[1][4:]  # at strength 0 it is plain fine-tuning
-    paths = list((tmp_path / "leaderboard" / "tuning").rglob("seed-3.json"))
+    paths = list((tmp_path / "leaderboard" / "tuning").rglob("seed-103.json"))
     assert len(paths) == 3
     assert not any('"test"' in path.read_text().partition('"answers"')[0] for path in paths)
     assert "3 of 3 runs have a record already" in _tune(tmp_path, "--values.strength", "0,1").stderr
@@ -35,18 +35,18 @@ def test_tune_compares_settings_without_test_episodes(tmp_path: Path) -> None:
 def test_runs_of_fewer_targets_leave_the_records_of_all_targets(tmp_path: Path) -> None:
     _tune(tmp_path, "--values.strength", "1")
     records = tmp_path / "leaderboard" / "tuning"
-    before = {path: path.read_bytes() for path in records.rglob("seed-3.json")}
+    before = {path: path.read_bytes() for path in records.rglob("seed-103.json")}
     assert len(before) == 2
     _tune(tmp_path, "--values.strength", "1", "--targets", "1")
     assert {path: path.read_bytes() for path in before} == before
-    assert len(list((records / "targets-1").rglob("seed-3.json"))) == 2
+    assert len(list((records / "targets-1").rglob("seed-103.json"))) == 2
 
 
 @pytest.mark.slow
 def test_tune_writes_the_best_of_six_settings(tmp_path: Path) -> None:
     result = _tune(tmp_path, "--write", "tuned/Toy-v0.json")
     file = json.loads((tmp_path / "tuned" / "Toy-v0.json").read_text())
-    assert (file["scenario"], file["seeds"]) == ("clbench/Toy-v0", [3])
+    assert (file["scenario"], file["seeds"]) == ("clbench/Toy-v0", [103])
     found = file["methods"]["l2_sp"]
     tried = [one["settings"] for one in found["tried"]]
     assert [one["step_factor"] for one in tried[:4]] == [1.0, 0.3, 0.1, 0.03]
@@ -60,5 +60,5 @@ def test_a_fixed_setting_is_in_every_run_and_in_the_file(tmp_path: Path) -> None
     _tune(tmp_path, "--set.schedule", "2", "--write", "tuned/Toy-v0.json", method="consft")
     found = json.loads((tmp_path / "tuned" / "Toy-v0.json").read_text())["methods"]["consft"]
     assert {one["settings"]["schedule"] for one in (found, *found["tried"])} == {2.0}
-    records = (tmp_path / "leaderboard" / "tuning").rglob("seed-3.json")
+    records = (tmp_path / "leaderboard" / "tuning").rglob("seed-103.json")
     assert [json.loads(path.read_text())["run"]["settings"]["schedule"] for path in records] == [2.0] * 6
