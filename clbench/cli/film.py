@@ -85,13 +85,12 @@ def film(
         check_device(device)
         runs = [RunSpec(scenario, name, seed, changes or {}, device).resolve() for name in methods]
         loaded = runs[0].scenario
-        shown = loaded.retained + loaded.target
-        if tasks is not None:
-            shown = tuple(loaded.task(name) for name in listed("--tasks", tasks))
+        names = None if tasks is None else listed("--tasks", tasks)
+        shown = loaded.retained + loaded.target if names is None else tuple(map(loaded.task, names))
         last = len(loaded.target)
         numbers = [0, last] if stages is None and len(runs) > 1 else _numbers("--stages", stages, last)
         (episode,) = _numbers("--episode", str(episode), loaded.budget.validation_episodes - 1)
-        path = output or _path(runs, tasks, stages, episode)
+        path = output or _path(runs, names, None if stages is None else numbers, episode)
         check_format(path)
         check_folders({"--output": path.parent})
         choose_back_end(task.world for task in shown)
@@ -105,15 +104,16 @@ def film(
         bars.finish("film", f"{path} ({width} x {height} pixels, {path.stat().st_size / 1e6:.1f} MB)")
 
 
-def _path(runs: Sequence[ResolvedRun], tasks: str | None, stages: str | None, episode: int) -> Path:
+def _path(
+    runs: Sequence[ResolvedRun], tasks: Sequence[str] | None, stages: Sequence[int] | None, episode: int
+) -> Path:
     """Return the path of a film without --output. Films of other tasks, stages or episodes have others."""
     from clbench.runs.film import FILMS
 
     path = runs[0].path(FILMS)
-    lists = {"tasks": tasks, "stages": stages}
-    chosen = {name: None if text is None else ",".join(listed(name, text)) for name, text in lists.items()}
-    chosen["episode"] = str(episode) if episode else None
-    name = "+".join([path.stem, *(f"{name}={value}" for name, value in chosen.items() if value is not None)])
+    chosen = {"tasks": tasks, "stages": stages, "episode": [episode] if episode else None}
+    parts = [f"{name}={','.join(map(str, values))}" for name, values in chosen.items() if values is not None]
+    name = "+".join([path.stem, *parts])
     if len(name) > LONGEST_NAME:
         name = f"{name[:LONGEST_NAME]}+{hash_of(name)}"
     return path.parents[1] / ",".join(run.path(FILMS).parent.name for run in runs) / f"{name}.gif"

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers import sealed
+from helpers import RATES, sealed, write_two_records
 
 import clbench
 from clbench.base.errors import NoRecordsError
@@ -15,18 +15,11 @@ from clbench.records.paths import record_path
 from clbench.records.record import Record
 from clbench.records.writer import write_record
 
-RATES = [[1.0, 0.5, 0.0, 0.0, 0.25], [0.5, 0.25, 1.0, 0.0, 0.0], [0.0, 0.5, 0.75, 1.0, 0.0]]
-
 
 @pytest.fixture
 def records(tmp_path: Path, make_record: Callable[..., Record]) -> Path:
-    """Return a folder with two records, one of them with changed settings, and a file that is none."""
-    for method, seed, changes in (("sft", 0, {}), ("lora", 3, {"rank": 4})):
-        record = make_record(RATES, episodes=4, method=method, seed=seed, changes=changes, settings=changes)
-        name = "lora+rank=4" if changes else method
-        write_record(record, record_path(tmp_path, "clbench/Toy-v0", name, seed))
-    (tmp_path / "notes.json").write_text("{}")
-    return tmp_path
+    """Return a folder with two records, and a file that is none."""
+    return write_two_records(tmp_path, make_record)
 
 
 def test_all_records_come_as_one_long_table(records: Path, caplog: pytest.LogCaptureFixture) -> None:

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers import RATES
 
 import clbench
 from clbench import plot
@@ -13,8 +14,6 @@ from clbench.records.paths import record_path
 from clbench.records.reader import RecordError
 from clbench.records.record import Record
 from clbench.records.writer import write_record
-
-RATES = [[1.0, 0.5, 0.0, 0.0, 0.25], [0.5, 0.25, 1.0, 0.0, 0.0], [0.0, 0.5, 0.75, 1.0, 0.0]]
 
 
 @pytest.fixture

@@ -19,7 +19,9 @@ from clbench.learning.method import Method
 from clbench.learning.registry import load_method, new_method, read_changes
 from clbench.policy.policy import Policy
 from clbench.records.content import content_hash
+from clbench.records.paths import record_path
 from clbench.records.record import AnswerRow, EpisodeRow, PolicyRow, Record
+from clbench.records.writer import write_record
 from clbench.scoring.reading import read_protocol
 from clbench.spec.task import Task
 
@@ -123,3 +125,17 @@ def set_in(name: str, key: str, value: Any) -> Callable[[Record], None]:
 def weights_of(policy: Policy) -> dict[str, Tensor]:
     """Return a copy of the parameters of a policy, by name."""
     return {name: weight.detach().clone() for name, weight in policy.named_parameters()}
+
+
+RATES = [[1.0, 0.5, 0.0, 0.0, 0.25], [0.5, 0.25, 1.0, 0.0, 0.0], [0.0, 0.5, 0.75, 1.0, 0.0]]
+"""Success rates of a run of two targets: after each stage, on two skills, the targets and a held-out task."""
+
+
+def write_two_records(folder: Path, make_record: Callable[..., Record]) -> Path:
+    """Write two records to a folder, one of them with changed settings, and a file that is none."""
+    for method, seed, changes in (("sft", 0, {}), ("lora", 3, {"rank": 4})):
+        record = make_record(RATES, episodes=4, method=method, seed=seed, changes=changes, settings=changes)
+        name = "lora+rank=4" if changes else method
+        write_record(record, record_path(folder, "clbench/Toy-v0", name, seed))
+    (folder / "notes.json").write_text("{}")
+    return folder
