@@ -19,12 +19,12 @@ from typing import Any
 
 import numpy as np
 import torch
-from ratios import median_ratio
+from ratios import median_ratio, take_turns
 from result_files import write_results
 from rich.progress import track
 from torch import Tensor
 
-from clbench.base.seeding import derive_seed, torch_generator
+from clbench.base.seeding import torch_generator
 from clbench.data.demonstrations import Demonstrations, load_demonstrations
 from clbench.evaluation.rollouts import Evaluator
 from clbench.learning.distillation import discrete_head, distilled
@@ -121,7 +121,7 @@ def difference(ours: list[bool], theirs: list[bool], generator: np.random.Genera
     return [round(float(value), 4) for value in (apart.mean(), *np.percentile(drawn, [2.5, 97.5]))]
 
 
-def seconds(entry: Entry, batch: Batch) -> float:
+def seconds(entry: Entry, batch: Batch, _: int) -> float:
     """Return the time in which the policy acts on each observation of a batch, one by one."""
     with decoding(entry) as policy:
         begin = time.perf_counter()
@@ -149,14 +149,17 @@ def by_width(spans: list[tuple[int, int]], rounds: int, generator: np.random.Gen
     """
     return {
         str(width): {
-            name: median_ratio(ratios, generator) for name, ratios in _at(width, spans, rounds).items()
+            name: median_ratio(ratios, generator)
+            for name, ratios in _at(width, spans, rounds, generator).items()
         }
         for width in WIDTHS
     }
 
 
 @torch.inference_mode()
-def _at(width: int, spans: list[tuple[int, int]], rounds: int) -> dict[str, list[float]]:
+def _at(
+    width: int, spans: list[tuple[int, int]], rounds: int, generator: np.random.Generator
+) -> dict[str, list[float]]:
     """Return the ratios of `by_width` in each round, at one width."""
     config = PolicyConfig(25, 4, width=width)
     sizes = (config.action_size, config.chunk, width, config.layers, config.heads)
@@ -172,13 +175,15 @@ def _at(width: int, spans: list[tuple[int, int]], rounds: int) -> dict[str, list
             lambda: [in_blocks.go_on(block, 0, keys, mask) for _ in range(EASY_FIRST_STEPS)],
         ),
     }
-    return {
-        name: [_time(peer) / _time(ours) for _ in range(rounds + 1)][1:]
-        for name, (peer, ours) in works.items()
-    }
+    found = {}
+    for name, (peer, ours) in works.items():
+        pair = {"peer": partial(_time, peer), "ours": partial(_time, ours)}
+        taken = take_turns(pair, rounds, generator, f"width {width}, {name}")
+        found[name] = [one["peer"] / one["ours"] for one in taken]
+    return found
 
 
-def _time(work: Callable[[], object]) -> float:
+def _time(work: Callable[[], object], _: int) -> float:
     begin = time.perf_counter()
     work()
     return time.perf_counter() - begin
@@ -208,13 +213,13 @@ def entries_of(seed: int) -> tuple[dict[str, Entry], Demonstrations]:
     return entries(teacher, students), Demonstrations.cat([data[task.name] for task in scenario.retained])
 
 
-def timed(found: dict[str, Entry], batch: Batch, rounds: int) -> dict[str, list[float]]:
-    """Return the seconds per chunk of each decoder in each round; a first round warms up."""
-    times: dict[str, list[float]] = {name: [] for name in found}
-    for number in track(range(rounds + 1), description="time"):
-        for name in sorted(found, key=lambda name: derive_seed("order", f"{name} {number}")):
-            times[name].append(seconds(found[name], batch) / len(batch))
-    return {name: one[1:] for name, one in times.items()}
+def timed(
+    found: dict[str, Entry], batch: Batch, rounds: int, generator: np.random.Generator
+) -> dict[str, list[float]]:
+    """Return the seconds per chunk of each decoder in each round."""
+    works = {name: partial(seconds, entry, batch) for name, entry in found.items()}
+    taken = take_turns(works, rounds, generator, "time")
+    return {name: [one[name] / len(batch) for one in taken] for name in found}
 
 
 def parse() -> argparse.Namespace:
@@ -239,7 +244,7 @@ def main() -> None:
             outcomes[name] = outcomes.get(name, []) + successes(found[name], options.episodes, seed)
     batch = skills.sample(options.chunks, torch_generator("benchmark", "decoding"))
     works = {name: work_of(entry, batch) for name, entry in found.items()}
-    times = timed(found, batch, options.rounds)
+    times = timed(found, batch, options.rounds, generator)
     rows = {
         name: {
             "is_pipeline": found[name].is_pipeline,
@@ -261,7 +266,7 @@ def main() -> None:
         "decoders": rows,
         "by_width": by_width(typical, options.rounds, generator),
     }
-    write_results("decoding", SCENARIO, values, BOARD)
+    write_results("decoding", values, BOARD)
 
 
 if __name__ == "__main__":

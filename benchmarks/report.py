@@ -18,9 +18,10 @@ INTRODUCTION = """\
 # Performance
 
 `python benchmarks/report.py` makes this page from `benchmarks/results/`; `make benchmark` measures these.
-Ratios compare blocks that take turns on one machine: the median, with a 95 % bootstrap interval. Seconds
-depend on that machine and cannot be compared with another machine's. The machine was otherwise idle, except
-during whole runs and steps of adaptation, when its other core was busy.
+Ratios compare blocks that take turns on one machine: the median over rounds, with a 95 % bootstrap interval,
+or with the lowest and the highest value where there are fewer than six rounds. Seconds depend on that machine
+and cannot be compared with another machine's. The machine was otherwise idle, except during whole runs and
+steps of adaptation, when its other core was busy.
 """
 TRIED = """\
 ## What was tried
@@ -63,7 +64,9 @@ def _read(name: str) -> Any:
     return found
 
 
-def _ratio(ratio: dict[str, float]) -> str:
+def _ratio(ratio: dict[str, float] | None) -> str:
+    if ratio is None:  # not compared
+        return "-"
     if ratio["low"] == ratio["high"]:  # one round only, or a ratio to itself
         return f"{ratio['median_ratio']:.2f}"
     return f"{ratio['median_ratio']:.2f} [{ratio['low']:.2f}, {ratio['high']:.2f}]"
@@ -78,23 +81,29 @@ def _table(head: list[str], rows: list[list[str]]) -> Iterator[str]:
 
 def _rollouts() -> Iterator[str]:
     suites = _read("rollouts")["suites"]
-    first = next(iter(suites.values()))
+    sizes = {(suite["num_envs"], suite["threads"]) for suite in suites.values()}
+    if len(sizes) > 1:
+        raise SystemExit("The suites were measured with different numbers of environments or threads.")
+    ((num_envs, threads),) = sizes
     yield "## Environment steps"
     yield ""
     yield (
-        f"Speed of `gym.make_vec(id, num_envs={first['num_envs']})` with {first['threads']} threads, as a "
-        "multiple of common vector environments on the suite's own environment, and of `mj_step` alone on as "
-        "many threads, which is the limit."
+        f"Speed of `gym.make_vec(id, num_envs={num_envs})` with {threads} threads, as a multiple of common "
+        "vector environments on the suite's own environment, and of `mj_step` alone on as many threads, "
+        "which is the limit. Steps per second are those of all environments together. Rows may come from "
+        "different machines: compare ratios, not steps."
     )
     yield ""
-    others = ["AsyncVectorEnv", "SubprocVecEnv", "SyncVectorEnv of ours", "clbench, one thread", "mj_step"]
+    one_thread = "clbench, one thread"
+    others = ["AsyncVectorEnv", "SubprocVecEnv", "SyncVectorEnv of ours", one_thread, "mj_step"]
     yield from _table(
-        ["suite (peer)", "steps / s", *others],
+        ["suite (peer)", "steps / s", "with one thread", *others],
         [
             [
                 f"{name} ({suite['peer']})",
                 str(suite["steps_per_second"]["clbench"]),
-                *(_ratio(suite["ratios_of_clbench_to"][other]) for other in others),
+                str(suite["steps_per_second"][one_thread]),
+                *(_ratio(suite["ratios_of_clbench_to"].get(other)) for other in others),
             ]
             for name, suite in suites.items()
         ],
@@ -142,14 +151,15 @@ def _steps() -> Iterator[str]:
 
 def _workers() -> Iterator[str]:
     found = _read("workers")
+    count = found["workers"]
     seconds = ", ".join(f"{way} {taken:.0f} s" for way, taken in found["seconds"].items())
     *_, ray = found["seconds"]
     yield "## Workers"
     yield ""
     yield (
-        f"One worker takes {_ratio(found['one_worker_to_many'])} times as long for {found['runs']} runs as "
-        f"{found['workers']} workers do. A Ray cluster of {found['workers']} workers takes "
-        f"{_ratio(found['ray_to_many'])} times as long as {found['workers']} local workers ({seconds}). The "
+        f"In {found.get('rounds', 3)} rounds, one worker takes {_ratio(found['one_worker_to_many'])} times "
+        f"as long for {found['runs']} runs as {count} workers do. A Ray cluster of {count} workers takes "
+        f"{_ratio(found['ray_to_many'])} times as long as {count} local workers ({seconds}). The "
         "records are the same. Each Ray worker keeps a process that has imported everything, and forks each "
         f"job from it. A cluster with these processes starts in {found['seconds_to_start'][ray]:.0f} s; the "
         "times do not include that."

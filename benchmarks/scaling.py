@@ -21,8 +21,8 @@ import gymnasium
 import numpy as np
 import torch
 from metaworld.env_dict import ALL_V3_ENVIRONMENTS
+from ratios import take_turns
 from result_files import write_results
-from rich.progress import track
 
 from clbench.base.seeding import torch_generator
 from clbench.data.demonstrations import Demonstrations, load_demonstrations
@@ -142,20 +142,18 @@ def main() -> None:
     found: dict[str, Any] = {}
     for name, (prepare, sizes) in MEASURES.items():
         measure = prepare()
-        for size in sizes:  # prepares everything that is made once, such as scenes
-            measure(size)
-        rounds = [
-            {int(size): measure(int(size)) for size in generator.permutation(sizes)}
-            for _ in track(range(arguments.rounds), name)
-        ]
-        seconds = [statistics.median(taken[size] for taken in rounds) for size in sizes]
+        # the first round also prepares everything that is made once, such as scenes
+        works = {str(size): lambda _, size=size, measure=measure: measure(size) for size in sizes}
+        rounds = take_turns(works, arguments.rounds, generator, name)
+        seconds = [statistics.median(taken[one] for taken in rounds) for one in works]
         found[name] = {"sizes": sizes, "seconds": [round(one, 3) for one in seconds], **line(sizes, seconds)}
         print(name, found[name])
     result = {
+        "rounds": arguments.rounds,
         "peak_memory_gb": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20, 2),
         "measures": found,
     }
-    write_results("scaling", FETCH, result)
+    write_results("scaling", result)
     print(f"peak memory {result['peak_memory_gb']} GB")
 
 

@@ -7,6 +7,7 @@ server in another process on the same machine. Both take turns; the outcomes mus
 from __future__ import annotations
 
 import argparse
+import functools
 import multiprocessing
 import time
 from collections.abc import Callable
@@ -16,9 +17,8 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from ratios import median_ratio
+from ratios import median_ratio, take_turns
 from result_files import write_results
-from rich.progress import track
 
 from clbench.base.seeding import torch_generator
 from clbench.evaluation.episodes import Episode, Trial
@@ -47,29 +47,33 @@ def main() -> None:
     server = spawn.Process(target=offer, args=(arguments.scenario, theirs), daemon=True)
     server.start()
     served = ServedPolicy(f"ws://localhost:{ours.recv()}")
-    taken: dict[str, ChunkPolicy] = {"in this process": here, "served": served}
-    rates, generator = [], np.random.default_rng(0)
-    for number in track(range(arguments.rounds + 1), "rounds"):
-        found: dict[str, float] = {}
-        outcomes: list[list[Episode]] = []
-        for name in generator.permutation(list(taken)).tolist():
-            begin = time.perf_counter()
-            outcomes.append(play_chunks(taken[name], scenario, trials, 0).episodes)
-            found[name] = len(trials) / (time.perf_counter() - begin)
-        if outcomes[0] != outcomes[1]:
+    outcomes: list[list[Episode]] = []
+
+    def rate(policy: ChunkPolicy, _: int) -> float:
+        begin = time.perf_counter()
+        outcomes.append(play_chunks(policy, scenario, trials, 0).episodes)
+        seconds = time.perf_counter() - begin
+        if outcomes[-1] != outcomes[0]:
             raise SystemExit("The served policy has other outcomes.")
-        if number:  # the first round warms up
-            rates.append(found)
+        return len(trials) / seconds
+
+    policies: dict[str, ChunkPolicy] = {"in this process": here, "served": served}
+    generator = np.random.default_rng(0)
+    rates = take_turns(
+        {name: functools.partial(rate, policy) for name, policy in policies.items()},
+        arguments.rounds,
+        generator,
+    )
     served.close()
     server.terminate()
     values = {
         "episodes": len(trials),
         "rounds": len(rates),
-        "episodes_per_second": {name: float(np.median([r[name] for r in rates])) for name in taken},
+        "episodes_per_second": {name: float(np.median([r[name] for r in rates])) for name in policies},
         "served_to_in_process": median_ratio([r["served"] / r["in this process"] for r in rates], generator),
     }
     print(values)
-    write_results("served_policy", arguments.scenario, values)
+    write_results("served_policy", values)
 
 
 def policy_of(scenario: str) -> Callable[[Observations], NDArray[Any]]:

@@ -1,9 +1,10 @@
 """Time and memory of a whole run, by its parts: `python benchmarks/whole_run.py ID`.
 
 It times one run of plain fine-tuning with one thread, as in `clbench run`, with its data and its pretrained
-policy in the cache. Clocks measure the physics, the pictures and the policy of the evaluation; training is
-the time of the loop without evaluations. The current speed of the machine is given too: matrix products of a
-policy's size, in GFLOPS, before and after.
+policy in the cache. Clocks measure the physics, the pictures and the policy of all evaluations and checks;
+training is the time of the stages' loops without them. All else is other: reading files, questions, probes of
+the policy, checkpoints, and the optimiser steps of relearning. The current speed of the machine is given too:
+matrix products of a policy's size, in GFLOPS, before and after.
 """
 
 from __future__ import annotations
@@ -14,13 +15,13 @@ import resource
 import tempfile
 import time
 from collections import defaultdict
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import torch
-from result_files import read_results, write_results
+from result_files import write_row
 from rich.progress import Progress
 
 from clbench.base.cache import cache_folder
@@ -55,8 +56,7 @@ def main() -> None:
     load_questions(scenario)
     with _cache_without_reports():
         found = measure(run)
-    runs = (read_results("whole_run") or {"runs": {}})["runs"]
-    write_results("whole_run", spec.scenario, {"runs": {**runs, spec.scenario: found}})
+    write_row("whole_run", "runs", spec.scenario, found)
     print(f"{spec.scenario}, {spec.method}: {found['seconds']:.0f} s, {found['peak_memory_gb']:.2f} GB")
     for part, seconds in found["parts"].items():
         print(f"  {part:10} {seconds:6.1f} s, {seconds / found['seconds']:4.0%}")
@@ -83,6 +83,7 @@ def _cache_without_reports() -> Iterator[None]:
 def measure(run: ResolvedRun) -> dict[str, Any]:
     """Return the duration of a run and of its parts."""
     clocks: defaultdict[str, float] = defaultdict(float)
+    steps = _counted_steps()
     # each kind of policy has its own `act`
     timed = {**PARTS, "policy": (policy_class(run.scenario.policy), ("act",))}
     for part, (owner, names) in timed.items():
@@ -102,11 +103,27 @@ def measure(run: ResolvedRun) -> dict[str, Any]:
         "method": run.spec.method,
         "seconds": round(seconds, 1),
         "parts": {part: round(value, 1) for part, value in parts.items()},
-        "environment_steps": sum(record.episodes["length"]),
+        "environment_steps": sum(steps),
         "optimiser_steps": record.costs.optimiser_steps,
         "peak_memory_gb": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20, 2),
         "gigaflops": [round(speed, 1) for speed in speeds],
     }
+
+
+def _counted_steps() -> list[int]:
+    """Return a list that gets the number of environments of each step from now on.
+
+    The lengths of a record's episodes are too few: checks of a criterion have steps, too.
+    """
+    steps: list[int] = []
+    step = Lanes.step
+
+    def counted(self: Lanes, lanes: Sequence[int], actions: Any) -> Any:
+        steps.append(len(lanes))
+        return step(self, lanes, actions)
+
+    Lanes.step = counted  # type: ignore[method-assign]
+    return steps
 
 
 def _clocked(function: Callable[..., Any], clocks: defaultdict[str, float], part: str) -> Callable[..., Any]:

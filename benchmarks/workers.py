@@ -1,17 +1,18 @@
 """Gain from a second worker, and cost of Ray: `python benchmarks/workers.py`.
 
-One worker, one worker per core and a Ray cluster on this machine take turns at the same runs: methods that
-take as long as plain fine-tuning, on the first target. Everything that the runs need is in the cache before.
-The cluster, and the process of each of its workers that has imported everything, start before the clock; the
-time of the start is reported separately. The records must be equal except for their times.
+One worker, one worker per core and a Ray cluster on this machine take turns at the same runs: methods whose
+runs take about as long as one of plain fine-tuning, on the first target. A first round puts everything that
+the runs need into the cache, and does not count. The cluster, and the process of each of its workers that has
+imported everything, start before the clock; the time of the start is reported separately. The records must be
+equal except for their times.
 """
 
 from __future__ import annotations
 
 import argparse
+import functools
 import io
 import json
-import os
 import tempfile
 import time
 from collections.abc import Callable
@@ -19,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from ratios import median_ratio
+from ratios import median_ratio, take_turns
 from result_files import write_results
 from rich.console import Console
 
@@ -31,6 +32,7 @@ from clbench.jobs.scheduler import run_with_bars
 from clbench.jobs.work import collect_scenes
 from clbench.records.reader import read_record
 from clbench.runs.spec import RunSpec
+from clbench.worlds.threads import cores
 
 METHODS = ("sft", "l2_sp", "stop_gradient", "constant_weight")
 
@@ -39,8 +41,8 @@ def main() -> None:
     """Measure, print the ratios and write results/workers.json."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--scenario", default="clbench/Fetch-v1")
-    parser.add_argument("--rounds", type=int, default=3)
-    parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
+    parser.add_argument("--rounds", type=int, default=6)
+    parser.add_argument("--workers", type=int, default=cores())
     arguments = parser.parse_args()
     count = arguments.workers
     specs = [RunSpec(arguments.scenario, name, 0, split="validation", targets=1) for name in METHODS]
@@ -49,31 +51,31 @@ def main() -> None:
         f"{count} workers": lambda: Processes(count),
         f"Ray, {count} workers": lambda: RayWorkers("local", count),
     }
-    with tempfile.TemporaryDirectory() as folder:
-        _seconds(specs, Path(folder), ways[f"{count} workers"])  # fills the cache
-    rounds, starts, generator = [], [], np.random.default_rng(0)
-    for number in range(arguments.rounds):
-        started, taken, found = {}, {}, []
-        for way in generator.permutation(list(ways)):
-            with tempfile.TemporaryDirectory() as folder:
-                started[str(way)], taken[str(way)] = _seconds(specs, Path(folder), ways[str(way)])
-                found.append(_outcomes(specs, Path(folder)))
-        assert all(outcomes == found[0] for outcomes in found), "the records differ"
-        print(f"round {number + 1}:", ", ".join(f"{way} {seconds:.0f} s" for way, seconds in taken.items()))
-        rounds.append(taken)
-        starts.append(started)
+    starts: dict[str, list[float]] = {way: [] for way in ways}
+    found: list[list[dict[str, Any]]] = []
+
+    def seconds(way: str, number: int) -> float:
+        with tempfile.TemporaryDirectory() as folder:
+            start, taken = _seconds(specs, Path(folder), ways[way])
+            found.append(_outcomes(specs, Path(folder)))
+        assert found[-1] == found[0], "the records differ"
+        starts[way].append(start)
+        print(f"round {number}: {way} {taken:.0f} s")
+        return taken
+
+    generator = np.random.default_rng(0)
+    rounds = take_turns({way: functools.partial(seconds, way) for way in ways}, arguments.rounds, generator)
     one, many, ray = ways
     result = {
         "runs": len(specs),
         "workers": count,
+        "rounds": arguments.rounds,
         "seconds": {way: round(float(np.median([taken[way] for taken in rounds])), 1) for way in ways},
-        "seconds_to_start": {
-            way: round(float(np.median([started[way] for started in starts])), 1) for way in ways
-        },
+        "seconds_to_start": {way: round(float(np.median(starts[way][1:])), 1) for way in ways},
         "one_worker_to_many": median_ratio([taken[one] / taken[many] for taken in rounds], generator),
         "ray_to_many": median_ratio([taken[ray] / taken[many] for taken in rounds], generator),
     }
-    write_results("workers", arguments.scenario, result)
+    write_results("workers", result)
     print(json.dumps({name: result[name] for name in ("one_worker_to_many", "ray_to_many")}, indent=1))
 
 

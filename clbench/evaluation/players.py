@@ -1,27 +1,35 @@
-"""Episodes of an agent or policy of any library: one after another, or in lock-step if it acts on batches."""
+"""Agents and policies of any library: where they were trained, and their episodes.
+
+Episodes run one after another, or in lock-step if the agent acts on batches.
+"""
 
 from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
+from copy import copy
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Any, NamedTuple, TypeAlias
+from itertools import compress
+from typing import Any, NamedTuple, TypeAlias, cast
 from typing import Protocol as Interface
 
+import gymnasium
 import numpy as np
 from gymnasium import spaces
+from gymnasium.vector import VectorEnv
 from numpy.typing import NDArray
 
-from clbench.base.errors import InputError
+from clbench.base.errors import InputError, WrongTypeError
 from clbench.base.progress import ProgressCallback, no_progress
 from clbench.base.seeding import derive_seed
 from clbench.evaluation.episodes import LANES, Episode, Live, Trial, play_in_lanes
 from clbench.spec.protocol import Split
 from clbench.spec.scenario import Scenario
 from clbench.worlds.lanes import Lanes
-from clbench.worlds.scenario_env import Observation
+from clbench.worlds.scenario_env import Observation, ScenarioEnv
+from clbench.worlds.scenario_vector_env import ScenarioVectorEnv
 from clbench.worlds.schedule import InstructionFormat, shown_instruction
 from clbench.worlds.threads import cores
 
@@ -43,10 +51,73 @@ ChunkPolicy: TypeAlias = Callable[[dict[str, Any]], Any]
 (LANES, H, A)."""
 
 
+class SideBySide(Interface):
+    """Environments side by side, with the interface of Stable-Baselines3's `VecEnv`."""
+
+    def get_attr(self, attr_name: str) -> Sequence[Any]:
+        """Return an attribute of each environment."""
+        ...
+
+
+TrainingEnv: TypeAlias = gymnasium.Env[Any, Any] | VectorEnv[Any, Any, Any] | SideBySide
+"""An environment of a scenario, or several side by side, of Gymnasium or Stable-Baselines3."""
+
+
+@dataclass(frozen=True)
+class Training:
+    """The environments in which an agent was trained, as far as its evaluation needs them."""
+
+    scenario: Scenario
+    """The scenario."""
+    stage: int | None
+    """Stage that they stay in; None if they go through all stages."""
+    order: int
+    """Order of the targets."""
+    instruction: InstructionFormat
+    """Form of the instruction in observations."""
+    steps: int
+    """Steps of all environments together since they were made."""
+    begun_at: float | None
+    """Start of the first episode in seconds, by `time.perf_counter`; None if there was none."""
+
+
+def training_of(env: TrainingEnv) -> Training:
+    """Return what the environments in which an agent was trained say about its training.
+
+    Raises:
+        WrongTypeError: They are no environments of a scenario.
+        InputError: They differ in their scenario, their stage or their form of instructions.
+    """
+    inner: Any = getattr(env, "unwrapped", env)
+    names = ("scenario", "stage", "order", "instruction", "steps_taken", "begun_at")
+    try:
+        if isinstance(inner, ScenarioEnv | ScenarioVectorEnv):
+            told = [[getattr(inner, name)] for name in names]
+        else:
+            told = [list(inner.get_attr(name)) for name in names]
+    except (AttributeError, EOFError, ConnectionError):  # such a process of Stable-Baselines3 ends
+        told = [[None]]
+    if not isinstance(told[0][0], Scenario):
+        raise WrongTypeError(
+            f"{env} does not belong to a scenario: make it with gymnasium.make('clbench/Fetch-v1', stage=0)."
+        )
+    scenarios, *alike, steps, begun = told
+    for name, values in zip(names, ([one.id for one in scenarios], *alike), strict=False):
+        if any(value != values[0] for value in values):
+            raise InputError(f"The environments of {env} differ in their {name}: {values}.")
+    stage, order, instruction = (values[0] for values in alike)
+    known = [seconds for seconds in begun if seconds is not None]
+    return Training(scenarios[0], stage, order, instruction, sum(steps), min(known, default=None))
+
+
+def _is_of_stable_baselines3(agent: Agent) -> bool:
+    module = sys.modules.get("stable_baselines3.common.base_class")
+    return module is not None and isinstance(agent, module.BaseAlgorithm)
+
+
 def acts_on_batches(agent: Agent, instruction: InstructionFormat) -> bool:
     """Return whether an agent is known to act on batches: one of Stable-Baselines3, which read tokens."""
-    module = sys.modules.get("stable_baselines3.common.base_class")
-    return module is not None and instruction == "tokens" and isinstance(agent, module.BaseAlgorithm)
+    return instruction == "tokens" and _is_of_stable_baselines3(agent)
 
 
 def play(
@@ -70,12 +141,46 @@ def play(
             another.
 
     Raises:
-        InputError: An action has the wrong shape, or an agent that acts on batches returned a memory.
+        InputError: An action has the wrong shape, an agent that acts on batches returned a memory, or an
+            agent of Stable-Baselines3 was trained behind a wrapper that evaluation lacks.
     """
+    _check_wrappers(agent, scenario, instruction)
     act = _act_on_batch if batched else _act
     count = LANES if batched else 1
     single = lambda lanes, live: act(agent, lanes, live)[:, None]  # noqa: E731 - chunks of one action
     return _play(single, scenario, trials, seed, instruction, count)
+
+
+def _check_wrappers(agent: Agent, scenario: Scenario, instruction: InstructionFormat) -> None:
+    """Refuse an agent of Stable-Baselines3 that was trained behind a wrapper which changed what it met.
+
+    Most wrappers would raise no error: the agent would act on other numbers than in training, and fail.
+    """
+    if not _is_of_stable_baselines3(agent):
+        return
+    trained: Any = agent
+    with closing(ScenarioEnv(scenario, instruction)) as env:
+        own, shown = trained.observation_space, cast("spaces.Dict", env.observation_space)
+        same = isinstance(own, spaces.Dict) and set(own) == set(shown)
+        observes = same and all(own[name] in (shown[name], _first_colours(shown[name])) for name in shown)
+        acts = trained.action_space == env.action_space
+    normalised = trained.get_vec_normalize_env()
+    if normalised is not None and normalised.norm_obs:
+        observes = False
+    if not (observes and acts):
+        other = " and ".join(compress(("observations", "actions"), (not observes, not acts)))
+        raise InputError(
+            f"The agent learned with other {other} than those of {scenario.id} with "
+            f"instruction={instruction!r}, for example behind a wrapper. Evaluate an object whose predict() "
+            "does what the wrapper did, as docs/guide/online.md shows."
+        )
+
+
+def _first_colours(space: spaces.Space[Any]) -> spaces.Space[Any]:
+    """Return the space of a picture with its colours first, as Stable-Baselines3 has it, or another space."""
+    if not isinstance(space, spaces.Box) or len(space.shape) != 3:
+        return space
+    return spaces.Box(space.low.transpose(2, 0, 1), space.high.transpose(2, 0, 1), dtype=space.low.dtype.type)
 
 
 class ChunkPlay(NamedTuple):
@@ -150,7 +255,7 @@ def _observations(lanes: Lanes, live: Sequence[Live]) -> Iterator[Observation]:
     numbers, images = lanes.observe([one.lane for one in live], tasks, states)
     for row, one in enumerate(live):
         picture = {} if one.trial[0].camera is None else {"image": images[row]}
-        yield {"state": numbers[row], **picture, "instruction": one.shown}
+        yield {"state": numbers[row], **picture, "instruction": copy(one.shown)}  # agents may change theirs
 
 
 def _act(agent: Agent, lanes: Lanes, live: Sequence[Live]) -> NDArray[np.float32]:

@@ -15,6 +15,7 @@ from clbench.base.entry_points import resolve, unknown
 from clbench.base.errors import InputError
 from clbench.base.leftovers import unfinished
 from clbench.base.text import counted
+from clbench.data.access import check_demonstrations
 
 # private names: under public ones every dataset and the policy that ships would have to be made again
 from clbench.data.demonstrations import (
@@ -56,10 +57,13 @@ def export_demonstrations(
         InputError: The folder exists, the format is unknown, or a world does not give its steps per second.
         UnknownNameError: A name is unknown.
         MissingPackageError: A package is not installed.
+        LeakError: The running hooks of a method must not read them.
         RenderingError: The tasks have a camera, and no back end of this machine can draw.
     """
     loaded, chosen = chosen_tasks(scenario, tasks)
     folder = check_output(output, format)
+    for task in chosen:
+        check_demonstrations(task.name)
     found = {task: read_dataset(dataset_folder(task, loaded.budget)) for task in chosen}
     return _in_one_step(folder, lambda partial: _WRITERS[format](partial, found))
 

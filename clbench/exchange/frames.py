@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import logging
+import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from clbench.base.text import printable
 from clbench.records.paths import RECORDS, check_folder
 from clbench.records.reader import RecordError, home_of, read_record
 from clbench.records.record import Record
@@ -25,8 +27,8 @@ def load_records(folder: Path | str = RECORDS) -> pandas.DataFrame:
     changed settings, as "lora+rank=4"), `seed`, `order`, `stage` (0 is before the first target), `step`
     (optimiser steps done in the stage), `task`, `group` ("retained", "target" or "held_out"), `split`
     ("test", "validation" or "perturbed"), `episode`, `success` (a boolean) and `length` (steps). Left out
-    are records of failed runs, files that are no records or contradict themselves, and second records of a
-    run; the log names them.
+    are records of failed runs, files that are no records, that contradict themselves or that are not at the
+    place of their run (SCENARIO/METHOD/seed-N.json), and second records of a run; the log names them.
 
     Args:
         folder: Folder of records, at any depth.
@@ -43,13 +45,13 @@ def load_records(folder: Path | str = RECORDS) -> pandas.DataFrame:
         try:
             record, place = _read(path)
         except RecordError as error:
-            LOG.warning("%s", error)
+            LOG.warning("%s", printable(str(error)))
             continue
         first = found.setdefault((record.run.split, place), path)
         if first == path:
             frames.append(frame(record))
         else:
-            LOG.warning("%s: its run has another record, %s.", path, first)
+            LOG.warning("%s", printable(f"{path}: its run has another record, {first}."))
     return (
         pandas.concat(frames, ignore_index=True) if frames else typed(pandas.DataFrame(columns=list(TYPES)))
     )
@@ -59,13 +61,16 @@ def _read(path: Path) -> tuple[Record, Path]:
     """Return the record of a run that succeeded, and its path from the folder of records.
 
     Raises:
-        RecordError: It cannot be read, contradicts itself, or the run failed.
+        RecordError: It cannot be read, contradicts itself, is not at the place of its run, or the run failed.
     """
     record = read_record(path)
     try:
         if record.status != "success":
             raise RecordError("the run failed.")
+        home = home_of(record.run)
+        if home.parts != Path(os.path.realpath(path)).parts[-len(home.parts) :]:
+            raise RecordError(f"it is the record of {home.as_posix()}, and must be there.")
         Scores.from_record(record, partial=True)
-        return record, home_of(record.run)
+        return record, home
     except RecordError as error:
         raise RecordError(f"{path}: {error}") from error

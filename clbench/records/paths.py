@@ -79,13 +79,16 @@ def record_path(
 ) -> Path:
     """Return the path of a run's record below the folder `records`, see `record_name`.
 
+    The folder of the same name without .json, which holds the policies or logs of the run, is checked, too.
+
     Raises:
         InputError: A name is refused, or a symbolic link leads out of the folder.
     """
     path = records / record_name(scenario, label, seed, order, policy)
-    # a link that leads to itself is left to who reads or writes there: `Path.resolve` would raise
-    if not Path(os.path.realpath(path.parent)).is_relative_to(os.path.realpath(records)):
-        raise InputError(f"{path.parent}: a symbolic link leads out of {records}.")
+    for place in (path.parent, path.with_suffix("")):
+        # a link that leads to itself is left to who reads or writes there: `Path.resolve` would raise
+        if not Path(os.path.realpath(place)).is_relative_to(os.path.realpath(records)):
+            raise InputError(f"{place}: a symbolic link leads out of {records}.")
     return path
 
 

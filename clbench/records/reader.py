@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -24,6 +25,7 @@ from clbench.records.record import (
     RunInfo,
 )
 from clbench.spec.identifiers import check_plain
+from clbench.spec.scenario import MOST_ORDERS
 
 MOST_ROWS = 200_000
 """Rows of a table. A record of Fetch-v1 has 1,780 episodes."""
@@ -102,8 +104,8 @@ def _record(values: Any) -> Record:
     scenario = record.scenario
     _check_names("task", (*scenario.retained, *scenario.target, *scenario.held_out))
     _check_names("kind of question", set(record.answers["kind"]))
-    if record.run.order < 0:
-        raise RecordError("run: order must not be below 0.")
+    _check_order(record)
+    _check_budget(scenario.budget)
     if schema >= FIRST_HASHED:
         _check_content(values, schema)
     elif "content" in values:
@@ -146,6 +148,29 @@ def _check_error(record: Record) -> None:
     for name, text in record.error.items():
         if not isinstance(text, str):
             raise RecordError(f"error: {name} must be a text.")
+
+
+def _check_budget(budget: dict[str, Any]) -> None:
+    """Refuse counts that no budget has: what it demands is listed, and compared with what was done."""
+    questions, curve, episodes = (
+        budget.get(name, 0) for name in ("test_questions", "curve_episodes", "test_episodes")
+    )
+    if type(questions) is not int or questions < 0:
+        found = json.dumps(questions)[:60]
+        raise RecordError(f"scenario: test_questions of its budget must be a whole number, not {found}.")
+    if type(curve) is type(episodes) is int and curve > episodes:
+        raise RecordError(
+            f"scenario: curve_episodes of its budget must be at most its test_episodes, {episodes:,}, not "
+            f"{curve:,}."
+        )
+
+
+def _check_order(record: Record) -> None:
+    """Refuse an order that no run can have: tables hold it in 64 bits, and pages compare the orders."""
+    if not 0 <= record.run.order <= MOST_ORDERS:
+        raise RecordError(f"run: order must be from 0 to {MOST_ORDERS}.")
+    if record.run.order and record.scenario.balanced:
+        raise RecordError("run: order must be 0: each seed of its scenario has an order of its own.")
 
 
 def _check_columns(name: str, table: dict[str, Any], columns: Iterable[str]) -> None:

@@ -18,7 +18,7 @@ TYPES = {
     "scenario": "str",
     "policy": "str",
     "method": "str",
-    "seed": "int64",
+    "seed": "uint64",  # a seed may have 64 bits: int64 would turn the largest into negative numbers
     "order": "int64",
     "stage": "int64",
     "step": "int64",

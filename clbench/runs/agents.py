@@ -20,9 +20,7 @@ from itertools import compress
 from pathlib import Path
 from typing import Any
 
-import gymnasium
 import torch
-from gymnasium.vector import VectorEnv
 
 from clbench.base.entry_points import resolve
 from clbench.base.errors import InputError, WrongTypeError
@@ -32,7 +30,7 @@ from clbench.base.strict_json import check_json
 from clbench.data.demonstrations import simulator_versions
 from clbench.evaluation.episodes import Episode, Trial
 from clbench.evaluation.examiner import episode_row
-from clbench.evaluation.players import Agent, acts_on_batches, play
+from clbench.evaluation.players import Agent, TrainingEnv, acts_on_batches, play, training_of
 from clbench.records.paths import RECORDS, record_path
 from clbench.records.pinned import other_parts
 from clbench.records.reader import read_record
@@ -41,11 +39,9 @@ from clbench.records.writer import write_record
 from clbench.runs.fingerprint import fingerprint
 from clbench.runs.spec import describe_scenario
 from clbench.spec.identifiers import built_in_methods, check_method_name
-from clbench.spec.protocol import Protocol
+from clbench.spec.protocol import LARGEST_SEED, Protocol
 from clbench.spec.registry import load_scenario
 from clbench.spec.scenario import Scenario
-from clbench.worlds.scenario_env import ScenarioEnv
-from clbench.worlds.scenario_vector_env import ScenarioVectorEnv
 
 LOG = logging.getLogger("clbench")
 
@@ -65,7 +61,7 @@ written or it ends, so that no other program drops or continues the stages of it
 
 def evaluate_agent(
     agent: Agent,
-    env: gymnasium.Env[Any, Any] | VectorEnv[Any, Any, Any],
+    env: TrainingEnv,
     *,
     method: str,
     seed: int = 0,
@@ -79,10 +75,11 @@ def evaluate_agent(
     Evaluate each stage once and in order, from stage 0. Evaluating stage 0 again starts over.
 
     Args:
-        agent: Agent after its training in the stage. It observes what `env` returns. Its actions should not
-            be random; NaN counts as 0.
-        env: Environment in which the agent was trained: `gymnasium.make(ID, stage=k)`. It gives the scenario,
-            the stage, the format of instructions and the number of environment steps.
+        agent: Agent after its training in the stage. It observes what `env` returns without its wrappers. Its
+            actions should not be random; NaN counts as 0.
+        env: Environment in which the agent was trained: `gymnasium.make(ID, stage=k)`, or several side by
+            side, of Gymnasium or of Stable-Baselines3. It gives the scenario, the stage, the format of
+            instructions and the number of environment steps.
         method: Name of the agent's row on the leaderboard, for example "me/sac".
         seed: Seed of the run; it chooses the initial states, the same for all methods.
         steps: Number of environment steps in the stage, if they were not taken in `env` itself.
@@ -99,41 +96,38 @@ def evaluate_agent(
         WrongTypeError: `env` is not an environment of a scenario, or `agent` cannot act.
         InputError: Another stage comes next, the targets are in another order, a record exists already,
             another program evaluates an agent of this name and seed, earlier stages had another version of
-            the scenario or its simulator, an action has the wrong shape, or the name, the seed, the steps or
-            the settings are invalid.
+            the scenario or its simulator, an action has the wrong shape, an agent of Stable-Baselines3 was
+            trained behind a wrapper that changes observations or actions, or the name, the seed, the steps
+            or the settings are invalid.
         LeaseLostError: Another program took the run over, because this one did not answer.
     """
-    world = getattr(env, "unwrapped", None)
-    if not isinstance(world, ScenarioEnv | ScenarioVectorEnv):
-        raise WrongTypeError(
-            f"{env} does not belong to a scenario: make it with gymnasium.make('clbench/Fetch-v1', stage=0)."
-        )
-    if world.stage is None:
+    training = training_of(env)
+    scenario, stage = training.scenario, training.stage
+    if stage is None:
         raise InputError(
             f"{env} goes through all stages: make an environment of a single stage, for example with "
-            f"gymnasium.make({world.scenario.id!r}, stage=0)."
+            f"gymnasium.make({scenario.id!r}, stage=0)."
         )
-    if world.order:
-        raise InputError(f"{env} has its targets in order {world.order}: agents are scored in order 0.")
+    if training.order:
+        raise InputError(f"{env} has its targets in order {training.order}: agents are scored in order 0.")
     if not (callable(agent) or hasattr(agent, "predict")):
         raise WrongTypeError(
             f"{type(agent).__name__} is not an agent: it has no predict() and cannot be called."
         )
     if steps is not None and (type(steps) is not int or steps < 0):
         raise InputError(f"steps must be a whole number from 0, not {steps!r}.")
-    run = StagedRun(world.scenario, method, seed, Path(records), USES)
+    run = StagedRun(scenario, method, seed, Path(records), USES)
     begin = time.perf_counter()
-    trained = begin - world.begun_at if steps is None and world.begun_at is not None else None
-    record = run.begin(world.stage, _plain(settings or {}), agent, again=world.stage == 0)
-    form = world.instruction
+    trained = begin - training.begun_at if steps is None and training.begun_at is not None else None
+    record = run.begin(stage, _plain(settings or {}), agent, again=stage == 0)
     if batched is None:
-        batched = acts_on_batches(agent, form)
-    with seeded("online evaluation", seed, world.stage):
-        episodes = play(agent, world.scenario, run.trials(world.stage), seed, form, batched)
-    run.report(record, world.stage, episodes)
-    run.count(record, world.stage, steps if steps is not None else world.steps_taken or None)
+        batched = acts_on_batches(agent, training.instruction)
+    with seeded("online evaluation", seed, stage):
+        episodes = play(agent, scenario, run.trials(stage), seed, training.instruction, batched)
+    run.report(record, stage, episodes)
+    run.count(record, stage, steps if steps is not None else training.steps or None, agent)
     run.time(record, trained, time.perf_counter() - begin)
-    run.keep(record, world.stage)
+    run.keep(record, stage)
     return record
 
 
@@ -191,8 +185,8 @@ class StagedRun:
                 f"{self.method!r} is a method of clbench: give your row its own name, "
                 f"for example 'me/{self.method}'."
             )
-        if type(self.seed) is not int or self.seed < 0:
-            raise InputError(f"seed must be a whole number from 0, not {self.seed!r}.")
+        if type(self.seed) is not int or not 0 <= self.seed <= LARGEST_SEED:
+            raise InputError(f"seed must be a whole number from 0 to {LARGEST_SEED}, not {self.seed!r}.")
 
     @property
     def last(self) -> int:
@@ -259,8 +253,8 @@ class StagedRun:
         ]
         raise InputError(
             f"Stage {self.next_after(record) - 1} of {self} was evaluated with another version of the "
-            f"scenario or its simulator: {', '.join(other)} differ{''.join(versions)}. Go back to it, or "
-            "evaluate all stages again (`clbench score` needs --restart). The stages so far are in "
+            f"scenario or its simulator: {', '.join(other)} differ{''.join(versions)}. Go back to it, "
+            "evaluate all stages again (`clbench score` needs --restart), or remove the stages so far: "
             f"{self.unfinished}."
         )
 
@@ -366,9 +360,6 @@ class StagedRun:
         record = Record("success", run, describe_scenario(self.scenario))
         record.fingerprint = {**self._fingerprint, "method": _describe(agent)}
         record.timing = {"started": datetime.now(UTC).isoformat(timespec="seconds"), "stages": []}
-        network = getattr(agent, "policy", None)
-        if isinstance(network, torch.nn.Module):
-            record.costs.parameters = sum(parameter.numel() for parameter in network.parameters())
         return record
 
     def trials(self, stage: int) -> list[Trial]:
@@ -385,8 +376,11 @@ class StagedRun:
         for kind in resolve(self.scenario.questions):
             record.add_answers(AnswerRow(*point, kind.name, 0, 0))
 
-    def count(self, record: Record, stage: int, steps: int | None) -> None:
-        """Add the environment steps of a stage."""
+    def count(self, record: Record, stage: int, steps: int | None, agent: Any) -> None:
+        """Add the environment steps of a stage, and count the parameters again: networks may grow."""
+        network = getattr(agent, "policy", None)
+        if isinstance(network, torch.nn.Module):
+            record.costs.parameters = sum(parameter.numel() for parameter in network.parameters())
         record.diagnostics[str(stage)] = {"environment_steps": steps}
         each = [found["environment_steps"] for found in record.diagnostics.values()]
         record.costs.environment_steps = None if None in each else sum(each)

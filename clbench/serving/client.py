@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import logging
+import socket
+import threading
 import time
-from contextlib import ExitStack
-from itertools import dropwhile
+from contextlib import ExitStack, suppress
+from itertools import dropwhile, islice
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -25,6 +27,12 @@ ATTEMPTS = 5
 
 REMINDER_SECONDS = 60.0
 """Seconds between two messages about a server that does not answer."""
+
+LONGEST_ERROR = 100_000
+"""Characters of an error of the server that are looked at: it may send 256 MB."""
+
+MOST_NAMES = 20
+"""Entries of a reply that a message names."""
 
 _LOST = (ConnectionClosed, InvalidHandshake, OSError)
 """Errors of a connection that another attempt may not have; a handshake out of time is an OSError."""
@@ -64,7 +72,7 @@ class ServedPolicy:
         for _ in range(ATTEMPTS):
             connection = self._connected()
             try:
-                connection.send(request)
+                self._send(connection, request)
                 reply = self._receive(connection)
             except _LOST as error:
                 LOG.warning("The connection to the policy at %s was lost: %s", self.address, _reason(error))
@@ -122,6 +130,38 @@ class ServedPolicy:
             self.metadata, self._opened = metadata, opened.pop_all()
         return connection
 
+    def _send(self, connection: ClientConnection, request: bytes) -> None:
+        """Send a request; a server that does not read it would make the program wait forever.
+
+        Raises:
+            InputError: The server does not read it in time.
+        """
+        ended = threading.Event()
+
+        def end() -> None:
+            ended.set()
+            with suppress(OSError):
+                connection.socket.shutdown(socket.SHUT_RDWR)
+
+        timer = threading.Timer(self._timeout, end)
+        timer.daemon = True
+        timer.start()
+        try:
+            connection.send(request)
+        except _LOST as error:
+            if not ended.is_set():
+                raise
+            self.close()
+            raise self._late() from error
+        finally:
+            timer.cancel()
+
+    def _late(self) -> InputError:
+        return InputError(
+            f"The policy at {self.address} did not answer within {self._timeout:g} seconds: a slower one "
+            "needs a larger --timeout."
+        )
+
     def _receive(self, connection: ClientConnection) -> Any:
         """Return the next message of the server.
 
@@ -132,10 +172,7 @@ class ServedPolicy:
             message = connection.recv(timeout=self._timeout)
         except TimeoutError as error:
             self.close()
-            raise InputError(
-                f"The policy at {self.address} did not answer within {self._timeout:g} seconds: a slower one "
-                "needs a larger --timeout."
-            ) from error
+            raise self._late() from error
         if isinstance(message, str):  # openpi's servers send their traceback, and end the connection
             self.close()
             raise InputError(f"The policy at {self.address} failed: {_error_of(message)}")
@@ -153,7 +190,7 @@ class ServedPolicy:
             if isinstance(actions, np.ndarray):
                 found = f"actions of the type {actions.dtype}, {actions.shape}"
             else:
-                found = ", ".join(map(str, reply)) if isinstance(reply, dict) else type(reply).__name__
+                found = _names(reply) if isinstance(reply, dict) else type(reply).__name__
             raise InputError(
                 f"The policy at {self.address} must reply with a dictionary that has an array of numbers "
                 f"called actions; it sent: {printable(found)}."
@@ -173,8 +210,18 @@ def _reason(error: BaseException) -> str:
     return printable(str(error).rstrip(".")) or type(error).__name__
 
 
+def _names(reply: dict[Any, Any]) -> str:
+    """Return the names of a reply's entries, the first ones if there are many."""
+    names = [shortened(str(name)[:LONGEST_ERROR], "the reply") for name in islice(reply, MOST_NAMES)]
+    more = len(reply) - len(names)
+    return ", ".join([*names, f"and {more:,} more"] if more else names)
+
+
 def _error_of(text: str) -> str:
     """Return the error that a traceback ends with, with its name and all lines of its message."""
-    lines = text.rpartition("Traceback (most recent call last):")[2].splitlines()
+    last = text.rpartition("Traceback (most recent call last):")[2]
+    if len(last) > LONGEST_ERROR:  # many frames before the error, or an error of one long line
+        last = last[-LONGEST_ERROR:].partition("\n")[2] or last[:LONGEST_ERROR]
+    lines = last.splitlines()
     shown = " ".join(line.strip() for line in dropwhile(lambda line: not line or line[0] == " ", lines))
-    return shortened(printable(shown or text.strip()), "the output of the server")
+    return shortened(printable(shown or text[:LONGEST_ERROR].strip()), "the output of the server")

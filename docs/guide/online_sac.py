@@ -4,10 +4,11 @@
     python docs/guide/online_sac.py clbench/PointMaze-v1 --seeds 3 --replay
 
 SAC continues to train from task to task. It acts in eight environments at once, and takes two gradient steps
-for each step of the eight; its other settings are the defaults. Its replay buffer is emptied at each stage,
-so that only its weights remember; with --replay it keeps the transitions of all stages. Word ids are names,
-not amounts, and go through an embedding. A seed that has a record is skipped; a seed that was stopped starts
-again.
+for each step of the eight; its other settings are the defaults. The first 100 steps of each stage are random.
+The replay buffer is emptied at each stage, so that only the weights remember; with --replay it keeps the
+transitions of all stages. Word ids are names, not amounts, and go through an embedding; pictures go through a
+convolutional network. A seed that has a record is skipped; a seed that was stopped starts again. The same
+seed repeats itself on the same machine.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ import gymnasium
 import torch
 from gymnasium import spaces
 from stable_baselines3 import SAC
-from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, NatureCNN
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 import clbench
@@ -31,21 +32,23 @@ ENVIRONMENTS, GRADIENT_STEPS = 8, 2
 """Environments that step together, and gradient steps for each of these steps."""
 
 
-class StateAndWords(BaseFeaturesExtractor):
-    """Features: the state, and the mean of the learned vectors of the instruction's words."""
+class Observed(BaseFeaturesExtractor):
+    """Features: the state, the mean of the learned vectors of the instruction's words, and of any picture."""
 
-    def __init__(self, space: spaces.Dict, width: int = 16) -> None:
-        state, words = space["state"], space["instruction"]
+    def __init__(self, space: spaces.Dict, width: int = 16, picture_width: int = 64) -> None:
+        state, words, picture = (space.spaces.get(name) for name in ("state", "instruction", "image"))
         assert isinstance(state, spaces.Box)
         assert isinstance(words, spaces.Box)
-        super().__init__(space, state.shape[0] + width)
+        super().__init__(space, state.shape[0] + width + (picture_width if picture else 0))
         self.words = torch.nn.Embedding(int(words.high.max()) + 1, width, padding_idx=0)
+        self.picture = NatureCNN(picture, picture_width) if picture else None
 
     def forward(self, observations: dict[str, torch.Tensor]) -> torch.Tensor:
-        """Return the features (B, S + width)."""
+        """Return the features (B, F)."""
         ids = observations["instruction"].long()
         words = self.words(ids).sum(dim=1) / (ids > 0).sum(dim=1, keepdim=True)
-        return torch.cat([observations["state"], words], dim=1)
+        pictures = [self.picture(observations["image"])] if self.picture else []
+        return torch.cat([observations["state"], words, *pictures], dim=1)
 
 
 def learn(scenario: str, seed: int, steps: int, replay: bool, records: Path) -> None:
@@ -70,26 +73,20 @@ def learn(scenario: str, seed: int, steps: int, replay: bool, records: Path) -> 
             agent = SAC(
                 "MultiInputPolicy",
                 envs,
-                seed=100 * seed,
-                policy_kwargs={"features_extractor_class": StateAndWords},
+                seed=1000 * seed,
+                policy_kwargs={"features_extractor_class": Observed},
                 buffer_size=steps * stages if replay else steps,
                 gradient_steps=GRADIENT_STEPS,
                 device="cpu",
             )
         agent.set_env(envs)
-        agent.set_random_seed(100 * seed + stage)
+        agent.set_random_seed(1000 * seed + 10 * stage)  # its eight environments count up from it
         assert agent.replay_buffer is not None
         if not replay:
             agent.replay_buffer.reset()
         agent.learn(steps)
         record = clbench.evaluate_agent(
-            agent,
-            envs.envs[0],
-            method=method,
-            seed=seed,
-            steps=agent.num_timesteps,
-            settings=settings,
-            records=records,
+            agent, envs, method=method, seed=seed, settings=settings, records=records
         )
         envs.close()
         scores = Scores.from_record(record, partial=True)  # later stages are still to come
@@ -112,6 +109,8 @@ def main() -> None:
     parser.add_argument("--replay", action="store_true", help="keep the transitions of earlier stages")
     parser.add_argument("--records", type=Path, default=RECORDS, help="folder of the records")
     wanted = parser.parse_args()
+    if wanted.steps < 1:
+        parser.error("--steps must be at least 1")
     torch.set_num_threads(1)  # small networks: more threads gain nothing, and may add up in another order
     for seed in range(wanted.first_seed, wanted.first_seed + wanted.seeds):
         learn(wanted.scenario, seed, wanted.steps, wanted.replay, wanted.records)

@@ -6,10 +6,12 @@ from typing import Any
 
 import mujoco
 import numpy as np
+from numpy.typing import NDArray
 
 from .arm import JOINTS as ARM_JOINTS
 from .arm import SUBSTEPS, Arm
 from .problem import Problem
+from .scene import HIDDEN, SEEN, Places
 from .state import CLOSE_BY, FINGERS, HAND, HAND_QUATERNION, JOINTS, PLACES, REACH, SIZE, State
 
 FINGER_JOINTS = slice(ARM_JOINTS, ARM_JOINTS + 2)
@@ -60,6 +62,25 @@ class Episode:
         self._arm.begin(problem.scene.rest)
         return self.state()
 
+    def recorded(self, states: NDArray[np.float64], places: Places) -> NDArray[np.float32]:
+        """Return the states (T, 213) of a recorded episode.
+
+        Args:
+            states: LIBERO's states (T, 1 + nq + nv): time, positions and velocities of the joints.
+            places: Places of all bodies in that episode.
+        """
+        model, data, self._places = self.problem.scene.model, self.data, places
+        found = []
+        for row in states:
+            joints, speeds = np.split(row[1:], [model.nq])
+            data.qpos[:] = joints
+            # after a step, bodies are where they were before its last 2 ms
+            mujoco.mj_integratePos(model, data.qpos, speeds, -model.opt.timestep)
+            self.forward()
+            data.qpos[:] = joints
+            found.append(self.state())
+        return np.stack(found)
+
     def forward(self) -> None:
         """Compute everything that follows from the joints; the next step does not depend on this call."""
         model = self._placed()
@@ -77,6 +98,8 @@ class Episode:
         self.forward()
         model = self.problem.scene.drawn
         model.body_pos[:], model.body_quat[:] = self._places
+        for site, is_on in self.problem.lights.items():
+            model.site_group[site] = SEEN if is_on(self.data) else HIDDEN
         return model
 
     def move(self) -> None:

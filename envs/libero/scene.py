@@ -21,8 +21,12 @@ Vector: TypeAlias = NDArray[np.float64]
 Places: TypeAlias = tuple[Vector, Vector]
 """Positions (bodies, 3) and quaternions (bodies, 4) of all bodies in the bodies that hold them."""
 
-CAMERA = {"distance": 1.6, "azimuth": 180.0, "elevation": -35.0, "lookat": np.array([-0.1, 0.0, 1.0])}
-"""A view of the table from the side opposite to the robot."""
+BELOW_HAND = 0.17
+"""Height in metres of the arm at rest over what the camera looks at: 10 cm above a table, or the floor."""
+SOLID = 0
+"""Group of the geoms that collide, which LIBERO does not draw."""
+SEEN, HIDDEN = 1, 3
+"""A group that MuJoCo draws unless it is told otherwise, and one that it does not draw."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,8 +50,17 @@ class Scene:
 
     @functools.cached_property
     def drawn(self) -> mujoco.MjModel:
-        """The scene with its textures, 210 MB."""
-        return mujoco.MjModel.from_xml_string(self.xml)
+        """The scene with its textures, 210 MB. As in LIBERO, collision geoms and marks are not drawn."""
+        model = mujoco.MjModel.from_xml_string(self.xml)
+        model.geom_group[model.geom_group == SOLID] = HIDDEN
+        model.site_group[:] = HIDDEN
+        return model
+
+    @property
+    def camera(self) -> dict[str, Any]:
+        """A view from the side opposite to the robot, of a table or, for libero_object, of the floor."""
+        lookat = np.array([-0.1, 0.0, self.rest.place[2] - BELOW_HAND])
+        return {"distance": 1.6, "azimuth": 180.0, "elevation": -35.0, "lookat": lookat}
 
 
 @functools.cache

@@ -104,6 +104,11 @@ class Subject:
         return self.scenarios[0]
 
     @property
+    def learned(self) -> Scenario:
+        """The verifier's scenario as the run met it: agents and served policies keep the published order."""
+        return self.scenarios[1 if self.run.record.run.trained_elsewhere else 0]
+
+    @property
     def protocol(self) -> Protocol:
         """The evaluation protocol of the run, with the ends of its stages."""
         planned = Protocol.of(self.scenario, self.spec.split, self.spec.perturb)

@@ -21,6 +21,7 @@ from rich.console import Console
 from clbench.base.cache import cached
 from clbench.base.errors import ClbenchError, UnknownNameError
 from clbench.base.progress import ProgressCallback, no_progress
+from clbench.base.strict_json import StrictJSONError, read_regular
 from clbench.jobs.job import Job, JobError
 from clbench.jobs.processes import Processes
 from clbench.jobs.scheduler import run_with_bars
@@ -28,9 +29,10 @@ from clbench.learning.pretraining import pretrain
 from clbench.policy.checkpoint import save_policy
 from clbench.records.pinned import LATER, other_parts
 from clbench.records.reader import RecordError
-from clbench.records.record import Record
+from clbench.records.record import Record, RunInfo, ScenarioInfo
 from clbench.runs.length import run_length
 from clbench.runs.run import execute, pretrained_hash
+from clbench.runs.spec import describe_scenario
 from clbench.scoring.metrics import measure
 from clbench.spec.scenario import Scenario
 
@@ -79,6 +81,7 @@ def verify(
         request: Options of the verification.
         progress: Called with the work done since its last call, in optimiser steps.
     """
+    digest = _digest(path)  # before it is read: the tier holds for these bytes alone
     try:
         run = read_run(records, path, changed=None)
     except RecordError as error:
@@ -98,17 +101,25 @@ def verify(
         if passed:
             reached, checks = tier, checks + found
         if reached != TIERS[0] and TIERS.index(reached) >= TIERS.index(tier_of(path)):
-            _write(path, subject, reached, checks)
+            _write(path, digest, subject, reached, checks)
         if not passed:
             return checks + found
     return checks
 
 
-def _write(path: Path, subject: Subject, tier: str, checks: Sequence[Check]) -> None:
+def _digest(path: Path) -> str:
+    """Return the hash of the bytes of a record, empty if they cannot be read: its reader says why."""
+    try:
+        return hashlib.sha256(read_regular(path)).hexdigest()
+    except (OSError, StrictJSONError):
+        return ""
+
+
+def _write(path: Path, digest: str, subject: Subject, tier: str, checks: Sequence[Check]) -> None:
     """Write the file with the tier of a record, the checks, and who did them when and with what."""
     values = {
         "tier": tier,
-        "record": hashlib.sha256(path.read_bytes()).hexdigest(),
+        "record": digest,
         "seed": subject.request.seed,
         "checks": [asdict(check) for check in checks],
         "by": subject.request.by,
@@ -129,7 +140,7 @@ def _recompute(subject: Subject, _: ProgressCallback) -> list[Check]:
     checks = [Check("metrics from its episodes", result, values["final_average"] is not None)]
     try:
         scenario = subject.scenario
-        described = None if subject.strange else subject.resolved
+        info = None if subject.strange else subject.resolved.info
     except UnknownNameError as error:
         result = str(error.args[0])
         if subject.request.scenario is None:
@@ -138,29 +149,36 @@ def _recompute(subject: Subject, _: ProgressCallback) -> list[Check]:
         return [*checks, Check("what was run", result, None)]
     except ClbenchError as error:
         return [*checks, Check("what was run", str(error.args[0]), None)]
-    checks.append(_check_horizons(run.record, scenario))
-    if described is None:
-        names = " and ".join(subject.strange)
-        result = f"{names} is not installed: its settings were not compared with its class"
-        checks.append(Check("what was run", result, True))
-    else:
-        ours = {"run": described.info, "scenario": described.scenario_info}
-        theirs = {"run": run.record.run, "scenario": run.record.scenario}
-        wrong = [
-            f"{part}.{name}" for part in ours for name in differences(vars(theirs[part]), vars(ours[part]))
-        ]
-        result = (
-            f"{', '.join(wrong)} differ from the installed code"
-            if wrong
-            else "matches its class and the scenario"
-        )
-        checks.append(Check("what was run", result, not wrong))
+    checks += [_check_horizons(run.record, scenario), _check_what_was_run(subject, info)]
     recorded, found = run.record.fingerprint.get("rollouts"), subject.here["rollouts"]
     worlds = ", ".join(differences(recorded, found)) or "all worlds"
     result = (
         "same rollouts as here" if recorded == found else f"the rollouts of {worlds} differ from those here"
     )
     return [*checks, Check("simulator", result, recorded == found), _check_definition(subject)]
+
+
+def _check_what_was_run(subject: Subject, info: RunInfo | None) -> Check:
+    """Check that the run and its scenario are those of the installed code.
+
+    Args:
+        subject: The record.
+        info: The run as the installed code does it; None if its method or policy may not be imported. The
+            scenario is compared nevertheless.
+    """
+    record = subject.run.record
+    pairs: dict[str, tuple[RunInfo | ScenarioInfo, RunInfo | ScenarioInfo]] = {}
+    if info is not None:
+        pairs["run"] = record.run, info
+    pairs["scenario"] = record.scenario, describe_scenario(subject.learned)
+    wrong = [f"{part}.{name}" for part, pair in pairs.items() for name in differences(*map(vars, pair))]
+    if wrong:
+        return Check("what was run", f"{', '.join(wrong)} differ from the installed code", False)
+    if info is None:
+        names = " and ".join(subject.strange)
+        unseen = f"{names} is not installed: its settings were not compared with its class"
+        return Check("what was run", f"matches the scenario; {unseen}", True)
+    return Check("what was run", "matches its class and the scenario", True)
 
 
 def _check_definition(subject: Subject) -> Check:

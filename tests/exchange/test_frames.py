@@ -14,6 +14,7 @@ from clbench.base.errors import NoRecordsError
 from clbench.records.paths import record_path
 from clbench.records.record import Record
 from clbench.records.writer import write_record
+from clbench.spec.protocol import LARGEST_SEED
 
 
 @pytest.fixture
@@ -54,10 +55,52 @@ def test_a_policy_of_another_name_is_told_apart(tmp_path: Path, make_record: Cal
 def test_a_second_record_of_a_run_is_left_out(records: Path, caplog: pytest.LogCaptureFixture) -> None:
     before = clbench.load_records(records)
     path = record_path(records, "clbench/Toy-v0", "sft", 0)
-    path.with_name("seed-0 again.json").write_bytes(path.read_bytes())
+    again = record_path(records / "a copy", "clbench/Toy-v0", "sft", 0)
+    again.parent.mkdir(parents=True)
+    again.write_bytes(path.read_bytes())
     with caplog.at_level(logging.WARNING):
         assert len(clbench.load_records(records)) == len(before)
     assert "its run has another record" in caplog.text
+
+
+@pytest.mark.parametrize(
+    "place", ["A/seed-0.json", "Toy-v0/sft/seed-1.json", "Toy-v0/theirs--mine/seed-0.json"]
+)
+def test_a_record_at_the_place_of_another_run_adds_nothing_and_hides_nothing(
+    place: str, records: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    before = clbench.load_records(records)
+    honest = record_path(records, "clbench/Toy-v0", "sft", 0)
+    values = json.loads(honest.read_text(encoding="utf-8"))
+    values["episodes"]["success"] = [1] * len(values["episodes"]["success"])
+    (records / place).parent.mkdir(parents=True, exist_ok=True)
+    (records / place).write_text(json.dumps(sealed(values)), encoding="utf-8")
+    with caplog.at_level(logging.WARNING):
+        assert clbench.load_records(records).equals(before)
+    assert f"{place}: it is the record of Toy-v0/sft/seed-0.json, and must be there." in caplog.text
+
+
+def test_a_folder_of_one_method_is_read_from_inside_and_through_a_link(
+    records: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = record_path(records, "clbench/Toy-v0", "sft", 0).parent
+    (tmp_path / "link").symlink_to(folder)
+    monkeypatch.chdir(folder)
+    assert len(clbench.load_records(".")) == len(clbench.load_records(tmp_path / "link")) > 0
+
+
+def test_the_largest_seed_stays_what_it_is(tmp_path: Path, make_record: Callable[..., Record]) -> None:
+    path = record_path(tmp_path, "clbench/Toy-v0", "sft", LARGEST_SEED)
+    write_record(make_record(RATES, episodes=4, seed=LARGEST_SEED), path)
+    assert set(clbench.load_records(tmp_path).seed) == {LARGEST_SEED}
+
+
+def test_the_log_does_not_control_the_terminal(records: Path, caplog: pytest.LogCaptureFixture) -> None:
+    (records / "\x1b[2Jevil.json").write_text("{}", encoding="utf-8")
+    with caplog.at_level(logging.WARNING):
+        clbench.load_records(records)
+    assert "\\x1b[2Jevil.json: is not a record" in caplog.text
+    assert "\x1b" not in caplog.text
 
 
 @pytest.mark.parametrize(

@@ -4,6 +4,7 @@ import dataclasses
 import json
 import re
 from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from helpers import same_demonstrations
 
 from clbench import export_demonstrations
 from clbench.base.errors import InputError
+from clbench.data.access import LeakError, hooks
 from clbench.data.demonstrations import Demonstrations, dataset_folder, read_dataset
 from clbench.exchange.hdf5 import read_hdf5
 from clbench.spec.task import Task
@@ -59,6 +61,17 @@ def test_an_exported_file_comes_back_bit_for_bit(exported: Path) -> None:
     for one, other in zip(after, before, strict=True):
         for found, expected in zip(vars(one).values(), vars(other).values(), strict=True):
             assert np.asarray(found).dtype == np.asarray(expected).dtype
+
+
+@pytest.mark.parametrize(("task", "refused"), [("down", True), ("left", True), ("right", False)])
+def test_a_hook_exports_no_demonstrations_that_it_must_not_read(
+    task: str, refused: bool, tmp_path: Path
+) -> None:
+    leak = pytest.raises(LeakError, match=f"reads demonstrations of {task}")
+    expected: AbstractContextManager[object] = leak if refused else nullcontext()
+    with hooks(["left", "right"], ["right"]), expected:
+        export_demonstrations(TOY, tmp_path / "out", format="hdf5", tasks=[task])
+    assert (tmp_path / "out").exists() != refused
 
 
 def test_a_file_has_the_layout_that_robomimic_reads(exported: Path) -> None:
@@ -140,6 +153,42 @@ def _remove(name: str) -> Callable[[h5py.Group], None]:
     return lambda data: data.__delitem__(name)
 
 
+def _moved(how: str) -> Callable[[h5py.Group], None]:
+    """Return an edit that leaves the actions of a demonstration in another file, which exists."""
+
+    def edit(data: h5py.Group) -> None:
+        other = f"{data.file.filename}.other"
+        actions = np.asarray(data["demo_1/actions"])
+        with h5py.File(other, "w") as file:
+            file["actions"] = actions
+        del data["demo_1/actions"]
+        if how == "link":
+            data["demo_1/actions"] = h5py.ExternalLink(other, "/actions")
+        elif how == "link to a link":
+            data["aside"] = h5py.ExternalLink(other, "/")
+            data["demo_1/actions"] = h5py.SoftLink("/data/aside/actions")
+        elif how == "virtual":
+            layout = h5py.VirtualLayout(actions.shape, actions.dtype)
+            layout[:] = h5py.VirtualSource(other, "actions", actions.shape)
+            data.create_virtual_dataset("demo_1/actions", layout)
+        else:  # the raw bytes of any file
+            Path(other).write_bytes(actions.tobytes())
+            outside = [(other, 0, actions.nbytes)]
+            data.create_dataset("demo_1/actions", actions.shape, actions.dtype, external=outside)
+
+    return edit
+
+
+def _claimed(name: str, shape: tuple[int, ...]) -> Callable[[h5py.Group], None]:
+    """Return an edit that claims a shape without one number of it in the file."""
+
+    def edit(data: h5py.Group) -> None:
+        del data[name]
+        data.create_dataset(name, shape, np.float64, chunks=(1, 2))
+
+    return edit
+
+
 def _all(data: h5py.Group) -> None:
     for name in list(data):
         del data[name]
@@ -199,6 +248,15 @@ def _last(value: float) -> Callable[[h5py.Group], None]:
         (lambda data: data.copy("demo_0", "demo_00"), "data has both demo_0 and demo_00"),
         (_set("demo_0", h5py.SoftLink("/nowhere")), "data/demo_0 must be a group, not .* a broken link"),
         (_set("demo_0", h5py.ExternalLink("none.hdf5", "/data/demo_0")), "data/demo_0 must be a group"),
+        *(
+            (_moved(how), "data/demo_1/actions has its numbers in another file: copy them into this one")
+            for how in ("link", "link to a link", "virtual", "raw")
+        ),
+        (
+            _claimed("demo_1/actions", (10**9, 2)),
+            "actions has 2,000,000,000 numbers; 10,000,000 are",
+        ),
+        (_claimed("demo_1/states", (4, 10**8)), "states has 400,000,000 numbers; 10,000,000 are the most"),
         (
             _attribute("problem_info", '{"language_instruction": [1, 2]}'),
             r"language_instruction in problem_info must be a text, not '\[1, 2\]'",

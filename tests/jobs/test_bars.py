@@ -44,6 +44,18 @@ def test_a_terminal_shows_bars_with_the_time_left() -> None:
     assert "left" in text
 
 
+def test_one_bar_counts_all_work_and_each_piece_its_own() -> None:
+    file = io.StringIO()
+    with Bars(200, Console(file=file, width=100, force_terminal=True)) as bars:
+        bars.start("sft seed 0", 50)
+        bars.advance("sft seed 0", 10)
+        bars.advance("sft seed 0", 20)
+        assert bars.share("sft seed 0") == 0.6
+    text = file.getvalue()
+    assert "15%" in text
+    assert "60%" in text
+
+
 def test_a_bar_and_a_line_say_where_a_run_is() -> None:
     terminal, lines = io.StringIO(), io.StringIO()
     for file, is_terminal in ((terminal, True), (lines, False)):

@@ -1,17 +1,21 @@
 """`clbench.run`: a method from Python, also one that no other process can import."""
 
 import importlib
+import io
 import subprocess
 import sys
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import pytest
+from rich.console import Console
 
 import clbench
 from clbench.base.errors import ClbenchError
 from clbench.base.progress import ProgressCallback
+from clbench.jobs.grid import run_missing
 from clbench.jobs.job import Job
 from clbench.jobs.processes import Here
 from clbench.runs.run import execute
@@ -111,6 +115,26 @@ def test_a_method_that_changes_the_folder_leaves_its_record_where_it_was_asked_f
     assert (tmp_path / "records/Toy-v0/moving.Slow/seed-0.json").is_file()
 
 
+def test_runs_that_failed_are_not_counted_and_neither_are_the_jobs_that_they_share(
+    tmp_path: Path, empty_caches: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    runs = [RunSpec(TOY, method, 1).resolve() for method in ("sft", "frozen")]
+
+    def fail(jobs: Sequence[Job], *_: Any) -> dict[Job, str]:
+        """Let the pretraining and one run fail; the other one ends without a record."""
+        pretraining = next(job for job in jobs if "pretraining" in job.title)
+        return {pretraining: "no room", next(job for job in jobs if job.is_done): "no room"}
+
+    monkeypatch.setattr("clbench.jobs.grid.run_with_bars", fail)
+    console = Console(file=io.StringIO(), width=200)
+    failed = run_missing(runs, tmp_path / "records", Here, console)
+    assert len(failed) == 3
+    assert isinstance(console.file, io.StringIO)
+    lost, last = console.file.getvalue().splitlines()
+    assert "it ended without a record of this run at" in lost
+    assert last.startswith("0 of 2 runs in 0.0 minutes; records in ")
+
+
 def test_a_class_inside_a_function_is_refused(tmp_path: Path) -> None:
     class Hidden(clbench.Method):
         pass
@@ -170,4 +194,5 @@ def test_a_job_of_this_process_ends_when_its_worker_is_closed() -> None:
     worker.close()
     count = len(reached)
     assert count > 0
+    time.sleep(0.05)  # in which a job that still ran would go on
     assert len(reached) == count

@@ -8,19 +8,20 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Hashable, Iterator
 from multiprocessing import forkserver
 from pathlib import Path
 from typing import Any
 
 import pytest
+from rich.console import Console
 
 from clbench.jobs.bars import Bars
-from clbench.jobs.job import Job
+from clbench.jobs.job import Event, Job
 from clbench.jobs.plan import Plan
 from clbench.jobs.processes import Here, Processes
 from clbench.jobs.recorded import has_record
-from clbench.jobs.scheduler import run_jobs
+from clbench.jobs.scheduler import run_jobs, run_with_bars
 from clbench.learning.pretraining import pretrained_policy
 from clbench.runs.run import execute
 from clbench.runs.spec import RunSpec
@@ -240,6 +241,46 @@ def test_jobs_on_the_longest_chain_start_first(bars: Bars) -> None:
         "run that goes fast",
         "short run",
     ]
+
+
+class _Two:
+    """Workers that report half of a job's length before they have done it."""
+
+    def __init__(self) -> None:
+        self._events: list[Event] = []
+
+    def free(self) -> int:
+        return 2
+
+    def start(self, job: Job) -> None:
+        self._events += [Event(job, "progress", job.length / 2), Event(job, "done", "went well")]
+
+    def events(self) -> Iterator[Event]:
+        while self._events:
+            yield self._events.pop(0)
+
+    def close(self) -> None:
+        pass
+
+
+def test_progress_is_counted_in_the_expected_time_of_each_job(monkeypatch: pytest.MonkeyPatch) -> None:
+    totals, advanced = [], []
+
+    class Watched(Bars):
+        def __init__(self, total: float, console: Console | None = None) -> None:
+            totals.append(total)
+            super().__init__(total, console)
+
+        def advance(self, piece: Hashable, amount: float) -> None:
+            advanced.append(amount)
+            super().advance(piece, amount)
+
+    monkeypatch.setattr("clbench.jobs.scheduler.Bars", Watched)
+    good = _function("good")
+    jobs = [Job("fast", good, {}, 60.0, pace=0.5), Job("slow", good, {}, 70.0)]
+    assert run_with_bars(jobs, _Two(), Console(file=io.StringIO())) == {}
+    assert totals == [30 + 70]
+    assert advanced == [35, 35, 15, 15]
 
 
 def test_runs_of_two_scenarios_have_separate_jobs_and_one_pretraining_for_each_seed(

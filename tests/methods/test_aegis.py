@@ -173,9 +173,12 @@ def test_parameters_outside_the_backbones_layers_keep_the_plain_gradient() -> No
 
 
 def _by_hand(
-    gradients: list[list[float]], against: list[list[float]], **changes: Any
+    gradients: list[list[float]], against: list[list[float]], of: Any = None, **changes: Any
 ) -> tuple[Any, list[list[float]]]:
-    """Return a method, and the gradients that it sets if loss and distance have these, layer by layer."""
+    """Return a method, and the gradients that it sets if loss and distance have these, layer by layer.
+
+    It is the method `of` after a further step, or a new one.
+    """
     layers = [nn.Linear(len(values), 1, bias=False) for values in gradients]
     policy: Any = SimpleNamespace(backbone_layers=layers)
 
@@ -183,8 +186,9 @@ def _by_hand(
         parts = zip(layers, slopes, strict=True)
         return torch.stack([(layer.weight[0] * torch.tensor(slope)).sum() for layer, slope in parts]).sum()
 
-    method: Any = build_method("aegis", changes)
-    method.start_task(TransformerPolicy(CONFIG), _stage(1))
+    method: Any = of or build_method("aegis", changes)
+    if of is None:
+        method.start_task(TransformerPolicy(CONFIG), _stage(1))
     method.distances.append(linear(against))
     method.gradients(policy, linear(gradients))
     return method, [layer.weight.grad[0].tolist() for layer in layers if layer.weight.grad is not None]
@@ -199,6 +203,16 @@ def test_two_layers_worked_by_hand() -> None:
     assert diagnostics["layers_projected_mean"] == 0.5
     assert diagnostics["energy_shed_mean"] == pytest.approx(0.01)  # 1 / 10 of 5 + 5
     assert diagnostics["energy_shed_highest"] == pytest.approx(0.01)
+
+
+def test_the_diagnostics_are_means_over_the_steps_of_the_stage_and_the_highest_of_them() -> None:
+    method, _ = _by_hand([[1.0, 2.0], [2.0, 1.0]], [[-3.0, 1.0], [1.0, 1.0]])  # sheds 0.01, one of two layers
+    for gradients, against in (([[2.0], [0.0]], [[-1.0], [1.0]]), ([[1.0], [1.0]], [[1.0], [1.0]])):
+        _by_hand(gradients, against, of=method)  # sheds everything, one of two layers; sheds nothing
+    diagnostics = method.diagnostics()
+    assert diagnostics["energy_shed_mean"] == pytest.approx((0.01 + 1 + 0) / 3)
+    assert diagnostics["energy_shed_highest"] == pytest.approx(1)
+    assert diagnostics["layers_projected_mean"] == pytest.approx((0.5 + 0.5 + 0) / 3)
 
 
 def test_opposite_gradients_leave_nothing_and_orthogonal_or_absent_ones_everything() -> None:

@@ -107,11 +107,13 @@ def test_beyond_the_schedule_the_temperature_stays_at_its_end() -> None:
     assert method.temperature(Progress(0, 100)) == pytest.approx(0.003)
 
 
-@pytest.mark.parametrize(("factor", "length"), [(1.0, 11.5), (0.1, 47.5)])
+@pytest.mark.parametrize(
+    ("factor", "schedule", "length"), [(1.0, 1.0, 11.5), (0.1, 1.0, 47.5), (1.0, 3.25, 3.25 * 11.5)]
+)
 def test_of_a_stage_to_a_criterion_the_schedule_is_as_long_as_plain_fine_tuning_learns(
-    factor: float, length: float
+    factor: float, schedule: float, length: float
 ) -> None:
-    method: Any = build_method("consft", {"step_factor": factor})
+    method: Any = build_method("consft", {"step_factor": factor, "schedule": schedule})
     for step in (0, 5, 11, 47, 60):
         # 7.5 steps are lost in the warm-up, and the step factors then add up to 4
         weight = _omega(1e-4, step / length, omega_min=0.0)

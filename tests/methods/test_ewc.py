@@ -9,7 +9,7 @@ from torch import Tensor
 
 from clbench.learning.adaptation import adapt
 from clbench.learning.method import Progress, Stage
-from clbench.learning.prior import Prior, Source
+from clbench.learning.prior import Nothing, Prior, Source
 from clbench.policy.batch import Batch
 from clbench.policy.policy import Policy
 from clbench.policy.transformer import TransformerPolicy
@@ -75,6 +75,23 @@ def test_importance_is_the_mean_squared_gradient_of_single_samples() -> None:
     assert (method.importance["head.embed.weight"] > 1.2 * mean.square()).float().mean() > 0.5
     assert all(method.anchor[name].equal(weight) for name, weight in before.items())
     assert all(weight.grad is None for weight in policy.parameters())
+
+
+def test_where_no_skill_is_retained_no_weight_is_important_during_the_first_target() -> None:
+    policy, batch = TransformerPolicy(SMALL), toy_source("right", seed=1).sample(8)
+    method: Any = build_method("ewc", {"samples": 4})
+    nothing = Source(Nothing(), torch.Generator(), TOY.budget.batch_size)
+    method.prepare(policy, Prior({"demonstrations": nothing}))
+    assert not any(value.any() for value in method.importance.values())
+    _moved(policy)
+    plain = torch.autograd.grad(policy.action_loss(batch).mean(), list(policy.head.parameters()))
+    _set(method, policy, batch)
+    assert all(
+        one.grad is not None and one.grad.equal(value)
+        for one, value in zip(policy.head.parameters(), plain, strict=True)
+    )
+    method.end_task(policy, _stage())
+    assert any(value.any() for value in method.importance.values())
 
 
 @pytest.mark.parametrize(

@@ -178,6 +178,7 @@ def test_the_vector_is_made_once_and_its_steps_count_every_time(monkeypatch: pyt
     _prepared(policies[2], alpha=0.5, orthogonal=1.0, direction="random")
     for policy, changes in (
         (TransformerPolicy(SMALL, seed=5), {"auxiliary": 0.5}),
+        (TransformerPolicy(SMALL, seed=5), {"step_size": 2e-3}),
         (TransformerPolicy(SMALL, seed=6), {}),
     ):
         with pytest.raises(AssertionError, match="made a second time"):

@@ -23,6 +23,7 @@ from clbench.runs.run import execute
 from clbench.runs.spec import RunSpec
 from clbench.scoring.metrics import METRICS, measure
 from clbench.scoring.scores import Scores
+from clbench.spec.identifiers import built_in_methods
 from clbench.spec.policies import DEFAULT_POLICY, POLICIES
 from clbench.testing import check_method
 
@@ -103,6 +104,50 @@ def test_the_link_of_a_method_is_the_first_paper_that_its_module_names(name: str
     papers = re.findall(r"arXiv\s(\d{4}\.\d{5})", sys.modules[cls.__module__].__doc__ or "")
     mine = papers and not cls.uses.reference
     assert cls.metadata.link == (f"https://arxiv.org/abs/{papers[0]}" if mine else None)
+
+
+CONSFT = {"tau_start": 0.003, "tau_end": 5.0, "kappa": 25.0, "decay": 0.8, "curvature": 3.5}
+CONSFT |= {"omega_min": 0.001, "schedule": 1.0}
+CALIBRATED = {**CONSFT, "loss_scale": 0.003}
+DEFAULTS: dict[str, tuple[dict[str, Any], Any]] = {
+    "aegis": ({"samples": 3000, "direction": "anchor"}, None),
+    "buffered_replay": ({"share": 0.02, "replay": 0.5}, ("replay", (0.75, 0.9))),
+    "co_training": ({"auxiliary": 1.0}, ("auxiliary", (0.3, 3.0))),
+    "consft": ({**CONSFT, "loss_scale": 1.0}, ("tau_start", (0.03, 0.3))),
+    "consft_calibrated": (CALIBRATED, ("loss_scale", (0.001, 0.01))),
+    "constant_weight": (CALIBRATED, ("loss_scale", (0.001, 0.01))),
+    "ewc": ({"strength": 1e4, "samples": 256}, ("strength", (1e3, 1e5))),
+    "experience_replay": ({"replay": 0.5}, ("replay", (0.75, 0.9))),
+    "fast_dvla": (
+        {
+            "alpha": 1.1,
+            "orthogonal": 1e-4,
+            "auxiliary": 1.0,
+            "steps": 150,
+            "step_size": 3e-4,
+            "direction": "capability",
+        },
+        ("orthogonal", (1e-2, 1.0)),
+    ),
+    "finch": ({"kappa": 0.3, "momentum": 0.9}, ("kappa", (0.1, 1.0))),
+    "from_scratch": ({}, ("step_factor", (2.2, 5.0))),
+    "knowledge_insulation": ({"alpha": 1.0}, None),
+    "l2_sp": ({"strength": 0.3}, ("strength", (0.1, 1.0))),
+    "lora": ({"rank": 16, "alpha": 32.0, "variant": "lora", "speed": 3.0}, ("rank", (4, 64))),
+    "lwf": ({"strength": 0.1}, ("strength", (0.01, 1.0))),
+    "shuffled_weights": (CALIBRATED, ("loss_scale", (0.001, 0.01))),
+    "weight_interpolation": ({"coefficient": 0.5}, ("coefficient", (0.7, 0.9))),
+}
+"""Hyper-parameters of the methods that have some, and what tuning tries: from papers, or chosen on validation
+episodes. Records hold other values only where a run or tuning changed them."""
+
+
+@pytest.mark.parametrize("name", built_in_methods())
+def test_a_method_has_the_published_defaults_and_tuning_tries_the_published_values(name: str) -> None:
+    cls = load_method(name)
+    settings, tunes = DEFAULTS.get(name, ({}, None))
+    assert dataclasses.asdict(cls()) == {"step_factor": 1.0, **settings}
+    assert cls.tunes == tunes
 
 
 @pytest.fixture

@@ -2,6 +2,7 @@
 
 import tracemalloc
 from collections.abc import Callable, Mapping
+from typing import Any
 
 import numpy as np
 import pytest
@@ -158,6 +159,45 @@ def test_a_reference_needs_its_own_name_and_the_same_seeds() -> None:
     assert report.of("intransigence", "joint").reason == "joint is what the others are compared with."
 
 
+@pytest.mark.parametrize("share", [0.15, 0.3])
+def test_three_tenths_of_rates_up_to_1_leave_the_unit_in_doubt_and_fewer_do_not(share: float) -> None:
+    small = round(20 * share)
+    matrix = np.array([*[0.5] * small, *[40.0] * (20 - small), *[0.0] * 5]).reshape(5, 5)
+    if share > 0.25:
+        with pytest.raises(InputError, match="and other rates are at most 1"):
+            from_matrix(matrix)
+    else:
+        assert from_matrix(matrix).unit == "percent"
+
+
+def test_a_rate_of_3_is_per_cent_and_one_of_2_is_in_doubt() -> None:
+    assert from_matrix([[3.0, 0.0], [2.5, 1.5]]).unit == "percent"
+    with pytest.raises(InputError, match="found 2: is it a share above 1"):
+        from_matrix([[2.0, 0.0], [1.5, 1.5]])
+
+
+def test_a_matrix_with_two_rows_too_few_is_refused() -> None:
+    with pytest.raises(InputError, match=r"The matrix has 2 rows\. Expected stages 1 to 3"):
+        from_matrix(TRIANGLE[:2])
+
+
+def test_a_difference_of_a_hundredth_is_no_tie_and_one_of_the_last_bits_is() -> None:
+    def flips(difference: float) -> int:
+        # one keeps more of the first target at the end, the other kept more on the way
+        early = [[0.8, 0.0, 0.0], [0.2, 0.8, 0.0], [0.3 + difference, 0.6, 0.8]]
+        late = [[0.8, 0.0, 0.0], [0.8, 0.8, 0.0], [0.3, 0.6, 0.8]]
+        return len(
+            [one for one in from_matrix({"early": early, "late": late}).flips if one.family == "forgetting"]
+        )
+
+    assert [flips(0.02), flips(1e-12), flips(0.0)] == [1, 0, 0]
+
+
+def test_without_a_name_the_value_is_that_of_the_first_method() -> None:
+    report = from_matrix({"first": TRIANGLE, "second": np.array(TRIANGLE) / 2})
+    assert report["adaptation"] == report.of("adaptation", "first") != report.of("adaptation", "second")
+
+
 def test_a_reason_names_the_missing_cells_of_a_reference() -> None:
     holed = np.array(JOINT)
     holed[2, 2] = np.nan
@@ -208,6 +248,9 @@ def test_a_table_of_pandas_has_a_row_for_every_metric_and_method() -> None:
     row = frame[(frame.metric == "forgetting_avalanche") & (frame.method == "other")].iloc[0]
     assert (row.family, row.source) == ("forgetting", METRICS["forgetting_avalanche"].source)
     assert row.value == pytest.approx(0.4)
+    runs: list[Any] = [TRIANGLE, np.array(TRIANGLE) - 0.2]
+    seeds = from_matrix(runs).frame().set_index("metric").loc["adaptation"]
+    assert seeds.low < seeds.value < seeds.high
 
 
 @pytest.mark.parametrize(

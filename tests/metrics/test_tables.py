@@ -54,6 +54,26 @@ def test_both_layouts_and_arrays_give_the_same_report(table: Path) -> None:
     assert others == [first] * 4
 
 
+def test_a_gain_compares_equal_seeds_whatever_their_order_in_the_table(table: Path) -> None:
+    rates = {("mine", 0): 0.9, ("mine", 1): 0.4, ("sft", 2): 0.0, ("sft", 1): 0.3, ("sft", 0): 0.8}
+    lines = [f"{method},{seed},1,{rate}" for (method, seed), rate in rates.items()]
+    table.write_text("\n".join(["method,seed,stage,reach", *lines]), encoding="utf-8")
+    gain = from_csv(table).of("gain", "mine")
+    # 0.1 with both seeds, and also without either: it is known exactly, though seeds differ by 0.5
+    assert gain.value == pytest.approx(0.1)
+    assert (gain.low, gain.high) == (None, None)
+    table.write_text("\n".join(["method,seed,stage,reach", *lines[:3], *lines[4:]]), encoding="utf-8")
+    assert from_csv(table).of("gain", "mine").reason == "Method sft has no seed '1'."
+
+
+def test_a_file_of_ones_own_comes_before_an_example_of_its_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("robocasa365.csv").write_text("stage,reach\n1,0.25\n", encoding="utf-8")
+    assert from_csv("robocasa365.csv")["final_average"].value == 0.25
+
+
 def test_the_notes_of_a_table_are_its_lines_that_begin_with_a_hash(table: Path) -> None:
     table.write_text(WIDE, encoding="utf-8")
     assert notes(table) == ["where it comes from"]

@@ -38,10 +38,12 @@ def test_no_name_leads_out_of_the_folder(scenario: str, label: str, tmp_path: Pa
         record_path(tmp_path, scenario, label, 0)
 
 
-def test_no_link_leads_out_of_the_folder(tmp_path: Path) -> None:
+@pytest.mark.parametrize("place", ["Toy-v0", "Toy-v0/sft", "Toy-v0/sft/seed-0"])
+def test_no_link_leads_out_of_the_folder(place: str, tmp_path: Path) -> None:
+    """Policies and logs of the run are in the folder seed-0."""
     records = tmp_path / "records"
-    records.mkdir()
-    (records / "Toy-v0").symlink_to(tmp_path)
+    (records / place).parent.mkdir(parents=True)
+    (records / place).symlink_to(tmp_path)
     with pytest.raises(ValueError, match="a symbolic link leads out of"):
         record_path(records, "clbench/Toy-v0", "sft", 0)
     (tmp_path / "link").symlink_to(records)  # the folder itself may be one

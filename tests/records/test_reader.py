@@ -121,7 +121,8 @@ def test_relearning_is_read_as_it_was_written(make_record: Callable[..., Record]
         ({"order": "1"}, "run: order must be a whole number"),
         ({"order": True}, "run: order must be a whole number"),
         ({"order": 1.0}, "run: order must be a whole number, not 1.0"),
-        ({"order": -1}, "run: order must not be below 0"),
+        ({"order": -1}, "run: order must be from 0 to 99"),
+        ({"order": 2**63}, "run: order must be from 0 to 99"),
         ({"perturb": 1}, "run: perturb must be true or false, not 1"),
         ({"seed": False}, "run: seed must be a whole number, not false"),
         ({"method": ["sft"]}, "run: method must be a text"),
@@ -137,6 +138,35 @@ def test_a_field_of_the_run_of_another_type_is_refused_by_name(
     assert read_record(path).run.order == 3
     change(path, run={**vars(record.run), **field})
     with pytest.raises(RecordError, match=re.escape(words)):
+        read_record(path)
+
+
+@pytest.mark.parametrize(
+    ("counts", "words"),
+    [
+        ({"test_questions": None}, "test_questions of its budget must be a whole number, not null"),
+        ({"test_questions": "x" * 99}, f'whole number, not "{"x" * 59}.'),
+        ({"test_questions": -1}, "test_questions of its budget must be a whole number, not -1"),
+        ({"curve_episodes": 10**9}, "curve_episodes of its budget must be at most its test_episodes, "),
+    ],
+)
+def test_a_count_that_no_budget_has_is_refused(
+    counts: dict[str, Any], words: str, record: Record, tmp_path: Path
+) -> None:
+    path = tmp_path / "record.json"
+    write_record(record, path)
+    change(path, scenario={**vars(record.scenario), "budget": {**record.scenario.budget, **counts}})
+    with pytest.raises(RecordError, match=re.escape(words)):
+        read_record(path)
+
+
+def test_a_run_cannot_choose_an_order_where_its_seed_does(record: Record, tmp_path: Path) -> None:
+    path = tmp_path / "record.json"
+    write_record(record, path)
+    change(path, scenario={**vars(record.scenario), "balanced": True})
+    assert read_record(path).scenario.balanced
+    change(path, run={**vars(record.run), "order": 3})
+    with pytest.raises(RecordError, match="run: order must be 0: each seed of its scenario has"):
         read_record(path)
 
 

@@ -1,12 +1,14 @@
 """Agents that learn by trial and error: their observations and their records."""
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import gymnasium
 import numpy as np
 import pytest
+import torch
 from agents import ID, LEARNED, TOY, Knowing, stage_env, trained
 
 from clbench.policy.transformer import TransformerPolicy
@@ -117,6 +119,21 @@ def test_a_function_is_an_agent_and_observes_what_its_env_returns(evaluate: Call
     assert dict(zip(scores.layout.tasks, rates, strict=True))["left"] == 1.0
 
 
+def test_an_agent_that_overwrites_its_observation_changes_no_later_one(
+    evaluate: Callable[..., Any],
+) -> None:
+    seen: list[Any] = []
+
+    def act(observation: Observation) -> Any:
+        seen.append(observation["instruction"].any())
+        for values in observation.values():
+            values[:] = 0
+        return np.zeros(2)
+
+    evaluate(act, stage_env(0, instruction="tokens"))
+    assert all(seen)
+
+
 def test_an_agent_receives_its_memory_except_at_the_first_step_of_an_episode(
     evaluate: Callable[..., Any],
 ) -> None:
@@ -167,23 +184,6 @@ def test_an_agent_that_acts_on_batches_has_the_same_outcomes_in_fewer_calls(
         records=tmp_path / "function",
     )
     assert outcomes(function) == outcomes(single)
-
-
-def test_agents_of_stable_baselines3_act_on_batches_by_themselves(
-    evaluate: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    stable_baselines3 = pytest.importorskip("stable_baselines3")
-    env = stage_env(0, instruction="tokens")
-    agent = stable_baselines3.PPO("MultiInputPolicy", env, n_steps=8, batch_size=8, seed=0)
-    predict, shapes = agent.predict, []
-
-    def watch(observation: Observation, **options: Any) -> Any:
-        shapes.append(observation["state"].shape)
-        return predict(observation, **options)
-
-    monkeypatch.setattr(agent, "predict", watch)
-    evaluate(agent, env)
-    assert {shape[0] for shape in shapes} == {40}
 
 
 @pytest.mark.parametrize(
@@ -242,6 +242,35 @@ def test_the_steps_of_parallel_environments_are_added_up(evaluate: Callable[...,
     assert evaluate(Knowing(), env).run.scenario == TOY.id
 
 
+def stages_side_by_side(*stages: int) -> gymnasium.vector.SyncVectorEnv:
+    return gymnasium.vector.SyncVectorEnv([partial(stage_env, stage) for stage in stages])
+
+
+def test_a_plain_vector_of_environments_tells_its_stage_steps_and_seconds(
+    evaluate: Callable[..., Any],
+) -> None:
+    env = stages_side_by_side(0, 0, 0)
+    env.reset(seed=0)
+    for _ in range(4):
+        env.step(np.zeros((3, 2), np.float32))
+    record = evaluate(Knowing(), env)
+    assert record.costs.environment_steps == 12
+    assert record.timing["stages"][0]["training"] is not None
+
+
+def test_environments_of_different_stages_are_refused(evaluate: Callable[..., Any]) -> None:
+    with pytest.raises(ValueError, match=r"differ in their stage: \[0, 1\]"):
+        evaluate(Knowing(), stages_side_by_side(0, 1))
+
+
+def test_the_parameters_of_a_network_that_grows_are_those_at_the_end(evaluate: Callable[..., Any]) -> None:
+    agent: Any = Knowing()
+    agent.policy = torch.nn.ModuleList([torch.nn.Linear(3, 1)])
+    assert evaluate(agent, stage_env(0)).costs.parameters == 4
+    agent.policy.append(torch.nn.Linear(3, 1))
+    assert evaluate(agent, stage_env(1)).costs.parameters == 8
+
+
 @pytest.mark.parametrize(
     ("agent", "error", "message"),
     [
@@ -281,7 +310,11 @@ def test_a_prediction_without_a_state_is_refused(evaluate: Callable[..., Any]) -
         ({"method": "../sac"}, "cannot be the name of a method"),
         ({"method": "my_agents:Sac"}, "'my_agents:Sac' is the name of a class that clbench imports"),
         ({"steps": -1}, "steps must be a whole number from 0, not -1"),
-        ({"seed": -1}, "seed must be a whole number from 0, not -1"),
+        ({"seed": -1}, "seed must be a whole number from 0 to 18446744073709551615, not -1"),
+        (
+            {"seed": 2**64},
+            "seed must be a whole number from 0 to 18446744073709551615, not 18446744073709551616",
+        ),
         ({"settings": {"speed": float("nan")}}, "record cannot hold the settings"),
         ({"settings": {"net": object()}}, "record cannot hold the settings"),
     ],
@@ -299,8 +332,9 @@ def test_targets_in_another_order_are_refused(evaluate: Callable[..., Any]) -> N
 
 
 def test_an_environment_without_a_scenario_or_a_stage_is_refused(evaluate: Callable[..., Any]) -> None:
-    with pytest.raises(TypeError, match="does not belong to a scenario"):
-        evaluate(Knowing(), gymnasium.make("CartPole-v1"))
+    for env in (gymnasium.make("CartPole-v1"), gymnasium.make_vec("CartPole-v1"), 3):
+        with pytest.raises(TypeError, match="does not belong to a scenario"):
+            evaluate(Knowing(), env)
     with pytest.raises(ValueError, match=r"goes through all stages: .*'clbench/Toy-v0', stage=0\)"):
         evaluate(Knowing(), gymnasium.make(ID))
 

@@ -4,10 +4,13 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
+import torch
 from helpers import blocks_of
 
+import clbench
 from clbench.records.reader import read_record
 
 ID = "clbench.testing:clbench/Toy-v0"
@@ -35,10 +38,34 @@ def _output(command: list[str], folder: Path) -> str:
     return done.stdout
 
 
-@pytest.mark.slow
-def test_the_code_of_the_page_makes_a_row(tmp_path: Path) -> None:
+def _small_blocks() -> tuple[str, str]:
+    """Return the code of the page, with the toy and few steps."""
     learning, flat = blocks_of(DOCS / "online.md", "python")
     small = learning.replace("clbench/Fetch-v1", ID).replace("range(5)", "range(3)").replace("5_000", "120")
+    return small, flat
+
+
+def test_the_agent_of_the_page_repeats_itself(monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("stable_baselines3")
+
+    def evaluate(agent: Any, *_: Any, **__: Any) -> None:
+        weights.append([parameter.detach().clone() for parameter in agent.policy.parameters()])
+
+    monkeypatch.setattr(clbench, "evaluate_agent", evaluate)
+    small, _ = _small_blocks()
+    runs = []
+    for _ in range(2):
+        weights: list[list[torch.Tensor]] = []
+        exec(small, {})
+        runs.append(weights)
+    assert [len(weights) for weights in runs] == [3, 3]
+    for one, other in zip(*runs, strict=True):
+        assert all(map(torch.equal, one, other))
+
+
+@pytest.mark.slow
+def test_the_code_of_the_page_makes_a_row(tmp_path: Path) -> None:
+    small, flat = _small_blocks()
     command = [sys.executable, "-c", small + flat + SHOW_FLAT]
     output = _output(command, tmp_path)
     assert output == "(16,)\n"
@@ -69,3 +96,4 @@ def test_the_program_of_the_page_makes_a_record_for_each_seed_and_skips_existing
         assert expected in output
     record = read_record(tmp_path / "leaderboard/records/Toy-v0/sac/seed-0.json")
     assert record.costs.environment_steps == 336
+    assert record.timing["seconds"] is not None

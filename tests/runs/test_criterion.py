@@ -4,18 +4,25 @@ import importlib
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 import torch
 from eager import EAGER
 
+from clbench.base.cache import cache_folder
+from clbench.evaluation.checks import Checker
+from clbench.evaluation.examiner import Examiner
 from clbench.evaluation.rollouts import Evaluator
 from clbench.learning.adaptation import Step
 from clbench.learning.trainer import Trainer
+from clbench.policy.transformer import TransformerPolicy
+from clbench.records.reader import read_record
 from clbench.records.record import Record
 from clbench.records.writer import write_record
 from clbench.runs.checkpoints import keep_stage, stage_policies
+from clbench.runs.length import run_length
 from clbench.runs.run import execute
 from clbench.runs.spec import RunSpec
 from clbench.scoring.metrics import measure
@@ -110,10 +117,42 @@ def test_an_interrupted_run_continues_to_the_same_record(
 ) -> None:
     spec = RunSpec(EAGER.id, "sft", seed=0)
     execute_and_kill(spec, tmp_path, share)
-    again = execute(spec, tmp_path)
+    kept = (cache_folder() / "runs").glob(f"*/stage-{stage}/record.json")
+    before = read_record(max(kept, key=lambda path: path.stat().st_mtime)).timing["seconds"]
+    amounts: list[float] = []
+    again = execute(spec, tmp_path, amounts.append)
     assert again.timing["resumed_after"] == stage  # the second time it was relearning
+    assert again.timing["seconds"] >= before + again.timing["relearning"]
+    run = spec.resolve()
+    assert sum(amounts) == pytest.approx(run_length(run.scenario, run.protocol), rel=0.05)
     for part in verification.PARTS:
         assert getattr(again, part) == getattr(record, part)
+
+
+def test_the_time_of_a_stage_is_that_of_its_training_its_checks_and_its_evaluation(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now = [1e9]  # later than any clock of this machine
+
+    def taking(seconds: float, function: Callable[..., Any]) -> Callable[..., Any]:
+        def slow(*arguments: Any, **named: Any) -> Any:
+            now[0] += seconds
+            return function(*arguments, **named)
+
+        return slow
+
+    monkeypatch.setattr("clbench.runs.run.time", SimpleNamespace(perf_counter=lambda: now[0]))
+    monkeypatch.setattr("clbench.runs.run.relearns", lambda _: False)
+    for cls, name, seconds in (
+        (Checker, "check", 100),
+        (Examiner, "examine", 10_000),
+        (TransformerPolicy, "action_loss", 1),
+    ):
+        monkeypatch.setattr(cls, name, taking(seconds, getattr(cls, name)))
+    record = execute(RunSpec(EAGER.id, "sft", seed=0, targets=1), tmp_path)
+    checks = record.check_rows()
+    steps = {"training": checks[-1].step, "checks": 100 * len(checks), "evaluation": 10_000}
+    assert record.timing["stages"] == [steps]
 
 
 def test_a_method_that_trains_nothing_is_checked_once(tmp_path: Path) -> None:

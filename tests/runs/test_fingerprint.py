@@ -1,6 +1,13 @@
+"""The fingerprint of a record: software, hardware, and the bits of the simulator."""
+
+import shutil
 import subprocess
 import sys
+from collections.abc import Callable
 from importlib.metadata import version
+from pathlib import Path
+
+import pytest
 
 from clbench.runs.fingerprint import fingerprint, rollout_hash
 from clbench.spec.registry import load_scenario
@@ -15,6 +22,64 @@ def test_a_rollout_hash_is_the_same_in_another_process_and_differs_between_tasks
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert rollout_hash(world, "press") == result.stdout.strip()
     assert rollout_hash(world, "press") != rollout_hash(world, "reach")
+
+
+WORLD = """
+from clbench.testing import ToyWorld
+
+class Counting(ToyWorld):
+    def reset(self, **given):
+        self.count = 0
+        return super().reset(**given)
+
+    def step(self, action):
+        self.count += 1
+        state, *rest = super().step(action)
+        return (state + (self.count == self.other), *rest)
+
+class Usual(Counting):
+    other = 0
+
+class Fiftieth(Counting):
+    other = 50
+
+class Later(Counting):
+    other = 51
+"""
+
+
+def test_a_rollout_hash_changes_with_any_of_fifty_steps(write_module: Callable[[str, str], None]) -> None:
+    write_module("counting_worlds", WORLD)
+    names = (
+        "clbench.testing:ToyWorld",
+        *(f"counting_worlds:{one}" for one in ("Usual", "Later", "Fiftieth")),
+    )
+    toy, usual, later, fiftieth = (rollout_hash(name, "left") for name in names)
+    assert toy == usual == later != fiftieth
+
+
+@pytest.mark.skipif(shutil.which("git") is None, reason="git is not installed")
+def test_a_commit_is_dirty_if_code_was_changed_and_not_by_records(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def git(*words: str) -> str:
+        author = ("-c", "user.name=a", "-c", "user.email=a@b")
+        command = ["git", "-C", str(tmp_path), *author, *words]
+        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+
+    code, record = tmp_path / "clbench" / "runs" / "fingerprint.py", tmp_path / "leaderboard" / "seed-0.json"
+    for path in (code, record):
+        path.parent.mkdir(parents=True)
+    code.touch()
+    git("init")
+    git("add", ".")
+    git("commit", "--message", "first")
+    monkeypatch.setattr("clbench.runs.fingerprint.__file__", str(code))
+    head = git("rev-parse", "HEAD")
+    record.touch()
+    assert fingerprint(TOY)["commit"] == {"id": head, "dirty": False}
+    code.write_text("changed = True")
+    assert fingerprint(TOY)["commit"] == {"id": head, "dirty": True}
 
 
 def test_a_fingerprint_names_only_the_simulator_of_its_suite() -> None:

@@ -1,12 +1,16 @@
 """The evaluation before the first target: done once, and shared by runs."""
 
 import shutil
+import threading
+import time
 from pathlib import Path
+from typing import Any
 
 import pytest
 from tiny import TINY
 
-from clbench.base.cache import cache_folder
+from clbench.base.cache import cache_folder, cached
+from clbench.base.lease import Lease
 from clbench.runs.length import run_length
 from clbench.runs.run import execute
 from clbench.runs.spec import RunSpec
@@ -48,8 +52,31 @@ def test_an_evaluation_that_another_run_makes_at_the_same_time_is_used(
     tmp_path: Path, reports: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     first = execute(RunSpec(TINY.id, "frozen", seed=0), tmp_path)
-    # it is missing at the first look, but exists when this run would make it
-    monkeypatch.setattr("clbench.runs.run.is_cached", lambda *_: False)
+    (folder,) = reports.iterdir()
+    made = folder.rename(tmp_path / "made")
+    before = (made / "report.json").stat().st_mtime_ns
+    held, asked = threading.Event(), threading.Event()
+
+    def make() -> None:
+        """Hold the lease, and finish once this run has found nothing and waits."""
+        with Lease(folder).held():
+            held.set()
+            asked.wait(60)
+            time.sleep(0.3)
+            made.rename(folder)
+
+    def cached_late(*arguments: Any) -> Path:
+        asked.set()
+        return cached(*arguments)
+
+    monkeypatch.setattr("clbench.runs.start.cached", cached_late)
+    other = threading.Thread(target=make)
+    other.start()
+    held.wait(60)
     second = execute(RunSpec(TINY.id, "sft", seed=0), tmp_path)
-    starts = [[stage for stage in one.episodes["stage"] if stage == 0] for one in (first, second)]
+    other.join()
+    assert (folder / "report.json").stat().st_mtime_ns == before
+    starts = [
+        [row for row in zip(*one.episodes.values(), strict=True) if row[0] == 0] for one in (first, second)
+    ]
     assert starts[0] == starts[1] != []

@@ -54,6 +54,8 @@ def test_a_method_without_its_own_strength_tries_learning_rates_between_the_rung
         {"step_factor": 0.055},
         {"step_factor": 0.18},
     ]
+    lowest = refinements(load_method("sft"), {"step_factor": 0.03})
+    assert [one["step_factor"] for one in lowest] == [0.0165, 0.054]
 
 
 def test_a_method_with_its_own_strength_tries_two_values_of_it_at_the_best_rung() -> None:
@@ -82,8 +84,9 @@ def test_hyper_parameters_that_tuning_sets_cannot_be_fixed(name: str) -> None:
 
 
 def test_the_best_final_average_wins_among_settings_that_learn_enough() -> None:
-    best, lazy = _tried(0.6, 0.85), _tried(0.7, 0.79)
+    best, lazy, enough = _tried(0.6, 0.85), _tried(0.7, 0.79), _tried(0.65, 0.8)
     assert best_of([_tried(0.5, 1.0), best, lazy]) is best
+    assert best_of([_tried(0.5, 1.0), best, lazy, enough]) is enough
 
 
 @pytest.fixture
@@ -104,6 +107,7 @@ def test_the_first_of_equal_settings_wins() -> None:
 def test_if_no_setting_learns_enough_the_one_that_learns_most_wins() -> None:
     most = _tried(0.2, 0.7)
     assert best_of([_tried(0.6, 0.1), most]) is most
+    assert best_of([most, _tried(0.6, 0.7)]) is most  # the first on a tie
 
 
 def test_a_run_takes_the_tuned_settings_unless_it_changes_them(toy_file: Path) -> None:

@@ -80,8 +80,13 @@ def test_no_number_of_episodes_makes_up_for_seeds_that_differ() -> None:
 def test_a_scenario_has_a_sentence_on_the_intervals_to_expect() -> None:
     three, one = (expected_precision(TOY, seeds) for seeds in (3, 1))
     episodes = TOY.budget.test_episodes
-    widths = [half_width(3, episodes, count) for count in (len(TOY.retained), len(TOY.target))]
+    skills, targets = len(TOY.retained), len(TOY.target)
+    widths = [half_width(3, episodes, count) for count in (skills, targets, skills + targets)]
+    assert len({f"{width:.2f}" for width in widths}) == 2  # as many skills as targets
     assert three.startswith(f"3 seeds x {episodes} episodes: ")
-    assert f"± {widths[0]:.2f} for retention, ± {widths[1]:.2f} for adaptation, ± " in three
+    assert (
+        f"± {widths[0]:.2f} for retention, ± {widths[1]:.2f} for adaptation, "
+        f"± {widths[2]:.2f} for final average"
+    ) in three
     assert one.startswith("1 seed x ")
     assert "this seed alone" in one

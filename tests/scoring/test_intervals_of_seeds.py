@@ -1,12 +1,23 @@
 """Intervals over seeds against SciPy and simulations, in the middle of a span and at its bounds."""
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import pytest
 from scipy import stats
 
-from clbench.scoring.intervals import NO_ESTIMATE, Estimate, interval, interval_of_seeds
+from clbench.records.record import Relearning
+from clbench.scoring.intervals import (
+    NO_ESTIMATE,
+    Estimate,
+    bootstrap,
+    estimate,
+    interval,
+    interval_of_seeds,
+    paired_difference,
+)
+from clbench.scoring.scores import Scores
 
 
 def of_means(values: Any, span: tuple[float, float]) -> tuple[float, float]:
@@ -77,6 +88,15 @@ def test_a_mean_of_two_seeds_at_both_bounds_keeps_wilsons_interval() -> None:
     assert 0.99 < high < 1
 
 
+def test_an_error_that_no_mean_can_have_gives_students_interval_cut_at_the_bounds() -> None:
+    # the error of a mean at one half is at most one half; the interval of that is inside, any other is cut
+    low, high = interval_of_seeds(0.5, 0.5, 3, (0.0, 1.0))
+    assert 0 < low < high < 1
+    assert interval_of_seeds(0.5, 0.6, 3, (0.0, 1.0)) == (0.0, 1.0)
+    reach = stats.t.ppf(0.975, 50) * 0.3
+    assert interval_of_seeds(0.1, 0.301, 50, (0.0, 1.0))[1] == pytest.approx(0.1 + reach, abs=0.003)
+
+
 @pytest.mark.parametrize("seeds", [3, 4, 5, 8])
 @pytest.mark.parametrize("rate", [0.01, 0.03, 0.5, 0.99])
 def test_intervals_hold_rates_near_0_and_1_about_as_often_as_they_should(seeds: int, rate: float) -> None:
@@ -108,3 +128,80 @@ def test_a_ratio_has_the_interval_of_its_logarithm() -> None:
     assert [got.low, got.high] == pytest.approx(expected)
     assert got.of_seeds
     assert interval(0.0, np.array([0.0, 0.0]), ratio=True) == Estimate(0.0, None, None)  # no logarithm
+    # a geometric mean of 0 without one of the seeds has no logarithm either: the interval is that of values
+    some = np.array([0.0, 0.5, 1.0])
+    assert interval(0.5, some, ratio=True) == interval(0.5, some)
+
+
+# ---- metrics -----------------------------------------------------------------------------------------------
+
+
+def _run(scores: Callable[..., Scores], ends: tuple[int, int] = (8, 12), earlier: float = 0.5) -> Scores:
+    """Return a run of two skills and two targets, whose stages took `ends` steps to their criterion."""
+    return scores(
+        [[1, 1, 0, 0, 0], [0.5, 0.5, 1, 0, 0], [0.5, 0.5, earlier, 1, 0]],
+        groups=(2, 2, 1),
+        steps=(100,),
+        ends=ends,
+        captured=[0.5, 0.25],
+        shift=[1.0, 2.0],
+        sparsity=[[0.5], [0.4]],
+        drift=[[1.0], [2.0]],
+        answers={(stage, "left"): (50, 40) for stage in range(3)},
+        relearning=Relearning("skill_0", 3, 14, True),
+    )
+
+
+WHOLE = {
+    "activation_drift": 2.0,
+    "criterion_met": 1.0,
+    "instruction_capture": 0.375,
+    "relearning_steps": 14.0,
+    "shift": 1.5,
+    "steps_to_criterion": 10.0,
+    "update_sparsity": 0.4,
+}
+"""Metrics that no draw of episodes changes, with their values for `_run`."""
+
+
+@pytest.mark.parametrize("seeds", [1, 3])
+def test_seeds_that_agree_on_what_no_episode_draws_have_no_interval_of_it(
+    seeds: int, scores: Callable[..., Scores]
+) -> None:
+    runs = dict.fromkeys(range(seeds), _run(scores))
+    found = estimate(WHOLE, runs, np.random.default_rng(0), replicates=20)
+    assert {name: one.value for name, one in found.items()} == pytest.approx(WHOLE)
+    assert {(one.low, one.high) for one in found.values()} == {(None, None)}
+    answers = bootstrap(
+        lambda rates: rates["one"].answer_curves[..., 0, 0].mean(axis=-1),
+        {"one": list(runs.values())},
+        np.random.default_rng(0),
+        replicates=20,
+    )
+    assert answers.value == pytest.approx(0.8)
+    assert (answers.low, answers.high) == (None, None)
+
+
+def test_the_speed_has_the_interval_of_its_logarithm(scores: Callable[..., Scores]) -> None:
+    ends = [(8, 12), (8, 25), (39, 12), (2, 4)]
+    runs = {seed: _run(scores, one) for seed, one in enumerate(ends)}
+    scratch = dict.fromkeys(runs, _run(scores, (44, 77)))
+    logs = np.array([np.mean(np.log([44 / first, 77 / second])) for first, second in ends])
+    reach = stats.t.ppf(0.975, 3) * stats.sem(logs)
+    references = {"from_scratch": scratch}
+    found = estimate(["speed"], runs, np.random.default_rng(0), references=references)["speed"]
+    expected = np.exp([logs.mean(), logs.mean() - reach, logs.mean() + reach])
+    assert [found.value, found.low, found.high] == pytest.approx(expected)
+
+
+def test_a_difference_may_be_as_large_as_both_ends_of_a_metric_are_apart(
+    scores: Callable[..., Scores],
+) -> None:
+    # backward transfer is from -1 to 1: 0, -0.5 and 0 against -1 differ by up to 1, and could by 2
+    runs = {seed: _run(scores, earlier=one) for seed, one in enumerate((1.0, 0.5, 1.0))}
+    others = dict.fromkeys(runs, _run(scores, earlier=0.0))
+    found = paired_difference("backward_transfer", runs, others, np.random.default_rng(0))
+    differences = np.array([1.0, 0.5, 1.0])
+    expected = interval_of_seeds(differences.mean(), stats.sem(differences), 2, (-2.0, 2.0))
+    assert (found.low, found.high) == pytest.approx(expected)
+    assert expected[1] > 1

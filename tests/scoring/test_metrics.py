@@ -36,6 +36,10 @@ def test_a_metric_is_found_by_its_title_on_the_board() -> None:
         ("min ACC", "minimum_accuracy"),
         ("REM", "remembering_diaz_rodriguez"),
         ("forgetting measure", "forgetting_chaudhry"),
+        ("FM", "forgetting_chaudhry"),
+        ("BWT+", "positive_backward_transfer_diaz_rodriguez"),
+        ("AUC", "area_under_curve_libero"),
+        ("ZS", "zero_shot"),
     ],
 )
 def test_a_metric_is_found_by_the_name_that_papers_use(usual: str, name: str) -> None:
@@ -47,6 +51,28 @@ def test_a_name_that_papers_use_for_several_metrics_lists_these_alone(usual: str
     with pytest.raises(LookupError, match=f"'{usual}' has several definitions: ") as raised:
         load_metric(usual)
     assert 2 <= sum(name in str(raised.value).replace(",", "").split() for name in METRICS) < 6
+
+
+def test_a_name_with_two_meanings_lists_both() -> None:
+    with pytest.raises(LookupError, match=r"several definitions: adaptation, intransigence\. Name one"):
+        load_metric("plasticity")
+    with pytest.raises(LookupError, match="several definitions: final_average, performance_"):
+        load_metric("accuracy")
+
+
+LESS_IS_BETTER = {
+    *("forgetting", "forgetting_chaudhry", "forgetting_mammoth", "forgetting_avalanche"),
+    *("forgetting_continual_world", "isolated_forgetting_cora", "intransigence"),
+    *(f"negative_backward_transfer_{source}" for source in ("libero", "clare", "arfm")),
+    *("steps_to_criterion", "relearning_steps", "instruction_capture", "activation_drift"),
+}
+NEITHER = {"update_sparsity", "shift"}
+
+
+def test_rows_are_ordered_by_the_right_end_of_every_metric() -> None:
+    found = {name: metric.higher_is_better for name, metric in METRICS.items()}
+    assert {name for name, better in found.items() if better is False} == LESS_IS_BETTER
+    assert {name for name, better in found.items() if better is None} == NEITHER
 
 
 def test_every_name_that_papers_use_leads_to_metrics_and_hides_none() -> None:

@@ -87,6 +87,26 @@ def test_steps_to_the_criterion_count_a_stage_that_never_met_it_with_all_its_ste
     assert measure("speed", run, {"from_scratch": scratch}) == pytest.approx((100 / 8 * 25 / 1) ** 0.5)
 
 
+def test_a_run_that_learned_one_target_in_four_has_a_speed_and_one_that_learned_none_has_none(
+    scores: Callable[..., Scores],
+) -> None:
+    matrix = np.full((5, 6), 0.5)
+    one, none, scratch = (
+        scores(matrix, groups=(1, 4, 1), steps=(100,), ends=ends)
+        for ends in ((8, 100, 100, 100), (100,) * 4, (39, 39, 39, 39))
+    )
+    speed = (39 / 8 * (39 / 100) ** 3) ** (1 / 4)
+    assert measure("speed", one, {"from_scratch": scratch}) == pytest.approx(speed)
+    assert measure("speed", none, {"from_scratch": scratch}) is None
+
+
+def test_where_nothing_succeeded_before_a_stage_there_is_no_share_that_is_kept(
+    scores: Callable[..., Scores],
+) -> None:
+    assert measure("kept_share", scores([[0, 0, 0], [0.5, 1, 0]])) is None
+    assert measure("kept_share", scores([[0.5, 0, 0], [0, 1, 0]])) == 0
+
+
 def test_a_stage_to_a_criterion_has_no_learning_curve(scores: Callable[..., Scores]) -> None:
     run = scores(MATRIX, steps=(100,), ends=(8, 12))
     for name in ("forward_transfer", "forward_transfer_libero", "area_under_curve_libero"):

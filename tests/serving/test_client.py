@@ -11,6 +11,9 @@ from typing import Any
 import numpy as np
 import pytest
 from served import serving, write_policy
+from websockets.http11 import Request
+from websockets.protocol import State
+from websockets.server import ServerProtocol
 from websockets.sync.server import ServerConnection, serve
 
 from clbench.base.errors import InputError
@@ -119,6 +122,9 @@ def sending(reply: Any) -> Callable[[ServerConnection], None]:
 TRACEBACK = 'Traceback (most recent call last):\n  File "policy.py", line 1, in act\n    return state\n'
 
 
+FRAME = '  File "policy.py", line 2, in deeper\n    return act(state)\n'
+
+
 def silent(connection: ServerConnection) -> None:
     greet(connection)
     for _ in connection:
@@ -147,6 +153,10 @@ def ending(connection: ServerConnection) -> None:
         (sending(pack({"actions": "left"})), "array of numbers called actions"),
         (sending(pack({"actions": np.array([["left"]])})), r"it sent: actions of the type <U4, \(1, 1\)"),
         (sending(pack([1])), "array of numbers called actions; it sent: list"),
+        (sending(pack(dict.fromkeys(map(str, range(999))))), r"it sent: 0, .*, 19, and 979 more\.$"),
+        (sending(pack({"x" * 10**6: 1})), r"it sent: x{500} \[\.\.\. the reply has the rest\]\.$"),
+        (sending(f"{TRACEBACK}{'x' * 10**6}"), r"failed: x{500} \[\.\.\. the output of the server has"),
+        (sending(f"{TRACEBACK}{FRAME * 3000}KeyError: 1\n"), r"failed: KeyError: 1$"),
         (sending(b"\xc1"), "does not speak openpi's protocol"),
         (silent, r"did not answer within 0\.2 seconds: a slower one needs a larger --timeout"),
         (ending, "ended the connection 5 times during one request"),
@@ -158,6 +168,33 @@ def test_a_reply_that_is_no_reply_is_an_error(handle: Callable[..., None], messa
         with pytest.raises(InputError, match=message):
             served(OBSERVATIONS)
         served.close()
+
+
+def test_a_server_that_does_not_read_a_large_request_is_an_error() -> None:
+    pictures = {**OBSERVATIONS, "image": np.zeros((40, 512, 512, 3), np.uint8)}  # 31 MB fill every buffer
+    with socket.create_server(("localhost", 0)) as listening:
+        thread = threading.Thread(target=greet_and_never_read, args=(listening,))
+        thread.start()
+        served = ServedPolicy(f"ws://localhost:{listening.getsockname()[1]}", timeout=0.5)
+        with pytest.raises(InputError, match=r"did not answer within 0\.5 seconds"):
+            served(pictures)
+        served.close()
+        thread.join()
+
+
+def greet_and_never_read(listening: socket.socket) -> None:
+    """Open one connection, send metadata, and read nothing until the client gives up."""
+    connection, _ = listening.accept()
+    protocol = ServerProtocol()
+    with connection:
+        while protocol.state is State.CONNECTING:
+            protocol.receive_data(connection.recv(4096))
+            for request in protocol.events_received():
+                assert isinstance(request, Request)
+                protocol.send_response(protocol.accept(request))
+        protocol.send_binary(pack({}))
+        connection.sendall(b"".join(protocol.data_to_send()))
+        time.sleep(3)
 
 
 @pytest.mark.parametrize(

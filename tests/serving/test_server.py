@@ -15,8 +15,9 @@ import numpy as np
 import pytest
 import torch
 from served import SERVER
-from websockets.exceptions import ConnectionClosedError
+from websockets.exceptions import ConnectionClosedError, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
+from websockets.typing import Origin
 
 from clbench.serving.server import lerobot_policy, open_server, openpi_policy, pack, serve, unpack
 
@@ -89,10 +90,18 @@ def test_what_a_message_cannot_hold_is_refused_before_it_is_sent(value: Any, err
         msgpack.packb({b"__ndarray__": True, b"data": b"", b"dtype": "<f8", b"shape": [0, 2**63]}),
         msgpack.packb({b"__ndarray__": True, b"data": b"", b"dtype": "nonsense", b"shape": [0]}),
         msgpack.packb({b"__npgeneric__": True, b"data": "x", b"dtype": "<f8"}),
+        msgpack.packb({b"__ndarray__": True, b"data": b"", b"dtype": "(1,,2)f8", b"shape": [0]}),
+        msgpack.packb({b"__npgeneric__": True, b"data": 1, b"dtype": None}),
     ],
 )
 def test_a_damaged_message_is_refused(message: bytes) -> None:
     with pytest.raises(ValueError, match="no message of a policy"):
+        unpack(message)
+
+
+def test_a_type_with_a_long_name_is_refused_before_numpy_reads_it() -> None:
+    message = msgpack.packb({b"__ndarray__": True, b"data": b"", b"dtype": "f8," * 10_000, b"shape": [0]})
+    with pytest.raises(ValueError, match="must name types as NumPy does, such as <f4"):
         unpack(message)
 
 
@@ -144,6 +153,13 @@ def test_the_metadata_come_first_and_each_request_has_a_reply() -> None:
             assert np.array_equal(received(connection)["actions"], 2 * state[:, None])
         with urllib.request.urlopen(f"http://localhost:{port}/healthz") as answer:
             assert answer.read() == b"OK\n"
+
+
+def test_a_page_in_a_browser_cannot_use_a_policy() -> None:
+    with connected(twice) as (connection, port):
+        with pytest.raises(InvalidStatus, match="HTTP 403"):
+            connect(f"ws://localhost:{port}", origin=Origin("https://example.com"), proxy=None)
+        assert received(connection) == {}
 
 
 @pytest.mark.parametrize(

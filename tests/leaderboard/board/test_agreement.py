@@ -6,6 +6,8 @@ from scipy.stats import kendalltau
 
 from clbench.base.entry_points import resolve
 
+Agreement = resolve("clbench.leaderboard.board.agreement:Agreement")
+Concordance = resolve("clbench.leaderboard.board.agreement:Concordance")
 agreement_between = resolve("clbench.leaderboard.board.agreement:agreement_between")
 concordance = resolve("clbench.leaderboard.board.agreement:concordance")
 kendall_tau = resolve("clbench.leaderboard.board.agreement:kendall_tau")
@@ -83,3 +85,34 @@ def test_few_rows_or_seeds_have_no_agreement(shape: tuple[int, int]) -> None:
 
 def test_rows_of_one_value_have_no_agreement() -> None:
     assert concordance(np.ones((5, 4))) is None
+
+
+def test_the_range_is_that_of_boards_whose_seeds_are_drawn_each_on_its_own() -> None:
+    generator = np.random.default_rng(2)
+    one = generator.normal(0, 1, (7, 1)) + generator.normal(0, 1, (7, 5))
+    other = one[:, :4] + generator.normal(0, 1, (7, 4))
+    found = agreement_between(one, other, replicates=300)
+    drawn = np.random.default_rng(0)
+    first, second = drawn.integers(5, size=(300, 5)), drawn.integers(4, size=(300, 4))
+    taus = [
+        kendalltau(one[:, some].mean(axis=1), other[:, others].mean(axis=1)).statistic
+        for some, others in zip(first, second, strict=True)
+    ]
+    assert (found.low, found.high) == pytest.approx(tuple(np.percentile(taus, (2.5, 97.5))))
+    assert found.tau == pytest.approx(kendalltau(one.mean(axis=1), other.mean(axis=1)).statistic)
+    assert (found.seeds, found.rows) == (9, 7)
+
+
+@pytest.mark.parametrize(("chance", "certain"), [(0.04, True), (0.049, True), (0.05, False), (0.06, False)])
+def test_chance_is_excluded_below_one_in_twenty(chance: float, certain: bool) -> None:
+    assert Concordance(0.5, chance, seeds=4, rows=6).certain == certain
+    for tau, low, high in ((0.5, 0.1, 0.9), (-0.5, -0.9, -0.1)):
+        agreement = Agreement(tau, low, high, seeds=8, rows=6, chance=chance)
+        assert agreement.direction == (np.sign(tau) if certain else 0)
+    assert Agreement(0.5, -0.1, 0.9, seeds=8, rows=6, chance=chance).direction == 0
+
+
+def test_rows_that_differ_in_the_last_bit_alone_are_ties_of_a_seed() -> None:
+    values = np.random.default_rng(4).integers(4, size=(6, 5)) / 4
+    nearly = values + np.arange(6)[:, None] * 1e-12
+    assert concordance(nearly) == concordance(values)

@@ -18,6 +18,8 @@ from clbench.records.record import Record
 from clbench.records.writer import write_record
 from clbench.spec.scenario import target_order
 
+Order, Orders = (resolve(f"clbench.leaderboard.board.orders:{name}") for name in ("Order", "Orders"))
+
 SCENARIO = "clbench/Toy-v0"
 BUDGET = {"curve_episodes": 20, "test_episodes": 20, "validation_episodes": 10}
 TARGETS = ["target_0", "target_1", "target_2"]
@@ -82,6 +84,12 @@ def test_without_a_seed_that_all_orders_have_there_is_no_order_sensitivity(
     for order in range(3):
         add(0.5, order=order, seed=order)
     assert math.isnan(load(records).order_sensitivity[0])
+
+
+def test_an_order_without_a_final_average_leaves_no_order_sensitivity() -> None:
+    known = [Order(number, (), final) for number, final in enumerate((0.5, 0.7, 0.6))]
+    assert Orders((0,), tuple(known)).sensitivity == pytest.approx(0.2)
+    assert Orders((0,), (*known, Order(3, (), None))).sensitivity is None
 
 
 def test_other_orders_change_nothing_else_of_a_row(add: Callable[..., Path], records: Path) -> None:

@@ -70,6 +70,35 @@ def test_predictors_that_order_the_methods_as_forgetting_does_have_tau_1(rows: l
         assert (one.tau, one.low, one.high, one.seeds, one.rows) == (1.0, 1.0, 1.0, 4, 7)
 
 
+def test_each_predictor_is_compared_with_the_share_of_what_was_known_that_is_lost(scores: Any) -> None:
+    # success on two skills before and after the first stage: what is left falls, its share falls more
+    known = [(8, 8), (10, 9), (12, 9), (14, 9), (16, 9), (18, 8), (20, 7)]
+
+    def run(number: int, seed: int) -> Any:
+        before, after = (count / 20 for count in known[number])
+        matrix = [[before] * 2 + [0] * 3, [after] * 2 + [1, 0, 0], [after] * 2 + [1, 1, 0]]
+        moved = {"sparsity": np.full((2, 1), 1 - 0.1 * number), "drift": np.full((2, 1), 9.0 - number)}
+        shift = [1.0 + number % 3, 1.0]
+        return scores(matrix, groups=(2, 2, 1), steps=(100,), ends=(8, 12), seed=seed, shift=shift, **moved)
+
+    names = ["sft", "ewc", "lora", "aegis", "lwf", "finch", "consft"]
+    made = [
+        _Row(name, "prior-data-free", {seed: run(number, seed) for seed in range(4)})
+        for number, name in enumerate(names)
+    ]
+    found = {one.predictor: one.tau for one in predictions(made)}
+    shifts = [1.0 + number % 3 for number in range(7)]
+    assert found == {
+        "the shift of the policy on the new data": pytest.approx(kendalltau(shifts, range(7)).statistic),
+        "the share of the weights that changed": 1.0,
+        "activation drift": -1.0,
+    }
+    for row in made:
+        row.scores = {seed: row.scores[seed] for seed in range(3)}
+        row.seeds = tuple(row.scores)
+    assert predictions(made) == []  # three seeds are too few
+
+
 def test_few_rows_and_rows_of_equal_stages_have_no_prediction(rows: list[_Row]) -> None:
     assert predictions(rows[:5]) == []
     for row in rows:

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,11 @@ from clbench.base.entry_points import resolve
 from clbench.records.record import Record
 from clbench.records.writer import record_text
 
+agreement = resolve("clbench.leaderboard.board.rows:agreement")
+apart_from_baseline = resolve("clbench.leaderboard.board.rows:apart_from_baseline")
 compute_board = resolve("clbench.leaderboard.board.rows:compute_board")
+costs_of = resolve("clbench.leaderboard.board.costs:costs_of")
+pretrained_success = resolve("clbench.leaderboard.board.rows:pretrained_success")
 standing_of = resolve("clbench.leaderboard.board.rows:standing_of")
 values_by_seed = resolve("clbench.leaderboard.board.rows:values_by_seed")
 
@@ -78,7 +83,6 @@ def test_the_relative_cost_compares_equal_seeds(even_board: Callable[..., Path])
     for seed in range(2):
         records = even_board("sft", seed, 0.5)
     even_board("lora", 1, 0.5)
-    costs_of = resolve("clbench.leaderboard.board.costs:costs_of")
     runs = {row.method: row.runs for row in compute_board(records).rows}
     for run, steps in zip((*runs["sft"], *runs["lora"]), (10, 40, 20), strict=True):
         run.record.costs.optimiser_steps = steps
@@ -86,6 +90,10 @@ def test_the_relative_cost_compares_equal_seeds(even_board: Callable[..., Path])
     assert costs_of(runs["lora"], runs["sft"])["relative_cost"] == pytest.approx(1.5)
     assert costs_of(runs["sft"], runs["sft"][:1])["relative_cost"] == 1.0
     assert costs_of(runs["lora"], runs["sft"][:1])["relative_cost"] is None
+    # a mean over the seeds that state a cost alone would be another
+    runs["sft"][0].record.costs.bytes_kept = None
+    costs = costs_of(runs["sft"], runs["sft"])
+    assert (costs["bytes_kept"], costs["steps"]) == (None, 25)
 
 
 def test_steps_to_the_criterion_of_one_seed_have_no_interval(even_board: Callable[..., Path]) -> None:
@@ -94,6 +102,79 @@ def test_steps_to_the_criterion_of_one_seed_have_no_interval(even_board: Callabl
     assert steps.value is not None
     assert (steps.low, steps.high) == (None, None)
     assert success.low < success.value < success.high
+
+
+# ---- rows as far as the functions read them ----------------------------------------------------------------
+
+
+def _row(method: str, scores: dict[int, Any], division: str = "prior-data-free", **fields: Any) -> Any:
+    """Return a row of a scenario whose seeds have orders of their own."""
+    given = {"balanced": True, "starts": [1.0], "height": 0.0, "groups": "a", **fields}
+    runs = [
+        SimpleNamespace(
+            published=SimpleNamespace(balanced=given["balanced"]),
+            record=SimpleNamespace(retained_at_start=lambda start=start: start),
+        )
+        for start in given["starts"]
+    ]
+    return SimpleNamespace(
+        method=method,
+        division=division,
+        scores=scores,
+        seeds=tuple(scores),
+        runs=runs,
+        height=given["height"],
+        groups=given["groups"],
+    )
+
+
+def test_rows_of_one_height_share_a_place_and_the_next_one_counts_both() -> None:
+    heights = {"one": 0.2, "two": 0.2 + 1e-12, "three": 0.1, "reference": 0.9, "missing": None}
+    rows = [_row(name, {}, height=height) for name, height in heights.items()]
+    rows[3].division, rows[4].groups = "reference", None
+    standings = [standing_of(row, rows) for row in rows]
+    assert [one and (one.place, one.count) for one in standings] == [(1, 3), (1, 3), (3, 3), (1, 1), None]
+
+
+def test_the_success_of_the_pretrained_policy_is_that_of_plain_fine_tuning_or_of_another_method() -> None:
+    joint, lora = _row("joint", {}, "reference", starts=[0.1]), _row("lora", {}, starts=[0.9, None, 0.7])
+    sft = _row("sft", {}, starts=[0.2, 0.3])
+    assert pretrained_success([joint, lora, sft]) == pytest.approx(0.25)
+    assert pretrained_success([joint, lora]) == pytest.approx(0.8)
+    assert pretrained_success([joint]) is None
+    assert pretrained_success([_row("sft", {}, starts=[None])]) is None
+
+
+def test_only_seeds_with_orders_of_their_own_have_an_agreement(scores: Callable[..., Any]) -> None:
+    made = []
+    for number, name in enumerate(("sft", "ewc", "lora", "aegis", "lwf", "finch")):
+        run = scores(np.full((2, 2), 0.1 * number), groups=(1, 1, 0), episodes=10)
+        made.append(_row(name, dict.fromkeys(range(4), run)))
+    found = agreement(made)
+    assert (found.w, found.seeds, found.rows) == (pytest.approx(1.0), 4, 6)
+    for row in made:
+        row.runs[0].published.balanced = False
+    assert agreement(made) is None
+
+
+def test_a_method_is_not_tested_together_with_those_that_may_look_at_more(
+    scores: Callable[..., Any],
+) -> None:
+    def some(rate: float) -> dict[int, Any]:
+        return dict.fromkeys(range(8), scores(np.full((2, 5), rate), groups=(3, 1, 1), episodes=10))
+
+    # one episode of ten: 0.1 with a standard error of 0.1 / sqrt(8), 2.8 times. Tukey's factor for 2 rows of
+    # 8 seeds is 2.36, and for 10 rows 3.28
+    sft, lora = _row("sft", some(0.4)), _row("lora", some(0.5))
+    others = [_row(f"method_{number}", some(0.4)) for number in range(8)]
+    assert apart_from_baseline([sft, lora]) == {"lora"}
+    assert apart_from_baseline([sft, lora, *others]) == set()
+    for row in others:
+        row.division = "prior demonstrations"
+    assert apart_from_baseline([sft, lora, *others]) == {"lora"}
+
+
+# ---- policies that were trained elsewhere ------------------------------------------------------------------
 
 
 @pytest.fixture

@@ -20,6 +20,7 @@ from clbench.records.paths import record_path
 from clbench.records.reader import read_record
 from clbench.runs.run import execute
 from clbench.runs.spec import RunSpec
+from clbench.testing import TOY as TOY_SCENARIO
 from clbench.testing import ToyWorld
 
 tiers = importlib.import_module("clbench.leaderboard.board.tiers")
@@ -45,8 +46,8 @@ def test_a_run_in_another_order_of_the_targets_is_verified_in_that_order(tmp_pat
     assert failures(verify(path, "retrained")) == ""
     assert tiers.tier_of(path) == "retrained"
     edit(path, lambda values: values["scenario"].update(balanced=True))
-    assert "scenario.balanced differ from the installed code" in failures(verify(path, "recomputed"))
-    edit(path, lambda values: values["scenario"]["target"].reverse())
+    assert "run: order must be 0: each seed of its scenario" in failures(verify(path, "recomputed"))
+    edit(path, lambda values: values["scenario"].update(balanced=False, target=["right", "down"]))
     assert "is missing at stage 1" in failures(verify(path, "recomputed"))
 
 
@@ -198,6 +199,21 @@ def test_a_tier_is_lost_with_the_first_changed_byte(mine: Path, honest: Path) ->
     assert tiers.tier_of(mine) == "self-reported"
 
 
+def test_a_record_that_changes_while_it_is_verified_has_no_tier(
+    mine: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    subject = importlib.import_module("clbench.leaderboard.submission.subject")
+    take = subject.fingerprint
+
+    def change_and_take(scenario: Any) -> Any:
+        edit(mine, lambda values: flip(values, 0, 60))
+        return take(scenario)
+
+    monkeypatch.setattr(subject, "fingerprint", change_and_take)
+    assert failures(verify(mine, "recomputed")) == ""
+    assert tiers.tier_of(mine) == "self-reported"
+
+
 def test_the_verification_of_another_record_counts_for_nothing(mine: Path, honest: Path) -> None:
     verify(mine, "recomputed", honest)
     other = mine.with_name("seed-1.json")
@@ -282,6 +298,27 @@ def test_a_module_that_a_record_names_is_not_imported_unless_the_verifier_allows
     assert not (tmp_path / "ran").exists()
     verify(place, "replayed", honest, method="stranger:Mine")
     assert (tmp_path / "ran").exists()
+
+
+@pytest.mark.parametrize(
+    ("fields", "reason"),
+    [
+        ({"budget": {**vars(TOY_SCENARIO.budget), "demonstrations": 10**6}}, "scenario.budget"),
+        ({"balanced": True}, "scenario.balanced"),
+        ({}, ""),
+    ],
+)
+def test_a_method_that_is_not_installed_has_the_scenario_of_all_others(
+    fields: dict[str, Any], reason: str, mine: Path
+) -> None:
+    place = record_path(mine.parents[2], "clbench/Toy-v0", "stranger:Mine", 0)
+    place.parent.mkdir()
+    shutil.move(mine, place)
+    edit(place, lambda values: values["run"].update(method="stranger:Mine"))
+    edit(place, lambda values: values["scenario"].update(fields))
+    expected = f"what was run: {reason} differ from the installed code" if fields else ""
+    assert failures(verify(place, "recomputed")) == expected
+    assert tiers.tier_of(place) == ("self-reported" if fields else "recomputed")
 
 
 def test_a_run_on_a_device_that_is_missing_here_is_recomputed_and_no_more(mine: Path, honest: Path) -> None:

@@ -1,0 +1,74 @@
+"""The forecast of a command: the time from the lengths of its jobs, the disk from what they keep."""
+
+import types
+from pathlib import Path
+from typing import Any
+
+import pytest
+from tiny import TINY
+
+from clbench.jobs import forecast as module
+from clbench.jobs import work
+from clbench.jobs.forecast import STEPS, forecast, step_seconds
+from clbench.jobs.job import Job
+from clbench.learning.pretraining import policy_config
+from clbench.policy.transformer import TransformerPolicy
+from clbench.runs.spec import RunSpec
+
+
+def _plan(*jobs: Job) -> Any:
+    """Return a plan, as far as a forecast reads it."""
+    return types.SimpleNamespace(jobs=jobs)
+
+
+def _job(function: Any, length: float, pace: float = 1.0) -> Job:
+    return Job("a job", function, {"scenario": TINY.id}, length, pace=pace)
+
+
+RUNS = [RunSpec(TINY.id, "sft", seed).resolve() for seed in range(2)]
+
+
+@pytest.mark.parametrize(
+    ("length", "workers", "words"),
+    [
+        (18_000, 1, "about 54 minutes with 1 at once"),  # 3 jobs, one at half of the pace: 2.5 x 18,000 steps
+        (18_000, 2, "about 27 minutes with 2 at once"),
+        (18_000, 8, "about 18 minutes with 8 at once"),  # there are no more than three jobs
+        (29_000, 1, "about 87 minutes with 1 at once"),
+        (31_000, 1, "about 1.6 hours with 1 at once"),
+    ],
+)
+def test_the_time_is_that_of_all_jobs_shared_by_the_workers(
+    length: float, workers: int, words: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "step_seconds", lambda _: 0.072)
+    jobs = [_job(work.do_run, length), _job(work.pretrain, length), _job(work.do_run, length, 0.5)]
+    _, time, _ = forecast(_plan(*jobs), RUNS, workers, None)
+    assert time == f"Time: {words}, at 72 ms for an optimiser step here."
+
+
+def test_the_disk_is_that_of_policies_demonstrations_and_records(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "step_seconds", lambda _: 0.1)
+    weights = TransformerPolicy(policy_config(TINY)).parameters()
+    bytes_of_policy = sum(weight.nbytes for weight in weights)
+    # 4 demonstrations of 5 tasks of at most 12 steps; each has a state of 4 numbers, three actions of 2, and
+    # four numbers more
+    demonstrations = 4 * 5 * 12 * 4 * (4 + 3 * 2 + 4)
+    jobs = [_job(work.pretrain, 1), _job(work.pretrain, 1), *(_job(work.do_run, 1) for _ in range(3))]
+    to_do, _, disk = forecast(_plan(*jobs), RUNS, 1, Path("kept"))
+    assert to_do == "To do: 2 policies to pretrain, 3 runs."
+    made, kept = 2 * bytes_of_policy + demonstrations, 2 * 3 * bytes_of_policy  # after 0, 1 and 2 targets
+    words = [f"{count / 1e3:.0f} kB" if count < 1e6 else f"{count / 1e6:.0f} MB" for count in (made, kept)]
+    assert disk == (
+        f"Disk: about {words[0]} in the caches, 300 kB of records, {words[1]} of policies in kept."
+    )
+
+
+def test_the_time_of_a_step_is_the_median_without_the_first(monkeypatch: pytest.MonkeyPatch) -> None:
+    taken = [100.0, *(float(number) for number in range(1, STEPS + 1))]
+    moments = []
+    for number, seconds in enumerate(taken):
+        moments += [1e3 * number, 1e3 * number + seconds]
+    clock = iter(moments)
+    monkeypatch.setattr(module, "time", types.SimpleNamespace(perf_counter=lambda: next(clock)))
+    assert step_seconds(TINY) == (1 + STEPS) / 2

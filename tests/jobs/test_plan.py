@@ -1,0 +1,79 @@
+"""The plan of runs: the lengths and paces of their jobs, and what runs share."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from eager import EAGER
+from tiny import TINY
+
+from clbench.jobs.job import Job
+from clbench.jobs.plan import Plan
+from clbench.runs.length import run_length
+from clbench.runs.spec import RunSpec
+
+WATCHING = """
+import clbench
+from dataclasses import dataclass
+
+@dataclass
+class Watching(clbench.Method):
+    uses = clbench.Uses(demonstrations="prepare")
+
+    def watch_pretraining(self, policy, progress):
+        pass
+"""
+
+
+def _job(folder: Path, scenario: str, method: str) -> Job:
+    return Plan().add_run(RunSpec(scenario, method, 0).resolve(), folder)
+
+
+@pytest.mark.parametrize(
+    ("scenario", "method", "pace"),
+    [
+        # 170 s with replay and 232 s without, on equal stages; 29 and 15 ms of 90 ms where stages end early
+        (TINY.id, "sft", 1.0),
+        (TINY.id, "buffered_replay", 1.0),
+        (TINY.id, "experience_replay", 0.75),
+        (EAGER.id, "sft", 0.2),
+        (EAGER.id, "experience_replay", 0.35),
+    ],
+)
+def test_runs_that_replay_or_end_early_are_expected_to_take_less(
+    scenario: str, method: str, pace: float, tmp_path: Path
+) -> None:
+    assert _job(tmp_path, scenario, method).pace == pace
+
+
+def test_a_method_that_watches_the_pretraining_takes_as_many_steps_more(
+    tmp_path: Path, write_module: Callable[[str, str], None]
+) -> None:
+    write_module("watching_method", WATCHING)
+    run = RunSpec(TINY.id, "sft", 0).resolve()
+    length = run_length(run.scenario, run.protocol)
+    assert _job(tmp_path, TINY.id, "sft").length == length
+    assert _job(tmp_path, TINY.id, "watching_method:Watching").length == length + 10
+
+
+def test_a_pretraining_is_as_long_as_its_steps(tmp_path: Path, empty_caches: Path) -> None:
+    plan = Plan()
+    plan.add_run(RunSpec(TINY.id, "sft", 0).resolve(), tmp_path)
+    (job,) = (job for job in plan.jobs if "pretraining" in job.title)
+    assert job.length == TINY.budget.pretraining_steps == 10
+
+
+def test_runs_share_the_evaluation_of_a_start_only_if_it_is_the_same(
+    tmp_path: Path, empty_caches: Path
+) -> None:
+    def starts(*changes: dict[str, Any]) -> int:
+        plan = Plan()
+        for number, change in enumerate(changes):
+            plan.add_run(RunSpec(TINY.id, ("sft", "frozen")[number], 0, **change).resolve(), tmp_path)
+        return sum("evaluation" in job.title for job in plan.jobs)
+
+    assert starts({}, {}) == 1
+    assert starts({"perturb": True}, {"perturb": True}) == 1
+    for other in ({"perturb": True}, {"split": "validation"}, {"order": 1}, {"targets": 1}):
+        assert starts({}, other) == 2

@@ -1,0 +1,86 @@
+"""The ladder of learning rates: its curves, and gains over settings that tuning rated as high as its own."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from clbench.base.entry_points import resolve
+from clbench.runs.tuning import Tried, Tuned
+from clbench.scoring.intervals import Estimate
+
+SCENARIO = "clbench/Even-v1"
+MODULE = "clbench.leaderboard.board.frontier"
+TiedGain = resolve(f"{MODULE}:TiedGain")
+is_certain_over = resolve(f"{MODULE}:is_certain_over")
+ladder_of, read_ladder, tied_gains = (
+    resolve(f"{MODULE}:{name}") for name in ("ladder_of", "read_ladder", "tied_gains")
+)
+compute_board = resolve("clbench.leaderboard.board.rows:compute_board")
+read_run = resolve("clbench.leaderboard.board.runs:read_run")
+
+
+@pytest.fixture
+def _tuned(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let tuning have rated plain fine-tuning alike at 0.1, which it chose, and at 0.3."""
+    scores = {1.0: 0.4, 0.1: 0.6, 0.3: 0.6, 0.03: 0.5}
+    tried = tuple(Tried({"step_factor": factor}, final, 0.9) for factor, final in scores.items())
+    found = {"sft": Tuned({"step_factor": 0.1}, tried)}
+    monkeypatch.setattr(f"{MODULE}.tuned", lambda name: found if name == SCENARIO else {})
+
+
+@pytest.mark.usefixtures("_tuned")
+def test_a_gain_over_a_tied_setting_is_that_over_plain_fine_tuning_there_on_common_seeds(
+    even_board: Callable[..., Path],
+) -> None:
+    for seed, kept in enumerate((0.6, 0.6, 0.7, 0.9)):
+        records = even_board("lora", seed, kept)
+    for seed, kept in enumerate((0.2, 0.2, 0.5)):
+        even_board("sft", seed, kept, "ladder", step_factor=0.3)
+        even_board("sft", seed, 0.0, "ladder", step_factor=0.1)  # tuning's choice is on the board already
+        even_board("finch", seed, 0.9, "ladder", step_factor=0.3)
+    runs = [read_run(records, path) for path in sorted(records.rglob("seed-*.json"))]
+    ladder, _ = read_ladder(ladder_of(records))
+    (one,) = tied_gains(SCENARIO, {"lora": {run.seed: run.scores for run in runs}}, ladder)["lora"]
+    assert (one.factor, one.seeds) == (0.3, 3)
+    # the final average has three tasks that are kept, and the last target, which all learn alike
+    differences = [3 / 4 * (0.6 - 0.2), 3 / 4 * (0.6 - 0.2), 3 / 4 * (0.7 - 0.5)]
+    assert one.gain.value == pytest.approx(sum(differences) / 3)
+    assert one.gain.low < one.gain.value < one.gain.high
+
+
+@pytest.mark.usefixtures("_tuned")
+def test_a_tied_setting_without_runs_shows_no_gain_that_would_be_certain(
+    even_board: Callable[..., Path],
+) -> None:
+    for seed in range(2):
+        even_board("sft", seed, 0.1)
+        records = even_board("lora", seed, 0.9)
+    tied = compute_board(records).tied[SCENARIO]
+    assert set(tied) == {"lora"}
+    (one,) = tied["lora"]
+    assert (one.factor, one.seeds, one.gain.value, one.is_certain) == (0.3, 0, None, False)
+
+
+def test_a_gain_is_certain_over_all_tied_settings_or_over_none() -> None:
+    sure, unsure = (TiedGain(0.3, Estimate(0.02, low, 0.03), 4) for low in (0.01, -0.01))
+    assert is_certain_over([])
+    assert is_certain_over([sure, sure])
+    assert not is_certain_over([sure, unsure])
+    assert not is_certain_over([unsure, sure])
+
+
+def test_curves_of_a_method_with_other_settings_are_named_by_these(even_board: Callable[..., Path]) -> None:
+    for factor in (1.0, 0.3):
+        even_board("finch", 0, 0.2, "ladder", step_factor=factor)
+        even_board("finch", 0, 0.4, "ladder", kappa=0.5, step_factor=factor)
+        even_board("l2_sp", 0, 0.4, "ladder", strength=2.0, step_factor=factor)
+    curves = compute_board(even_board("sft", 0, 0.1)).frontiers[SCENARIO]
+    assert [curve.method for curve in curves] == ["finch", "finch+kappa=0.5", "l2_sp"]
+    assert [[rung.factor for rung in curve.rungs] for curve in curves] == [[1.0, 0.3]] * 3
+
+
+def test_one_learning_rate_is_no_ladder(even_board: Callable[..., Path]) -> None:
+    even_board("finch", 0, 0.2, "ladder", step_factor=0.3)
+    even_board("sft", 0, 0.2, "ladder", step_factor=0.3)
+    assert not compute_board(even_board("sft", 0, 0.1)).frontiers

@@ -1,0 +1,86 @@
+"""The table over scenarios: means of rows that are in all of them, and their intervals."""
+
+import dataclasses
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+
+from clbench.base.entry_points import resolve
+from clbench.scoring.intervals import NO_ESTIMATE, Estimate
+from clbench.scoring.metrics import METRICS
+
+RowSummary = resolve("clbench.leaderboard.board.summary:RowSummary")
+mean_estimate = resolve("clbench.leaderboard.board.overall:mean_estimate")
+overall = resolve("clbench.leaderboard.board.overall:overall")
+
+
+def _row(scenario: str, method: str, final: float | None = 0.5, **fields: Any) -> Any:
+    """Return a row whose metrics all have the same value."""
+    one = NO_ESTIMATE if final is None else Estimate(final, final - 0.1, final + 0.1)
+    row = RowSummary(
+        scenario=scenario,
+        method=method,
+        division="prior-data-free",
+        groups="a",
+        tier="self-reported",
+        seeds=(0,),
+        to_criterion=True,
+        estimates=dict.fromkeys(METRICS, one),
+        costs={},
+        order_sensitivity=None,
+    )
+    return dataclasses.replace(row, **fields)
+
+
+def test_the_interval_of_a_mean_of_scenarios_has_the_error_of_independent_ones() -> None:
+    parts = [Estimate(0.2, 0.1, 0.4), Estimate(0.6, 0.5, 0.7), Estimate(0.7, 0.3, 0.9)]
+    found = mean_estimate(parts)
+    assert found.value == pytest.approx(0.5)
+    # errors of independent numbers add up in squares, and the mean has a third of the error of the sum
+    assert found.low == pytest.approx(0.5 - math.sqrt(0.1**2 + 0.1**2 + 0.4**2) / 3)
+    assert found.high == pytest.approx(0.5 + math.sqrt(0.2**2 + 0.1**2 + 0.2**2) / 3)
+
+
+def test_the_mean_of_simulated_scenarios_is_in_its_interval_as_often_as_each_in_its_own() -> None:
+    generator, held = np.random.default_rng(0), 0
+    for _ in range(2000):
+        values, errors = generator.normal(0, (0.1, 0.3)), (0.1, 0.3)
+        parts = [
+            Estimate(value, value - 1.96 * error, value + 1.96 * error)
+            for value, error in zip(values, errors, strict=True)
+        ]
+        found = mean_estimate(parts)
+        held += found.low <= 0 <= found.high
+    assert held / 2000 == pytest.approx(0.95, abs=0.015)
+
+
+def test_a_missing_value_leaves_no_mean_and_a_missing_interval_leaves_the_mean_alone() -> None:
+    whole, alone = Estimate(0.2, 0.1, 0.3), Estimate(0.4, None, None)
+    assert mean_estimate([whole, NO_ESTIMATE]) == NO_ESTIMATE
+    found = mean_estimate([whole, alone])
+    assert (found.value, found.low, found.high) == (pytest.approx(0.3), None, None)
+
+
+def test_only_methods_with_a_row_in_every_scenario_are_listed_the_best_first() -> None:
+    one, two, other = "clbench/One-v0", "clbench/Two-v0", "clbench/One-v0+discrete_diffusion"
+    rows = [
+        _row(one, "good", 0.8),
+        _row(two, "good", 0.4, groups="b"),
+        _row(one, "missing", None),
+        _row(two, "missing"),
+        _row(one, "better", 0.8),
+        _row(two, "better", 0.6, to_criterion=False),
+        _row(one, "half", 1.0),
+        _row(other, "half", 1.0),  # another policy is no other scenario
+        _row(one, "reference", 0.9, division="reference"),
+        _row(two, "reference", 0.9, division="reference"),
+    ]
+    found = overall(rows)
+    assert [row.method for row in found] == ["better", "good", "missing", "reference"]
+    better, good, *_ = found
+    assert good.estimates["retention"].value == pytest.approx(0.6)
+    assert (good.scenarios, good.groups) == ((one, two), ("a", "b"))
+    assert (better.to_criterion, good.to_criterion) == (False, True)
+    assert overall([row for row in rows if row.scenario != two]) == ()

@@ -1,0 +1,362 @@
+"""The bars of the rules: a verdict changes exactly where the rule says, a thousandth on either side of it."""
+
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from clbench.base.entry_points import resolve
+from clbench.scoring.intervals import NO_ESTIMATE, Estimate
+
+CLAIMS = resolve("clbench.leaderboard.claims.judges:CLAIMS")
+Figure = resolve("clbench.leaderboard.claims.evidence:Figure")
+MODULE = "clbench.leaderboard.claims"
+
+Ends = tuple[float, float]
+Given = dict[str, Ends]
+
+
+class Stated:
+    """Evidence whose figures have stated intervals, by their names; all others are missing."""
+
+    scenario, not_used = "clbench/Toy-v0", ()
+
+    def __init__(self, given: Given, runs: dict[str, Any] | None = None) -> None:
+        self.given, self.runs, self.asked = given, runs or {}, set[str]()
+
+    def figure(self, what: str, quantity: Any, *methods: str, **_: Any) -> Any:
+        self.asked.add(what)
+        ends = self.given.get(what)
+        found = NO_ESTIMATE if ends is None else Estimate((ends[0] + ends[1]) / 2, *ends)
+        return Figure(what, tuple(dict.fromkeys(methods)), found, (0, 1, 2))
+
+    def metric(self, name: str, method: str, **_: Any) -> Any:
+        return self.figure(f"{name.replace('_', ' ')} of {method}", None, method)
+
+    def difference(self, name: str, method: str, other: str, **_: Any) -> Any:
+        return self.figure(f"{name.replace('_', ' ')}, {method} - {other}", None, method, other)
+
+    def pooled(self, method: str, what: str, *_: Any) -> Any:
+        return self.figure(what, None, method)
+
+    def diagnostic(self, method: str, what: str, *_: Any) -> Any:
+        return self.figure(what, None, method)
+
+    def cost(self, name: str, method: str, what: str, *_: Any) -> Any:
+        return self.figure(what, None, method)
+
+    def step_time(self, method: str) -> Any:
+        return self.figure(f"time of {method}", None, method)
+
+    def share_of_preparation(self, method: str) -> Any:
+        return self.figure(f"preparation of {method}", None, method)
+
+
+def judged(identifier: str, given: Given, runs: dict[str, Any] | None = None) -> Any:
+    """Return the finding on a claim, after a look whether its rule asks for what is given."""
+    evidence = Stated(given, runs)
+    finding = CLAIMS[identifier].judge(evidence)
+    assert given.keys() <= evidence.asked, given.keys() - evidence.asked
+    return finding
+
+
+def _shares(consft: float, calibrated: float) -> Given:
+    """Return the shares of the weights of both arms that differ between samples."""
+    what = "share of the weights of {} between 0.01 and 0.9, first nine tenths of the schedule"
+    return {
+        what.format(arm): (value, value)
+        for arm, value in (("consft", consft), ("consft_calibrated", calibrated))
+    }
+
+
+def _kept(consft: Ends, calibrated: Ends, other: str = "sft", rung: str = "") -> Given:
+    what = f"retained success, {{}}{rung} - {other}{rung}"
+    return {what.format("consft"): consft, what.format("consft_calibrated"): calibrated}
+
+
+BOTH = _shares(0.1, 0.1)
+SFT: Given = {"retention of sft": (0.1, 0.2), "retention of sft@1": (0.1, 0.2)}
+LESS = (0.1, 0.199)
+AT_ONE = _kept(LESS, LESS, rung="@1")
+DROP = "retained success, pretrained - sft after the last target"
+ANSWERS = "question accuracy, pretrained - {} after the last target"
+EARLY = "success on the targets, mean over the evaluated steps, stop_gradient - sft"
+LORA = ("lora", "lora+rank=4", "lora+rank=64")
+
+
+def _lora(answers: tuple[Ends, Ends, Ends], skills: Ends = (-0.04, 0.1)) -> Given:
+    found = {f"question retention, {label} - frozen": ends for label, ends in zip(LORA, answers, strict=True)}
+    return {**found, **{f"retention, {label} - frozen": skills for label in LORA}}
+
+
+def _drops(stop_gradient: Ends, sft: Ends = (0.011, 0.1)) -> Given:
+    return {ANSWERS.format("stop_gradient"): stop_gradient, ANSWERS.format("sft"): sft}
+
+
+def _costs(bytes_kept: float, added: float, time: Ends) -> Given:
+    return {
+        "bytes kept of consft": (bytes_kept, bytes_kept),
+        "parameters added of consft": (added, added),
+        "bytes kept of sft": (5, 5),
+        "parameters added of sft": (5, 5),
+        "time of consft": time,
+    }
+
+
+KEPT, LOST = (-0.009, 0.01), (-0.1, -0.011)
+CASES: list[tuple[str, str, Given]] = [
+    ("C1", "holds", {DROP: (0.051, 0.3)}),
+    ("C1", "undecided", {DROP: (0.049, 0.3)}),
+    ("C1", "undecided", {DROP: (0.0, 0.051)}),
+    ("C1", "does not hold", {DROP: (0.0, 0.049)}),
+    ("C2", "does not hold", {**BOTH, **SFT, **_kept(LESS, LESS), **AT_ONE}),
+    ("C2", "holds", {**BOTH, **SFT, **_kept(LESS, (0.2, 0.3)), **AT_ONE}),
+    ("C2", "undecided", {**BOTH, **SFT, **_kept(LESS, (0.199, 0.3)), **AT_ONE}),
+    ("C2", "holds in part", {**BOTH, **SFT, **_kept(LESS, LESS), **_kept((0.2, 0.3), LESS, rung="@1")}),
+    ("C2", "undecided", {**BOTH, **SFT, **_kept(LESS, LESS), **_kept((0.199, 0.3), LESS, rung="@1")}),
+    # an arm counts from a tenth of its weights on
+    ("C2", "does not hold", {**_shares(0.1, 0.099), **SFT, **_kept(LESS, (0.2, 0.3)), **AT_ONE}),
+    ("C2", "holds", {**_shares(0.1, 0.099), **SFT, **_kept((0.2, 0.3), LESS), **AT_ONE}),
+    ("C2", "cannot be shown here", {**_shares(0.099, 0.099), **SFT, **_kept((0.2, 0.3), LESS), **AT_ONE}),
+    # plain fine-tuning keeps too much at both settings
+    *[
+        (
+            "C2",
+            verdict,
+            {**BOTH, **_kept(LESS, LESS), **AT_ONE, "retention of sft": best, "retention of sft@1": at_one},
+        )
+        for best, at_one, verdict in (
+            ((0.801, 0.9), (0.801, 0.9), "cannot be shown here"),
+            ((0.801, 0.9), (0.799, 0.9), "does not hold"),
+            ((0.799, 0.9), (0.801, 0.9), "does not hold"),
+        )
+    ],
+    *[
+        (
+            "C3",
+            verdict,
+            {
+                **BOTH,
+                **_kept(first, (-0.3, -0.051), "experience_replay"),
+                **_kept(second, (-0.3, 0.1), "buffered_replay"),
+            },
+        )
+        for first, second, verdict in (
+            ((-0.05, 0.1), (-0.05, 0.1), "holds"),
+            ((-0.051, 0.1), (-0.05, 0.1), "undecided"),
+            ((-0.05, 0.1), (-0.051, 0.1), "undecided"),
+            ((-0.05, 0.1), (-0.3, -0.051), "does not hold"),
+            ((-0.05, 0.1), (-0.3, -0.049), "undecided"),
+        )
+    ],
+    *[
+        (
+            "C4",
+            verdict,
+            {
+                **BOTH,
+                "update sparsity, consft - sft": first,
+                "update sparsity, consft_calibrated - sft": second,
+                **({"update sparsity, l2_sp - sft": response} if response else {}),
+            },
+        )
+        for first, second, response, verdict in (
+            ((0.051, 0.2), (-0.1, 0.0), (0.0, 0.051), "holds"),
+            ((0.049, 0.2), (-0.1, 0.0), (0.0, 0.051), "undecided"),
+            ((-0.1, 0.049), (-0.1, 0.049), (0.0, 0.051), "does not hold"),
+            ((-0.1, 0.051), (-0.1, 0.049), (0.0, 0.051), "undecided"),
+            ((0.051, 0.2), (-0.1, 0.0), (0.0, 0.049), "cannot be shown here"),
+            ((0.051, 0.2), (-0.1, 0.0), None, "undecided"),  # whether the measure responds is not known
+            ((-0.1, 0.049), (-0.1, 0.049), None, "undecided"),
+        )
+    ],
+    ("C6", "holds", _costs(5, 5, (1.0, 1.05))),
+    ("C6", "undecided", _costs(5, 5, (1.0, 1.051))),
+    ("C6", "does not hold", _costs(5, 5, (1.051, 1.1))),
+    ("C6", "does not hold", _costs(6, 5, (1.0, 1.02))),
+    ("C6", "does not hold", _costs(5, 6, (1.0, 1.02))),
+    ("C6", "undecided", _costs(4, 5, (1.0, 1.02))),
+    *[
+        (
+            "C7",
+            verdict,
+            {**BOTH, "backward transfer of consft": first, "backward transfer of consft_calibrated": second},
+        )
+        for first, second, verdict in (
+            ((-0.1, 0.0), (-0.4, -0.2), "holds"),
+            ((-0.101, 0.0), (-0.4, -0.2), "undecided"),
+            ((-0.3, -0.101), (-0.4, -0.101), "does not hold"),
+            ((-0.3, -0.099), (-0.4, -0.101), "undecided"),
+        )
+    ],
+    *[
+        (
+            "C8",
+            verdict,
+            {
+                **BOTH,
+                "success on new targets, plain - perturbed, sft": loss,
+                "loss in perturbed episodes, sft - consft": first,
+                "loss in perturbed episodes, sft - consft_calibrated": second,
+            },
+        )
+        for loss, first, second, verdict in (
+            ((0.0, 0.049), (0.051, 0.1), (0.0, 0.0), "cannot be shown here"),
+            ((0.0, 0.051), (0.051, 0.1), (0.0, 0.0), "holds"),
+            ((0.0, 0.051), (0.049, 0.1), (0.0, 0.0), "undecided"),
+            ((0.0, 0.051), (0.0, 0.049), (0.0, 0.049), "does not hold"),
+            ((0.0, 0.051), (0.0, 0.051), (0.0, 0.049), "undecided"),
+        )
+    ],
+    ("A2", "holds", {**_drops((0.0, 0.009)), EARLY: (-0.2, -0.051)}),
+    ("A2", "undecided", {**_drops((0.0, 0.011)), EARLY: (-0.2, -0.051)}),
+    ("A2", "undecided", {**_drops((0.0, 0.009)), EARLY: (-0.2, -0.049)}),
+    ("A2", "does not hold", {**_drops((0.0, 0.009)), EARLY: (-0.049, 0.0)}),
+    ("A2", "does not hold", {**_drops((0.011, 0.1)), EARLY: (-0.2, -0.051)}),
+    ("A2", "cannot be shown here", {**_drops((0.0, 0.009), sft=(0.009, 0.1)), EARLY: (-0.2, -0.051)}),
+    ("A3", "holds", _lora((LOST, LOST, LOST))),
+    ("A3", "holds in part", _lora((LOST, LOST, (-0.1, -0.009)))),
+    ("A3", "holds in part", _lora((KEPT, KEPT, LOST))),
+    ("A3", "holds in part", _lora((KEPT, KEPT, KEPT), skills=(-0.2, -0.051))),
+    ("A3", "undecided", _lora((KEPT, KEPT, KEPT), skills=(-0.051, -0.049))),
+    ("A3", "does not hold", _lora((KEPT, KEPT, KEPT), skills=(-0.049, 0.0))),
+    ("A3", "undecided", _lora((KEPT, KEPT, (-0.011, 0.01)))),
+    *[
+        (
+            "A4",
+            verdict,
+            {"question retention, aegis - frozen": aegis, ANSWERS.format("sft"): sft},
+        )
+        for aegis, sft, verdict in (
+            ((-0.01, 0.0), (0.011, 0.1), "holds"),
+            ((-0.011, 0.0), (0.011, 0.1), "undecided"),
+            ((-0.1, -0.011), (0.011, 0.1), "does not hold"),
+            ((-0.01, 0.0), (0.009, 0.1), "cannot be shown here"),
+        )
+    ],
+    *[
+        ("A5", verdict, {"share of the energy that is shed, mean over steps, first stage": shed})
+        for shed, verdict in (
+            ((0.0, 0.0099), "holds"),
+            ((0.0, 0.0101), "undecided"),
+            ((0.0101, 0.1), "does not hold"),
+        )
+    ],
+    *[
+        ("A6", verdict, {"activation drift, aegis / sft": ratio})
+        for ratio, verdict in (
+            ((0.1, 0.499), "holds"),
+            ((0.1, 0.501), "undecided"),
+            ((0.501, 0.9), "does not hold"),
+        )
+    ],
+]
+
+
+@pytest.mark.parametrize(
+    ("identifier", "verdict", "given"), CASES, ids=[f"{case[0]}-{n}" for n, case in enumerate(CASES)]
+)
+def test_a_verdict_changes_at_the_bar_of_its_rule(identifier: str, verdict: str, given: Given) -> None:
+    assert judged(identifier, given).verdict == verdict
+
+
+@pytest.mark.parametrize(
+    ("uses", "time", "verdict"),
+    [
+        ("prepare", (1.2, 1.6), "holds"),
+        ("prepare", (1.2, 1.601), "undecided"),
+        ("prepare", (1.601, 1.8), "does not hold"),
+        ("throughout", (1.2, 1.3), "does not hold"),
+    ],
+)
+def test_the_cost_of_aegis_includes_a_buffer_in_any_run(uses: str, time: Ends, verdict: str) -> None:
+    read = [{"demonstrations": "never", "questions": one} for one in ("prepare", uses)]
+    record = [SimpleNamespace(run=SimpleNamespace(uses=one)) for one in read]
+    runs = {"aegis": {seed: SimpleNamespace(record=one) for seed, one in enumerate(record)}}
+    assert judged("A7", {"time of aegis": time}, runs).verdict == verdict
+
+
+def test_only_a_method_that_certainly_keeps_more_answers_than_plain_fine_tuning_is_said_to() -> None:
+    given = _lora(((-0.05, -0.02), (-0.04, -0.019), LOST))
+    given["question retention, sft - frozen"] = (-0.2, -0.045)
+    assert judged("A3", given).sentences == ("lora+rank=4: fewer answers are lost than with sft.",)
+
+
+# ---- claims of how fast a target is learned ----------------------------------------------------------------
+
+CO_TRAINING, SFT_STEPS = "co_training+step_factor=1.0", "steps to the criterion, {} / sft@1"
+RANDOM = "steps to the criterion, fast_dvla@1 / fast_dvla+direction=random+step_factor=1.0"
+WITHOUT = "steps to the criterion, fast_dvla@1 / fast_dvla+orthogonal=0.0+step_factor=1.0"
+HELPS: Given = {SFT_STEPS.format(CO_TRAINING): (0.5, 0.95)}
+NO_HELP: Given = {SFT_STEPS.format(CO_TRAINING): (0.951, 1.0)}
+VECTOR = SFT_STEPS.format("fast_dvla@1")
+FAST, SLOW, OPEN = (0.5, 0.949), (0.951, 1.2), (0.949, 0.951)
+
+
+@pytest.mark.parametrize(
+    ("identifier", "verdict", "given", "median"),
+    [
+        ("F1", "holds", {SFT_STEPS.format(CO_TRAINING): FAST, f"time of {CO_TRAINING}": (1.101, 1.2)}, 20),
+        (
+            "F1",
+            "holds in part",
+            {SFT_STEPS.format(CO_TRAINING): FAST, f"time of {CO_TRAINING}": (1.099, 1.2)},
+            20,
+        ),
+        ("F1", "does not hold", {SFT_STEPS.format(CO_TRAINING): SLOW}, 20),
+        ("F1", "undecided", {SFT_STEPS.format(CO_TRAINING): OPEN}, 20),
+        ("F1", "cannot be shown here", {SFT_STEPS.format(CO_TRAINING): FAST}, 19.5),
+        ("F2", "holds", {**HELPS, VECTOR: FAST, RANDOM: FAST}, 20),
+        ("F2", "undecided", {**HELPS, VECTOR: FAST, RANDOM: OPEN}, 20),
+        ("F2", "undecided", {**HELPS, VECTOR: OPEN, RANDOM: FAST}, 20),
+        ("F2", "does not hold", {**HELPS, VECTOR: SLOW, RANDOM: FAST}, 20),
+        ("F2", "does not hold", {**HELPS, VECTOR: FAST, RANDOM: SLOW}, 20),
+        ("F2", "cannot be shown here", {**NO_HELP, VECTOR: FAST, RANDOM: FAST}, 20),
+        ("F2", "cannot be shown here", {**HELPS, VECTOR: FAST, RANDOM: FAST}, 19.5),
+        ("F3", "holds", {**HELPS, WITHOUT: FAST}, 20),
+        ("F3", "undecided", {**HELPS, WITHOUT: OPEN}, 20),
+        ("F3", "does not hold", {**HELPS, WITHOUT: SLOW}, 20),
+        ("F3", "cannot be shown here", {**NO_HELP, WITHOUT: FAST}, 20),
+        ("F5", "holds", {**HELPS, RANDOM: FAST, VECTOR: SLOW}, 20),
+        ("F5", "undecided", {**HELPS, RANDOM: OPEN, VECTOR: FAST}, 20),
+        ("F5", "does not hold", {**HELPS, RANDOM: SLOW, VECTOR: FAST}, 20),
+        ("F5", "cannot be shown here", {**NO_HELP, RANDOM: FAST, VECTOR: FAST}, 20),
+    ],
+)
+def test_a_saving_of_steps_counts_from_a_twentieth_on(
+    identifier: str, verdict: str, given: Given, median: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stage = Figure("median", ("sft@1",), Estimate(median, None, None))
+    monkeypatch.setattr(f"{MODULE}.fast_dvla.median_stage", lambda *_: stage)
+    assert judged(identifier, given).verdict == verdict
+
+
+# ---- claims of a curve of answers --------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("curve", "end", "verdict"),
+    [
+        (((0.0, 0.1), (0.011, 0.1), (0.02, 0.1)), (0.02, 0.1), "holds"),
+        (((0.0, 0.1), (0.009, 0.1), (0.02, 0.1)), (0.011, 0.1), "holds in part"),
+        (((0.0, 0.1), (0.009, 0.1), (0.02, 0.1)), (0.009, 0.1), "undecided"),
+        (((0.0, 0.1), (0.009, 0.1), (0.0, 0.1)), (0.0, 0.009), "does not hold"),
+    ],
+)
+def test_answers_are_lost_rapidly_where_some_are_before_the_end_of_the_stage(
+    curve: tuple[Ends, ...], end: Ends, verdict: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def answers(evidence: Stated, method: str) -> list[Any]:
+        points = [Figure("a point", (method,), Estimate(ends[0], *ends), (0, 1)) for ends in curve]
+        return points if method == "sft" else []
+
+    monkeypatch.setattr(f"{MODULE}.aegis.answer_curve", answers)
+    monkeypatch.setattr(f"{MODULE}.aegis.learning_curve", lambda *_: ((25, 50, 100), [0.89, 0.9, 1.0]))
+    finding = judged("A1", {ANSWERS.format("sft"): end})
+    assert finding.verdict == verdict
+    lost = next((step for step, ends in zip((25, 50, 100), curve, strict=True) if ends[0] > 0.01), None)
+    says = (
+        "sft does the target in 0.9 of the episodes after 50 steps; it has certainly lost 0.01 of the "
+        f"answers after {lost} of 100 steps."
+    )
+    assert finding.sentences == ((says,) if lost else ())

@@ -1,0 +1,151 @@
+"""Figures of the claims against the records that they are computed from, by hand."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from claims_bench import Bench
+from helpers import set_in
+from scipy import stats
+
+from clbench.base.entry_points import resolve
+from clbench.records.paths import record_path
+from clbench.records.record import Record
+from clbench.records.writer import write_record
+from clbench.scoring.intervals import Estimate, interval_of_seeds
+from clbench.testing import TOY
+
+figures = {
+    name: resolve(f"clbench.leaderboard.claims.figures:{name}")
+    for name in (
+        "early_success",
+        "kept",
+        "learning_curve",
+        "median_stage",
+        "perturbation_gain",
+        "perturbation_loss",
+        "share_between",
+        "share_of_steps",
+    )
+}
+Figure = resolve("clbench.leaderboard.claims.evidence:Figure")
+best_first = resolve("clbench.leaderboard.claims.claim:best_first")
+what_would_change = resolve("clbench.leaderboard.claims.claim:what_would_change")
+
+
+@pytest.fixture
+def add(bench: Bench, make_record: Callable[..., Record]) -> Callable[..., None]:
+    """Return a function that adds a record of two skills and two targets, of the published order."""
+
+    def add(method: str, seed: int, success: Any, **options: Any) -> None:
+        record = make_record(success, groups=(2, 2, 1), method=method, seed=seed, **options)
+        write_record(record, record_path(bench.folder / "records", TOY.id, method, seed))
+
+    return add
+
+
+def test_the_ratio_of_steps_is_a_geometric_mean_in_which_no_step_counts_as_one(bench: Bench) -> None:
+    bench.add("fast_dvla", took=(0, 8))  # seed 0 takes a check longer: 2 steps
+    bench.add("sft", took=(4, 8))  # seed 1: 6 steps
+    evidence = bench.evidence()
+    found = figures["share_of_steps"](evidence, "fast_dvla", "sft")
+    ratios = [(2 / 4) * (8 / 8), (1 / 6) * (8 / 8), (1 / 4) * (8 / 8)]
+    assert found.value == pytest.approx(np.prod(ratios) ** (1 / 6))  # two targets, three seeds
+    assert figures["median_stage"](evidence, "sft").value == 7  # of 4, 4, 6, 8, 8 and 8
+
+
+def test_the_share_of_weights_leaves_out_both_ends_and_the_last_tenth(bench: Bench) -> None:
+    tables = {"1": [[1, 2, 3, 4, 90], [0, 50, 0, 0, 0]], "2": [[40, 0, 10, 0, 50], [0, 0, 0, 0, 9]]}
+    bench.add("consft", diagnostics={stage: {"omega_counts": table} for stage, table in tables.items()})
+    found = figures["share_between"](bench.evidence(), "consft")
+    assert found.value == pytest.approx((2 + 3 + 4 + 10) / 200)
+
+
+def test_the_curve_of_a_target_is_the_mean_of_the_seeds(bench: Bench, add: Callable[..., None]) -> None:
+    success = [[1, 1, 0, 0, 0], [1, 1, 1, 0, 0], [1, 1, 1, 1, 0]]
+    for seed, first in enumerate((0.2, 0.6)):
+        add("sft", seed, success, curves=[[first], [0.9]], steps=(50, 100))
+    steps, curve = figures["learning_curve"](bench.evidence(), "sft")
+    assert (steps, curve) == ((50, 100), pytest.approx([0.4, 1.0]))
+
+
+def test_early_success_is_the_mean_over_the_points_of_all_stages(
+    bench: Bench, add: Callable[..., None]
+) -> None:
+    success = [[1, 1, 0, 0, 0], [1, 1, 0.8, 0, 0], [1, 1, 1, 0.6, 0]]
+    for seed in range(2):
+        add("sft", seed, success, curves=[[0.4], [0.2]], steps=(50, 100))
+        add("stop_gradient", seed, success, curves=[[0.1], [0.1]], steps=(50, 100))
+    found = figures["early_success"](bench.evidence(), "stop_gradient", "sft")
+    assert found.value == pytest.approx((0.1 + 0.8 + 0.1 + 0.6) / 4 - (0.4 + 0.8 + 0.2 + 0.6) / 4)
+
+
+def test_the_loss_by_perturbation_is_that_from_what_was_learned(
+    bench: Bench, add: Callable[..., None]
+) -> None:
+    def success(learned: float) -> list[list[float]]:
+        return [[1, 1, 0, 0, 0], [1, 1, learned, 0, 0], [1, 1, 0, learned, 0]]
+
+    for seed in range(2):
+        for method, learned, displaced in (("sft", 1.0, (0.7, 0.6)), ("consft", 0.8, (0.6, 0.7))):
+            perturbed = {"perturbed": np.ones((3, 2)), "perturbed_learned": displaced}
+            add(method, seed, success(learned), **perturbed)
+    evidence = bench.evidence()
+    assert figures["perturbation_loss"](evidence, "sft").value == pytest.approx(1.0 - 0.65)
+    gain = figures["perturbation_gain"](evidence, "consft", "sft")
+    assert gain.value == pytest.approx((1.0 - 0.65) - (0.8 - 0.65))
+
+
+def test_a_difference_of_a_metric_may_be_twice_as_large_as_the_metric(
+    bench: Bench, add: Callable[..., None]
+) -> None:
+    # backward transfer 0, -0.5 and 0 against -1
+    for seed, earlier in enumerate((1.0, 0.5, 1.0)):
+        for method, kept in (("consft", earlier), ("sft", 0.0)):
+            add(method, seed, [[1, 1, 0, 0, 0], [1, 1, 1, 0, 0], [1, 1, kept, 1, 0]])
+    found = bench.evidence().difference("backward_transfer", "consft", "sft")
+    expected = interval_of_seeds(5 / 6, stats.sem([1.0, 0.5, 1.0]), 2, (-2.0, 2.0))
+    assert (found.low, found.high) == pytest.approx(expected)
+
+
+def test_a_preparation_is_a_share_of_all_steps(bench: Bench) -> None:
+    bench.add("fast_dvla", costs={"optimiser_steps": 400, "preparation_steps": 100})
+    assert bench.evidence().share_of_preparation("fast_dvla").value == 0.25
+
+
+def test_a_note_tells_the_settings_in_which_methods_differ(bench: Bench) -> None:
+    settings = {"replay": 0.9, "step_factor": 0.3, "other": 5}, {"tau_start": 0.03, "loss_scale": 0.01}
+    for method, values in zip(("stranger", "other"), settings, strict=True):
+        bench.add(method, edit=set_in("run", "settings", values))
+    found = figures["kept"](bench.evidence(), "stranger", "other")
+    assert found.note == "stranger: replay 0.9, step_factor 0.3; other: tau_start 0.03, loss_scale 0.01"
+
+
+def test_controls_of_another_simulator_than_the_boards_are_left_out(bench: Bench) -> None:
+    bench.add("aegis")
+    other = {"toy:world": "4567"}
+    bench.add("aegis+direction=random", edit=lambda record: record.fingerprint.update(rollouts=other))
+    evidence = bench.evidence()
+    assert list(evidence.runs) == ["aegis"]
+    assert {entry.reason for entry in evidence.not_used} == {
+        "it cannot be compared with the board: rollouts differ."
+    }
+
+
+def test_the_largest_figure_comes_first_and_a_missing_one_never_does() -> None:
+    small, large, missing = (
+        Figure(name, (), Estimate(value, None, None))
+        for name, value in (("small", -0.5), ("large", 0.5), ("missing", None))
+    )
+    assert best_first([missing, small, large]) == (large, missing, small)
+    assert best_first([missing, small]) == (small, missing)
+
+
+@pytest.mark.parametrize("distance", [0.15, 0.1, 0.05, 0.026, 0.0245])
+def test_the_seeds_that_would_decide_are_those_whose_interval_ends_at_the_bar(distance: float) -> None:
+    figure = Figure("a gain", (), Estimate(0.05 + distance, distance - 0.15, distance + 0.25), (0, 1, 2, 3))
+    deviation = 0.2 / stats.t.ppf(0.975, 3) * 2  # half of the width with 4 seeds is 0.2
+    halves = {n: stats.t.ppf(0.975, n - 1) * deviation / n**0.5 for n in range(4, 101)}
+    needed = next((f"about {n}" for n, half in halves.items() if half <= distance), "more than 100")
+    assert f"At this spread {needed} seeds: " in what_would_change(figure, 0.05)
