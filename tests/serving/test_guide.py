@@ -19,10 +19,10 @@ from helpers import blocks_of
 from served import SERVER
 
 from clbench.base.errors import ClbenchError, MissingPackageError
-from clbench.records.pinned import pinned
 from clbench.serving.client import ServedPolicy
+from clbench.spec.identifiers import scenario_ids
 from clbench.spec.protocol import Protocol
-from clbench.spec.registry import load_scenario
+from clbench.spec.registry import load_scenario, registered_scenario
 
 PAGE = Path(__file__).parents[2] / "docs" / "guide" / "external.md"
 SIZES, SERVED, LEROBOT, OPENPI, SCORED = blocks_of(PAGE, "python")
@@ -70,8 +70,10 @@ def test_the_policy_of_the_page_is_served_and_scored_by_its_commands(
 
 def test_the_page_lists_the_sizes_of_all_scenarios_that_retain_skills() -> None:
     shown = {f"clbench/{name}" for name, *_ in ROWS}
-    assert shown <= pinned().keys()
-    for name in pinned():
+    worlds = {name: registered_scenario(name).tasks[0].world for name in scenario_ids()}
+    ours = {name for name, world in worlds.items() if world.startswith("clbench.envs.")}
+    assert shown <= ours
+    for name in ours:
         with contextlib.suppress(MissingPackageError):
             assert (name in shown) == bool(load_scenario(name).retained)
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers import complete_record
+from helpers import complete_record, set_in
 
 from clbench.base.entry_points import resolve
 from clbench.records.record import Record
@@ -102,6 +102,14 @@ def test_steps_to_the_criterion_of_one_seed_have_no_interval(even_board: Callabl
     assert steps.value is not None
     assert (steps.low, steps.high) == (None, None)
     assert success.low < success.value < success.high
+
+
+def test_a_setting_that_older_records_lack_splits_no_row(add: Callable[..., Path], tmp_path: Path) -> None:
+    add("lora", 0, edit=set_in("run", "settings", {"rank": 16}))
+    add("lora", 1, edit=set_in("run", "settings", {"rank": 16, "speed": 3.0}))
+    board = compute_board(tmp_path / "leaderboard" / "records")
+    assert [(row.method, row.seeds) for row in board.rows] == [("lora", (0, 1))]
+    assert board.not_shown == ()
 
 
 # ---- rows as far as the functions read them ----------------------------------------------------------------
