@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 from rich.console import Console
 from rich.text import Text
 
-from clbench.base.errors import InputError
+from clbench.base.errors import InputError, MissingPackageError
 from clbench.cli.arguments import ScenarioId, add_cwd_to_path, check_names, checked_input, whole_number
 from clbench.records.paths import RECORDS, check_folder
 from clbench.spec.identifiers import folder_name, scenario_ids
@@ -109,7 +109,8 @@ def scenario_card(
     """Write the card of each of SCENARIOS: its tasks with pictures, and whether it tells methods apart.
 
     The command measures experts and draws pictures only where they are missing from the folder of the card.
-    Where no renderer works, a card lacks the missing pictures and reports it.
+    Where no renderer works, a card lacks the missing pictures and reports it. Unless it is named, a card whose
+    scenario lacks a package stays as it is.
 
     Args:
         scenarios: Gymnasium ids (default: all scenarios with records, or with a card in the folder).
@@ -123,6 +124,7 @@ def scenario_card(
     from .scenario_tasks import choose_renderer, make_missing, picture_path, undrawn
 
     add_cwd_to_path()
+    console = Console(stderr=True, soft_wrap=True)
     with checked_input():
         board = _board(records)
         names = scenarios or [
@@ -132,10 +134,16 @@ def scenario_card(
         ]
         if not names:
             raise InputError(f"No scenario has records in {records}. Name one, for example {SCENARIO}.")
-        loaded = [load_scenario(name) for name in names]
-    typed = {scenario.id: name for name, scenario in zip(names, loaded, strict=True)}
-    homes = {output / folder_name(scenario.id): scenario for scenario in loaded}
-    console = Console(stderr=True, soft_wrap=True)
+        typed, homes = {}, {}
+        for name in names:
+            try:
+                scenario = load_scenario(name)
+            except MissingPackageError as error:
+                if scenarios:
+                    raise
+                console.print(Text(f"The card of {name} stays as it is. {error.args[0]}"))
+                continue
+            typed[scenario.id], homes[output / folder_name(scenario.id)] = name, scenario
     fault = choose_renderer([task for home, scenario in homes.items() for task in undrawn(scenario, home)])
     if fault is not None:
         console.print(Text(f"No pictures are drawn; existing ones are kept. {fault}"))
