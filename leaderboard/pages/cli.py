@@ -17,6 +17,8 @@ from clbench.spec.identifiers import folder_name, scenario_ids
 from ..board.paths import CONTROLS, SCENARIO
 
 if TYPE_CHECKING:
+    from clbench.spec.scenario import Scenario
+
     from ..board.rows import Board
     from ..claims.evidence import Evidence
 
@@ -109,8 +111,8 @@ def scenario_card(
     """Write the card of each of SCENARIOS: its tasks with pictures, and whether it tells methods apart.
 
     The command measures experts and draws pictures only where they are missing from the folder of the card.
-    Where no renderer works, a card lacks the missing pictures and reports it. Unless it is named, a card whose
-    scenario lacks a package stays as it is.
+    Where no renderer works, a card lacks the missing pictures and reports it. Unless it is named, a card
+    whose scenario lacks a package stays as it is.
 
     Args:
         scenarios: Gymnasium ids (default: all scenarios with records, or with a card in the folder).
@@ -134,7 +136,8 @@ def scenario_card(
         ]
         if not names:
             raise InputError(f"No scenario has records in {records}. Name one, for example {SCENARIO}.")
-        typed, homes = {}, {}
+        typed: dict[str, str] = {}
+        homes: dict[Path, Scenario] = {}
         for name in names:
             try:
                 scenario = load_scenario(name)
