@@ -103,11 +103,11 @@ def read_unchanged(records: Path, inputs: dict[str, str]) -> Summary | None:
     """Return the numbers of the board, None unless every file of the site is whole and made from `inputs`."""
     site = site_of(records)
     try:
-        kept: dict[str, Any] = json.loads((site / NUMBERS).read_text(encoding="utf-8"))
-        files = {name: _text_hash((site / name).read_bytes()) for name in kept["files"]}
+        kept: dict[str, Any] = json.loads(read_regular(site / NUMBERS))
+        files = {name: _text_hash(read_regular(site / name)) for name in kept["files"]}
         whole = kept["files"] == files and kept["content"] == content_hash(kept)
         return Summary.from_json(kept["board"]) if whole and kept["made_from"] == inputs else None
-    except (OSError, ValueError, KeyError, TypeError, AttributeError):  # none yet, or damaged
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):  # none yet, or damaged
         return None
 
 

@@ -19,6 +19,7 @@ from safetensors import SafetensorError
 from clbench.base.errors import ClbenchError
 from clbench.base.lease import Lease
 from clbench.base.leftovers import finished_name, is_unfinished, unfinished
+from clbench.base.strict_json import read_json
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -146,7 +147,7 @@ def fault_of(folder: Path, inputs: Mapping[str, Any]) -> str | None:
 def _fault(folder: Path, key: str) -> str | None:
     """Return the fault of `folder`, or None."""
     try:
-        manifest = json.loads((folder / MANIFEST).read_text(encoding="utf-8"))
+        manifest = read_json(folder / MANIFEST)
         if manifest["inputs"] != key:
             return "was made from other inputs"
         if manifest["files"] != _file_hashes(folder):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import os
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -12,6 +13,8 @@ from typing import NamedTuple
 from filelock import SoftFileLease, Timeout
 
 from clbench.base.errors import ClbenchError
+from clbench.base.strict_json import OPEN_PLAINLY, read_json
+from clbench.base.text import printable
 
 SECONDS = 30.0
 """Seconds without a heartbeat after which another machine may take a lease over. The end of a process is
@@ -32,7 +35,7 @@ class Owner(NamedTuple):
     host: str
 
     def __str__(self) -> str:
-        return f"process {self.process} on {self.host}"
+        return f"process {self.process} on {printable(self.host)}"
 
 
 class Report(NamedTuple):
@@ -105,8 +108,13 @@ class Lease:
         if now - self._reported >= REPORT_SECONDS:
             self._reported = now
             text = json.dumps(Report(share, now - self._begin))
-            with contextlib.suppress(OSError):  # a full disk must not end the work
-                _report_path(self._path).write_text(text, encoding="utf-8")
+            # a full disk must not end the work, and a link must not lead it to another file
+            with contextlib.suppress(OSError):
+                flags = os.O_WRONLY | os.O_CREAT | os.O_TRUNC | OPEN_PLAINLY
+                with os.fdopen(
+                    os.open(_report_path(self._path), flags, 0o666), "w", encoding="utf-8"
+                ) as file:
+                    file.write(text)
 
     def clear(self) -> bool:
         """Remove the lease of a dead process, and its report; return whether nobody holds the lease."""
@@ -138,9 +146,9 @@ class Lease:
     def progress(self) -> Report | None:
         """The last report of the owner, None if there is none."""
         try:
-            share, seconds = json.loads(_report_path(self._path).read_text(encoding="utf-8"))
-            return Report(float(share), float(seconds))
-        except (OSError, ValueError, TypeError):
+            share, seconds = read_json(_report_path(self._path))
+            return Report(float(share), float(seconds)) if 0 <= share <= 1 and seconds >= 0 else None
+        except (ValueError, TypeError):
             return None
 
 

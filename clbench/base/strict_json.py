@@ -30,7 +30,7 @@ LARGEST = 2**64
 
 _SCALARS = {str, int, float, bool, type(None)}
 
-_PLAINLY = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
+OPEN_PLAINLY = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
 """Flags for opening a file: do not follow a link, and do not wait for a pipe without a writer."""
 
 
@@ -66,7 +66,7 @@ def read_regular(path: Path) -> bytes:
     """
     if path.is_symlink():
         raise StrictJSONError("is a symbolic link, which is not followed.")
-    with open(path, "rb", opener=lambda name, flags: os.open(name, flags | _PLAINLY)) as file:
+    with open(path, "rb", opener=lambda name, flags: os.open(name, flags | OPEN_PLAINLY)) as file:
         status = os.fstat(file.fileno())
         if not stat.S_ISREG(status.st_mode):
             raise StrictJSONError("is no regular file.")
@@ -124,12 +124,23 @@ def _check(where: str, value: Any, depth: int) -> None:
             _check_name(where, name)
             _check(where, entry, depth + 1)
     # the columns of a record are long and have few different values
-    elif set(map(type, value)) <= _SCALARS:
+    elif (kinds := set(map(type, value))) <= _SCALARS:
+        _check_range(where, value if kinds == {int} else [entry for entry in value if type(entry) is int])
         for entry in set(value):
             _check_scalar(where, entry)
     else:
         for entry in value:
             _check(where, entry, depth + 1)
+
+
+def _check_range(where: str, numbers: list[int]) -> None:
+    """Refuse numbers that are too large, before a set holds them.
+
+    Multiples of 2**61 - 1 have one hash: a set of 100,000 of them takes minutes. Below `LARGEST`, 16 at most
+    share a hash.
+    """
+    for one in (min(numbers), max(numbers)) if numbers else ():
+        _check_scalar(where, one)
 
 
 def _check_name(where: str, name: Any) -> None:

@@ -111,14 +111,14 @@ def _table(states: Sequence[RunState]) -> Table:
         table.add_column(name, justify="right", no_wrap=True)
     for folder in dict.fromkeys(state.path.parent for state in states):
         counts = Counter(state.state for state in states if state.path.parent == folder)
-        names = (escape(folder.parent.name), escape(folder.name))
+        names = (escape(printable(folder.parent.name)), escape(printable(folder.name)))
         table.add_row(*names, *(str(counts[name] or "") for name in shown))
     return table
 
 
 def _line(state: RunState, records: Path) -> str | None:
     """Return a line about a run that is running or that went wrong."""
-    name = state.path.relative_to(records).with_suffix("").as_posix()
+    name = printable(state.path.relative_to(records).with_suffix("").as_posix())
     if state.owner is not None:
         if state.progress is None:
             return f"{name}: begun by {state.owner}"

@@ -29,15 +29,13 @@ from clbench.cli.arguments import (
 from clbench.cli.runs import do_runs
 from clbench.jobs.folders import check_folders
 from clbench.records.paths import TUNING
+from clbench.spec.protocol import FIRST_TUNING_SEED
 from clbench.spec.references import BASELINE
 
 if TYPE_CHECKING:
     from clbench.learning.method import Method
     from clbench.runs.spec import ResolvedRun, RunSpec
     from clbench.runs.tuning import Settings, Tried, Tuned
-
-FIRST_SEED = 100
-"""First seed of tuning: no board has it or a later one."""
 
 
 def tune(
@@ -46,7 +44,7 @@ def tune(
     *methods: MethodName,
     every: Annotated[bool, Parameter(name="--all", negative="")] = False,
     seeds: Seeds = 2,
-    first_seed: Seed = FIRST_SEED,
+    first_seed: Seed = FIRST_TUNING_SEED,
     fixed: Annotated[dict[str, str] | None, Parameter(name="--set")] = None,
     values: dict[str, str] | None = None,
     targets: Annotated[int | None, whole_number(1)] = None,
@@ -104,9 +102,9 @@ def tune(
             raise InputError("--targets goes with --values: settings are chosen on all targets.")
         if write is not None and values:
             raise InputError("--write goes without --values: with them nothing is chosen.")
-        if write is not None and first_seed < FIRST_SEED:
+        if write is not None and first_seed < FIRST_TUNING_SEED:
             raise InputError(
-                f"--write needs seeds that no board has: --first-seed must be at least {FIRST_SEED}, not "
+                f"--write needs seeds that no board has: --first-seed must be at least {FIRST_TUNING_SEED}, not "
                 f"{first_seed}."
             )
         if fixed and values:

@@ -177,9 +177,14 @@ def dataset_folder(task: Task, budget: Budget, progress: ProgressCallback = no_p
         task: Task of the demonstrations.
         budget: Budget with the number of demonstrations.
         progress: Called with the number of episodes collected since its last call.
+
+    Raises:
+        InputError: The expert fails more often than it succeeds.
+        LeakError: The running hooks of a method must not read them.
     """
     from minari.storage.datasets_root_dir import get_dataset_path
 
+    check_demonstrations(task.name)
     name = dataset_id(task, budget)
     folder = get_dataset_path(name)
     _declare_namespaces(folder, name)

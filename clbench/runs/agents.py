@@ -42,6 +42,7 @@ from clbench.spec.identifiers import built_in_methods, check_method_name
 from clbench.spec.protocol import LARGEST_SEED, Protocol
 from clbench.spec.registry import load_scenario
 from clbench.spec.scenario import Scenario
+from clbench.worlds.schedule import is_whole
 
 LOG = logging.getLogger("clbench")
 
@@ -114,7 +115,7 @@ def evaluate_agent(
         raise WrongTypeError(
             f"{type(agent).__name__} is not an agent: it has no predict() and cannot be called."
         )
-    if steps is not None and (type(steps) is not int or steps < 0):
+    if steps is not None and (not is_whole(steps) or steps < 0):
         raise InputError(f"steps must be a whole number from 0, not {steps!r}.")
     run = StagedRun(scenario, method, seed, Path(records), USES)
     begin = time.perf_counter()
@@ -125,7 +126,7 @@ def evaluate_agent(
     with seeded("online evaluation", seed, stage):
         episodes = play(agent, scenario, run.trials(stage), seed, training.instruction, batched)
     run.report(record, stage, episodes)
-    run.count(record, stage, steps if steps is not None else training.steps or None, agent)
+    run.count(record, stage, int(steps) if steps is not None else training.steps or None, agent)
     run.time(record, trained, time.perf_counter() - begin)
     run.keep(record, stage)
     return record
@@ -185,8 +186,9 @@ class StagedRun:
                 f"{self.method!r} is a method of clbench: give your row its own name, "
                 f"for example 'me/{self.method}'."
             )
-        if type(self.seed) is not int or not 0 <= self.seed <= LARGEST_SEED:
+        if not is_whole(self.seed) or not 0 <= self.seed <= LARGEST_SEED:
             raise InputError(f"seed must be a whole number from 0 to {LARGEST_SEED}, not {self.seed!r}.")
+        object.__setattr__(self, "seed", int(self.seed))  # no record holds a number of NumPy
 
     @property
     def last(self) -> int:

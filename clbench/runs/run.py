@@ -76,6 +76,9 @@ def execute(
     path = resolved.path(Path(records).absolute())
     folder = _checkpoints(resolved, Path(records))
     kept, log = (None if one is None else Path(one).absolute() for one in (checkpoints, tensorboard))
+    for other in (kept, log):
+        if other is not None:
+            resolved.path(other)  # refuses a link that leads out of the folder before the run, not at its end
     lease = Lease(folder)
     with lease.held():
         with deterministic(resolved.spec.device):

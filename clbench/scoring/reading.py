@@ -66,7 +66,7 @@ def read_protocol(record: Record) -> Protocol:
             raise RecordError(f"scenario: {name} of its budget must be a whole number, not {count!r}.")
     # few rows may ask for more memory than there is
     check_cells("stages x points x tasks", len(scenario.target) + 1, len(scenario.evaluation_steps), tasks)
-    episodes = max(scenario.budget[name] for name in ("validation_episodes", "test_episodes"))
+    episodes = max(scenario.budget[f"{name}_episodes"] for name in ("validation", "test", "curve"))
     check_cells("tasks x episodes", tasks, episodes)
     criterion = scenario.budget.get("criterion")
     if criterion is None:

@@ -35,6 +35,9 @@ MOST_SEEDS = 10_000
 LARGEST_SEED = 2**64 - 1
 """The largest seed: PyTorch takes no larger one, and records hold no larger number."""
 
+FIRST_TUNING_SEED = 100
+"""First seed of tuning: no board has it or a later one."""
+
 EPISODE_WEIGHT = 0.3
 """Duration of an evaluation episode in optimiser steps, for the time left that a progress bar shows."""
 

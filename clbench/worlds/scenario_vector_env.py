@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from copy import copy
-from numbers import Integral
 from typing import Any
 
 import gymnasium
@@ -22,15 +21,11 @@ from clbench.spec.scenario import Scenario
 from clbench.spec.task import Task
 from clbench.worlds.lanes import Lanes
 from clbench.worlds.scenario_env import Observation
-from clbench.worlds.schedule import InstructionFormat, Schedule, Start
+from clbench.worlds.schedule import InstructionFormat, Schedule, Start, is_whole
 from clbench.worlds.threads import cores
 
 Flags = NDArray[np.bool_]
 Outcome = tuple[Observation, NDArray[np.float64], Flags, Flags, dict[str, Any]]
-
-
-def _is_whole(seed: object) -> bool:
-    return isinstance(seed, Integral) and not isinstance(seed, bool)
 
 
 class ScenarioVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]]):
@@ -143,10 +138,10 @@ class ScenarioVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]
     def _seeds(self, seed: Any) -> Sequence[int | None]:
         if seed is None:
             return [None] * self.num_envs
-        if _is_whole(seed):
+        if is_whole(seed):
             return range(int(seed), int(seed) + self.num_envs)
         seeds = list(seed) if np.iterable(seed) else [seed]
-        if not all(one is None or _is_whole(one) for one in seeds):
+        if not all(one is None or is_whole(one) for one in seeds):
             raise WrongTypeError(f"seed must be a whole number, or one per environment, not {seed!r}.")
         if len(seeds) != self.num_envs:
             raise InputError(f"{self.num_envs} environments need as many seeds, not {len(seeds)}.")
@@ -157,13 +152,17 @@ class ScenarioVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]
 
         Raises:
             ResetNeeded: There was no `reset` yet.
+            InputError: There is not one action for each environment.
         """
         if not self._starts:
             raise gymnasium.error.ResetNeeded(f"{self.scenario.id} has no episodes yet: call reset().")
+        actions, shape = np.asarray(actions), self.action_space.shape
+        if actions.shape != shape:  # NumPy would repeat a single action
+            raise InputError(f"The actions must have shape {shape}, not {actions.shape}: a row each.")
         if self._ended.any():
             rewards, terminated = self._step_some(actions)
         else:
-            self._states, rewards, terminated = self._lanes.step(self._everywhere, np.asarray(actions))
+            self._states, rewards, terminated = self._lanes.step(self._everywhere, actions)
             self._steps_left -= 1
             self.steps_taken += self.num_envs
         truncated = ~terminated & (self._steps_left <= 0)
@@ -175,7 +174,7 @@ class ScenarioVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]
         rewards, terminated = np.zeros(self.num_envs), np.zeros(self.num_envs, np.bool_)
         beginning, going = np.flatnonzero(self._ended).tolist(), np.flatnonzero(~self._ended).tolist()
         if going:
-            outcomes = self._lanes.step(going, np.asarray(actions)[going])
+            outcomes = self._lanes.step(going, actions[going])
             self._states[going], rewards[going], terminated[going] = outcomes
             self._steps_left[going] -= 1
             self.steps_taken += len(going)

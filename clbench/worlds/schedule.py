@@ -61,7 +61,7 @@ class Schedule:
     ) -> None:
         if instruction not in ("text", "tokens"):
             raise InputError(f'instruction must be "text" or "tokens", not {instruction!r}.')
-        if not _is_whole(episodes_per_stage) or episodes_per_stage < 1:
+        if not is_whole(episodes_per_stage) or episodes_per_stage < 1:
             raise InputError(
                 f"episodes_per_stage must be a whole number, at least 1, not {episodes_per_stage!r}."
             )
@@ -121,7 +121,7 @@ class Schedule:
     def _check_stage(self, stage: Any) -> None:
         """Refuse a stage that the scenario does not have, or that this schedule never reaches."""
         last = len(self._scenario.target)
-        if not _is_whole(stage) or stage not in range(self._first, last + 1):
+        if not is_whole(stage) or stage not in range(self._first, last + 1):
             raise InputError(f"{self._scenario.id} has stages {self._first} to {last}, not {stage!r}.")
         if self._stage not in (None, stage):
             raise InputError(
@@ -129,7 +129,7 @@ class Schedule:
             )
 
 
-def _is_whole(value: Any) -> bool:
+def is_whole(value: Any) -> bool:
     """Return whether a value is a whole number, of Python or of NumPy; True and 1.0 are none."""
     return isinstance(value, int | np.integer) and not isinstance(value, bool)
 

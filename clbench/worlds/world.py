@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from clbench.base.entry_points import resolve
 from clbench.base.errors import InputError
+from clbench.worlds.gl_backend import draw_without_display
 
 if TYPE_CHECKING:
     import mujoco
@@ -161,6 +162,7 @@ class MujocoWorld(OneLaneWorld):
 
     def picture(self) -> NDArray[np.uint8]:
         """Draw the scene, (480, 480, 3)."""
+        draw_without_display()
         from gymnasium.envs.mujoco.mujoco_rendering import MujocoRenderer  # only drawing needs MuJoCo here
 
         model, data, camera = self._world.drawable(0)

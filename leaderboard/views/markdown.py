@@ -121,12 +121,12 @@ def _escaped_unless_markdown(value: object) -> str:
 def escaped(text: str) -> Markdown:
     """Return `text`, which a stranger may have written, so that Markdown shows it as it is.
 
-    Backslashes go before every character that can open markup, HTML, a mention or a table cell, and into web
-    addresses.
+    Backslashes go before every character that can open markup, HTML, a formula, a mention or a table cell,
+    and into web addresses.
     """
     return Markdown(
         re.sub(
-            r"([\\`*_{}\[\]<>|~&@#]|(?<=:)/(?=/)|(?<=www)\.)", r"\\\1", printable(text), flags=re.IGNORECASE
+            r"([\\`*_{}\[\]<>|~&@#$]|(?<=:)/(?=/)|(?<=www)\.)", r"\\\1", printable(text), flags=re.IGNORECASE
         )
     )
 

@@ -112,3 +112,38 @@ def test_a_lease_whose_owner_is_on_another_machine_counts_while_it_is_fresh(tmp_
     long_ago = time.time() - 3 * leases.SECONDS
     os.utime(lease_path(tmp_path / "x"), (long_ago, long_ago))
     assert lease.owner is None
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "[" * 100_000,
+        "",
+        "{}",
+        "[0.5]",
+        "[NaN, 1]",
+        '["nan", 1]',
+        "[1.5, 1]",
+        "[0.5, -1]",
+        "[0.5, 1e999]",
+        '"ab"',
+    ],
+)
+def test_a_report_that_nobody_wrote_counts_as_none(text: str, tmp_path: Path) -> None:
+    (tmp_path / ".x.progress").write_text(text)
+    assert Lease(tmp_path / "x").progress is None
+
+
+def test_a_report_does_not_follow_a_link(tmp_path: Path) -> None:
+    (tmp_path / "mine").write_text("mine")
+    (tmp_path / ".x.progress").symlink_to(tmp_path / "mine")
+    lease = Lease(tmp_path / "x")
+    assert lease.take()
+    lease.report(0.5)
+    assert lease.progress is None
+    lease.release()
+    assert (tmp_path / "mine").read_text() == "mine"
+
+
+def test_the_name_of_an_owners_machine_controls_no_terminal() -> None:
+    assert str(leases.Owner(1, "\x1b[2Jhost")) == r"process 1 on \x1b[2Jhost"

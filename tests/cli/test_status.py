@@ -87,3 +87,13 @@ def test_a_long_reason_is_cut_and_names_the_record(
     (line,) = (line for line in capsys.readouterr().out.splitlines() if "failed, stage 1" in line)
     assert len(line) < 600
     assert line.endswith("xxx [... Toy-v0/frozen/seed-0.json has the rest]")
+
+
+def test_names_of_folders_control_no_terminal(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = tmp_path / "\x1b[2JToy" / "a[b]"
+    folder.mkdir(parents=True)
+    (folder / "seed-0.json").write_text("{", encoding="utf-8")
+    resolve("clbench.cli.status:status")(records=tmp_path)
+    shown = capsys.readouterr().out
+    assert "\x1b[2J" not in shown
+    assert r"\x1b[2JToy/a[b]/seed-0: damaged" in shown

@@ -14,7 +14,7 @@ TOY = "clbench.testing:clbench/Toy-v0"
 METHODS = '''
 import dataclasses
 
-from clbench.data.demonstrations import load_demonstrations
+from clbench.data.demonstrations import dataset_folder, load_demonstrations, read_dataset
 from clbench.evaluation.players import play
 from clbench.evaluation.rollouts import Evaluator
 from clbench.learning.method import Method
@@ -39,6 +39,15 @@ class Undeclared(Method):
 
     def start_task(self, policy, stage):
         load_demonstrations(TOY.retained[0], TOY, policy.config)
+        return policy.parameters()
+
+
+@dataclasses.dataclass
+class Direct(Method):
+    """It reads the folder of a later target's dataset."""
+
+    def start_task(self, policy, stage):
+        read_dataset(dataset_folder(TOY.target[-1], TOY.budget))
         return policy.parameters()
 
 
@@ -157,6 +166,7 @@ def _methods(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     ("method", "message"),
     [
         ("Ahead", "reads demonstrations of down, which its stage must not know yet"),
+        ("Direct", "reads demonstrations of down, which its stage must not know yet"),
         ("Undeclared", "reads demonstrations of left, which its `uses` does not declare"),
         ("Chooser", "runs test episodes of right: nothing may be chosen on them"),
         ("RobustChooser", "runs perturbed episodes of right: nothing may be chosen on them"),

@@ -20,6 +20,8 @@ pytest.importorskip("libero", reason="pip install 'clbench[libero]'")
 
 from clbench.base.entry_points import resolve
 from clbench.base.errors import InputError, UnknownNameError
+from clbench.evaluation.rules import rule_code
+from clbench.spec.registry import registered_scenario
 from clbench.worlds.lanes import vector_world
 
 WORLD = "clbench.envs.libero.world:LiberoWorld"
@@ -304,3 +306,9 @@ def test_the_experts_do_all_ten_tasks_of_a_suite(suite: str) -> None:
             break
     world.close()
     assert len(going) <= 1, sorted({tasks[lane] for lane in going})
+
+
+def test_the_rule_of_a_task_has_the_predicates_of_its_goal() -> None:
+    rule = rule_code(registered_scenario("clbench:clbench/LiberoGoal-v0").task(BOWL))
+    for part in ("def _on(", "def _touching(", "'is_open'"):
+        assert part in rule

@@ -49,6 +49,22 @@ def test_an_agent_has_its_own_division_and_takes_no_part_in_others(board: Path) 
         assert np.isnan(row[missing]), missing
 
 
+class Other(Knowing):
+    """Another agent, of which a name says nothing."""
+
+
+def test_two_agents_of_one_name_make_no_row_together(tmp_path: Path) -> None:
+    for seed, kind in enumerate((Knowing, Knowing, Other)):
+        for stage, known in enumerate(LEARNED):
+            evaluate_agent(
+                kind(*known), trained(stage, 7), method="me/knows", seed=seed, records=tmp_path / "records"
+            )
+    table = compute_board(tmp_path / "records")
+    assert [row.seeds for row in table.rows] == [(0, 1)]
+    (left,) = table.not_shown
+    assert "class of the agent differ" in left.reason
+
+
 def test_the_page_marks_an_agent_and_shows_no_run_command_for_it(
     board: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

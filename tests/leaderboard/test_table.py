@@ -30,6 +30,8 @@ def test_there_is_one_row_for_each_method_sorted_by_division_and_final_average(
         "reference",
     ]
     assert list(frame.seeds) == [1, 2, 2, 2, 2]
+    letters = frame.set_index("method").groups
+    assert letters[letters.isna()].index.tolist() == ["from_scratch"]  # a reference does not compete
 
 
 def test_a_row_has_every_metric_with_its_interval_and_the_costs(four_methods: Path) -> None:

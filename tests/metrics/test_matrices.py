@@ -101,6 +101,7 @@ def test_per_cent_are_recognised_and_can_be_declared() -> None:
         ([[0.9, 0.1, 0.1], [0.5, 1.05, 0.1], [0.4, 0.5, 0.9]], "stage 2, task 'task 2': found 1.05"),
         ([[0.9, 0.0, 0.0], [0.5, 85, 0.0], [0.4, 0.5, 0.9]], "stage 2, task 'task 2': found 85, and other"),
         ({"a": [[0.9, 0.0], [0.5, 1.0]], "b": [[90, 0], [50, 100]]}, "method 'b', stage 2, task 'task 2': f"),
+        ([[0.9, 0.1], [0.5, 1.001]], "stage 2, task 'task 2': found 1.001: is it a share above 1"),
         ([[1.5, 0.5], [0.5, 1.8]], "stage 2, task 'task 2': found 1.8: is it a share above 1, or per cent"),
     ],
 )
@@ -297,5 +298,6 @@ def test_the_front_door_leads_here() -> None:
 def test_a_mean_that_exceeds_1_in_its_last_bit_is_a_share() -> None:
     above = [[1.0, 0.5], [0.8, 1.0000000000000002]]
     assert from_matrix(above)["performance_continual_world"].value == pytest.approx(0.9)
+    assert from_matrix([[1.0000000000000002]])["final_average"].value == 1.0
     with pytest.raises(InputError, match="per cent"):
         from_matrix([[1.0, 0.5], [0.8, -0.1]], unit="percent")

@@ -326,6 +326,15 @@ def test_invalid_names_seeds_and_settings_are_refused(
         evaluate(Knowing(), stage_env(0), **options)
 
 
+def test_the_seed_and_the_steps_may_be_numbers_of_numpy(evaluate: Callable[..., Any]) -> None:
+    record = evaluate(Knowing(), stage_env(0), seed=np.int64(3), steps=np.uint32(5))
+    assert (type(record.run.seed), record.run.seed) == (int, 3)
+    assert record.costs.environment_steps == 5
+    for wrong in ({"seed": True}, {"seed": 1.0}, {"steps": np.float64(5)}, {"steps": True}):
+        with pytest.raises(ValueError, match="must be a whole number from 0"):
+            evaluate(Knowing(), stage_env(0), method="me/wrong", **wrong)
+
+
 def test_targets_in_another_order_are_refused(evaluate: Callable[..., Any]) -> None:
     with pytest.raises(ValueError, match="in order 1: agents are scored in order 0"):
         evaluate(Knowing(), gymnasium.make("clbench/Toy-v0", stage=0, order=1))

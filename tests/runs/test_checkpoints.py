@@ -16,6 +16,7 @@ import torch
 from tiny import TINY
 from torch import Tensor
 
+from clbench.base.errors import InputError
 from clbench.cli.runs import run
 from clbench.learning.method import Method, MethodState, Stage
 from clbench.learning.optimise import MethodError
@@ -114,6 +115,16 @@ def test_a_method_that_draws_from_global_generators_makes_the_same_policies_agai
     spec = RunSpec(TINY.id, stranger(Restless), seed=0, targets=1)
     execute(spec, tmp_path / "records", checkpoints=tmp_path)
     _assert_equal(stage_policies(spec.resolve(), tmp_path), stage_policies(spec.resolve()))
+
+
+@pytest.mark.parametrize("option", ["checkpoints", "tensorboard"])
+def test_a_link_that_leads_out_of_a_folder_is_refused_before_the_run(option: str, tmp_path: Path) -> None:
+    (tmp_path / "kept").mkdir()
+    SPEC.resolve().path(tmp_path / "kept").parents[1].symlink_to(tmp_path)
+    folders: dict[str, Path] = {option: tmp_path / "kept"}
+    with pytest.raises(InputError, match="leads out of"):
+        execute(SPEC, tmp_path / "records", **folders)
+    assert not (tmp_path / "records").exists()
 
 
 def test_a_killed_run_keeps_all_stages_once_it_has_finished(

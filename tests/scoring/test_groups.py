@@ -134,6 +134,47 @@ def test_a_row_that_varies_more_than_others_is_told_apart_less_easily() -> None:
     assert groups("final_average", board_of(row(0, 8, 1, 9, 2)))["last"] == "a"
 
 
+def test_a_row_that_varies_far_more_than_many_others_needs_its_own_error() -> None:
+    # 20 steady rows, and one whose seeds are 1 higher and lower in turn: differences have a variance of 4 / 3
+    steady = 0.01 * np.random.default_rng(0).standard_normal((20, 4))
+    noisy = np.array([1.0, -1.0, 1.0, -1.0])
+    factor = stats.studentized_range.ppf(0.95, 21, 60) / np.sqrt(2)
+    for lower, apart in ((0.9, False), (1.1, True)):
+        values = np.vstack([steady, noisy - lower * factor * np.sqrt(4 / 3 / 4)])
+        values = values[np.argsort(-values.mean(axis=1))]
+        found = told_apart(values, np.repeat(values[..., None], 2, axis=2))
+        assert found[-1, :-1].all() == found[-1, :-1].any() == apart
+
+
+def test_two_rows_without_a_common_seed_are_told_apart_as_by_students_test() -> None:
+    generator, agreed = np.random.default_rng(1), set()
+    for _ in range(60):
+        first, second = generator.normal(1.5, 1.0, 3), generator.normal(0.0, 1.0, 5)
+        if first.mean() < second.mean():
+            continue
+        values = np.full((2, 8), np.nan)
+        values[0, :3], values[1, 3:] = first, second
+        found = bool(told_apart(values, np.repeat(values[..., None], 2, axis=2))[0, 1])
+        assert found == (stats.ttest_ind(first, second).pvalue < 0.05)
+        agreed.add(found)
+    assert agreed == {True, False}
+
+
+def test_the_error_of_episodes_is_the_standard_error_of_their_paired_differences() -> None:
+    # outcomes of all tasks alike, so that an episode has one outcome
+    one, two = (
+        np.tile(outcomes, (3, 1)) for outcomes in ([1, 1, 1, 1, 0, 1, 0, 0], [1, 0, 0, 1, 0, 0, 1, 0])
+    )
+    error = stats.sem(one[0] - two[0])
+    seeds = {"one": dict.fromkeys(range(4), run(one)), "two": dict.fromkeys(range(4), run(two))}
+    needed = differences_needed("final_average", seeds, "one")
+    assert needed["two"] == pytest.approx(stats.t.ppf(0.975, 3) * error / np.sqrt(4))
+    # of one seed, another deviation of 0.2 is assumed for each row, beside that of its episodes
+    alone = differences_needed("final_average", {"one": {0: run(one)}, "two": {0: run(two)}}, "one")
+    of_episodes = (stats.sem(one[0]) ** 2 + stats.sem(two[0]) ** 2) / 2
+    assert alone["two"] == pytest.approx(1.95996 * np.sqrt(2 * (0.2**2 + of_episodes)), rel=1e-4)
+
+
 def test_seeds_that_agree_by_chance_do_not_split_rows_that_differ_in_one_episode() -> None:
     rows = {
         "all": row(10, 10, 10),

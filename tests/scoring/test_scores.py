@@ -393,3 +393,11 @@ def test_runs_of_different_layouts_do_not_mix(scores: Callable[..., Scores]) -> 
         rates_of([scores(MATRIX)], {"from_scratch": [scores(MATRIX, steps=(200,))]})
     with pytest.raises(ValueError, match="do not mix"):
         rates_of([scores(MATRIX, **ALL), scores(MATRIX, **ALL, validation_episodes=20)], {})
+
+
+@pytest.mark.parametrize("name", ["validation_episodes", "test_episodes", "curve_episodes"])
+def test_a_budget_that_would_take_all_memory_is_refused(name: str, make_record: MakeRecord) -> None:
+    record = make_record(MATRIX, groups=(2, 2, 1))
+    record.scenario.budget[name] = 10_001
+    with pytest.raises(RecordError, match="tasks x episodes are 5 x 10,001, and 20,000 are the most"):
+        Scores.from_record(record, partial=True)

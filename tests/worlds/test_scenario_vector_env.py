@@ -111,6 +111,10 @@ def test_wrong_calls_are_refused_by_name() -> None:
         env.step(env.action_space.sample())
     with pytest.raises(ValueError, match="2 environments need as many seeds, not 3"):
         env.reset(seed=[1, 2, 3])
+    env.reset(seed=0)
+    for actions in (env.single_action_space.sample(), env.action_space.sample()[:1]):
+        with pytest.raises(ValueError, match=r"The actions must have shape \(2, 2\), not .*: a row each"):
+            env.step(actions)
     with pytest.raises(LookupError, match="Did you mean 'left'"):
         env.reset(options={"task": "lefft"})
     with pytest.raises(ValueError, match="episodes_per_stage"):

@@ -38,7 +38,7 @@ def test_a_gain_over_a_tied_setting_is_that_over_plain_fine_tuning_there_on_comm
     for seed, kept in enumerate((0.2, 0.2, 0.5)):
         even_board("sft", seed, kept, "ladder", step_factor=0.3)
         even_board("sft", seed, 0.0, "ladder", step_factor=0.1)  # tuning's choice is on the board already
-        even_board("finch", seed, 0.9, "ladder", step_factor=0.3)
+        even_board("stop_gradient", seed, 0.9, "ladder", step_factor=0.3)
     runs = [read_run(records, path) for path in sorted(records.rglob("seed-*.json"))]
     ladder, _ = read_ladder(ladder_of(records))
     (one,) = tied_gains(SCENARIO, {"lora": {run.seed: run.scores for run in runs}}, ladder)["lora"]
@@ -55,6 +55,7 @@ def test_a_tied_setting_without_runs_shows_no_gain_that_would_be_certain(
 ) -> None:
     for seed in range(2):
         even_board("sft", seed, 0.1)
+        even_board("frozen", seed, 0.9)  # a reference, which does not compete
         records = even_board("lora", seed, 0.9)
     tied = compute_board(records).tied[SCENARIO]
     assert set(tied) == {"lora"}

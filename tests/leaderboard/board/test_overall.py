@@ -64,23 +64,21 @@ def test_a_missing_value_leaves_no_mean_and_a_missing_interval_leaves_the_mean_a
 
 
 def test_only_methods_with_a_row_in_every_scenario_are_listed_the_best_first() -> None:
-    one, two, other = "clbench/One-v0", "clbench/Two-v0", "clbench/One-v0+discrete_diffusion"
+    names = one, two, three = "clbench/One-v0", "clbench/Two-v0", "clbench/Three-v0"
+    finals = {"good": (0.8, 0.4, 0.6), "missing": (0.9, None, 0.9), "better": (0.8, 0.6, 0.7)}
     rows = [
-        _row(one, "good", 0.8),
-        _row(two, "good", 0.4, groups="b"),
-        _row(one, "missing", None),
-        _row(two, "missing"),
-        _row(one, "better", 0.8),
-        _row(two, "better", 0.6, to_criterion=False),
-        _row(one, "half", 1.0),
-        _row(other, "half", 1.0),  # another policy is no other scenario
-        _row(one, "reference", 0.9, division="reference"),
-        _row(two, "reference", 0.9, division="reference"),
+        _row(name, method, final, groups="b" if name == two else "a")
+        for method, values in finals.items()
+        for name, final in zip(names, values, strict=True)
     ]
+    rows += [_row(name, "reference", 0.9, division="reference") for name in names]
+    rows += [_row(name, "two of three", 1.0) for name in (one, two)]
+    rows += [_row(f"{three}+discrete_diffusion", "two of three", 1.0)]  # another policy is no scenario
+    rows[-6] = dataclasses.replace(rows[-6], to_criterion=False)  # the reference, in the first scenario
     found = overall(rows)
     assert [row.method for row in found] == ["better", "good", "missing", "reference"]
-    better, good, *_ = found
+    assert [row.to_criterion for row in found] == [True, True, True, False]
+    good = found[1]
     assert good.estimates["retention"].value == pytest.approx(0.6)
-    assert (good.scenarios, good.groups) == ((one, two), ("a", "b"))
-    assert (better.to_criterion, good.to_criterion) == (False, True)
-    assert overall([row for row in rows if row.scenario != two]) == ()
+    assert (good.scenarios, good.groups) == (names, ("a", "b", "a"))
+    assert overall([row for row in rows if row.scenario == one]) == ()

@@ -12,11 +12,14 @@ from helpers import complete_record, set_in
 from clbench.base.entry_points import resolve
 from clbench.records.record import Record
 from clbench.records.writer import record_text
+from clbench.scoring.groups import groups
 
 agreement = resolve("clbench.leaderboard.board.rows:agreement")
 apart_from_baseline = resolve("clbench.leaderboard.board.rows:apart_from_baseline")
 compute_board = resolve("clbench.leaderboard.board.rows:compute_board")
 costs_of = resolve("clbench.leaderboard.board.costs:costs_of")
+division_of = resolve("clbench.leaderboard.board.runs:division_of")
+no_row = resolve("clbench.leaderboard.board.runs:no_row")
 pretrained_success = resolve("clbench.leaderboard.board.rows:pretrained_success")
 standing_of = resolve("clbench.leaderboard.board.rows:standing_of")
 values_by_seed = resolve("clbench.leaderboard.board.rows:values_by_seed")
@@ -182,6 +185,51 @@ def test_a_method_is_not_tested_together_with_those_that_may_look_at_more(
     assert apart_from_baseline([sft, lora, *others]) == {"lora"}
 
 
+def test_a_method_that_shares_a_letter_with_plain_fine_tuning_is_not_apart_from_it(
+    scores: Callable[..., Any],
+) -> None:
+    # the row between the others is like both, which are not like each other
+    successes = {"high": (8, 7, 9, 8), "sft": (6, 7, 6, 7), "low": (5, 4, 5, 6)}
+    rows = [
+        _row(
+            name,
+            {
+                seed: scores(np.full((2, 5), count / 10), groups=(3, 1, 1), episodes=10)
+                for seed, count in enumerate(counts)
+            },
+        )
+        for name, counts in successes.items()
+    ]
+    assert groups("final_average", {row.method: row.scores for row in rows}) == {
+        "high": "a",
+        "sft": "ab",
+        "low": "b",
+    }
+    assert apart_from_baseline(rows) == set()
+
+
+@pytest.mark.parametrize(
+    ("demonstrations", "questions", "reference", "division"),
+    [
+        ("never", "never", False, "prior-data-free"),
+        ("never", "prepare", False, "prior questions"),
+        ("throughout", "never", False, "prior demonstrations"),
+        ("prepare", "throughout", False, "prior demonstrations"),  # of both, what tells more counts
+        ("prepare", "throughout", True, "reference"),
+    ],
+)
+def test_a_method_competes_with_those_that_may_look_at_as_much(
+    demonstrations: str, questions: str, reference: bool, division: str
+) -> None:
+    uses = {"demonstrations": demonstrations, "questions": questions, "reference": reference}
+    assert division_of(uses) == division
+
+
+def test_a_page_of_a_reason_is_cut() -> None:
+    assert no_row("a", "x" * 300).reason == "x" * 300
+    assert no_row("a", "x" * 301).reason == "x" * 300 + "…"
+
+
 # ---- policies that were trained elsewhere ------------------------------------------------------------------
 
 
@@ -221,6 +269,8 @@ def test_a_policy_trained_elsewhere_has_a_row_with_every_seed(
         "sft": (0, 1, 2, 3),
         "me/elsewhere": (0, 1, 2, 3),
     }
+    gains = {row.method: row.estimates["gain"].value for row in table.rows}
+    assert gains == {"sft": 0, "me/elsewhere": None}  # it had other data, and is compared with nothing
 
 
 def test_a_policy_trained_elsewhere_has_no_learning_curve_where_stages_end_at_a_criterion(
@@ -229,6 +279,12 @@ def test_a_policy_trained_elsewhere_has_no_learning_curve_where_stages_end_at_a_
     (row,) = compute_board(add_elsewhere(0)).rows
     assert row.estimates["forward_transfer_libero"].value is None
     assert row.estimates["area_under_curve_libero"].value is None
+
+
+def test_an_episode_of_a_tuning_seed_makes_no_row(add_elsewhere: Callable[..., Path]) -> None:
+    table = compute_board(add_elsewhere(100))
+    assert table.rows == ()
+    assert "seeds from 100 are for tuning" in table.not_shown[0].reason
 
 
 def test_a_policy_trained_elsewhere_cannot_have_checks(add_elsewhere: Callable[..., Path]) -> None:

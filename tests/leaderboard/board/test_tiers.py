@@ -9,11 +9,33 @@ import pytest
 
 from clbench.base.entry_points import resolve
 
+compute_board = resolve("clbench.leaderboard.board.rows:compute_board")
 TIERS = "clbench.leaderboard.board.tiers"
 tier_of, checks_of = resolve(f"{TIERS}:tier_of"), resolve(f"{TIERS}:checks_of")
 verification_path, verification_text = (
     resolve(f"{TIERS}:{name}") for name in ("verification_path", "verification_text")
 )
+
+
+@pytest.mark.parametrize(
+    ("tiers", "lowest"),
+    [
+        (("replayed", "retrained"), "replayed"),
+        (("retrained", "recomputed"), "recomputed"),
+        (("retrained", None), "self-reported"),
+    ],
+)
+def test_a_row_has_the_lowest_tier_of_its_runs(
+    tiers: tuple[str, str | None], lowest: str, add: Callable[..., Path], tmp_path: Path
+) -> None:
+    for seed, tier in enumerate(tiers):
+        record = add(seed=seed)
+        if tier:
+            content = hashlib.sha256(record.read_bytes()).hexdigest()
+            values = {"tier": tier, "record": content, "checks": []}
+            verification_path(record).write_text(verification_text(values), encoding="utf-8")
+    (row,) = compute_board(tmp_path / "leaderboard" / "records").rows
+    assert row.tier == lowest
 
 
 @pytest.mark.parametrize("checks", [5, None, "all"])

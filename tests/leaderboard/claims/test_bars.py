@@ -242,6 +242,9 @@ CASES: list[tuple[str, str, Given]] = [
             ((0.0101, 0.1), "does not hold"),
         )
     ],
+    ("F4", "holds", {"time of fast_dvla": (1.0, 1.05)}),
+    ("F4", "undecided", {"time of fast_dvla": (1.0, 1.051)}),
+    ("F4", "does not hold", {"time of fast_dvla": (1.051, 1.1)}),
     *[
         ("A6", verdict, {"activation drift, aegis / sft": ratio})
         for ratio, verdict in (

@@ -114,3 +114,11 @@ def test_web_addresses_of_strangers_are_no_links(
     _, page = shown()
     assert "://" not in page
     assert "www." not in page
+
+
+def test_a_formula_of_a_stranger_is_no_formula(
+    add_full: Callable[..., Path], shown: Callable[[], tuple[str, str]]
+) -> None:
+    add_full("sft", 7, edit=set_in("run", "changes", {"$x$": 1}))
+    _, page = shown()
+    assert r"\$x\$" in page
