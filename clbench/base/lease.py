@@ -108,12 +108,10 @@ class Lease:
         if now - self._reported >= REPORT_SECONDS:
             self._reported = now
             text = json.dumps(Report(share, now - self._begin))
-            # a full disk must not end the work, and a link must not lead it to another file
-            with contextlib.suppress(OSError):
-                flags = os.O_WRONLY | os.O_CREAT | os.O_TRUNC | OPEN_PLAINLY
-                with os.fdopen(
-                    os.open(_report_path(self._path), flags, 0o666), "w", encoding="utf-8"
-                ) as file:
+            flags = os.O_WRONLY | os.O_CREAT | os.O_TRUNC | OPEN_PLAINLY  # a link leads to another file
+            with contextlib.suppress(OSError):  # a full disk must not end the work
+                descriptor = os.open(_report_path(self._path), flags, 0o666)
+                with open(descriptor, "w", encoding="utf-8") as file:
                     file.write(text)
 
     def clear(self) -> bool:

@@ -104,8 +104,8 @@ def tune(
             raise InputError("--write goes without --values: with them nothing is chosen.")
         if write is not None and first_seed < FIRST_TUNING_SEED:
             raise InputError(
-                f"--write needs seeds that no board has: --first-seed must be at least {FIRST_TUNING_SEED}, not "
-                f"{first_seed}."
+                f"--write needs seeds that no board has: --first-seed must be at least {FIRST_TUNING_SEED}, "
+                f"not {first_seed}."
             )
         if fixed and values:
             raise InputError("--set goes without --values: give the value as --values.NAME.")
