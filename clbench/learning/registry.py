@@ -127,9 +127,11 @@ def _held(name: str, value: Any, hint: Any) -> Any:
     if type(value) is int and float in kinds and int not in kinds:
         return float(value)
     choices = _choices(kinds)
-    if choices and value not in choices and (NoneType not in kinds or value is not None):
-        raise InputError(f"{name} must be {_words(kinds)}, not {value!r}.")
-    if all(kind in WORDS for kind in kinds) and type(value) not in kinds:
+    if choices:
+        fits = value in choices or (value is None and NoneType in kinds)
+    else:
+        fits = type(value) in kinds or any(kind not in WORDS for kind in kinds)
+    if not fits:
         raise InputError(f"{name} must be {_words(kinds)}, not {value!r}.")
     return value
 

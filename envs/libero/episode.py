@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .arm import JOINTS as ARM_JOINTS
-from .arm import SUBSTEPS, Arm
+from .arm import Arm
 from .problem import Problem
 from .scene import HIDDEN, SEEN, Places
 from .state import CLOSE_BY, FINGERS, HAND, HAND_QUATERNION, JOINTS, PLACES, REACH, SIZE, State
@@ -105,10 +105,7 @@ class Episode:
     def move(self) -> None:
         """Advance the physics by `action`; several threads may do so at once, each for another episode."""
         model = self._placed()
-        for substep in range(SUBSTEPS):
-            mujoco.mj_step1(model, self.data)
-            self._arm.drive(model, self.action, is_new=substep == 0)
-            mujoco.mj_step2(model, self.data)
+        self._arm.move(model, self.action)
         self.problem.scene.models.give_back(model)
 
     def state(self) -> State:
