@@ -49,17 +49,19 @@ def _compiled_physics() -> tuple[Any, ...]:
 
     In compiled code, an error of MuJoCo ends the process; from Python it would raise.
     """
-    from llvmlite.binding import load_library_permanently  # robosuite's, which `original` finds or asks for
-    from numba.types import ExternalFunction, int32, uintp, void
+    import numba  # robosuite brings it, which `original` finds or asks for
+    from llvmlite.binding import load_library_permanently
 
+    types: Any = numba.types
     folder = Path(mujoco.__file__).parent
     (library,) = [*folder.glob("libmujoco.*"), *folder.glob("mujoco.dll")]
     load_library_permanently(str(library))  # Python's functions call the same one
+    both, address = (types.uintp, types.uintp), types.uintp
     return (
-        ExternalFunction("mj_step1", void(uintp, uintp)),
-        ExternalFunction("mj_step2", void(uintp, uintp)),
-        ExternalFunction("mj_fullM", void(uintp, uintp, uintp)),
-        ExternalFunction("mj_jacSite", void(uintp, uintp, uintp, uintp, int32)),
+        types.ExternalFunction("mj_step1", types.void(*both)),
+        types.ExternalFunction("mj_step2", types.void(*both)),
+        types.ExternalFunction("mj_fullM", types.void(*both, address)),
+        types.ExternalFunction("mj_jacSite", types.void(*both, address, address, types.int32)),
     )
 
 
@@ -223,7 +225,7 @@ class Arm:
         self._goal = sensed.place + displacement[:3]
         if displacement[3:].any():  # robosuite keeps the goal of an earlier action otherwise
             self._goal_axes = set_goal_orientation(displacement[3:], sensed.axes)
-        aim = self._bias, self._goal, self._goal_axes, self._closing, float(np.sign(action[6]))
-        _drive(sensed, *aim, self._limits, self._controls)
-        addresses = model._address, self._data._address
-        _finish(*addresses, self._site, self._now, *aim, self._limits, self._controls)
+        aim: tuple[Any, ...] = self._goal, self._goal_axes, self._closing, float(np.sign(action[6]))
+        rest = self._bias, *aim, self._limits, self._controls
+        _drive(sensed, *rest)
+        _finish(model._address, self._data._address, self._site, self._now, *rest)
