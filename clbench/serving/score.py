@@ -5,6 +5,7 @@ Its record has the division `external`: how the policy was trained is declared b
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import math
 import time
@@ -20,8 +21,9 @@ from clbench.base.seeding import seeded
 from clbench.base.text import printable
 from clbench.evaluation.players import ChunkPlay, ChunkPolicy, play_chunks
 from clbench.records.paths import RECORDS
+from clbench.records.reader import RecordError, read_record
 from clbench.records.record import Record
-from clbench.runs.agents import StagedRun
+from clbench.runs.agents import UNFINISHED, StagedRun
 from clbench.spec.registry import load_scenario
 
 LOG = logging.getLogger("clbench")
@@ -128,6 +130,14 @@ def score(
             stage - 1,
             described(server),
         )
+    same = _seeds_of(server, run, stage) if server and stage else []
+    if same:
+        LOG.warning(
+            "The server says the same about itself as with seed %s in this stage (%s): fine-tune once for "
+            "each seed. Seeds of one checkpoint differ in initial states alone.",
+            ", ".join(map(str, same)),
+            described(server),
+        )
     trials = run.trials(stage)
     with seeded("external evaluation", seed, stage):
         played = play_chunks(
@@ -151,6 +161,17 @@ def score(
     run.time(record, None, time.perf_counter() - begin)
     run.keep(record, stage)
     return record
+
+
+def _seeds_of(server: Mapping[str, Any], run: StagedRun, stage: int) -> list[int]:
+    """Return the other seeds of a row whose server said the same about itself in a stage."""
+    found = set()
+    for path in (*run.path.parent.glob("seed-*.json"), *run.path.parent.glob(f"seed-*.json{UNFINISHED}")):
+        with contextlib.suppress(RecordError):  # the board names a damaged one
+            record = read_record(path)
+            if record.diagnostics.get(str(stage), {}).get("server") == server:
+                found.add(record.run.seed)
+    return sorted(found - {run.seed})
 
 
 def described(server: Mapping[str, Any]) -> str:

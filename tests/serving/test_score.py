@@ -374,6 +374,19 @@ def test_a_server_that_says_the_same_as_in_the_stage_before_is_suspected(
     ]
 
 
+def test_a_checkpoint_that_was_scored_with_another_seed_is_no_second_training(
+    run: Callable[..., Record], caplog: pytest.LogCaptureFixture
+) -> None:
+    for seed, checkpoints in ((0, "abc"), (1, "ade"), (2, "ad")):  # all begin with one pretrained policy
+        for stage, checkpoint in enumerate(checkpoints):
+            assert not caplog.messages
+            run(Describing(stage, {"checkpoint": checkpoint}), stage, seed=seed)
+    (message,) = caplog.messages
+    assert message.startswith(
+        "The server says the same about itself as with seed 1 in this stage (checkpoint d)"
+    )
+
+
 @pytest.mark.parametrize(
     ("chunks", "executed", "message"),
     [
