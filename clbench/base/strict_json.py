@@ -14,7 +14,7 @@ from clbench.base.errors import ClbenchError, InputError
 from clbench.base.text import quoted
 
 MOST_BYTES = 8 * 2**20
-"""Size limit of a file. A record of Fetch-v1 has 0.1 MB; 8 MB of brackets take 0.3 GB of memory and 3 s."""
+"""Size limit of a file. A record of Fetch-v1 has 0.07 MB; 8 MB of brackets take 0.3 GB of memory and 3 s."""
 
 DEEPEST = 16
 """Nesting limit of lists and objects. Records have 5 levels."""

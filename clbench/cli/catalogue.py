@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, requires, version
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from cyclopts import Parameter
 from rich.console import Console
@@ -20,6 +20,7 @@ from clbench import __version__
 from clbench.base.errors import InputError
 from clbench.base.text import printable
 from clbench.cli.arguments import AsJson, checked_input, print_json
+from clbench.records.tables import GROUPS
 
 if TYPE_CHECKING:
     from packaging.requirements import Requirement
@@ -34,23 +35,16 @@ def list_(*, as_json: AsJson = False) -> None:
     Args:
         as_json: Print one JSON object with both, and no tables.
     """
-    from clbench.spec.identifiers import scenario_ids
-    from clbench.spec.registry import registered_scenario
-
-    found = [registered_scenario(name) for name in scenario_ids()]
-    groups = ("retained", "target", "held_out")
-    scenarios = [
-        {"id": one.id, **{group: [task.name for task in getattr(one, group)] for group in groups}}
-        for one in found
-    ]
-    methods = _methods()
+    scenarios, methods = _scenarios(), _methods()
     if as_json:
         print_json({"scenarios": scenarios, "methods": methods})
         return
     console = Console()
     for values in scenarios:
-        names = {group.replace("_", " "): ", ".join(values[group]) for group in groups if values[group]}
-        _print_entries(console, str(values["id"]), names)
+        names = {group.replace("_", " "): ", ".join(values[group]) for group in GROUPS if values[group]}
+        if values["fault"] is not None:
+            names = {"cannot be loaded:": values["fault"]}
+        _print_entries(console, values["id"], names)
     by_data: dict[str, dict[str, str]] = {}
     for method in methods:
         by_data.setdefault(_prior_data(method), {})[str(method["name"])] = str(method["summary"])
@@ -76,6 +70,23 @@ def _prior_data(method: Mapping[str, str | None]) -> str:
     times = {"prepare": "before the first target", "throughout": "throughout"}
     used = [f"prior {kind} {times[when]}" for kind, when in kinds.items() if when in times]
     return " and ".join(used) or "no prior data"
+
+
+def _scenarios() -> list[dict[str, Any]]:
+    """Return the registered scenarios with their tasks; those that cannot be loaded have a fault instead."""
+    from clbench.spec.identifiers import scenario_ids
+    from clbench.spec.registry import registered_scenario
+
+    found: list[dict[str, Any]] = []
+    for name in scenario_ids():
+        values: dict[str, Any] = {"id": name, **dict.fromkeys(GROUPS), "fault": None}
+        try:
+            one = registered_scenario(name)
+            values |= {group: [task.name for task in getattr(one, group)] for group in GROUPS}
+        except Exception as error:  # a broken plug-in must not hide the others
+            values["fault"] = printable(str(error))
+        found.append(values)
+    return found
 
 
 def _methods() -> list[dict[str, str | None]]:
@@ -143,8 +154,8 @@ def metrics(
             raise InputError("--retained, --target, --held-out and --unit need a CSV file.")
         metric = load_metric(name) if name else None
     if markdown:
-        markdown.parent.mkdir(parents=True, exist_ok=True)
-        markdown.write_text(metric_pages.page(), encoding="utf-8", newline="\n")
+        with checked_input():
+            _write_page(markdown, metric_pages.page())
     elif as_json:
         chosen = [metric] if metric else METRICS.values()
         print_json([{"name": one.name, "description": one.description, **facts(one)} for one in chosen])
@@ -152,6 +163,19 @@ def metrics(
         console.print(metric_pages.text(metric), end="", soft_wrap=True, highlight=False, markup=False)
     else:
         console.print(metric_pages.listing(), highlight=False)
+
+
+def _write_page(path: Path, text: str) -> None:
+    """Write a page.
+
+    Raises:
+        InputError: The file system refuses.
+    """
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text, encoding="utf-8", newline="\n")
+    except OSError as error:
+        raise InputError(f"{path} cannot be written: {error.strerror}.") from error
 
 
 def doctor(*, as_json: AsJson = False) -> None:

@@ -194,7 +194,7 @@ def pretrain(
             raise InputError("--ship needs a checkout of clbench: it does not change an installed package.")
         policy_class(loaded.policy)
     length = loaded.budget.pretraining_steps + vision_steps(loaded)
-    with Bars(length) as bars:
+    with checked_input(), Bars(length) as bars:  # an expert may fail, the disk may be full
         name = f"{loaded.id} pretraining seed {seed}"
         bars.start(name, length)
         _, folder = pretrained_policy(loaded, seed, lambda steps: bars.advance(name, steps))

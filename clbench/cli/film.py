@@ -23,6 +23,7 @@ from clbench.cli.arguments import (
     whole_number,
 )
 from clbench.jobs.folders import check_folders
+from clbench.spec.identifiers import LONGEST_LABEL
 
 LONGEST_NAME = 120
 """Characters of a film's name before a hash; file systems take 255 bytes."""
@@ -41,7 +42,7 @@ def film(
     seed: Seed = 0,
     tasks: str | None = None,
     stages: str | None = None,
-    episode: int = 0,
+    episode: Annotated[int, whole_number(0)] = 0,
     output: Path | None = None,
     size: Annotated[int, whole_number(96)] = 200,
     fps: Annotated[int | None, whole_number(1)] = None,
@@ -83,7 +84,9 @@ def film(
         if fps is not None and fps > FASTEST:
             raise InputError(f"--fps must be from 1 to {FASTEST}, not {fps}.")
         check_device(device)
-        runs = [RunSpec(scenario, name, seed, changes or {}, device).resolve() for name in methods]
+        runs = [
+            RunSpec(scenario, name, seed, changes or {}, device).resolve() for name in dict.fromkeys(methods)
+        ]
         loaded = runs[0].scenario
         names = None if tasks is None else listed("--tasks", tasks)
         shown = loaded.retained + loaded.target if names is None else tuple(map(loaded.task, names))
@@ -95,7 +98,8 @@ def film(
         check_folders({"--output": path.parent})
         choose_back_end(task.world for task in shown)
     console = Console(stderr=True)
-    policies = _policies(runs, numbers, checkpoints, console)
+    with checked_input():
+        policies = _policies(runs, numbers, checkpoints, console)
     with Bars(len(shown) * len(policies), console) as bars:
         bars.start("film", len(shown) * len(policies))
         made = film_runs(runs, policies, shown, episode, size, lambda takes: bars.advance("film", takes))
@@ -113,10 +117,14 @@ def _path(
     path = runs[0].path(FILMS)
     chosen = {"tasks": tasks, "stages": stages, "episode": [episode] if episode else None}
     parts = [f"{name}={','.join(map(str, values))}" for name, values in chosen.items() if values is not None]
+    methods = ",".join(run.path(FILMS).parent.name for run in runs)
     name = "+".join([path.stem, *parts])
-    if len(name) > LONGEST_NAME:
-        name = f"{name[:LONGEST_NAME]}+{hash_of(name)}"
-    return path.parents[1] / ",".join(run.path(FILMS).parent.name for run in runs) / f"{name}.gif"
+    return path.parents[1] / _cut(methods, LONGEST_LABEL) / f"{_cut(name, LONGEST_NAME)}.gif"
+
+
+def _cut(name: str, most: int) -> str:
+    """Return a name, or its beginning and a hash where it has more than `most` characters."""
+    return name if len(name) <= most else f"{name[:most]}+{hash_of(name)}"
 
 
 def _policies(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import keyword
 import re
+import shlex
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -66,7 +67,7 @@ def new_policy(name: str, /, *, folder: Path = Path()) -> None:
 def _print_next(kind: str, files: tuple[Path, Path], folder: Path, command: str) -> None:
     module, test = files
     lines = [f"Wrote {module} and {test}. Make the {kind} yours, then:"]
-    lines += [f"  cd {folder}"] if folder != Path() else []
+    lines += [f"  cd {shlex.quote(str(folder))}"] if folder != Path() else []
     lines += [f"  python -m pytest {test.name}  # pip install pytest", f"  {command}"]
     Console().print("\n".join(lines), highlight=False, markup=False, soft_wrap=True)
 

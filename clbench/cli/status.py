@@ -32,7 +32,7 @@ from clbench.records.status import RunState, State, found_runs, run_state, secon
 from clbench.spec.policies import DEFAULT_POLICY, SMALL, policy_name
 from clbench.spec.protocol import DEFAULT_SEEDS
 
-NOT_GIVEN: tuple[object, ...] = (DEFAULT_SEEDS, 0, 0, DEFAULT_POLICY, SMALL, {})
+NOT_GIVEN: tuple[object, ...] = (False, DEFAULT_SEEDS, 0, 0, DEFAULT_POLICY, SMALL, {})
 """Values of the options that choose among the runs of a scenario."""
 
 STATES: tuple[State, ...] = ("done", "running", "failed", "damaged", "to do")
@@ -77,7 +77,7 @@ def status(
     add_cwd_to_path()
     with checked_input():
         if scenarios is None:
-            if (seeds, first_seed, order, policy, policy_size, changes or {}) != NOT_GIVEN:
+            if (every, seeds, first_seed, order, policy, policy_size, changes or {}) != NOT_GIVEN:
                 raise InputError("Such options choose among the runs of a scenario: name it.")
             paths = found_runs(records)
             if not paths:

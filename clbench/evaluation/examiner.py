@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Sequence
 from functools import cached_property
 
@@ -22,6 +21,7 @@ from clbench.policy.activations import Gaussian
 from clbench.policy.batch import Batch, QuestionBatch
 from clbench.policy.policy import Policy
 from clbench.records.record import AnswerRow, EpisodeRow, PolicyRow, Record
+from clbench.scoring.reading import FARTHEST
 from clbench.spec.protocol import EPISODE_WEIGHT, Point, Protocol
 from clbench.spec.scenario import Scenario
 
@@ -110,7 +110,7 @@ class Examiner:
     def _drift(self, policy: Policy) -> float | None:
         """Return how far the hidden states are from the pretrained ones, None for a policy without any."""
         now, anchor = self._activations(policy), self._anchor
-        return None if now is None or anchor is None else float(now.distance(anchor).mean())
+        return None if now is None or anchor is None else _known(float(now.distance(anchor).mean()))
 
     def _activations(self, policy: Policy) -> Gaussian | None:
         if "hidden_states" not in policy.abilities:
@@ -118,9 +118,8 @@ class Examiner:
         return activations(policy, self._asked[1].to(self._device))
 
     def _shift(self, policy: Policy, stage: int, before: Tensor) -> float | None:
-        """Return the shift since `before`, None for a diverged policy, whose predictions are not finite."""
-        moved = shift(before, self.predictions(policy, stage), self._batch(stage).valid)
-        return moved if math.isfinite(moved) else None
+        """Return the shift since `before`."""
+        return _known(shift(before, self.predictions(policy, stage), self._batch(stage).valid))
 
     def _captured(self, policy: Policy, stage: int) -> float | None:
         """Return the share of episodes in which `policy` does a stage's target though told to do a skill.
@@ -154,6 +153,11 @@ class Examiner:
     def close(self) -> None:
         """Close all worlds."""
         self._evaluator.close()
+
+
+def _known(moved: float) -> float | None:
+    """Return how far a policy moved, None for a diverged one: no reader takes its infinite or NaN numbers."""
+    return moved if moved <= FARTHEST else None
 
 
 def episode_row(point: Point, episode: Episode) -> EpisodeRow:

@@ -51,7 +51,7 @@ def export_demonstrations(
         output: New folder.
         format: "lerobot" for one LeRobotDataset v3 of all tasks, or "hdf5" for one file of the layout of
             robomimic and LIBERO for each task, `TASK_demo.hdf5`.
-        tasks: Names of tasks; the retained skills and the targets if there are none.
+        tasks: Names of tasks, or one name; the retained skills and the targets if there are none.
 
     Raises:
         InputError: The folder exists, the format is unknown, or a world does not give its steps per second.
@@ -69,13 +69,13 @@ def export_demonstrations(
 
 
 def chosen_tasks(scenario: Scenario | str, tasks: Iterable[str]) -> tuple[Scenario, list[Task]]:
-    """Return a scenario, and those of its tasks that have some names.
+    """Return a scenario, and those of its tasks that have some names, or one name.
 
     Raises:
         UnknownNameError: A name is unknown; the nearest one is named.
     """
     loaded = load_scenario(scenario) if isinstance(scenario, str) else scenario
-    names = dict.fromkeys(tasks)
+    names = dict.fromkeys([tasks] if isinstance(tasks, str) else tasks)
     return loaded, [loaded.task(name) for name in names] or [*loaded.retained, *loaded.target]
 
 
@@ -137,7 +137,7 @@ def import_demonstrations(
         task: Name of the task.
         path: File of the layout of robomimic and LIBERO, with one group `data/demo_i` for each demonstration.
         state: Datasets of each demonstration that make, side by side, the state of the task's world, for
-            example ("obs/ee_states", "obs/gripper_states").
+            example ("obs/ee_states", "obs/gripper_states"), or the name of the only one.
 
     Raises:
         InputError: The file cannot be read or does not fit the task, the task has an expert or names other

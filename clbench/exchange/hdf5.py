@@ -111,12 +111,14 @@ def read_hdf5(path: Path, task: Task, state: Sequence[str] = ("states",)) -> lis
     Args:
         path: The file.
         task: Task whose world, horizon and instructions the demonstrations must fit.
-        state: Datasets of each demonstration that make, side by side, the state of the world (S,).
+        state: Datasets of each demonstration that make, side by side, the state of the world (S,), or the
+            name of the only one.
 
     Raises:
         InputError: The file cannot be read, has another layout, or does not fit the task. The message names
             the demonstration and the dataset.
     """
+    state = [state] if isinstance(state, str) else state
     if not state or any(not name or name.startswith("/") for name in state):
         raise InputError(
             "The state must name datasets of a demonstration, such as states or obs/ee_states, not "

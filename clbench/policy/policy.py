@@ -48,7 +48,7 @@ class PolicyConfig:
     euler_steps: int = 5
     """Euler steps that integrate the flow."""
     vocabulary_size: int = VOCABULARY_SIZE
-    """Number of words that it can read and answer."""
+    """Number of tokens that it can read and answer."""
     text_length: int = TEXT_LENGTH
     """Words, or pieces of words, that it can read at once."""
     image_size: int = 0

@@ -22,13 +22,14 @@ from typing import Any, get_args, get_type_hints
 from clbench.base.errors import InputError
 from clbench.base.seeding import seeded
 from clbench.base.text import did_you_mean
+from clbench.evaluation.rules import names_in
 from clbench.learning.method import Metadata, Method
 from clbench.learning.prior import Access, Uses
 from clbench.learning.registry import read_changes
 from clbench.policy.policy import ABILITIES
 from clbench.spec.policies import DEFAULT_POLICY
 from clbench.testing.error import Check, ContractError
-from clbench.testing.global_state import GENERATORS, functions_of, names_in, own_classes, same, watched
+from clbench.testing.global_state import GENERATORS, functions_of, own_classes, same, watched
 from clbench.testing.toy_run import HOOKS, ToyRun, frozen_return, mean_return
 
 TARGETS, STEPS = 2, 2
@@ -288,10 +289,7 @@ def _check_stored(cls: type[Method]) -> None:
         name = field.name
         default = getattr(method, name) if field.default is dataclasses.MISSING else field.default
         _check_type(cls, name, default)
-        given = [default]
-        if type(default) in (bool, int, float):
-            given.append(not default if type(default) is bool else type(default)(default / 2 + 1))
-        for value in given:
+        for value in (default, *_others(default)):
             try:
                 kept = getattr(cls(**{name: value}), name)
             except ValueError:
@@ -301,6 +299,12 @@ def _check_stored(cls: type[Method]) -> None:
                 raise _misbuilt(expected, words) from error
             if kept != value:
                 raise _misbuilt(expected, f"{name}={value!r} becomes {kept!r}")
+
+
+def _others(default: Any) -> tuple[Any, ...]:
+    """Return other values of the type of a default: above it, and between it and 0."""
+    numbers = (default + 1, type(default)(default / 2)) if type(default) in (int, float) else ()
+    return (not default,) if type(default) is bool else numbers
 
 
 def _check_type(cls: type[Method], name: str, default: Any) -> None:

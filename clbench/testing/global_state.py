@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from itertools import takewhile
 from pathlib import Path
-from types import CodeType, FunctionType, ModuleType
+from types import FunctionType, ModuleType
 from typing import Any
 
 import numpy as np
@@ -24,6 +24,7 @@ from torch import Tensor
 
 from clbench.base.cache import cache_folder
 from clbench.base.source import package_of
+from clbench.evaluation.rules import names_in
 from clbench.learning.method import Method
 from clbench.policy.policy import Policy
 from clbench.policy.transformer import TransformerPolicy
@@ -71,7 +72,10 @@ def read(settings: Mapping[str, _Setting]) -> dict[str, Any]:
 
 
 def same(one: Any, other: Any) -> bool:
-    """Return whether two values are equal, including arrays and tensors inside them; NaN equals NaN."""
+    """Return whether two values are equal, also arrays and tensors, alone and in tuples.
+
+    In a tensor, NaN equals NaN.
+    """
     if isinstance(one, Tensor):
         if not isinstance(other, Tensor) or (one.shape, one.dtype) != (other.shape, other.dtype):
             return False
@@ -88,8 +92,8 @@ def watched(found: list[str], *, generators: bool) -> Iterator[None]:
     """Add a description of the side effects of the code inside to `found`, and restore the settings.
 
     Args:
-        found: Receives a line for each setting that differs afterwards, and for each new file outside
-            clbench's cache that still exists.
+        found: Receives a line for each setting that differs afterwards, and for each file outside
+            clbench's cache that was opened for writing and still exists.
         generators: Whether the global random generators count as settings.
     """
     settings = {**SETTINGS, **(GENERATORS if generators else {})}
@@ -103,7 +107,8 @@ def watched(found: list[str], *, generators: bool) -> Iterator[None]:
                     found.append(_difference(name, before[name], after))
                     settings[name][1](before[name])
     cache = cache_folder()
-    left = (path for path in dict.fromkeys(paths) if path.exists() and cache not in path.parents)
+    # /dev/null, which silences a library, is no file
+    left = (path for path in dict.fromkeys(paths) if path.is_file() and cache not in path.parents)
     found.extend(f"the file {path} is written" for path in left)
 
 
@@ -145,12 +150,6 @@ def functions_of(cls: type) -> dict[str, FunctionType]:
     """Return the functions that a class itself defines, without their decorators, by name."""
     plain = {name: getattr(value, "__func__", value) for name, value in vars(cls).items()}
     return {name: inspect.unwrap(one) for name, one in plain.items() if isinstance(one, FunctionType)}
-
-
-def names_in(code: CodeType) -> set[str]:
-    """Return the names of attributes and global variables that code uses, with the functions inside it."""
-    inside = (names_in(constant) for constant in code.co_consts if isinstance(constant, CodeType))
-    return set(code.co_names).union(*inside)
 
 
 @contextmanager

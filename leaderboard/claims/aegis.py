@@ -6,8 +6,9 @@ before plain fine-tuning has forgotten any answer.
 
 from __future__ import annotations
 
-import math
+from clbench.base.text import counted
 
+from ..board.runs import is_number
 from .claim import (
     ANYWHERE,
     KNOWLEDGE,
@@ -15,30 +16,39 @@ from .claim import (
     Paper,
     claim,
     decided,
+    deciding,
+    is_open,
     not_told_apart,
     what_would_change,
 )
 from .evidence import SHARE, Evidence, Figure
-from .figures import answer_curve, drift_ratio, early_success, learning_curve, question_drop
+from .figures import (
+    answer_curve,
+    drift_ratio,
+    early_success,
+    learning_curve,
+    loses_no_answers,
+    question_drop,
+)
 
 AEGIS = Paper("AEGIS", ("2604.16067",))
 
+SHARES = ("energy_shed_mean", "energy_shed_highest", "layers_projected_mean")
+"""Diagnostics of AEGIS that are shares."""
+
 NOTHING_TO_KEEP = "sft does not certainly lose 0.01 of the answers: there is nothing to keep."
 LOSES_ANSWERS = "A longer or narrower fine-tuning, after which sft has certainly lost answers."
-
-
-def _nothing_to_keep(of_sft: Figure) -> bool:
-    """Return whether fine-tuning was measured, and does not certainly lose answers."""
-    return not math.isnan(of_sft.high) and not of_sft.low > 0.01
 
 
 @claim(
     "A1",
     AEGIS,
     reported="OK-VQA 60.15 before, 57.36 after; the loss on held-out questions rises within 1,500 steps",
-    rule="Holds if sft's drop in question accuracy certainly exceeds 0.01 within the first half of the "
-    "stage; holds in part, because it is not rapid, if it does so only by the end; does not hold if the "
-    "upper end of the drop at the end is below 0.01.",
+    rule="Judged on a scenario that was made for it and trains one target long past learning: where stages "
+    "end when the target is learned, sft loses less than 0.01 of the answers (findings.md). Holds if sft's "
+    "drop in question accuracy certainly exceeds 0.01 within the first half of the stage; holds in part, "
+    "because it is not rapid, if it does so only by the end; does not hold if the upper end of the drop at "
+    "the end is below 0.01.",
     margin="0.01 of the answers",
     scenarios=KNOWLEDGE,
 )
@@ -46,19 +56,22 @@ def action_loss_erodes_answers(evidence: Evidence) -> Finding:
     """The gradient of the action loss rapidly erodes question answering."""
     drop, stopped = (question_drop(evidence, method) for method in ("sft", "stop_gradient"))
     curve = answer_curve(evidence, "sft")
+    steps, _ = learning_curve(evidence, "sft")
+    half = [one for step, one in zip(steps, curve, strict=True) if step <= steps[-1] / 2]
     sentences = _how_rapid(evidence, curve)
     if evidence.difference("question_retention", "stop_gradient", "sft").low > 0:
         sentences.append("Without that gradient in the backbone less is lost: the gradient is the cause.")
+    verdict = decided(
+        holds=any(figure.low > 0.01 for figure in half),
+        in_part=drop.low > 0.01,
+        fails=drop.high < 0.01,
+    )
     return Finding(
-        decided(
-            holds=any(figure.low > 0.01 for figure in curve[:-1]),
-            in_part=drop.low > 0.01,
-            fails=drop.high < 0.01,
-        ),
+        verdict,
         (drop, *curve),
         (stopped, *answer_curve(evidence, "stop_gradient")),
         tuple(sentences),
-        what_would_change(drop, 0.01),
+        what_would_change(deciding(verdict, half, 0.01) if verdict == "holds" else drop, 0.01),
     )
 
 
@@ -91,7 +104,7 @@ def stop_gradient_keeps_and_wastes(evidence: Evidence) -> Finding:
     """Stopping the gradient keeps knowledge but throws away supervision."""
     answers, early = question_drop(evidence, "stop_gradient"), early_success(evidence, "stop_gradient", "sft")
     of_sft = question_drop(evidence, "sft")
-    if _nothing_to_keep(of_sft):
+    if loses_no_answers(of_sft):
         return Finding("cannot be shown here", (early, answers), (of_sft,), (NOTHING_TO_KEEP,), LOSES_ANSWERS)
     return Finding(
         decided(
@@ -101,7 +114,7 @@ def stop_gradient_keeps_and_wastes(evidence: Evidence) -> Finding:
         (early, answers),
         (of_sft,),
         (),
-        what_would_change(early, -0.05),
+        what_would_change(*((early, -0.05) if is_open(early, -0.05) else (answers, 0.01))),
     )
 
 
@@ -134,7 +147,7 @@ def lora_still_overwrites(evidence: Evidence) -> Finding:
         (answers[1], answers[0], answers[2], *skills),
         (of_sft, evidence.difference("retention", "sft", "frozen")),
         (f"{', '.join(less)}: fewer answers are lost than with sft.",) if less else (),
-        what_would_change(answers[1], -0.01),
+        what_would_change(max(answers, key=lambda one: one.high) if all(lost) else answers[1], -0.01),
     )
 
 
@@ -158,7 +171,7 @@ def keeps_answers(evidence: Evidence) -> Finding:
         for other in ("sft", "aegis+direction=random")
     )
     of_sft = question_drop(evidence, "sft")
-    if _nothing_to_keep(of_sft):
+    if loses_no_answers(of_sft):
         return Finding("cannot be shown here", (aegis,), (sft, *gains), (NOTHING_TO_KEEP,), LOSES_ANSWERS)
     return Finding(
         decided(holds=aegis.low >= -0.01, fails=aegis.high < -0.01),
@@ -192,7 +205,8 @@ def sheds_little(evidence: Evidence) -> Finding:
     """Sheds less than 1 % of the gradient's energy on average."""
     shed = "share of the energy that is shed, mean over steps"
     first = _of_stages(evidence, "energy_shed_mean", f"{shed}, first stage", stage=1)
-    highest = _of_stages(evidence, "energy_shed_highest", "the same at the step that sheds most", stage=1)
+    most = "share of the energy that is shed at the step that sheds most, first stage"
+    highest = _of_stages(evidence, "energy_shed_highest", most, stage=1)
     layers = _of_stages(
         evidence, "layers_projected_mean", "share of the layers projected, first stage", stage=1
     )
@@ -200,8 +214,22 @@ def sheds_little(evidence: Evidence) -> Finding:
     return Finding(
         decided(holds=first.high < 0.01, fails=first.low > 0.01),
         (first, everywhere, highest, layers),
+        sentences=_seeds_below(evidence),
         change=what_would_change(first, 0.01),
     )
+
+
+def _seeds_below(evidence: Evidence) -> tuple[str, ...]:
+    """Return in how many seeds the share is below the bar: one seed may decide the mean."""
+    runs = evidence.runs.get("aegis", {}).values()
+    shed = [run.record.diagnostics.get("1") for run in runs]
+    values = [found.get("energy_shed_mean") for found in shed if isinstance(found, dict)]
+    known = [value for value in values if is_number(value)]
+    if len(known) < 2:
+        return ()
+    below = sum(value < 0.01 for value in known)
+    seeds = f"{below} of {counted(len(known), 'seed')}"
+    return (f"The share of the first stage is below 1 % in {seeds}; the largest is {max(known):.2%}.",)
 
 
 def _of_stages(evidence: Evidence, name: str, what: str, stage: int | None = None) -> Figure:

@@ -31,7 +31,7 @@ PREDICATES: Mapping[Verdict, tuple[str, str]] = {
 """Verdicts as predicates: of one claim, and of several."""
 
 BOARDS = ("clbench/Fetch-v1", "clbench/MetaWorld-v1", "clbench/PointMaze-v1")
-"""Scenarios at equal learning, with runs at the published learning rate and controls: most claims are judged
+"""Scenarios at equal learning, with runs at the scenario's learning rate and controls: most claims are judged
 on them."""
 
 ANYWHERE = BOARDS[:1]
@@ -147,6 +147,29 @@ def what_would_change(figure: Figure, bar: float) -> str:
     needed = _seeds_for(gap, half, len(figure.seeds))
     how_many = f"about {needed}" if needed else f"more than {MOST_SEEDS}"
     return f"At this spread {how_many} seeds: the {interval} contains {bar:{form}}."
+
+
+def deciding(verdict: Verdict, figures: Sequence[Figure], bar: float) -> Figure:
+    """Return the figure that would first change the verdict of a rule on several figures.
+
+    The rule holds if one figure is above the bar, and does not hold if all are below it.
+
+    Args:
+        verdict: Verdict of the rule.
+        figures: Figures of the rule, the most important first.
+        bar: Bar of the rule.
+    """
+    known = [figure for figure in figures if not math.isnan(figure.low)]
+    if verdict == "does not hold":
+        return max(known, key=lambda figure: figure.high)
+    if verdict in ("holds", "holds in part"):
+        return max(known, key=lambda figure: figure.low)
+    return next((figure for figure in figures if is_open(figure, bar)), figures[0])
+
+
+def is_open(figure: Figure, bar: float) -> bool:
+    """Return whether an interval contains the bar, or is not known."""
+    return not (figure.low >= bar or figure.high < bar)
 
 
 def _seeds_for(reach: float, half: float, seeds: int) -> int | None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from itertools import combinations
+from itertools import combinations, takewhile
 
 import numpy as np
 
@@ -11,7 +11,14 @@ from clbench.base.text import counted
 from clbench.scoring.layout import Array
 from clbench.scoring.metrics import load_metric
 
-from ..board.agreement import LEAST_ROWS, Agreement, Concordance, agreement_between, kendall_tau
+from ..board.agreement import (
+    LEAST_ROWS,
+    SIGNIFICANCE,
+    Agreement,
+    Concordance,
+    agreement_between,
+    kendall_tau,
+)
 from ..board.rows import Board, Row, agreement, values_by_seed
 from ..board.summary import RANKED_BY, WITHOUT_DEMONSTRATIONS
 from ..views.format import concordance_text, tau_text, title_of
@@ -32,15 +39,32 @@ def agreement_sentences(board: Board, boards: Mapping[str, list[Row]]) -> Iterat
             if alone is not None:  # replay is far above the others
                 yield f"On {name}, without methods that read prior demonstrations, {_seeds_order(alone)}."
             yield from _shares_of_variance(name, without)
+    chances = []
     for (one, rows), (other, others) in combinations(boards.items(), 2):
         across = _between(rows, others)
         if across is not None:
+            chances.append(across.chance)
             yield f"{one} and {other} {_order(across, counted(across.rows, 'method'))}."
         rest = _between(*(_without_demonstrations(them) for them in (rows, others)))
         if across is not None and rest is not None:
+            chances.append(rest.chance)
             methods = f"{counted(rest.rows, 'method')} without prior demonstrations"
             yield f"{one} and {other} {_order(rest, methods)}."
+    yield from after_correction(chances)
     yield from _definitions(boards)
+
+
+def after_correction(chances: Sequence[float]) -> Iterator[str]:
+    """Yield how many of several p stay below 0.05 after Holm's correction, if one is below without it."""
+    below = sum(chance < SIGNIFICANCE for chance in chances)
+    if len(chances) < 2 or not below:
+        return
+    corrected = ((len(chances) - place) * chance for place, chance in enumerate(sorted(chances)))
+    stay = sum(1 for _ in takewhile(lambda chance: chance < SIGNIFICANCE, corrected))
+    yield (
+        f"Of these {len(chances)} p, {below} {'is' if below == 1 else 'are'} below {SIGNIFICANCE:g}; after "
+        f"Holm's correction for their number, {stay or 'none'}."
+    )
 
 
 DEFINITIONS = ("kept_share", "forgetting", "backward_transfer")

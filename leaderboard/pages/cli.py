@@ -68,7 +68,7 @@ def findings(
 
     evidence = _evidence(None, records, controls)
     board = _board(records)
-    found = sections(board, judge_all(evidence))
+    found = sections(board, judge_all(evidence), evidence)
     drawn = {output.parent / "findings" / name: svg for name, svg in pictures(board).items()}
     print_written(write_all({output: page(found), **drawn}))
 

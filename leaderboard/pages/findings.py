@@ -7,7 +7,7 @@ the last section says what the records cannot tell.
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
@@ -19,18 +19,20 @@ from clbench.scoring.intervals import Estimate
 from clbench.spec.policies import DEFAULT_POLICY
 from clbench.spec.references import BASELINE, FROZEN
 
-from ..board.frontier import Curve, TiedGain, is_certain_over
+from ..board.frontier import TiedGain, is_certain_over
 from ..board.predictors import predictions
 from ..board.rows import Board, Row, apart_from_baseline
 from ..board.summary import METHODS, RANKED_BY, WITHOUT_DEMONSTRATIONS, tables_of
 from ..claims.claim import PREDICATES, Verdict, tally
+from ..claims.evidence import Evidence
 from ..claims.judges import Judged
 from ..policies.compared import by_table
 from ..views.format import MISSING, format_interval, tau_text
 from ..views.markdown import templates
 from ..views.page.charts.picture import themed
-from .agreements import agreement_sentences
+from .agreements import after_correction, agreement_sentences
 from .findings_chart import gains_chart
+from .learning_rates import rate_lines, rate_sentences
 from .lost_skills import relearning_sentences
 
 FORGOTTEN_BY = "kept_share"
@@ -68,13 +70,19 @@ def pictures(board: Board) -> dict[str, str]:
     return {f"gains{'-dark' if dark else ''}.svg": themed(chart, dark).svg() for dark in (False, True)}
 
 
-def sections(board: Board, judged: Sequence[Judged]) -> list[Section]:
-    """Return the sections that the records can fill, at least in part."""
+def sections(board: Board, judged: Sequence[Judged], evidence: Callable[[str], Evidence]) -> list[Section]:
+    """Return the sections that the records can fill, at least in part.
+
+    Args:
+        board: The board of the records.
+        judged: Findings on the claims.
+        evidence: Returns the runs of the scenario with a Gymnasium id, those of the ladder included.
+    """
     boards = _boards(board)
     found = (
         _gains(boards, board.tied),
         _replay(boards),
-        _learning_rates(board),
+        _learning_rates(board, evidence),
         Section("Is a lost skill gone?", tuple(relearning_sentences(boards))),
         _claims(judged),
         Section(
@@ -153,7 +161,7 @@ def _gain_sentences(name: str, rows: Sequence[Row], tied: Mapping[str, Sequence[
         if len(gains) > 1:
             which = f"the largest gain of {len(gains)} methods, that of `{best}`,"
         yield (
-            f"On {name}, none is told apart from it as better: {which} is "
+            f"On {name}, none is told apart from plain fine-tuning as better: {which} is "
             f"{format_interval(gains[best], '.3f')}. {_power(rows, gains)}"
         )
     alone = "by its own interval alone"
@@ -173,7 +181,7 @@ def _gain_sentences(name: str, rows: Sequence[Row], tied: Mapping[str, Sequence[
     }
     worse = {method: loss for method, loss in lower.items() if method in apart}
     if worse:
-        yield f"Told apart from it as worse: {_listed(worse)}."
+        yield f"Told apart from plain fine-tuning as worse: {_listed(worse)}."
     if len(worse) < len(lower):
         rest = {method: loss for method, loss in lower.items() if method not in worse}
         yield f"Lower {alone}: {_listed(rest)}."
@@ -220,7 +228,15 @@ def _replay(boards: dict[str, list[Row]]) -> Section:
                 f"{kept / 1e6:.1f} MB between stages, and takes {format_interval(_steps(row), '.0f')} steps "
                 f"to learn a target (plain fine-tuning: {usual}){_never_learned(row)}."
             )
+    if answers:
+        answers.append(OWN_RATES)
     return Section("What do prior demonstrations buy?", tuple(answers))
+
+
+OWN_RATES = (
+    "Each method has the learning rate that tuning chose for it, and a smaller one takes more steps: a "
+    "difference in steps need not come from the demonstrations."
+)
 
 
 def _never_learned(row: Row) -> str:
@@ -237,70 +253,12 @@ def _steps(row: Row) -> Estimate:
     return row.estimates["steps_to_criterion"]
 
 
-def _learning_rates(board: Board) -> Section:
+def _learning_rates(board: Board, evidence: Callable[[str], Evidence]) -> Section:
     """How much a smaller learning rate does alone."""
-    answers, lines = [], []
-    for name, curves in board.frontiers.items():
-        for curve in curves:
-            lines += [
-                (
-                    name,
-                    curve.method,
-                    f"{rung.factor:g}",
-                    format_interval(rung.learned),
-                    format_interval(rung.kept),
-                )
-                for rung in curve.rungs
-            ]
-            if curve.is_baseline:
-                answers.append(_of_the_baseline(name, curve))
-                answers += _at_the_first_rung(name, curve, curves)
-        answers += _of_frozen(name, _usual(board).get(name, []))
     head = ("scenario", "method", "factor", "learned", "kept")
-    return Section("How much does a smaller learning rate do alone?", tuple(answers), head, tuple(lines))
-
-
-def _of_the_baseline(name: str, curve: Curve) -> str:
-    """Return what plain fine-tuning keeps at the first rung, and at the one where it keeps most."""
-    first, best = curve.rungs[0], max(curve.rungs, key=lambda rung: rung.kept.value or 0.0)
-    more = ""
-    if best is not first:
-        more = (
-            f", and {format_interval(best.kept)} at {_rate(best.factor)}, where it learns "
-            f"{format_interval(best.learned)}: the most of {len(curve.rungs)} rates, in these same episodes"
-        )
-    return f"On {name}, plain fine-tuning keeps {format_interval(first.kept)} at {_rate(first.factor)}{more}."
-
-
-def _rate(factor: float) -> str:
-    return "the scenario's learning rate" if factor == 1 else f"{factor:g} times the scenario's learning rate"
-
-
-def _at_the_first_rung(name: str, baseline: Curve, curves: Sequence[Curve]) -> Iterator[str]:
-    """Yield what the methods without prior demonstrations keep at the learning rate of the first rung."""
-    factor = baseline.rungs[0].factor
-    kept = {
-        curve.method: curve.rungs[0].kept
-        for curve in curves
-        if curve.division in WITHOUT_DEMONSTRATIONS
-        and curve is not baseline
-        and curve.rungs[0].factor == factor
-    }
-    if kept:
-        falling = sorted(kept, key=lambda method: -(kept[method].value or 0.0))
-        listed = ", ".join(f"`{method}` {format_interval(kept[method])}" for method in falling)
-        yield f"On {name}, methods without prior demonstrations keep at factor {factor:g}: {listed}."
-
-
-def _of_frozen(name: str, rows: Sequence[Row]) -> Iterator[str]:
-    """Yield what a policy that learns nothing keeps by this measure."""
-    for row in rows:
-        if row.method == FROZEN:
-            yield (
-                f"On {name}, `{FROZEN}`, which learns nothing, keeps "
-                f"{format_interval(row.estimates['kept'])} by this measure: a target that was never learned "
-                "counts as not kept."
-            )
+    answers = tuple(rate_sentences(board.frontiers, _usual(board), evidence))
+    lines = tuple(rate_lines(board.frontiers))
+    return Section("How much does a smaller learning rate do alone?", answers, head, lines)
 
 
 def _claims(judged: Sequence[Judged]) -> Section:
@@ -308,7 +266,8 @@ def _claims(judged: Sequence[Judged]) -> Section:
     answers = []
     by_paper = groupby(judged, key=lambda one: one.claim.paper.name)
     for paper, members in by_paper:
-        answers.append(f"{paper}: {tally(one.finding.verdict for one in members)}.")
+        every = list(members)
+        answers.append(f"{paper}: {tally(one.finding.verdict for one in every)}.{_those_that_hold(every)}")
     decided = [one for one in judged if one.finding.verdict != "undecided"]
     lines = tuple(
         (
@@ -316,28 +275,53 @@ def _claims(judged: Sequence[Judged]) -> Section:
             f"{one.claim.words} {' '.join(one.finding.sentences[-1:])}".strip(),
             one.evidence.scenario,
             one.finding.verdict,
+            _first_figure(one),
         )
         for one in decided
     )
-    return Section(
-        "Which claims of the papers hold here?", tuple(answers), ("id", "claim", "scenario", "verdict"), lines
-    )
+    head = ("id", "claim", "scenario", "verdict", "first figure")
+    return Section("Which claims of the papers hold here?", tuple(answers), head, lines)
+
+
+def _those_that_hold(judged: Sequence[Judged]) -> str:
+    """Return in a sentence which claims hold: some are about plain fine-tuning, costs, or algebra."""
+    words = {
+        one.claim.id: one.claim.words.rstrip(".")
+        for one in judged
+        if one.finding.verdict in ("holds", "holds in part")
+    }
+    if not words:
+        return ""
+    return " What holds: " + "; ".join(f"{id_}, {claim}" for id_, claim in words.items()) + "."
+
+
+def _first_figure(one: Judged) -> str:
+    """Return the first figure of a finding with its value."""
+    if not one.finding.figures:
+        return MISSING
+    figure = one.finding.figures[0]
+    return f"{figure.what}: {format_interval(figure.estimate, figure.form)}"
 
 
 def _predictors(boards: dict[str, list[Row]]) -> Section:
     """What orders the methods as their forgetting does."""
     answers = []
     words = {
-        1: "agrees with their forgetting on the order of the methods more than chance would explain",
+        1: "orders the methods as forgetting does, more than chance would explain",
         0: "shows no certain agreement with forgetting on the order of the methods",
         -1: "orders the methods against their forgetting",
     }
-    for name, rows in boards.items():
-        for one in predictions(rows):
-            tau = f"Kendall's tau {tau_text(one)}, {counted(one.rows, 'method')}"
-            answers.append(f"On {name}, {one.predictor} {words[one.direction]} ({tau}).")
+    found = [(name, one) for name, rows in boards.items() for one in predictions(rows)]
+    for name, one in found:
+        tau = f"Kendall's tau {tau_text(one)}, {counted(one.rows, 'method')}"
+        answers.append(f"On {name}, {one.predictor} {words[one.direction]} ({tau}).")
     if answers:
-        answers.insert(0, "Forgetting is here 1 minus the kept share.")
+        answers.insert(
+            0,
+            "Forgetting is here 1 minus the kept share. Methods differ in more than one way, such as their "
+            "learning rate: an order that agrees does not say what causes forgetting.",
+        )
+        answers += after_correction([one.chance for _, one in found])
     return Section("What predicts how much a method forgets?", tuple(answers))
 
 

@@ -13,14 +13,15 @@ from jinja2 import Template
 
 from clbench.learning.registry import load_method
 from clbench.runs.tuning import CONTROLS, fixed_settings, tuned, tuned_scenarios
-from clbench.scoring.intervals import Estimate
+from clbench.scoring.intervals import UNBOUNDED, Estimate
 from clbench.spec.identifiers import folder_name
 
 from ..board.commands import commands_of, run_command
 from ..board.rows import Row
 from ..board.runs import is_number
 from ..board.summary import DIVISIONS
-from ..claims.evidence import Evidence
+from ..claims.aegis import SHARES
+from ..claims.evidence import SHARE, Evidence
 from ..claims.judges import Judged
 from ..views.descriptions import Description, common_hyper_parameters
 from ..views.format import shown
@@ -139,7 +140,10 @@ def _diagnostics(method: Description, sources: Sources) -> dict[str, Estimate]:
 
 
 def _mean_diagnostic(method: str, name: str, sources: Sources) -> Estimate:
-    figure = sources.evidence.diagnostic(method, f"{name} of {method}", lambda stage: stage.get(name))
+    span = SHARE if name in SHARES else UNBOUNDED  # as on the page of the claims
+    figure = sources.evidence.diagnostic(
+        method, f"{name} of {method}", lambda stage: stage.get(name), span=span
+    )
     return figure.estimate
 
 

@@ -39,6 +39,10 @@ def test_a_path_may_begin_with_the_home_folder(
             ["run", "clbench/Fetch-v1", "sft", "--seeds", "1.5"],
             "--seeds: it must be a whole number, not '1.5'",
         ),
+        (
+            ["film", "clbench/Fetch-v1", "sft", "--episode", "1.5"],
+            "--episode: it must be a whole number, not '1.5'",
+        ),
         (["run", "clbench/Fetch-v1", "sft", "--workers", "1.4"], "it must be a whole number, not '1.4'"),
         (["run", "../../etc:clbench/X-v0", "sft"], "No module '../../etc' can be imported for"),
         (

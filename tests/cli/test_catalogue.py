@@ -1,8 +1,10 @@
 """`clbench list` and `clbench metrics` in terminals of any width."""
 
+import copy
 import json
 from pathlib import Path
 
+import gymnasium
 import pytest
 
 from clbench import load_scenario
@@ -36,6 +38,23 @@ def test_methods_are_listed_by_the_prior_data_that_they_use(capsys: pytest.Captu
     free, _, others = shown.partition("Methods that use no prior data")[2].partition("Methods that use")
     assert "  l2_sp " in free
     assert "  experience_replay " in others.partition("prior demonstrations throughout")[2]
+
+
+def test_a_scenario_that_cannot_be_loaded_hides_no_other(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    broken = copy.copy(gymnasium.registry["clbench/Fetch-v1"])
+    broken.kwargs = {"scenario": "no_such_module:SCENARIO"}
+    monkeypatch.setitem(gymnasium.registry, "me/Broken-v0", broken)
+    app(["list"], result_action="return_value")
+    shown = " ".join(capsys.readouterr().out.split())
+    assert "me/Broken-v0 cannot be loaded: No module 'no_such_module' can be imported" in shown
+    assert "clbench/Fetch-v1 retained" in shown
+    app(["list", "--json"], result_action="return_value")
+    found = {one["id"]: one for one in json.loads(capsys.readouterr().out)["scenarios"]}
+    assert found["me/Broken-v0"]["retained"] is None
+    assert "no_such_module" in found["me/Broken-v0"]["fault"]
+    assert found["clbench/Fetch-v1"]["fault"] is None
 
 
 def test_everything_about_one_metric_is_shown(capsys: pytest.CaptureFixture[str]) -> None:
@@ -128,9 +147,10 @@ def test_the_metrics_of_a_table_are_printed_as_json_with_reasons_and_flips(
         (["forgetting", "--unit", "share"], "need a CSV file"),
         (["robocasa365.csv", "--retained", "atomics"], "Did you mean 'atomic'?"),
         (["robocasa365.csv", "--markdown", "page.md"], "give a name or --markdown, not both"),
+        (["--markdown", "."], ". cannot be written: Is a directory"),
     ],
 )
-def test_a_wrong_table_is_an_error_in_one_line(
+def test_a_wrong_table_or_page_is_an_error_in_one_line(
     words: list[str], message: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with pytest.raises(SystemExit) as ended:

@@ -91,6 +91,32 @@ def test_demonstrations_are_exported_after_those_that_are_missing_are_collected(
     assert len(list((empty_caches / "minari").rglob("main_data.hdf5"))) == 2
 
 
+def test_pretraining_after_an_expert_that_fails_ends_with_exit_code_2_and_one_line(
+    write_module: Callable[[str, str], None], capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_module(
+        "lazy_left",
+        """
+import dataclasses
+import clbench
+import numpy
+from clbench.testing import TOY
+
+def lazy(task):
+    return lambda state: numpy.zeros(2, numpy.float32)
+
+LEFT = dataclasses.replace(TOY.task("left"), suite="lazy", expert="lazy_left:lazy")
+SCENARIO = dataclasses.replace(TOY, id="me/Lazy-v0", retained=(LEFT,))
+clbench.register("me/Lazy-v0", "lazy_left:SCENARIO")
+""",
+    )
+    with pytest.raises(SystemExit) as ended:
+        _clbench("pretrain", "lazy_left:me/Lazy-v0")
+    assert ended.value.code == 2
+    (line,) = (one for one in capsys.readouterr().err.splitlines() if one.startswith("error: "))
+    assert "The expert of 'left' succeeded 0 times in 20 attempts" in line
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

@@ -169,10 +169,10 @@ def test_a_fresh_template_runs(fresh: str, tmp_path: Path) -> None:
 def test_the_next_steps_name_another_folder(
     tmp_path: Path, clbench: Callable[..., None], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    (tmp_path / "mine").mkdir()
-    clbench("new-method", "freshly_written", "--folder", "mine")
-    assert capsys.readouterr().out.splitlines()[1] == "  cd mine"
-    assert sorted(path.name for path in (tmp_path / "mine").iterdir()) == [
+    (tmp_path / "my methods").mkdir()
+    clbench("new-method", "freshly_written", "--folder", "my methods")
+    assert capsys.readouterr().out.splitlines()[1] == "  cd 'my methods'"
+    assert sorted(path.name for path in (tmp_path / "my methods").iterdir()) == [
         "freshly_written.py",
         "test_freshly_written.py",
     ]

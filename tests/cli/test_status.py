@@ -9,6 +9,7 @@ import pytest
 
 from clbench.base.entry_points import resolve
 from clbench.base.lease import Lease
+from clbench.cli.main import app
 from clbench.jobs.recorded import has_record
 from clbench.records.reader import read_record
 from clbench.records.record import Record
@@ -75,6 +76,16 @@ def test_an_empty_folder_is_said_to_be_empty(tmp_path: Path, capsys: pytest.Capt
         resolve("clbench.cli.status:status")(records=tmp_path)
     assert stopped.value.code == 2
     assert "There are no runs in" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("option", [["--all"], ["--seeds", "2"], ["--set.step_factor", "2"]])
+def test_an_option_that_chooses_among_the_runs_of_a_scenario_needs_one(
+    option: list[str], records: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as stopped:
+        app(["status", "--records", str(records), *option])
+    assert stopped.value.code == 2
+    assert "name it" in capsys.readouterr().err
 
 
 def test_a_long_reason_is_cut_and_names_the_record(

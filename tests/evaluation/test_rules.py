@@ -95,6 +95,30 @@ def test_a_threshold_that_moves_a_little_changes_the_rule_of_its_tasks_alone(
     assert other_parts(found[1], found[0]) == ([f"rule {TOY.retained[0].name}"] if changed else [])
 
 
+PLAIN = "def is_near(distance):\n    return distance < NEAR\n"
+
+
+@pytest.mark.parametrize(
+    "near",
+    [
+        "def is_near(distance):\n    return all(one < NEAR for one in [distance])\n",
+        "def is_near(distance):\n    return [one < NEAR for one in [distance]][0]\n",
+        "def is_near(distance):\n    return (lambda one: one < NEAR)(distance)\n",
+        f"import functools\n@functools.cache\n{PLAIN}",
+        f"import numpy\n@numpy.errstate(all='ignore')\n{PLAIN}",
+        "LIMITS = frozenset({NEAR, 0.0})\ndef is_near(distance):\n    return distance < max(LIMITS)\n",
+    ],
+)
+def test_a_value_counts_wherever_a_rule_uses_it(near: str, module: Callable[[str, str], str]) -> None:
+    source = NEAR.replace(PLAIN, near)
+    assert source.count(near) == 1
+    codes = []
+    for name, limit in (("one_world", "0.3"), ("same_world", "0.3"), ("other_world", "0.30001")):
+        world = module(name, source.replace("NEAR = 0.3", f"NEAR = {limit}"))
+        codes.append(rule_code(dataclasses.replace(TOY.retained[0], world=f"{world}:World")))
+    assert codes[0] == codes[1] != codes[2]
+
+
 @pytest.mark.parametrize(
     ("before", "after", "changed"),
     [

@@ -285,6 +285,12 @@ def test_the_datasets_of_the_state_are_named_with_the_nearest_one(libero: Path) 
         read_hdf5(libero, TASK, ["obs/ee_pos", "robot_states"])
 
 
+def test_one_dataset_or_one_task_may_be_named_without_a_list(exported: Path, tmp_path: Path) -> None:
+    assert same_demonstrations(read_hdf5(exported, TASK, "states"), read_hdf5(exported, TASK))
+    folder = export_demonstrations(TOY, tmp_path / "one", format="hdf5", tasks="right")
+    assert [path.name for path in folder.iterdir()] == ["right_demo.hdf5"]
+
+
 @pytest.mark.parametrize("state", [(), ("states", ""), ("/data/demo_0/states",)])
 def test_the_state_needs_the_names_of_datasets_of_a_demonstration(
     state: tuple[str, ...], exported: Path

@@ -44,6 +44,16 @@ class Prepared(Method):
 
 
 @dataclasses.dataclass
+class Capped(Method):
+    """Takes no more rounds than its default."""
+
+    rounds: int = 2
+
+    def __post_init__(self) -> None:
+        self.rounds = min(self.rounds, 2)
+
+
+@dataclasses.dataclass
 class Rounding(Method):
     """Changes its argument."""
 
@@ -295,6 +305,7 @@ FAULTS_OF_STATE: list[tuple[Any, str, str, str]] = [
     (Demanding, "constructor", "a default for every hyper-parameter", "rate has none"),
     (Prepared, "constructor", "only hyper-parameters to be stored", "it sets buffer"),
     (Rounding, "constructor", "to be kept unchanged", "rate=0.5 becomes 0"),
+    (Capped, "constructor", "to be kept unchanged", "rounds=3 becomes 2"),
     (Loaded, "constructor", "numbers, truth values, text", "weights is a Tensor"),
     (Unequal, "constructor", "equal objects from equal arguments", "two objects with the defaults differ"),
     (Learned, "constructor", "every field to be a hyper-parameter", "anchor has init=False"),

@@ -279,6 +279,60 @@ def test_the_cost_of_aegis_includes_a_buffer_in_any_run(uses: str, time: Ends, v
     assert judged("A7", {"time of aegis": time}, runs).verdict == verdict
 
 
+@pytest.mark.parametrize(
+    ("demonstrations", "questions", "verdict"),
+    [
+        ("never", "never", "holds"),
+        ("prepare", "never", "does not hold"),
+        ("never", "throughout", "does not hold"),
+    ],
+)
+def test_consft_needs_no_data_only_if_no_run_reads_any(
+    demonstrations: str, questions: str, verdict: str
+) -> None:
+    uses = {"demonstrations": demonstrations, "questions": questions, "reference": False}
+    record = SimpleNamespace(run=SimpleNamespace(uses=uses))
+    runs = {"consft": {0: SimpleNamespace(record=record)}}
+    assert judged("C6", _costs(5, 5, (1.0, 1.05)), runs).verdict == verdict
+
+
+def test_what_would_change_a_verdict_is_the_figure_nearest_to_the_bar() -> None:
+    at_one = _kept((-0.1, 0.19), LESS, rung="@1")
+    best = _kept((0.0, 0.1), (-0.1, 0.05))
+    finding = judged("C2", {**BOTH, **SFT, **best, **at_one})
+    assert finding.verdict == "does not hold"
+    assert '"retained success, consft_calibrated@1 - sft@1" would have to move by 0.00' in finding.change
+
+
+@pytest.mark.parametrize(("own", "shown"), [(0.1, True), (0.3, False)])
+def test_consft_is_also_compared_with_plain_fine_tuning_at_its_own_learning_rate(
+    own: float, shown: bool
+) -> None:
+    def run(factor: float) -> SimpleNamespace:
+        settings = {"step_factor": factor}
+        return SimpleNamespace(record=SimpleNamespace(run=SimpleNamespace(settings=settings)))
+
+    runs = {label: {0: run(factor)} for label, factor in (("sft", own), ("consft", 0.3), ("sft@0.3", 0.3))}
+    kept = {"retained success, consft - sft": (0.0, 0.1)}
+    moved = {"backward transfer of consft": (-0.1, 0.0)}
+    for identifier, given, what in (("C2", kept, "retained success"), ("C7", moved, "backward transfer")):
+        names = [figure.what for figure in judged(identifier, {**BOTH, **given}, runs).controls]
+        assert (f"{what}, consft - sft@0.3" in names) is shown
+
+
+@pytest.mark.parametrize(("half", "verdict"), [(True, "holds"), (False, "holds in part")])
+def test_a_loss_after_half_of_the_stage_is_not_rapid(
+    half: bool, verdict: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    point = Figure("a point", ("sft",), Estimate(0.1, 0.05, 0.2), (0, 1))
+    steps = (50, 100) if half else (60, 100)
+    monkeypatch.setattr(
+        f"{MODULE}.aegis.answer_curve", lambda _, method: [point, point][: 2 * (method == "sft")]
+    )
+    monkeypatch.setattr(f"{MODULE}.aegis.learning_curve", lambda *_: (steps, [0.5, 0.6]))
+    assert judged("A1", {ANSWERS.format("sft"): (0.05, 0.2)}).verdict == verdict
+
+
 def test_only_a_method_that_certainly_keeps_more_answers_than_plain_fine_tuning_is_said_to() -> None:
     given = _lora(((-0.05, -0.02), (-0.04, -0.019), LOST))
     given["question retention, sft - frozen"] = (-0.2, -0.045)

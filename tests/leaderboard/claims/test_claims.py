@@ -52,6 +52,12 @@ def test_without_any_record_every_claim_says_which_command_is_missing(bench: Ben
     )
 
 
+def test_the_page_says_how_many_rules_were_corrected_with_the_records_known(bench: Bench) -> None:
+    corrected = resolve("clbench.leaderboard.pages.claims_page:CORRECTED")
+    assert set(corrected) < set(IDS)
+    assert f"but {len(corrected)} of {len(IDS)} were corrected with the records known" in bench.page()
+
+
 def test_every_claim_has_its_paper_rule_and_the_papers_figure(bench: Bench) -> None:
     page = bench.page()
     for identifier in IDS:
@@ -92,7 +98,7 @@ def test_a_control_says_whether_it_explains_what_is_kept(bench: Bench) -> None:
     assert "The records cannot show what shuffled_weights says about it." in entry
 
 
-def test_what_keeps_skills_at_the_published_learning_rate_is_asked_of_controls_there(bench: Bench) -> None:
+def test_what_keeps_skills_at_the_scenarios_learning_rate_is_asked_of_controls_there(bench: Bench) -> None:
     for label in ("sft", "sft@1", "consft", "consft@1", "consft_calibrated"):
         bench.add(label)
     for label in ("consft_calibrated@1", "constant_weight+step_factor=1.0"):
@@ -100,9 +106,9 @@ def test_what_keeps_skills_at_the_published_learning_rate_is_asked_of_controls_t
     bench.add("shuffled_weights+step_factor=1.0", kept=0.2)
     entry = section(bench.page(), "C2")
     assert (
-        "At the published learning rate consft_calibrated@1 keeps 0.70 more than sft; constant_weight is not "
-        "told apart from it: weighing single samples need not be what keeps skills; shuffled_weights does "
-        "not reach it: it matters which samples get small weights."
+        "At the scenario's learning rate, consft_calibrated@1 keeps 0.70 more than sft; constant_weight is "
+        "not told apart from it: weighing single samples need not be what keeps skills; shuffled_weights "
+        "does not reach it: it matters which samples get small weights."
     ) in entry
 
 

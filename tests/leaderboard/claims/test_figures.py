@@ -25,12 +25,14 @@ figures = {
         "median_stage",
         "perturbation_gain",
         "perturbation_loss",
+        "share_afterwards",
         "share_between",
         "share_of_steps",
     )
 }
 Figure = resolve("clbench.leaderboard.claims.evidence:Figure")
 best_first = resolve("clbench.leaderboard.claims.claim:best_first")
+deciding = resolve("clbench.leaderboard.claims.claim:deciding")
 what_would_change = resolve("clbench.leaderboard.claims.claim:what_would_change")
 
 
@@ -60,6 +62,9 @@ def test_the_share_of_weights_leaves_out_both_ends_and_the_last_tenth(bench: Ben
     bench.add("consft", diagnostics={stage: {"omega_counts": table} for stage, table in tables.items()})
     found = figures["share_between"](bench.evidence(), "consft")
     assert found.value == pytest.approx((2 + 3 + 4 + 10) / 200)
+    later = figures["share_between"](bench.evidence(), "consft", afterwards=True)
+    assert later.value == pytest.approx(50 / 59)
+    assert figures["share_afterwards"](bench.evidence(), "consft").value == pytest.approx(59 / 259)
 
 
 def test_the_curve_of_a_target_is_the_mean_of_the_seeds(bench: Bench, add: Callable[..., None]) -> None:
@@ -95,6 +100,21 @@ def test_the_loss_by_perturbation_is_that_from_what_was_learned(
     assert figures["perturbation_loss"](evidence, "sft").value == pytest.approx(1.0 - 0.65)
     gain = figures["perturbation_gain"](evidence, "consft", "sft")
     assert gain.value == pytest.approx((1.0 - 0.65) - (0.8 - 0.65))
+
+
+def test_a_target_that_no_policy_can_do_when_perturbed_costs_no_method_anything(
+    bench: Bench, add: Callable[..., None], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    success = [[1, 1, 0, 0, 0], [1, 1, 1, 0, 0], [1, 1, 0, 0.9, 0]]
+    for seed in range(2):
+        for method, displaced in (("sft", (0.5, 0.7)), ("consft", (0.4, 0.8))):
+            add(method, seed, success, perturbed=np.ones((3, 2)), perturbed_learned=displaced)
+    run = bench.evidence().runs["sft"][0]
+    impossible = frozenset({run.scores.layout.target[0]})
+    monkeypatch.setattr("clbench.leaderboard.claims.figures.IMPOSSIBLE", impossible)
+    evidence = bench.evidence()
+    assert figures["perturbation_loss"](evidence, "sft").value == pytest.approx(0.9 - 0.7)
+    assert figures["perturbation_gain"](evidence, "consft", "sft").value == pytest.approx(0.2 - 0.1)
 
 
 def test_a_difference_of_a_metric_may_be_twice_as_large_as_the_metric(
@@ -140,6 +160,17 @@ def test_the_largest_figure_comes_first_and_a_missing_one_never_does() -> None:
     )
     assert best_first([missing, small, large]) == (large, missing, small)
     assert best_first([missing, small]) == (small, missing)
+
+
+@pytest.mark.parametrize(
+    ("verdict", "which"),
+    [("does not hold", "near"), ("holds", "high"), ("holds in part", "high"), ("undecided", "missing")],
+)
+def test_the_figure_that_decides_is_the_first_that_would_change_the_verdict(verdict: str, which: str) -> None:
+    ends = {"low": (-0.3, -0.2), "near": (-0.1, 0.19), "missing": (None, None), "high": (0.2, 0.3)}
+    given = {name: Figure(name, (), Estimate(0.0, *both), (0, 1)) for name, both in ends.items()}
+    of_verdict = [figure for name, figure in given.items() if verdict != "does not hold" or name != "high"]
+    assert deciding(verdict, of_verdict, 0.20).what == which
 
 
 @pytest.mark.parametrize("distance", [0.15, 0.1, 0.05, 0.026, 0.0245])

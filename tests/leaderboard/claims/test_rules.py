@@ -223,6 +223,58 @@ def test_a_verdict_follows_from_the_records_by_the_rule(
     assert bench.judge(identifier).verdict == verdict
 
 
+def test_an_objective_that_the_policy_knows_already_cannot_show_what_it_adds(bench: Bench) -> None:
+    bench.add("sft@1", took=(77, 77), right=(500, 499))
+    for label in ("co_training+step_factor=1.0", VECTOR, AT_RANDOM, NO_REGULARISER):
+        bench.add(label, took=(96, 96))
+    for identifier in ("F1", "F2", "F3", "F5"):
+        finding = bench.judge(identifier)
+        assert finding.verdict == "cannot be shown here"
+        assert "is a part of the pretraining, and sft does not certainly lose 0.01" in finding.sentences[0]
+
+
+@pytest.mark.parametrize(
+    ("joint", "says"),
+    [
+        (0.9, "joint, which also learns every target, keeps more: learning alone need not degrade."),
+        ((0.1, 0.2, 0.6), "joint, which trains on all data, is not told apart from sft: the missing"),
+    ],
+)
+def test_skills_that_joint_training_loses_too_are_not_put_down_to_the_missing_constraint(
+    joint: Any, says: str, bench: Bench
+) -> None:
+    bench.add("sft", kept=0.2)
+    bench.add("joint", kept=joint)
+    (sentence,) = bench.judge("C1").sentences
+    assert sentence.startswith(says)
+
+
+def test_a_penalty_that_the_measure_hardly_notices_is_told_with_its_difference(bench: Bench) -> None:
+    bench.add("l2_sp", sparsity=0.52)
+    bench.add("sft", sparsity=0.5)
+    bench.add("consft", sparsity=0.5, diagnostics=ACTIVE)
+    assert "Even a penalty on moved weights keeps only 0.020 more of them in place" in " ".join(
+        bench.judge("C4").sentences
+    )
+
+
+def test_what_would_change_a_rapid_loss_is_the_point_that_shows_it(bench: Bench) -> None:
+    bench.add("sft", right=(500, 400), edit=_early_loss)
+    finding = bench.judge("A1")
+    assert finding.verdict == "holds"
+    assert "sft after 50 steps of the first target" in finding.change
+
+
+def test_the_seeds_in_which_aegis_sheds_little_are_counted(bench: Bench) -> None:
+    def shed(record: Record) -> None:
+        record.diagnostics["1"] = {"energy_shed_mean": 0.004 + 0.05 * (record.run.seed == 2)}
+
+    bench.add("aegis", edit=shed)
+    assert bench.judge("A5").sentences == (
+        "The share of the first stage is below 1 % in 2 of 3 seeds; the largest is 5.40%.",
+    )
+
+
 @pytest.mark.parametrize(
     ("low", "high", "says"),
     [

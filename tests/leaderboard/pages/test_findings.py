@@ -39,7 +39,7 @@ def test_a_method_that_is_certainly_better_is_named_with_its_gain(
     text = page()
     # kept counts two skills and one earlier target of four tasks in all: a gain of 3/4 of the difference
     assert "On clbench/Even-v1, yes: `finch` by 0.300 [" in text
-    assert "Told apart from it as worse: `l2_sp` by 0.300 [" in text
+    assert "Told apart from plain fine-tuning as worse: `l2_sp` by 0.300 [" in text
     table = text.partition("| scenario | method | gain |")[2]
     assert [line.split(" | ")[1] for line in table.splitlines()[2:5]] == ["finch", "lora", "l2_sp"]
 
@@ -50,9 +50,9 @@ def test_without_one_the_page_says_so_and_names_the_largest_gain(
     fill(even_board, sft=0.4, finch=0.4, lora=0.4)
     text = page()
     assert (
-        "none is told apart from it as better: the largest gain of 2 methods, that of `finch`, is 0.000"
-        in text
-    )
+        "none is told apart from plain fine-tuning as better: the largest gain of 2 methods, that of "
+        "`finch`, is 0.000"
+    ) in text
     assert re.search(
         r"To be told apart, a gain must exceed 0\.\d{3}( to 0\.\d{3}, depending on the method)?\.", text
     )
@@ -65,8 +65,9 @@ def test_a_difference_that_is_certain_only_without_counting_the_comparisons_is_s
     fill(even_board, sft=0.4, finch=0.5, lora=0.3, **same)
     text = page()
     assert (
-        "none is told apart from it as better: the largest gain of 9 methods, that of `finch`, is 0.0" in text
-    )
+        "none is told apart from plain fine-tuning as better: the largest gain of 9 methods, that of "
+        "`finch`, is 0.0"
+    ) in text
     alone = "by its own interval alone, without correction for 9 comparisons"
     assert f"Higher {alone}: `finch` by 0.0" in text
     assert f"Lower {alone}: `lora` by 0.0" in text
@@ -82,6 +83,37 @@ def test_the_ladder_tells_what_a_smaller_learning_rate_does(
             even_board("sft", seed, kept, "ladder", step_factor=factor)
     assert "plain fine-tuning keeps 0.20" in page()
     assert "at the scenario's learning rate, and 0.50" in page()
+    assert "The difference, seed by seed, is 0.30 [" in page()
+    assert "which is not certain; it flatters" not in page()
+
+
+def test_a_smaller_learning_rate_that_keeps_more_by_chance_is_not_called_certain(
+    even_board: Callable[..., Path], page: Callable[[], str]
+) -> None:
+    fill(even_board, sft=0.4)
+    for factor, kept in ((1.0, (0.1, 0.5)), (0.1, (0.5, 0.3))):
+        for seed, share in enumerate(kept):
+            even_board("sft", seed, share, "ladder", step_factor=factor)
+    found = re.search(r"The difference, seed by seed, is 0\.10 \[-0\.\d+, 0\.\d+\](.*)", page())
+    assert found
+    assert found[1] == (
+        ", which is not certain; it flatters this rate, the best of 2 in the episodes that measure it."
+    )
+
+
+@pytest.mark.parametrize(
+    ("chances", "says"),
+    [
+        ([0.016, 0.039, 0.11, 0.2, 0.6, 0.7], "Of these 6 p, 2 are below 0.05; after"),  # 6 x 0.016
+        ([0.0001, 0.0002, 0.04], "Of these 3 p, 3 are below 0.05; after"),
+        ([0.2, 0.6], None),
+        ([0.01], None),
+    ],
+)
+def test_several_p_are_corrected_for_their_number(chances: list[float], says: str | None) -> None:
+    sentences = list(resolve("clbench.leaderboard.pages.agreements:after_correction")(chances))
+    stay = "none" if len(chances) == 6 else "3"
+    assert sentences == ([f"{says} Holm's correction for their number, {stay}."] if says else [])
 
 
 def test_a_gain_that_is_not_certain_over_a_tied_setting_is_no_yes(
@@ -98,6 +130,13 @@ def test_a_gain_that_is_not_certain_over_a_tied_setting_is_no_yes(
     assert "On clbench/Even-v1, yes" not in text
     assert "On clbench/Even-v1, not for certain: `finch` gains 0.300" in text
     assert "but 0.000 [0.000, 0.000] at factor 0.1, which tuning rated as high (4 seeds)." in text
+
+
+def test_claims_that_hold_are_named_since_some_are_about_plain_fine_tuning(
+    even_board: Callable[..., Path], page: Callable[[], str]
+) -> None:
+    fill(even_board, sft=0.4)
+    assert "What holds: C5, Bounds how much a step can disrupt" in page()
 
 
 def test_how_fast_lost_skills_come_back_is_told_with_their_names(

@@ -309,3 +309,14 @@ def test_fields_are_read_with_the_docstrings_under_them() -> None:
     assert described.division == "prior demonstrations"
     assert described.summary == "A method of this file."
     assert described.hook("diagnostics") == []
+
+
+def test_a_share_has_the_interval_that_it_has_on_the_page_of_the_claims(bench: Bench) -> None:
+    for seed in range(3):
+        shed = {"1": {"energy_shed_mean": 0.004 + 0.05 * (seed == 2)}}
+        bench.add("aegis", seed=seed, diagnostics=shed)
+    row = re.search(
+        r"\| energy_shed_mean \| 0\.02067 \[(\S+), (\S+)\] \|", bench.pages()["aegis"].replace("\\", "")
+    )
+    assert row
+    assert 0 < float(row[1]) < float(row[2]) < 1  # plain Student's would begin at -0.05
