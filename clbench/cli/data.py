@@ -205,7 +205,7 @@ def pretrain(
         bars.finish(name, f"in {folder}")
 
 
-def measure(scenario: str, /, *tasks: str, episodes: Annotated[int, whole_number(1)] = 100) -> None:
+def measure(scenario: ScenarioId, /, *tasks: str, episodes: Annotated[int, whole_number(1)] = 100) -> None:
     """Measure the experts of SCENARIO, or of TASKS alone: their success rates and returns.
 
     Args:

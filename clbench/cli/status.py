@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 from rich.console import Console
@@ -31,6 +32,10 @@ from clbench.records.paths import RECORDS
 from clbench.records.status import RunState, State, found_runs, run_state, seconds_left
 from clbench.spec.policies import DEFAULT_POLICY, SMALL, policy_name
 from clbench.spec.protocol import DEFAULT_SEEDS
+
+if TYPE_CHECKING:
+    from clbench.records.record import Record
+    from clbench.runs.spec import ResolvedRun
 
 NOT_GIVEN: tuple[object, ...] = (False, DEFAULT_SEEDS, 0, 0, DEFAULT_POLICY, SMALL, {})
 """Values of the options that choose among the runs of a scenario."""
@@ -82,13 +87,14 @@ def status(
             paths = found_runs(records)
             if not paths:
                 raise InputError(f"There are no runs in {records}: `clbench run` makes them.")
+            states = [run_state(path, Scores.from_record) for path in paths]
         else:
             from clbench.runs.spec import RunSpec
 
             name = policy_name(policy, policy_size)
             spec = RunSpec("", "", first_seed, changes or {}, order=order, policy=name)
-            paths = [one.path(records) for one in requested(scenarios, methods, every, seeds, spec, records)]
-        states = [run_state(path, Scores.from_record) for path in paths]
+            runs = requested(scenarios, methods, every, seeds, spec, records)
+            states = [_state_of(run, records) for run in runs]
     if as_json:
         print_json([_values(state, records) for state in states])
         return
@@ -99,6 +105,26 @@ def status(
         if line:
             console.print(line, markup=False, highlight=False, soft_wrap=True)
     console.print(_summary(states), highlight=False)
+
+
+def _state_of(run: ResolvedRun, records: Path) -> RunState:
+    """Return the state of a run that was asked for: a record of other settings is not its record."""
+    from clbench.scoring.scores import Scores
+
+    is_other = False
+
+    def check(record: Record) -> None:
+        nonlocal is_other
+        Scores.from_record(record)
+        # the device and the perturbed episodes are not asked for
+        found = replace(record.run, device=run.info.device, perturb=run.info.perturb)
+        is_other = (found, record.scenario) != (run.info, run.scenario_info)
+
+    state = run_state(run.path(records), check)
+    if not is_other:
+        return state
+    reason = "the record there has other settings or another budget: `clbench run` replaces it"
+    return RunState(state.path, "to do", reason=reason)
 
 
 def _table(states: Sequence[RunState]) -> Table:

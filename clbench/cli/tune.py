@@ -119,7 +119,7 @@ def tune(
         ladder = {name: rungs(cls, fixed) for name, cls in classes.items()}
         combinations = _combinations(values or {})
     if values:
-        found = run({BASELINE: [{}], **dict.fromkeys(names, combinations)})
+        found = run({BASELINE: [{}], **{name: _besides(name, combinations) for name in names}})
         Console().print(_table(scenario, {name: (None, one) for name, one in found.items()}, seeds))
         return
     chosen = _choose(classes, ladder, run)
@@ -145,6 +145,11 @@ def _choose(
         tried = (*begun[name], *refined[name])
         chosen[name] = Tuned(best_of(tried).settings, tried)
     return chosen
+
+
+def _besides(name: str, combinations: list[dict[str, str]]) -> list[dict[str, str]]:
+    """Return the settings to try of a method; plain fine-tuning is also run unchanged, to compare with."""
+    return [{}, *combinations] if name == BASELINE else combinations
 
 
 def _without_controls(names: list[str], controls: Mapping[str, str], every: bool) -> list[str]:
@@ -176,17 +181,19 @@ def _run(
 
     with checked_input():
         runs = {
-            name: [
-                [replace(first, method=name, seed=seed, changes=dict(one)).resolve() for seed in seeds]
-                for one in settings
-            ]
-            for name, settings in wanted.items()
+            name: _resolved(replace(first, method=name), settings, seeds) for name, settings in wanted.items()
         }
     every = [one for groups in runs.values() for group in groups for one in group]
     if not do_runs(every, records, lambda: Processes(workers)):
         sys.exit(1)
     with checked_input():
         return {name: [_tried(group, records) for group in groups] for name, groups in runs.items()}
+
+
+def _resolved(first: RunSpec, settings: Sequence[Settings], seeds: Sequence[int]) -> list[list[ResolvedRun]]:
+    """Return the runs of each setting; what a method holds as one, such as 1 and 1.0, is one setting."""
+    groups = [[replace(first, seed=seed, changes=dict(one)).resolve() for seed in seeds] for one in settings]
+    return list({group[0].label: group for group in groups}.values())
 
 
 def _tried(runs: Sequence[ResolvedRun], records: Path) -> Tried:

@@ -54,8 +54,8 @@ def export_demonstrations(
         tasks: Names of tasks, or one name; the retained skills and the targets if there are none.
 
     Raises:
-        InputError: The folder exists, the format is unknown, or a world does not give its steps per second.
-        UnknownNameError: A name is unknown.
+        InputError: The folder exists, or a world does not give its steps per second.
+        UnknownNameError: The format or a name is unknown.
         MissingPackageError: A package is not installed.
         LeakError: The running hooks of a method must not read them.
         RenderingError: The tasks have a camera, and no back end of this machine can draw.

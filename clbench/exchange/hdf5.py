@@ -313,7 +313,7 @@ class _File:
         if outside.any():
             row, column = np.argwhere(outside)[0]
             raise self._error(
-                f"row {row}, column {column} of {what} is {values[row, column]:g}: the world "
+                f"row {row}, column {column} of {what} is {values[row, column]:.9g}: the world "
                 f"{self._task.world} takes float32 numbers from {space.low[column]:g} to "
                 f"{space.high[column]:g}"
             )

@@ -19,6 +19,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from clbench.base.entry_points import resolve
+from clbench.base.errors import InputError
 from clbench.base.seeding import derive_seed
 from clbench.data.demonstrations import demonstrate
 from clbench.data.questions import QuestionKind
@@ -56,9 +57,12 @@ def check_scenario(scenario: Scenario, *, episodes: int = 10, success: float = 0
         success: Share of the episodes in which the expert must succeed.
 
     Raises:
+        InputError: There are no episodes.
         UnknownNameError: An entry point does not exist.
         ScenarioError: Any other part is wrong.
     """
+    if episodes < 1:
+        raise InputError(f"episodes must be a whole number from 1, not {episodes}.")
     tasks = scenario.tasks + scenario.background
     try:
         check_scenario_id(scenario.id)
@@ -170,6 +174,10 @@ def _play(task: Task, world: World, seed: int, act: Any) -> _Episode:
             raise ScenarioError(f"{where}: the action of {task.expert} must be in {world.action_space}.")
         actions.append(action.clip(-1, 1))
         state, reward, done, _, info = world.step(actions[-1])
+        if np.shares_memory(state, states[-1]):
+            raise ScenarioError(
+                f"{where}: the world gives the array of its last state again, changed: return a copy."
+            )
         states.append(state)
         if not np.isfinite(float(reward)):
             raise ScenarioError(f"{where}: the reward is {reward}.")

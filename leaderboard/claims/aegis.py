@@ -6,6 +6,8 @@ before plain fine-tuning has forgotten any answer.
 
 from __future__ import annotations
 
+from typing import Any
+
 from clbench.base.text import counted
 
 from ..board.runs import is_number
@@ -223,7 +225,7 @@ def _seeds_below(evidence: Evidence) -> tuple[str, ...]:
     """Return in how many seeds the share is below the bar: one seed may decide the mean."""
     runs = evidence.runs.get("aegis", {}).values()
     shed = [run.record.diagnostics.get("1") for run in runs]
-    values = [found.get("energy_shed_mean") for found in shed if isinstance(found, dict)]
+    values: list[Any] = [found.get("energy_shed_mean") for found in shed if isinstance(found, dict)]
     known = [value for value in values if is_number(value)]
     if len(known) < 2:
         return ()

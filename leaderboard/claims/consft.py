@@ -146,9 +146,9 @@ def _controls_of(evidence: Evidence, arm: str) -> tuple[Figure, ...]:
 
 def _sft_at_the_rate_of(evidence: Evidence, arm: str) -> tuple[str, ...]:
     """Return the label of sft at the arm's learning rate, if tuning chose another for sft and it ran."""
-    first = (next(iter(evidence.runs.get(label, {}).values()), None) for label in (arm, "sft"))
-    factors = [run.record.run.settings.get("step_factor", PUBLISHED) if run else None for run in first]
-    if None in factors or factors[0] == factors[1]:
+    runs = [next(iter(evidence.runs.get(label, {}).values()), None) for label in (arm, "sft")]
+    factors = [run.record.run.settings.get("step_factor", PUBLISHED) for run in runs if run is not None]
+    if len(factors) < len(runs) or factors[0] == factors[1]:
         return ()
     label = rung("sft", factors[0])
     return (label,) if label in evidence.runs else ()
@@ -202,7 +202,7 @@ def as_good_as_replay(evidence: Evidence) -> Finding:
     sentences = [f"It holds for {' and '.join(holding)}."] if holding else []
     if fails:
         names = " and ".join(arm[0].methods[0] for arm in arms)
-        sentences = [f"Replay keeps certainly more skills than {names}."]
+        sentences = [f"Replay certainly keeps more skills than {names}."]
     return Finding(
         decided(holds=bool(holding), fails=fails),
         figures,

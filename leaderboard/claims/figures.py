@@ -157,7 +157,8 @@ def _lost_by_perturbation(rates: Rates) -> Array:
     of_targets = rates.perturbed[..., 1:, rates.layout.columns("target")]
     lost = rates.learned - np.diagonal(of_targets, axis1=-2, axis2=-1)
     known = np.isfinite(lost)
-    return np.where(known, lost, 0.0).sum(axis=-1) / np.where(known.any(axis=-1), known.sum(axis=-1), np.nan)
+    total: Array = np.where(known, lost, 0.0).sum(axis=-1)
+    return total / np.where(known.any(axis=-1), known.sum(axis=-1), np.nan)
 
 
 def _possible(evidence: Evidence) -> Evidence:

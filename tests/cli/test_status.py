@@ -71,6 +71,21 @@ def test_a_record_that_run_would_do_again_is_not_done(
     assert "Toy-v0/frozen/seed-0: damaged, " in capsys.readouterr().out
 
 
+def test_a_record_of_other_settings_is_not_that_of_the_run(
+    done: Record, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    settings = {**done.run.settings, "step_factor": 0.25}
+    other = dataclasses.replace(done, run=dataclasses.replace(done.run, settings=settings))
+    write_record(other, RunSpec(TOY, "frozen", seed=0).path(tmp_path))
+    assert not has_record(RunSpec(TOY, "frozen", seed=0).resolve(), tmp_path)
+    resolve("clbench.cli.status:status")(TOY, "frozen", seeds=1, records=tmp_path)
+    shown = capsys.readouterr().out
+    assert "Toy-v0/frozen/seed-0: to do, the record there has other settings or another budget" in shown
+    assert "1 run: 1 to do." in shown
+    resolve("clbench.cli.status:status")(records=tmp_path)
+    assert "1 run: 1 done." in capsys.readouterr().out
+
+
 def test_an_empty_folder_is_said_to_be_empty(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as stopped:
         resolve("clbench.cli.status:status")(records=tmp_path)
@@ -80,8 +95,9 @@ def test_an_empty_folder_is_said_to_be_empty(tmp_path: Path, capsys: pytest.Capt
 
 @pytest.mark.parametrize("option", [["--all"], ["--seeds", "2"], ["--set.step_factor", "2"]])
 def test_an_option_that_chooses_among_the_runs_of_a_scenario_needs_one(
-    option: list[str], records: Path, capsys: pytest.CaptureFixture[str]
+    option: list[str], records: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    monkeypatch.syspath_prepend(".")  # and take back what the command puts there
     with pytest.raises(SystemExit) as stopped:
         app(["status", "--records", str(records), *option])
     assert stopped.value.code == 2

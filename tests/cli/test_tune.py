@@ -7,6 +7,8 @@ from pathlib import Path
 
 import pytest
 
+from clbench.cli.main import app
+
 TOY = "clbench.testing:clbench/Toy-v0"
 
 
@@ -16,6 +18,20 @@ def _tune(folder: Path, *arguments: str, method: str = "l2_sp") -> subprocess.Co
     done = subprocess.run(command, capture_output=True, text=True, cwd=folder, timeout=600, check=False)
     assert done.returncode == 0, done.stderr
     return done
+
+
+def test_equal_settings_run_once_and_plain_fine_tuning_is_run_unchanged_too(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.syspath_prepend(".")  # and take back what the command puts there
+    values = ("--values.step_factor", "1,1.0", "--first-seed", "0", "--seeds", "1")
+    words = ("tune", "tiny:me/Tiny-v0", "sft", *values, "--records", str(tmp_path))
+    app(words, result_action="return_value")
+    printed = capsys.readouterr()
+    rows = [line.split() for line in printed.out.splitlines() if " sft" in line]
+    assert [row[3] for row in rows] == ["unchanged", "step_factor=1.0"]
+    assert "done by another command" not in printed.err
+    assert len(list(tmp_path.rglob("seed-0.json"))) == 2
 
 
 @pytest.mark.slow

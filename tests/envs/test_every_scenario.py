@@ -359,8 +359,10 @@ def test_a_lane_without_an_episode_is_named(scenario: Scenario) -> None:
 @every_scenario
 def test_instructions_and_questions_are_plain_words_of_the_vocabulary(scenario: Scenario) -> None:
     sentences = []
+    tasks = (*scenario.tasks, *scenario.background)
     for texts in (
-        *(task.instructions for task in scenario.tasks),
+        # a wording of test episodes must be no wording of training, of its own task or of another
+        *((*task.instructions, *task.test_instructions) for task in tasks),
         *(kind.wordings for kind in resolve(scenario.questions)),
     ):
         assert len(set(texts)) == len(texts) >= 3

@@ -232,6 +232,7 @@ def _last(value: float) -> Callable[[h5py.Group], None]:
         ),
         (_set("demo_1/states", np.full((4, 4), np.nan)), "demo_1/states holds numbers that are not finite"),
         (_set("demo_1/states", np.full((4, 4), 1e300)), r"row 0, column 0 of data/demo_1/states is 1e\+300"),
+        (_last(1.0000002), "row 1, column 0 of data/demo_1/actions is 1.00000024: the world"),
         (_last(1.5), r"row 1, column 0 of data/demo_1/actions is 1.5: the world .* from -1 to 1"),
         (
             _set("demo_1/actions", np.zeros((0, 2))),

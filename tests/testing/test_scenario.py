@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
+from clbench.base.errors import InputError
 from clbench.data.questions import QuestionKind
 from clbench.spec.scenario import Scenario
 from clbench.testing import TOY, TOY_QUESTIONS, ScenarioError, ToyWorld, check_scenario, toy_expert
@@ -41,6 +42,18 @@ class Alike(ToyWorld):
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
         return super().reset(seed=0, options=options)
+
+
+class Reusing(ToyWorld):
+    """It has one array for all states of an episode."""
+
+    def reset(self, **options: Any) -> tuple[Any, dict[str, Any]]:
+        self.shown, info = super().reset(**options)
+        return self.shown, info
+
+    def step(self, action: Any) -> Any:
+        self.shown[:], *others = super().step(action)
+        return self.shown, *others
 
 
 class Mute(ToyWorld):
@@ -150,6 +163,7 @@ def test_the_toy_passes() -> None:
         ("Rounded", "task left, step 0: the state is not in"),
         ("Remembering", "the same seed and actions give another episode after other episodes"),
         ("Alike", "all seeds have the same initial state"),
+        ("Reusing", "step 0: the world gives the array of its last state again, changed: return a copy"),
         ("Mute", r'terminated is True, info\["success"\] is None'),
         ("Giving", "doing nothing completes it"),
         ("Lost", "step 0: the reward is nan"),
@@ -232,3 +246,8 @@ def test_instructions_that_differ_in_case_and_punctuation_alone_are_the_same() -
 def test_a_scenario_without_a_target_is_named() -> None:
     with pytest.raises(ScenarioError, match="no target to learn"):
         check_scenario(dataclasses.replace(TOY, target=()))
+
+
+def test_a_check_needs_episodes() -> None:
+    with pytest.raises(InputError, match="episodes must be a whole number from 1, not 0"):
+        check_scenario(TOY, episodes=0)

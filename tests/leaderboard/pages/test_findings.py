@@ -79,7 +79,7 @@ def test_the_ladder_tells_what_a_smaller_learning_rate_does(
     fill(even_board, sft=0.4)
     assert "smaller learning rate" not in page()
     for factor, kept in ((1.0, 0.2), (0.1, 0.5)):
-        for seed in range(2):
+        for seed in range(4):
             even_board("sft", seed, kept, "ladder", step_factor=factor)
     assert "plain fine-tuning keeps 0.20" in page()
     assert "at the scenario's learning rate, and 0.50" in page()

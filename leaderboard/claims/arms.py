@@ -1,0 +1,66 @@
+"""The two arms of ConSFT, and whether their weights differ between samples: an arm counts only if they do."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+from .claim import Finding, best_first
+from .evidence import Evidence, Figure
+from .figures import share_afterwards, share_between
+
+ARMS = ("consft", "consft_calibrated")
+"""The published loss with a tuned first temperature; the published constants, with the loss in their unit."""
+
+LEAST_BETWEEN = 0.1
+"""Share of the weights between 0.01 and 0.9, before the last tenth of the schedule, from which an arm counts.
+Below it, most samples of most steps weigh alike: nothing, which Adam cancels, or 1."""
+
+NEEDS_WEIGHTS = "Weights that differ between samples while the temperature is low."
+"""What would change a verdict without an arm that counts."""
+
+
+def _counts(share: Figure) -> bool:
+    """Return whether an arm with this share has weights that differ between samples; unknown ones may."""
+    return math.isnan(share.value) or share.value >= LEAST_BETWEEN
+
+
+def arms_that_count(evidence: Evidence) -> tuple[str, ...]:
+    """Return the arms that count: those whose weights differ between samples."""
+    return tuple(arm for arm in ARMS if _counts(share_between(evidence, arm)))
+
+
+def inactive_sentences(evidence: Evidence) -> tuple[str, ...]:
+    """Return a sentence for each arm that does not count."""
+    shares = ((arm, share_between(evidence, arm)) for arm in ARMS)
+    return tuple(
+        f"Before the last tenth of its schedule, {share.value:.1%} of the weights of {arm} lie between 0.01 "
+        f"and 0.9: most samples weigh alike, and its figures do not count.{_afterwards(evidence, arm)}"
+        for arm, share in shares
+        if not _counts(share)
+    )
+
+
+def _afterwards(evidence: Evidence, arm: str) -> str:
+    """Return how much of the training the rule on weights leaves out: a stage may outlast the schedule."""
+    later = share_afterwards(evidence, arm)
+    if math.isnan(later.value):
+        return ""
+    between = share_between(evidence, arm, afterwards=True)
+    return (
+        f" This leaves out the last tenth and what follows: {later.value:.0%} of its weights, of which "
+        f"{between.value:.0%} lie between."
+    )
+
+
+def without_an_arm(evidence: Evidence, figures: Sequence[Figure], controls: Sequence[Figure] = ()) -> Finding:
+    """Return the finding on a board on which no arm counts."""
+    shares = tuple(one(evidence, arm) for arm in ARMS for one in (share_between, share_afterwards))
+    return Finding(
+        "cannot be shown here",
+        best_first(figures),
+        (*controls, *shares),
+        inactive_sentences(evidence),
+        NEEDS_WEIGHTS,
+        about=ARMS,
+    )

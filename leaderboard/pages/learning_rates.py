@@ -1,0 +1,96 @@
+"""Sentences of the findings on smaller learning rates: what they keep, without any method."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+
+from clbench.spec.references import BASELINE, FROZEN
+
+from ..board.frontier import Curve, Rung
+from ..board.rows import Row
+from ..board.summary import WITHOUT_DEMONSTRATIONS
+from ..claims.evidence import Evidence, rung
+from ..views.format import format_interval
+
+Curves = Mapping[str, Sequence[Curve]]
+
+
+def rate_sentences(
+    frontiers: Curves, boards: Mapping[str, Sequence[Row]], evidence: Callable[[str], Evidence]
+) -> Iterator[str]:
+    """Yield what plain fine-tuning and other methods keep at the rates of the ladder.
+
+    Args:
+        frontiers: Curves of each scenario with a ladder.
+        boards: Rows of each scenario with the usual policy.
+        evidence: Returns the runs of the scenario with a Gymnasium id, those of the ladder included.
+    """
+    for name, curves in frontiers.items():
+        for curve in curves:
+            if curve.is_baseline:
+                yield _of_the_baseline(name, curve, evidence)
+                yield from _at_the_first_rung(name, curve, curves)
+        yield from _of_frozen(name, boards.get(name, []))
+
+
+def rate_lines(frontiers: Curves) -> Iterator[tuple[str, ...]]:
+    """Yield the cells of the table: scenario, method, factor, learned and kept."""
+    for name, curves in frontiers.items():
+        for curve in curves:
+            for one in curve.rungs:
+                learned, kept = format_interval(one.learned), format_interval(one.kept)
+                yield name, curve.method, f"{one.factor:g}", learned, kept
+
+
+def _of_the_baseline(name: str, curve: Curve, evidence: Callable[[str], Evidence]) -> str:
+    """Return what plain fine-tuning keeps at the first rung, and at the one where it keeps most."""
+    first, best = curve.rungs[0], max(curve.rungs, key=lambda rung: rung.kept.value or 0.0)
+    more = ""
+    if best is not first:
+        more = (
+            f", and {format_interval(best.kept)} at {_rate(best.factor)}, where it learns "
+            f"{format_interval(best.learned)}"
+        )
+        more += f". {_gain_of_a_rate(first, best, len(curve.rungs), evidence(name))}"
+    return f"On {name}, plain fine-tuning keeps {format_interval(first.kept)} at {_rate(first.factor)}{more}."
+
+
+def _gain_of_a_rate(first: Rung, best: Rung, rates: int, evidence: Evidence) -> str:
+    """Return what the rate that keeps most gains over the first one, seed by seed."""
+    gain = evidence.difference("kept", *(rung(BASELINE, one.factor) for one in (best, first))).estimate
+    certain = "" if gain.is_above(0) else ", which is not certain"
+    return (
+        f"The difference, seed by seed, is {format_interval(gain)}{certain}; it flatters this rate, the best "
+        f"of {rates} in the episodes that measure it"
+    )
+
+
+def _rate(factor: float) -> str:
+    return "the scenario's learning rate" if factor == 1 else f"{factor:g} times the scenario's learning rate"
+
+
+def _at_the_first_rung(name: str, baseline: Curve, curves: Sequence[Curve]) -> Iterator[str]:
+    """Yield what the methods without prior demonstrations keep at the learning rate of the first rung."""
+    factor = baseline.rungs[0].factor
+    kept = {
+        curve.method: curve.rungs[0].kept
+        for curve in curves
+        if curve.division in WITHOUT_DEMONSTRATIONS
+        and curve is not baseline
+        and curve.rungs[0].factor == factor
+    }
+    if kept:
+        falling = sorted(kept, key=lambda method: -(kept[method].value or 0.0))
+        listed = ", ".join(f"`{method}` {format_interval(kept[method])}" for method in falling)
+        yield f"On {name}, methods without prior demonstrations keep at factor {factor:g}: {listed}."
+
+
+def _of_frozen(name: str, rows: Sequence[Row]) -> Iterator[str]:
+    """Yield what a policy that learns nothing keeps by this measure."""
+    for row in rows:
+        if row.method == FROZEN:
+            yield (
+                f"On {name}, `{FROZEN}`, which learns nothing, keeps "
+                f"{format_interval(row.estimates['kept'])} by this measure: a target that was never learned "
+                "counts as not kept."
+            )
