@@ -21,8 +21,8 @@ if TYPE_CHECKING:
 
 MASSES = (0.5, 2.0)
 """Factors on the mass and the moments of inertia of an object. Policies have met the plain mass alone, and
-experts succeed with both factors. Two values rather than a range: no episode is nearly plain, and all
-episodes of one mass share a compiled model, of 9 MB in Fetch and 18 MB in Meta-World."""
+experts of skills succeed with both factors. Two values rather than a range: no episode is nearly plain, and
+all episodes of one mass share a compiled model, of 9 MB in Fetch and 18 MB in Meta-World."""
 
 
 @dataclass(frozen=True)

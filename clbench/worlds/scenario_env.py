@@ -143,7 +143,8 @@ class ScenarioEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
 
     def render(self) -> Any:
         """Return the rendering of the current world; without a display MuJoCo draws off screen."""
-        draw_without_display()
+        if self.render_mode is not None:
+            draw_without_display()
         return self._world(self._start.task).render()
 
     def close(self) -> None:

@@ -76,7 +76,8 @@ class Schedule:
         """Space of the instruction in observations."""
         if self._format == "tokens":
             return spaces.Box(0, VOCABULARY_SIZE - 1, (self._scenario.text_length,), np.int64)
-        texts = [words for task in self._scenario.tasks for words in task.instructions]
+        tasks = (*self._scenario.tasks, *self._scenario.background)
+        texts = [words for task in tasks for words in task.instructions]
         characters = {*string.ascii_lowercase, " ", *"".join(texts)}
         return spaces.Text(max_length=max(map(len, texts)), charset="".join(sorted(characters)))
 

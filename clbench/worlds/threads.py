@@ -50,7 +50,8 @@ class Team:
                     return
                 work(item)
 
-        helpers = self._helpers[: len(items) - 1] if items else []
+        # in a forked process, threads of the parent do not live
+        helpers = [one for one in self._helpers[: len(items) - 1] if one.thread.is_alive()] if items else []
         for helper in helpers:
             helper.asked.put(take)
         try:

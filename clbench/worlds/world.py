@@ -127,13 +127,16 @@ class OneLaneWorld(World, ABC):
         Raises:
             InputError: The action has another shape than the action space, or a number in it is not finite.
         """
-        states, rewards, successes = self._world.step([0], np.asarray(action, np.float32)[None])
+        states, rewards, successes = self._world.step([0], np.asarray(action)[None])
         success = bool(successes[0])
         return (states[0], float(rewards[0]), success, False, {"success": success, "task": self._task})
 
     def render(self) -> NDArray[np.uint8] | None:
         """Return a picture (480, 480, 3) if the render mode is "rgb_array"."""
-        return None if self.render_mode is None else self.picture()
+        if self.render_mode is None:
+            return None
+        draw_without_display()
+        return self.picture()
 
     @abstractmethod
     def picture(self) -> NDArray[np.uint8]:
@@ -162,7 +165,6 @@ class MujocoWorld(OneLaneWorld):
 
     def picture(self) -> NDArray[np.uint8]:
         """Draw the scene, (480, 480, 3)."""
-        draw_without_display()
         from gymnasium.envs.mujoco.mujoco_rendering import MujocoRenderer  # only drawing needs MuJoCo here
 
         model, data, camera = self._world.drawable(0)
@@ -179,20 +181,26 @@ class MujocoWorld(OneLaneWorld):
             self._renderer = None
 
 
-def checked_actions(actions: NDArray[np.float32], space: spaces.Box, world: str) -> NDArray[np.float32]:
+def checked_actions(
+    actions: NDArray[np.floating[Any]], space: spaces.Box, world: str, lanes: int
+) -> NDArray[np.float32]:
     """Return actions (N, A) within the bounds of the action space of a world.
 
     Raises:
-        InputError: An action has another shape than the space, or a number in it is not finite.
+        InputError: An action has another shape than the space, a number in it is not finite, or there is not
+            one for each of the N lanes.
     """
-    actions = np.asarray(actions, np.float32)
+    actions = np.asarray(actions)
     if actions.shape[1:] != space.shape:
         raise InputError(f"An action of the {world} world has shape {space.shape}, not {actions.shape[1:]}.")
+    if len(actions) != lanes:
+        raise InputError(f"{lanes} lanes of the {world} world take as many actions, not {len(actions)}.")
     finite = np.isfinite(actions)
     if not finite.all():
         wrong = actions[~finite.all(axis=1)][0]
         raise InputError(f"An action of the {world} world is finite, not {wrong.tolist()}.")
-    return np.minimum(np.maximum(actions, space.low), space.high)
+    within: NDArray[np.float32] = np.minimum(np.maximum(actions, space.low), space.high)
+    return within.astype(np.float32, copy=False)
 
 
 def lane_at(lanes: Sequence[Lane | None], number: int, world: str) -> Lane:

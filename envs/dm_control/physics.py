@@ -85,7 +85,7 @@ class DMControlVectorWorld:
         Raises:
             InputError: An action has another shape than (2,), or contains a number that is not finite.
         """
-        actions = checked_actions(actions, self.single_action_space, "dm_control")
+        actions = checked_actions(actions, self.single_action_space, "dm_control", len(lanes))
         moved = [self._lane(number) for number in lanes]
         observations = self._advance(moved, actions)
         states, rewards = np.empty((len(lanes), SIZE), np.float32), np.empty(len(lanes))

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import contextlib
+import copy
 import functools
 import importlib
 import os
+import threading
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any
@@ -17,6 +19,9 @@ from clbench.base.errors import InputError
 from clbench.worlds.perturbation import with_mass
 
 from .state import ACTION_SIZE, OBSERVATION_SIZE, Observation
+
+_ALONE = threading.Lock()
+"""Held while dm_control's own physics begins an episode, or dm_control is imported: worlds share both."""
 
 
 @dataclass(frozen=True)
@@ -51,13 +56,15 @@ class Start:
     task: Any
     """The `dm_control.suite.base.Task`."""
     model: mujoco.MjModel
+    """The scene of all episodes. `physics` has another: a reset switches its motors off for a moment."""
 
     def begin(self, seed: int, data: mujoco.MjData) -> None:
         """Set `data` to the initial state that dm_control draws for a seed."""
-        self.task.random.seed(seed)
-        with self.physics.reset_context():
-            self.task.initialize_episode(self.physics)
-        mujoco.mj_copyData(data, self.model, self.physics.data.ptr)
+        with _ALONE:
+            self.task.random.seed(seed % 2**32)  # NumPy's generator takes no larger seed
+            with self.physics.reset_context():
+                self.task.initialize_episode(self.physics)
+            mujoco.mj_copyData(data, self.model, self.physics.data.ptr)
 
     @functools.cached_property
     def _takes_whole_steps(self) -> bool:
@@ -91,7 +98,8 @@ def start(body: str, task: str) -> Start:
         )
     if motors > ACTION_SIZE:
         raise InputError(f"{body} has {motors} motors; an action has places for {ACTION_SIZE}.")
-    return Start(BODY_OF[body], environment.physics, environment.task, environment.physics.model.ptr)
+    model = copy.copy(environment.physics.model.ptr)
+    return Start(BODY_OF[body], environment.physics, environment.task, model)
 
 
 @functools.cache
@@ -104,7 +112,7 @@ def start_with_mass(body: str, task: str, mass: float) -> Start:
 
 def original_environment(domain: str, task: str) -> Any:
     """Return dm_control's own environment of a task."""
-    with _without_dm_control_renderer():
+    with _ALONE, _without_dm_control_renderer():
         return importlib.import_module(f"dm_control.suite.{domain}").SUITE[task]()
 
 

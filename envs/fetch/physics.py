@@ -174,7 +174,7 @@ class FetchVectorWorld:
         Raises:
             InputError: An action has another shape than (4,), or contains a number that is not finite.
         """
-        actions = checked_actions(actions, self.single_action_space, "Fetch")
+        actions = checked_actions(actions, self.single_action_space, "Fetch", len(lanes))
         moved = [self._lane(number) for number in lanes]
         self._act(moved, actions)
         self._team.each(self._advance, moved)

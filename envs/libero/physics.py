@@ -85,7 +85,7 @@ class LiberoVectorWorld:
         Raises:
             InputError: An action has another shape than (7,), or contains a number that is not finite.
         """
-        actions = checked_actions(actions, self.single_action_space, "LIBERO")
+        actions = checked_actions(actions, self.single_action_space, "LIBERO", len(lanes))
         moved = [self._lane(number) for number in lanes]
         for episode, action in zip(moved, actions, strict=True):
             episode.action = action

@@ -79,8 +79,10 @@ def scene_of(xml: str) -> Scene:
 @functools.cache
 def heavier(scene: Scene, mass: float) -> Scene:
     """Return a scene in which all objects are `mass` times as heavy; all its episodes share the copy."""
-    free = scene.model.jnt_type == mujoco.mjtJoint.mjJNT_FREE
-    model = with_mass(scene.model, scene.model.jnt_bodyid[free].tolist(), mass)
+    model = copy.copy(scene.model)
+    model.body_pos[:], model.body_quat[:] = scene.places  # episodes move the fixtures
+    free = model.jnt_type == mujoco.mjtJoint.mjJNT_FREE
+    model = with_mass(model, model.jnt_bodyid[free].tolist(), mass)
     return replace(scene, model=model, models=_copies(model))
 
 

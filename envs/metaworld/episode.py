@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import copy
 import functools
+from collections.abc import Iterator
 from typing import Any, TypeAlias
 
 import mujoco
@@ -68,25 +70,38 @@ class Episode(SawyerXYZEnv):
             self._settle, self.hand_init_pos = SETTLE, self._hand_place + START * np.array(start)
         self.np_random = np_random(seed)[0]
         self.seeded_rand_vec, self._freeze_rand_vec = True, False
-        self.model.body_pos[:], self.model.site_pos[:] = self.scene.body_pos, self.scene.site_pos
-        self.reset_model()  # draws places and moves objects there
-        self._freeze_rand_vec = True
-        self.reset_model()  # with the same draw: measures all objects in place
-        self._places = self.model.body_pos.copy(), self.model.site_pos.copy()
-        mujoco.mj_forward(self.model, self.data)
-        self._prev_obs = self._get_curr_obs_combined_no_goal()
-        self.curr_path_length = 0
-        return self._get_obs().astype(np.float32)
+        with self._own_model() as model:
+            model.body_pos[:], model.site_pos[:] = self.scene.body_pos, self.scene.site_pos
+            self.reset_model()  # draws places and moves objects there
+            self._freeze_rand_vec = True
+            self.reset_model()  # with the same draw: measures all objects in place
+            self._places = model.body_pos.copy(), model.site_pos.copy()
+            mujoco.mj_forward(model, self.data)
+            self._prev_obs = self._get_curr_obs_combined_no_goal()
+            self.curr_path_length = 0
+            return self._get_obs().astype(np.float32)
+
+    @contextlib.contextmanager
+    def _own_model(self) -> Iterator[mujoco.MjModel]:
+        """Let Meta-World's code use a model that no other thread moves or steps, and return it."""
+        taken = self.scene.models.take()
+        self.model = taken[0]
+        try:
+            yield self.model
+        finally:
+            self.model = self.scene.model
+            self.scene.models.give_back(taken)
 
     def place(self) -> None:
-        """Set the places of bodies and sites in the shared model to this episode's."""
+        """Set the places of bodies and sites in the model to this episode's."""
         self.model.body_pos[:], self.model.site_pos[:] = self._places
 
     def advance(self, action: NDArray[np.float32]) -> tuple[State, float, bool]:
         """Move by an action (4,) in [-1, 1]; return the state (39,), Meta-World's reward and the success."""
-        self.place()
         self.curr_path_length = 0  # the caller counts the steps
-        state, reward, _, _, info = self.step(action)
+        with self._own_model():
+            self.place()
+            state, reward, _, _, info = self.step(action)
         return state.astype(np.float32), float(reward), bool(info["success"])
 
     def move(self) -> None:

@@ -115,7 +115,7 @@ class MetaWorldVectorWorld:
         Raises:
             InputError: An action has another shape than (4,), or contains a number that is not finite.
         """
-        actions = checked_actions(actions, self.single_action_space, "Meta-World")
+        actions = checked_actions(actions, self.single_action_space, "Meta-World", len(lanes))
         order = self._order_of([self._lane(lane) for lane in lanes])
         states = np.empty((len(lanes), SIZE), np.float32)
         rewards, successes = np.empty(len(lanes)), np.empty(len(lanes), np.bool_)

@@ -42,8 +42,9 @@ class Scene:
 
     def with_mass(self, mass: float) -> Scene:
         """Return the scene with all movable objects `mass` times as heavy."""
-        self.model.body_pos[:], self.model.site_pos[:] = self.body_pos, self.site_pos  # episodes move them
-        return replace(self, model=with_mass(self.model, _things(self.model), mass))
+        model = copy.copy(self.model)
+        model.body_pos[:], model.site_pos[:] = self.body_pos, self.site_pos  # episodes move them
+        return replace(self, model=with_mass(model, _things(model), mass))
 
 
 def scene_of(original: type[SawyerXYZEnv]) -> Scene:

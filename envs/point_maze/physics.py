@@ -68,8 +68,9 @@ class PointMazeVectorWorld:
     """The ball, the physics and the observation of PointMaze in three mazes, with the tasks of `GOALS`.
 
     It is a `clbench.worlds.world.VectorWorld`. An action (2,) in [-1, 1] pushes the ball to the right and
-    upwards for 0.1 s, by up to 24 m/s^2. The reward is minus the length of the shortest way to the goal in
-    metres, plus `SUCCESS_BONUS` on success. Only success ends an episode; the caller counts its steps.
+    upwards for 0.1 s, by up to 24 m/s^2. The reward is minus the length of the way to the goal in metres,
+    through the centres of the cells, plus `SUCCESS_BONUS` on success. Only success ends an episode; the
+    caller counts its steps.
 
     Args:
         lanes: Number of lanes. A lane allocates its memory when it first enters a maze.
@@ -114,7 +115,7 @@ class PointMazeVectorWorld:
         Raises:
             InputError: An action has another shape than (2,), or contains a number that is not finite.
         """
-        actions = checked_actions(actions, self.single_action_space, "PointMaze")
+        actions = checked_actions(actions, self.single_action_space, "PointMaze", len(lanes))
         for number, action in zip(lanes, actions, strict=True):
             self._lane(number).advance(action)
         states = self._observe(lanes)

@@ -10,6 +10,7 @@ import re
 import subprocess
 import sys
 import warnings
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import gymnasium
@@ -264,11 +265,21 @@ def test_the_expert_does_its_task(task: Task) -> None:
     assert sum(expert_succeeds(task, seed) for seed in range(100, 104)) >= least
 
 
+HARD_IF_PERTURBED = {
+    "carry_back": 0.5,  # the hand relaxes while it moves to its start, and drops the heavier block
+    "peg_unplug_side": 0.6,  # Meta-World's expert flicks the peg, which moves it too little if it is heavier
+    "stick_pull": 0.7,
+    "cartpole_left": 0.75,
+    "cartpole_right": 0.75,
+}
+"""Least success of the experts that fail in more than a tenth of the perturbed episodes; docs/guide/statistics.md."""
+
+
 @pytest.mark.slow
 @every_scenario
-def test_experts_do_the_skills_in_perturbed_worlds_too(scenario: Scenario) -> None:
+def test_experts_do_the_tasks_in_perturbed_worlds_too(scenario: Scenario) -> None:
     episodes = 40
-    for task in scenario.retained:
+    for task in (*scenario.retained, *scenario.target):
         make(task.world).close()
         expert, lanes = resolve(task.expert)(task.name), Lanes(episodes)
         going, done = list(range(episodes)), 0
@@ -280,8 +291,35 @@ def test_experts_do_the_skills_in_perturbed_worlds_too(scenario: Scenario) -> No
             done, states = done + int(successes.sum()), states[~successes]
             if not going:
                 break
-        assert done >= 0.9 * episodes, f"{task.name}: {done} of {episodes}"
+        assert done >= HARD_IF_PERTURBED.get(task.name, 0.9) * episodes, f"{task.name}: {done} of {episodes}"
         lanes.close()
+
+
+@every_scenario
+def test_worlds_that_threads_use_at_the_same_time_change_nothing(
+    scenario: Scenario,
+) -> None:
+    make(scenario.tasks[0].world).close()
+    tasks = [task for task in scenario.tasks if task.world == scenario.tasks[0].world]
+
+    def states(number: int) -> list[NDArray[np.float32]]:
+        world, found = vector_world(tasks[0].world, 1), []
+        for seed in (*range(50 * number, 50 * number + 20), 2**32):
+            found.append(world.reset([0], [seed], [tasks[seed // 5 % len(tasks)].name]))
+            pushes = np.random.default_rng(seed).uniform(-1.0, 1.0, (3, *world.single_action_space.shape))
+            found += [world.step([0], push[None])[0] for push in pushes]
+        world.close()
+        return found
+
+    expected = [states(number) for number in range(3)]
+    before = sys.getswitchinterval()
+    sys.setswitchinterval(1e-5)
+    try:
+        with ThreadPoolExecutor(3) as pool:
+            for number, found in enumerate(pool.map(states, range(3))):
+                np.testing.assert_array_equal(found, expected[number])
+    finally:
+        sys.setswitchinterval(before)
 
 
 @every_scenario
@@ -331,18 +369,22 @@ def test_an_impossible_action_is_an_error_that_names_it(scenario: Scenario) -> N
             lanes.step([0, 1], np.stack([longer, longer]))
         with pytest.raises(ValueError, match=re.escape(f"has shape ({size},), not (1, {size})")):
             plain.step(good[None])
+        for rows in (1, 3):  # NumPy would repeat the one, and leave out the third
+            with pytest.raises(ValueError, match=f"2 lanes of the .* world take as many actions, not {rows}"):
+                lanes.step([0, 1], np.stack([good] * rows))
 
 
 @every_scenario
 def test_actions_beyond_the_bounds_are_cut(scenario: Scenario) -> None:
     for task in first_task_of_each_world(scenario):
         world, states = make(task.world), []
-        for far in (1.0, 9.0):
+        for far in (1.0, 9.0, 1e300):  # the last is finite, but too large for a number of 32 bits
             world.reset(seed=0, options={"task": task.name})
-            action = np.full_like(actions(world, 0, 1)[0], far)
+            action = np.full(world.action_space.shape or (), far)
             action[1::2] *= -1
             states.append(world.step(action)[0])
         np.testing.assert_array_equal(states[0], states[1])
+        np.testing.assert_array_equal(states[0], states[2])
 
 
 @every_scenario

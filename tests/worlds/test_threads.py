@@ -103,6 +103,21 @@ def test_a_team_that_one_of_its_threads_drops_does_not_wait_for_itself(
         time.sleep(0.01)
 
 
+def test_a_forked_process_works_with_its_own_thread(before: set[threading.Thread]) -> None:
+    # a process of its own: pytest and its workers have threads
+    code = (
+        "import os\n"
+        "from clbench.worlds.threads import Team\n"
+        "team, done = Team(3), []\n"
+        "child = os.fork()\n"
+        "team.each(done.append, range(5))\n"
+        "assert sorted(done) == list(range(5))\n"
+        "if child:\n"
+        "    assert os.waitpid(child, 0)[1] == 0\n"
+    )
+    subprocess.run([sys.executable, "-W", "ignore", "-c", code], check=True, timeout=60)
+
+
 def test_an_interpreter_exits_at_once_with_a_team_that_nobody_closed() -> None:
     code = "from clbench.worlds.threads import Team; team = Team(3); done = []; team.each(done.append, 'abc')"
     code += "; print(sorted(done))"
