@@ -72,7 +72,8 @@ def demonstrate(world: World, task: Task, seed: int, noisy: bool) -> Demonstrati
     generator = np.random.default_rng([seed, 1])
     low, high = _action_bounds(world)
     state, _ = world.reset(seed=seed, options={"task": task.name})
-    states, executed, labels, random, rewards = [state], [], [expert(state)], [], []
+    # copies: a world may return the same array in every step
+    states, executed, labels, random, rewards = [np.array(state, np.float32)], [], [expert(state)], [], []
     success, remaining = False, 0
     for _ in range(task.horizon):
         if noisy and remaining == 0 and generator.random() < task.action_noise:
@@ -82,7 +83,7 @@ def demonstrate(world: World, task: Task, seed: int, noisy: bool) -> Demonstrati
         random.append(remaining > 0)
         remaining = max(0, remaining - 1)
         state, reward, terminated, _, _ = world.step(action)
-        states.append(state)
+        states.append(np.array(state, np.float32))
         executed.append(action)
         labels.append(expert(state))
         rewards.append(float(reward))

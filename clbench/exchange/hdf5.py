@@ -193,7 +193,7 @@ class _File:
         rate = kwargs.get("control_freq") if isinstance(kwargs, dict) else None
         if not isinstance(rate, int | float) or self._rate is None:
             return
-        if abs(rate - self._rate) > FARTHEST_RATE * self._rate:
+        if not abs(rate - self._rate) <= FARTHEST_RATE * self._rate:  # also if it is NaN
             raise self._error(
                 f"it was recorded at {rate:g} steps per second, but the world {self._task.world} makes "
                 f"{self._rate:g}: an action would last another time"

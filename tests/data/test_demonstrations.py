@@ -3,12 +3,15 @@ import dataclasses
 import logging
 import re
 from pathlib import Path
+from typing import Any
 
+import gymnasium
 import minari
 import numpy as np
 import pytest
 import torch
 from helpers import same_demonstrations
+from numpy.typing import NDArray
 
 from clbench.base.entry_points import resolve
 from clbench.base.errors import InputError
@@ -24,7 +27,9 @@ from clbench.data.demonstrations import (
 from clbench.spec.budget import Budget
 from clbench.spec.language import encode
 from clbench.spec.registry import load_scenario
+from clbench.testing import ToyWorld
 
+State = NDArray[np.float32]
 TOY = load_scenario("clbench.testing:clbench/Toy-v0")
 TASK = TOY.task("left")
 BUDGET = dataclasses.replace(TOY.budget, demonstrations=5)
@@ -109,6 +114,23 @@ def test_the_recorded_actions_replay_to_the_recorded_states_bit_for_bit() -> Non
     state, _ = world.reset(seed=7, options={"task": task.name})
     states = [state] + [world.step(action)[0] for action in episode.executed]
     assert np.array_equal(np.array(states), episode.state)
+
+
+class OneArray(gymnasium.Wrapper[State, State, State, State]):
+    """A world that returns the same array in every step."""
+
+    def reset(self, **options: Any) -> tuple[State, dict[str, Any]]:
+        self.array, info = self.env.reset(**options)
+        return self.array, info
+
+    def step(self, action: State) -> Any:
+        self.array[:], *rest = self.env.step(action)
+        return self.array, *rest
+
+
+def test_a_world_may_return_the_same_array_in_every_step() -> None:
+    usual, other = (demonstrate(world, TASK, 3, True) for world in (ToyWorld(), OneArray(ToyWorld())))
+    assert same_demonstrations([usual], [other])
 
 
 def test_an_expert_that_mostly_fails_is_named(monkeypatch: pytest.MonkeyPatch) -> None:

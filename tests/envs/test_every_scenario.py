@@ -272,7 +272,7 @@ HARD_IF_PERTURBED = {
     "cartpole_left": 0.75,
     "cartpole_right": 0.75,
 }
-"""Least success of the experts that fail in more than a tenth of the perturbed episodes; docs/guide/statistics.md."""
+"""Least success of experts that fail in over a tenth of the perturbed episodes; docs/guide/statistics.md."""
 
 
 @pytest.mark.slow

@@ -270,6 +270,7 @@ def _last(value: float) -> Callable[[h5py.Group], None]:
             _attribute("env_args", '{"env_kwargs": {"control_freq": 20}}'),
             "recorded at 20 steps per second, but the world .* makes 10: an action would last another time",
         ),
+        (_attribute("env_args", '{"env_kwargs": {"control_freq": NaN}}'), "recorded at nan steps per second"),
     ],
 )
 def test_what_does_not_fit_is_named(edit: Callable[[h5py.Group], None], message: str, exported: Path) -> None:
