@@ -73,7 +73,7 @@ class WalkerVectorWorld:
 
     def step(self, lanes: Sequence[int], actions: NDArray[np.float32]) -> Outcomes:
         """Move each of `lanes` by its row of actions (N, 6)."""
-        actions = checked_actions(actions, self.single_action_space, "walker")
+        actions = checked_actions(actions, self.single_action_space, "walker", len(lanes))
         for lane, action in zip(lanes, actions, strict=True):
             self._controls[lane][:] = action
         self._team.each(_start().advance, [self._data[lane] for lane in lanes])

@@ -342,8 +342,9 @@ def same_settings(runs: list[Run]) -> Sifted:
 def _learner(run: Run) -> dict[str, Any]:
     """Return the class of an agent that learned by trial: two that share a name make no row together."""
     method = run.record.fingerprint.get("method")
-    online = run.division == "online" and isinstance(method, dict)
-    return {"class of the agent": method.get("class")} if online else {}
+    if run.division != "online" or not isinstance(method, dict):
+        return {}
+    return {"class of the agent": method.get("class")}
 
 
 ALIKE: tuple[Sift, ...] = (same_scenario, same_definition, same_simulator, same_layout, same_settings)
