@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -25,7 +26,7 @@ class OverallRow:
     scenarios: tuple[str, ...]
     """Names of the tables that it is the mean of, in the order of the board."""
     groups: tuple[str | None, ...]
-    """Letters of its groups in the scenarios, in the order of the board."""
+    """Letters of its groups in the scenarios, in the order of the board; None where it has no rival."""
     estimates: Mapping[str, Estimate]
     """Mean over scenarios and interval of every metric."""
     to_criterion: bool
@@ -38,14 +39,16 @@ def overall(rows: Iterable[RowSummary]) -> tuple[OverallRow, ...]:
     There is none if there is only one scenario. Rows of other policies than the usual one do not count.
     """
     by_method: dict[tuple[str, str], dict[str, RowSummary]] = {}
+    competing: Counter[tuple[str, str]] = Counter()
     for row in rows:
         if table_parts(row.scenario)[1] != DEFAULT_POLICY:
             continue
+        competing[row.scenario, row.division] += 1
         by_method.setdefault((row.division, row.method), {})[row.scenario] = row
     scenarios = {scenario for found in by_method.values() for scenario in found}
     if len(scenarios) < 2:
         return ()
-    whole = [_overall_row(found) for found in by_method.values() if set(found) == scenarios]
+    whole = [_overall_row(found, competing) for found in by_method.values() if set(found) == scenarios]
     return tuple(sorted(whole, key=_place))
 
 
@@ -54,14 +57,14 @@ def _place(row: OverallRow) -> tuple[int, float, str]:
     return DIVISIONS.index(row.division), math.inf if value is None else -value, row.method
 
 
-def _overall_row(found: Mapping[str, RowSummary]) -> OverallRow:
+def _overall_row(found: Mapping[str, RowSummary], competing: Mapping[tuple[str, str], int]) -> OverallRow:
     rows = list(found.values())
     estimates = {name: mean_estimate([row.estimates[name] for row in rows]) for name in METRICS}
     return OverallRow(
         rows[0].method,
         rows[0].division,
         tuple(found),
-        tuple(row.groups for row in rows),
+        tuple(row.groups if competing[row.scenario, row.division] > 1 else None for row in rows),
         estimates,
         all(row.to_criterion for row in rows),
     )

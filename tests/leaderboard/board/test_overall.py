@@ -82,3 +82,9 @@ def test_only_methods_with_a_row_in_every_scenario_are_listed_the_best_first() -
     assert good.estimates["retention"].value == pytest.approx(0.6)
     assert (good.scenarios, good.groups) == (names, ("a", "b", "a"))
     assert overall([row for row in rows if row.scenario == one]) == ()
+
+
+def test_a_method_without_a_rival_in_a_scenario_has_no_letter_there() -> None:
+    one, two = "clbench/One-v0", "clbench/Two-v0"
+    (row,) = overall([_row(one, "sft", 0.5), _row(two, "sft", 0.5), _row(two, "lora", 0.4)])
+    assert row.groups == (None, "a")
