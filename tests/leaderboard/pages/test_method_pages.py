@@ -209,7 +209,7 @@ def test_scalar_diagnostics_are_averaged_over_stages_and_seeds(bench: Bench) -> 
         bench.add("aegis", seed=seed, diagnostics={"0": "none", **stages})
     section = part(bench.pages()["aegis"], "Diagnostics")
     assert section.startswith("How much was projected out")
-    # Wilson's interval of a share, as on the page of claims: the mean +- Student's would be [0.01752, 0.02248]
+    # Wilson's interval of a share, as on the page of claims; Student's would be [0.01752, 0.02248]
     assert "| energy_shed_mean | 0.02 [0.01766, 0.02264] |" in section
     assert "| anchor_distance" not in section
 
