@@ -20,8 +20,7 @@ from clbench.evaluation.rollouts import Evaluator
 from clbench.policy.activations import Gaussian
 from clbench.policy.batch import Batch, QuestionBatch
 from clbench.policy.policy import Policy
-from clbench.records.record import AnswerRow, EpisodeRow, PolicyRow, Record
-from clbench.scoring.reading import FARTHEST
+from clbench.records.record import FARTHEST, AnswerRow, EpisodeRow, PolicyRow, Record
 from clbench.spec.protocol import EPISODE_WEIGHT, Point, Protocol
 from clbench.spec.scenario import Scenario
 

@@ -36,11 +36,12 @@ POLICY_COLUMNS = ("stage", "step", "update_sparsity", "activation_drift", "shift
 `activation_drift` is the squared 2-Wasserstein distance between its and the pretrained policy's hidden states
 on the questions, averaged over layers. `shift` is the mean squared change of what `Policy.predict` returns (a
 flow policy: the velocity) on 256 samples of the stage's target since the beginning of the stage, in
-normalised actions. `captured` is the
-share of episodes in which the policy does the stage's target although it is told to do a retained skill. Only
-the ends of stages have the last two. Each may be None.
+normalised actions. `captured` is the share of episodes in which the policy does the stage's target although
+it is told to do a retained skill. Only the ends of stages have the last two. Each may be None.
 """
 
+FARTHEST = 1e18
+"""A greater activation drift or shift than any policy has whose outputs are numbers of any use."""
 
 CHECK_COLUMNS = ("stage", "step", "episodes", "successes")
 """One row for each check of a stage's criterion. A check plays the target's validation episodes until its

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from clbench.records.reader import RecordError
-from clbench.records.record import EPISODE_COLUMNS, CheckRow, Record
+from clbench.records.record import EPISODE_COLUMNS, FARTHEST, CheckRow, Record
 from clbench.scoring.layout import Array
 from clbench.spec.protocol import SPLITS, Point, Protocol, check_steps
 
@@ -22,9 +22,6 @@ MOST_POINTS = 100
 MOST_CELLS = 20_000
 """Cells of a table of rates, for example stages x points x tasks: 2,000 replicates of it take 320 MB.
 Fetch-v1 has 240, a sequence of 40 targets among 50 tasks 8,200."""
-
-FARTHEST = 1e18
-"""A greater activation drift or shift than any policy has whose outputs are numbers of any use."""
 
 _HIGHEST = {"update_sparsity": 1.0, "activation_drift": FARTHEST, "shift": FARTHEST, "captured": 1.0}
 """Greatest possible value of each change of the policy, in the order of the columns."""
