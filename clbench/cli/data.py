@@ -110,7 +110,7 @@ def export(
     add_cwd_to_path()
     with checked_input():
         loaded, chosen = chosen_tasks(scenario, tasks)
-        check_output(output, format)
+        check_output(output, format, chosen)
         check_folders({"--output": output})
     _collect(scenario, loaded, chosen, workers)
     with checked_input():

@@ -29,6 +29,7 @@ from clbench.data.demonstrations import (
 )
 from clbench.evaluation.definition import recording_of
 from clbench.exchange.recorded import expert_of, recording_hash
+from clbench.exchange.shown import steps_per_second
 from clbench.spec.registry import load_scenario
 from clbench.spec.scenario import Scenario
 from clbench.spec.task import Task
@@ -61,7 +62,7 @@ def export_demonstrations(
         RenderingError: The tasks have a camera, and no back end of this machine can draw.
     """
     loaded, chosen = chosen_tasks(scenario, tasks)
-    folder = check_output(output, format)
+    folder = check_output(output, format, chosen)
     for task in chosen:
         check_demonstrations(task.name)
     found = {task: read_dataset(dataset_folder(task, loaded.budget)) for task in chosen}
@@ -79,11 +80,11 @@ def chosen_tasks(scenario: Scenario | str, tasks: Iterable[str]) -> tuple[Scenar
     return loaded, [loaded.task(name) for name in names] or [*loaded.retained, *loaded.target]
 
 
-def check_output(output: Path | str, kind: str) -> Path:
-    """Return the folder of an export, before any work starts.
+def check_output(output: Path | str, kind: str, tasks: Sequence[Task]) -> Path:
+    """Return the folder of an export of some tasks, before any work starts.
 
     Raises:
-        InputError: The folder exists.
+        InputError: The folder exists, or a world does not give its steps per second.
         UnknownNameError: There is no such format.
         MissingPackageError: A package that it needs is not installed.
     """
@@ -91,6 +92,10 @@ def check_output(output: Path | str, kind: str) -> Path:
         raise unknown("format", kind, get_args(Format))
     if kind == "lerobot":
         require("pyarrow", "exchange", "A LeRobotDataset")
+        if any(task.camera is not None for task in tasks):
+            require("PIL", "film", "A LeRobotDataset with pictures")
+    for task in {task.world: task for task in tasks}.values():
+        steps_per_second(task)
     if os.path.lexists(output):
         raise InputError(f"{output} exists: an export makes a new folder.")
     return Path(output)
