@@ -20,8 +20,8 @@ INTRODUCTION = """\
 `python benchmarks/report.py` makes this page from `benchmarks/results/`; `make benchmark` measures these.
 Ratios compare blocks that take turns on one machine: the median over rounds, with a 95 % bootstrap interval,
 or with the lowest and the highest value where there are fewer than six rounds. Seconds depend on that machine
-and cannot be compared with another machine's. The machine was otherwise idle, except during LIBERO's steps and
-some whole runs, when others used a part of it.
+and cannot be compared with another machine's. The machine was otherwise idle, except during LIBERO's steps
+and some whole runs, when others used a part of it.
 """
 TRIED = """\
 ## What was tried
