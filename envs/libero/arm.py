@@ -85,65 +85,59 @@ class Sensed(NamedTuple):
     """Positions of the arm's joints (7,)."""
 
 
+class Aim(NamedTuple):
+    """What the controller heads for in an action."""
+
+    place: Vector
+    """Goal of the hand's position (3,)."""
+    axes: Vector
+    """Goal of its orientation (3, 3)."""
+    closing: Vector
+    """Shares to which the fingers are closed (2,), which change."""
+    direction: float
+    """1 to close them, -1 to open them, 0 to leave them."""
+
+
+class Motors(NamedTuple):
+    """What the controller sets, and what it must know to do so: views of the physics."""
+
+    bias: Vector
+    """Bias forces of the joints (7,)."""
+    limits: Vector
+    """Lowest and highest controls (9, 2)."""
+    controls: Vector
+    """The controls (9,)."""
+
+
 @njit(nogil=True, cache=True)  # type: ignore[untyped-decorator, unused-ignore]  # typed where numba is
-def _drive(
-    sensed: Sensed,
-    bias: Vector,
-    goal: Vector,
-    goal_axes: Vector,
-    closing: Vector,
-    direction: float,
-    limits: Vector,
-    controls: Vector,
-) -> None:
+def _drive(sensed: Sensed, aim: Aim, motors: Motors) -> None:
     """Set the controls of a physics step: torques of the joints, and places of the fingers.
 
     Matrices have the layouts in memory that robosuite's have, column by column: others change the last bit.
-
-    Args:
-        sensed: What the controller senses.
-        bias: Bias forces of the joints (7,).
-        goal: Goal of the hand's position (3,).
-        goal_axes: Goal of its orientation (3, 3).
-        closing: Shares to which the fingers are closed (2,), which change.
-        direction: 1 to close them, -1 to open them, 0 to leave them.
-        limits: Lowest and highest controls (9, 2).
-        controls: The controls (9,), which are set.
     """
     jacobian, speeds = sensed.jacobian, sensed.speeds
     of_both = jacobian[:, :JOINTS].T.copy().T
     of_place, of_axes = jacobian[:3, :JOINTS].T.copy().T, jacobian[3:, :JOINTS].T.copy().T
     inertia = sensed.inertia[:JOINTS, :JOINTS].T.copy().T
     _, place_mass, axes_mass, null_space = opspace_matrices(inertia, of_both, of_place, of_axes)
-    force = (goal - sensed.place) * STIFFNESS - np.dot(jacobian[:3], speeds) * DAMPING
-    turn = orientation_error(goal_axes, sensed.axes)
+    force = (aim.place - sensed.place) * STIFFNESS - np.dot(jacobian[:3], speeds) * DAMPING
+    turn = orientation_error(aim.axes, sensed.axes)
     torque = turn * STIFFNESS - np.dot(jacobian[3:], speeds) * DAMPING
     wrench = np.concatenate((np.dot(place_mass, force), np.dot(axes_mass, torque)))
     to_rest = nullspace_torques(inertia, null_space, REST, sensed.joints, speeds[:JOINTS].copy())
-    controls[:JOINTS] = np.dot(of_both.T, wrench) + bias + to_rest
+    controls, limits, closing = motors.controls, motors.limits, aim.closing
+    controls[:JOINTS] = np.dot(of_both.T, wrench) + motors.bias + to_rest
     for joint in range(JOINTS):
         controls[joint] = min(max(controls[joint], limits[joint, 0]), limits[joint, 1])
     for finger in range(2):
         low, high = limits[JOINTS + finger]
-        moved = closing[finger] + FINGERS[finger] * FINGER_SPEED * direction
+        moved = closing[finger] + FINGERS[finger] * FINGER_SPEED * aim.direction
         closing[finger] = min(max(moved, -1.0), 1.0)
         controls[JOINTS + finger] = 0.5 * (high + low) + 0.5 * (high - low) * closing[finger]
 
 
 @njit(nogil=True, cache=True)  # type: ignore[untyped-decorator, unused-ignore]
-def _finish(
-    model: int,
-    data: int,
-    site: int,
-    sensed: Sensed,
-    bias: Vector,
-    goal: Vector,
-    goal_axes: Vector,
-    closing: Vector,
-    direction: float,
-    limits: Vector,
-    controls: Vector,
-) -> None:
+def _finish(model: int, data: int, site: int, sensed: Sensed, aim: Aim, motors: Motors) -> None:
     """Do the rest of an action, from the second half of its first physics step.
 
     Args:
@@ -151,20 +145,15 @@ def _finish(
         data: Address of the episode's physics.
         site: Number of the point that the controller moves.
         sensed: The episode's own views and buffers, which change with the physics.
-        bias: As for `_drive`, like all that follow.
-        goal: Goal of the hand's position (3,).
-        goal_axes: Goal of its orientation (3, 3).
-        closing: Shares to which the fingers are closed (2,), which change.
-        direction: 1 to close them, -1 to open them, 0 to leave them.
-        limits: Lowest and highest controls (9, 2).
-        controls: The controls (9,), which are set.
+        aim: What the action heads for.
+        motors: The episode's motors.
     """
     _step2(model, data)
     for _ in range(SUBSTEPS - 1):
         _step1(model, data)
         _jacobian(model, data, sensed.jacobian.ctypes.data, sensed.jacobian[3:].ctypes.data, site)
         _full_inertia(model, data, sensed.inertia.ctypes.data)
-        _drive(sensed, bias, goal, goal_axes, closing, direction, limits, controls)
+        _drive(sensed, aim, motors)
         _step2(model, data)
 
 
@@ -178,7 +167,7 @@ class Arm:
 
     def __init__(self, model: mujoco.MjModel, data: mujoco.MjData) -> None:
         site = int(model.site(SITE).id)
-        self._data, self._site, self._limits = data, site, model.actuator_ctrlrange.copy()
+        self._data, self._site = data, site
         self._now = Sensed(
             data.site_xpos[site],
             data.site_xmat[site].reshape(3, 3),
@@ -187,7 +176,7 @@ class Arm:
             data.qvel,
             data.qpos[:JOINTS],
         )
-        self._bias, self._controls = data.qfrc_bias[:JOINTS], data.ctrl
+        self._motors = Motors(data.qfrc_bias[:JOINTS], model.actuator_ctrlrange.copy(), data.ctrl)
 
     def begin(self, rest: Sensed) -> None:
         """Begin an episode: the goal of the hand is its place at rest.
@@ -225,7 +214,6 @@ class Arm:
         self._goal = sensed.place + displacement[:3]
         if displacement[3:].any():  # robosuite keeps the goal of an earlier action otherwise
             self._goal_axes = set_goal_orientation(displacement[3:], sensed.axes)
-        aim: tuple[Any, ...] = self._goal, self._goal_axes, self._closing, float(np.sign(action[6]))
-        rest = self._bias, *aim, self._limits, self._controls
-        _drive(sensed, *rest)
-        _finish(model._address, self._data._address, self._site, self._now, *rest)
+        aim = Aim(self._goal, self._goal_axes, self._closing, float(np.sign(action[6])))
+        _drive(sensed, aim, self._motors)
+        _finish(model._address, self._data._address, self._site, self._now, aim, self._motors)
