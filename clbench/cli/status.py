@@ -109,22 +109,14 @@ def status(
 
 def _state_of(run: ResolvedRun, records: Path) -> RunState:
     """Return the state of a run that was asked for: a record of other settings is not its record."""
+    from clbench.jobs.recorded import has_settings_of
     from clbench.scoring.scores import Scores
 
-    is_other = False
+    def is_wanted(record: Record) -> bool:
+        here = replace(record.run, device=run.info.device)  # the device is not asked for
+        return has_settings_of(replace(record, run=here), run)
 
-    def check(record: Record) -> None:
-        nonlocal is_other
-        Scores.from_record(record)
-        # the device and the perturbed episodes are not asked for
-        found = replace(record.run, device=run.info.device, perturb=run.info.perturb)
-        is_other = (found, record.scenario) != (run.info, run.scenario_info)
-
-    state = run_state(run.path(records), check)
-    if not is_other:
-        return state
-    reason = "the record there has other settings or another budget: `clbench run` replaces it"
-    return RunState(state.path, "to do", reason=reason)
+    return run_state(run.path(records), Scores.from_record, is_wanted)
 
 
 def _table(states: Sequence[RunState]) -> Table:

@@ -31,13 +31,16 @@ def has_record(run: ResolvedRun, records: Path) -> bool:
         Scores.from_record(record)
     except RecordError:
         return False
-    found = record.run if run.spec.perturb else dataclasses.replace(record.run, perturb=False)
-    if record.status != "success" or (found, record.scenario) != (run.info, run.scenario_info):
-        return False
-    if not _same_code(record, run):
+    if record.status != "success" or not has_settings_of(record, run) or not _same_code(record, run):
         return False
     _check_definition(record, run.published, path)
     return True
+
+
+def has_settings_of(record: Record, run: ResolvedRun) -> bool:
+    """Return whether a record has the settings, the budget and the device of a run; it may be perturbed."""
+    found = record.run if run.spec.perturb else dataclasses.replace(record.run, perturb=False)
+    return (found, record.scenario) == (run.info, run.scenario_info)
 
 
 def set_aside(run: ResolvedRun, records: Path) -> str | None:

@@ -13,6 +13,10 @@ from clbench.records.record import Record
 State = Literal["done", "running", "failed", "damaged", "to do"]
 
 
+OTHER_SETTINGS = "the record there has other settings or another budget: `clbench run` replaces it"
+"""Reason of a run that is to do although its place has a record."""
+
+
 class RunState(NamedTuple):
     """The state of one run."""
 
@@ -37,13 +41,16 @@ class RunState(NamedTuple):
         return self.progress.seconds * (1 / self.progress.share - 1)
 
 
-def run_state(path: Path, check: Callable[[Record], object]) -> RunState:
+def run_state(
+    path: Path, check: Callable[[Record], object], is_wanted: Callable[[Record], bool] = lambda _: True
+) -> RunState:
     """Return the state of the run whose record has the path.
 
     Args:
         path: Path of the record.
         check: Refuses the record of a run that succeeded with a `RecordError` if it contradicts itself, such
             as `Scores.from_record`.
+        is_wanted: Returns whether such a record is the one that is asked for.
     """
     lease = Lease(path)
     owner = lease.owner
@@ -58,6 +65,8 @@ def run_state(path: Path, check: Callable[[Record], object]) -> RunState:
             raise RecordError(f"{path}: it is the record of {home}, and must be there.")
         if record.error is None:
             check(record)
+            if not is_wanted(record):
+                return RunState(path, "to do", reason=OTHER_SETTINGS)
     except RecordError as error:
         return RunState(path, "damaged", reason=str(error))
     seconds = record.timing.get("seconds")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -12,7 +11,7 @@ from clbench.scoring.intervals import NO_ESTIMATE, Estimate
 from clbench.scoring.metrics import METRICS
 from clbench.spec.policies import DEFAULT_POLICY
 
-from .summary import DIVISIONS, RANKED_BY, RowSummary
+from .summary import DIVISIONS, RANKED_BY, RowSummary, group_of, tables_of
 
 
 @dataclass(frozen=True)
@@ -39,16 +38,13 @@ def overall(rows: Iterable[RowSummary]) -> tuple[OverallRow, ...]:
     There is none if there is only one scenario. Rows of other policies than the usual one do not count.
     """
     by_method: dict[tuple[str, str], dict[str, RowSummary]] = {}
-    competing: Counter[tuple[str, str]] = Counter()
-    for row in rows:
-        if table_parts(row.scenario)[1] != DEFAULT_POLICY:
-            continue
-        competing[row.scenario, row.division] += 1
-        by_method.setdefault((row.division, row.method), {})[row.scenario] = row
-    scenarios = {scenario for found in by_method.values() for scenario in found}
-    if len(scenarios) < 2:
+    tables = tables_of(row for row in rows if table_parts(row.scenario)[1] == DEFAULT_POLICY)
+    for scenario, members in tables.items():
+        for row in members:
+            by_method.setdefault((row.division, row.method), {})[scenario] = row
+    if len(tables) < 2:
         return ()
-    whole = [_overall_row(found, competing) for found in by_method.values() if set(found) == scenarios]
+    whole = [_overall_row(found, tables) for found in by_method.values() if len(found) == len(tables)]
     return tuple(sorted(whole, key=_place))
 
 
@@ -57,14 +53,14 @@ def _place(row: OverallRow) -> tuple[int, float, str]:
     return DIVISIONS.index(row.division), math.inf if value is None else -value, row.method
 
 
-def _overall_row(found: Mapping[str, RowSummary], competing: Mapping[tuple[str, str], int]) -> OverallRow:
+def _overall_row(found: Mapping[str, RowSummary], tables: Mapping[str, Sequence[RowSummary]]) -> OverallRow:
     rows = list(found.values())
     estimates = {name: mean_estimate([row.estimates[name] for row in rows]) for name in METRICS}
     return OverallRow(
         rows[0].method,
         rows[0].division,
         tuple(found),
-        tuple(row.groups if competing[row.scenario, row.division] > 1 else None for row in rows),
+        tuple(group_of(row, tables[row.scenario]) or None for row in rows),
         estimates,
         all(row.to_criterion for row in rows),
     )

@@ -152,6 +152,17 @@ PlacedRow = TypeVar("PlacedRow", bound=Placed)
 AnyRow = TypeVar("AnyRow")
 
 
+def group_of(row: RowSummary, rows: Iterable[RowSummary]) -> str:
+    """Return the letters of a row; none if its division has no other row to tell it apart from.
+
+    Args:
+        row: The row.
+        rows: All rows of its table.
+    """
+    rivals = [other for other in rows if other.division == row.division]
+    return row.groups if row.groups and len(rivals) > 1 else ""
+
+
 def tables_of(rows: Iterable[OneRow]) -> dict[str, list[OneRow]]:
     """Return the rows by the name of their table, tables and rows in the order of `rows`."""
     return _grouped(rows, lambda row: row.scenario)

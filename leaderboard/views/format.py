@@ -202,12 +202,6 @@ def aligned(groups: str | None, rows: Iterable[RowSummary]) -> str:
     return "".join(letter if letter in groups else " " for letter in letters) if groups else ""
 
 
-def group_of(row: RowSummary, rows: Iterable[RowSummary]) -> str:
-    """Return the letters of a row; none if its division has no other row to tell it apart from."""
-    rivals = [other for other in rows if other.division == row.division]
-    return row.groups if row.groups and len(rivals) > 1 else ""
-
-
 def standing_text(row: Row, rows: Iterable[Row], named: int | None = None) -> str:
     """Return the place of a row in its division, and the methods that are not told apart from it.
 

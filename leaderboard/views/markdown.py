@@ -21,7 +21,7 @@ from clbench.scoring.metric import Metric
 
 from ..board.overall import overall
 from ..board.rows import Board, Row
-from ..board.summary import tables_of
+from ..board.summary import group_of, tables_of
 from ..policies.compared import Comparisons
 from ..policies.decoders import read_decoding
 from .format import (
@@ -30,7 +30,6 @@ from .format import (
     agreement_text,
     column_title,
     format_interval,
-    group_of,
     number_text,
     prediction_text,
     shown,

@@ -18,14 +18,13 @@ from clbench.scoring.scores import rates_of
 from clbench.spec.identifiers import built_in_methods
 
 from ...board.rows import Row, standing_of
-from ...board.summary import DIVISIONS, ELSEWHERE, RANKED_BY
+from ...board.summary import DIVISIONS, ELSEWHERE, RANKED_BY, group_of
 from ..descriptions import Description, describe
 from ..format import (
     Column,
     Rows,
     aligned,
     format_interval,
-    group_of,
     number_text,
     shown,
     standing_text,
