@@ -11,15 +11,18 @@ from numpy.typing import NDArray
 from .arm import JOINTS as ARM_JOINTS
 from .arm import Arm
 from .problem import Problem
-from .scene import HIDDEN, SEEN, Places
+from .scene import HIDDEN, SEEN, Places, Scene
 from .state import CLOSE_BY, FINGERS, HAND, HAND_QUATERNION, JOINTS, PLACES, REACH, SIZE, State
 
 FINGER_JOINTS = slice(ARM_JOINTS, ARM_JOINTS + 2)
+ROBOT_JOINTS = slice(0, ARM_JOINTS + 2)
 DISPLACED = [0, 1, 3]
 """Joints of the arm that move the hand to the side, forward and up."""
 START = 0.1
 """Largest displacement of these joints in a perturbed episode, in radians: five times the spread of LIBERO's
 starts, and 5 to 8 cm of the hand."""
+FALL = 250
+"""Steps of 2 ms in which things come to rest: LIBERO drops some from 18 cm."""
 HAND_BODY, HAND_SITE = "robot0_right_hand", "gripper0_grip_site"
 
 
@@ -52,15 +55,35 @@ class Episode:
         """
         self.problem = problem
         start, self._places = problem.start(seed)
-        model, data = problem.scene.model, self.data
-        mujoco.mj_resetData(model, data)  # also clears controls and the warm start of the solver
-        data.time = start[0]
-        data.qpos[:], data.qvel[:] = np.split(start[1:], [model.nq])
+        self._set(start)
         if displaced is not None:
-            data.qpos[DISPLACED] += START * np.array(displaced)
+            self._fall()
+            self.data.qpos[DISPLACED] += START * np.array(displaced)
         self.forward()
         self._arm.begin(problem.scene.rest)
         return self.state()
+
+    def _set(self, start: NDArray[np.float64]) -> None:
+        """Set time, positions and velocities (1 + nq + nv,), and forget all before."""
+        model, data = self.problem.scene.model, self.data
+        mujoco.mj_resetData(model, data)  # also clears controls and the warm start of the solver
+        data.time = start[0]
+        data.qpos[:], data.qvel[:] = np.split(start[1:], [model.nq])
+
+    def _fall(self) -> None:
+        """Let things come to rest with their own mass, while the robot stands still.
+
+        The bowl that LIBERO drops onto the ramekin stays there, but bounces off it if it is twice as heavy.
+        """
+        start = np.concatenate(([self.data.time], self.data.qpos, np.zeros(self.problem.scene.model.nv)))
+        joints = start[1:][ROBOT_JOINTS]
+        model = self._placed(self.problem.plain)
+        for _ in range(FALL):
+            mujoco.mj_step(model, self.data)
+            self.data.qpos[ROBOT_JOINTS], self.data.qvel[ROBOT_JOINTS] = joints, 0.0
+        self.problem.plain.models.give_back(model)
+        start[1:][: model.nq] = self.data.qpos
+        self._set(start)
 
     def recorded(self, states: NDArray[np.float64], places: Places) -> NDArray[np.float32]:
         """Return the states (T, 213) of a recorded episode.
@@ -83,13 +106,13 @@ class Episode:
 
     def forward(self) -> None:
         """Compute everything that follows from the joints; the next step does not depend on this call."""
-        model = self._placed()
+        model = self._placed(self.problem.scene)
         mujoco.mj_forward(model, self.data)
         self.problem.scene.models.give_back(model)
 
-    def _placed(self) -> mujoco.MjModel:
-        """Take a model from those of the scene, and move its fixtures to their places."""
-        model = self.problem.scene.models.take()
+    def _placed(self, scene: Scene) -> mujoco.MjModel:
+        """Take a model from those of a scene, and move its fixtures to their places."""
+        model = scene.models.take()
         model.body_pos[:], model.body_quat[:] = self._places
         return model
 
@@ -104,7 +127,7 @@ class Episode:
 
     def move(self) -> None:
         """Advance the physics by `action`; several threads may do so at once, each for another episode."""
-        model = self._placed()
+        model = self._placed(self.problem.scene)
         self._arm.move(model, self.action)
         self.problem.scene.models.give_back(model)
 

@@ -35,7 +35,7 @@ class Problem:
 
     scene: Scene
     plain: Scene
-    """The scene with objects of their own mass, in which LIBERO draws the starts."""
+    """The scene with objects of their own mass, in which LIBERO draws the starts and things fall to rest."""
     goal: Sequence[Predicate]
     """Predicates that hold together when the task is done."""
     starts: Vector
