@@ -271,8 +271,6 @@ HARD_IF_PERTURBED = {
     "stick_pull": 0.7,
     "cartpole_left": 0.75,
     "cartpole_right": 0.75,
-    # 24 of 40; nobody looked for the cause yet
-    "pick_up_the_black_bowl_on_the_ramekin_and_place_it_on_the_plate": 0.55,
 }
 """Least success of experts that fail in over a tenth of the perturbed episodes; docs/guide/statistics.md."""
 
