@@ -23,6 +23,7 @@ from clbench.base.errors import InputError, UnknownNameError
 from clbench.evaluation.rules import rule_code
 from clbench.spec.registry import registered_scenario
 from clbench.worlds.lanes import vector_world
+from clbench.worlds.perturbation import draw_perturbation
 
 WORLD = "clbench.envs.libero.world:LiberoWorld"
 World = resolve(WORLD)
@@ -244,6 +245,24 @@ def test_no_bowl_is_drawn_so_deep_in_the_plate_that_the_physics_throws_it_over()
         states = world.step(range(2), np.zeros((2, 7), np.float32))[0]
     x, y = states[:, thing("akita_black_bowl_1")][:, 4:6].T  # of the quaternion
     assert np.degrees(np.arccos(1 - 2 * (x**2 + y**2))).max() < 10
+
+
+def test_a_bowl_of_twice_the_mass_rests_on_the_ramekin_where_a_bowl_of_its_own_mass_does() -> None:
+    task = "pick_up_the_black_bowl_on_the_ramekin_and_place_it_on_the_plate"
+    seeds = [seed for seed in range(100, 120) if draw_perturbation(seed).mass == 2.0][:3]
+
+    def above_ramekin(perturbed: bool) -> NDArray[np.float32]:
+        world = vector_world(WORLD, len(seeds), perturbed=perturbed)
+        states = world.reset(range(len(seeds)), seeds, [task] * len(seeds))
+        for _ in range(10):
+            states, _, _ = world.step(range(len(seeds)), np.zeros((len(seeds), 7), np.float32))
+        world.close()
+        bowl, ramekin = thing("akita_black_bowl_1"), thing("glazed_rim_porcelain_ramekin_1")
+        return (states[:, bowl] - states[:, ramekin])[:, :3]
+
+    found = above_ramekin(perturbed=True)
+    assert np.all(found[:, 2] > 0.03)  # 0 on the table
+    np.testing.assert_allclose(found, above_ramekin(perturbed=False), atol=5e-3)
 
 
 def test_wrong_tasks_and_actions_are_named() -> None:
