@@ -1,4 +1,4 @@
-"""The claims of AEGIS, each with its rule; docs/history.md names the rules that were corrected later.
+"""The claims of AEGIS, each with its rule; docs/history.md says which rules changed, and why.
 
 Claims about answers to questions are judged on the scenario of one long stage: on the boards, stages end
 before plain fine-tuning has forgotten any answer.
@@ -51,6 +51,7 @@ LOSES_ANSWERS = "A longer or narrower fine-tuning, after which sft has certainly
     "drop in question accuracy certainly exceeds 0.01 within the first half of the stage; holds in part, "
     "because it is not rapid, if it does so only by the end; does not hold if the upper end of the drop at "
     "the end is below 0.01.",
+    settled="2026-11-23T07:13Z",
     margin="0.01 of the answers",
     scenarios=KNOWLEDGE,
 )
@@ -99,6 +100,7 @@ def _how_rapid(evidence: Evidence, losses: list[Figure]) -> list[str]:
     "lost; does not hold if the lower end of the drop is above 0.01, or if the lower end of the difference "
     "in early success is above -0.05. Cannot be shown here if sft does not certainly lose 0.01 of the "
     "answers.",
+    settled="2026-11-23T07:13Z",
     margin="0.01 of the answers, 0.05 of the success",
     scenarios=KNOWLEDGE,
 )
@@ -128,6 +130,7 @@ def stop_gradient_keeps_and_wastes(evidence: Evidence) -> Finding:
     "-0.01 in question accuracy; holds in part if it is so for some of them, or only in retention and below "
     "-0.05; does not hold if, for every rank, both lower ends are above these margins. LoRA trains at 3 "
     "times sft's learning rate, and alpha stays 32: the scale of its output falls as the rank rises.",
+    settled="2026-11-23T07:13Z",
     margin="0.01 of the answers, 0.05 of the retained success",
     scenarios=KNOWLEDGE,
 )
@@ -160,6 +163,7 @@ def lora_still_overwrites(evidence: Evidence) -> Finding:
     rule="Holds if the lower end of the difference in question accuracy to the frozen policy is at least "
     "-0.01; does not hold if the upper end is below -0.01. Cannot be shown here if sft does not certainly "
     "lose 0.01 of the answers.",
+    settled="2026-11-23T07:13Z",
     margin="0.01 of the answers",
     scenarios=KNOWLEDGE,
 )
@@ -201,6 +205,7 @@ def keeps_answers(evidence: Evidence) -> Finding:
     reported="0.62 % on average, at most 3.4 %; about half of the layers projected on a typical step",
     rule="Judged in the first stage, as the paper fine-tunes on one data set. Holds if the upper end of the "
     "mean share over steps and seeds is below 0.01; does not hold if the lower end is above 0.01.",
+    settled="2026-11-23T07:13Z",
     margin="0.01 of the energy, the claim's own",
 )
 def sheds_little(evidence: Evidence) -> Finding:
@@ -244,6 +249,7 @@ def _of_stages(evidence: Evidence, name: str, what: str, stage: int | None = Non
     reported="stated about the projection; no number was found",
     rule="Activation drift divided by sft's with the same seed: holds if the upper end is below 0.5; does "
     "not hold if the lower end is above 0.5.",
+    settled="2026-11-23T07:13Z",
     margin="half of the drift",
     scenarios=KNOWLEDGE,
 )
@@ -264,6 +270,7 @@ def removes_drift(evidence: Evidence) -> Finding:
     reported="about 40 % more time; no buffer",
     rule="Holds if the upper end of a step's time is at most 1.6 times sft's, and stages read no prior data; "
     "does not hold if the lower end is above 1.6, or if they read any.",
+    settled="2026-11-25T02:02Z",
     margin="0.2 of the time of a step",
     scenarios=ANYWHERE,
 )

@@ -12,6 +12,7 @@ import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from datetime import datetime
 from typing import Literal
 
 from clbench.base.text import counted
@@ -86,6 +87,8 @@ class Claim:
     """The paper's figure."""
     rule: str
     """When the claim holds, when it does not, and when the setting cannot show it; else it is undecided."""
+    settled: datetime
+    """When the rule last changed in what it says: records that are older were known by then."""
     margin: str
     """Smallest difference that counts."""
     scenarios: tuple[str, ...]
@@ -100,6 +103,7 @@ def claim(
     *,
     reported: str,
     rule: str,
+    settled: str,
     margin: str,
     scenarios: tuple[str, ...] = BOARDS,
 ) -> Callable[[Callable[[Evidence], Finding]], Claim]:
@@ -107,7 +111,8 @@ def claim(
 
     def enter(judge: Callable[[Evidence], Finding]) -> Claim:
         words = " ".join((judge.__doc__ or "").split())
-        return Claim(identifier, paper, words, reported, rule, margin, scenarios, judge)
+        since = datetime.fromisoformat(settled)
+        return Claim(identifier, paper, words, reported, rule, since, margin, scenarios, judge)
 
     return enter
 

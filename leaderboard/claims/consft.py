@@ -1,4 +1,4 @@
-"""The claims of ConSFT, each with its rule; docs/history.md names the rules that were corrected later."""
+"""The claims of ConSFT, each with its rule; docs/history.md says which rules changed, and why."""
 
 from __future__ import annotations
 
@@ -39,6 +39,7 @@ CONSFT = Paper("ConSFT", ("2605.08879",))
     "LIBERO, Tables 1 and 2)",
     rule="Holds if the lower end of the drop in retained success with sft at its best learning rate is above "
     "0.05; does not hold if the upper end is below 0.05.",
+    settled="2026-11-23T07:13Z",
     margin="0.05 of the retained success",
 )
 def sft_degrades(evidence: Evidence) -> Finding:
@@ -77,6 +78,7 @@ def _what_joint_says(gain: Figure) -> tuple[str, ...]:
     "part if it is so only with both at the scenario's learning rate; does not hold if all upper ends of "
     "both comparisons are below 0.20. Cannot be shown here if no arm counts, or if sft certainly keeps more "
     "than 0.80 at both settings.",
+    settled="2026-11-26T20:19Z",
     margin="0.20 of the retained success, the claim's own",
 )
 def keeps_20_points_more(evidence: Evidence) -> Finding:
@@ -188,6 +190,7 @@ def _what_controls_say(figures: tuple[Figure, ...], arms: Sequence[str]) -> list
     "these arms has an upper end below -0.05 against one of them. Cannot be shown here if no arm counts. "
     "Replay draws from the demonstrations of the retained skills themselves, and the note has its tuned "
     "share; the paper compares with pretraining data at 1:1.",
+    settled="2026-11-26T04:12Z",
     margin="0.05 of the retained success",
 )
 def as_good_as_replay(evidence: Evidence) -> Finding:
@@ -221,6 +224,7 @@ def as_good_as_replay(evidence: Evidence) -> Finding:
     "of the difference to sft is above 0.05 for one of the arms of C2 that count; does not hold if all their "
     "upper ends are below 0.05. Cannot be shown here if the measure does not notice a penalty on moved "
     "weights (l2_sp's difference to sft has an upper end below 0.05), or if no arm counts.",
+    settled="2026-11-26T04:12Z",
     margin="0.05 of the parameters",
 )
 def stays_sparse(evidence: Evidence) -> Finding:
@@ -269,6 +273,7 @@ def stays_sparse(evidence: Evidence) -> Finding:
     rule="Holds by construction for one sample, while the test "
     "`test_one_sample_disrupts_old_knowledge_by_the_square_of_its_weight` of `tests/methods/test_consft.py` "
     "passes. No record can change it.",
+    settled="2026-11-23T07:13Z",
     margin="none: an identity",
     scenarios=ANYWHERE,
 )
@@ -295,6 +300,7 @@ def bounds_the_risk_of_a_step(evidence: Evidence) -> Finding:
     rule="Holds if bytes kept and parameters added equal those of sft, no prior data is read, and the upper "
     "end of a step's time is at most 1.05 times sft's; does not hold if bytes or parameters are more, if "
     "prior data is read, or if the lower end is above 1.05. Steps may be more: this is the cost of one.",
+    settled="2026-11-26T20:19Z",
     margin="5 % of the time of a step",
     scenarios=ANYWHERE,
 )
@@ -328,6 +334,7 @@ def costs_nothing(evidence: Evidence) -> Finding:
     "earlier targets are kept is our reading, and no number was found",
     rule="Holds if the lower end of backward transfer is at least -0.10 for one of the arms of C2 that "
     "count; does not hold if all their upper ends are below -0.10. Cannot be shown here if no arm counts.",
+    settled="2026-11-26T04:12Z",
     margin="0.10 of the success on earlier targets",
 )
 def keeps_earlier_targets(evidence: Evidence) -> Finding:
@@ -385,6 +392,7 @@ def _what_keeps_targets(over_sft: Figure, over_controls: Sequence[Figure]) -> st
     "Holds if the lower end of sft's loss minus the method's is above 0.05 for one of the arms of C2 that "
     "count; does not hold if all their upper ends are below 0.05. Cannot be shown here if no arm counts, or "
     "if the upper end of sft's own loss is below 0.05.",
+    settled="2026-11-26T20:19Z",
     margin="0.05 of the success",
     scenarios=ANYWHERE,
 )

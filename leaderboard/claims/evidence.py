@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -100,6 +101,12 @@ class Evidence:
     """Runs by label of the method ("lora", "lora+rank=4") and by seed."""
     not_used: tuple[NotShown, ...]
     """Records that are left out, with their reasons."""
+
+    @property
+    def began(self) -> datetime | None:
+        """When the first of the runs started; None if no record says so."""
+        starts = [_start_of(run) for runs in self.runs.values() for run in runs.values()]
+        return min((start for start in starts if start), default=None)
 
     # ---- figures of scores -------------------------------------------------------------------------
 
@@ -244,6 +251,15 @@ def number_mean(values: Sequence[Any]) -> float:
     if not values or not all(is_number(value) for value in values):
         return math.nan
     return math.fsum(values) / len(values)
+
+
+def _start_of(run: Run) -> datetime | None:
+    """Return when a run started, None if its record does not say so: nothing checks this part of a record."""
+    try:
+        start = datetime.fromisoformat(run.record.timing.get("started"))
+    except (TypeError, ValueError):
+        return None
+    return start if start.tzinfo else start.replace(tzinfo=UTC)
 
 
 def _words(name: str) -> str:

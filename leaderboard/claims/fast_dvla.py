@@ -1,4 +1,4 @@
-"""The claims of Fast-dVLA, each with its rule; docs/history.md names the rules that were corrected later.
+"""The claims of Fast-dVLA, each with its rule; docs/history.md says which rules changed, and why.
 
 Fast-dVLA has the abstract of CapVector; most claims here are CapVector's. Its claims are about how fast and
 how well a policy adapts. With stages to a criterion all methods learn as well, so the rules compare steps.
@@ -69,6 +69,7 @@ def _not_shown(evidence: Evidence, figure: Figure, *controls: Figure) -> Finding
     "only the first; does not hold if the lower end of the steps is above 0.95. Cannot be shown here if "
     "sft's median stage is shorter than 20 steps, of which 5 % is no whole step, or if sft does not "
     "certainly lose 0.01 of the answers: the objective, to answer questions, is then known already.",
+    settled="2026-11-26T20:19Z",
     margin="5 % of the steps, 10 % of the time",
 )
 def auxiliary_objective_helps(evidence: Evidence) -> Finding:
@@ -101,6 +102,7 @@ def auxiliary_objective_helps(evidence: Evidence) -> Finding:
     "divided by sft and by a random vector of equal norms are below 0.95; does not hold if the lower end "
     "of one of the two is above 0.95. Cannot be shown here for the reasons of F1, or if "
     "co_training certainly saves less than 5 % of the steps.",
+    settled="2026-11-26T20:19Z",
     margin="5 % of the steps",
 )
 def vector_carries_the_capability(evidence: Evidence) -> Finding:
@@ -134,6 +136,7 @@ def _of_the_vector(evidence: Evidence) -> tuple[Figure, Figure]:
     rule="Steps to the criterion at the scenario's learning rate, with the regulariser divided by without. "
     "Holds if the upper end is below 0.95; does not hold if the lower end is above 0.95. Cannot be shown "
     "here for the reasons of F1, or if co_training certainly saves less than 5 % of the steps.",
+    settled="2026-11-26T20:19Z",
     margin="5 % of the steps",
 )
 def regulariser_keeps_the_vector(evidence: Evidence) -> Finding:
@@ -157,6 +160,7 @@ def regulariser_keeps_the_vector(evidence: Evidence) -> Finding:
     reported="less than 0.8 % more compute and memory, without the cost of making the vectors",
     rule="Holds if the upper end of a step's time is at most 1.05 times sft's; does not hold if the lower "
     "end is above 1.05. The preparation and the bytes kept are shown, and not judged.",
+    settled="2026-11-23T07:13Z",
     margin="5 % of the time of a step",
     scenarios=ANYWHERE,
 )
@@ -182,6 +186,7 @@ def costs_little(evidence: Evidence) -> Finding:
     "the scenario's learning rate, divided by those with a random vector of equal norms: holds if the "
     "upper end is below 0.95; does not hold if the lower end is above 0.95. Cannot be shown here for "
     "the reasons of F1, or if co_training certainly saves less than 5 % of the steps.",
+    settled="2026-11-26T20:19Z",
     margin="5 % of the steps",
 )
 def vector_transfers(evidence: Evidence) -> Finding:
@@ -208,6 +213,7 @@ def vector_transfers(evidence: Evidence) -> Finding:
     "would not hold, success is equal, and one forward succeeds as often as 12 (there is nothing to speed "
     "up), or a forward of all tokens takes less than 1.5 times as long as one of a block (the time is then "
     "that of forwards, whatever their tokens).",
+    settled="2026-11-25T02:02Z",
     margin="a speed-up of 2.65, 0.03 of success",
     scenarios=ANYWHERE,
 )

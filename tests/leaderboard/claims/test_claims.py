@@ -2,6 +2,9 @@
 
 import json
 import re
+from collections.abc import Callable
+from datetime import UTC, datetime
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +15,33 @@ from helpers import sealed
 from clbench.base.entry_points import resolve
 from clbench.records.paths import record_path
 from clbench.records.record import Record
+
+CLAIMS = resolve("clbench.leaderboard.claims.judges:CLAIMS")
+
+RULES = {
+    "C1": ("11-23 07:13", "7af4eb25"),
+    "C2": ("11-26 20:19", "483a9ea6"),
+    "C3": ("11-26 04:12", "e0c31c2f"),
+    "C4": ("11-26 04:12", "1b292c9a"),
+    "C5": ("11-23 07:13", "80fc1c75"),
+    "C6": ("11-26 20:19", "c82929bc"),
+    "C7": ("11-26 04:12", "25f13c14"),
+    "C8": ("11-26 20:19", "dd725f59"),
+    "A1": ("11-23 07:13", "0d51b161"),
+    "A2": ("11-23 07:13", "cc698f86"),
+    "A3": ("11-23 07:13", "93d38edc"),
+    "A4": ("11-23 07:13", "18964cb4"),
+    "A5": ("11-23 07:13", "484f3624"),
+    "A6": ("11-23 07:13", "744d4392"),
+    "A7": ("11-25 02:02", "7a9b938a"),
+    "F1": ("11-26 20:19", "1cbd0a1d"),
+    "F2": ("11-26 20:19", "51851300"),
+    "F3": ("11-26 20:19", "9ef10f3e"),
+    "F4": ("11-23 07:13", "e412fbc1"),
+    "F5": ("11-26 20:19", "28726b8d"),
+    "F6": ("11-25 02:02", "496af8de"),
+}
+"""When each rule was settled, in 2026, and a hash of its words."""
 
 ACTIVE = {"1": {"omega_counts": [[5, 5, 0, 0, 0], [0, 5, 3, 1, 1]]}}
 SAME = {"1": {"omega_counts": [[98, 2, 0, 0, 0], [60, 0, 0, 0, 40]]}}
@@ -52,10 +82,34 @@ def test_without_any_record_every_claim_says_which_command_is_missing(bench: Ben
     )
 
 
-def test_the_page_says_how_many_rules_were_corrected_with_the_records_known(bench: Bench) -> None:
-    corrected = resolve("clbench.leaderboard.pages.claims_page:CORRECTED")
-    assert set(corrected) < set(IDS)
-    assert f"but {len(corrected)} of {len(IDS)} were corrected with the records known" in bench.page()
+def test_the_page_says_how_many_rules_changed_after_the_first_record_that_they_judge(bench: Bench) -> None:
+    bench.add("sft", edit=started("2026-11-25T12:00:00+00:00"))
+    bench.add("frozen", edit=started("2026-11-26T12:00:00+00:00"))
+    later = [one for one in CLAIMS.values() if one.settled > datetime(2026, 11, 25, 12, tzinfo=UTC)]
+    assert 0 < len(later) < len(IDS)
+    text = f"is of 2026-11-25; {len(later)} of the {len(IDS)} rules changed after it."
+    assert text in bench.page()
+
+
+def started(text: object) -> Callable[[Record], None]:
+    """Return an edit that sets when a run started."""
+    return lambda record: record.timing.update(started=text)
+
+
+@pytest.mark.parametrize("text", [None, 7, "yesterday", "2999-01-01"])
+def test_a_record_may_say_anything_about_its_start(bench: Bench, text: object) -> None:
+    bench.add("sft", edit=started(text))
+    known = text == "2999-01-01"
+    assert (f"is of 2999-01-01; none of the {len(IDS)} rules changed after it." in bench.page()) == known
+
+
+def test_a_rule_that_says_something_new_gets_the_time_of_its_change() -> None:
+    """If you changed what a rule says, change its `settled` and its line here; else its line alone."""
+    found = {
+        one.id: (one.settled.strftime("%m-%d %H:%M"), sha256(one.rule.encode()).hexdigest()[:8])
+        for one in CLAIMS.values()
+    }
+    assert found == RULES
 
 
 def test_every_claim_has_its_paper_rule_and_the_papers_figure(bench: Bench) -> None:
@@ -252,7 +306,7 @@ def test_the_same_records_give_the_same_bytes_and_no_place_or_date(
     assert bench.page() == first
     assert capsys.readouterr().out == printed
     assert str(bench.folder) not in first
-    assert not re.search(r"\b20\d\d-\d\d", first)
+    assert not re.search(r"(?<!- The rule is of )\b20\d\d-\d\d", first)
     assert (
         len({line.count("|") - line.count("\\|") for line in first.splitlines() if line.startswith("| [")})
         == 1
