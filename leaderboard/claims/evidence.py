@@ -256,8 +256,8 @@ def number_mean(values: Sequence[Any]) -> float:
 def _start_of(run: Run) -> datetime | None:
     """Return when a run started, None if its record does not say so: nothing checks this part of a record."""
     try:
-        start = datetime.fromisoformat(run.record.timing.get("started"))
-    except (TypeError, ValueError):
+        start = datetime.fromisoformat(str(run.record.timing.get("started")))
+    except ValueError:
         return None
     return start if start.tzinfo else start.replace(tzinfo=UTC)
 
