@@ -4,11 +4,12 @@
     python docs/guide/online_sac.py clbench/PointMaze-v1 --seeds 3 --replay
 
 SAC continues to train from task to task. It acts in eight environments at once, and takes two gradient steps
-for each step of the eight; its other settings are the defaults. The first 100 steps of each stage are random.
-The replay buffer is emptied at each stage, so that only the weights remember; with --replay it keeps the
-transitions of all stages. Word ids are names, not amounts, and go through an embedding; pictures go through a
-convolutional network. A seed that has a record is skipped; a seed that was stopped starts again. The same
-seed repeats itself on the same machine.
+for each step of the eight. Its networks have two layers of 128 units; its other settings are the defaults. So
+that it explores again, each stage begins with the entropy coefficient at 1, and its first twentieth of steps
+is random. The replay buffer is emptied at each stage, so that only the weights remember; with --replay it
+keeps the transitions of all stages. Word ids are names, not amounts, and go through an embedding; pictures go
+through a convolutional network. A seed that has a record is skipped; a seed that was stopped starts again.
+The same seed repeats itself on the same machine.
 """
 
 from __future__ import annotations
@@ -30,6 +31,10 @@ from clbench.scoring.scores import Scores
 
 ENVIRONMENTS, GRADIENT_STEPS = 8, 2
 """Environments that step together, and gradient steps for each of these steps."""
+RANDOM = 0.05
+"""Share of random steps, at the beginning of each stage."""
+WIDTH = 128
+"""Units of each hidden layer."""
 
 
 class Observed(BaseFeaturesExtractor):
@@ -62,6 +67,8 @@ def learn(scenario: str, seed: int, steps: int, replay: bool, records: Path) -> 
         "steps_per_stage": steps,
         "environments": ENVIRONMENTS,
         "gradient_steps": GRADIENT_STEPS,
+        "random_share": RANDOM,
+        "width": WIDTH,
         "replay_buffer": "kept" if replay else "emptied at each stage",
         "words": "embedded",
     }
@@ -74,8 +81,9 @@ def learn(scenario: str, seed: int, steps: int, replay: bool, records: Path) -> 
                 "MultiInputPolicy",
                 envs,
                 seed=1000 * seed,
-                policy_kwargs={"features_extractor_class": Observed},
+                policy_kwargs={"features_extractor_class": Observed, "net_arch": [WIDTH, WIDTH]},
                 buffer_size=steps * stages if replay else steps,
+                learning_starts=round(RANDOM * steps),
                 gradient_steps=GRADIENT_STEPS,
                 device="cpu",
             )
@@ -84,6 +92,9 @@ def learn(scenario: str, seed: int, steps: int, replay: bool, records: Path) -> 
         assert agent.replay_buffer is not None
         if not replay:
             agent.replay_buffer.reset()
+        assert isinstance(agent.log_ent_coef, torch.Tensor)
+        with torch.no_grad():
+            agent.log_ent_coef.zero_()
         agent.learn(steps)
         record = clbench.evaluate_agent(
             agent, envs, method=method, seed=seed, settings=settings, records=records
@@ -105,7 +116,7 @@ def main() -> None:
     parser.add_argument("scenario", help="Gymnasium id of the scenario, for example clbench/Fetch-v1")
     parser.add_argument("--seeds", type=int, default=4, help="number of seeds")
     parser.add_argument("--first-seed", type=int, default=0, help="first seed")
-    parser.add_argument("--steps", type=int, default=20_000, help="environment steps per stage")
+    parser.add_argument("--steps", type=int, default=40_000, help="environment steps per stage")
     parser.add_argument("--replay", action="store_true", help="keep the transitions of earlier stages")
     parser.add_argument("--records", type=Path, default=RECORDS, help="folder of the records")
     wanted = parser.parse_args()
