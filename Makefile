@@ -75,6 +75,8 @@ records: .venv/installed-dev
 	$(BIN)/clbench run clbench/Fetch-v1 sft experience_replay lora --seeds 1 --policy-size base
 	$(BIN)/clbench run $(FIXED),clbench/MetaWorldCW-v0 sft frozen joint from_scratch --seeds 3
 	$(BIN)/clbench run $(FIXED) experience_replay --seeds 3
+	$(BIN)/python docs/guide/online_sac.py clbench/PointMaze-v1 --seeds 3
+	$(BIN)/python docs/guide/online_sac.py clbench/PointMaze-v1 --seeds 3 --replay
 	$(BIN)/clbench leaderboard
 
 # The frontier: what a smaller learning rate does, for plain fine-tuning and for the methods that compete with it. The
