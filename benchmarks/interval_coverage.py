@@ -241,12 +241,12 @@ def seed_deviations(records: Path) -> dict[str, dict[str, float]]:
     """Return the deviation between seeds in `records`, beyond the noise of their episodes, for some metrics.
 
     For each metric: the number of methods with several seeds, and the root mean square and the greatest of
-    their standard deviations. Agents that learned by trial are no methods.
+    their standard deviations. What was trained elsewhere is no method.
     """
     runs: dict[Path, list[Scores]] = {}
     for path in sorted(records.rglob("*.json")):
         record = read_record(path)
-        if not record.run.order and "online" not in record.run.uses:
+        if not record.run.order and not record.run.trained_elsewhere:
             runs.setdefault(path.parent, []).append(Scores.from_record(record))
     found = {}
     for name in ("retention", "adaptation", "final_average"):

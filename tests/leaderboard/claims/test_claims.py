@@ -82,6 +82,11 @@ def test_without_any_record_every_claim_says_which_command_is_missing(bench: Ben
     )
 
 
+def started(text: object) -> Callable[[Record], None]:
+    """Return an edit that sets when a run started."""
+    return lambda record: record.timing.update(started=text)
+
+
 def test_the_page_says_how_many_rules_changed_after_the_first_record_that_they_judge(bench: Bench) -> None:
     bench.add("sft", edit=started("2026-11-25T12:00:00+00:00"))
     bench.add("frozen", edit=started("2026-11-26T12:00:00+00:00"))
@@ -89,11 +94,6 @@ def test_the_page_says_how_many_rules_changed_after_the_first_record_that_they_j
     assert 0 < len(later) < len(IDS)
     text = f"is of 2026-11-25; {len(later)} of the {len(IDS)} rules changed after it."
     assert text in bench.page()
-
-
-def started(text: object) -> Callable[[Record], None]:
-    """Return an edit that sets when a run started."""
-    return lambda record: record.timing.update(started=text)
 
 
 @pytest.mark.parametrize("text", [None, 7, "yesterday", "2999-01-01"])
