@@ -57,7 +57,7 @@ class Episode:
         start, self._places = problem.start(seed)
         self._set(start)
         if displaced is not None:
-            self._fall()
+            self._fall(start)
             self.data.qpos[DISPLACED] += START * np.array(displaced)
         self.forward()
         self._arm.begin(problem.scene.rest)
@@ -70,20 +70,17 @@ class Episode:
         data.time = start[0]
         data.qpos[:], data.qvel[:] = np.split(start[1:], [model.nq])
 
-    def _fall(self) -> None:
-        """Let things come to rest with their own mass, while the robot stands still.
+    def _fall(self, start: NDArray[np.float64]) -> None:
+        """Let things come to rest with their own mass, while the robot stands still as in `start`.
 
         The bowl that LIBERO drops onto the ramekin stays there, but bounces off it if it is twice as heavy.
         """
-        start = np.concatenate(([self.data.time], self.data.qpos, np.zeros(self.problem.scene.model.nv)))
-        joints = start[1:][ROBOT_JOINTS]
-        model = self._placed(self.problem.plain)
+        model, data = self._placed(self.problem.plain), self.data
         for _ in range(FALL):
-            mujoco.mj_step(model, self.data)
-            self.data.qpos[ROBOT_JOINTS], self.data.qvel[ROBOT_JOINTS] = joints, 0.0
+            mujoco.mj_step(model, data)
+            data.qpos[ROBOT_JOINTS], data.qvel[ROBOT_JOINTS] = start[1:][ROBOT_JOINTS], 0.0
         self.problem.plain.models.give_back(model)
-        start[1:][: model.nq] = self.data.qpos
-        self._set(start)
+        self._set(np.concatenate((start[:1], data.qpos, np.zeros(model.nv))))
 
     def recorded(self, states: NDArray[np.float64], places: Places) -> NDArray[np.float32]:
         """Return the states (T, 213) of a recorded episode.
