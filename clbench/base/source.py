@@ -41,7 +41,8 @@ def source_hash(*modules: str) -> str:
         if origin is None:  # a class that was typed at a prompt has no source to read
             continue
         for path in sorted(origin.parent.rglob("*")) if origin.name == "__init__.py" else [origin]:
-            if path.is_file() and path.suffix != ".pyc":
+            # Python and numba keep what they compile there, and would change the key in the middle of a run
+            if path.is_file() and path.parent.name != "__pycache__":
                 status = path.stat()
                 digest.update(_file_hash(path, status.st_mtime_ns, status.st_size))
     return digest.hexdigest()[:16]

@@ -93,6 +93,20 @@ def test_a_change_of_a_file_below_a_package_changes_its_hash(
     assert source_hash("some_package") != before
 
 
+def test_what_python_and_numba_keep_of_compiled_code_does_not_change_a_hash(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    package = tmp_path / "some_compiled_package"
+    package.mkdir()
+    (package / "__init__.py").touch()
+    monkeypatch.syspath_prepend(tmp_path)
+    before = source_hash("some_compiled_package")
+    (package / "__pycache__").mkdir(exist_ok=True)
+    for name in ("arm.cpython-311.pyc", "arm._drive-112.py311.nbi", "arm._drive-112.py311.1.nbc"):
+        (package / "__pycache__" / name).write_bytes(b"compiled")
+    assert source_hash("some_compiled_package") == before
+
+
 def test_the_order_in_which_packages_are_named_does_not_matter() -> None:
     assert source_hash("clbench.policy", "clbench.spec") == source_hash("clbench.spec", "clbench.policy")
 
