@@ -2,15 +2,17 @@
 
 A key names packages, each with every package below it, and not single modules: a module that moves inside its
 package stays covered, and code that cannot change a result (the film maker, the command line) is not in the
-key.
+key. The code of users has no such order, so that what their modules import from beside them counts, too.
 """
 
 from __future__ import annotations
 
+import ast
 import functools
 import hashlib
 import importlib.util
 import sys
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from types import CodeType
 
@@ -25,7 +27,11 @@ RUN_SOURCES = (*TRAINING_SOURCES, "clbench.records", "clbench.evaluation", "clbe
 
 
 def source_hash(*modules: str) -> str:
-    """Return the hash of the source of `modules`; a package counts with all files below it.
+    """Return the hash of the source of `modules`.
+
+    A package counts with all files below it. Outside of clbench, what a module imports from beside it counts,
+    too, directly or through one another: files below the same folder on Python's path or, if the module is
+    installed, files of its own top-level package. Imports are read, not run.
 
     Args:
         modules: Names of modules and packages, in any order.
@@ -40,12 +46,20 @@ def source_hash(*modules: str) -> str:
         digest.update(module.encode())
         if origin is None:  # a class that was typed at a prompt has no source to read
             continue
-        for path in sorted(origin.parent.rglob("*")) if origin.name == "__init__.py" else [origin]:
+        files = [origin]
+        if origin.name == "__init__.py":
             # Python and numba keep what they compile there, and would change the key in the middle of a run
-            if path.is_file() and path.parent.name != "__pycache__":
-                status = path.stat()
-                digest.update(_file_hash(path, status.st_mtime_ns, status.st_size))
+            files = [one for one in sorted(origin.parent.rglob("*")) if one.parent.name != "__pycache__"]
+        for path in [*files, *_imported_beside(module, origin, files)]:
+            if path.is_file():
+                digest.update(_file_hash(path, *_stamp(path)))
     return digest.hexdigest()[:16]
+
+
+def _stamp(path: Path) -> tuple[int, int]:
+    """Return when a file was last changed, and its size."""
+    status = path.stat()
+    return status.st_mtime_ns, status.st_size
 
 
 @functools.lru_cache(maxsize=4096)  # a run asks 20 times, 10 ms each
@@ -71,6 +85,57 @@ def _origin(module: str) -> Path | None:
             f"There is no module {module!r}, whose source is part of a key.", name=module
         )
     return Path(file) if file is not None else None
+
+
+def _imported_beside(module: str, origin: Path, files: Iterable[Path]) -> list[Path]:
+    """Return the other files that the `files` of a module outside of clbench import, in a fixed order."""
+    if module == "__main__":  # a script, or a module that `python -m` runs
+        module = getattr(sys.modules[module].__spec__, "name", origin.stem)
+    top, depth = module.partition(".")[0], module.count(".") + (origin.name == "__init__.py")
+    folder = origin.parents[depth] if depth < len(origin.parents) else origin.parent
+    if top == "clbench" or _file_below(folder, module) != origin:
+        return []
+    installed = folder.name in ("site-packages", "dist-packages")
+    found: dict[Path, None] = dict.fromkeys(files)
+    own, pending = len(found), [path for path in found if path.suffix == ".py"]
+    while pending:
+        path = pending.pop()
+        for name in _imports(path, folder, *_stamp(path)):
+            first = name.partition(".")[0]
+            file = (
+                _file_below(folder, name) if first == top or not (installed or first == "clbench") else None
+            )
+            if file is not None and file not in found:
+                found[file] = None
+                pending.append(file)
+    return sorted(list(found)[own:])
+
+
+def _file_below(folder: Path, module: str) -> Path | None:
+    place = folder.joinpath(*module.split("."))
+    return next((one for one in (place / "__init__.py", Path(f"{place}.py")) if one.is_file()), None)
+
+
+@functools.lru_cache(maxsize=4096)
+def _imports(path: Path, folder: Path, changed: int, size: int) -> tuple[str, ...]:
+    """Return the names in the imports of a file that may be modules, each with the packages that hold it."""
+    try:
+        tree = ast.parse(path.read_bytes())
+    except (SyntaxError, ValueError):  # nobody can import it either; its bytes count
+        return ()
+    package = path.relative_to(folder).parent.parts
+    names = [name for node in ast.walk(tree) for name in _names_in(node, package)]
+    return tuple(dict.fromkeys(".".join(name[:end]) for name in names for end in range(1, len(name) + 1)))
+
+
+def _names_in(node: ast.AST, package: Sequence[str]) -> Iterator[list[str]]:
+    """Yield the parts of the names that an import in a module of `package` asks for."""
+    if isinstance(node, ast.Import):
+        yield from (alias.name.split(".") for alias in node.names)
+    elif isinstance(node, ast.ImportFrom):
+        start = package[: len(package) - node.level + 1] if node.level else ()
+        base = [*start, *(node.module.split(".") if node.module else ())]
+        yield from ([*base, alias.name] for alias in node.names)
 
 
 def class_hash(cls: type) -> str:

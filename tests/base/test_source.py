@@ -1,13 +1,21 @@
 """Hashes of source code: a cache key covers all code of its stage, and every module it names exists."""
 
+import importlib
 import os
 import subprocess
 import sys
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 
-from clbench.base.source import DATA_SOURCES, RUN_SOURCES, TRAINING_SOURCES, class_hash, source_hash
+from clbench.base.source import (
+    DATA_SOURCES,
+    RUN_SOURCES,
+    TRAINING_SOURCES,
+    class_hash,
+    source_hash,
+)
 
 STAGES = {
     "demonstrations": (
@@ -105,6 +113,96 @@ def test_what_python_and_numba_keep_of_compiled_code_does_not_change_a_hash(
     for name in ("arm.cpython-311.pyc", "arm._drive-112.py311.nbi", "arm._drive-112.py311.1.nbc"):
         (package / "__pycache__" / name).write_bytes(b"compiled")
     assert source_hash("some_compiled_package") == before
+
+
+LAYOUTS = {
+    "a module that imports one beside it": ("mine", {"mine.py": "import near", "near.py": ""}, "near.py"),
+    "through another one": (
+        "mine",
+        {"mine.py": "import near", "near.py": "def f():\n    from far.deep import x", "far/deep.py": "x = 1"},
+        "far/deep.py",
+    ),
+    "another package of the same top": (
+        "top.methods.mine",
+        {
+            "top/__init__.py": "",
+            "top/methods/__init__.py": "",
+            "top/methods/mine.py": "from ..tools import loss",
+            "top/tools/__init__.py": "",
+            "top/tools/loss.py": "",
+        },
+        "top/tools/loss.py",
+    ),
+    "what Python runs of a package": (
+        "mine",
+        {"mine.py": "import near.deep", "near/__init__.py": "", "near/deep.py": ""},
+        "near/__init__.py",
+    ),
+}
+"""Modules of users: their names, their files, and the file that their keys must follow."""
+
+
+@pytest.fixture
+def lay_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[dict[str, str]], None]]:
+    """Return a function that writes files below a folder on Python's path; their modules are forgotten."""
+    before = set(sys.modules)
+    monkeypatch.syspath_prepend(tmp_path)
+
+    def write(files: dict[str, str]) -> None:
+        for name, text in files.items():
+            (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+            (tmp_path / name).write_text(text)
+        importlib.invalidate_caches()
+
+    yield write
+    for name in set(sys.modules) - before:
+        if Path(getattr(sys.modules[name], "__file__", None) or "/").is_relative_to(tmp_path):
+            del sys.modules[name]
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_a_change_of_a_file_that_a_module_imports_from_beside_it_changes_its_hash(
+    layout: str, lay_out: Callable[[dict[str, str]], None]
+) -> None:
+    module, files, helper = LAYOUTS[layout]
+    lay_out({**files, "unrelated.py": "one"})
+    before = source_hash(module)
+    lay_out({"unrelated.py": "another"})
+    assert source_hash(module) == before
+    lay_out({helper: "changed = True"})
+    assert source_hash(module) != before
+
+
+def test_what_is_installed_and_what_is_in_clbench_does_not_count_with_a_module_that_imports_it(
+    lay_out: Callable[[dict[str, str]], None],
+) -> None:
+    lay_out({"alone.py": "import numpy, clbench\nfrom clbench.methods import lora\nimport nothing_here"})
+    before = source_hash("alone")
+    lay_out({"clbench/methods/lora.py": "", "clbench/__init__.py": ""})
+    assert source_hash("alone") == before
+
+
+def test_what_is_installed_beside_an_installed_module_does_not_count_with_it(
+    tmp_path: Path, lay_out: Callable[[dict[str, str]], None], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = "site-packages/"
+    lay_out({folder + "plug/mine.py": "import other\nfrom plug.tools import loss", folder + "other.py": ""})
+    lay_out({folder + "plug/tools/loss.py": ""})
+    monkeypatch.syspath_prepend(tmp_path / "site-packages")
+    before = source_hash("plug.mine")
+    lay_out({folder + "other.py": "changed = True"})
+    assert source_hash("plug.mine") == before
+    lay_out({folder + "plug/tools/loss.py": "changed = True"})
+    assert source_hash("plug.mine") != before
+
+
+def test_a_file_that_python_cannot_read_counts_with_its_bytes(
+    lay_out: Callable[[dict[str, str]], None],
+) -> None:
+    lay_out({"mine.py": "def later():\n    import torn", "torn.py": "def ("})
+    before = source_hash("mine")
+    lay_out({"torn.py": "def (("})
+    assert source_hash("mine") != before
 
 
 def test_the_order_in_which_packages_are_named_does_not_matter() -> None:

@@ -17,7 +17,6 @@ from clbench.learning.registry import (
     describe_method,
     load_method,
     method_names,
-    method_packages,
 )
 
 
@@ -200,12 +199,30 @@ def test_a_method_is_described_with_the_hash_of_its_code(
     assert len(set(hashes)) == 2
 
 
-def test_the_source_of_a_method_covers_the_methods_that_it_derives_from(
-    write_module: Callable[[str, str], None],
-) -> None:
+BEHIND = {
+    "a method that it derives from": "base_of_mine",
+    "a module that it imports from beside it": "helper_of_mine",
+    "a module that its base imports from beside it": "helper_of_base",
+}
+
+
+@pytest.mark.parametrize("changed", BEHIND.values(), ids=BEHIND)
+def test_the_source_of_a_method_covers(changed: str, write_module: Callable[[str, str], None]) -> None:
+    write_module("helper_of_mine", "")
+    write_module("helper_of_base", "")
+    write_module(
+        "base_of_mine",
+        "import dataclasses, helper_of_base\nfrom clbench.methods.lora import LoRA\n"
+        "@dataclasses.dataclass\nclass Base(LoRA): 'Base.'\n",
+    )
     write_module(
         "derived",
-        "import dataclasses\nfrom clbench.methods.lora import LoRA\n"
-        "@dataclasses.dataclass\nclass Mine(LoRA):\n    '''Mine.'''\n",
+        "import dataclasses, helper_of_mine\nfrom base_of_mine import Base\n"
+        "@dataclasses.dataclass\nclass Mine(Base): 'Mine.'\n",
     )
-    assert method_packages(load_method("derived:Mine")) == ["clbench.methods", "derived"]
+    before = describe_method(load_method("derived:Mine"))["source"]
+    path = Path(sys.modules[changed].__file__ or "")
+    path.write_text(path.read_text() + "# changed\n")
+    assert describe_method(load_method("derived:Mine"))["source"] != before
+    for name in ("derived", *BEHIND.values()):
+        del sys.modules[name]
