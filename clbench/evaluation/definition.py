@@ -14,6 +14,7 @@ bits depend on the processor, and contacts make more of them. Their records are 
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import sys
@@ -144,23 +145,22 @@ def _moments(task: Task, perturbed: bool) -> Iterator[tuple[NDArray[Any], ...]]:
     All actions are random if the task has no expert.
     """
     expert = resolve(task.expert)(task.name) if recording_of(task) is None else None
-    world = vector_world(task.world, 1, 1, perturbed)
-    space = world.single_action_space
-    generator = np.random.default_rng(0)
-    for seed in range(EPISODES):
-        state = world.reset([0], [seed], [task.name])[0].copy()
-        for step in range(task.horizon):
-            if expert is None or step % RANDOM == RANDOM - 1:
-                action = generator.uniform(space.low, space.high)
-            else:
-                action = np.round(expert(state) * GRID) / GRID
-            after, rewards, successes = world.step([0], action[None].astype(np.float32))
-            yield state, action, rewards, successes
-            state = after[0].copy()
-            if successes[0]:
-                break
-        yield (state,)
-    world.close()
+    with contextlib.closing(vector_world(task.world, 1, 1, perturbed)) as world:
+        space = world.single_action_space
+        generator = np.random.default_rng(0)
+        for seed in range(EPISODES):
+            state = world.reset([0], [seed], [task.name])[0].copy()
+            for step in range(task.horizon):
+                if expert is None or step % RANDOM == RANDOM - 1:
+                    action = generator.uniform(space.low, space.high)
+                else:
+                    action = np.round(expert(state) * GRID) / GRID
+                after, rewards, successes = world.step([0], action[None].astype(np.float32))
+                yield state, action, rewards, successes
+                state = after[0].copy()
+                if successes[0]:
+                    break
+            yield (state,)
 
 
 def main() -> None:
