@@ -31,7 +31,7 @@ from clbench.cli.arguments import (
 )
 from clbench.jobs.folders import check_folders
 from clbench.records.paths import RECORDS, record_path
-from clbench.spec.identifiers import scenario_ids
+from clbench.spec.identifiers import scenario_ids, without_module
 from clbench.spec.protocol import DEFAULT_SEEDS
 
 from .board.paths import SCENARIO
@@ -70,8 +70,8 @@ def show(
     from clbench.scoring.metrics import load_metric
 
     from .board.summary import column_names, values_of
+    from .files import print_written
     from .publishing import add_published, inputs_of, read_unchanged, site_of, write_site
-    from .views.format import print_written
     from .views.terminal import terminal
 
     if sort is not None:
@@ -97,7 +97,8 @@ def show(
         for entry in shown.not_shown:
             messages.print(Text(printable(f"Not shown: {entry.path}: {entry.reason}")))
         return
-    written = [] if computed is None else write_site(computed, records, inputs)
+    with checked_input():
+        written = [] if computed is None else write_site(computed, records, inputs)
     console = Console()
     console.print(terminal(shown, console.width, sort))
     if written:
@@ -122,7 +123,7 @@ def _chosen(board: Summary, scenario: str | None, records: Path) -> Summary:
     """
     if scenario is None:
         return board
-    scenario = scenario.rpartition(":")[2]  # a board needs no module
+    scenario = without_module(scenario)
     rows = tuple(row for row in board.rows if row.scenario == scenario)
     if not rows and scenario in scenario_ids():
         raise UnknownNameError(
@@ -172,23 +173,26 @@ def submit(
     from clbench.runs.spec import RunSpec, check_device
 
     from .board.rows import compute_board
-    from .publishing import inputs_of, write_site
+    from .files import print_written
+    from .publishing import inputs_of, site_of, write_site
     from .submission.submit import placement, run_submission
-    from .views.format import print_written
 
     add_cwd_to_path()
     with checked_input():
         check_device(device)
         first = RunSpec(scenario, method, first_seed, device=device, order=order)
         runs = [replace(first, seed=first_seed + number).resolve() for number in range(seeds)]
-        check_folders({"--records": records, "--checkpoints": checkpoints})
+        folders = {"--records": records, "--checkpoints": checkpoints, "The board's folder": site_of(records)}
+        check_folders(folders)
         went_well = run_submission(runs, records, workers, checkpoints)
     if went_well is None:
         raise SystemExit(1)
     if records.is_dir():
         inputs = inputs_of(records)
         board = compute_board(records)
-        print_written(write_site(board, records, inputs))
+        with checked_input():
+            written = write_site(board, records, inputs)
+        print_written(written)
         lines = placement(board, runs[0], records)
         Console().print(Text("\n".join(lines)), soft_wrap=True)
     if not went_well:

@@ -33,6 +33,17 @@ def unfinished(path: Path) -> Path:
     return path.with_name(f".{path.name}.{_host()}{os.getpid():08x}{uuid.uuid4().hex[:16]}.partial")
 
 
+@contextlib.contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """Yield a new path beside `path`: what is written there replaces `path` in one step, unless one fails."""
+    partial = unfinished(path)
+    try:
+        yield partial
+        partial.replace(path)
+    finally:
+        partial.unlink(missing_ok=True)
+
+
 @functools.cache
 def _host() -> str:
     """Return a hash of what process numbers belong to: a machine, or a container on it."""

@@ -18,6 +18,7 @@ from rich.text import Text
 
 from clbench import __version__
 from clbench.base.errors import InputError
+from clbench.base.leftovers import replacing
 from clbench.base.text import printable
 from clbench.cli.arguments import AsJson, checked_input, print_json
 from clbench.records.tables import GROUPS
@@ -173,7 +174,8 @@ def _write_page(path: Path, text: str) -> None:
     """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(text, encoding="utf-8", newline="\n")
+        with replacing(path) as partial:
+            partial.write_text(text, encoding="utf-8", newline="\n")
     except OSError as error:
         raise InputError(f"{path} cannot be written: {error.strerror}.") from error
 
@@ -318,5 +320,6 @@ def _films(faults: dict[str, str | None]) -> str:
 
 
 def _folder(path: Path, variable: str) -> str:
-    size = sum(file.stat().st_size for file in path.rglob("*") if file.is_file()) if path.exists() else 0
-    return f"{path} ({size / 1e6:.1f} MB; {variable} moves it)"
+    from clbench.cli.cache import Entry
+
+    return f"{path} ({Entry(path.name, path).size / 1e6:.1f} MB; {variable} moves it)"

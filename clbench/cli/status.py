@@ -25,11 +25,13 @@ from clbench.cli.arguments import (
     Seeds,
     add_cwd_to_path,
     checked_input,
+    listed,
     print_json,
 )
 from clbench.cli.runs import requested
 from clbench.records.paths import RECORDS
 from clbench.records.status import RunState, State, found_runs, run_state, seconds_left
+from clbench.spec.identifiers import check_known
 from clbench.spec.policies import DEFAULT_POLICY, SMALL, policy_name
 from clbench.spec.protocol import DEFAULT_SEEDS
 
@@ -89,6 +91,7 @@ def status(
                 raise InputError(f"There are no runs in {records}: `clbench run` makes them.")
             states = [run_state(path, Scores.from_record) for path in paths]
         else:
+            check_known(listed("SCENARIOS", scenarios), methods)
             from clbench.runs.spec import RunSpec
 
             name = policy_name(policy, policy_size)

@@ -29,6 +29,7 @@ from clbench.cli.arguments import (
 from clbench.cli.runs import do_runs
 from clbench.jobs.folders import check_folders
 from clbench.records.paths import TUNING
+from clbench.spec.identifiers import without_module
 from clbench.spec.protocol import FIRST_TUNING_SEED
 from clbench.spec.references import BASELINE
 
@@ -127,7 +128,7 @@ def tune(
         _table(scenario, {name: (one.settings, one.tried) for name, one in chosen.items()}, seeds)
     )
     if write is not None:
-        write_tuned(write, scenario.rpartition(":")[2], numbers, chosen)
+        write_tuned(write, without_module(scenario), numbers, chosen)
 
 
 def _choose(

@@ -22,7 +22,7 @@ from clbench.base.cache import cached, hash_of
 from clbench.base.dependencies import versions
 from clbench.base.entry_points import resolve
 from clbench.base.errors import InputError
-from clbench.base.leftovers import unfinished
+from clbench.base.leftovers import replacing
 from clbench.base.progress import ProgressCallback, no_progress
 from clbench.base.seeding import derive_seed, numpy_generator
 from clbench.base.source import DATA_SOURCES, source_hash
@@ -205,11 +205,10 @@ def _declare_namespaces(folder: Path, dataset_id: str) -> None:
         namespace.mkdir(parents=True, exist_ok=True)
         path = namespace / "namespace_metadata.json"
         if not path.exists():
-            partial = unfinished(path)
-            partial.write_text(
-                json.dumps({"description": "Expert demonstrations of clbench"}), encoding="utf-8"
-            )
-            partial.replace(path)  # written in place, it would stay empty after a full disk
+            with replacing(path) as partial:  # written in place, it would stay empty after a full disk
+                partial.write_text(
+                    json.dumps({"description": "Expert demonstrations of clbench"}), encoding="utf-8"
+                )
 
 
 def _write(folder: Path, name: str, task: Task, world: World, episodes: Sequence[Demonstration]) -> None:

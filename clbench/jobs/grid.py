@@ -69,9 +69,13 @@ def missing(runs: Sequence[ResolvedRun], records: Path, checkpoints: Path | None
     """Return what has to be done until all runs have a record and, with `checkpoints`, policies there."""
     from clbench.runs.checkpoints import has_stages
 
-    without = [run for run in runs if not has_record(run, records)]
-    recorded = [run for run in runs if run not in without]
-    return Missing(without, [run for run in recorded if checkpoints and not has_stages(run, checkpoints)])
+    without, stages = [], []
+    for run in runs:
+        if not has_record(run, records):
+            without.append(run)
+        elif checkpoints and not has_stages(run, checkpoints):
+            stages.append(run)
+    return Missing(without, stages)
 
 
 def run_missing(
@@ -123,12 +127,20 @@ def run_missing(
     for job, reason in lost.items():
         _print(console, f"{job}: {reason}")
     failed |= lost
-    good = len(to_do.runs) - sum(job.is_done is not None for job in failed)
-    done = f"{good} of " if good < len(to_do.runs) else ""
-    done += counted(len(to_do.runs), "run")
-    done += f" and the policies of {len(to_do.stages)}" if to_do.stages else ""
+    lost_runs = sum(job.is_done is not None for job in failed)
+    done = f"{_part(lost_runs, len(to_do.runs))}{counted(len(to_do.runs), 'run')}"
+    if to_do.stages:
+        from clbench.jobs.work import make_policies
+
+        lost_stages = sum(job.function is make_policies for job in failed)
+        done += f" and the policies of {_part(lost_stages, len(to_do.stages))}{len(to_do.stages)}"
     _print(console, f"{done} in {seconds / 60:.1f} minutes; records in {records}.")
     return failed
+
+
+def _part(lost: int, count: int) -> str:
+    """Return "3 of " if one of 4 is lost, and nothing if none is."""
+    return f"{count - lost} of " if lost else ""
 
 
 def _without_record(jobs: Sequence[Job], failed: Mapping[Job, str], records: Path) -> dict[Job, str]:
@@ -212,7 +224,7 @@ def run_specs(firsts: Sequence[RunSpec], seeds: int, records: Path, workers: int
     runs = [spec.resolve() for spec in specs]
     console = lines_console()
     typed = [run for run in runs if run.spec.method.startswith("__main__:")]
-    others = [run for run in runs if run not in typed]
+    others = [run for run in runs if not run.spec.method.startswith("__main__:")]
     # other processes cannot import the class, but can make what its runs need
     needed = [
         job for job in missing(typed, records, None).plan(records, None).jobs if "spec" not in job.arguments

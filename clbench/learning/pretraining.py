@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import logging
 from collections.abc import Callable, Mapping, Sequence
@@ -133,20 +134,18 @@ def vision_steps(scenario: Scenario) -> int:
 def policy_config(scenario: Scenario) -> PolicyConfig:
     """Return the sizes of a policy for the scenario's worlds."""
     first = scenario.tasks[0]
-    world = resolve(first.world)()
     observer = Observer(first.world, first.camera)
     width, layers = size_of(scenario.policy) or (scenario.budget.policy_width, scenario.budget.policy_layers)
-    config = PolicyConfig(
-        state_size=observer.spaces(world.observation_space)["state"].shape[0],
-        action_size=world.action_space.shape[0],
-        text_length=scenario.text_length,
-        image_size=observer.image_size,
-        width=width,
-        layers=layers,
-        kind=kind_of(scenario.policy),
-    )
-    world.close()
-    return config
+    with contextlib.closing(resolve(first.world)()) as world:
+        return PolicyConfig(
+            state_size=observer.spaces(world.observation_space)["state"].shape[0],
+            action_size=world.action_space.shape[0],
+            text_length=scenario.text_length,
+            image_size=observer.image_size,
+            width=width,
+            layers=layers,
+            kind=kind_of(scenario.policy),
+        )
 
 
 @deterministic()  # the means and deviations of the data depend on the number of threads, too

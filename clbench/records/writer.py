@@ -5,12 +5,11 @@ from __future__ import annotations
 import dataclasses
 import json
 import logging
-import os
 from pathlib import Path
 from typing import Any
 
 from clbench.base.errors import InputError
-from clbench.base.leftovers import unfinished
+from clbench.base.leftovers import replacing
 from clbench.base.strict_json import LONGEST_TEXT, check_json
 from clbench.records.content import content_hash
 from clbench.records.reader import RecordError, read_record
@@ -39,14 +38,10 @@ def write_record(record: Record, path: Path) -> None:
     check_diagnostics(record.diagnostics)
     text = record_text(record)
     path.parent.mkdir(parents=True, exist_ok=True)
-    partial = unfinished(path)
-    try:
+    with replacing(path) as partial:
         with open(partial, "x", encoding="utf-8") as file:
             file.write(text)
         _check_readable(partial)
-        os.replace(partial, path)
-    finally:
-        partial.unlink(missing_ok=True)
 
 
 def write_result(record: Record, path: Path) -> None:

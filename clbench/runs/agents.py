@@ -322,8 +322,17 @@ class StagedRun:
                 has taken the run; and as for `plan`.
             LeaseLostError: Another process took the run over.
         """
+        owned = self.unfinished in _LEASES
         if not self.path.exists():
             self._own()
+        try:
+            return self._begun(stage, settings, agent, again)
+        except BaseException:
+            if not owned and self.unfinished in _LEASES:
+                self._release()
+            raise
+
+    def _begun(self, stage: int, settings: dict[str, Any] | None, agent: Any, again: bool) -> Record:
         self.check_unfinished()  # also for a process that has just finished the run
         record = self.plan(stage, again)
         following = self.next_after(record)
@@ -406,6 +415,9 @@ class StagedRun:
             return
         write_record(record, self.path)
         self.unfinished.unlink(missing_ok=True)
+        self._release()
+
+    def _release(self) -> None:
         _LEASES.pop(self.unfinished).release()
 
 

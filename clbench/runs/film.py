@@ -6,6 +6,7 @@ repeats the actions of an `Evaluator`, so a film ends like the recorded episode.
 
 from __future__ import annotations
 
+import contextlib
 import functools
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
@@ -21,7 +22,7 @@ from PIL import Image, ImageColor, ImageDraw, ImageFont
 from clbench.base.dependencies import require
 from clbench.base.entry_points import resolve
 from clbench.base.errors import InputError
-from clbench.base.leftovers import unfinished
+from clbench.base.leftovers import replacing
 from clbench.base.progress import ProgressCallback, no_progress
 from clbench.evaluation.episodes import Episode, Trial, start_of
 from clbench.evaluation.rollouts import Evaluator
@@ -223,12 +224,8 @@ class Film:
         """
         check_format(path)
         path.parent.mkdir(parents=True, exist_ok=True)
-        partial = unfinished(path)
-        try:
+        with replacing(path) as partial:
             (self._save_gif if path.suffix == ".gif" else self._save_mp4)(partial, fps)
-            partial.replace(path)
-        finally:
-            partial.unlink(missing_ok=True)
 
     def _save_gif(self, path: Path, fps: int) -> None:
         palette = self._palette()
@@ -258,11 +255,11 @@ class Film:
 
         # one thread and no encoder name in the file: the same film has the same bytes
         exact = ["-threads", "1", "-fflags", "+bitexact", "-flags:v", "+bitexact", "-crf", "23", "-f", "mp4"]
-        writer = write_frames(path, self.size, fps=fps, macro_block_size=2, output_params=exact)
-        writer.send(None)
-        for time in range(len(self) + round(HOLD_SECONDS * fps)):
-            writer.send(self.frame(min(time, len(self) - 1)).tobytes())
-        writer.close()
+        frames = write_frames(path, self.size, fps=fps, macro_block_size=2, output_params=exact)
+        with contextlib.closing(frames) as writer:
+            writer.send(None)
+            for time in range(len(self) + round(HOLD_SECONDS * fps)):
+                writer.send(self.frame(min(time, len(self) - 1)).tobytes())
 
 
 def _write(draw: ImageDraw.ImageDraw, place: tuple[int, int], text: str, width: int, colour: str) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import os
 import platform
@@ -40,16 +41,15 @@ def rollout_hash(world: str, task: str) -> str:
         world: Entry point of the environment.
         task: Name of the task that chooses the initial state.
     """
-    environment = resolve(world)()
-    assert isinstance(environment.action_space, gymnasium.spaces.Box)
-    generator = np.random.default_rng(0)
-    low, high = environment.action_space.low, environment.action_space.high
-    state, _ = environment.reset(seed=0, options={"task": task})
-    digest = hashlib.sha256(np.asarray(state, np.float32).tobytes())
-    for _ in range(_ROLLOUT_STEPS):
-        state, *_ = environment.step(generator.uniform(low, high).astype(np.float32))
-        digest.update(np.asarray(state, np.float32).tobytes())
-    environment.close()
+    with contextlib.closing(resolve(world)()) as environment:
+        assert isinstance(environment.action_space, gymnasium.spaces.Box)
+        generator = np.random.default_rng(0)
+        low, high = environment.action_space.low, environment.action_space.high
+        state, _ = environment.reset(seed=0, options={"task": task})
+        digest = hashlib.sha256(np.asarray(state, np.float32).tobytes())
+        for _ in range(_ROLLOUT_STEPS):
+            state, *_ = environment.step(generator.uniform(low, high).astype(np.float32))
+            digest.update(np.asarray(state, np.float32).tobytes())
     return digest.hexdigest()[:16]
 
 

@@ -173,9 +173,9 @@ class _Run:
         pretrained = pretrained.to(spec.device)
         data = TrainingData.open(scenario, pretrained.config)
         trainer = Trainer(scenario, data, pretrained, run.new_method, spec.seed)
+        record = _new_record(run, trainer, folder)
         examiner = Examiner(scenario, run.protocol, data, pretrained, spec.seed, progress)
         checker = Checker(scenario, run.protocol, spec.seed)
-        record = _new_record(run, trainer, folder)
         parts = (run, trainer, examiner, checker, record, Log(), progress, checkpoints, lease)
         return cls(*parts, kept, tensorboard, _inputs(run))
 

@@ -15,6 +15,7 @@ from clbench.records.paths import label_of, record_path
 from clbench.records.record import RunInfo, ScenarioInfo
 from clbench.runs.tuning import tuned_settings
 from clbench.spec.fields import check_whole
+from clbench.spec.identifiers import without_module
 from clbench.spec.policies import DEFAULT_POLICY, kind_of
 from clbench.spec.protocol import LARGEST_SEED, Protocol, ScoredSplit
 from clbench.spec.registry import load_scenario
@@ -70,7 +71,7 @@ class RunSpec:
 
     def path(self, records: Path) -> Path:
         """Return the path of the record below the folder `records`."""
-        scenario = self.scenario.rpartition(":")[2]
+        scenario = without_module(self.scenario)
         return record_path(records, scenario, self.label, self.seed, self.order, self.policy)
 
     def resolve(self) -> ResolvedRun:

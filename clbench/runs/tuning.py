@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, Any
 
 from clbench.base.errors import InputError
 from clbench.base.lease import Lease
-from clbench.base.leftovers import unfinished
+from clbench.base.leftovers import replacing
 from clbench.base.strict_json import read_json
 from clbench.spec.identifiers import folder_name, scenario_ids
 
@@ -146,12 +146,9 @@ def write_tuned(path: Path, scenario: str, seeds: Sequence[int], methods: Mappin
         if path.is_file():
             known = {**read_json(path)["methods"], **known}
         content = {"scenario": scenario, "seeds": list(seeds), "methods": dict(sorted(known.items()))}
-        partial = unfinished(path)
-        try:
+        with replacing(path) as partial:  # a full disk leaves the settings of the others
             partial.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
-            partial.replace(path)  # a full disk leaves the settings of the others
-        finally:
-            partial.unlink(missing_ok=True)
+    tuned.cache_clear()
 
 
 def fixed_settings(method: type[Method], found: Tuned) -> dict[str, Any]:

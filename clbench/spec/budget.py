@@ -69,10 +69,10 @@ class Budget:
                 f"Budget.policy_width must be a multiple of {HEADS}, the number of attention heads, not "
                 f"{self.policy_width}."
             )
-        if self.criterion is not None and not 0 < self.criterion <= 1:
-            raise InputError(
-                f"Budget.criterion must be a success rate above 0, at most 1, not {self.criterion}."
-            )
+        if self.criterion is not None:
+            check_share(self, "criterion")
+            if self.criterion == 0:
+                raise InputError("Budget.criterion must be above 0: every policy meets a criterion of 0.")
 
     def episodes(self, split: Split) -> int:
         """Return the number of episodes per task in `split`."""

@@ -141,6 +141,11 @@ def check_plain(kind: str, name: str) -> None:
         raise InputError(f"{quoted(name)} cannot be the name of a {kind}: letters, digits, _, - and . only.")
 
 
+def without_module(scenario: str) -> str:
+    """Return the Gymnasium id in a name of a scenario, which may be "module:id"."""
+    return scenario.rpartition(":")[2]
+
+
 def folder_name(name: str) -> str:
     """Return the name of a folder for a checked scenario id or label; no two share one."""
     return name.removeprefix("clbench/").replace("/", "--").replace(":", ".")

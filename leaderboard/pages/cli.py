@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -12,7 +12,7 @@ from rich.text import Text
 from clbench.base.errors import InputError, MissingPackageError
 from clbench.cli.arguments import ScenarioId, add_cwd_to_path, check_names, checked_input, whole_number
 from clbench.records.paths import RECORDS, check_folder
-from clbench.spec.identifiers import folder_name, scenario_ids
+from clbench.spec.identifiers import folder_name, scenario_ids, without_module
 
 from ..board.paths import CONTROLS, SCENARIO
 
@@ -43,10 +43,11 @@ def claims(
     from ..claims.judges import judge_all
     from .claims_page import page, terminal
 
-    judged = judge_all(_evidence(scenario, records, controls), scenario)
+    evidence = _evidence(scenario, records, controls)
+    judged = judge_all(evidence, None if scenario is None else without_module(scenario))
     console = Console()
     console.print(terminal(judged))
-    _write(output, page(judged))
+    _write({output: page(judged)})
 
 
 def findings(
@@ -63,14 +64,13 @@ def findings(
         output: Path of the page; pictures go to the folder `findings` beside it.
     """
     from ..claims.judges import judge_all
-    from ..views.format import print_written, write_all
     from .findings import page, pictures, sections
 
     evidence = _evidence(None, records, controls)
     board = _board(records)
     found = sections(board, judge_all(evidence), evidence)
     drawn = {output.parent / "findings" / name: svg for name, svg in pictures(board).items()}
-    print_written(write_all({output: page(found), **drawn}))
+    _write({output: page(found), **drawn})
 
 
 def method_pages(
@@ -89,16 +89,15 @@ def method_pages(
         output: Folder of the pages.
     """
     from ..claims.judges import judge_all
+    from ..files import write_all
     from ..views.descriptions import built_in_methods
-    from ..views.format import write_if_changed
     from .method_pages import Sources, pages
 
     evidence = _evidence(scenario, records, controls, optional=True)
-    sources = Sources(evidence(scenario), judge_all(evidence), _board(records).rows)
+    sources = Sources(evidence(without_module(scenario)), judge_all(evidence), _board(records).rows)
     texts = pages(built_in_methods(), sources)
-    output.mkdir(parents=True, exist_ok=True)
-    for name, text in texts.items():
-        write_if_changed(output / name, text)
+    with checked_input():
+        write_all({output / name: text for name, text in texts.items()})
     Console().print(Text(f"Written: {len(texts)} pages in {output}"), soft_wrap=True)
 
 
@@ -154,7 +153,7 @@ def scenario_card(
         experts = make_missing(scenario, home, episodes, drawing=fault is None, console=console)
         drawn = {task.name for task in scenario.tasks if picture_path(home, task).is_file()}
         card = Card(scenario, board, experts, frozenset(drawn), typed[scenario.id], records)
-        _write(output / f"{home.name}.md", card.page())
+        _write({output / f"{home.name}.md": card.page()})
 
 
 def _evidence(
@@ -169,7 +168,7 @@ def _evidence(
     from ..claims.evidence import read_evidence
 
     if scenario is not None:
-        homes = [home / folder_name(scenario) for home in (records, controls)]
+        homes = [home / folder_name(without_module(scenario)) for home in (records, controls)]
         if not any(home.is_dir() for home in homes):  # one with records may be of a missing package
             check_names([scenario], [])  # before all records are read, which takes 10 s
     if not optional:
@@ -189,7 +188,10 @@ def _board(records: Path) -> Board:
     return compute_board(records) if records.is_dir() else Board()
 
 
-def _write(path: Path, text: str) -> None:
-    from ..views.format import print_written, write_all
+def _write(texts: Mapping[Path, str]) -> None:
+    """Write texts to their paths, and print the paths."""
+    from ..files import print_written, write_all
 
-    print_written(write_all({path: text}))
+    with checked_input():
+        written = write_all(texts)
+    print_written(written)

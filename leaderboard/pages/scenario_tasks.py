@@ -5,7 +5,6 @@ Both are made once and kept in the folder of the card until the version of a tas
 
 from __future__ import annotations
 
-import io
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -15,6 +14,7 @@ from rich.console import Console
 
 from clbench.base.dependencies import require
 from clbench.base.errors import ClbenchError
+from clbench.base.leftovers import replacing
 from clbench.base.progress import ProgressCallback
 from clbench.base.seeding import derive_seed
 from clbench.base.text import counted
@@ -26,7 +26,7 @@ from clbench.spec.task import Task
 from clbench.worlds.gl_backend import choose_back_end
 from clbench.worlds.world import opened_worlds
 
-from ..views.format import write_if_changed
+from ..files import write_all
 
 EXPERTS = "experts.json"
 """File with the measurements of the experts, in the folder of the card."""
@@ -107,7 +107,7 @@ def make_missing(
         path.unlink()
     found = {task.name: kept[task.name] for task in scenario.tasks}
     lines = (f"{json.dumps(name)}: {json.dumps(entry)}" for name, entry in found.items())
-    write_if_changed(folder / EXPERTS, "{\n" + ",\n".join(lines) + "\n}\n")
+    write_all({folder / EXPERTS: "{\n" + ",\n".join(lines) + "\n}\n"})
     return Experts(episodes, {name: entry["successes"] for name, entry in found.items()})
 
 
@@ -124,9 +124,8 @@ def _draw(tasks: Sequence[Task], folder: Path, progress: ProgressCallback) -> No
             world(task).reset(seed=seed, options={"task": task.name})
             for action in actions[: len(actions) // 2]:
                 world(task).step(action)
-            content = io.BytesIO()
-            picture(world(task), WIDTH).save(content, "WEBP", quality=QUALITY, method=6)
-            picture_path(folder, task).write_bytes(content.getvalue())
+            with replacing(picture_path(folder, task)) as partial:  # half a picture would count as drawn
+                picture(world(task), WIDTH).save(partial, "WEBP", quality=QUALITY, method=6)
             progress(1)
 
 

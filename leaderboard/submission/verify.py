@@ -39,7 +39,7 @@ from clbench.spec.scenario import Scenario
 from ..board.runs import differences, read_run
 from ..board.summary import ELSEWHERE
 from ..board.tiers import TIERS, tier_of, verification_path, verification_text
-from ..views.format import write_if_changed
+from ..files import write_all
 from .replay import replay
 from .subject import Check, Request, Subject, some
 
@@ -126,7 +126,7 @@ def _write(path: Path, digest: str, subject: Subject, tier: str, checks: Sequenc
         "time": datetime.now(UTC).isoformat(timespec="seconds"),
         "verifier": subject.here,
     }
-    write_if_changed(verification_path(path), verification_text(values))
+    write_all({verification_path(path): verification_text(values)})
 
 
 # ---- recomputed --------------------------------------------------------------------------------------------

@@ -6,15 +6,10 @@ The same rows give the same bytes: no date, no absolute path, fixed digits.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TypeAlias
 
-from rich.console import Console
-from rich.text import Text
-
-from clbench.base.leftovers import unfinished
 from clbench.scoring.intervals import Estimate
 from clbench.scoring.metric import Metric
 from clbench.scoring.metrics import METRICS, TITLES
@@ -250,37 +245,3 @@ def scaled(count: float) -> tuple[str, str]:
     # The rounded number decides: 999.9 k is 1 M.
     power = next((power for power, value in enumerate(digits) if value < 1000), len(units) - 1)
     return f"{digits[power]:g}" if power else number_text(count, ".0f"), units[power]
-
-
-def write_if_changed(path: Path, text: str) -> None:
-    """Write `text` to `path` in one step, unless the file has this text already."""
-    write_all({path: text})
-
-
-def write_all(texts: Mapping[Path, str]) -> list[Path]:
-    """Write the texts to their paths, all or none, except those that are there already; return the paths.
-
-    Nothing is replaced before everything is written beside its place: a full disk leaves the old files.
-    """
-    partials: dict[Path, Path] = {}
-    try:
-        for path, text in texts.items():
-            content = text.encode("utf-8")
-            if path.is_file() and path.read_bytes() == content:
-                continue
-            path.parent.mkdir(parents=True, exist_ok=True)
-            partials[path] = unfinished(path)
-            partials[path].write_bytes(content)
-        for path, partial in partials.items():
-            partial.replace(path)
-    finally:
-        for partial in partials.values():
-            partial.unlink(missing_ok=True)
-    return list(texts)
-
-
-def print_written(paths: Iterable[Path]) -> None:
-    """Print the paths of files that were written."""
-    console = Console()
-    for path in paths:
-        console.print(Text(f"Written: {path}"), soft_wrap=True)

@@ -6,9 +6,11 @@ import sys
 import time
 from pathlib import Path
 
+import pytest
+
 from clbench.base.cache import cached
 from clbench.base.lease import Lease
-from clbench.base.leftovers import FILE_SECONDS, sweep, unfinished
+from clbench.base.leftovers import FILE_SECONDS, replacing, sweep, unfinished
 
 HEX = "0123456789abcdef" * 2
 
@@ -90,3 +92,15 @@ def test_a_result_that_is_made_again_removes_what_its_dead_makers_left(tmp_path:
         (tmp_path / name).mkdir()
     cached(tmp_path / "x", {}, lambda folder: None)
     assert sorted(path.name for path in tmp_path.iterdir()) == [f".xy.{HEX}.partial", "x"]
+
+
+def test_what_replaces_a_file_appears_in_one_step_and_leaves_nothing_behind(tmp_path: Path) -> None:
+    path = tmp_path / "file"
+    path.write_text("old")
+    with pytest.raises(FileNotFoundError), replacing(path) as partial:
+        partial.write_text((tmp_path / "none").read_text())
+    assert (path.read_text(), list(tmp_path.iterdir())) == ("old", [path])
+    with replacing(path) as partial:
+        partial.write_text("new")
+        assert path.read_text() == "old"
+    assert (path.read_text(), list(tmp_path.iterdir())) == ("new", [path])

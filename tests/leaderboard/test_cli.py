@@ -165,7 +165,10 @@ def test_a_folder_without_rows_lists_why(tmp_path: Path, capsys: pytest.CaptureF
 
 
 def test_a_full_disk_leaves_every_file_of_the_board_as_it_was(
-    four_methods: Path, shown: Callable[[], tuple[str, str]], monkeypatch: pytest.MonkeyPatch
+    four_methods: Path,
+    shown: Callable[[], tuple[str, str]],
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     shown()
     site = four_methods.parent / "site"
@@ -180,8 +183,11 @@ def test_a_full_disk_leaves_every_file_of_the_board_as_it_was(
         return write(path, content)
 
     monkeypatch.setattr(Path, "write_bytes", fill)
-    with pytest.raises(OSError, match="No space left"):
+    with pytest.raises(SystemExit) as ended:
         shown()
+    assert ended.value.code == 2
+    assert f"error: {written[1].parent}" in (message := capsys.readouterr().err)
+    assert "cannot be written: No space left on device." in message
     assert {path.name: path.read_bytes() for path in site.iterdir()} == before
 
 

@@ -189,3 +189,18 @@ def test_two_programs_do_not_mix_their_stages(evaluate: Callable[..., Any], empt
     for stage in range(3):
         evaluate(Knowing(), stage_env(stage), seed=1)
     assert files_below(empty_caches / "records") == [f"Toy-v0/me--knows/seed-{seed}.json" for seed in (0, 1)]
+
+
+BEGINS = """
+import gymnasium, clbench
+env = gymnasium.make("{id}", stage=0)
+clbench.evaluate_agent(lambda _: [0, 0], env, method="me/knows", records="records")
+"""
+
+
+def test_a_program_that_was_refused_a_stage_does_not_keep_the_run(
+    evaluate: Callable[..., Any], empty_caches: Path
+) -> None:
+    with pytest.raises(InputError, match="comes next, not 1"):
+        evaluate(Knowing(), stage_env(1), records=empty_caches / "records")
+    subprocess.run([sys.executable, "-c", BEGINS.format(id=ID)], cwd=empty_caches, check=True)

@@ -115,6 +115,8 @@ def test_a_run_takes_the_tuned_settings_unless_it_changes_them(toy_file: Path) -
     write_tuned(toy_file, "clbench/Toy-v0", [100, 101], {"l2_sp": Tuned(settings, (_tried(0.6, 0.9),))})
     plain, changed = (RunSpec(TOY, "l2_sp", 0, changes).resolve() for changes in ({}, {"strength": "5"}))
     assert plain.info.settings == settings
+    write_tuned(toy_file, "clbench/Toy-v0", [100, 101], {"l2_sp": Tuned({**settings, "strength": 1.0}, ())})
+    assert RunSpec(TOY, "l2_sp", 0).resolve().info.settings["strength"] == 1.0
     assert (plain.info.changes, plain.label) == ({}, "l2_sp")
     assert changed.info.settings == {"strength": 5.0, "step_factor": 0.1}
     assert changed.label == "l2_sp+strength=5.0"

@@ -1,0 +1,28 @@
+"""The commands that write pages: what they are asked for, and what they refuse."""
+
+from pathlib import Path
+
+import pytest
+from clbench.leaderboard.pages.cli import claims, findings, method_pages
+
+TOY = "clbench/Toy-v0"
+
+
+def test_a_scenario_may_be_named_with_its_module(four_methods: Path, tmp_path: Path) -> None:
+    pages = []
+    for name in (TOY, f"clbench.testing:{TOY}", "clbench/Fetch-v1"):
+        claims(records=four_methods, controls=tmp_path, scenario=name, output=tmp_path / "claims.md")
+        pages.append((tmp_path / "claims.md").read_text(encoding="utf-8"))
+    assert pages[0] == pages[1] != pages[2]
+
+
+@pytest.mark.parametrize("command", [claims, findings, method_pages])
+def test_a_page_that_cannot_be_written_is_named_in_one_line(
+    command: object, four_methods: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "file").touch()
+    assert callable(command)
+    with pytest.raises(SystemExit) as ended:
+        command(records=four_methods, controls=tmp_path, output=tmp_path / "file" / "page.md")
+    assert ended.value.code == 2
+    assert f"error: {tmp_path / 'file' / 'page.md'}" in capsys.readouterr().err
