@@ -256,12 +256,15 @@ def interval(
     return Estimate(value, min(float(low), value), max(float(high), value), of_seeds=degrees > 0)
 
 
-def mean_of_seeds(values: Sequence[float], span: Span = UNBOUNDED) -> Estimate:
-    """Return the mean of one or more values, one for each seed, with its interval; none with one seed."""
+def mean_of_seeds(values: Sequence[float], span: Span = UNBOUNDED, *, ratio: bool = False) -> Estimate:
+    """Return the mean of one or more values, one for each seed, with its interval; none with one seed.
+
+    `ratio` is that of `interval`.
+    """
     mean = math.fsum(values) / len(values)
     rest = [[*values[:place], *values[place + 1 :]] for place in range(len(values))]
     without_one = [math.fsum(part) / len(part) for part in rest if part]
-    return interval(mean, np.array(without_one), span=span)
+    return interval(mean, np.array(without_one), span=span, ratio=ratio)
 
 
 def interval_of_seeds(value: float, error: float, degrees: int, span: Span = UNBOUNDED) -> Span:

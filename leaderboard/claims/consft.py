@@ -10,6 +10,7 @@ from .claim import (
     ANYWHERE,
     Finding,
     Paper,
+    Verdict,
     best_first,
     claim,
     decided,
@@ -44,8 +45,8 @@ CONSFT = Paper("ConSFT", ("2605.08879",))
 )
 def sft_degrades(evidence: Evidence) -> Finding:
     """Fine-tuning without constraint degrades pretrained skills."""
-    drop, joint = retention_drop(evidence, "sft"), kept(evidence, "joint", "sft")
-    published = retention_drop(evidence, rung("sft", PUBLISHED))
+    drop, published = (retention_drop(evidence, label) for label in ("sft", rung("sft", PUBLISHED)))
+    joint = kept(evidence, "joint", rung("sft", PUBLISHED))  # joint has the scenario's learning rate
     return Finding(
         decided(holds=drop.low > 0.05, fails=drop.high < 0.05),
         (drop, published),
@@ -56,14 +57,18 @@ def sft_degrades(evidence: Evidence) -> Finding:
 
 
 def _what_joint_says(gain: Figure) -> tuple[str, ...]:
-    """Return whether training on all data keeps more than plain fine-tuning, nothing if it is not known."""
+    """Return whether training on all data keeps more than sft at its learning rate; nothing if unknown."""
     if math.isnan(gain.low):
         return ()
     if gain.low > 0:
-        return ("joint, which also learns every target, keeps more: learning alone need not degrade.",)
+        return (
+            "joint, which also learns every target, keeps more than sft at the same learning rate: learning "
+            "alone need not degrade.",
+        )
+    less = "keeps even less than" if gain.high < 0 else "is not told apart from"
     return (
-        "joint, which trains on all data, is not told apart from sft: the missing constraint need not be "
-        "the cause.",
+        f"joint, which trains on all data, {less} sft at the same learning rate: the records do not show "
+        "that the missing constraint is the cause.",
     )
 
 
@@ -126,11 +131,11 @@ def keeps_20_points_more(evidence: Evidence) -> Finding:
 CONTROLS = {
     "constant_weight": (
         "weighing single samples need not be what keeps skills",
-        "the weights of single samples matter",
+        "the weights of single samples may matter",
     ),
     "shuffled_weights": (
         "it need not matter which samples get small weights",
-        "it matters which samples get small weights",
+        "it may matter which samples get small weights",
     ),
     "finch": (
         "a learning rate that follows the loss may suffice",
@@ -346,17 +351,30 @@ def keeps_earlier_targets(evidence: Evidence) -> Finding:
         return without_an_arm(evidence, tuple(own.values()), references)
     figures = best_first(arms)
     over_sft, *over_controls = _gains_in_transfer(evidence, figures[0].methods[0])
-    verdict = decided(
-        holds=any(one.low >= -0.10 for one in arms), fails=all(one.high < -0.10 for one in arms)
-    )
+    others = [arm for arm in ARMS if own[arm] not in arms]
+    not_counted = [
+        figure
+        for arm in others
+        for figure in (own[arm], evidence.difference("backward_transfer", arm, "sft"))
+    ]
+    verdict, of_all = _keeps_targets(arms), _keeps_targets(list(own.values()))
     return Finding(
         verdict,
         figures,
-        (over_sft, *over_controls, *references),
-        (*inactive_sentences(evidence), _what_keeps_targets(over_sft, over_controls)),
+        (over_sft, *over_controls, *not_counted, *references),
+        (
+            *inactive_sentences(evidence),
+            *([f'If {" and ".join(others)} counted: "{of_all}".'] if of_all != verdict else ()),
+            _what_keeps_targets(over_sft, over_controls),
+        ),
         what_would_change(deciding(verdict, figures, -0.10), -0.10),
         about=ARMS,
     )
+
+
+def _keeps_targets(arms: Sequence[Figure]) -> Verdict:
+    """Return the verdict on the backward transfer of some arms."""
+    return decided(holds=any(one.low >= -0.10 for one in arms), fails=all(one.high < -0.10 for one in arms))
 
 
 def _gains_in_transfer(evidence: Evidence, arm: str) -> Iterator[Figure]:

@@ -231,6 +231,8 @@ class Evidence:
         values: Callable[[Run], Sequence[Any]],
         form: str,
         span: Span = UNBOUNDED,
+        *,
+        ratio: bool = False,
     ) -> Figure:
         runs = self.runs.get(method, {})
         missing = () if runs else (method,)
@@ -238,12 +240,12 @@ class Evidence:
         if not means or not np.isfinite(means).all():
             note = "" if missing else "not in these records"
             return Figure(what, (method,), NO_ESTIMATE, tuple(runs), missing, note, form)
-        return Figure(what, (method,), mean_of_seeds(means, span), tuple(runs), (), "", form)
+        return Figure(what, (method,), mean_of_seeds(means, span, ratio=ratio), tuple(runs), (), "", form)
 
     def step_time(self, method: str) -> Figure:
         """Return the time of a step of the method, divided by sft's."""
         what = f"time of a step of {method} divided by sft's"
-        return self._mean_of(method, what, lambda run: [step_ratio(run)], ".2f")
+        return self._mean_of(method, what, lambda run: [step_ratio(run)], ".2f", ratio=True)
 
 
 def number_mean(values: Sequence[Any]) -> float:

@@ -30,7 +30,7 @@ NO_CAPABILITY = (
 )
 KNOWN = (
     "The auxiliary objective, to answer questions, is a part of the pretraining, and sft does not certainly "
-    "lose 0.01 of the answers: there is nothing that the objective could add."
+    "lose 0.01 of the answers: whether the objective could add anything here is open."
 )
 A_CAPABILITY = "An auxiliary objective that speeds up learning, or a policy that lacks it."
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from itertools import combinations, takewhile
+from itertools import combinations
 
 import numpy as np
 
@@ -39,19 +39,29 @@ def agreement_sentences(board: Board, boards: Mapping[str, list[Row]]) -> Iterat
             if alone is not None:  # replay is far above the others
                 yield f"On {name}, without methods that read prior demonstrations, {_seeds_order(alone)}."
             yield from _shares_of_variance(name, without)
-    chances = []
+    pairs: list[tuple[str, Agreement, str]] = []
     for (one, rows), (other, others) in combinations(boards.items(), 2):
         across = _between(rows, others)
         if across is not None:
-            chances.append(across.chance)
-            yield f"{one} and {other} {_order(across, counted(across.rows, 'method'))}."
+            pairs.append((f"{one} and {other}", across, counted(across.rows, "method")))
         rest = _between(*(_without_demonstrations(them) for them in (rows, others)))
         if across is not None and rest is not None:
-            chances.append(rest.chance)
             methods = f"{counted(rest.rows, 'method')} without prior demonstrations"
-            yield f"{one} and {other} {_order(rest, methods)}."
+            pairs.append((f"{one} and {other}", rest, methods))
+    chances = [between.chance for _, between, _ in pairs]
+    for (names, between, methods), corrected in zip(pairs, holm(chances), strict=True):
+        yield f"{names} {_order(between, methods, corrected)}."
     yield from after_correction(chances)
     yield from _definitions(boards)
+
+
+def holm(chances: Sequence[float]) -> list[float]:
+    """Return several p corrected for their number (Holm 1979, Scandinavian Journal of Statistics 6)."""
+    corrected, least = [0.0] * len(chances), 0.0
+    for place, index in enumerate(sorted(range(len(chances)), key=chances.__getitem__)):
+        least = max(least, min(1.0, (len(chances) - place) * chances[index]))
+        corrected[index] = least
+    return corrected
 
 
 def after_correction(chances: Sequence[float]) -> Iterator[str]:
@@ -59,8 +69,7 @@ def after_correction(chances: Sequence[float]) -> Iterator[str]:
     below = sum(chance < SIGNIFICANCE for chance in chances)
     if len(chances) < 2 or not below:
         return
-    corrected = ((len(chances) - place) * chance for place, chance in enumerate(sorted(chances)))
-    stay = sum(1 for _ in takewhile(lambda chance: chance < SIGNIFICANCE, corrected))
+    stay = sum(chance < SIGNIFICANCE for chance in holm(chances))
     yield (
         f"Of these {len(chances)} p, {below} {'is' if below == 1 else 'are'} below {SIGNIFICANCE:g}; after "
         f"Holm's correction for their number, {stay or 'none'}."
@@ -164,11 +173,12 @@ def _seeds_order(found: Concordance) -> str:
     return f"the {found.seeds} seeds {words} ({concordance_text(found)})"
 
 
-def _order(found: Agreement, methods: str = "the methods") -> str:
-    """Return the predicate of a sentence on two boards."""
+def _order(found: Agreement, methods: str, corrected: float) -> str:
+    """Return the predicate of a sentence on two boards; `corrected` is p corrected for all such pairs."""
     words = {
         1: f"agree on the order of {methods} more than chance would explain",
         0: f"show no certain agreement on the order of {methods}",
         -1: f"put {methods} in opposite orders",
     }
-    return f"{words[found.direction]} (Kendall's tau {tau_text(found)})"
+    alone = ", by this p alone" if found.direction and corrected >= SIGNIFICANCE else ""
+    return f"{words[found.direction]}{alone} (Kendall's tau {tau_text(found)})"

@@ -30,11 +30,11 @@ INTRODUCTION = (
     "lora with one setting changed. On clbench/FetchKnowledge-v1 no setting was tuned. Numbers are means "
     "over seeds with 95 % confidence intervals over seeds (docs/guide/statistics.md); differences and "
     "ratios are paired by seed and episode. Each verdict takes its intervals alone, without correction for "
-    "the number of verdicts: where a true value lies at the bar of a rule, one interval in 40 is wrongly "
-    'beyond it. A rule that asks for an interval needs {seeds} seeds. "Cannot be shown here" means that the '
-    "setting could not have shown the claim, whether it is true or not. A control is the method without the "
-    "one ingredient that is supposed to explain its success. `{missing}` marks a value that could not be "
-    "computed."
+    "the number of verdicts and controls: where a true value lies at the bar of a rule, one interval in 40 "
+    'is wrongly beyond it. A rule that asks for an interval needs {seeds} seeds. "Cannot be shown here" '
+    "means that the setting could not have shown the claim, whether it is true or not. A control is the "
+    "method without the one ingredient that is supposed to explain its success. `{missing}` marks a value "
+    "that could not be computed."
 )
 """Text above the table."""
 

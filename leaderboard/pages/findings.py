@@ -23,11 +23,11 @@ from ..board.frontier import TiedGain, is_certain_over
 from ..board.predictors import predictions
 from ..board.rows import Board, Row, apart_from_baseline
 from ..board.summary import METHODS, RANKED_BY, WITHOUT_DEMONSTRATIONS, tables_of
-from ..claims.claim import PREDICATES, Verdict, tally
+from ..claims.claim import PREDICATES, Claim, Verdict, tally
 from ..claims.evidence import Evidence
 from ..claims.judges import Judged
 from ..policies.compared import by_table
-from ..views.format import MISSING, format_interval, tau_text
+from ..views.format import MISSING, format_interval, over_tied, tau_text
 from ..views.markdown import templates
 from ..views.page.charts.picture import themed
 from .agreements import after_correction, agreement_sentences
@@ -150,11 +150,15 @@ def _gain_sentences(name: str, rows: Sequence[Row], tied: Mapping[str, Sequence[
     gains = {row.method: row.estimates["gain"] for row in others}
     apart = apart_from_baseline(rows)
     better = {method: gains[method] for method in gains if method in apart and (gains[method].value or 0) > 0}
-    certain = {method: gain for method, gain in better.items() if is_certain_over(tied.get(method, ()))}
+    certain = {
+        method: gain
+        for method, gain in better.items()
+        if gain.is_above(0) and is_certain_over(tied.get(method, ()))
+    }
     if certain:
         yield f"On {name}, yes: {_listed(certain)}."
     for method in better:
-        yield from _over_tied(name, method, gains[method], tied.get(method, ()))
+        yield from over_tied(name, method, gains[method], tied.get(method, ()))
     if not better:
         best = next(iter(gains))
         which = f"the gain of `{best}`"
@@ -185,18 +189,6 @@ def _gain_sentences(name: str, rows: Sequence[Row], tied: Mapping[str, Sequence[
     if len(worse) < len(lower):
         rest = {method: loss for method, loss in lower.items() if method not in worse}
         yield f"Lower {alone}: {_listed(rest)}."
-
-
-def _over_tied(name: str, method: str, gain: Estimate, tied: Sequence[TiedGain]) -> Iterator[str]:
-    """Yield how a certain gain fares against settings of plain fine-tuning that tuning rated as high."""
-    for one in tied:
-        sure = one.is_certain
-        chosen, other = format_interval(gain, ".3f"), format_interval(one.gain, ".3f")
-        yield (
-            f"On {name}, {'for' if sure else 'not for'} certain: `{method}` gains {chosen} over plain "
-            f"fine-tuning at the setting that tuning chose, {'and' if sure else 'but'} {other} at factor "
-            f"{one.factor:g}, which tuning rated as high ({counted(one.seeds, 'seed')})."
-        )
 
 
 def _power(rows: Iterable[Row], methods: Collection[str]) -> str:
@@ -285,14 +277,15 @@ def _claims(judged: Sequence[Judged]) -> Section:
 
 def _those_that_hold(judged: Sequence[Judged]) -> str:
     """Return in a sentence which claims hold: some are about plain fine-tuning, costs, or algebra."""
-    words = {
-        one.claim.id: one.claim.words.rstrip(".")
-        for one in judged
-        if one.finding.verdict in ("holds", "holds in part")
-    }
-    if not words:
-        return ""
-    return " What holds: " + "; ".join(f"{id_}, {claim}" for id_, claim in words.items()) + "."
+    boards: dict[Claim, list[bool]] = {}
+    for one in judged:
+        boards.setdefault(one.claim, []).append(one.finding.verdict in ("holds", "holds in part"))
+    words = [
+        f"{claim.id}, {claim.words.rstrip('.')} (on {sum(held)} of {counted(len(held), 'board')})"
+        for claim, held in boards.items()
+        if any(held)
+    ]
+    return f" What holds: {'; '.join(words)}." if words else ""
 
 
 def _first_figure(one: Judged) -> str:

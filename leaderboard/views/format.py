@@ -6,16 +6,18 @@ The same rows give the same bytes: no date, no absolute path, fixed digits.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import TypeAlias
 
+from clbench.base.text import counted
 from clbench.scoring.intervals import Estimate
 from clbench.scoring.metric import Metric
 from clbench.scoring.metrics import METRICS, TITLES
 from clbench.scoring.scores import WEAK, WEAK_WARNING
 
 from ..board.agreement import Agreement, Concordance
+from ..board.frontier import TiedGain
 from ..board.overall import OverallRow
 from ..board.predictors import predictions
 from ..board.rows import Row, standing_of
@@ -245,3 +247,15 @@ def scaled(count: float) -> tuple[str, str]:
     # The rounded number decides: 999.9 k is 1 M.
     power = next((power for power, value in enumerate(digits) if value < 1000), len(units) - 1)
     return f"{digits[power]:g}" if power else number_text(count, ".0f"), units[power]
+
+
+def over_tied(name: str, method: str, gain: Estimate, tied: Sequence[TiedGain]) -> Iterator[str]:
+    """Yield how a certain gain fares against settings of plain fine-tuning that tuning rated as high."""
+    for one in tied:
+        sure = one.is_certain
+        chosen, other = format_interval(gain, ".3f"), format_interval(one.gain, ".3f")
+        yield (
+            f"On {name}, {'for' if sure else 'not for'} certain: `{method}` gains {chosen} over plain "
+            f"fine-tuning at the setting that tuning chose, {'and' if sure else 'but'} {other} at factor "
+            f"{one.factor:g}, which tuning rated as high ({counted(one.seeds, 'seed')})."
+        )

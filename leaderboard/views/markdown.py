@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -19,8 +19,9 @@ from clbench.records.paths import table_parts
 from clbench.scoring.intervals import Estimate
 from clbench.scoring.metric import Metric
 
+from ..board.frontier import TiedGain, is_certain_over
 from ..board.overall import overall
-from ..board.rows import Board, Row
+from ..board.rows import Board, Row, apart_from_baseline
 from ..board.summary import group_of, tables_of
 from ..policies.compared import Comparisons
 from ..policies.decoders import read_decoding
@@ -31,6 +32,7 @@ from .format import (
     column_title,
     format_interval,
     number_text,
+    over_tied,
     prediction_text,
     shown,
     start_text,
@@ -71,8 +73,22 @@ def markdown(board: Board, comparisons: Comparisons) -> str:
         tiers_text=tiers_text,
         prediction_text=prediction_text,
         group_of=group_of,
+        tied_text=lambda id_, rows: _tied_text(id_, rows, board.tied.get(id_, {})),
         ends=_ends,
     )
+
+
+def _tied_text(name: str, rows: Sequence[Row], tied: Mapping[str, Sequence[TiedGain]]) -> str:
+    """Return which rows are told apart above plain fine-tuning, but not from its settings rated as high."""
+    apart = apart_from_baseline(rows)
+    unsure = [row for row in rows if row.method in apart and not is_certain_over(tied.get(row.method, ()))]
+    found = [
+        sentence.replace("`", "")  # the template escapes it
+        for row in unsure
+        if (row.estimates["gain"].value or 0.0) > 0
+        for sentence in over_tied(name, row.method, row.estimates["gain"], tied[row.method])
+    ]
+    return " ".join(found)
 
 
 def _all_shown(tables: Iterable[Sequence[Row]]) -> list[Column]:

@@ -236,17 +236,29 @@ def test_an_objective_that_the_policy_knows_already_cannot_show_what_it_adds(ben
 @pytest.mark.parametrize(
     ("joint", "says"),
     [
-        (0.9, "joint, which also learns every target, keeps more: learning alone need not degrade."),
-        ((0.1, 0.2, 0.6), "joint, which trains on all data, is not told apart from sft: the missing"),
+        (0.9, "joint, which also learns every target, keeps more than sft at the same learning rate: "),
+        ((0.1, 0.4, 0.8), "joint, which trains on all data, is not told apart from sft at the same "),
+        (0.0, "joint, which trains on all data, keeps even less than sft at the same learning rate: "),
     ],
 )
 def test_skills_that_joint_training_loses_too_are_not_put_down_to_the_missing_constraint(
     joint: Any, says: str, bench: Bench
 ) -> None:
-    bench.add("sft", kept=0.2)
+    bench.add("sft", kept=0.9)  # at a smaller rate, which joint does not have
+    bench.add("sft@1", kept=0.4)
     bench.add("joint", kept=joint)
     (sentence,) = bench.judge("C1").sentences
     assert sentence.startswith(says)
+
+
+def test_an_arm_that_does_not_count_is_shown_with_the_verdict_that_it_would_give(bench: Bench) -> None:
+    bench.add("sft", earlier=0.4)
+    bench.add("consft", earlier=1.0, diagnostics=SAME)
+    bench.add("consft_calibrated", earlier=0.4, diagnostics=ACTIVE)
+    finding = bench.judge("C7")
+    assert finding.verdict == "does not hold"
+    assert 'If consft counted: "holds".' in finding.sentences
+    assert {one.methods for one in finding.controls} >= {("consft",), ("consft", "sft")}
 
 
 def test_a_penalty_that_the_measure_hardly_notices_is_told_with_its_difference(bench: Bench) -> None:

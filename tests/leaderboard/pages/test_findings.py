@@ -101,6 +101,14 @@ def test_a_smaller_learning_rate_that_keeps_more_by_chance_is_not_called_certain
     )
 
 
+@pytest.mark.parametrize("chances", [[], [0.01], [0.2, 0.03, 0.04, 0.01], [0.6, 0.02, 0.02, 0.5]])
+def test_a_corrected_p_is_that_of_holm(chances: list[float]) -> None:
+    corrected = resolve("clbench.leaderboard.pages.agreements:holm")(chances)
+    for chance, found in zip(chances, corrected, strict=True):
+        steps = [one * sum(other >= one for other in chances) for one in chances if one <= chance]
+        assert found == pytest.approx(min(1.0, max(steps)))
+
+
 @pytest.mark.parametrize(
     ("chances", "says"),
     [

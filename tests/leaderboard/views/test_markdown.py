@@ -1,5 +1,6 @@
 """The leaderboard as Markdown: its contents, and strangers' words without markup."""
 
+import dataclasses
 from collections.abc import Callable
 from pathlib import Path
 
@@ -10,11 +11,15 @@ from helpers import set_in
 
 from clbench.base.entry_points import resolve
 from clbench.records.record import Record
+from clbench.scoring.intervals import Estimate
 
 VALIDATION = [[0.3, 0.6, 0.9, 0.9], [0.1, 0.3, 0.8, 0.8]]
 ASKS = {"demonstrations": "never", "questions": "prepare", "reference": False}
 PERTURBED = [[0.9, 0.8], [0.5, 0.7], [0.4, 0.2]]
 load = resolve("clbench:load_board")
+compute_board = resolve("clbench.leaderboard.board.rows:compute_board")
+markdown = resolve("clbench.leaderboard.views.markdown:markdown")
+TiedGain = resolve("clbench.leaderboard.board.frontier:TiedGain")
 
 
 def test_the_markdown_has_values_with_intervals_and_explains_them(
@@ -122,3 +127,17 @@ def test_a_formula_of_a_stranger_is_no_formula(
     add_full("sft", 7, edit=set_in("run", "changes", {"$x$": 1}))
     _, page = shown()
     assert r"\$x\$" in page
+
+
+def test_a_gain_that_another_setting_of_plain_fine_tuning_takes_back_is_told_below_the_table(
+    even_board: Callable[..., Path],
+) -> None:
+    for seed in range(4):
+        even_board("sft", seed, 0.1)
+        records = even_board("lora", seed, 0.9)
+    board = compute_board(records)
+    tied = {"lora": (TiedGain(0.1, Estimate(0.007, -0.016, 0.03), 4),)}
+    assert "not for certain" not in markdown(board, {})
+    assert ("but 0.007 [-0.016, 0.030] at factor 0.1, which tuning rated as high (4 seeds).") in markdown(
+        dataclasses.replace(board, tied={"clbench/Even-v1": tied}), {}
+    ).replace("\\", "")
