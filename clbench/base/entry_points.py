@@ -46,14 +46,17 @@ def import_module(module: str, needed_for: str) -> Any:
         UnknownNameError: The module, or a module that it imports, does not exist.
         InputError: A module that is not part of clbench raises an error while it is imported.
     """
+    hint = f" Did you mean {needed_for.replace('.py:', ':')!r}?" if module.endswith(".py") else ""
     if not is_module(module):
-        raise UnknownNameError(f"No module {module!r} can be imported for {needed_for!r}.")
+        raise UnknownNameError(f"No module {module!r} can be imported for {needed_for!r}.{hint}")
     try:
         return importlib.import_module(module)
     except ClbenchError:
         raise
     except ModuleNotFoundError as error:
-        raise UnknownNameError(f"No module {error.name!r} can be imported for {needed_for!r}.") from error
+        raise UnknownNameError(
+            f"No module {error.name!r} can be imported for {needed_for!r}.{hint}"
+        ) from error
     except Exception as error:
         if module.partition(".")[0] == "clbench":  # a bug of ours shows its traceback
             raise

@@ -49,9 +49,16 @@ def minutes(seconds: float) -> str:
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:
-    """Return the end of a message with the known name that is nearest, empty if none is near."""
-    near = difflib.get_close_matches(name, known, n=1)
-    return f" Did you mean {near[0]!r}?" if near else ""
+    """Return the end of a message with the known name that is nearest, empty if none is near.
+
+    Small and capital letters are the same, and a name with a namespace is near to its last part.
+    """
+    names: dict[str, str] = {}
+    for one in known:
+        for part in (one, one.rpartition("/")[2]):
+            names.setdefault(part.casefold(), one)
+    near = difflib.get_close_matches(name.casefold(), names, n=1)
+    return f" Did you mean {names[near[0]]!r}?" if near else ""
 
 
 def html_table(title: str, columns: Iterable[str], rows: Iterable[Iterable[object]]) -> str:

@@ -14,6 +14,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from clbench.base.errors import WrongTypeError
 from clbench.base.progress import ProgressCallback, no_progress
 from clbench.base.seeding import torch_generator
 from clbench.evaluation.episodes import LANES, Episode, Live, Trial, Watch, play_in_lanes
@@ -119,9 +120,24 @@ class Evaluator:
         state[: len(live)], image[: len(live)] = map(torch.from_numpy, shown)
         device = policy.device
         chunks = policy.act(state.to(device), words.to(device), noise.to(device), image.to(device))
+        _check_chunks(policy, chunks, rows)
         actions: NDArray[np.float32] = chunks[: len(live), : config.executed].cpu().numpy()
         # a diverged policy returns NaN: with zero actions it fails and does not stop the run
         return np.nan_to_num(actions).clip(-1.0, 1.0)
+
+
+def _check_chunks(policy: Policy, chunks: object, rows: int) -> None:
+    """Refuse actions of another shape: NumPy would repeat a single number, and take chunks for steps.
+
+    Raises:
+        WrongTypeError: `act()` returned something else than a tensor (B, H, A).
+    """
+    wanted = (rows, policy.config.chunk, policy.config.action_size)
+    found = tuple(chunks.shape) if isinstance(chunks, torch.Tensor) else type(chunks).__name__
+    if found != wanted:
+        raise WrongTypeError(
+            f"act() of {type(policy).__name__} must return a tensor (B, H, A), here {wanted}, not {found}."
+        )
 
 
 def _begin(policy: Policy, one: Live) -> None:

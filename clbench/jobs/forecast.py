@@ -131,7 +131,8 @@ def _data_bytes(scenario: Scenario) -> int:
 
 
 def _duration(seconds: float) -> str:
-    return f"{seconds / 60:.0f} minutes" if seconds < 5400 else f"{seconds / 3600:.1f} hours"
+    minutes = counted(max(1, round(seconds / 60)), "minute")
+    return minutes if seconds < 5400 else f"{seconds / 3600:.1f} hours"
 
 
 def _megabytes(count: int) -> str:

@@ -57,7 +57,12 @@ def adapt(
         GradientError: A gradient is not finite; the message names its parameter.
         MethodError: Optimisation fails, or leaves a parameter that is not finite.
     """
-    parameters: list[Any] = list(method.start_task(policy, stage))
+    chosen = method.start_task(policy, stage)
+    if chosen is None:
+        raise MethodError(
+            "start_task() must return the parameters to train, not None: `return policy.parameters()` is all."
+        )
+    parameters: list[Any] = list(chosen)
     to_criterion = budget.criterion is not None
     loss: Tensor | None = None
     learning_rate: float | None = None

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Generic, Literal, NoReturn, Protocol, TypeVar
+from typing import Any, Generic, Literal, NoReturn, Protocol, TypeVar, get_args
 
 import torch
 
-from clbench.base.errors import ClbenchError
+from clbench.base.errors import ClbenchError, InputError
 from clbench.policy.batch import Batch, QuestionBatch
 
 Access = Literal["never", "prepare", "throughout"]
@@ -27,6 +27,12 @@ class Uses:
     """Access to the training questions."""
     reference: bool = False
     """Whether the method is a reference, which does not compete, such as one that trains nothing."""
+
+    def __post_init__(self) -> None:
+        for name, value in (("demonstrations", self.demonstrations), ("questions", self.questions)):
+            if value not in get_args(Access):
+                wanted = ", ".join(map(repr, get_args(Access)))
+                raise InputError(f"Uses.{name} must be one of {wanted}, not {value!r}.")
 
 
 class UndeclaredAccessError(ClbenchError, RuntimeError):

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from clbench.base.errors import InputError, WrongTypeError
+from clbench.base.text import did_you_mean
 from clbench.records.paths import label_of, record_path
 from clbench.records.record import RunInfo, ScenarioInfo
 from clbench.runs.tuning import tuned_settings
@@ -202,4 +203,5 @@ def check_device(device: str) -> None:
         torch.zeros(1, device=device)
     except (RuntimeError, AssertionError) as error:
         reason = str(error).partition("\n")[0].partition(". ")[0]  # PyTorch goes on for pages
-        raise InputError(f"The device {device!r} cannot be used: {reason.rstrip('.')}.") from error
+        hint = did_you_mean(device, ("cpu", "cuda", "mps"))
+        raise InputError(f"The device {device!r} cannot be used: {reason.rstrip('.')}.{hint}") from error

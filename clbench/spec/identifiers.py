@@ -71,7 +71,8 @@ def check_known(scenarios: Iterable[str] = (), methods: Iterable[str] = ()) -> N
 def unknown_method(name: str) -> UnknownNameError:
     """Return the error for a name that no installed method has, with the nearest one."""
     installed = sorted(installed_methods())
-    hint = did_you_mean(name, installed)
+    module, _, attribute = name.rpartition(".")
+    hint = did_you_mean(name, installed) or (f" Did you mean '{module}:{attribute}'?" if module else "")
     names = ", ".join(installed) or "none; run `pip install -e .` in the checkout"
     return UnknownNameError(f"No method is called {name!r}.{hint} Installed: {names}. Or give module:Class.")
 

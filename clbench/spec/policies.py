@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 
 from clbench.base.entry_points import unknown
+from clbench.base.errors import InputError, WrongTypeError
 from clbench.base.source import package_of
 
 POLICIES = {
@@ -39,9 +40,12 @@ def policy_name(kind: str, size: str = SMALL) -> str:
 
     Raises:
         UnknownNameError: There is no such size; the message has the nearest one.
+        InputError: The kind has no sizes.
     """
     if size not in SIZES:
         raise unknown("size of a policy", size, SIZES)
+    if size != SMALL and kind not in POLICIES:
+        raise InputError(f"Only {' and '.join(POLICIES)} have sizes; {kind} cannot be {size}.")
     return kind if size == SMALL else f"{kind}-{size}"
 
 
@@ -64,8 +68,11 @@ def check_policy_name(name: str) -> None:
     """Refuse a text that is neither the name of a built-in policy nor of the form "module:Class".
 
     Raises:
+        WrongTypeError: It is no text, but perhaps the class itself.
         UnknownNameError: The message has the nearest name.
     """
+    if not isinstance(name, str):
+        raise WrongTypeError(f"A policy is given by a name, such as 'module:Class', not by {name!r}.")
     if name not in policy_names() and not (len(name) <= _LONGEST and _CLASS.fullmatch(name)):
         raise unknown("policy", name, [*policy_names(), "module:Class"])
 

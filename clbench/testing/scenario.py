@@ -26,6 +26,7 @@ from clbench.data.questions import QuestionKind
 from clbench.evaluation.definition import recording_of
 from clbench.spec.identifiers import check_plain, check_scenario_id
 from clbench.spec.language import LENGTHS, fitting_length, word_id, word_ids
+from clbench.spec.registry import load_scenario
 from clbench.spec.scenario import Scenario
 from clbench.spec.task import Task
 from clbench.worlds.lanes import Lanes
@@ -39,7 +40,7 @@ class ScenarioError(AssertionError):
     """A scenario fails the check: the message names the part, the expectation and the finding."""
 
 
-def check_scenario(scenario: Scenario, *, episodes: int = 10, success: float = 0.9) -> None:
+def check_scenario(scenario: Scenario | str, *, episodes: int = 10, success: float = 0.9) -> None:
     """Check a scenario: its worlds, every task with its expert, and its questions.
 
     Worlds: all have spaces of numbers, of one size in the whole scenario, and actions from -1 to 1.
@@ -52,7 +53,7 @@ def check_scenario(scenario: Scenario, *, episodes: int = 10, success: float = 0
     Questions: all words are in the vocabulary, and every answer occurs in the experts' noisy episodes.
 
     Args:
-        scenario: Scenario to check.
+        scenario: Scenario to check, or its Gymnasium id; "module:id" imports the module first.
         episodes: Number of the expert's episodes on each task, and of noisy episodes for the questions.
         success: Share of the episodes in which the expert must succeed.
 
@@ -61,6 +62,8 @@ def check_scenario(scenario: Scenario, *, episodes: int = 10, success: float = 0
         UnknownNameError: An entry point does not exist.
         ScenarioError: Any other part is wrong.
     """
+    if isinstance(scenario, str):
+        scenario = load_scenario(scenario)
     if episodes < 1:
         raise InputError(f"episodes must be a whole number from 1, not {episodes}.")
     tasks = scenario.tasks + scenario.background

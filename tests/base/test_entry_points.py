@@ -18,6 +18,7 @@ def test_an_entry_point_names_an_object() -> None:
         ("clbench.base.entry_points:resolv", "Did you mean 'resolve'"),
         ("clbench.no.such:thing", "No module 'clbench.no'"),
         (":thing", "No module ''"),
+        ("mine.py:Mine", "Did you mean 'mine:Mine'"),
     ],
 )
 def test_a_wrong_name_is_refused_with_the_nearest_one(name: str, message: str) -> None:

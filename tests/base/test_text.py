@@ -43,6 +43,8 @@ def test_one_thing_is_singular() -> None:
 def test_the_nearest_known_name_is_offered_if_one_is_near() -> None:
     assert did_you_mean("aegs", ["aegis", "sft"]) == " Did you mean 'aegis'?"
     assert did_you_mean("replay", ["aegis", "sft"]) == ""
+    assert did_you_mean("EWC", ["aegis", "ewc"]) == " Did you mean 'ewc'?"
+    assert did_you_mean("Fetch", ["clbench/Fetch-v1", "me/Other-v0"]) == " Did you mean 'clbench/Fetch-v1'?"
 
 
 def test_an_html_table_has_every_cell_and_no_markup_of_its_texts() -> None:

@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from clbench.base.entry_points import resolve
+from clbench.base.errors import WrongTypeError
 from clbench.base.seeding import derive_seed, torch_generator
 from clbench.data.questions import load_questions, scored_questions
 from clbench.evaluation.answers import answer
@@ -194,3 +195,32 @@ def test_nothing_is_measured_of_a_policy_in_training_mode() -> None:
         assert modes
         assert not any(modes)
         assert policy.training
+
+
+class Narrow(TransformerPolicy):
+    """Its actions have one number, which NumPy would repeat."""
+
+    def act(self, *observed: Any) -> Any:
+        return super().act(*observed)[..., :1]
+
+
+class Flat(TransformerPolicy):
+    """It returns one action for each episode, and no chunk of actions."""
+
+    def act(self, *observed: Any) -> Any:
+        return super().act(*observed)[:, 0]
+
+
+class Converted(TransformerPolicy):
+    """It returns an array."""
+
+    def act(self, *observed: Any) -> Any:
+        return super().act(*observed).numpy()
+
+
+@pytest.mark.parametrize("cls", [Narrow, Flat, Converted])
+def test_actions_of_another_shape_are_refused_with_both_shapes(cls: type[TransformerPolicy]) -> None:
+    policy = cls(policy_config(TOY), seed=0).eval()
+    wanted = f"act\\(\\) of {cls.__name__} must return a tensor \\(B, H, A\\), here \\(40, .*, 2\\), not "
+    with pytest.raises(WrongTypeError, match=wanted):
+        Evaluator(TOY, 0).evaluate(policy, TOY.target[:1])

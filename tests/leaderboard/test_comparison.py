@@ -41,4 +41,6 @@ def test_a_method_whose_record_makes_no_row_is_named_with_the_reason(tmp_path: P
 def test_an_unknown_method_is_named_before_anything_runs(tmp_path: Path) -> None:
     with pytest.raises(UnknownNameError, match="Did you mean 'frozen'"):
         clbench.compare(TOY, "frosen", records=tmp_path)
+    with pytest.raises(UnknownNameError, match="Did you mean 'my_method:Mine'"):
+        clbench.compare(TOY, "my_method.Mine", records=tmp_path)
     assert not list(tmp_path.iterdir())

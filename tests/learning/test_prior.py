@@ -5,7 +5,8 @@ from typing import Any
 import pytest
 import torch
 
-from clbench.learning.prior import Source, UndeclaredAccessError, twin_of
+from clbench.base.errors import InputError
+from clbench.learning.prior import Source, UndeclaredAccessError, Uses, twin_of
 
 
 class Numbers:
@@ -39,3 +40,9 @@ def test_a_twin_closes_with_its_source() -> None:
     source.close()
     with pytest.raises(UndeclaredAccessError, match="after the hooks that received it"):
         twin.sample(1)
+
+
+@pytest.mark.parametrize("name", ["demonstrations", "questions"])
+def test_another_access_than_the_three_is_refused(name: str) -> None:
+    with pytest.raises(InputError, match=f"Uses.{name} must be one of 'never', 'prepare', .*, not 'always'"):
+        Uses(**{name: "always"})  # type: ignore[arg-type]

@@ -367,6 +367,12 @@ class _Poisons(Method):
 
 
 @dataclasses.dataclass
+class _Chooses(Method):
+    def start_task(self, policy: Policy, stage: Stage) -> Any:
+        self.chosen = policy.parameters()  # and nothing is returned
+
+
+@dataclasses.dataclass
 class _Forgetful(Method):
     def end_task(self, policy: Policy, stage: Stage) -> None:
         raise RuntimeError(f"cannot merge {stage.task.name}")
@@ -391,6 +397,7 @@ class _Boasts(Method):
         (_Explodes, "stage 1 (right)", "step 0: a gradient is not finite: that of "),
         (_Poisons, "stage 1 (right)", "The parameter head.position is not finite after 'right'"),
         (_Forgetful, "stage 1 (right)", "cannot merge right"),
+        (_Chooses, "stage 1 (right)", "start_task() must return the parameters to train, not None"),
     ],
 )
 def test_a_method_that_fails_leaves_a_record_that_names_the_place(

@@ -2,7 +2,7 @@
 
 import pytest
 
-from clbench.base.errors import UnknownNameError
+from clbench.base.errors import InputError, UnknownNameError, WrongTypeError
 from clbench.learning.pretraining import policy_config
 from clbench.policy.kinds import new_policy
 from clbench.records.paths import record_name, table_name, table_parts
@@ -81,3 +81,14 @@ def test_larger_policies_have_about_5_and_40_million_parameters(size: str, least
     for kind in POLICIES:
         policy = new_policy(policy_config(TOY.with_policy(policy_name(kind, size))))
         assert least < sum(parameter.numel() for parameter in policy.parameters()) < most
+
+
+def test_a_class_is_named_by_a_text_and_has_no_size_of_ours_to_choose() -> None:
+    with pytest.raises(
+        WrongTypeError, match="A policy is given by a name, such as 'module:Class', not by <cl"
+    ):
+        check_policy_name(object)  # type: ignore[arg-type]
+    with pytest.raises(
+        InputError, match="Only flow and discrete_diffusion have sizes; mine:Mine cannot be base"
+    ):
+        policy_name("mine:Mine", "base")

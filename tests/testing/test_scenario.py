@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-from clbench.base.errors import InputError
+from clbench.base.errors import InputError, UnknownNameError
 from clbench.data.questions import QuestionKind
 from clbench.spec.scenario import Scenario
 from clbench.testing import TOY, TOY_QUESTIONS, ScenarioError, ToyWorld, check_scenario, toy_expert
@@ -251,3 +251,10 @@ def test_a_scenario_without_a_target_is_named() -> None:
 def test_a_check_needs_episodes() -> None:
     with pytest.raises(InputError, match="episodes must be a whole number from 1, not 0"):
         check_scenario(TOY, episodes=0)
+
+
+def test_a_scenario_may_be_named_by_its_id() -> None:
+    with pytest.raises(InputError, match="episodes must be a whole number from 1, not 0"):
+        check_scenario("clbench.testing:clbench/Toy-v0", episodes=0)
+    with pytest.raises(UnknownNameError, match="Did you mean 'clbench/Fetch-v1'"):
+        check_scenario("clbench/fetch-v1")
