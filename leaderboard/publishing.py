@@ -24,9 +24,9 @@ from clbench.spec.identifiers import installed_methods
 from .board.frontier import ladder_of
 from .board.paths import CARDS, FILM
 from .board.summary import Summary
-from .files import write_all
 from .policies.decoders import RESULTS
 from .views.csv import csv_text
+from .views.files import write_all
 
 if TYPE_CHECKING:
     from .board.rows import Board

@@ -267,10 +267,8 @@ class StagedRun:
     def check_unfinished(self) -> None:
         """Refuse to evaluate a stage of a run that has a record, with an `InputError`."""
         if self.path.exists():
-            raise InputError(
-                f"{self} has a record already, {self.path}, which is never edited: "
-                "choose another seed or name, or remove it."
-            )
+            told = f"{self} has a record already, {self.path}, which is never edited"
+            raise InputError(f"{told}: choose another seed or name, or remove it.")
 
     def plan(self, stage: int, again: bool) -> Record | None:
         """Return the record so far, if a stage comes next or has been evaluated.
@@ -289,9 +287,8 @@ class StagedRun:
         following = self.next_after(record)
         if stage > following:
             found = "does not exist" if record is None else f"ends with stage {following - 1}"
-            raise InputError(
-                f"Stage {following} of {self} comes next, not {stage}: {self.unfinished} {found}."
-            )
+            message = f"Stage {following} of {self} comes next, not {stage}"
+            raise InputError(f"{message}: {self.unfinished} {found}.")
         return record
 
     def _own(self) -> None:
@@ -300,10 +297,8 @@ class StagedRun:
             lease = Lease(self.unfinished)
             while not lease.take():
                 if (owner := lease.owner) is not None:
-                    raise InputError(
-                        f"{self} belongs to {owner}, which is evaluating its stages: choose another name or "
-                        "seed, or wait until that process has ended."
-                    )
+                    told = f"{self} belongs to {owner}, which is evaluating its stages"
+                    raise InputError(f"{told}: choose another name or seed, or wait until it has ended.")
                 time.sleep(0.1)  # the lease of a dead process on another machine is watched for a while
             _LEASES[self.unfinished] = lease
         _LEASES[self.unfinished].check()
@@ -323,12 +318,12 @@ class StagedRun:
             LeaseLostError: Another process took the run over.
         """
         owned = self.unfinished in _LEASES
-        if not self.path.exists():
-            self._own()
         try:
+            if not self.path.exists():
+                self._own()
             return self._begun(stage, settings, agent, again)
         except BaseException:
-            if not owned and self.unfinished in _LEASES:
+            if not owned:
                 self._release()
             raise
 
@@ -348,9 +343,8 @@ class StagedRun:
             return self._new_record(settings or {}, agent)
         assert record is not None  # some stage precedes
         if settings not in (None, record.run.settings):
-            raise InputError(
-                f"The settings of {self} are {settings}, but were {record.run.settings} in stage 0."
-            )
+            before = record.run.settings
+            raise InputError(f"The settings of {self} are {settings}, but were {before} in stage 0.")
         if stage < following:
             LOG.warning("%s: its stages %d to %d are dropped.", self, stage, following - 1)
             _drop(record, stage)
@@ -418,7 +412,8 @@ class StagedRun:
         self._release()
 
     def _release(self) -> None:
-        _LEASES.pop(self.unfinished).release()
+        if lease := _LEASES.pop(self.unfinished, None):
+            lease.release()
 
 
 def _drop(record: Record, stage: int) -> None:

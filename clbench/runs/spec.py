@@ -203,5 +203,5 @@ def check_device(device: str) -> None:
         torch.zeros(1, device=device)
     except (RuntimeError, AssertionError) as error:
         reason = str(error).partition("\n")[0].partition(". ")[0]  # PyTorch goes on for pages
-        hint = did_you_mean(device, ("cpu", "cuda", "mps"))
+        hint = did_you_mean(device, {"cpu", "cuda", "mps"} - {device})
         raise InputError(f"The device {device!r} cannot be used: {reason.rstrip('.')}.{hint}") from error

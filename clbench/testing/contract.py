@@ -17,7 +17,7 @@ import inspect
 import json
 from collections.abc import Callable, Mapping
 from functools import cached_property
-from typing import Any, get_args, get_type_hints
+from typing import Any, get_type_hints
 
 from clbench.base.errors import InputError
 from clbench.base.seeding import seeded
@@ -176,11 +176,6 @@ def _check_declared(cls: type[Method]) -> None:
     unknown = sorted(set(cls.needs) - set(ABILITIES))
     if unknown:
         raise _breach(declaration, f"needs among {', '.join(ABILITIES)}", ", ".join(unknown), "needs")
-    for name in PRIOR:
-        access = getattr(cls.uses, name)
-        if access not in get_args(Access):
-            expected = f"uses.{name} to be one of {', '.join(get_args(Access))}"
-            raise _breach(declaration, expected, repr(access), "uses")
 
 
 def _check_tunes(cls: type[Method]) -> None:

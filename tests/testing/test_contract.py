@@ -56,13 +56,6 @@ class Undeclared(Method):
 
 
 @dataclasses.dataclass
-class Misdeclared(Method):
-    """Declares a time that does not exist."""
-
-    uses = Uses(questions="always")
-
-
-@dataclasses.dataclass
 class Misspelt(Method):
     """Misspells a hook."""
 
@@ -246,7 +239,6 @@ FAULTS: list[tuple[Any, str, str, str]] = [
     (Silent, "declaration", "a class docstring", "none"),
     (Annotated, "declaration", "without an annotation", "uses is a field of the dataclass"),
     (Undeclared, "declaration", "uses to be a Uses", "'questions'"),
-    (Misdeclared, "declaration", "uses.questions to be one of never, prepare, throughout", "'always'"),
     (Helpful, "declaration", "Names of helpers begin with _", "compute_loss() is never called"),
     (Misspelt, "declaration", "Did you mean 'gradients()'?", "gradient() is never called"),
     (Forgetful, "declaration", "loss(self, policy, batch, progress)", "loss(self, policy, batch)"),

@@ -3,9 +3,13 @@
 from pathlib import Path
 
 import pytest
-from clbench.leaderboard.pages.cli import claims, findings, method_pages
+
+from clbench.base.entry_points import resolve
 
 TOY = "clbench/Toy-v0"
+claims, findings, method_pages = (
+    resolve(f"clbench.leaderboard.pages.cli:{name}") for name in ("claims", "findings", "method_pages")
+)
 
 
 def test_a_scenario_may_be_named_with_its_module(four_methods: Path, tmp_path: Path) -> None:
