@@ -122,16 +122,12 @@ class Entry:
 
     @cached_property
     def _stats(self) -> dict[Path, os.stat_result]:
-        stats = {}
-        for path in (self.path, *_walk(self.path)):
-            with contextlib.suppress(FileNotFoundError):  # a run has just removed it
-                stats[path] = path.lstat()
-        return stats
+        return _stats_below(self.path)
 
     @property
     def size(self) -> int:
         """Bytes of its files."""
-        return sum(stat.st_size for stat in self._stats.values() if not S_ISDIR(stat.st_mode))
+        return _bytes(self._stats)
 
     @property
     def made(self) -> float:
@@ -275,6 +271,23 @@ def _listed(manifest: Path) -> set[Path]:
     """Return the files that a manifest lists, and itself."""
     values = _read_manifest(manifest)
     return set() if values is None else {manifest, *(manifest.parent / name for name in values["files"])}
+
+
+def size_of(path: Path) -> int:
+    """Return the bytes of the files in a folder, 0 if it does not exist."""
+    return _bytes(_stats_below(path))
+
+
+def _bytes(stats: Mapping[Path, os.stat_result]) -> int:
+    return sum(stat.st_size for stat in stats.values() if not S_ISDIR(stat.st_mode))
+
+
+def _stats_below(path: Path) -> dict[Path, os.stat_result]:
+    stats = {}
+    for one in (path, *_walk(path)):
+        with contextlib.suppress(FileNotFoundError):  # a run has just removed it
+            stats[one] = one.lstat()
+    return stats
 
 
 def _walk(folder: Path) -> Iterator[Path]:

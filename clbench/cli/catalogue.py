@@ -320,6 +320,6 @@ def _films(faults: dict[str, str | None]) -> str:
 
 
 def _folder(path: Path, variable: str) -> str:
-    from clbench.cli.cache import Entry
+    from clbench.cli.cache import size_of
 
-    return f"{path} ({Entry(path.name, path).size / 1e6:.1f} MB; {variable} moves it)"
+    return f"{path} ({size_of(path) / 1e6:.1f} MB; {variable} moves it)"

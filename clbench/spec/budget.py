@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from clbench.base.errors import InputError
-from clbench.spec.fields import check_positive, check_share, check_whole
+from clbench.spec.fields import check_number, check_positive, check_share, check_whole
 from clbench.spec.protocol import Split, check_steps
 
 HEADS = 4
@@ -70,9 +70,11 @@ class Budget:
                 f"{self.policy_width}."
             )
         if self.criterion is not None:
-            check_share(self, "criterion")
-            if self.criterion == 0:
-                raise InputError("Budget.criterion must be above 0: every policy meets a criterion of 0.")
+            check_number(self, "criterion")
+            if not 0 < self.criterion <= 1:
+                raise InputError(
+                    f"Budget.criterion must be a success rate above 0, at most 1, not {self.criterion}."
+                )
 
     def episodes(self, split: Split) -> int:
         """Return the number of episodes per task in `split`."""

@@ -28,7 +28,7 @@ def check_whole(part: object, least: int, *fields: str, most: int | None = None)
 def check_positive(part: object, *fields: str) -> None:
     """Check that fields of `part` are finite numbers above 0."""
     for name in fields:
-        _check_number(part, name)
+        check_number(part, name)
         if not 0 < getattr(part, name) < math.inf:
             raise InputError(f"{_place(part, name)} must be above 0, not {getattr(part, name)}.")
 
@@ -36,7 +36,7 @@ def check_positive(part: object, *fields: str) -> None:
 def check_share(part: object, *fields: str) -> None:
     """Check that fields of `part` are numbers from 0 to 1."""
     for name in fields:
-        _check_number(part, name)
+        check_number(part, name)
         if not 0 <= getattr(part, name) <= 1:
             raise InputError(f"{_place(part, name)} must be from 0 to 1, not {getattr(part, name)}.")
 
@@ -60,7 +60,12 @@ def check_entry_point(part: object, *fields: str) -> None:
             raise InputError(f"{_place(part, name)} must have the form 'module:name', not {value!r}.")
 
 
-def _check_number(part: object, name: str) -> None:
+def check_number(part: object, name: str) -> None:
+    """Check that a field of `part` is a number.
+
+    Raises:
+        WrongTypeError: It is not.
+    """
     value = getattr(part, name)
     if not isinstance(value, int | float) or isinstance(value, bool):
         raise WrongTypeError(f"{_place(part, name)} must be a number, not {value!r}.")

@@ -72,7 +72,9 @@ def unknown_method(name: str) -> UnknownNameError:
     """Return the error for a name that no installed method has, with the nearest one."""
     installed = sorted(installed_methods())
     module, _, attribute = name.rpartition(".")
-    hint = did_you_mean(name, installed) or (f" Did you mean '{module}:{attribute}'?" if module else "")
+    hint = did_you_mean(name, installed)
+    if module and not hint:
+        hint = f" Did you mean {f'{module}:{attribute}'!r}?"
     names = ", ".join(installed) or "none; run `pip install -e .` in the checkout"
     return UnknownNameError(f"No method is called {name!r}.{hint} Installed: {names}. Or give module:Class.")
 

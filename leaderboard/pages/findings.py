@@ -158,7 +158,7 @@ def _gain_sentences(name: str, rows: Sequence[Row], tied: Mapping[str, Sequence[
     if certain:
         yield f"On {name}, yes: {_listed(certain)}."
     for method in better:
-        yield from over_tied(name, method, gains[method], tied.get(method, ()))
+        yield from over_tied(name, f"`{method}`", gains[method], tied.get(method, ()))
     if not better:
         best = next(iter(gains))
         which = f"the gain of `{best}`"

@@ -249,13 +249,16 @@ def scaled(count: float) -> tuple[str, str]:
     return f"{digits[power]:g}" if power else number_text(count, ".0f"), units[power]
 
 
-def over_tied(name: str, method: str, gain: Estimate, tied: Sequence[TiedGain]) -> Iterator[str]:
-    """Yield how a certain gain fares against settings of plain fine-tuning that tuning rated as high."""
+def over_tied(name: str, words: str, gain: Estimate, tied: Sequence[TiedGain]) -> Iterator[str]:
+    """Yield how a certain gain fares against settings of plain fine-tuning that tuning rated as high.
+
+    `words` name the method, with the markup of the page.
+    """
     for one in tied:
         sure = one.is_certain
         chosen, other = format_interval(gain, ".3f"), format_interval(one.gain, ".3f")
         yield (
-            f"On {name}, {'for' if sure else 'not for'} certain: `{method}` gains {chosen} over plain "
+            f"On {name}, {'for' if sure else 'not for'} certain: {words} gains {chosen} over plain "
             f"fine-tuning at the setting that tuning chose, {'and' if sure else 'but'} {other} at factor "
             f"{one.factor:g}, which tuning rated as high ({counted(one.seeds, 'seed')})."
         )

@@ -83,7 +83,7 @@ def _tied_text(name: str, rows: Sequence[Row], tied: Mapping[str, Sequence[TiedG
     apart = apart_from_baseline(rows)
     unsure = [row for row in rows if row.method in apart and not is_certain_over(tied.get(row.method, ()))]
     found = [
-        sentence.replace("`", "")  # the template escapes it
+        sentence
         for row in unsure
         if (row.estimates["gain"].value or 0.0) > 0
         for sentence in over_tied(name, row.method, row.estimates["gain"], tied[row.method])

@@ -17,6 +17,7 @@ from clbench.learning.registry import (
     describe_method,
     load_method,
     method_names,
+    method_packages,
 )
 
 
@@ -199,6 +200,17 @@ def test_a_method_is_described_with_the_hash_of_its_code(
     assert len(set(hashes)) == 2
 
 
+def test_the_source_of_a_method_covers_the_methods_that_it_derives_from(
+    write_module: Callable[[str, str], None],
+) -> None:
+    write_module(
+        "derived",
+        "import dataclasses\nfrom clbench.methods.lora import LoRA\n"
+        "@dataclasses.dataclass\nclass Mine(LoRA):\n    '''Mine.'''\n",
+    )
+    assert method_packages(load_method("derived:Mine")) == ["clbench.methods", "derived"]
+
+
 BEHIND = {
     "a method that it derives from": "base_of_mine",
     "a module that it imports from beside it": "helper_of_mine",
@@ -216,13 +228,13 @@ def test_the_source_of_a_method_covers(changed: str, write_module: Callable[[str
         "@dataclasses.dataclass\nclass Base(LoRA): 'Base.'\n",
     )
     write_module(
-        "derived",
+        "derived_with_helpers",
         "import dataclasses, helper_of_mine\nfrom base_of_mine import Base\n"
         "@dataclasses.dataclass\nclass Mine(Base): 'Mine.'\n",
     )
-    before = describe_method(load_method("derived:Mine"))["source"]
+    before = describe_method(load_method("derived_with_helpers:Mine"))["source"]
     path = Path(sys.modules[changed].__file__ or "")
     path.write_text(path.read_text() + "# changed\n")
-    assert describe_method(load_method("derived:Mine"))["source"] != before
-    for name in ("derived", *BEHIND.values()):
+    assert describe_method(load_method("derived_with_helpers:Mine"))["source"] != before
+    for name in ("derived_with_helpers", *BEHIND.values()):
         del sys.modules[name]

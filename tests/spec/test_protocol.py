@@ -101,9 +101,15 @@ def test_with_a_criterion_every_evaluated_point_of_a_stage_is_its_end() -> None:
     assert len(finished.episodes(Point(1, 14))) == 5 * 3
 
 
-@pytest.mark.parametrize("criterion", [0, -0.5, 1.1, "0.9", True])
-def test_a_criterion_that_is_no_success_rate_is_refused(criterion: Any) -> None:
-    with pytest.raises(ClbenchError, match=r"Budget\.criterion must be "):
+@pytest.mark.parametrize("criterion", [0, -0.5, 1.1])
+def test_a_criterion_that_is_no_success_rate_is_refused(criterion: float) -> None:
+    with pytest.raises(ValueError, match=r"Budget\.criterion must be a success rate"):
+        Budget(criterion=criterion)
+
+
+@pytest.mark.parametrize("criterion", ["0.9", True])
+def test_a_criterion_that_is_no_number_is_refused(criterion: Any) -> None:
+    with pytest.raises(ClbenchError, match=r"Budget\.criterion must be a .*number"):
         Budget(criterion=criterion)
 
 
