@@ -124,11 +124,11 @@ def _imports(path: Path, folder: Path, changed: int, size: int) -> tuple[str, ..
     except (SyntaxError, ValueError):  # nobody can import it either; its bytes count
         return ()
     package = path.relative_to(folder).parent.parts
-    names = [name for node in ast.walk(tree) for name in _names_in(node, package)]
+    names = [name for node in ast.walk(tree) for name in _imported_by(node, package)]
     return tuple(dict.fromkeys(".".join(name[:end]) for name in names for end in range(1, len(name) + 1)))
 
 
-def _names_in(node: ast.AST, package: Sequence[str]) -> Iterator[list[str]]:
+def _imported_by(node: ast.AST, package: Sequence[str]) -> Iterator[list[str]]:
     """Yield the parts of the names that an import in a module of `package` asks for."""
     if isinstance(node, ast.Import):
         yield from (alias.name.split(".") for alias in node.names)
@@ -164,6 +164,15 @@ def _code_text(code: CodeType) -> str:
         return repr(sorted(map(repr, constant))) if isinstance(constant, frozenset) else repr(constant)
 
     return f"{code.co_code.hex()} {code.co_names} {list(map(text, code.co_consts))}"
+
+
+def names_in(code: CodeType) -> set[str]:
+    """Return the names of attributes and global variables that code uses, with the functions inside it.
+
+    A comprehension is a function of its own in Python 3.11, and none in 3.12.
+    """
+    inside = (names_in(constant) for constant in code.co_consts if isinstance(constant, CodeType))
+    return set(code.co_names).union(*inside)
 
 
 def has_source(module: str) -> bool:

@@ -13,12 +13,13 @@ import importlib
 import importlib.util
 import inspect
 from collections.abc import Iterator, Mapping
-from types import CodeType, FunctionType, ModuleType
+from types import FunctionType, ModuleType
 from typing import Any
 
 import numpy as np
 
 from clbench.base.entry_points import resolve
+from clbench.base.source import names_in
 from clbench.spec.task import Task
 
 _PLAIN = (bool, int, float, str, bytes, slice, type(None))
@@ -108,15 +109,6 @@ class _Reached:
         self._add_all(name, inspect.getclosurevars(value).nonlocals)
         for other in sorted(names_in(value.__code__) & value.__globals__.keys()):
             self.add(other, value.__globals__[other])
-
-
-def names_in(code: CodeType) -> set[str]:
-    """Return the names of attributes and global variables that code uses, with the functions inside it.
-
-    A comprehension is a function of its own in Python 3.11, and none in 3.12.
-    """
-    inside = (names_in(constant) for constant in code.co_consts if isinstance(constant, CodeType))
-    return set(code.co_names).union(*inside)
 
 
 def _is_wrapper(function: FunctionType) -> bool:

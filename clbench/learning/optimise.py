@@ -110,8 +110,8 @@ def optimise(
 
     Raises:
         GradientError: A gradient is not finite.
-        MethodError: The loss is not a finite scalar with a gradient, or a learning rate is not a finite float
-            of at least 0.
+        MethodError: The loss is not a finite scalar with a gradient, no parameter in training has a gradient,
+            or a learning rate is not a finite float of at least 0.
     """
     groups: list[Any] = list(parameters)
     if not groups:
@@ -128,6 +128,11 @@ def optimise(
         _check_loss(loss, step)
         optimiser.zero_grad()
         gradients(loss)
+        if all(parameter.grad is None for parameter in trained):
+            raise MethodError(
+                f"step {step}: no parameter in training has a gradient: gradients() sets none, or the loss "
+                "depends on other parameters."
+            )
         _clip(trained, step)
         for group, peak in zip(optimiser.param_groups, peaks, strict=True):
             group["lr"] = _checked_rate(rate(peak * factor(step), step), step)

@@ -17,6 +17,7 @@ from clbench.base.entry_points import resolve
 from clbench.base.errors import InputError, UnknownNameError, WrongTypeError
 from clbench.base.source import class_hash, has_source, package_of, source_hash
 from clbench.base.text import did_you_mean
+from clbench.learning.hooks import misfits, uncalled_functions
 from clbench.learning.method import Method
 from clbench.spec.identifiers import built_in_methods, installed_methods, unknown_method
 
@@ -32,7 +33,8 @@ def load_method(spec: str) -> type[Method]:
     Raises:
         UnknownNameError: No such method is installed or can be imported; the message names the nearest one.
         InputError: The module of the method raises an error while it is imported.
-        WrongTypeError: The object of this name is not a method.
+        WrongTypeError: The object of this name is not a method, or has a hook that is misspelt or that the
+            loop cannot call.
     """
     if ":" in spec:
         cls = resolve(spec)
@@ -44,6 +46,11 @@ def load_method(spec: str) -> type[Method]:
         raise WrongTypeError(f"{spec!r} is not a subclass of clbench.Method.")
     if "__dataclass_fields__" not in vars(cls):  # it inherits those of Method
         raise WrongTypeError(f"{spec!r} is not a dataclass: decorate it with @dataclasses.dataclass.")
+    for name, hint in uncalled_functions(cls).items():
+        # a misspelt hook would run as plain fine-tuning, and nobody would know
+        raise WrongTypeError(f"{spec!r}: nothing calls {name}().{hint} Names of helpers begin with _.")
+    for hook, (given, taken) in misfits(cls).items():
+        raise WrongTypeError(f"{spec!r}: {hook}() must take ({given}), not ({taken}).")
     return cls
 
 
@@ -87,16 +94,25 @@ def read_changes(spec: str, cls: type[Method], changes: Mapping[str, Any]) -> di
     values = {}
     for name, value in changes.items():
         if name not in fields:
-            hint = did_you_mean(name, fields)
-            raise UnknownNameError(
-                f"{spec} has no hyper-parameter {name!r}.{hint} It has: {', '.join(fields) or 'none'}."
-            )
+            raise UnknownNameError(_no_field(spec, cls, name, fields))
         told = f"{spec}: {name}"
         values[name] = (
             _read(told, value, hints[name]) if isinstance(value, str) else _held(told, value, hints[name])
         )
     held = new_method(spec, cls, values)
     return {name: getattr(held, name) for name in values}
+
+
+def _no_field(spec: str, cls: type[Method], name: str, fields: list[str]) -> str:
+    """Return the message that a method has no hyper-parameter of this name."""
+    value = getattr(cls, name, None)
+    if isinstance(value, int | float | str) and not hasattr(Method, name):
+        hint = (
+            f" The class sets it without an annotation: write `{name}: {type(value).__name__} = {value!r}`."
+        )
+    else:
+        hint = did_you_mean(name, fields)
+    return f"{spec} has no hyper-parameter {name!r}.{hint} It has: {', '.join(fields) or 'none'}."
 
 
 def new_method(spec: str, cls: type[Method], values: Mapping[str, Any]) -> Method:
@@ -122,6 +138,9 @@ def new_method(spec: str, cls: type[Method], values: Mapping[str, Any]) -> Metho
 def _held(name: str, value: Any, hint: Any) -> Any:
     """Return a value as a field of the type `hint` holds it: 5 is 5.0 where no whole number belongs."""
     kinds = _kinds(hint)
+    items = [get_args(kind) for kind in kinds if get_origin(kind) is list]
+    if items and isinstance(value, list):
+        return [_held(f"{name}: item {place}", one, items[0][0]) for place, one in enumerate(value, 1)]
     if isinstance(value, np.generic):
         value = value.item()
     if type(value) is int and float in kinds and int not in kinds:
@@ -130,7 +149,8 @@ def _held(name: str, value: Any, hint: Any) -> Any:
     if choices:
         fits = value in choices or (value is None and NoneType in kinds)
     else:
-        fits = type(value) in kinds or any(kind not in WORDS for kind in kinds)
+        others = [kind for kind in kinds if kind not in WORDS and get_origin(kind) is not list]
+        fits = type(value) in kinds or bool(others)  # the method itself refuses a value of another type
     if not fits:
         raise InputError(f"{name} must be {_words(kinds)}, not {value!r}.")
     return value
@@ -166,9 +186,11 @@ def _read(name: str, text: str, hint: Any) -> Any:
         if str(choice) == text:
             return choice
     if any(get_origin(kind) is list for kind in kinds):
+        found = None
         with contextlib.suppress(ValueError):
-            if isinstance(found := json.loads(text), list):
-                return found
+            found = json.loads(text)
+        if isinstance(found, list):
+            return _held(name, found, hint)
     for kind in (bool, int, float, str):
         if kind not in kinds:
             continue

@@ -22,6 +22,7 @@ from clbench.base.lease import LeaseLostError
 from clbench.base.progress import ProgressCallback, no_progress
 from clbench.evaluation.checks import Checker
 from clbench.learning.adaptation import Step
+from clbench.learning.hooks import place_of
 from clbench.learning.optimise import MethodError, deterministic
 from clbench.learning.registry import method_packages
 from clbench.learning.trainer import STAGE_FILES, Trainer, load_stage, sources
@@ -157,7 +158,8 @@ def make_stages(run: ResolvedRun, progress: ProgressCallback = no_progress) -> P
         except NOT_THE_METHOD:
             raise
         except Exception as error:
-            message = f"{run.label} failed in {trainer.where}: {type(error).__name__}: {error}"
+            place = place_of(error, trainer.where)
+            message = f"{run.label} failed in {place}: {type(error).__name__}: {error}"
             raise MethodError(message) from error
 
     checker = Checker(scenario, run.protocol, run.spec.seed)

@@ -21,6 +21,7 @@ from clbench.data.training_data import TrainingData
 from clbench.evaluation.checks import Checker
 from clbench.evaluation.examiner import Examiner
 from clbench.learning.adaptation import Step
+from clbench.learning.hooks import place_of
 from clbench.learning.optimise import deterministic
 from clbench.learning.pretraining import pretrained_policy
 from clbench.learning.registry import describe_method, method_packages
@@ -190,7 +191,7 @@ class _Run:
         except Exception as error:
             self.record.status = "failed"
             self.record.error = {
-                "where": self.trainer.where,
+                "where": place_of(error, self.trainer.where),
                 "type": type(error).__name__,
                 "message": str(error),
                 "traceback": traceback.format_exc(),

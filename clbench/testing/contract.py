@@ -21,16 +21,15 @@ from typing import Any, get_type_hints
 
 from clbench.base.errors import InputError
 from clbench.base.seeding import seeded
-from clbench.base.text import did_you_mean
-from clbench.evaluation.rules import names_in
+from clbench.learning.hooks import misfits, own_classes, uncalled_functions
 from clbench.learning.method import Metadata, Method
 from clbench.learning.prior import Access, Uses
 from clbench.learning.registry import read_changes
 from clbench.policy.policy import ABILITIES
 from clbench.spec.policies import DEFAULT_POLICY
 from clbench.testing.error import Check, ContractError
-from clbench.testing.global_state import GENERATORS, functions_of, own_classes, same, watched
-from clbench.testing.toy_run import HOOKS, ToyRun, frozen_return, mean_return
+from clbench.testing.global_state import GENERATORS, same, watched
+from clbench.testing.toy_run import ToyRun, frozen_return, mean_return
 
 TARGETS, STEPS = 2, 2
 """Number of targets, and of optimiser steps on each, in runs whose learning does not matter."""
@@ -217,25 +216,15 @@ def _check_annotated(cls: type[Method]) -> None:
 
 def _check_names(cls: type[Method]) -> None:
     """Check that no hook is misspelt: something calls each public function."""
-    functions = [function for base in own_classes(cls) for function in functions_of(base).items()]
-    used = set(HOOKS).union(*(names_in(function.__code__) for _, function in functions))
-    for name, _ in functions:
-        if not name.startswith("_") and name not in used:
-            hint = did_you_mean(f"{name}()", [f"{hook}()" for hook in HOOKS])
-            expected = f"hooks that the loop calls.{hint} Names of helpers begin with _"
-            raise _breach(declaration, expected, f"{name}() is never called", f"{name}()")
+    for name, hint in uncalled_functions(cls).items():
+        expected = f"hooks that the loop calls.{hint} Names of helpers begin with _"
+        raise _breach(declaration, expected, f"{name}() is never called", f"{name}()")
 
 
 def _check_signatures(cls: type[Method]) -> None:
     """Check that the loop can call every hook."""
-    for hook in HOOKS:
-        given, taken = (inspect.signature(getattr(one, hook)) for one in (Method, cls))
-        try:
-            taken.bind(*given.parameters)
-        except TypeError as error:
-            expected = f"{hook}({', '.join(given.parameters)})"
-            found = f"{hook}({', '.join(taken.parameters)})"
-            raise _breach(declaration, expected, found, f"{hook}()") from error
+    for hook, (given, taken) in misfits(cls).items():
+        raise _breach(declaration, f"{hook}({given})", f"{hook}({taken})", f"{hook}()")
 
 
 def constructor(subject: Subject) -> None:

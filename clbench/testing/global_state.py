@@ -13,7 +13,6 @@ import warnings
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from itertools import takewhile
 from pathlib import Path
 from types import FunctionType, ModuleType
 from typing import Any
@@ -23,8 +22,8 @@ import torch
 from torch import Tensor
 
 from clbench.base.cache import cache_folder
-from clbench.base.source import package_of
-from clbench.evaluation.rules import names_in
+from clbench.base.source import names_in, package_of
+from clbench.learning.hooks import functions_of, own_classes
 from clbench.learning.method import Method
 from clbench.policy.policy import Policy
 from clbench.policy.transformer import TransformerPolicy
@@ -139,17 +138,6 @@ def _set_attributes(cls: type, values: Mapping[str, Any]) -> None:
 
 
 # ---- memory outside of objects -----------------------------------------------------------------------------
-
-
-def own_classes(cls: type[Method]) -> list[type]:
-    """Return a method's class and its bases before `Method`, in the order in which Python looks them up."""
-    return list(takewhile(lambda base: base is not Method, cls.__mro__))
-
-
-def functions_of(cls: type) -> dict[str, FunctionType]:
-    """Return the functions that a class itself defines, without their decorators, by name."""
-    plain = {name: getattr(value, "__func__", value) for name, value in vars(cls).items()}
-    return {name: inspect.unwrap(one) for name, one in plain.items() if isinstance(one, FunctionType)}
 
 
 @contextmanager

@@ -23,6 +23,7 @@ from clbench.base.text import did_you_mean
 from clbench.data.training_data import TrainingData
 from clbench.evaluation.rollouts import Evaluator
 from clbench.learning.adaptation import Step
+from clbench.learning.hooks import HOOKS
 from clbench.learning.method import Method, Stage
 from clbench.learning.optimise import MethodError, deterministic
 from clbench.learning.pretraining import pretrained_policy
@@ -36,21 +37,6 @@ from clbench.spec.policies import DEFAULT_POLICY
 from clbench.testing.error import ContractError
 from clbench.testing.global_state import GENERATORS, forgetting, read, same, watched
 from clbench.testing.toy import TOY
-
-HOOKS = (
-    "watch_pretraining",
-    "prepare",
-    "start_task",
-    "batch",
-    "loss",
-    "gradients",
-    "learning_rate",
-    "end_task",
-    "state",
-    "load_state",
-    "diagnostics",
-)
-"""Hooks of `Method`."""
 
 UNSEEDED = ("state", "diagnostics")
 """Hooks that may not draw at random."""

@@ -32,6 +32,7 @@ def module(monkeypatch: pytest.MonkeyPatch) -> types.ModuleType:
         strength: float = 0.5
         rounds: int = 3
         gentle: bool = False
+        rate = 0.25  # without an annotation it is no field
 
     class Plain(Method):
         pass
@@ -107,9 +108,26 @@ def test_a_choice_that_is_none_names_the_choices(
 
 
 @pytest.mark.parametrize(
+    ("value", "message"),
+    [
+        ('[1, "two"]', "layers: item 2 must be a whole number, not 'two'"),
+        ([0.5], "layers: item 1 must be a whole number, not 0.5"),
+        (5, r"layers must be list\[int\], not 5"),
+        ("5", r"layers must be list\[int\], not '5'"),
+    ],
+)
+def test_a_list_with_an_item_of_another_type_is_refused_by_name(
+    value: Any, message: str, stranger: Callable[[type[Method]], str]
+) -> None:
+    with pytest.raises(InputError, match=message):
+        build_method(stranger(Chooses), {"layers": value})
+
+
+@pytest.mark.parametrize(
     ("changes", "error", "message"),
     [
         ({"strenght": "1"}, LookupError, r"has no hyper-parameter 'strenght'. Did you mean 'strength'\?"),
+        ({"rate": "1"}, LookupError, "The class sets it without an annotation: write `rate: float = 0.25`"),
         ({"rounds": "many"}, ValueError, "rounds must be a whole number, not 'many'"),
         ({"rounds": 2.5}, ValueError, "rounds must be a whole number, not 2.5"),
         ({"rounds": True}, ValueError, "rounds must be a whole number, not True"),

@@ -74,6 +74,14 @@ def test_a_loss_that_cannot_be_minimised_stops_with_the_step_in_the_error(loss: 
     assert weight.tolist() == [1.0, 1.0]
 
 
+@pytest.mark.parametrize("gradients", [lambda loss: None, Tensor.backward])
+def test_a_step_that_sets_no_gradient_of_the_trained_parameters_is_refused(gradients: object) -> None:
+    trained, other = nn.Parameter(torch.ones(2)), nn.Parameter(torch.ones(2))
+    with pytest.raises(MethodError, match="step 0: no parameter in training has a gradient"):
+        optimise([trained], 0.1, 1, lambda _: other.sum(), gradients)  # type: ignore[arg-type]
+    assert trained.tolist() == [1.0, 1.0]
+
+
 @pytest.mark.parametrize("warn_only", [False, True])
 def test_the_deterministic_block_restores_what_was_set(warn_only: bool) -> None:
     def state() -> tuple[int, bool, bool]:

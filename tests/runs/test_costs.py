@@ -121,8 +121,12 @@ def test_a_buffer_that_the_method_added_is_kept_data(
     [
         (Forgetful, "load_state() after stage 0", "load_state() must give a new policy the parameters and "),
         (Endless, "prepare", "The buffer mask is not finite after prepare()."),
-        (Greedy, "stage 1 (right)", f"draws {2 * BATCH} samples of the target in a step: {BATCH}, its"),
-        (Hoarding, "stage 2 (down)", "draws from data after the hooks that received it"),
+        (
+            Greedy,
+            "loss() in stage 1 (right)",
+            f"draws {2 * BATCH} samples of the target in a step: {BATCH}, its",
+        ),
+        (Hoarding, "start_task() in stage 2 (down)", "draws from data after the hooks that received it"),
     ],
 )
 def test_a_method_is_told_what_it_did_wrong(

@@ -1,0 +1,76 @@
+"""The hooks of a method: which a class misspells, which the loop cannot call, which raised an error."""
+
+from __future__ import annotations
+
+import inspect
+from itertools import takewhile
+from traceback import walk_tb
+from types import FunctionType
+
+from clbench.base.source import names_in
+from clbench.base.text import did_you_mean
+from clbench.learning.method import Method
+
+HOOKS = (
+    "watch_pretraining",
+    "prepare",
+    "start_task",
+    "batch",
+    "loss",
+    "gradients",
+    "learning_rate",
+    "end_task",
+    "state",
+    "load_state",
+    "diagnostics",
+)
+"""Hooks of `Method`, in the order in which a run calls them."""
+
+
+def own_classes(cls: type[Method]) -> list[type]:
+    """Return a method's class and its bases before `Method`, in the order in which Python looks them up."""
+    return list(takewhile(lambda base: base is not Method, cls.__mro__))
+
+
+def functions_of(cls: type) -> dict[str, FunctionType]:
+    """Return the functions that a class itself defines, without their decorators, by name."""
+    plain = {name: getattr(value, "__func__", value) for name, value in vars(cls).items()}
+    return {name: inspect.unwrap(one) for name, one in plain.items() if isinstance(one, FunctionType)}
+
+
+def uncalled_functions(cls: type[Method]) -> dict[str, str]:
+    """Return the public functions of a method that neither the loop nor the class calls.
+
+    Each has the end of a message with the hook whose name is near, empty if none is.
+    """
+    functions = [item for base in own_classes(cls) for item in functions_of(base).items()]
+    used = set(HOOKS).union(*(names_in(function.__code__) for _, function in functions))
+    uncalled = [name for name, _ in functions if not name.startswith("_") and name not in used]
+    return {name: did_you_mean(f"{name}()", [f"{hook}()" for hook in HOOKS]) for name in uncalled}
+
+
+def misfits(cls: type[Method]) -> dict[str, tuple[str, str]]:
+    """Return the hooks that the loop cannot call, each with its arguments in `Method` and in the class."""
+    found = {}
+    for hook in HOOKS:
+        given, taken = (inspect.signature(getattr(one, hook)) for one in (Method, cls))
+        try:
+            taken.bind(*given.parameters)
+        except TypeError:
+            found[hook] = (", ".join(given.parameters), ", ".join(taken.parameters))
+    return found
+
+
+def place_of(error: BaseException, place: str) -> str:
+    """Return a place in a run with the hook that raised an error, such as "loss() in stage 1 (push)".
+
+    Args:
+        error: The error, with its traceback.
+        place: What ran: a stage, or a hook.
+    """
+    for frame, _ in walk_tb(error.__traceback__):
+        hook = frame.f_code.co_name
+        if hook in HOOKS and isinstance(frame.f_locals.get("self"), Method):
+            called = place.partition(" ")[0].removesuffix("()") == hook
+            return place if called else f"{hook}() in {place}"
+    return place
