@@ -113,14 +113,15 @@ class Episode:
         model.body_pos[:], model.body_quat[:] = self._places
         return model
 
-    def drawn(self) -> mujoco.MjModel:
-        """Return the scene with its textures and with the fixtures in place, for a picture of `data`."""
-        self.forward()
-        model = self.problem.scene.drawn
+    def seen(self) -> tuple[mujoco.MjModel, mujoco.MjData]:
+        """Return the whole scene as it is now, for a picture; the next step does not depend on this call."""
+        model, data = self.problem.scene.seen
         model.body_pos[:], model.body_quat[:] = self._places
+        data.qpos[:] = self.data.qpos
+        mujoco.mj_forward(model, data)
         for site, is_on in self.problem.lights.items():
             model.site_group[site] = SEEN if is_on(self.data) else HIDDEN
-        return model
+        return model, data
 
     def move(self) -> None:
         """Advance the physics by `action`; several threads may do so at once, each for another episode."""

@@ -108,6 +108,9 @@ def environment(task: str, compiled: Callable[[str], mujoco.MjModel]) -> Any:
 
     def initialize(self: Any, _: str | None = None) -> None:
         self.sim = MjSim(compiled(self.model.get_xml()))
+        # robosuite numbers all geoms, for masks of pictures; the model lacks those that are only seen
+        numbers = self.sim.model._geom_name2id
+        self.sim.model.geom_name2id = lambda name: numbers.get(name, name)
         self.sim.forward()
         self.initialize_time(self.control_freq)
 

@@ -36,7 +36,7 @@ class Scene:
     xml: str
     """The scene in MJCF."""
     model: mujoco.MjModel
-    """The scene without textures, which need two thirds of its memory, and without its unused sensors."""
+    """The scene without what is only seen, which needs 95 % of the memory, and without its unused sensors."""
     models: Copies[mujoco.MjModel]
     """The model, for threads that advance episodes at the same time: each moves the fixtures in its own."""
     places: Places
@@ -49,12 +49,12 @@ class Scene:
         return self
 
     @functools.cached_property
-    def drawn(self) -> mujoco.MjModel:
-        """The scene with its textures, 210 MB. As in LIBERO, collision geoms and marks are not drawn."""
+    def seen(self) -> tuple[mujoco.MjModel, mujoco.MjData]:
+        """The whole scene, 210 MB, and physics to draw. As in LIBERO, solid geoms and marks are hidden."""
         model = mujoco.MjModel.from_xml_string(self.xml)
         model.geom_group[model.geom_group == SOLID] = HIDDEN
         model.site_group[:] = HIDDEN
-        return model
+        return model, mujoco.MjData(model)
 
     @property
     def camera(self) -> dict[str, Any]:
@@ -65,8 +65,8 @@ class Scene:
 
 @functools.cache
 def scene_of(xml: str) -> Scene:
-    """Compile a scene in MJCF; this takes half a second, once per process and scene."""
-    model = mujoco.MjModel.from_xml_string(_without_textures(xml))
+    """Compile a scene in MJCF, once per process."""
+    model = mujoco.MjModel.from_xml_string(_without_looks(xml))
     # LIBERO reads no sensor, and the physics does not depend on them
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_SENSOR
     data = mujoco.MjData(model)
@@ -87,15 +87,16 @@ def heavier(scene: Scene, mass: float) -> Scene:
 
 
 def _copies(model: mujoco.MjModel) -> Copies[mujoco.MjModel]:
-    """Return the model with copies of it, of 65 to 106 MB."""
+    """Return the model with copies of it, of 3 MB."""
     return Copies(model, lambda: copy.copy(model))
 
 
-def _without_textures(xml: str) -> str:
+def _without_looks(xml: str) -> str:
+    """Return a scene that is compiled without geoms that collide with nothing, their meshes and textures.
+
+    The physics has the same bits, and a step takes 10 to 20 % less time: MuJoCo places all geoms in each.
+    """
     root = ElementTree.fromstring(xml)
-    for asset in root.iter("asset"):
-        for texture in asset.findall("texture"):
-            asset.remove(texture)
-    for material in root.iter("material"):
-        material.attrib.pop("texture", None)
+    for compiler in root.iter("compiler"):
+        compiler.set("discardvisual", "true")
     return ElementTree.tostring(root, encoding="unicode")

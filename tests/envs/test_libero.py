@@ -52,6 +52,12 @@ def random_actions(seed: int, steps: int) -> NDArray[np.float32]:
     return actions
 
 
+def physics_of(world: Any) -> mujoco.MjData:
+    """The physics of the first lane, for tests that move a drawer or a knob by hand."""
+    data: mujoco.MjData = world._lane(0).data
+    return data
+
+
 def trails(starts: Iterable[Start], steps: int = 15) -> dict[Start, str]:
     """Hash of the physics after each step of some episodes, which one object runs per scene."""
     episodes: dict[int, Any] = {}
@@ -183,8 +189,7 @@ def test_an_open_drawer_is_success_with_reward_one() -> None:
     world.reset([0], [0], [OPEN])
     _, rewards, successes = world.step([0], still)
     assert (rewards[0], successes[0]) == (0.0, False)
-    drawn: Any = world
-    drawn.drawable(0).data.joint("wooden_cabinet_1_middle_level").qpos[:] = -0.15
+    physics_of(world).joint("wooden_cabinet_1_middle_level").qpos[:] = -0.15
     states, rewards, successes = world.step([0], still)
     assert (rewards[0], successes[0]) == (1.0, True)
     joints = resolve("clbench.envs.libero.state:JOINTS")
@@ -204,12 +209,25 @@ def test_a_picture_shows_the_scene_with_its_textures_and_leaves_the_next_step_al
     np.testing.assert_array_equal(*(world.step([0], action)[0] for world in worlds))
 
 
+def test_the_physics_moves_nothing_that_is_only_seen_and_a_picture_has_the_same_bodies() -> None:
+    episode, solid = Episode(problem_of(OPEN)), problem_of(OPEN).scene.model
+    episode.begin(problem_of(OPEN), 2)
+    for episode.action in random_actions(0, 5):
+        episode.move()
+    seen, data = episode.seen()
+    assert solid.ngeom == ((seen.geom_contype != 0) | (seen.geom_conaffinity != 0)).sum() < seen.ngeom
+    assert solid.nbuffer < 5e6 < seen.nbuffer
+    episode.forward()
+    for name in ("xpos", "xquat", "site_xpos"):
+        np.testing.assert_array_equal(getattr(episode.data, name), getattr(data, name), name)
+
+
 def test_a_picture_has_no_collision_geoms_or_marks_and_a_red_burner_only_while_the_stove_is_on() -> None:
     world: Any = vector_world(WORLD, 1)
     world.reset([0], [0], [BOWL])
     drawn = mujoco.MjvOption()  # what MuJoCo draws
     for angle, expected in ((0.0, set()), (0.6, {"flat_stove_1_burner"}), (0.4, set())):
-        world.drawable(0).data.joint("flat_stove_1_button").qpos[:] = angle
+        physics_of(world).joint("flat_stove_1_button").qpos[:] = angle
         model = world.drawable(0).model
         assert not drawn.geomgroup[model.geom("gripper0_hand_collision").group[0]]
         assert drawn.geomgroup[model.geom("gripper0_hand_visual").group[0]]

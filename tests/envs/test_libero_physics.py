@@ -113,7 +113,7 @@ libero.reset()
 libero.sim.model.body_pos[:], libero.sim.model.body_quat[:] = positions, quaternions
 if angle:
     address = int(problem_of(task).scene.model.joint("flat_stove_1_button").qposadr[0])
-    state[1 + address] = world.drawable(0).data.qpos[address] = angle
+    state[1 + address] = world._lane(0).data.qpos[address] = angle
 libero.set_init_state(state)
 seen = libero.env._get_observations(force_update=True)
 model, data, _ = world.drawable(0)
