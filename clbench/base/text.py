@@ -43,6 +43,12 @@ def counted(count: int, noun: str, nouns: str = "") -> str:
     return f"{count} {noun if count == 1 else nouns or f'{noun}s'}"
 
 
+def listed(parts: Iterable[str]) -> str:
+    """Return the parts of a sentence in a row: "a", "a and b", "a, b and c"."""
+    *first, last = list(parts) or [""]
+    return " and ".join([*filter(None, [", ".join(first)]), last])
+
+
 def minutes(seconds: float) -> str:
     """Return a time as minutes and seconds, such as "2:05"."""
     return f"{int(seconds) // 60}:{int(seconds) % 60:02d}"

@@ -62,7 +62,7 @@ def misfits(cls: type[Method]) -> dict[str, tuple[str, str]]:
 
 
 def place_of(error: BaseException, place: str) -> str:
-    """Return a place in a run with the hook that raised an error, such as "loss() in stage 1 (push)".
+    """Return a place in a run with the hook that raised an error, such as "loss() of stage 1 (push)".
 
     Args:
         error: The error, with its traceback.
@@ -72,5 +72,5 @@ def place_of(error: BaseException, place: str) -> str:
         hook = frame.f_code.co_name
         if hook in HOOKS and isinstance(frame.f_locals.get("self"), Method):
             called = place.partition(" ")[0].removesuffix("()") == hook
-            return place if called else f"{hook}() in {place}"
+            return place if called else f"{hook}() of {place}"
     return place

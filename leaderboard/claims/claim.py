@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from datetime import datetime
 from typing import Literal
 
-from clbench.base.text import counted
+from clbench.base.text import counted, listed
 from clbench.scoring.intervals import student_quantile
 
 from .evidence import Evidence, Figure
@@ -128,8 +128,7 @@ def tally(verdicts: Iterable[Verdict]) -> str:
         for verdict, (one, several) in PREDICATES.items()
         if counts[verdict]
     ]
-    listed = " and ".join(filter(None, (", ".join(parts[:-1]), parts[-1])))
-    return f"of {counted(counts.total(), 'verdict')}, {listed}"
+    return f"of {counted(counts.total(), 'verdict')}, {listed(parts)}"
 
 
 def decided(*, holds: bool, fails: bool, in_part: bool = False) -> Verdict:

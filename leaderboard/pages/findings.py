@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
 
-from clbench.base.text import counted
+from clbench.base.text import counted, listed
 from clbench.records.paths import table_parts
 from clbench.scoring.groups import differences_needed
 from clbench.scoring.intervals import Estimate
@@ -260,19 +260,63 @@ def _claims(judged: Sequence[Judged]) -> Section:
     for paper, members in by_paper:
         every = list(members)
         answers.append(f"{paper}: {tally(one.finding.verdict for one in every)}.{_those_that_hold(every)}")
-    decided = [one for one in judged if one.finding.verdict != "undecided"]
-    lines = tuple(
-        (
-            one.claim.id,
-            f"{one.claim.words} {' '.join(one.finding.sentences[-1:])}".strip(),
-            one.evidence.scenario,
-            one.finding.verdict,
-            _first_figure(one),
+    boards = tuple(dict.fromkeys(one.evidence.scenario for one in judged))
+    found: dict[Claim, dict[str, Judged]] = {}
+    for one in judged:
+        found.setdefault(one.claim, {})[one.evidence.scenario] = one
+    lines = tuple(_claim_line(claim, verdicts, boards) for claim, verdicts in found.items())
+    head = ("id", "claim", "first figure", *boards)
+    answers += [*_explanations(judged), *_what_would_show_it(judged)]
+    if lines:
+        answers.append(
+            "The table has the value of the first figure after each verdict. The page of the claims has the "
+            "rules, the other figures and the controls."
         )
-        for one in decided
-    )
-    head = ("id", "claim", "scenario", "verdict", "first figure")
     return Section("Which claims of the papers hold here?", tuple(answers), head, lines)
+
+
+def _claim_line(claim: Claim, verdicts: Mapping[str, Judged], boards: Sequence[str]) -> tuple[str, ...]:
+    """Return the cells of a claim: what is measured first, and on each board the verdict with its value."""
+    figures = [one.finding.figures[0] for one in verdicts.values() if one.finding.figures]
+    what = figures[0].what if figures else MISSING
+    return (claim.id, claim.words, what, *(_verdict_cell(verdicts.get(board), what) for board in boards))
+
+
+def _verdict_cell(one: Judged | None, what: str) -> str:
+    """Return a verdict with the value of its first figure, if that is the figure `what`."""
+    if one is None:
+        return ""
+    shown = [figure for figure in one.finding.figures[:1] if figure.what == what]
+    return ": ".join(
+        [one.finding.verdict, *(format_interval(figure.estimate, figure.form) for figure in shown)]
+    )
+
+
+def _explanations(judged: Sequence[Judged]) -> list[str]:
+    """Return the last conclusion from the figures and controls of each verdict that is a yes or a no."""
+    told: dict[tuple[str, str], list[str]] = {}
+    for one in judged:
+        if one.finding.verdict in ("holds", "holds in part", "does not hold"):
+            for sentence in one.finding.sentences[-1:]:
+                told.setdefault((one.claim.id, sentence), []).append(one.evidence.scenario)
+    return [f"{claim} on {listed(boards)}: {sentence}" for (claim, sentence), boards in told.items()]
+
+
+def _what_would_show_it(judged: Sequence[Judged]) -> list[str]:
+    """Return a sentence for each thing that boards lack to show some claims."""
+    lacking: dict[str, dict[str, list[str]]] = {}
+    for one in judged:
+        if one.finding.verdict == "cannot be shown here":
+            boards = lacking.setdefault(one.finding.change, {})
+            boards.setdefault(one.evidence.scenario, []).append(one.claim.id)
+    sentences = []
+    for change, boards in lacking.items():
+        claims: dict[str, list[str]] = {}
+        for board, names in boards.items():
+            claims.setdefault(listed(names), []).append(board)
+        where = "; ".join(f"{names} on {listed(on)}" for names, on in claims.items())
+        sentences.append(f"What would show {where}: {change[0].lower()}{change[1:]}")
+    return sentences
 
 
 def _those_that_hold(judged: Sequence[Judged]) -> str:
@@ -286,14 +330,6 @@ def _those_that_hold(judged: Sequence[Judged]) -> str:
         if any(held)
     ]
     return f" What holds: {'; '.join(words)}." if words else ""
-
-
-def _first_figure(one: Judged) -> str:
-    """Return the first figure of a finding with its value."""
-    if not one.finding.figures:
-        return MISSING
-    figure = one.finding.figures[0]
-    return f"{figure.what}: {format_interval(figure.estimate, figure.form)}"
 
 
 def _predictors(boards: dict[str, list[Row]]) -> Section:

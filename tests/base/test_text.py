@@ -6,6 +6,7 @@ from clbench.base.text import (
     counted,
     did_you_mean,
     html_table,
+    listed,
     printable,
     printable_lines,
     quoted,
@@ -38,6 +39,10 @@ def test_a_long_text_is_cut() -> None:
 def test_one_thing_is_singular() -> None:
     assert [counted(number, "seed") for number in (0, 1, 2)] == ["0 seeds", "1 seed", "2 seeds"]
     assert counted(2, "policy", "policies") == "2 policies"
+
+
+def test_parts_are_listed_as_in_a_sentence() -> None:
+    assert [listed("abc"[:count]) for count in range(4)] == ["", "a", "a and b", "a, b and c"]
 
 
 def test_the_nearest_known_name_is_offered_if_one_is_near() -> None:

@@ -119,9 +119,9 @@ class Unrelated:
 @pytest.mark.parametrize(
     ("call", "place", "expected"),
     [
-        (lambda: Failing().end_task(None, None), "stage 1 (push)", "end_task() in stage 1 (push)"),
+        (lambda: Failing().end_task(None, None), "stage 1 (push)", "end_task() of stage 1 (push)"),
         (lambda: Failing().prepare(None, None), "prepare", "prepare"),
-        (lambda: Failing().batch(None, None), "stage 1 (batch)", "batch() in stage 1 (batch)"),
+        (lambda: Failing().batch(None, None), "stage 1 (batch)", "batch() of stage 1 (batch)"),
         (
             lambda: Failing().load_state(None, {"a": 1}),  # type: ignore[arg-type]
             "load_state() after stage 0",

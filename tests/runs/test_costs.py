@@ -123,10 +123,10 @@ def test_a_buffer_that_the_method_added_is_kept_data(
         (Endless, "prepare", "The buffer mask is not finite after prepare()."),
         (
             Greedy,
-            "loss() in stage 1 (right)",
+            "loss() of stage 1 (right)",
             f"draws {2 * BATCH} samples of the target in a step: {BATCH}, its",
         ),
-        (Hoarding, "start_task() in stage 2 (down)", "draws from data after the hooks that received it"),
+        (Hoarding, "start_task() of stage 2 (down)", "draws from data after the hooks that received it"),
     ],
 )
 def test_a_method_is_told_what_it_did_wrong(

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
-from clbench.base.text import counted, printable
+from clbench.base.text import counted, listed, printable
 from clbench.scoring.groups import groups
 from clbench.scoring.intervals import Estimate
 from clbench.spec.references import BASELINE
@@ -290,4 +290,4 @@ def _names(names: Sequence[str]) -> str:
     shown = [printable(name) for name in (names[:NAMED] if many else names)]
     if many:
         return f"{', '.join(shown)} and {len(names) - NAMED} more"
-    return " and ".join([", ".join(shown[:-1]), shown[-1]] if len(shown) > 1 else shown)
+    return listed(shown)

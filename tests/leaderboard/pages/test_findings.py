@@ -3,6 +3,8 @@
 import re
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
@@ -10,6 +12,7 @@ from clbench.base.entry_points import resolve
 from clbench.records.paths import record_path
 from clbench.records.record import Record, Relearning
 from clbench.records.writer import write_record
+from clbench.scoring.intervals import Estimate
 
 findings = resolve("clbench.leaderboard.pages.cli:findings")
 
@@ -145,6 +148,39 @@ def test_claims_that_hold_are_named_since_some_are_about_plain_fine_tuning(
 ) -> None:
     fill(even_board, sft=0.4)
     assert "What holds: C5, Bounds how much a step can disrupt" in page()
+
+
+def test_a_claim_is_a_line_with_a_verdict_for_each_board_what_explains_it_and_what_is_missing(
+    even_board: Callable[..., Path], page: Callable[[], str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first, second = map(resolve("clbench.leaderboard.claims.judges:CLAIMS").get, ("C2", "C7"))
+    finding = resolve("clbench.leaderboard.claims.claim:Finding")
+    figure = resolve("clbench.leaderboard.claims.evidence:Figure")
+
+    def judged(claim: Any, board: str, verdict: str, what: str, *sentences: str) -> Any:
+        value = figure(what, ("consft", "sft"), Estimate(0.25, 0.125, 0.5))
+        found = finding(verdict, (value,), (), sentences, "Longer stages.")
+        return SimpleNamespace(claim=claim, evidence=SimpleNamespace(scenario=board), finding=found)
+
+    every = (
+        judged(first, "a", "does not hold", "kept", "Half are 0.", "A constant weight keeps as much."),
+        judged(first, "b", "does not hold", "kept", "A constant weight keeps as much."),
+        judged(first, "c", "cannot be shown here", "kept", "It has no arm."),
+        judged(second, "b", "undecided", "lost", "Nothing explains it."),
+        judged(second, "c", "cannot be shown here", "lost in c"),
+    )
+    monkeypatch.setattr("clbench.leaderboard.claims.judges.judge_all", lambda *_: every)
+    fill(even_board, sft=0.4)
+    section = page().partition("## Which claims of the papers hold here?")[2].partition("## ")[0]
+    assert "- C2 on a and b: A constant weight keeps as much.\n" in section
+    assert "Half are 0" not in section
+    assert "Nothing explains it" not in section
+    assert "- What would show C2 and C7 on c: longer stages.\n" in section
+    assert "| id | claim | first figure | a | b | c |\n" in section
+    value, none = "0.25 [0.12, 0.50]", "cannot be shown here"
+    cells = f"kept | does not hold: {value} | does not hold: {value} | {none}: {value} |"
+    assert f"| C2 | {first.words} | {cells}\n" in section
+    assert f"| C7 | {second.words} | lost |  | undecided: {value} | {none} |\n" in section
 
 
 def test_how_fast_lost_skills_come_back_is_told_with_their_names(
