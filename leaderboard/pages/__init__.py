@@ -1,1 +1,1 @@
-"""Reference pages written from code and records: one for each method and one for each scenario."""
+"""Reference pages written from code and records: claims, findings, and one for each method and scenario."""
