@@ -16,14 +16,15 @@ if TYPE_CHECKING:
 def load_board(records: Path | str = RECORDS) -> pandas.DataFrame:
     """Return the leaderboard as a table with one row per scenario and method, in the order of the board.
 
-    Columns: `scenario`, `method`, `division`, `groups` (letters; two rows of a division share one if they are
-    not told apart in final average), `tier`, `seeds` (their number); for every metric its value and the ends
-    of its 95 % confidence interval, for example `retention`, `retention_low`, `retention_high`; then
-    `relative_cost` (training time relative to sft), `steps`, `bytes_kept`, `parameters`, `parameters_added`
-    and `environment_steps` (of agents that learned online), each a mean over seeds; `order_sensitivity`
-    (range of the final average over three or more orders of the targets); and `settings_tried` (number of
-    settings that tuning tried). Missing values are NaN.
-    `clbench leaderboard` lists the records that make no row, with the reason.
+    Columns: `scenario` (its id; with another policy than the usual one it ends in the policy's name, such as
+    "clbench/Fetch-v1+discrete_diffusion", because only rows of one policy are compared), `method`,
+    `division`, `groups` (letters; two rows of a division share one if they are not told apart in final
+    average), `tier`, `seeds` (their number); for every metric its value and the ends of its 95 % confidence
+    interval, for example `retention`, `retention_low`, `retention_high`; then `relative_cost` (training time
+    relative to sft), `steps`, `bytes_kept`, `parameters`, `parameters_added` and `environment_steps` (of
+    agents that learned online), each a mean over seeds; `order_sensitivity` (range of the final average over
+    three or more orders of the targets); and `settings_tried` (number of settings that tuning tried). Missing
+    values are NaN. `clbench leaderboard` lists the records that make no row, with the reason.
 
     Args:
         records: Folder of the records.
