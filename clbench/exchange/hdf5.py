@@ -138,6 +138,11 @@ def read_hdf5(path: Path, task: Task, state: Sequence[str] = ("states",)) -> lis
 def _check_readable(path: Path) -> None:
     """Check that a path is a file that can be read: HDF5 would answer with flags and addresses."""
     try:
+        if (path / "meta" / "info.json").is_file():
+            raise InputError(
+                f"{path} is a LeRobotDataset, which clbench cannot read: write its episodes to an HDF5 file, "
+                "as data/demo_0 and so on."
+            )
         if path.is_dir():
             raise InputError(f"{path} is a folder, not an HDF5 file.")
         path.open("rb").close()
@@ -162,7 +167,18 @@ class _File:
         names = data if isinstance(data, h5py.Group) else ()
         found = sorted((int(one[1]), name) for name in names if (one := _NAME.fullmatch(name)) is not None)
         if not found:
-            raise self._error("it has no demonstrations: the layout of robomimic and LIBERO has data/demo_0")
+            there = ", ".join(sorted([f"data/{name}" for name in names] or self._file)[:5]) or "nothing"
+            raise self._error(
+                f"it has no demonstrations: the layout of robomimic and LIBERO has data/demo_0, found {there}"
+            )
+        own = [name for name in names if isinstance(data.get(name, getlink=True), h5py.HardLink)]
+        groups = {name for name in own if data.get(name, getclass=True) is h5py.Group}
+        others = sorted(groups - {name for _, name in found})
+        if others:
+            raise self._error(
+                f"data also holds {', '.join(others[:5])}: call each demonstration demo_ and its number, or "
+                "take it out"
+            )
         for (number, name), (following, other) in pairwise(found):
             if number == following:
                 raise self._error(f"data has both {name} and {other}: each number may occur once")

@@ -189,17 +189,28 @@ def _likely_unit(known: Mapping[Cell, float], where: str) -> Unit:
     cell = max(known, key=known.__getitem__, default=None)
     if cell is None or known[cell] <= 1 + ROUNDING:
         return "share"
-    by_method: dict[str, list[bool]] = {}
-    for one, rate in known.items():
-        if rate > 0:
-            by_method.setdefault(one.method, []).append(rate <= 1 + ROUNDING)
-    if known[cell] <= DOUBTFUL or any(sum(small) >= MIXED * len(small) for small in by_method.values()):
-        others = "" if known[cell] <= DOUBTFUL else ", and other rates are at most 1"
+    mixed = "" if known[cell] <= DOUBTFUL else _mixed(known)
+    if known[cell] <= DOUBTFUL or mixed:
         raise InputError(
-            f"{where}{cell}: found {known[cell]:g}{others}: is it a share above 1, or per cent? Correct it, "
-            'or say --unit percent, in Python unit="percent".'
+            f"{where}{cell}: found {known[cell]:g}{mixed}: is it a share above 1, or per cent? Correct it, "
+            'or say --unit percent, in Python unit="percent": then all rates are per cent.'
         )
     return "percent"
+
+
+def _mixed(known: Mapping[Cell, float]) -> str:
+    """Return in words where a table in per cent has rates that look like shares; nothing if it has none."""
+    small: dict[tuple[str, str], list[bool]] = {}
+    for one, rate in known.items():
+        if rate > 0:
+            for part in ("", f"seed {quoted(one.seed)}", f"task {quoted(one.task)}"):
+                small.setdefault((part, one.method), []).append(rate <= 1 + ROUNDING)
+    for (part, _), rates in small.items():
+        if part and len(rates) > 1 and all(rates):
+            return f", and all rates of {part} are at most 1"
+        if not part and sum(rates) >= MIXED * len(rates):
+            return ", and other rates are at most 1"
+    return ""
 
 
 def _check_range(known: Mapping[Cell, float], unit: Unit, where: str) -> None:

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clbench.base.entry_points import unknown
-from clbench.base.text import counted, quoted
+from clbench.base.text import counted, did_you_mean, quoted
 from clbench.metrics.definitions import DEFINITIONS, FAMILIES, INSTEAD
 from clbench.scoring.intervals import interval
 from clbench.scoring.layout import Array, Layout
@@ -240,7 +240,7 @@ def _reason(metric: Metric, method: str, matrices: Matrices) -> str:
     for name in metric.references:
         found = matrices.success.get(name)
         if found is None:
-            return f"No method is called {name}."
+            return f"No method is called {name}.{did_you_mean(name, matrices.success)}"
         absent = [seed for seed in runs if seed not in found]
         if absent:
             words = (f"seed {quoted(seed)}" if seed else "matrix without a seed" for seed in absent)

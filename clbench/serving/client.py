@@ -58,6 +58,7 @@ class ServedPolicy:
         self.address, self._timeout, self._patience = address, timeout, patience
         self._connection: ClientConnection | None = None
         self._opened = ExitStack()
+        self._greeting: dict[Any, bytes] | None = None
         self.metadata: dict[str, Any] = {}
         """What the server says about itself."""
         self._connected()
@@ -127,6 +128,15 @@ class ServedPolicy:
             metadata = self._receive(connection)
             if not isinstance(metadata, dict):
                 raise InputError(f"The server at {self.address} must first send a dictionary of metadata.")
+            greeting = {name: pack(value) for name, value in metadata.items()}
+            if self._greeting is not None and greeting != self._greeting:
+                changed = sorted(str(name) for name, _ in greeting.items() ^ self._greeting.items())
+                raise InputError(
+                    f"The server at {self.address} came back as another one: its metadata differ in "
+                    f"{printable(', '.join(dict.fromkeys(changed)))}. A stage needs one checkpoint: serve "
+                    "it, and score the stage again."
+                )
+            self._greeting = greeting
             self.metadata, self._opened = metadata, opened.pop_all()
         return connection
 

@@ -151,6 +151,7 @@ def score(
         )
     _warn(stage, played)
     run.report(record, stage, played.episodes)
+    _warn_if_unchanged(record, stage)
     record.run.settings = {"executed": played.executed}
     declared = {"data": data, "steps": steps, "server": server or None}
     record.diagnostics[str(stage)] = {
@@ -161,6 +162,23 @@ def score(
     run.time(record, None, time.perf_counter() - begin)
     run.keep(record, stage)
     return record
+
+
+def _warn_if_unchanged(record: Record, stage: int) -> None:
+    """Say if all episodes ended as in the stage before: an unchanged policy repeats itself exactly."""
+    names = ("stage", "task", "split", "episode", "success", "length")
+    outcomes: dict[int, dict[tuple[Any, ...], tuple[Any, ...]]] = {}
+    for one, *place, success, length in zip(*(record.episodes[name] for name in names), strict=True):
+        outcomes.setdefault(one, {})[tuple(place)] = success, length
+    before, now = outcomes.get(stage - 1, {}), outcomes.get(stage, {})
+    shared = before.keys() & now.keys()
+    succeeded = any(now[place][0] for place in shared)  # all failures have the same length
+    if succeeded and all(before[place] == now[place] for place in shared):
+        LOG.warning(
+            "All %d episodes ended as in stage %d, in equal steps: does the policy have the new checkpoint?",
+            len(shared),
+            stage - 1,
+        )
 
 
 def _seeds_of(server: Mapping[str, Any], run: StagedRun, stage: int) -> list[int]:

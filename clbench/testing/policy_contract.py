@@ -13,7 +13,8 @@ import dataclasses
 import functools
 import tempfile
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import cached_property
 from pathlib import Path
 
@@ -141,7 +142,8 @@ def initial_weights(subject: Subject) -> None:
 def losses(subject: Subject) -> None:
     """`action_loss` returns one loss per sample, a function of that sample and of the weights alone."""
     policy, batch = subject.build(), subject.batch
-    loss = policy.action_loss(batch)
+    with _left_alone(losses, batch, "action_loss()"):
+        loss = policy.action_loss(batch)
     _check_shape(losses, loss, (SAMPLES,), "action_loss()")
     if not bool(torch.isfinite(loss).all()):
         raise _breach(losses, "finite losses", str(loss.tolist()), "action_loss()")
@@ -175,9 +177,13 @@ def actions(subject: Subject) -> None:
     policy, batch = subject.build().eval(), subject.batch
     size = (SAMPLES, subject.config.chunk, subject.config.action_size)
     before = read(GENERATORS)
-    chunk = _act(policy, batch)
+    with _left_alone(actions, batch, "act()"):
+        chunk = _act(policy, batch)
     _check_shape(actions, chunk, size, "act()")
-    _check_shape(actions, policy.predict(batch), size, "predict()")
+    if chunk.dtype != torch.float32:
+        raise _breach(actions, "actions of type float32", str(chunk.dtype), "act()")
+    with _left_alone(actions, batch, "predict()"):
+        _check_shape(actions, policy.predict(batch), size, "predict()")
     again = _act(policy, batch)
     untouched = all(same(value, before[name]) for name, value in read(GENERATORS).items())
     if not (chunk.equal(again) and untouched):
@@ -235,6 +241,9 @@ def checkpoints(subject: Subject) -> None:
 def abilities(subject: Subject) -> None:
     """The policy has the abilities that it declares, and no others."""
     policy, batch = subject.build(), subject.batch
+    if not isinstance(subject.cls.abilities, frozenset | set):
+        expected = f'a set of texts, such as abilities = frozenset({{"{ABILITIES[0]}"}})'
+        raise _breach(abilities, expected, repr(subject.cls.abilities), "abilities")
     unknown = sorted(subject.cls.abilities - set(ABILITIES))
     if unknown:
         expected = f"abilities among {', '.join(ABILITIES)}"
@@ -287,6 +296,16 @@ def _breach(clause: Callable[[Subject], None], expected: str, found: str, look: 
 def _act(policy: Policy, batch: Batch) -> Tensor:
     """Return the actions (B, H, A) of a policy, asked as every run asks for them."""
     return policy.act(batch.state, batch.words, batch.noise, batch.image)
+
+
+@contextmanager
+def _left_alone(clause: Callable[[Subject], None], batch: Batch, look: str) -> Iterator[None]:
+    """Check that the code inside changes no tensor of a batch: a method may use it again."""
+    kept = copy.deepcopy(batch)
+    yield
+    for name, before in vars(kept).items():
+        if not same(getattr(batch, name), before):
+            raise _breach(clause, "its arguments to stay as they are", f"it changed {name} in place", look)
 
 
 def _check_shape(clause: Callable[[Subject], None], value: object, shape: tuple[int, ...], look: str) -> None:

@@ -204,7 +204,7 @@ def _last(value: float) -> Callable[[h5py.Group], None]:
 @pytest.mark.parametrize(
     ("edit", "message"),
     [
-        (_all, r"no demonstrations: the layout of robomimic and LIBERO has data/demo_0"),
+        (_all, r"no demonstrations: the layout of robomimic and LIBERO has data/demo_0, found data"),
         (_remove("demo_1/actions"), r"data/demo_1 has no 'actions'\..* It has \['dones', 'executed', "),
         (_remove("demo_1/dones"), r"data/demo_1 has no 'dones'"),
         (
@@ -247,6 +247,14 @@ def _last(value: float) -> Callable[[h5py.Group], None]:
         (_attribute("total", "unknown"), "total of data must be a whole number, not 'unknown'"),
         (_attribute("num_demos", 9), "data has num_demos 9, but 10 demonstrations"),
         (lambda data: data.copy("demo_0", "demo_00"), "data has both demo_0 and demo_00"),
+        (
+            lambda data: data.move("demo_1", "demo_1_retry"),
+            "data also holds demo_1_retry: call each",
+        ),
+        (
+            lambda data: data.move("demo_1", "Demo_1"),
+            "data also holds Demo_1: call each",
+        ),
         (_set("demo_0", h5py.SoftLink("/nowhere")), "data/demo_0 must be a group, not .* a broken link"),
         (_set("demo_0", h5py.ExternalLink("none.hdf5", "/data/demo_0")), "data/demo_0 must be a group"),
         *(
@@ -349,6 +357,13 @@ def test_a_file_of_another_format_is_named(tmp_path: Path) -> None:
     path.write_bytes(b"no HDF5")
     with pytest.raises(InputError, match=rf"{path} cannot be read as HDF5: it is damaged \(.* signature"):
         read_hdf5(path, TASK)
+
+
+def test_a_lerobot_dataset_is_named_as_one(tmp_path: Path) -> None:
+    (tmp_path / "meta").mkdir()
+    (tmp_path / "meta" / "info.json").write_text("{}")
+    with pytest.raises(InputError, match=f"^{tmp_path} is a LeRobotDataset, which clbench cannot read"):
+        read_hdf5(tmp_path, TASK)
 
 
 def test_attributes_that_say_nothing_are_no_fault(exported: Path) -> None:

@@ -153,6 +153,8 @@ def test_a_tie_is_no_flip() -> None:
 
 def test_a_reference_needs_its_own_name_and_the_same_seeds() -> None:
     assert from_matrix({"mine": TRIANGLE})["gain"].reason == "No method is called sft."
+    reason = from_matrix({"mine": TRIANGLE, "SFT": TRIANGLE})["gain"].reason
+    assert reason == "No method is called sft. Did you mean 'SFT'?"
     report = from_matrix({"mine": [TRIANGLE, TRIANGLE], "sft": TRIANGLE, "joint": [TRIANGLE, TRIANGLE]})
     assert report.of("gain", "mine").reason == "Method sft has no seed '0', no seed '1'."
     assert report.of("gain", "joint").value is None
@@ -169,6 +171,19 @@ def test_three_tenths_of_rates_up_to_1_leave_the_unit_in_doubt_and_fewer_do_not(
             from_matrix(matrix)
     else:
         assert from_matrix(matrix).unit == "percent"
+
+
+def test_shares_of_one_seed_or_of_one_task_in_a_table_of_per_cent_are_noticed() -> None:
+    percent = np.array([[80.0, 5.0, 10.0], [60.0, 70.0, 15.0], [50.0, 55.0, 90.0]])
+    seeds = np.stack([percent] * 5)
+    assert from_matrix(seeds).unit == "percent"
+    seeds[4] /= 100
+    with pytest.raises(InputError, match="and all rates of seed '4' are at most 1: is it a share"):
+        from_matrix(seeds)
+    percent = np.tile(percent, (1, 2))[:, :5]
+    percent[:, 1] /= 100
+    with pytest.raises(InputError, match="and all rates of task 'task 2' are at most 1: is it a share"):
+        from_matrix(percent, held_out=["task 4", "task 5"])
 
 
 def test_a_rate_of_3_is_per_cent_and_one_of_2_is_in_doubt() -> None:

@@ -72,6 +72,23 @@ def test_a_server_that_is_killed_and_started_again_is_found_again(
     assert f"Waiting for the policy at {address}" in caplog.text
 
 
+def test_a_server_that_comes_back_with_another_checkpoint_ends_the_stage() -> None:
+    checkpoints = iter(("stage-0", "stage-0", "stage-1"))
+
+    def handle(connection: ServerConnection) -> None:
+        connection.send(pack({"checkpoint": next(checkpoints), "config": "small"}))
+        connection.recv()
+        connection.send(pack({"actions": np.zeros((2, 3, 4), np.float32)}))
+
+    with answering(handle) as address:
+        served = ServedPolicy(address)
+        for _ in range(2):
+            assert served(OBSERVATIONS).shape == (2, 3, 4)
+            served.close()
+        with pytest.raises(InputError, match="came back as another one: its metadata differ in checkpoint"):
+            served(OBSERVATIONS)
+
+
 def test_nobody_at_the_address_is_an_error_that_says_what_to_do() -> None:
     with socket.create_server(("localhost", 0)) as free:
         port = free.getsockname()[1]

@@ -374,6 +374,15 @@ def test_a_server_that_says_the_same_as_in_the_stage_before_is_suspected(
     ]
 
 
+def test_a_policy_that_repeats_all_episodes_of_the_stage_before_is_suspected(
+    run: Callable[..., Record], caplog: pytest.LogCaptureFixture
+) -> None:
+    for stage, policy in ((0, Describing(0, {})), (1, Describing(0, {})), (2, Describing(2, {}))):
+        run(policy, stage)
+    (message,) = caplog.messages
+    assert message.endswith("ended as in stage 0, in equal steps: does the policy have the new checkpoint?")
+
+
 def test_a_checkpoint_that_was_scored_with_another_seed_is_no_second_training(
     run: Callable[..., Record], caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -120,6 +120,36 @@ class Detached(Base):
         return loss.detach() + 0 * loss
 
 
+class Meddling(Base):
+    """Changes the actions that it learns from; a second time they stay."""
+
+    def action_loss(self, batch: Batch, hidden: list[Tensor] | None = None) -> Tensor:
+        batch.action.clamp_(-0.1, 0.1)
+        return super().action_loss(batch, hidden)
+
+
+class Shifting(Base):
+    """Changes the state that it acts on."""
+
+    @torch.inference_mode()
+    def act(self, state: Tensor, words: Tensor, noise: Tensor, image: Tensor | None = None) -> Tensor:
+        return super().act(state.sub_(1.0), words, noise, image)
+
+
+class Rounded(Base):
+    """Acts with half the digits."""
+
+    @torch.inference_mode()
+    def act(self, state: Tensor, words: Tensor, noise: Tensor, image: Tensor | None = None) -> Tensor:
+        return super().act(state, words, noise, image).bfloat16()
+
+
+class Listing(Plain):
+    """Lists its abilities."""
+
+    abilities = ("answers",)  # type: ignore[assignment]
+
+
 class Restless(Base):
     """Acts at random."""
 
@@ -231,6 +261,9 @@ BROKEN: list[tuple[type[Policy], str, str]] = [
     (Padded, "losses", "does not depend on `valid`"),
     (Detached, "gradients", "none that is not 0"),
     (Restless, "actions", "draws from a global generator"),
+    (Meddling, "losses", "it changed action in place"),
+    (Shifting, "actions", "it changed state in place"),
+    (Rounded, "actions", "torch.bfloat16"),
     (Short, "actions", r"\(6, 8, 2\)\n  found:    \(6, 4, 2\)"),
     (ImageBlind, "actions", "TypeError: .*act.* takes 4 positional arguments but 5 were given"),
     (Batched, "losses", r"ValueError: Expected more than 1 value(.|\n)*look at:  chunk\(\)"),
@@ -239,6 +272,7 @@ BROKEN: list[tuple[type[Policy], str, str]] = [
     (Stubborn, "learning", "a loss of at most"),
     (Forgetful, "checkpoints", "a loaded policy acts otherwise"),
     (Boastful, "abilities", "telepathy"),
+    (Listing, "abilities", r"a set of texts, such as abilities = frozenset\(\{"),
     (Leaking, "abilities", "gradient outside of it"),
     (Wrong, "abilities", "another loss"),
     (Mute, "abilities", "vocabulary|shape"),
