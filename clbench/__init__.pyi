@@ -40,7 +40,7 @@ from .records.reader import read_record as read_record
 from .records.record import Record as Record
 from .runs.agents import evaluate_agent as evaluate_agent
 from .runs.agents import next_stage as next_stage
-from .runs.checkpoints import NoRoomError as NoRoomError
+from .runs.checkpoints import MachineError as MachineError
 from .runs.run import execute as execute
 from .runs.spec import RunSpec as RunSpec
 from .spec.budget import Budget as Budget

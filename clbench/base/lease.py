@@ -91,21 +91,26 @@ class Lease:
         Raises:
             LeaseLostError: Another process has it.
         """
-        if self._lock.compromise is not None:
+        if self._is_lost():
             raise LeaseLostError(
                 f"{self._file} was lost to another process: this one did not answer for {SECONDS:.0f} s."
             )
 
+    def _is_lost(self) -> bool:
+        """Return whether another process has the lease; the heartbeat alone notices it up to 20 s late."""
+        found = self._lock.owner
+        return self._lock.compromise is not None or (found is not None and found.token != self._lock.token)
+
     def release(self) -> None:
         """Give the lease back, if this process has it."""
-        if self._lock.is_locked:
+        if self._lock.is_locked and not self._is_lost():
             _report_path(self._path).unlink(missing_ok=True)
         self._lock.release()
 
     def report(self, share: float) -> None:
         """Tell others how far the work is, every `REPORT_SECONDS` at most."""
         now = time.monotonic()
-        if now - self._reported >= REPORT_SECONDS:
+        if now - self._reported >= REPORT_SECONDS and not self._is_lost():
             self._reported = now
             text = json.dumps(Report(share, now - self._begin))
             flags = os.O_WRONLY | os.O_CREAT | os.O_TRUNC | OPEN_PLAINLY  # a link leads to another file

@@ -67,11 +67,16 @@ def finished_name(name: str) -> str:
 
 
 def is_left_behind(path: Path) -> bool:
-    """Return whether the process that was making or removing `path` is gone."""
+    """Return whether the process that was making or removing `path` is gone.
+
+    A process of this machine that lives may be stopped, and lose its lease: it still has what it was making.
+    """
+    found = _UNFINISHED.fullmatch(path.name)
+    if found is not None and found["host"] == _host() and psutil.pid_exists(int(found["process"], 16)):
+        return False
     if not path.is_dir():
-        found = _UNFINISHED.fullmatch(path.name)
         if found is not None and found["host"] == _host():
-            return not psutil.pid_exists(int(found["process"], 16))
+            return True
         with contextlib.suppress(OSError):
             return time.time() - path.stat().st_mtime > FILE_SECONDS
         return False

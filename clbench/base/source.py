@@ -29,9 +29,10 @@ RUN_SOURCES = (*TRAINING_SOURCES, "clbench.records", "clbench.evaluation", "clbe
 def source_hash(*modules: str) -> str:
     """Return the hash of the source of `modules`.
 
-    A package counts with all files below it. Outside of clbench, what a module imports from beside it counts,
-    too, directly or through one another: files below the same folder on Python's path or, if the module is
-    installed, files of its own top-level package. Imports are read, not run.
+    A package counts with all files below it but hidden ones, such as those of editors. Outside of clbench,
+    what a module imports from beside it counts, too, directly or through one another: files below the same
+    folder on Python's path or, if the module is installed, files of its own top-level package. Imports are
+    read, not run.
 
     Args:
         modules: Names of modules and packages, in any order.
@@ -49,7 +50,8 @@ def source_hash(*modules: str) -> str:
         files = [origin]
         if origin.name == "__init__.py":
             # Python and numba keep what they compile there, and would change the key in the middle of a run
-            files = [one for one in sorted(origin.parent.rglob("*")) if one.parent.name != "__pycache__"]
+            below = sorted(origin.parent.rglob("*"))
+            files = [one for one in below if one.parent.name != "__pycache__" and one.name[0] != "."]
         for path in [*files, *_imported_beside(module, origin, files)]:
             if path.is_file():
                 digest.update(_file_hash(path, *_stamp(path)))

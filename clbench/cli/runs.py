@@ -107,7 +107,8 @@ def run(
 
     add_cwd_to_path()
     with checked_input():
-        check_device(device)
+        if ray is None:  # a cluster's workers may have a GPU that this machine lacks
+            check_device(device)
         if tensorboard:
             require_tensorboard()
         name = policy_name(policy, policy_size)

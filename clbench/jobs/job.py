@@ -41,6 +41,8 @@ class Job:
     meanwhile. None lets several do the job."""
     is_done: Callable[[], bool] | None = None
     """Returns whether another command has made the file."""
+    has_failed: Callable[[], bool] | None = None
+    """Returns whether another command did the job since this one began, and it failed."""
 
     def __str__(self) -> str:
         return self.title

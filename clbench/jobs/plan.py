@@ -9,7 +9,7 @@ from typing import Any
 
 from clbench.jobs import work
 from clbench.jobs.job import Job
-from clbench.jobs.recorded import has_record
+from clbench.jobs.recorded import has_failed, has_record
 from clbench.learning.pretraining import is_pretrained, vision_steps
 from clbench.records.paths import table_name
 from clbench.runs.length import point_length, run_length, training_length, watching_length
@@ -134,7 +134,14 @@ class Plan:
         title = _title(_place(run), title)
         job = Job(title, function, {**arguments}, length, needs, limits, run.spec.device, _pace(run))
         if records is not None:
-            job = replace(job, makes=run.path(records), is_done=lambda: has_record(run, records))
+            path = run.path(records)
+            before = _version(path)
+            job = replace(
+                job,
+                makes=path,
+                is_done=lambda: has_record(run, records),
+                has_failed=lambda: _version(path) != before and has_failed(run, records),
+            )
         self._runs.append(job)
         return job
 
@@ -208,6 +215,15 @@ class Plan:
             length = scenario.budget.demonstrations
             jobs[key] = Job(title, work.collect_demonstrations, arguments, length, self._first)
         return jobs[key]
+
+
+def _version(path: Path) -> tuple[int, int] | None:
+    """Return what changes when a file is written again, None if there is no file."""
+    try:
+        status = path.stat()
+    except OSError:
+        return None
+    return status.st_ino, status.st_mtime_ns
 
 
 def _pace(run: ResolvedRun) -> float:

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import itertools
 import os
 from pathlib import Path
 
 from clbench.base.errors import InputError
 from clbench.records.pinned import other_parts
-from clbench.records.reader import RecordError, read_record
+from clbench.records.reader import RecordError, UnreadableRecordError, read_record
 from clbench.records.record import Record
 from clbench.runs.spec import ResolvedRun
 from clbench.scoring.scores import Scores
@@ -24,14 +25,17 @@ def has_record(run: ResolvedRun, records: Path) -> bool:
 
     Raises:
         InputError: The record was made with another definition of the scenario.
+        UnreadableRecordError: A record that may count cannot be read now, or by this clbench.
     """
     path = run.path(records)
     try:
         record = read_record(path)
         Scores.from_record(record)
+    except UnreadableRecordError:
+        raise
     except RecordError:
         return False
-    if record.status != "success" or not has_settings_of(record, run) or not _same_code(record, run):
+    if record.status != "success" or not has_settings_of(record, run) or not has_code_of(record, run):
         return False
     _check_definition(record, run.published, path)
     return True
@@ -43,11 +47,23 @@ def has_settings_of(record: Record, run: ResolvedRun) -> bool:
     return (found, record.scenario) == (run.info, run.scenario_info)
 
 
+def has_failed(run: ResolvedRun, records: Path) -> bool:
+    """Return whether exactly this run has a record, and failed."""
+    try:
+        record = read_record(run.path(records))
+    except RecordError:
+        return False
+    return record.status == "failed" and has_settings_of(record, run) and has_code_of(record, run)
+
+
 def set_aside(run: ResolvedRun, records: Path) -> str | None:
     """Rename the record of a run if it is damaged, or of older code of its method, to do the run again.
 
     Returns:
         A sentence that says what was wrong and where the record is now; None if there is no such record.
+
+    Raises:
+        UnreadableRecordError: A record that may be sound cannot be read now, or by this clbench.
     """
     path = run.path(records)
     if not os.path.lexists(path):
@@ -56,19 +72,22 @@ def set_aside(run: ResolvedRun, records: Path) -> str | None:
         record = read_record(path)
         if record.status == "success":
             Scores.from_record(record)
+    except UnreadableRecordError:
+        raise
     except RecordError as error:
         fault, ending = str(error).removeprefix(f"{path}: ").rstrip("."), "damaged"
     else:
-        if record.status != "success" or _same_code(record, run):
+        if record.status != "success" or has_code_of(record, run):
             return None
         fault, ending = f"the code of {run.spec.method} has changed since", "old"
-    aside = path.with_name(f"{path.name}.{ending}")
+    names = (path.with_name(f"{path.name}.{ending}{number or ''}") for number in itertools.count())
+    aside = next(one for one in names if not os.path.lexists(one))
     with contextlib.suppress(FileNotFoundError):  # another command was faster
         path.replace(aside)
     return f"{path}: {fault}. It is set aside as {aside.name}, and the run is done again."
 
 
-def _same_code(record: Record, run: ResolvedRun) -> bool:
+def has_code_of(record: Record, run: ResolvedRun) -> bool:
     """Return whether a record is of the code that its method has now.
 
     Methods with a name of their own have versions; those of a module are work in progress.

@@ -9,8 +9,11 @@ from functools import cache
 from rich.console import Console
 
 from clbench.base import interrupts
+from clbench.base.errors import ClbenchError
 from clbench.jobs.bars import Bars
 from clbench.jobs.job import Job, Workers
+
+DONE, FAILED = "done by another command", "failed in another command"
 
 WAIT_SECONDS = 1.0
 """Seconds between two looks at jobs that other commands do."""
@@ -36,12 +39,16 @@ def run_jobs(jobs: Sequence[Job], workers: Workers, bars: Bars) -> dict[Job, str
         while waiting or started:
             interrupts.check()
             waiting = _drop_hopeless(waiting, failed)
-            for job in leases.take(_ready(waiting, succeeded), workers.free()):
+            for job, fault in leases.take(_ready(waiting, succeeded), workers.free()).items():
                 waiting.remove(job)
-                if job.is_done is not None and job.is_done():
-                    succeeded.add(job)
+                ending = fault or _ending(job)
+                if ending is not None:
                     leases.release(job)
-                    bars.skip(job, job.duration, "done by another command")
+                    if ending == DONE:
+                        succeeded.add(job)
+                    else:
+                        failed[job] = ending
+                    bars.skip(job, job.duration, ending)
                     continue
                 workers.start(job)
                 started[job] = time.monotonic()
@@ -72,6 +79,16 @@ def run_jobs(jobs: Sequence[Job], workers: Workers, bars: Bars) -> dict[Job, str
     return failed
 
 
+def _ending(job: Job) -> str | None:
+    """Return how a job ended elsewhere, or why that cannot be told; None if it is to be done."""
+    try:
+        if job.is_done is not None and job.is_done():
+            return DONE
+        return FAILED if job.has_failed is not None and job.has_failed() else None
+    except ClbenchError as error:
+        return str(error)
+
+
 class _Leases:
     """The leases of jobs that one command at a time may do."""
 
@@ -79,14 +96,20 @@ class _Leases:
         self._all = {job: lease for job in jobs if (lease := job.new_lease()) is not None}
         self._told = False
 
-    def take(self, ready: Iterable[Job], most: int) -> list[Job]:
-        """Take the leases of as many of the jobs as can be had, in their order, and return these jobs."""
-        taken: list[Job] = []
+    def take(self, ready: Iterable[Job], most: int) -> dict[Job, str | None]:
+        """Take the leases of as many of the jobs as can be had, in their order, and return these jobs.
+
+        Each comes with the fault of the file system that refused a lease, None where there is none.
+        """
+        taken: dict[Job, str | None] = {}
         for job in ready:
             if len(taken) >= most:  # a cluster that shrinks has fewer than none
                 break
-            if job not in self._all or self._all[job].take():
-                taken.append(job)
+            try:
+                if job not in self._all or self._all[job].take():
+                    taken[job] = None
+            except OSError as error:
+                taken[job] = f"its lease cannot be written: {error}"
         return taken
 
     def wait(self, waiting: Sequence[Job], bars: Bars) -> None:

@@ -44,6 +44,10 @@ class RecordError(ClbenchError, ValueError):
     """A file is not a record that can be read."""
 
 
+class UnreadableRecordError(RecordError):
+    """A record that may be sound cannot be read here: it is of a newer schema, or the file system refuses."""
+
+
 def read_record(path: Path | str) -> Record:
     """Read the record at `path`, which a stranger may have written.
 
@@ -58,7 +62,16 @@ def read_record(path: Path | str) -> Record:
     try:
         return _record(read_json(Path(path)))
     except (StrictJSONError, InputError, RecordError) as error:
-        raise RecordError(f"{path}: {error}") from error
+        kind = UnreadableRecordError if _may_be_sound(error) else RecordError
+        raise kind(f"{path}: {error}") from error
+
+
+def _may_be_sound(error: Exception) -> bool:
+    """Return whether an error in reading says nothing against the record itself."""
+    refused, nothing = error.__cause__, (FileNotFoundError, NotADirectoryError, IsADirectoryError)
+    return isinstance(error, UnreadableRecordError) or (
+        isinstance(refused, OSError) and not isinstance(refused, nothing)
+    )
 
 
 def home_of(run: RunInfo) -> Path:
@@ -87,7 +100,7 @@ def _record(values: Any) -> Record:
             f"{SCHEMA}, found {found}."
         )
     if schema > SCHEMA:
-        raise RecordError(f"is of schema {schema}, newer than {SCHEMA}: update clbench.")
+        raise UnreadableRecordError(f"is of schema {schema}, newer than {SCHEMA}: update clbench.")
     fields = {name: value for name, value in values.items() if name not in ("schema", "content")}
     if schema < SCHEMA:
         fields = to_present(fields, schema)

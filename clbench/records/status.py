@@ -13,7 +13,7 @@ from clbench.records.record import Record
 State = Literal["done", "running", "failed", "damaged", "to do"]
 
 
-OTHER_SETTINGS = "the record there has other settings or another budget: `clbench run` replaces it"
+OTHER_SETTINGS = "the record there has other settings, budget or code: `clbench run` replaces it"
 """Reason of a run that is to do although its place has a record."""
 
 

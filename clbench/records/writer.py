@@ -12,7 +12,7 @@ from clbench.base.errors import InputError
 from clbench.base.leftovers import replacing
 from clbench.base.strict_json import LONGEST_TEXT, check_json
 from clbench.records.content import content_hash
-from clbench.records.reader import RecordError, read_record
+from clbench.records.reader import RecordError, UnreadableRecordError, read_record
 from clbench.records.record import SCHEMA, Record
 
 LOG = logging.getLogger("clbench")
@@ -45,20 +45,22 @@ def write_record(record: Record, path: Path) -> None:
 
 
 def write_result(record: Record, path: Path) -> None:
-    """Write the record of a run, but leave the record of a run that succeeded if this one failed.
+    """Write the record of a run, but leave that of a run that succeeded, or may have, if this one failed.
 
     Raises:
         InputError: As for `write_record`.
     """
-    if record.status == "failed" and _has_succeeded(path):
-        LOG.warning("%s stays: it is of a run that succeeded, and the new one failed.", path)
+    if record.status == "failed" and _may_have_succeeded(path):
+        LOG.warning("%s stays: it is of a run that succeeded, or may be, and the new one failed.", path)
         return
     write_record(record, path)
 
 
-def _has_succeeded(path: Path) -> bool:
+def _may_have_succeeded(path: Path) -> bool:
     try:
         return read_record(path).status == "success"
+    except UnreadableRecordError:
+        return True
     except RecordError:
         return False
 

@@ -40,30 +40,35 @@ LOG = logging.getLogger("clbench")
 _NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EMFILE, errno.ENFILE)
 """Errors of a machine that has no room for a file, or none for an open one."""
 
+_FAILING = (errno.EIO, errno.ESTALE, errno.EROFS, errno.ETIMEDOUT, errno.EHOSTDOWN)
+"""Errors of a disk, or of the network to a shared folder."""
 
-class NoRoomError(ClbenchError, OSError):
-    """The machine had no room for a file, or too many open files, while a method ran."""
+
+class MachineError(ClbenchError, OSError):
+    """While a method ran, the machine had no room for a file, or its disk or network failed."""
 
 
-NOT_THE_METHOD = (CacheError, CheckpointError, LeaseLostError, NoRoomError, RenderingError)
+NOT_THE_METHOD = (CacheError, CheckpointError, LeaseLostError, MachineError, RenderingError)
 """Failures of the machine: a run can be done again, and leaves no record that blames its method."""
 
 
 @contextmanager
-def room_needed() -> Iterator[None]:
-    """Tell a machine without room apart from what a method inside does wrong.
+def machine_needed() -> Iterator[None]:
+    """Tell a failure of the machine apart from what a method inside does wrong.
 
     Raises:
-        NoRoomError: The machine has no room.
+        MachineError: The machine has no room, or its disk or network fails.
     """
     try:
         yield
     except OSError as error:
-        if error.errno not in _NO_ROOM:
+        if error.errno not in _NO_ROOM + _FAILING:
             raise
-        raise NoRoomError(
-            f"The machine has no room: {error}. The method is not to blame, and the run leaves no record: "
-            "make room, and repeat the command."
+        full = error.errno in _NO_ROOM
+        fault, mend = ("has no room", "make room") if full else ("failed", "mend it")
+        raise MachineError(
+            f"The machine {fault}: {error}. The method is not to blame, and the run leaves no record: "
+            f"{mend}, and repeat the command."
         ) from error
 
 
@@ -147,7 +152,7 @@ def make_stages(run: ResolvedRun, progress: ProgressCallback = no_progress) -> P
             )
 
         try:
-            with room_needed():
+            with machine_needed():
                 if number:
                     trainer.load(stage_folder(root, number - 1), number - 1)
                     steps = trainer.learn(number, after)

@@ -30,7 +30,7 @@ from clbench.records.paths import stage_folder
 from clbench.records.reader import read_record
 from clbench.records.record import Costs, Record
 from clbench.records.writer import check_diagnostics, write_record, write_result
-from clbench.runs.checkpoints import NOT_THE_METHOD, drop_stages, has_stages, keep_stage, room_needed
+from clbench.runs.checkpoints import NOT_THE_METHOD, drop_stages, has_stages, keep_stage, machine_needed
 from clbench.runs.fingerprint import fingerprint
 from clbench.runs.length import relearning_length, relearns, run_length
 from clbench.runs.relearning import relearn
@@ -68,7 +68,7 @@ def execute(
             record.
         CheckpointError: A checkpoint of this run cannot be read.
         LeaseLostError: Another process took the run over.
-        NoRoomError: The machine has no room for a file of the method, or too many open files.
+        MachineError: The machine has no room for a file of the method, or too many open files.
     """
     if tensorboard is not None:
         require_tensorboard()
@@ -184,7 +184,7 @@ class _Run:
         """Go through all stages without a checkpoint, and return the record."""
         self.record.timing["started"] = datetime.now(UTC).isoformat(timespec="seconds")
         try:
-            with room_needed():
+            with machine_needed():
                 self._go_through()
         except NOT_THE_METHOD:
             raise

@@ -86,6 +86,27 @@ def test_an_owner_learns_that_it_lost_its_lease(tmp_path: Path, monkeypatch: pyt
     lease.release()
 
 
+def test_an_owner_that_slept_learns_at_once_that_another_process_took_over(tmp_path: Path) -> None:
+    lease, path = Lease(tmp_path / "x"), tmp_path / "x"
+    assert lease.take()
+    mine = lease_path(path).read_text()
+    lease_path(path).unlink()
+    with subprocess.Popen(
+        [sys.executable, "-c", HOLD, str(path)], stdout=subprocess.PIPE, text=True
+    ) as other:
+        assert other.stdout is not None
+        assert other.stdout.readline() == "taken\n"
+        with pytest.raises(LeaseLostError, match=r"\.x\.lease was lost"):
+            lease.check()
+        lease.report(0.75)
+        lease.release()
+        assert lease_path(path).read_text() != mine
+        progress = Lease(path).progress
+        assert progress is not None
+        assert progress.share == 0.25
+        other.kill()
+
+
 def _check_for_a_while(lease: Lease) -> None:
     deadline = time.monotonic() + 20
     while time.monotonic() < deadline:

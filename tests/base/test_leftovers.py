@@ -61,6 +61,15 @@ def test_what_is_being_made_stays(tmp_path: Path) -> None:
     lease.release()
 
 
+def test_a_folder_that_a_living_process_of_this_machine_makes_stays_without_its_lease(tmp_path: Path) -> None:
+    with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as other:
+        name = unfinished(tmp_path / "x").name.replace(f"{os.getpid():08x}", f"{other.pid:08x}")
+        (tmp_path / name).mkdir()
+        assert sweep(tmp_path) == 0
+        other.kill()
+    assert sweep(tmp_path) == 1
+
+
 def test_an_unfinished_file_goes_at_once_if_its_process_is_dead(tmp_path: Path) -> None:
     code = "import sys; from pathlib import Path; from clbench.base.leftovers import unfinished; "
     code += "unfinished(Path(sys.argv[1])).touch()"

@@ -101,7 +101,7 @@ def test_a_change_of_a_file_below_a_package_changes_its_hash(
     assert source_hash("some_package") != before
 
 
-def test_what_python_and_numba_keep_of_compiled_code_does_not_change_a_hash(
+def test_what_python_numba_and_editors_keep_beside_code_does_not_change_a_hash(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     package = tmp_path / "some_compiled_package"
@@ -112,6 +112,7 @@ def test_what_python_and_numba_keep_of_compiled_code_does_not_change_a_hash(
     (package / "__pycache__").mkdir(exist_ok=True)
     for name in ("arm.cpython-311.pyc", "arm._drive-112.py311.nbi", "arm._drive-112.py311.1.nbc"):
         (package / "__pycache__" / name).write_bytes(b"compiled")
+    (package / ".arm.py.swp").write_bytes(b"edited")
     assert source_hash("some_compiled_package") == before
 
 

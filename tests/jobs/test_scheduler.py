@@ -16,6 +16,7 @@ from typing import Any
 import pytest
 from rich.console import Console
 
+from clbench.base.errors import InputError
 from clbench.jobs.bars import Bars
 from clbench.jobs.job import Event, Job
 from clbench.jobs.plan import Plan
@@ -111,6 +112,24 @@ def test_a_job_that_fails_or_is_killed_does_not_stop_the_others(bars: Bars) -> N
     assert "exit code -9" in failed["dead"]
     assert failed["hopeless"] == "left out, because dead failed"
     assert "fine: went well" in _printed(bars)
+
+
+def _damaged() -> bool:
+    raise InputError("the record cannot be read")
+
+
+def test_a_job_that_failed_elsewhere_or_cannot_be_judged_does_not_start_and_stops_no_other(
+    tmp_path: Path, bars: Bars
+) -> None:
+    (tmp_path / "file").touch()
+    places = {"failed": "a", "unreadable": "b", "locked out": "file/c", "fine": "d"}
+    jobs = {name: _claimed(name, tmp_path / place) for name, place in places.items()}
+    jobs["failed"] = dataclasses.replace(jobs["failed"], has_failed=lambda: True)
+    jobs["unreadable"] = dataclasses.replace(jobs["unreadable"], is_done=_damaged)
+    found = {job.title: reason for job, reason in run_jobs([*jobs.values()], Processes(1), bars).items()}
+    assert found.pop("locked out").startswith("its lease cannot be written: ")
+    assert found == {"failed": "failed in another command", "unreadable": "the record cannot be read"}
+    assert {path.name for path in tmp_path.iterdir()} <= {"d", "file", "some_jobs.py", "__pycache__"}
 
 
 def _claimed(title: str, makes: Path) -> Job:

@@ -3,6 +3,7 @@
 import contextlib
 import dataclasses
 import errno
+import json
 import os
 import resource
 import signal
@@ -20,11 +21,13 @@ from clbench.base import lease as leases
 from clbench.base.cache import CacheError, cache_folder
 from clbench.base.entry_points import resolve
 from clbench.base.lease import LeaseLostError
+from clbench.jobs.recorded import has_record, set_aside
 from clbench.learning.method import Method
 from clbench.policy.policy import Policy
-from clbench.records.reader import read_record
-from clbench.records.writer import write_record
-from clbench.runs.checkpoints import NoRoomError, make_stages
+from clbench.records.reader import UnreadableRecordError, read_record
+from clbench.records.record import SCHEMA
+from clbench.records.writer import write_record, write_result
+from clbench.runs.checkpoints import MachineError, make_stages
 from clbench.runs.run import execute
 from clbench.runs.spec import RunSpec
 from clbench.scoring.scores import Scores
@@ -167,11 +170,26 @@ def test_a_full_disk_is_not_the_methods_fault_and_leaves_no_record(
 ) -> None:
     spec = RunSpec(TOY, stranger(_Writes), seed=0)
     match = "The machine has no room: .*No space left on device: 'notes.txt'. The method is not to blame"
-    with pytest.raises(NoRoomError, match=match):
+    with pytest.raises(MachineError, match=match):
         execute(spec, tmp_path)
-    with pytest.raises(NoRoomError, match=match):
+    with pytest.raises(MachineError, match=match):
         make_stages(spec.resolve())
     assert not list(tmp_path.rglob("*.json"))
+
+
+@dataclasses.dataclass
+class _Reads(Method):
+    """A method that reads from a folder of another machine."""
+
+    def end_task(self, policy: Policy, stage: Any) -> None:
+        raise OSError(errno.ESTALE, os.strerror(errno.ESTALE), "data.pt")
+
+
+def test_a_failing_network_is_not_the_methods_fault(
+    tmp_path: Path, stranger: Callable[[type[Method]], str]
+) -> None:
+    with pytest.raises(MachineError, match=r"The machine failed: .*'data.pt'. The method is not to blame"):
+        execute(RunSpec(TOY, stranger(_Reads), seed=0), tmp_path)
 
 
 def test_a_method_that_exits_is_named_with_its_hook(
@@ -242,3 +260,31 @@ def test_a_damaged_record_is_named_set_aside_and_made_again(
     assert ("cannot be read as JSON" if damage == "torn" else "is missing at stage 2, step 60") in said
     assert path.with_name(f"{path.name}.damaged").read_bytes() == damaged
     assert Scores.from_record(read_record(path)).success.shape[0] == 3
+
+
+def test_a_record_of_a_newer_clbench_stays_where_it_is(
+    tmp_path: Path, stranger: Callable[[type[Method]], str]
+) -> None:
+    spec = RunSpec(TOY, "frozen", seed=0, targets=1)
+    path = spec.path(tmp_path)
+    path.parent.mkdir(parents=True)
+    path.write_text(json.dumps({"schema": SCHEMA + 1}))
+    newer = path.read_bytes()
+    for refuses in (has_record, set_aside):
+        with pytest.raises(UnreadableRecordError, match=f"newer than {SCHEMA}: update clbench"):
+            refuses(spec.resolve(), tmp_path)
+    failed = execute(RunSpec(TOY, stranger(_Raises), seed=0), tmp_path / "other")
+    assert failed.status == "failed"
+    write_result(failed, path)
+    assert path.read_bytes() == newer
+
+
+def test_records_that_are_set_aside_one_after_the_other_all_stay(tmp_path: Path) -> None:
+    spec = RunSpec(TOY, "frozen", seed=0, targets=1)
+    path = spec.path(tmp_path)
+    path.parent.mkdir(parents=True)
+    for text in ("first", "second", "third"):
+        path.write_text(text)
+        assert set_aside(spec.resolve(), tmp_path) is not None
+    names = (f"{path.name}.damaged{number}" for number in ("", "1", "2"))
+    assert [path.with_name(name).read_text() for name in names] == ["first", "second", "third"]
