@@ -1,5 +1,6 @@
 """The plan of runs: the lengths and paces of their jobs, and what runs share."""
 
+import dataclasses
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -10,7 +11,10 @@ from tiny import TINY
 
 from clbench.jobs.job import Job
 from clbench.jobs.plan import Plan
+from clbench.records.reader import read_record
+from clbench.records.writer import write_record
 from clbench.runs.length import run_length
+from clbench.runs.run import execute
 from clbench.runs.spec import RunSpec
 
 WATCHING = """
@@ -62,6 +66,35 @@ def test_a_pretraining_is_as_long_as_its_steps(tmp_path: Path, empty_caches: Pat
     plan.add_run(RunSpec(TINY.id, "sft", 0).resolve(), tmp_path)
     (job,) = (job for job in plan.jobs if "pretraining" in job.title)
     assert job.length == TINY.budget.pretraining_steps == 10
+
+
+FAILING = """
+import clbench
+from dataclasses import dataclass
+
+@dataclass
+class Failing(clbench.Method):
+    def prepare(self, policy, prior):
+        raise RuntimeError("no anchor")
+"""
+
+
+def test_a_run_that_failed_counts_as_failed_only_if_another_command_did_it_since(
+    tmp_path: Path, write_module: Callable[[str, str], None]
+) -> None:
+    write_module("failing_method", FAILING)
+    spec = RunSpec(TINY.id, "failing_method:Failing", 0)
+    assert execute(spec, tmp_path).status == "failed"
+    job = Plan().add_run(spec.resolve(), tmp_path)
+    assert job.has_failed is not None
+    assert not job.has_failed()
+    record = read_record(spec.path(tmp_path))
+    write_record(record, spec.path(tmp_path))
+    assert job.has_failed()
+    write_record(
+        dataclasses.replace(record, run=dataclasses.replace(record.run, device="cuda")), spec.path(tmp_path)
+    )
+    assert not job.has_failed()
 
 
 def test_runs_share_the_evaluation_of_a_start_only_if_it_is_the_same(
