@@ -315,7 +315,7 @@ def _what_would_show_it(judged: Sequence[Judged]) -> list[str]:
         for board, names in boards.items():
             claims.setdefault(listed(names), []).append(board)
         where = "; ".join(f"{names} on {listed(on)}" for names, on in claims.items())
-        sentences.append(f"What would show {where}: {change[0].lower()}{change[1:]}")
+        sentences.append(f"What would show {where}: {change[:1].lower()}{change[1:]}")
     return sentences
 
 
