@@ -276,7 +276,9 @@ def test_a_quiet_run_prints_failures_alone(
     with pytest.raises(SystemExit):
         app(["run", TOY, "loud:Broken", "--seeds", "1", "-q", "--records", str(tmp_path)])
     said = capsys.readouterr().err
-    assert said.startswith("Toy-v0 loud:Broken seed 0: failed in stage 1 (right): ValueError: no idea")
+    assert said.startswith(
+        "Toy-v0 loud:Broken seed 0: failed in loss() of stage 1 (right): ValueError: no idea"
+    )
 
 
 @pytest.mark.slow
@@ -315,7 +317,7 @@ def test_a_stranger_runs_a_class_from_the_working_directory_and_sees_it_on_the_b
     (tmp_path / "mine.py").write_text(METHOD)
     result = _clbench("run", TOY, "mine:Gentle", "mine:Broken", "sft", "--seeds", "1", folder=tmp_path)
     assert result.returncode == 1  # the broken one; the others went on
-    assert "mine:Broken seed 0: failed in stage 1 (right): ValueError: no idea" in result.stderr
+    assert "mine:Broken seed 0: failed in loss() of stage 1 (right): ValueError: no idea" in result.stderr
     assert "Traceback" not in result.stderr  # it is in the record
     assert "1 failed: Toy-v0 mine:Broken seed 0" in result.stderr
     records = sorted(

@@ -217,5 +217,7 @@ def test_a_state_that_cannot_be_read_again_is_refused_when_it_is_written(
 
 
 def test_the_error_of_a_failing_method_names_the_stage(stranger: Callable[[type[Method]], str]) -> None:
-    with pytest.raises(MethodError, match=r"failed in stage 1 \(right\): RuntimeError: cannot merge right"):
+    with pytest.raises(
+        MethodError, match=r"failed in end_task\(\) of stage 1 \(right\): RuntimeError: cannot merge right"
+    ):
         stage_policies(RunSpec(TINY.id, stranger(Stumbling), seed=0).resolve())
