@@ -40,7 +40,7 @@ without AVX-512.
 | `mujoco.rollout` | other bits, because it drops the solver's warm start | no |
 | observing Fetch's lanes while others still move | at most 5 %, because observing takes no more | no |
 | half steps of Fetch as work items for threads; fixed shares of lanes | 1 % faster; 7 % slower | no |
-| no geoms in LIBERO's physics that are only seen | 15 to 30 % more steps, 0.9 instead of 2.3 GB, the same bits | yes |
+| no geoms in LIBERO's physics that are only seen | 15 to 30 % faster, 0.9 of 2.3 GB, the same bits | yes |
 | Meta-World's rewards and observations in batches | 2 to 3.5 times the speed, the same bits | yes |
 | queues in C instead of an executor between threads | 2 to 4 % faster on Meta-World, no gain on Fetch | yes |
 | dm_control's rewards in batches, for the body where the bits agree | 1.4 times the speed | yes |
