@@ -40,6 +40,7 @@ class Peer:
     def reset(self, seed: int) -> State:
         """Begin both as our episodes begin, and return the first state."""
         state: State = self.episode.begin(seed)
+        self.episode.place()  # it began with a copy of the model if an earlier test used threads
         self.original._last_rand_vec = self.episode._last_rand_vec
         self.original.reset()
         check_start(self.episode, self.original, SLACK.get(self.task, 0.0))
