@@ -152,6 +152,12 @@ def _check_readable(path: Path) -> None:
         raise InputError(f"{path} cannot be read: {error.strerror}.") from error
 
 
+def _is_own_group(data: h5py.Group, name: str) -> bool:
+    """Return whether an entry is a group in this place, and no link to another one."""
+    is_here = isinstance(data.get(name, getlink=True), h5py.HardLink)
+    return is_here and data.get(name, getclass=True) is h5py.Group
+
+
 class _File:
     """An HDF5 file that is read for a task."""
 
@@ -171,9 +177,7 @@ class _File:
             raise self._error(
                 f"it has no demonstrations: the layout of robomimic and LIBERO has data/demo_0, found {there}"
             )
-        own = [name for name in names if isinstance(data.get(name, getlink=True), h5py.HardLink)]
-        groups = {name for name in own if data.get(name, getclass=True) is h5py.Group}
-        others = sorted(groups - {name for _, name in found})
+        others = sorted(name for name in names if _NAME.fullmatch(name) is None and _is_own_group(data, name))
         if others:
             raise self._error(
                 f"data also holds {', '.join(others[:5])}: call each demonstration demo_ and its number, or "

@@ -275,19 +275,13 @@ class ToyRun:
         except (TypeError, ValueError, KeyError) as error:
             found = type(parameters).__name__ if parameters is None else str(error)
             raise _unsound("start_task", SOUND["start_task"], found) from error
-        self._trained = [parameter for group in made for parameter in group["params"]]
-        if not self._trained and not self.uses.reference:
+        trained = [parameter for group in made for parameter in group["params"]]
+        if not trained and not self.uses.reference:
             expected = "parameters to train; only a reference, `uses = Uses(reference=True)`, may train none"
             raise _unsound("start_task", expected, "none")
-        if not all(one.requires_grad for one in self._trained):
+        if not all(one.requires_grad for one in trained):
             raise _unsound("start_task", "parameters that require a gradient", "one that does not")
         return groups
-
-    def _checked_gradients(self, result: Any) -> Any:
-        if all(parameter.grad is None for parameter in self._trained):
-            found = "no parameter that start_task() returned has a gradient"
-            raise ContractError("sound hooks", SOUND["gradients"], found, "gradients()")
-        return result
 
     def _checked_state(self, state: Any) -> Any:
         if not isinstance(state, dict):

@@ -11,6 +11,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, S
 from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
+from typing import TypeVar
 
 from clbench.base.text import counted, listed
 from clbench.records.paths import table_parts
@@ -34,6 +35,9 @@ from .agreements import after_correction, agreement_sentences
 from .findings_chart import gains_chart
 from .learning_rates import rate_lines, rate_sentences
 from .lost_skills import relearning_sentences
+
+Key = TypeVar("Key")
+Value = TypeVar("Value")
 
 FORGOTTEN_BY = "kept_share"
 """Metric by which policies are compared: the final average also counts what they knew and learned."""
@@ -261,10 +265,8 @@ def _claims(judged: Sequence[Judged]) -> Section:
         every = list(members)
         answers.append(f"{paper}: {tally(one.finding.verdict for one in every)}.{_those_that_hold(every)}")
     boards = tuple(dict.fromkeys(one.evidence.scenario for one in judged))
-    found: dict[Claim, dict[str, Judged]] = {}
-    for one in judged:
-        found.setdefault(one.claim, {})[one.evidence.scenario] = one
-    lines = tuple(_claim_line(claim, verdicts, boards) for claim, verdicts in found.items())
+    found = _grouped((one.claim, one) for one in judged)
+    lines = tuple(_claim_line(claim, members, boards) for claim, members in found.items())
     head = ("id", "claim", "first figure", *boards)
     answers += [*_explanations(judged), *_what_would_show_it(judged)]
     if lines:
@@ -275,17 +277,16 @@ def _claims(judged: Sequence[Judged]) -> Section:
     return Section("Which claims of the papers hold here?", tuple(answers), head, lines)
 
 
-def _claim_line(claim: Claim, verdicts: Mapping[str, Judged], boards: Sequence[str]) -> tuple[str, ...]:
+def _claim_line(claim: Claim, judged: Sequence[Judged], boards: Sequence[str]) -> tuple[str, ...]:
     """Return the cells of a claim: what is measured first, and on each board the verdict with its value."""
-    figures = [one.finding.figures[0] for one in verdicts.values() if one.finding.figures]
+    figures = [one.finding.figures[0] for one in judged if one.finding.figures]
     what = figures[0].what if figures else MISSING
-    return (claim.id, claim.words, what, *(_verdict_cell(verdicts.get(board), what) for board in boards))
+    cells = {one.evidence.scenario: _verdict_cell(one, what) for one in judged}
+    return (claim.id, claim.words, what, *(cells.get(board, "") for board in boards))
 
 
-def _verdict_cell(one: Judged | None, what: str) -> str:
+def _verdict_cell(one: Judged, what: str) -> str:
     """Return a verdict with the value of its first figure, if that is the figure `what`."""
-    if one is None:
-        return ""
     shown = [figure for figure in one.finding.figures[:1] if figure.what == what]
     return ": ".join(
         [one.finding.verdict, *(format_interval(figure.estimate, figure.form) for figure in shown)]
@@ -294,36 +295,41 @@ def _verdict_cell(one: Judged | None, what: str) -> str:
 
 def _explanations(judged: Sequence[Judged]) -> list[str]:
     """Return the last conclusion from the figures and controls of each verdict that is a yes or a no."""
-    told: dict[tuple[str, str], list[str]] = {}
-    for one in judged:
-        if one.finding.verdict in ("holds", "holds in part", "does not hold"):
-            for sentence in one.finding.sentences[-1:]:
-                told.setdefault((one.claim.id, sentence), []).append(one.evidence.scenario)
+    told = _grouped(
+        ((one.claim.id, sentence), one.evidence.scenario)
+        for one in judged
+        if one.finding.verdict in ("holds", "holds in part", "does not hold")
+        for sentence in one.finding.sentences[-1:]
+    )
     return [f"{claim} on {listed(boards)}: {sentence}" for (claim, sentence), boards in told.items()]
 
 
 def _what_would_show_it(judged: Sequence[Judged]) -> list[str]:
     """Return a sentence for each thing that boards lack to show some claims."""
-    lacking: dict[str, dict[str, list[str]]] = {}
-    for one in judged:
-        if one.finding.verdict == "cannot be shown here":
-            boards = lacking.setdefault(one.finding.change, {})
-            boards.setdefault(one.evidence.scenario, []).append(one.claim.id)
-    sentences = []
-    for change, boards in lacking.items():
-        claims: dict[str, list[str]] = {}
-        for board, names in boards.items():
-            claims.setdefault(listed(names), []).append(board)
-        where = "; ".join(f"{names} on {listed(on)}" for names, on in claims.items())
-        sentences.append(f"What would show {where}: {change[:1].lower()}{change[1:]}")
-    return sentences
+    claims = _grouped(
+        ((one.finding.change, one.evidence.scenario), one.claim.id)
+        for one in judged
+        if one.finding.verdict == "cannot be shown here"
+    )
+    boards = _grouped(((change, listed(names)), board) for (change, board), names in claims.items())
+    places = _grouped((change, f"{names} on {listed(on)}") for (change, names), on in boards.items())
+    return [
+        f"What would show {'; '.join(where)}: {change[:1].lower()}{change[1:]}"
+        for change, where in places.items()
+    ]
+
+
+def _grouped(pairs: Iterable[tuple[Key, Value]]) -> dict[Key, list[Value]]:
+    """Return the values of each key, in their order."""
+    found: dict[Key, list[Value]] = {}
+    for key, value in pairs:
+        found.setdefault(key, []).append(value)
+    return found
 
 
 def _those_that_hold(judged: Sequence[Judged]) -> str:
     """Return in a sentence which claims hold: some are about plain fine-tuning, costs, or algebra."""
-    boards: dict[Claim, list[bool]] = {}
-    for one in judged:
-        boards.setdefault(one.claim, []).append(one.finding.verdict in ("holds", "holds in part"))
+    boards = _grouped((one.claim, one.finding.verdict in ("holds", "holds in part")) for one in judged)
     words = [
         f"{claim.id}, {claim.words.rstrip('.')} (on {sum(held)} of {counted(len(held), 'board')})"
         for claim, held in boards.items()

@@ -12,7 +12,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import pytest
 from tiny import TINY
@@ -161,35 +161,37 @@ def test_an_interrupt_is_the_methods_where_ctrl_c_is_ignored_and_the_users_elsew
 class _Writes(Method):
     """A method that writes where there is no room."""
 
+    _fault: ClassVar[tuple[int, str]] = errno.ENOSPC, "notes.txt"
+
     def end_task(self, policy: Policy, stage: Any) -> None:
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "notes.txt")
+        number, name = self._fault
+        raise OSError(number, os.strerror(number), name)
 
 
-def test_a_full_disk_is_not_the_methods_fault_and_leaves_no_record(
-    tmp_path: Path, stranger: Callable[[type[Method]], str]
+@dataclasses.dataclass
+class _Reads(_Writes):
+    """A method that reads from a folder of another machine."""
+
+    _fault: ClassVar[tuple[int, str]] = errno.ESTALE, "data.pt"
+
+
+@pytest.mark.parametrize(
+    ("cls", "fault"),
+    [
+        (_Writes, "The machine has no room: .*No space left on device: 'notes.txt'"),
+        (_Reads, "The machine failed: .*'data.pt'"),
+    ],
+)
+def test_a_full_disk_or_a_failing_network_is_not_the_methods_fault_and_leaves_no_record(
+    tmp_path: Path, stranger: Callable[[type[Method]], str], cls: type[Method], fault: str
 ) -> None:
-    spec = RunSpec(TOY, stranger(_Writes), seed=0)
-    match = "The machine has no room: .*No space left on device: 'notes.txt'. The method is not to blame"
+    spec = RunSpec(TOY, stranger(cls), seed=0)
+    match = f"{fault}. The method is not to blame"
     with pytest.raises(MachineError, match=match):
         execute(spec, tmp_path)
     with pytest.raises(MachineError, match=match):
         make_stages(spec.resolve())
     assert not list(tmp_path.rglob("*.json"))
-
-
-@dataclasses.dataclass
-class _Reads(Method):
-    """A method that reads from a folder of another machine."""
-
-    def end_task(self, policy: Policy, stage: Any) -> None:
-        raise OSError(errno.ESTALE, os.strerror(errno.ESTALE), "data.pt")
-
-
-def test_a_failing_network_is_not_the_methods_fault(
-    tmp_path: Path, stranger: Callable[[type[Method]], str]
-) -> None:
-    with pytest.raises(MachineError, match=r"The machine failed: .*'data.pt'. The method is not to blame"):
-        execute(RunSpec(TOY, stranger(_Reads), seed=0), tmp_path)
 
 
 def test_a_method_that_exits_is_named_with_its_hook(
