@@ -72,10 +72,11 @@ def is_left_behind(path: Path) -> bool:
     A process of this machine that lives may be stopped, and lose its lease: it still has what it was making.
     """
     found = _UNFINISHED.fullmatch(path.name)
-    if found is not None and found["host"] == _host() and psutil.pid_exists(int(found["process"], 16)):
+    made_here = found is not None and found["host"] == _host()
+    if found is not None and made_here and psutil.pid_exists(int(found["process"], 16)):
         return False
     if not path.is_dir():
-        if found is not None and found["host"] == _host():
+        if made_here:
             return True
         with contextlib.suppress(OSError):
             return time.time() - path.stat().st_mtime > FILE_SECONDS

@@ -65,12 +65,15 @@ def place_of(error: BaseException, place: str) -> str:
     """Return a place in a run with the hook that raised an error, such as "loss() of stage 1 (push)".
 
     Args:
-        error: The error, with its traceback.
+        error: The error, with its traceback and those of the errors that caused it.
         place: What ran: a stage, or a hook.
     """
-    for frame, _ in walk_tb(error.__traceback__):
-        hook = frame.f_code.co_name
-        if hook in HOOKS and isinstance(frame.f_locals.get("self"), Method):
-            called = place.partition(" ")[0].removesuffix("()") == hook
-            return place if called else f"{hook}() of {place}"
+    cause: BaseException | None = error
+    while cause is not None:
+        for frame, _ in walk_tb(cause.__traceback__):
+            hook = frame.f_code.co_name
+            if hook in HOOKS and isinstance(frame.f_locals.get("self"), Method):
+                called = place.partition(" ")[0].removesuffix("()") == hook
+                return place if called else f"{hook}() of {place}"
+        cause = cause.__cause__
     return place

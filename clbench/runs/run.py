@@ -68,7 +68,7 @@ def execute(
             record.
         CheckpointError: A checkpoint of this run cannot be read.
         LeaseLostError: Another process took the run over.
-        MachineError: The machine has no room for a file of the method, or too many open files.
+        MachineError: The machine has no room for a file of the method, or its disk or network fails.
     """
     if tensorboard is not None:
         require_tensorboard()

@@ -199,7 +199,7 @@ def test_a_method_that_exits_is_named_with_its_hook(
 ) -> None:
     record = execute(RunSpec(TOY, stranger(_Exits), seed=0), tmp_path)
     assert record.error is not None
-    assert record.error["where"] == "stage 1 (right)"
+    assert record.error["where"] == "end_task() of stage 1 (right)"
     assert record.error["message"] == "The hook raised SystemExit(3)."
 
 
