@@ -2,7 +2,7 @@
 
 A skill that comes back within a few steps was hidden rather than lost. All methods are measured alike: a copy
 of the final policy is fine-tuned with all its parameters, adapters included, at the scenario's learning rate,
-until it meets the criterion of the stages.
+until it meets the criterion of the stages. Only what the policy's own class freezes stays frozen.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from clbench.learning.optimise import MethodError
 from clbench.learning.prior import Prior, Source
 from clbench.learning.registry import load_method
 from clbench.learning.trainer import Trainer
+from clbench.policy.policy import Policy
 from clbench.records.record import Relearning
 from clbench.spec.protocol import Point
 from clbench.spec.references import BASELINE
@@ -48,10 +49,20 @@ def relearn(
     return Relearning(skill, successes[skill], steps, met)
 
 
+def _trainable(policy: Policy, pretrained: Policy) -> Policy:
+    """Return a copy of a policy that trains all but what its own class freezes, such as an image encoder."""
+    frozen = {name for name, one in pretrained.named_parameters() if not one.requires_grad}
+    policy = copy.deepcopy(policy)
+    for name, parameter in policy.named_parameters():
+        # peft moves the weights of a layer with an adapter to `base_layer`
+        parameter.requires_grad_(name.replace(".base_layer.", ".") not in frozen)
+    return policy
+
+
 def _regain(trainer: Trainer, skill: Task, checker: Checker, progress: ProgressCallback) -> tuple[int, bool]:
     """Fine-tune a copy of the policy on a skill; return the steps done, and whether it met the criterion."""
     budget, seed, number = trainer.scenario.budget, trainer.seed, len(trainer.scenario.target) + 1
-    policy = copy.deepcopy(trainer.policy).requires_grad_(True)
+    policy = _trainable(trainer.policy, trainer.pretrained)
     generator = torch_generator("relearning", seed)
     source = Source(trainer.data.demonstrations(skill), generator, budget.batch_size, trainer.device)
     stage = Stage(

@@ -4,6 +4,7 @@ import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -140,6 +141,34 @@ def test_adapters_are_relearned_with_all_that_they_adapt(tmp_path: Path) -> None
     first, *_, last = stage_policies(spec.resolve(), tmp_path / "kept")
     for (name, before), after in zip(first.named_parameters(), last.parameters(), strict=True):
         assert ("lora_" in name) or torch.equal(before, after), name
+
+
+@pytest.mark.parametrize("method", ["sft", "lora"])
+def test_what_a_policy_freezes_stays_frozen_in_relearning(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, method: str
+) -> None:
+    made, loss = TransformerPolicy.__init__, TransformerPolicy.action_loss
+    frozen: list[set[str]] = []
+
+    def half_frozen(self: TransformerPolicy, *args: Any, **kwargs: Any) -> None:
+        made(self, *args, **kwargs)
+        self.backbone_layers[0].requires_grad_(False)
+
+    def watched(self: TransformerPolicy, *args: Any, **kwargs: Any) -> torch.Tensor:
+        frozen.append({name for name, one in self.named_parameters() if not one.requires_grad})
+        return loss(self, *args, **kwargs)
+
+    monkeypatch.setattr(TransformerPolicy, "__init__", half_frozen)
+    monkeypatch.setattr(TransformerPolicy, "action_loss", watched)
+    spec = RunSpec(EAGER.id, method, seed=0)
+    record = execute(spec, tmp_path)
+    assert record.relearning is not None
+    assert record.relearning.steps > 0
+    policy = stage_policies(spec.resolve())[-1]
+    layer = {id(one) for one in policy.backbone_layers[0].parameters()}
+    of_layer = {name for name, one in policy.named_parameters() if id(one) in layer}
+    assert {name for name in of_layer if "lora_" not in name} in frozen
+    assert set() not in frozen
 
 
 class Broken(TransformerPolicy):
