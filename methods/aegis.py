@@ -11,8 +11,8 @@ Details:
    tokens except padding. Mean and deviation are kept per channel: the paper writes "means and variances" of a
    layer, and its distance is exact for diagonal Gaussians.
 2. The hidden state is the output of each backbone layer. The statistics of a step come from its batch.
-3. The block of a layer holds all its weights. Weights outside the backbone's layers (embeddings, action head,
-   answer head) keep the loss's gradient.
+3. The block of a layer holds all weights that it trains. Weights outside the backbone's layers (embeddings,
+   action head, answer head) keep the loss's gradient.
 4. The paper adds eps to the norm, which leaves a small negative product. Here the division is exact, and an
    anchor gradient of norm 0 does not change the block.
 5. The distance is summed over channels and averaged over layers. Its scale cancels out of the projection.
@@ -31,6 +31,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from clbench.base.errors import InputError
 from clbench.learning.method import Metadata, Method, MethodState, Progress, Stage
 from clbench.learning.prior import Prior, Uses
 from clbench.policy.activations import Gaussian
@@ -61,6 +62,11 @@ class Aegis(Method):
     @torch.no_grad()
     def prepare(self, policy: Policy, prior: Prior) -> None:
         """Compute the anchor."""
+        if not any(one.requires_grad for layer in policy.backbone_layers for one in layer.parameters()):
+            raise InputError(
+                f"aegis projects gradients in the backbone, and {type(policy).__name__} freezes all of its "
+                "layers. Nothing is left to project: leave aegis out."
+            )
         questions = prior.questions.sample(self.samples)
         hidden = policy.hidden_states(questions.state, questions.words, questions.image)
         self.anchor = Gaussian.of(hidden, policy.token_mask(questions.words))
@@ -81,7 +87,10 @@ class Aegis(Method):
 
     def gradients(self, policy: Policy, loss: Tensor) -> None:
         """Set the gradients of the loss, projected in the backbone's layers."""
-        blocks = [list(layer.parameters()) for layer in policy.backbone_layers]
+        layers = [
+            [one for one in layer.parameters() if one.requires_grad] for layer in policy.backbone_layers
+        ]
+        blocks = [layer for layer in layers if layer]
         weights = [weight for block in blocks for weight in block]
         away = iter(
             torch.autograd.grad(self.distances[-1], weights, retain_graph=True, materialize_grads=True)

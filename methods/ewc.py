@@ -79,12 +79,12 @@ class EWC(Method):
 
 def fisher_information(policy: Policy, source: Source[Batch], samples: int) -> Weights:
     """Return the mean squared gradient over `samples` losses, for each weight by name; 0 if none."""
-    names, weights = zip(*policy.named_parameters(), strict=True)
-    squares = [torch.zeros_like(weight) for weight in weights]
+    squares = {name: torch.zeros_like(weight) for name, weight in policy.named_parameters()}
+    trained = {name: weight for name, weight in policy.named_parameters() if weight.requires_grad}
     for _ in range(samples):
         loss = policy.action_loss(source.sample(1)).mean()
-        found = torch.autograd.grad(loss, weights, allow_unused=True)
-        for square, gradient in zip(squares, found, strict=True):
+        found = torch.autograd.grad(loss, list(trained.values()), allow_unused=True)
+        for name, gradient in zip(trained, found, strict=True):
             if gradient is not None:
-                square.addcmul_(gradient, gradient, value=1 / samples)
-    return dict(zip(names, squares, strict=True))
+                squares[name].addcmul_(gradient, gradient, value=1 / samples)
+    return squares

@@ -27,6 +27,8 @@ from clbench.policy.policy import Policy
 
 from ._requirements import in_range, one_of
 
+PAST_ADAPTERS = (nn.MultiheadAttention, nn.TransformerEncoderLayer)
+"""Modules of PyTorch whose fast paths hand the weights of their linear maps to one fused function."""
 VARIANTS = ("lora", "dora", "rslora")
 
 
@@ -64,6 +66,13 @@ class LoRA(Method):
             for name, module in policy.named_modules()
             if isinstance(module, nn.Linear) and "layers" in name.split(".")
         ]
+        for name in linear:
+            owner = policy.get_submodule(name.rpartition(".")[0])
+            if isinstance(owner, PAST_ADAPTERS):
+                raise InputError(
+                    f"lora would change nothing in {name}: {type(owner).__name__} reads its weights past the "
+                    "adapters. Write attention with nn.Linear maps, or leave lora out."
+                )
         if not linear:
             raise InputError(
                 f"lora needs linear maps inside modules that are called `layers`; {type(policy).__name__} "

@@ -12,6 +12,7 @@ from helpers import build_method
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from clbench.base.errors import InputError
 from clbench.learning.adaptation import adapt
 from clbench.learning.method import Progress, Stage
 from clbench.learning.prior import Prior
@@ -75,6 +76,14 @@ def _set(policy: Policy) -> dict[str, NDArray[np.float64]]:
         name: (torch.zeros_like(weight) if weight.grad is None else weight.grad).double().numpy()
         for name, weight in policy.named_parameters()
     }
+
+
+def test_a_policy_with_a_frozen_backbone_is_refused() -> None:
+    policy, method = TransformerPolicy(CONFIG), build_method("aegis", {"samples": 3})
+    for layer in policy.backbone_layers:
+        layer.requires_grad_(False)
+    with pytest.raises(InputError, match="TransformerPolicy freezes all of its layers"):
+        method.prepare(policy, Prior({"questions": toy_questions(3)}))
 
 
 def test_the_anchor_is_the_gaussian_of_the_questions_that_prepare_draws() -> None:

@@ -166,6 +166,28 @@ def test_a_policy_without_layers_is_refused_with_what_to_do() -> None:
         method.prepare(_Flat(), Prior({}))
 
 
+class _Fused(TransformerPolicy):
+    """A policy with PyTorch's own layers, which read the weights of their linear maps themselves."""
+
+    def __init__(self, layer: nn.Module) -> None:
+        super().__init__(SMALL)
+        self.encoder = nn.ModuleDict({"layers": nn.ModuleList([layer])})
+
+
+@pytest.mark.parametrize(
+    ("layer", "place"),
+    [
+        (nn.TransformerEncoderLayer(8, 2), r"encoder\.layers\.0\.self_attn\.out_proj: MultiheadAttention"),
+        (nn.MultiheadAttention(8, 2), r"encoder\.layers\.0\.out_proj: MultiheadAttention"),
+    ],
+)
+def test_a_layer_that_reads_its_weights_past_the_adapters_is_refused(layer: nn.Module, place: str) -> None:
+    policy, method = _Fused(layer), build_method("lora", {})
+    with pytest.raises(InputError, match=f"lora would change nothing in {place} reads its weights past"):
+        method.prepare(policy, Prior({}))
+    assert not any("lora_" in name for name, _ in policy.named_parameters())
+
+
 def test_a_wrong_variant_is_told_the_nearest_one() -> None:
     with pytest.raises(ValueError, match=r"one of lora, dora, rslora, not 'doar'\. Did you mean 'dora'"):
         build_method("lora", {"variant": "doar"})

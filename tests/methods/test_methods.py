@@ -9,15 +9,18 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from helpers import build_method
+import torch
+from helpers import build_method, weights_of
 from torch import nn
 
 import clbench.testing
+from clbench.learning.adaptation import adapt
 from clbench.learning.method import Method, Stage
 from clbench.learning.prior import Access, Prior, Source, UndeclaredAccessError, Uses
 from clbench.learning.registry import load_method, method_names
 from clbench.policy.batch import Batch
 from clbench.policy.policy import Policy
+from clbench.policy.transformer import TransformerPolicy
 from clbench.records.record import Record
 from clbench.runs.run import execute
 from clbench.runs.spec import RunSpec
@@ -26,6 +29,8 @@ from clbench.scoring.scores import Scores
 from clbench.spec.identifiers import built_in_methods
 from clbench.spec.policies import DEFAULT_POLICY, POLICIES
 from clbench.testing import check_method
+from clbench.testing.small import SMALL, toy_questions, toy_source
+from clbench.testing.toy import TOY as SCENARIO
 
 TOY = "clbench.testing:clbench/Toy-v0"
 METHODS = ("sft", "experience_replay", "joint", "frozen", "from_scratch")
@@ -96,6 +101,21 @@ OF_THE_KIND = ("aegis", "lora", "lwf", "stop_gradient")
 )
 def test_every_method_keeps_the_contract_with_every_policy(name: str, policy: str) -> None:
     check_method(load_method(name), policy=policy, **FEWER.get(name, {}))
+
+
+@pytest.mark.parametrize("name", sorted({*method_names()} - {"from_scratch"}))  # which starts anew
+def test_what_a_policy_freezes_stays_frozen(name: str) -> None:
+    policy, method = TransformerPolicy(SMALL), build_method(name, FEWER.get(name, {}))
+    policy.backbone_layers[0].requires_grad_(False)
+    prior = Prior({"demonstrations": toy_source("left"), "questions": toy_questions()})
+    method.prepare(policy, prior)
+    frozen = {id(one) for one in policy.backbone_layers[0].parameters() if not one.requires_grad}
+    names = {key for key, one in policy.named_parameters() if id(one) in frozen and "lora_" not in key}
+    before = weights_of(policy)
+    adapt(policy, method, Stage(1, SCENARIO.task("right"), 0, 3, toy_source("right"), prior), SCENARIO.budget)
+    after = weights_of(policy)
+    assert {key for key, weight in before.items() if not torch.equal(after[key], weight)}.isdisjoint(names)
+    assert names
 
 
 @pytest.mark.parametrize("name", method_names())
