@@ -52,10 +52,13 @@ def hash_of(values: Any) -> str:
 
 def hash_of_tensors(tensors: Mapping[str, Tensor]) -> str:
     """Return a short hash of the names and the bits of tensors."""
+    import torch  # takes a second to import
+
     digest = hashlib.sha256()
     for name, value in sorted(tensors.items()):
         digest.update(f"{name} {value.dtype} {tuple(value.shape)}".encode())
-        digest.update(value.detach().cpu().contiguous().numpy().tobytes())
+        # as bytes: NumPy has no bfloat16
+        digest.update(value.detach().cpu().contiguous().reshape(-1).view(torch.uint8).numpy().tobytes())
     return digest.hexdigest()[:16]
 
 

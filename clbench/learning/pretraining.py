@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import functools
 import logging
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -11,7 +12,7 @@ from typing import Any
 
 from torch import Tensor
 
-from clbench.base.cache import cache_folder, cached, fault_of, hash_of, is_cached
+from clbench.base.cache import cache_folder, cached, fault_of, hash_of, hash_of_tensors, is_cached
 from clbench.base.dependencies import versions
 from clbench.base.entry_points import resolve
 from clbench.base.progress import ProgressCallback, no_progress
@@ -22,7 +23,7 @@ from clbench.data.questions import Questions, load_questions
 from clbench.learning.optimise import deterministic, optimise
 from clbench.learning.vision_pretraining import STEPS_SHARE, pictures_of, pretrain_vision
 from clbench.policy.checkpoint import load_policy, save_policy
-from clbench.policy.kinds import new_policy
+from clbench.policy.kinds import new_policy, policy_class
 from clbench.policy.policy import Policy, PolicyConfig
 from clbench.policy.vision import Vision
 from clbench.spec.identifiers import folder_name
@@ -69,9 +70,24 @@ def pretraining_inputs(scenario: Scenario, seed: int) -> dict[str, Any]:
         "policy": scenario.policy,
         "frame": frame_hash(scenario.scene_tasks[0]),
         "source": source_hash(*TRAINING_SOURCES, *suites),
+        **_own_weights(scenario, seed),
         # a label such as torch's +cpu names other abilities of a build; pretraining does not use them
         "versions": {name: version.partition("+")[0] for name, version in installed.items()},
     }
+
+
+def _own_weights(scenario: Scenario, seed: int) -> dict[str, str]:
+    """Return the hash of the weights that a class of policies brings, nothing if clbench trains them.
+
+    They may lie in a file that no source names, and that somebody replaces.
+    """
+    cls = policy_class(kind_of(scenario.policy))
+    return {"weights": _weights_hash(cls, policy_config(scenario), seed)} if cls.pretrained else {}
+
+
+@functools.lru_cache(maxsize=16)  # a run asks at every stage, and a large policy takes seconds to load
+def _weights_hash(cls: type[Policy], config: PolicyConfig, seed: int) -> str:
+    return hash_of_tensors(cls(config, derive_seed("weights", seed)).state_dict())
 
 
 def shipped_folder(scenario: Scenario, seed: int) -> Path:

@@ -2,8 +2,9 @@ import logging
 from pathlib import Path
 
 import pytest
+import torch
 
-from clbench.base.cache import CacheError, cached, is_cached
+from clbench.base.cache import CacheError, cached, hash_of_tensors, is_cached
 
 INPUTS = {"seed": 0}
 
@@ -81,3 +82,19 @@ def test_a_file_that_a_maker_lacks_is_not_called_an_error_of_the_cache(tmp_path:
     with pytest.raises(FileNotFoundError, match=r"asset\.xml"):
         cached(tmp_path / "cache" / "result", {}, lambda _: asset.open().close())
     assert not (tmp_path / "cache" / "result").exists()
+
+
+def test_the_hash_of_tensors_tells_names_shapes_types_and_bits_apart() -> None:
+    value = torch.tensor([1.0, -0.0])
+    others = [
+        {"b": value},
+        {"a": value[None]},
+        {"a": value.bfloat16()},
+        {"a": torch.tensor([1.0, 0.0])},
+        {"a": torch.tensor([1.0, 0.0]).bfloat16()},
+        {"a": value[1]},
+        {"a": value > 0},
+    ]
+    hashes = [hash_of_tensors(one) for one in ({"a": value}, *others)]
+    assert len(set(hashes)) == len(hashes)
+    assert hash_of_tensors({"a": torch.tensor([[1.0, 2.0], [-0.0, 3.0]]).T[0]}) == hashes[0]

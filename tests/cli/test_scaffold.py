@@ -9,9 +9,11 @@ from pathlib import Path
 import pytest
 from verification import failures, verify
 
+from clbench import load_scenario
 from clbench.base.errors import InputError
 from clbench.cli.main import app
 from clbench.cli.scaffold import class_name, write_method, write_policy
+from clbench.learning.pretraining import pretrained_policy
 from clbench.learning.registry import load_method
 from clbench.records.reader import read_record
 from clbench.runs.run import execute
@@ -113,6 +115,38 @@ def test_a_record_of_a_fresh_policy_is_replayed_only_if_the_verifier_names_it(
     words = failures(verify(path, "replayed", tmp_path))
     assert f"{fresh_policy} is not installed: name it with --policy to import and run its code" in words
     assert failures(verify(path, "replayed", tmp_path, policy=fresh_policy)) == ""
+
+
+OWN = """
+from pathlib import Path
+
+import torch
+from fresh_policy import FreshPolicy
+
+
+class Own(FreshPolicy):
+    pretrained = True
+
+    def __init__(self, config, seed=0):
+        super().__init__(config, seed)
+        value = float(Path(__file__).with_name("weights.txt").read_text())
+        for parameter in self.parameters():
+            torch.nn.init.constant_(parameter, value)
+"""
+
+
+@pytest.mark.usefixtures("fresh_policy")
+def test_runs_start_from_the_weights_that_a_policys_own_file_has_now(tmp_path: Path) -> None:
+    (tmp_path / "own_policy.py").write_text(OWN, encoding="utf-8")
+    scenario = load_scenario("clbench.testing:clbench/Toy-v0").with_policy("own_policy:Own")
+    found = []
+    for value in ("0.5", "0.25", "0.5"):
+        sys.modules.pop("own_policy", None)  # as in another process
+        (tmp_path / "weights.txt").write_text(value, encoding="utf-8")
+        policy, folder = pretrained_policy(scenario, seed=0)
+        assert {one for weight in policy.parameters() for one in weight.flatten().tolist()} == {float(value)}
+        found.append(folder)
+    assert found[0] == found[2] != found[1]
 
 
 def test_a_method_whose_need_a_fresh_policy_lacks_is_refused_by_name(fresh_policy: str) -> None:
