@@ -135,6 +135,13 @@ def run_missing(
         lost_stages = sum(job.function is make_policies for job in failed)
         done += f" and the policies of {_part(lost_stages, len(to_do.stages))}{len(to_do.stages)}"
     _print(console, f"{done} in {seconds / 60:.1f} minutes; records in {records}.")
+    others = len(missing(to_do.runs, records, checkpoints).stages)
+    if others:
+        _print(
+            console,
+            f"Another command did {counted(others, 'run')} and kept no policies in {checkpoints}. Repeat the "
+            "command to make them again, and keep them.",
+        )
     return failed
 
 

@@ -18,6 +18,7 @@ from clbench.base.progress import ProgressCallback
 from clbench.jobs.grid import run_missing
 from clbench.jobs.job import Job
 from clbench.jobs.processes import Here
+from clbench.runs.checkpoints import has_stages
 from clbench.runs.run import execute
 from clbench.runs.spec import RunSpec
 
@@ -141,6 +142,27 @@ def test_a_class_inside_a_function_is_refused(tmp_path: Path) -> None:
 
     with pytest.raises(TypeError, match="cannot be found by its name: define it outside of functions"):
         clbench.run(TOY, Hidden, records=tmp_path)
+
+
+def test_a_run_of_another_command_that_kept_no_policies_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    spec, records = RunSpec(TOY, "frozen", 0), tmp_path / "records"
+
+    def elsewhere(jobs: Sequence[Job], *_: Any) -> dict[Job, str]:
+        """Do the run as another command does, which names no folder for policies."""
+        execute(spec, records)
+        return {}
+
+    monkeypatch.setattr("clbench.jobs.grid.run_with_bars", elsewhere)
+    printed = io.StringIO()
+    run_missing([spec.resolve()], records, Here, Console(file=printed, width=200), tmp_path / "kept")
+    assert f"Another command did 1 run and kept no policies in {tmp_path / 'kept'}." in printed.getvalue()
+    monkeypatch.undo()
+    printed = io.StringIO()
+    run_missing([spec.resolve()], records, Here, Console(file=printed, width=200), tmp_path / "kept")
+    assert has_stages(spec.resolve(), tmp_path / "kept")
+    assert "Another command" not in printed.getvalue()
 
 
 @pytest.mark.parametrize(
