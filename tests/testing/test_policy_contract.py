@@ -81,6 +81,16 @@ class Constant(Base):
         super().__init__(config, 0)
 
 
+class Downloaded(Constant):
+    """Has pretrained weights of its own, the same for every seed."""
+
+    pretrained = True
+
+
+def test_pretrained_weights_of_a_policys_own_may_be_the_same_for_all_seeds() -> None:
+    check_policy(f"{__name__}:Downloaded")
+
+
 class Together(Base):
     """Has one loss for all samples."""
 
