@@ -126,16 +126,16 @@ class Scores(Measured):
         def spread(array: Array) -> Array:
             return np.broadcast_to(array, batch + array.shape)
 
-        success = np.einsum("lte,...te->...lt", self.success, counts) / number
+        success = _sums(self.success, counts) / number
         if np.isnan(self.perturbed).all():  # most runs have none, and to count them takes long
             perturbed = spread(np.full(self.perturbed.shape[:-1], np.nan))
         else:
-            perturbed = np.einsum("lte,...te->...lt", self.perturbed, counts) / number
+            perturbed = _sums(self.perturbed, counts) / number
         if layout.curve_episodes:
             weights = counts[..., np.searchsorted(layout.episodes, layout.curve_episodes)]
             weights = np.where(weights.sum(axis=-1, keepdims=True) > 0, weights, 1.0)
-            weights = weights / weights.sum(axis=-1, keepdims=True)
-            on_the_way = np.einsum("kpte,...te->...kpt", self.on_the_way, weights)
+            total = weights.sum(axis=-1)[..., None, None, :]
+            on_the_way = _sums(self.on_the_way, weights) / total
         else:
             on_the_way = spread(np.full(self.on_the_way.shape[:-1], np.nan))
         measured: dict[str, Any] = {name: spread(getattr(self, name)) for name in MEASURED}
@@ -152,6 +152,24 @@ def _chosen_on(rows: Sequence[Row], protocol: Protocol) -> list[Row]:
     """Return the validation episodes of each stage's target, which choices may look at."""
     own = [row for row in rows if row.split == "validation" and row.point.stage > 0]
     return [row for row in own if row.task == protocol.target[row.point.stage - 1]]
+
+
+def _sums(values: Array, counts: Array) -> Array:
+    """Return the sums of values (..., tasks, episodes) over episodes, each as often as it counts.
+
+    Args:
+        values: Values, (*shape, tasks, episodes).
+        counts: How often each episode counts, (*batch, tasks, episodes).
+
+    Returns:
+        The sums, (*batch, *shape, tasks).
+    """
+    shape, batch = values.shape[:-1], counts.shape[:-2]
+    tasks, episodes = counts.shape[-2:]
+    # one product of matrices for each task: three times as fast as numpy.einsum
+    left = np.moveaxis(counts, -2, 0).reshape(tasks, -1, episodes)
+    right = np.moveaxis(values.reshape(-1, tasks, episodes), 0, -1)
+    return np.ascontiguousarray(np.moveaxis(left @ right, 0, -1)).reshape(*batch, *shape)
 
 
 def _places(names: Sequence[Any]) -> dict[Any, int]:
