@@ -24,7 +24,7 @@ from result_files import write_results
 from clbench.base.seeding import torch_generator
 from clbench.data.training_data import TrainingData
 from clbench.learning.adaptation import Step
-from clbench.learning.optimise import BETAS, GRADIENT_NORM, deterministic
+from clbench.learning.optimise import BETAS, GRADIENT_NORM, WEIGHT_DECAY, deterministic
 from clbench.learning.pretraining import pretrained_policy
 from clbench.learning.registry import load_method, method_names, new_method
 from clbench.learning.trainer import Trainer
@@ -84,7 +84,7 @@ class BareLoop:
         batches = [self.target.sample(size, generator) for _ in range(steps + 1)]
         parameters = list(self.policy.parameters())
         optimiser = torch.optim.AdamW(
-            parameters, lr=self.budget.learning_rate, betas=BETAS, weight_decay=1e-10, fused=True
+            parameters, lr=self.budget.learning_rate, betas=BETAS, weight_decay=WEIGHT_DECAY, fused=True
         )
         begin = 0.0
         for number, batch in enumerate(batches):

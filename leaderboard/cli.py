@@ -64,8 +64,8 @@ def show(
         records: Folder of the records.
         published: First copy the records that come with clbench to the folder, where it lacks them: your rows
             then stand beside the published ones.
-        as_json: Print JSON, one object for each row with every metric and cost, and write no files. Standard
-            error says which records are not shown.
+        as_json: Print a JSON list with an object for each row, which has every metric and cost, and write no
+            files. Standard error says which records are not shown.
     """
     from clbench.scoring.metrics import load_metric
 

@@ -53,7 +53,7 @@ def compare(
 
     Returns:
         One row for each method, by division, the best first. The columns are those of `clbench.load_board`,
-        such as each metric with its interval, the costs, and in `groups` which methods are not told apart.
+        such as each metric with its interval, the costs, and in `letters` which methods are not told apart.
 
     Raises:
         UnknownNameError: There is no such scenario or method.

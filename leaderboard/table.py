@@ -18,7 +18,7 @@ def load_board(records: Path | str = RECORDS) -> pandas.DataFrame:
 
     Columns: `scenario` (its id; with another policy than the usual one it ends in the policy's name, such as
     "clbench/Fetch-v1+discrete_diffusion", because only rows of one policy are compared), `method`,
-    `division`, `groups` (letters; two rows of a division share one if they are not told apart in final
+    `division`, `letters` (two rows of a division share one if they are not told apart in final
     average), `tier`, `seeds` (their number); for every metric its value and the ends of its 95 % confidence
     interval, for example `retention`, `retention_low`, `retention_high`; then `relative_cost` (training time
     relative to sft), `steps`, `bytes_kept`, `parameters`, `parameters_added` and `environment_steps` (of
@@ -45,6 +45,6 @@ def frame_of(board: Summary) -> pandas.DataFrame:
 
     rows = [values_of(row) for row in board.rows]
     frame = pandas.DataFrame(rows, columns=column_names(), dtype=object)
-    kinds = {"seeds": "int64", **dict.fromkeys(("scenario", "method", "division", "groups", "tier"), "str")}
+    kinds = {"seeds": "int64", **dict.fromkeys(("scenario", "method", "division", "letters", "tier"), "str")}
     # a copy is in one piece: else pandas warns when a column is added
     return frame.astype({name: kinds.get(name, "float64") for name in column_names()}).copy()

@@ -131,7 +131,7 @@ def metrics(
         unit: Unit of the file's rates; without it, they are shares unless one is above 1.
         markdown: Write the page of all metrics to this file, for example docs/reference/metrics.md, and show
             nothing.
-        as_json: Print JSON: one object for each metric, or one for the file.
+        as_json: Print a JSON list with an object for each metric, or one object for the file.
     """
     from clbench.cli import metric_pages
     from clbench.cli.metric_pages import facts

@@ -77,7 +77,7 @@ def status(
         records: Folder of the records.
         changes: Hyper-parameters that differ from those tuned for the scenario or, without tuning, from the
             method's defaults, as --set.name value.
-        as_json: Print one JSON object for each run, and no table.
+        as_json: Print a JSON list with an object for each run, and no table.
     """
     from clbench.scoring.scores import Scores
 

@@ -38,7 +38,7 @@ from clbench.spec.task import Task, packages_of
 from clbench.worlds.camera import load_camera
 from clbench.worlds.lanes import vector_world
 
-CODE = (*DATA_SOURCES, "clbench.evaluation.definition")
+CODE = (*DATA_SOURCES, "clbench.evaluation.definition", "clbench.evaluation.rules")
 """Code that a definition depends on, besides the suites of the tasks."""
 
 EPISODES = 4

@@ -6,6 +6,7 @@ import statistics
 import time
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from itertools import pairwise
 from pathlib import Path
 
 import torch
@@ -14,6 +15,7 @@ from clbench.base.text import counted
 from clbench.jobs import work
 from clbench.jobs.job import Job
 from clbench.jobs.plan import Plan
+from clbench.learning.optimise import optimise
 from clbench.learning.pretraining import policy_config
 from clbench.policy.batch import Batch
 from clbench.policy.kinds import new_policy
@@ -105,17 +107,17 @@ def step_seconds(scenario: Scenario) -> float:
             noise=torch.randn(chunk),
             image=torch.zeros((size, config.image_size, config.image_size, 3), dtype=torch.uint8),
         )
-        optimiser = torch.optim.AdamW(policy.parameters())
-        taken = []
-        for _ in range(STEPS + 1):
-            begin = time.perf_counter()
-            optimiser.zero_grad()
-            torch.autograd.backward(policy.action_loss(batch).mean())
-            optimiser.step()
-            taken.append(time.perf_counter() - begin)
+        ends: list[float] = []
+        optimise(
+            policy.parameters(),
+            scenario.budget.learning_rate,
+            STEPS + 1,
+            lambda _: policy.action_loss(batch).mean(),
+            after=lambda _: ends.append(time.perf_counter()),
+        )
     finally:
         torch.set_num_threads(threads)
-    return statistics.median(taken[1:])
+    return statistics.median(end - begin for begin, end in pairwise(ends))
 
 
 def _policy_bytes(scenario: Scenario) -> int:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, Protocol
 
@@ -51,6 +51,14 @@ class Job:
     def duration(self) -> float:
         """Expected time of the job, relative to an optimiser step."""
         return self.length * self.pace
+
+    def bare(self) -> Job:
+        """Return the job with what a worker needs alone.
+
+        The command has the lease, and looks whether the file is made. The functions that look know the whole
+        run: they would travel with it, and make the worker import its method before it begins.
+        """
+        return replace(self, needs=(), makes=None, is_done=None, has_failed=None)
 
     def new_lease(self) -> Lease | None:
         """Return the lease that a command needs to do the job, None if it needs none."""

@@ -98,9 +98,7 @@ class RayWorkers:
         gpus = 0 if job.device == "cpu" else 1
         options = {"max_retries": RETRIES, "retry_exceptions": [LostProcessError]}
         task = self._ray.remote(num_cpus=1, num_gpus=gpus, **options)(_do)
-        # the driver has the lease
-        bare = replace(job, needs=(), makes=None, is_done=None)
-        self._running[task.remote(self._progress_actor, bare)] = job
+        self._running[task.remote(self._progress_actor, job.bare())] = job
 
     def events(self) -> Iterator[Event]:
         """Yield the events since the last call; wait at most a second for one."""

@@ -18,7 +18,10 @@ GRADIENT_NORM = 1.0
 """Maximum norm of the gradients; they are clipped after the method has set them."""
 
 BETAS = (0.9, 0.95)
-"""Betas of AdamW, as in the three seed papers and openpi; the weight decay of 1e-10 is theirs too."""
+"""Betas of AdamW, as in the three seed papers and openpi."""
+
+WEIGHT_DECAY = 1e-10
+"""Weight decay of AdamW, from the same sources."""
 
 
 class MethodError(ClbenchError, RuntimeError):
@@ -120,7 +123,9 @@ def optimise(
                 break
         return 0
     factor = schedule or (lambda step: learning_rate_factor(step, steps))
-    optimiser = torch.optim.AdamW(groups, lr=learning_rate, betas=BETAS, weight_decay=1e-10, fused=True)
+    optimiser = torch.optim.AdamW(
+        groups, lr=learning_rate, betas=BETAS, weight_decay=WEIGHT_DECAY, fused=True
+    )
     peaks = [group["lr"] for group in optimiser.param_groups]
     trained = [parameter for group in optimiser.param_groups for parameter in group["params"]]
     for step in range(steps):

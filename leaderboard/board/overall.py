@@ -11,7 +11,7 @@ from clbench.scoring.intervals import NO_ESTIMATE, Estimate
 from clbench.scoring.metrics import METRICS
 from clbench.spec.policies import DEFAULT_POLICY
 
-from .summary import DIVISIONS, RANKED_BY, RowSummary, group_of, tables_of
+from .summary import DIVISIONS, RANKED_BY, RowSummary, letters_of, tables_of
 
 
 @dataclass(frozen=True)
@@ -24,7 +24,7 @@ class OverallRow:
     """One of `DIVISIONS`."""
     scenarios: tuple[str, ...]
     """Names of the tables that it is the mean of, in the order of the board."""
-    groups: tuple[str | None, ...]
+    letters: tuple[str | None, ...]
     """Letters of its groups in the scenarios, in the order of the board; None where it has no rival."""
     estimates: Mapping[str, Estimate]
     """Mean over scenarios and interval of every metric."""
@@ -60,7 +60,7 @@ def _overall_row(found: Mapping[str, RowSummary], tables: Mapping[str, Sequence[
         rows[0].method,
         rows[0].division,
         tuple(found),
-        tuple(group_of(row, tables[row.scenario]) or None for row in rows),
+        tuple(letters_of(row, tables[row.scenario]) or None for row in rows),
         estimates,
         all(row.to_criterion for row in rows),
     )

@@ -160,7 +160,7 @@ def _row(
         scenario=first.table,
         method=method,
         division=first.division,
-        groups=letters,
+        letters=letters,
         tier=min((run.tier for run in members), key=TIERS.index),
         seeds=tuple(run.seed for run in members),
         to_criterion=first.published.budget.get("criterion") is not None,
@@ -261,12 +261,12 @@ class Standing:
 
 def standing_of(row: Row, rows: Iterable[Row]) -> Standing | None:
     """Return the standing of `row` among all `rows` of its scenario; None if it is in no group."""
-    if row.groups is None:
+    if row.letters is None:
         return None
-    division = [other for other in rows if other.division == row.division and other.groups is not None]
+    division = [other for other in rows if other.division == row.division and other.letters is not None]
     # Values are quotients of whole numbers: equal ones may differ in the last bit.
     better = [other for other in division if _falling(other.height) < _falling(row.height) - 1e-9]
-    alike = [other for other in division if other is not row and set(other.groups or "") & set(row.groups)]
+    alike = [other for other in division if other is not row and set(other.letters or "") & set(row.letters)]
     return Standing(1 + len(better), len(division), tuple(other.method for other in alike))
 
 

@@ -55,7 +55,7 @@ class RowSummary:
     """Name or "module:Class"."""
     division: str
     """One of `DIVISIONS`."""
-    groups: str | None
+    letters: str | None
     """Letters of its groups. Two rows of a scenario and division share a letter if they are not told apart.
     None for a reference, which does not compete, and for a row without a final average."""
     tier: str
@@ -121,7 +121,7 @@ class Summary:
         )
 
 
-_PLAIN = ("scenario", "method", "division", "groups", "tier", "to_criterion", "order_sensitivity", "tried")
+_PLAIN = ("scenario", "method", "division", "letters", "tier", "to_criterion", "order_sensitivity", "tried")
 """Fields of a row that are JSON as they are."""
 
 
@@ -135,8 +135,12 @@ def _row_to_json(row: RowSummary) -> dict[str, Any]:
 
 
 def _row_from_json(values: Mapping[str, Any]) -> RowSummary:
-    estimates = {name: Estimate(*ends) for name, ends in values["estimates"].items()}
-    return RowSummary(**{**values, "seeds": tuple(values["seeds"]), "estimates": estimates})
+    seeds = tuple(values["seeds"])
+    estimates = {
+        name: Estimate(value, low, high, of_seeds=len(seeds) > 1)
+        for name, (value, low, high) in values["estimates"].items()
+    }
+    return RowSummary(**{**values, "seeds": seeds, "estimates": estimates})
 
 
 class Placed(Protocol):
@@ -152,7 +156,7 @@ PlacedRow = TypeVar("PlacedRow", bound=Placed)
 AnyRow = TypeVar("AnyRow")
 
 
-def group_of(row: RowSummary, rows: Iterable[RowSummary]) -> str:
+def letters_of(row: RowSummary, rows: Iterable[RowSummary]) -> str:
     """Return the letters of a row; none if its division has no other row to tell it apart from.
 
     Args:
@@ -160,7 +164,7 @@ def group_of(row: RowSummary, rows: Iterable[RowSummary]) -> str:
         rows: All rows of its table.
     """
     rivals = [other for other in rows if other.division == row.division]
-    return row.groups if row.groups and len(rivals) > 1 else ""
+    return row.letters if row.letters and len(rivals) > 1 else ""
 
 
 def tables_of(rows: Iterable[OneRow]) -> dict[str, list[OneRow]]:
@@ -188,7 +192,7 @@ def column_names() -> list[str]:
         "scenario",
         "method",
         "division",
-        "groups",
+        "letters",
         "tier",
         "seeds",
         *metrics,
@@ -203,5 +207,5 @@ def values_of(row: RowSummary) -> list[str | float | None]:
     """Return the values of `row` in the order of `column_names`."""
     estimates = (row.estimates[name] for name in METRICS)
     numbers = [number for one in estimates for number in (one.value, one.low, one.high)]
-    place = [row.scenario, row.method, row.division, row.groups, row.tier, len(row.seeds)]
+    place = [row.scenario, row.method, row.division, row.letters, row.tier, len(row.seeds)]
     return [*place, *numbers, *row.costs.values(), row.order_sensitivity, row.tried]

@@ -280,9 +280,9 @@ def _group_counts(competing: Sequence[Row]) -> list[tuple[str, int, int]]:
     """Return how many methods each division has, and how many groups they form on the board."""
     found = []
     for division in METHODS:
-        members = [row for row in competing if row.division == division and row.groups]
+        members = [row for row in competing if row.division == division and row.letters]
         if len(members) > 1:
-            letters = {letter for row in members for letter in row.groups or ""}
+            letters = {letter for row in members for letter in row.letters or ""}
             found.append((division, len(members), len(letters)))
     return found
 

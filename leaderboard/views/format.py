@@ -188,15 +188,15 @@ def format_interval(estimate: Estimate, form: str = ".2f") -> str:
     return value if estimate.low is None else f"{value} [{low}, {high}]"
 
 
-def aligned(groups: str | None, rows: Iterable[RowSummary]) -> str:
+def aligned(letters: str | None, rows: Iterable[RowSummary]) -> str:
     """Return the letters of a row, each in the column of its group: "a", "ab" and " b" below each other.
 
     Args:
-        groups: Letters of the row.
+        letters: Letters of the row.
         rows: All rows of its scenario and division.
     """
-    letters = sorted({letter for row in rows for letter in row.groups or ""})
-    return "".join(letter if letter in groups else " " for letter in letters) if groups else ""
+    every = sorted({letter for row in rows for letter in row.letters or ""})
+    return "".join(letter if letter in letters else " " for letter in every) if letters else ""
 
 
 def standing_text(row: Row, rows: Iterable[Row], named: int | None = None) -> str:

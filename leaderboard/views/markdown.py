@@ -22,7 +22,7 @@ from clbench.scoring.metric import Metric
 from ..board.frontier import TiedGain, is_certain_over
 from ..board.overall import overall
 from ..board.rows import Board, Row, apart_from_baseline
-from ..board.summary import group_of, tables_of
+from ..board.summary import letters_of, tables_of
 from ..policies.compared import Comparisons
 from ..policies.decoders import read_decoding
 from .format import (
@@ -72,7 +72,7 @@ def markdown(board: Board, comparisons: Comparisons) -> str:
         start_text=start_text,
         tiers_text=tiers_text,
         prediction_text=prediction_text,
-        group_of=group_of,
+        letters_of=letters_of,
         tied_text=lambda id_, rows: _tied_text(id_, rows, board.tied.get(id_, {})),
         ends=_ends,
     )

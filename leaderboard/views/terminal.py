@@ -169,7 +169,7 @@ def _best(head: _Head, rows: Sequence[Any]) -> float | None:
 
 
 def _letters(row: RowSummary | OverallRow, rows: Sequence[Any]) -> str:
-    return aligned(row.groups, rows) if isinstance(row, RowSummary) else ""
+    return aligned(row.letters, rows) if isinstance(row, RowSummary) else ""
 
 
 def _heads(rows: list[RowSummary]) -> list[_Head]:
@@ -187,8 +187,8 @@ def _heads(rows: list[RowSummary]) -> list[_Head]:
 
 def _overall_heads(rows: Sequence[OverallRow]) -> list[_Head]:
     """Return the columns of the table over scenarios."""
-    groups = _Head("groups", lambda row: ",".join(letters or MISSING for letters in row.groups))
-    return [groups, *_metric_heads(rows)]
+    letters = _Head("letters", lambda row: ",".join(letters or MISSING for letters in row.letters))
+    return [letters, *_metric_heads(rows)]
 
 
 def _metric_heads(rows: Rows) -> list[_Head]:

@@ -1,5 +1,6 @@
 """The forecast of a command: the time from the lengths of its jobs, the disk from what they keep."""
 
+import itertools
 import types
 from pathlib import Path
 from typing import Any
@@ -66,9 +67,6 @@ def test_the_disk_is_that_of_policies_demonstrations_and_records(monkeypatch: py
 
 def test_the_time_of_a_step_is_the_median_without_the_first(monkeypatch: pytest.MonkeyPatch) -> None:
     taken = [100.0, *(float(number) for number in range(1, STEPS + 1))]
-    moments = []
-    for number, seconds in enumerate(taken):
-        moments += [1e3 * number, 1e3 * number + seconds]
-    clock = iter(moments)
+    clock = itertools.accumulate(taken)  # the clock is read at the end of each step
     monkeypatch.setattr(module, "time", types.SimpleNamespace(perf_counter=lambda: next(clock)))
     assert step_seconds(TINY) == (1 + STEPS) / 2

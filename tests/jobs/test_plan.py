@@ -34,6 +34,15 @@ def _job(folder: Path, scenario: str, method: str) -> Job:
     return Plan().add_run(RunSpec(scenario, method, 0).resolve(), folder)
 
 
+def test_a_job_takes_no_function_of_its_command_to_another_machine(tmp_path: Path) -> None:
+    plan = Plan()
+    plan.add_run(RunSpec(TINY.id, "sft", 0).resolve(), tmp_path)
+    for job in plan.jobs:
+        bare = job.bare()
+        assert (bare.title, bare.function, bare.arguments) == (job.title, job.function, job.arguments)
+        assert [name for name, value in vars(bare).items() if callable(value)] == ["function"]
+
+
 @pytest.mark.parametrize(
     ("scenario", "method", "pace"),
     [

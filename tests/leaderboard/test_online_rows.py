@@ -35,7 +35,7 @@ def board(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_an_agent_has_its_own_division_and_takes_no_part_in_others(board: Path) -> None:
     table = load(board / "records").set_index("method")
     assert dict(table["division"]) == {"sft": "prior-data-free", "me/knows": "online"}
-    assert list(table["groups"]) == ["a", "a"]
+    assert list(table["letters"]) == ["a", "a"]
     row = table.loc["me/knows"]
     assert (row["retention"], row["environment_steps"], row["tier"]) == (0.5, 21, "self-reported")
     for missing in (

@@ -30,7 +30,7 @@ def test_there_is_one_row_for_each_method_sorted_by_division_and_final_average(
         "reference",
     ]
     assert list(frame.seeds) == [1, 2, 2, 2, 2]
-    letters = frame.set_index("method").groups
+    letters = frame.set_index("method").letters
     assert letters[letters.isna()].index.tolist() == ["from_scratch"]  # a reference does not compete
 
 
@@ -73,8 +73,8 @@ def test_a_row_does_not_depend_on_the_other_rows(four_methods: Path, add_full: C
     add_full("sft", 0, scenario="clbench/Other-v0")
     after = load(four_methods)
     kept = after[(after.scenario == "clbench/Toy-v0") & (after.method != "another")]
-    kept = kept.reset_index(drop=True).drop(columns="groups")
-    pandas.testing.assert_frame_equal(kept, before.drop(columns="groups"))
+    kept = kept.reset_index(drop=True).drop(columns="letters")
+    pandas.testing.assert_frame_equal(kept, before.drop(columns="letters"))
 
 
 def test_the_relative_cost_counts_all_steps_with_the_time_of_one(

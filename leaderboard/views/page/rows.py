@@ -18,7 +18,7 @@ from clbench.scoring.scores import rates_of
 from clbench.spec.identifiers import built_in_methods
 
 from ...board.rows import Row, standing_of
-from ...board.summary import DIVISIONS, ELSEWHERE, RANKED_BY, group_of
+from ...board.summary import DIVISIONS, ELSEWHERE, RANKED_BY, letters_of
 from ..descriptions import Description, describe
 from ..format import (
     Column,
@@ -74,7 +74,7 @@ class RowView:
     """A row and its section."""
 
     row: Row
-    groups: str
+    letters: str
     """Letters of its groups, each in the column of its group."""
     place: int | None
     """Place in its division."""
@@ -220,7 +220,7 @@ def row_view(row: Row, rows: Sequence[Row]) -> RowView:
     seeds = _of_seeds(row, rows)
     return RowView(
         row,
-        _groups(row, rows),
+        _letters(row, rows),
         standing.place if (standing := standing_of(row, rows)) else None,
         standing_text(row, rows, NAMED),
         tuple(number(row.estimates[one.metric.name], one) for one in columns(rows)),
@@ -231,10 +231,10 @@ def row_view(row: Row, rows: Sequence[Row]) -> RowView:
     )
 
 
-def _groups(row: Row, rows: Iterable[Row]) -> str:
+def _letters(row: Row, rows: Iterable[Row]) -> str:
     """Return the letters of a row; a dash if there is no other row to tell it apart from."""
     rivals = [other for other in rows if other.division == row.division]
-    letters = group_of(row, rivals)
+    letters = letters_of(row, rivals)
     return aligned(letters, rivals) if letters else MISSING
 
 

@@ -134,7 +134,7 @@ def verdicts(rows: Sequence[Row], tied: Mapping[str, Sequence[TiedGain]] | None 
     found = []
     baseline = next((row for row in rows if row.method == BASELINE), None)
     for division, members in divisions_of(rows).items():
-        known = [row for row in members if row.groups is not None]
+        known = [row for row in members if row.letters is not None]
         if division not in METHODS or not known:
             continue
         leader = known[0]

@@ -75,14 +75,14 @@ class ScenarioView:
 
     @property
     def sorted_by(self) -> str:
-        """The column that the table is sorted by: a metric, or the group where no metric orders all rows."""
+        """The column that the table is sorted by: a metric, or the letters where none orders all rows."""
         for metric in (GAIN, RANKED_BY):
             values = [
                 (row.estimates[metric].value, row.height) for row in self.table if row.height is not None
             ]
             if all(value is not None and abs(value - height) < 1e-9 for value, height in values):
                 return metric
-        return "group"
+        return "letters"
 
     @property
     def protocol(self) -> str:

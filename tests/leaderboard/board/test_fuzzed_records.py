@@ -272,8 +272,8 @@ def check_board(board: Path, examples: int) -> Counter[str]:
         came["in the table"] += 1
     importlib.import_module("clbench.leaderboard.cli").show(records=board)
     table = clbench.load_board(board)
-    expected = rows.set_index(["scenario", "method"]).drop(columns="groups")
-    after = table.set_index(["scenario", "method"]).drop(columns="groups")
+    expected = rows.set_index(["scenario", "method"]).drop(columns="letters")
+    after = table.set_index(["scenario", "method"]).drop(columns="letters")
     pandas.testing.assert_frame_equal(after.loc[expected.index], expected)
     for (scenario, method), row in after.drop(expected.index).iterrows():
         place = PLACES[scenario].replace("mine", method.removeprefix("theirs/"))

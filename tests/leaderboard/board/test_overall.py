@@ -23,7 +23,7 @@ def _row(scenario: str, method: str, final: float | None = 0.5, **fields: Any) -
         scenario=scenario,
         method=method,
         division="prior-data-free",
-        groups="a",
+        letters="a",
         tier="self-reported",
         seeds=(0,),
         to_criterion=True,
@@ -67,7 +67,7 @@ def test_only_methods_with_a_row_in_every_scenario_are_listed_the_best_first() -
     names = one, two, three = "clbench/One-v0", "clbench/Two-v0", "clbench/Three-v0"
     finals = {"good": (0.8, 0.4, 0.6), "missing": (0.9, None, 0.9), "better": (0.8, 0.6, 0.7)}
     rows = [
-        _row(name, method, final, groups="b" if name == two else "a")
+        _row(name, method, final, letters="b" if name == two else "a")
         for method, values in finals.items()
         for name, final in zip(names, values, strict=True)
     ]
@@ -80,11 +80,11 @@ def test_only_methods_with_a_row_in_every_scenario_are_listed_the_best_first() -
     assert [row.to_criterion for row in found] == [True, True, True, False]
     good = found[1]
     assert good.estimates["retention"].value == pytest.approx(0.6)
-    assert (good.scenarios, good.groups) == (names, ("a", "b", "a"))
+    assert (good.scenarios, good.letters) == (names, ("a", "b", "a"))
     assert overall([row for row in rows if row.scenario == one]) == ()
 
 
 def test_a_method_without_a_rival_in_a_scenario_has_no_letter_there() -> None:
     one, two = "clbench/One-v0", "clbench/Two-v0"
     (row,) = overall([_row(one, "sft", 0.5), _row(two, "sft", 0.5), _row(two, "lora", 0.4)])
-    assert row.groups == (None, "a")
+    assert row.letters == (None, "a")

@@ -120,7 +120,7 @@ def test_a_setting_that_older_records_lack_splits_no_row(add: Callable[..., Path
 
 def _row(method: str, scores: dict[int, Any], division: str = "prior-data-free", **fields: Any) -> Any:
     """Return a row of a scenario whose seeds have orders of their own."""
-    given = {"balanced": True, "starts": [1.0], "height": 0.0, "groups": "a", **fields}
+    given = {"balanced": True, "starts": [1.0], "height": 0.0, "letters": "a", **fields}
     runs = [
         SimpleNamespace(
             published=SimpleNamespace(balanced=given["balanced"]),
@@ -135,14 +135,14 @@ def _row(method: str, scores: dict[int, Any], division: str = "prior-data-free",
         seeds=tuple(scores),
         runs=runs,
         height=given["height"],
-        groups=given["groups"],
+        letters=given["letters"],
     )
 
 
 def test_rows_of_one_height_share_a_place_and_the_next_one_counts_both() -> None:
     heights = {"one": 0.2, "two": 0.2 + 1e-12, "three": 0.1, "reference": 0.9, "missing": None}
     rows = [_row(name, {}, height=height) for name, height in heights.items()]
-    rows[3].division, rows[4].groups = "reference", None
+    rows[3].division, rows[4].letters = "reference", None
     standings = [standing_of(row, rows) for row in rows]
     assert [one and (one.place, one.count) for one in standings] == [(1, 3), (1, 3), (3, 3), (1, 1), None]
 

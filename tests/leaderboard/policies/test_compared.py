@@ -61,7 +61,7 @@ def test_the_page_shows_both_policies_and_never_ranks_one_against_the_other(both
     assert "Does forgetting depend on the policy?" in section
     assert "| sft | final average |" in section
     assert "lora" not in section
-    letters = {(row.scenario, row.method): row.groups for row in table.rows}
+    letters = {(row.scenario, row.method): row.letters for row in table.rows}
     assert letters[PLACE, "sft"] == "a"
 
 

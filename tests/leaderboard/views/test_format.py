@@ -26,7 +26,7 @@ def rows(add: Callable[..., Path], matrix: Any, tmp_path: Path) -> dict[str, Any
     add("ideal", 0, uses={"demonstrations": "never", "questions": "never", "reference": True})
     table = compute_board(tmp_path / "leaderboard" / "records")
     letters = {"best": "a", "good": "b", "twin": "bc", "middle": "bcd", "worst": "d", "ideal": None}
-    return {row.method: dataclasses.replace(row, groups=letters[row.method]) for row in table.rows}
+    return {row.method: dataclasses.replace(row, letters=letters[row.method]) for row in table.rows}
 
 
 def test_a_place_counts_the_better_rows_and_names_those_that_are_not_told_apart(rows: dict[str, Any]) -> None:
@@ -41,7 +41,7 @@ def test_a_place_counts_the_better_rows_and_names_those_that_are_not_told_apart(
 def test_a_row_that_does_not_compete_has_no_place(rows: dict[str, Any]) -> None:
     board = list(rows.values())
     assert standing_text(rows["ideal"], board) == "a reference does not compete"
-    lost = dataclasses.replace(rows["worst"], groups=None)
+    lost = dataclasses.replace(rows["worst"], letters=None)
     assert standing_text(lost, board) == "no final average"
     assert standing_text(rows["best"], [rows["best"], rows["ideal"]]) == "place 1 of 1"
     two = [rows["best"], rows["worst"]]
@@ -50,7 +50,7 @@ def test_a_row_that_does_not_compete_has_no_place(rows: dict[str, Any]) -> None:
 
 def test_letters_are_below_each_other_if_their_groups_are_the_same(rows: dict[str, Any]) -> None:
     board = list(rows.values())
-    letters = [aligned(row.groups, board) for row in rows.values()]
+    letters = [aligned(row.letters, board) for row in rows.values()]
     assert letters == ["a   ", " b  ", " bc ", " bcd", "   d", ""]
 
 

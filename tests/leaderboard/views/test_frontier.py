@@ -69,14 +69,14 @@ def test_scenarios_with_a_criterion_come_first(records: Path, make_record: Calla
     rows = compute_board(records).rows
     assert list(dict.fromkeys(row.scenario for row in rows)) == [SCENARIO, fixed]
     (whole,) = overall(rows)
-    assert tuple(row.groups for row in rows if row.method == "sft") == ("c", "a")
-    assert whole.groups == ("c", None)  # alone, it is told apart from nothing
+    assert tuple(row.letters for row in rows if row.method == "sft") == ("c", "a")
+    assert whole.letters == ("c", None)  # alone, it is told apart from nothing
     assert f"Means over {SCENARIO}, {fixed}, for methods" in markdown(compute_board(records), {})
 
 
 def test_a_scenario_with_a_criterion_has_its_own_columns(records: Path) -> None:
     head = next(
-        line for line in markdown(compute_board(records), {}).splitlines() if line.startswith("| group")
+        line for line in markdown(compute_board(records), {}).splitlines() if line.startswith("| letters")
     )
     columns = [cell.strip() for cell in head.strip("|").split("|")][5:]
     assert columns[:6] == ["final average", "gain", "learned", "kept skills", "kept targets", "kept"]

@@ -43,7 +43,7 @@ def test_perturbed_retention_follows_retention_where_a_row_has_it(
         add_full("sft", seed, perturbed=PERTURBED)
     add_full("asks", 1, uses=ASKS, perturbed=PERTURBED)  # one of its two seeds alone
     after, (_, page) = load(four_methods), shown()
-    head = next(line for line in page.splitlines() if line.startswith("| group |"))
+    head = next(line for line in page.splitlines() if line.startswith("| letters |"))
     place = [cell.strip() for cell in head.split("|")].index("perturbed retention")
     assert head.split("|")[place - 1].strip() == "retention"
     cells = {

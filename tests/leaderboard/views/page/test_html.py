@@ -87,7 +87,7 @@ def test_the_page_is_valid_and_has_a_row_and_a_section_for_each_method(records: 
 
 def test_rows_show_their_groups_and_what_intervals_do_not_cover(records: Path) -> None:
     section = by_id(parsed(page(compute_board(records), {})), "clbench/Toy-v0")
-    cells = [one for one in section.iter("td") if one.get("class") == "groups"]
+    cells = [one for one in section.iter("td") if one.get("class") == "letters"]
     assert [(one.text, one.get("data-order"), one.get("data-note")) for one in cells] == [
         ("a", "1", "place 1 of 2; not told apart from sft"),
         ("a", "2", "place 2 of 2; not told apart from better"),
@@ -279,7 +279,7 @@ def test_the_only_method_of_a_division_has_a_dash_instead_of_a_letter(
 ) -> None:
     add("alone", 0, scenario="clbench/Other-v0")
     section = by_id(parsed(page(compute_board(records), {})), "clbench/Other-v0")
-    cells = [one for one in section.iter("td") if one.get("class") == "groups"]
+    cells = [one for one in section.iter("td") if one.get("class") == "letters"]
     assert [(one.text, one.get("data-note")) for one in cells] == [("\N{EN DASH}", "place 1 of 1")]
 
 

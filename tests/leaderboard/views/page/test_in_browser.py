@@ -228,7 +228,7 @@ def test_the_keys_lead_through_the_page_and_show_where_they_are(open_page: Calla
         "division",
         "all",
         "grouped",
-        "group",
+        "letters",
         "method",
         "final average",
         "other",
