@@ -19,7 +19,7 @@ make tuning       missing tuning runs, and the settings of the methods
 make records      missing records of the boards, then the leaderboard
 make ladder       missing records of the ladder of learning rates
 make controls     missing records that only the claims need
-make benchmark    speed, in two hours of a quiet machine
+make benchmark    speed, in two hours on an idle machine
 make clean        delete .venv, build and dist
 endef
 
@@ -121,7 +121,7 @@ $(FILM): | .venv/installed-dev
 site: .venv/installed-docs
 	$(BIN)/python -m sphinx --fail-on-warning --keep-going --quiet --builder html docs build/site
 
-# Speed, as ratios: benchmarks/results/, and docs/reference/performance.md from them. It takes two hours of a quiet machine.
+# Speed, as ratios: benchmarks/results/, and docs/reference/performance.md from them. It takes two hours on an idle machine.
 benchmark: .venv/installed-dev
 	$(BIN)/python benchmarks/rollouts.py
 	$(BIN)/python benchmarks/step_time.py

@@ -117,7 +117,7 @@ def _make(folder: Path, manifest: Mapping[str, Any], make: Callable[[Path], None
 
 @contextmanager
 def _explained(folder: Path) -> Iterator[None]:
-    """Name what cannot be kept if the file system fails inside; files elsewhere are the affair of `make`."""
+    """Name what cannot be kept if the file system fails inside; files elsewhere are for `make` to handle."""
     try:
         yield
     except CacheError:  # of another result, which `make` needs

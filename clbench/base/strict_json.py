@@ -145,7 +145,7 @@ def _check_range(where: str, numbers: list[int]) -> None:
 
 def _check_name(where: str, name: Any) -> None:
     if not isinstance(name, str):
-        raise StrictJSONError(f"{where}: the name of an entry must be a text, not {name!r}.")
+        raise StrictJSONError(f"{where}: the name of an entry must be a string, not {name!r}.")
     if len(name) > LONGEST_NAME:
         raise StrictJSONError(
             f"{where}: a name of {len(name):,} characters: {quoted(name)}; {LONGEST_NAME} are the most."
@@ -159,4 +159,6 @@ def _check_scalar(where: str, value: Any) -> None:
     if kind is int and abs(value) >= LARGEST:
         raise StrictJSONError(f"{where}: a whole number of {value.bit_length()} bits; 64 are the most.")
     if kind is str and len(value) > LONGEST_TEXT:
-        raise StrictJSONError(f"{where}: a text of {len(value):,} characters; {LONGEST_TEXT:,} are the most.")
+        raise StrictJSONError(
+            f"{where}: a string of {len(value):,} characters; {LONGEST_TEXT:,} are the most."
+        )

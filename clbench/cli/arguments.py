@@ -97,7 +97,7 @@ def print_json(values: object) -> None:
     sys.stdout.write(f"{json.dumps(values, indent=1, allow_nan=False)}\n")
 
 
-def listed(option: str, text: str) -> list[str]:
+def items_of(option: str, text: str) -> list[str]:
     """Return the items of a list with commas, each once and without the space around it.
 
     Args:
@@ -111,6 +111,24 @@ def listed(option: str, text: str) -> list[str]:
     if "" in items:
         raise InputError(f"{option} has an empty item: {text!r}. Write names with a comma between them.")
     return list(dict.fromkeys(items))
+
+
+def chosen_methods(methods: Iterable[str], every: bool) -> list[str]:
+    """Return the names of methods, each once.
+
+    Args:
+        methods: Names of methods.
+        every: Whether all installed methods are meant, too.
+
+    Raises:
+        InputError: No method is named.
+    """
+    from clbench.learning.registry import method_names
+
+    names = list(dict.fromkeys([*methods, *(method_names() if every else ())]))
+    if not names:
+        raise InputError("Name at least one method, or --all; `clbench list` shows them.")
+    return names
 
 
 def check_names(scenarios: Iterable[str], methods: Iterable[str]) -> None:

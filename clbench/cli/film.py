@@ -19,7 +19,7 @@ from clbench.cli.arguments import (
     add_cwd_to_path,
     check_names,
     checked_input,
-    listed,
+    items_of,
     whole_number,
 )
 from clbench.jobs.folders import check_folders
@@ -88,7 +88,7 @@ def film(
             RunSpec(scenario, name, seed, changes or {}, device).resolve() for name in dict.fromkeys(methods)
         ]
         loaded = runs[0].scenario
-        names = None if tasks is None else listed("--tasks", tasks)
+        names = None if tasks is None else items_of("--tasks", tasks)
         shown = loaded.retained + loaded.target if names is None else tuple(map(loaded.task, names))
         last = len(loaded.target)
         numbers = [0, last] if stages is None and len(runs) > 1 else _numbers("--stages", stages, last)
@@ -146,7 +146,7 @@ def _numbers(option: str, text: str | None, last: int) -> list[int]:
     """Return the numbers from 0 to `last` that an option lists; all if it was not given."""
     if text is None:
         return list(range(last + 1))
-    words = listed(option, text)
+    words = items_of(option, text)
     if not all(word.isdecimal() and int(word) <= last for word in words):
         raise InputError(f"{option} takes numbers from 0 to {last}, not {text}.")
     return [int(word) for word in words]

@@ -25,7 +25,8 @@ from clbench.cli.arguments import (
     add_cwd_to_path,
     check_names,
     checked_input,
-    listed,
+    chosen_methods,
+    items_of,
     whole_number,
 )
 from clbench.jobs.folders import check_folders
@@ -99,7 +100,7 @@ def run(
         quiet: Print nothing but failures.
     """
     with checked_input():
-        ids = listed("SCENARIOS", scenarios)
+        ids = items_of("SCENARIOS", scenarios)
     check_names(ids, methods)
     from clbench.runs.spec import RunSpec, check_device
     from clbench.runs.tensorboard import require_tensorboard
@@ -232,14 +233,10 @@ def requested(
     Raises:
         InputError: No method is named.
     """
-    from clbench.learning.registry import method_names
-
-    names = dict.fromkeys([*methods, *(method_names() if every else ())])
-    if not names:
-        raise InputError("Name at least one method, or --all; `clbench list` shows them.")
+    names = chosen_methods(methods, every)
     runs = [
         replace(first, scenario=scenario, method=name, seed=seed).resolve()
-        for scenario in listed("SCENARIOS", scenarios)
+        for scenario in items_of("SCENARIOS", scenarios)
         for seed in range(first.seed, first.seed + seeds)
         for name in names
     ]

@@ -134,7 +134,7 @@ def check_new_name(name: str, kind: str) -> None:
             f"and _, a letter first.{hint}"
         )
     if keyword.iskeyword(name):
-        raise InputError(f"{name!r} is a word of Python. Did you mean {f'{name}_{kind}'!r}?")
+        raise InputError(f"{name!r} is a Python keyword. Did you mean {f'{name}_{kind}'!r}?")
     check_method_name(name)
     if find_spec(name) is not None:
         raise InputError(f"There is a module {name!r} already. Did you mean {f'{name}_{kind}'!r}?")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -14,7 +14,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from clbench.base.errors import InputError
-from clbench.base.text import counted, minutes, printable, shortened
+from clbench.base.text import counted, listed, minutes, printable, shortened
 from clbench.cli.arguments import (
     AsJson,
     MethodName,
@@ -25,7 +25,7 @@ from clbench.cli.arguments import (
     Seeds,
     add_cwd_to_path,
     checked_input,
-    listed,
+    items_of,
     print_json,
 )
 from clbench.cli.runs import requested
@@ -39,8 +39,15 @@ if TYPE_CHECKING:
     from clbench.records.record import Record
     from clbench.runs.spec import ResolvedRun
 
-NOT_GIVEN: tuple[object, ...] = (False, DEFAULT_SEEDS, 0, 0, DEFAULT_POLICY, SMALL, {})
-"""Values of the options that choose among the runs of a scenario."""
+NOT_GIVEN: Mapping[str, object] = {
+    "--all": False,
+    "--seeds": DEFAULT_SEEDS,
+    "--first-seed": 0,
+    "--order": 0,
+    "--policy": DEFAULT_POLICY,
+    "--policy-size": SMALL,
+}
+"""Values of the options that choose among the runs of a scenario, where nobody gave them."""
 
 STATES: tuple[State, ...] = ("done", "running", "failed", "damaged", "to do")
 
@@ -84,14 +91,19 @@ def status(
     add_cwd_to_path()
     with checked_input():
         if scenarios is None:
-            if (every, seeds, first_seed, order, policy, policy_size, changes or {}) != NOT_GIVEN:
-                raise InputError("Such options choose among the runs of a scenario: name it.")
+            values = (every, seeds, first_seed, order, policy, policy_size)
+            options = zip(NOT_GIVEN, values, strict=True)
+            given = [name for name, value in options if value != NOT_GIVEN[name]]
+            given += [f"--set.{name}" for name in changes or {}]
+            if given:
+                chosen = f"{listed(given)} {'chooses' if len(given) == 1 else 'choose'}"
+                raise InputError(f"{chosen} among the runs of a scenario: name the scenario first.")
             paths = found_runs(records)
             if not paths:
                 raise InputError(f"There are no runs in {records}: `clbench run` makes them.")
             states = [run_state(path, Scores.from_record) for path in paths]
         else:
-            check_known(listed("SCENARIOS", scenarios), methods)
+            check_known(items_of("SCENARIOS", scenarios), methods)
             from clbench.runs.spec import RunSpec
 
             name = policy_name(policy, policy_size)

@@ -23,7 +23,8 @@ from clbench.cli.arguments import (
     add_cwd_to_path,
     check_names,
     checked_input,
-    listed,
+    chosen_methods,
+    items_of,
     whole_number,
 )
 from clbench.cli.runs import do_runs
@@ -82,7 +83,7 @@ def tune(
             `clbench run` reads methods/tuned/. Nothing is chosen with --values.
     """
     check_names([scenario], methods)
-    from clbench.learning.registry import load_method, method_names
+    from clbench.learning.registry import load_method
     from clbench.runs.spec import RunSpec, check_device
     from clbench.runs.tuning import CONTROLS, check_tuned, rungs, write_tuned
 
@@ -96,9 +97,7 @@ def tune(
 
     add_cwd_to_path()
     with checked_input():
-        names = list(dict.fromkeys([*methods, *(method_names() if every else ())]))
-        if not names:
-            raise InputError("Name at least one method, or --all; `clbench list` shows them.")
+        names = chosen_methods(methods, every)
         if targets is not None and not values:
             raise InputError("--targets goes with --values: settings are chosen on all targets.")
         if write is not None and values:
@@ -166,7 +165,7 @@ def _without_controls(names: list[str], controls: Mapping[str, str], every: bool
 
 def _combinations(values: Mapping[str, str]) -> list[dict[str, str]]:
     """Return every combination of the values that are separated by commas."""
-    lists = [[(name, value) for value in listed(f"--values.{name}", text)] for name, text in values.items()]
+    lists = [[(name, value) for value in items_of(f"--values.{name}", text)] for name, text in values.items()]
     return [dict(combination) for combination in itertools.product(*lists)]
 
 

@@ -155,10 +155,11 @@ def dataset_id(task: Task, budget: Budget) -> str:
     Two versions of a task, or two budgets, therefore never share a folder.
     """
     namespace, _, name = task.dataset_id.rpartition("/")
-    return f"{namespace}/{hash_of(_inputs(task, budget))}/{name}"
+    return f"{namespace}/{hash_of(dataset_inputs(task, budget))}/{name}"
 
 
-def _inputs(task: Task, budget: Budget) -> dict[str, Any]:
+def dataset_inputs(task: Task, budget: Budget) -> dict[str, Any]:
+    """Return everything that the demonstrations of a task depend on."""
     return {
         "task": dataclasses.asdict(task),
         "demonstrations": budget.demonstrations,
@@ -188,16 +189,16 @@ def dataset_folder(task: Task, budget: Budget, progress: ProgressCallback = no_p
     check_demonstrations(task.name)
     name = dataset_id(task, budget)
     folder = get_dataset_path(name)
-    _declare_namespaces(folder, name)
+    declare_namespaces(folder, name)
 
     def make(partial: Path) -> None:
         with contextlib.closing(_world(task)) as world:
-            _write(partial / "data", name, task, world, _collect(world, task, budget, progress))
+            write_dataset(partial / "data", name, task, world, _collect(world, task, budget, progress))
 
-    return cached(folder, _inputs(task, budget), make)
+    return cached(folder, dataset_inputs(task, budget), make)
 
 
-def _declare_namespaces(folder: Path, dataset_id: str) -> None:
+def declare_namespaces(folder: Path, dataset_id: str) -> None:
     """Write the namespace files that Minari's own listing looks for."""
     parts = dataset_id.split("/")[:-1]
     for depth in range(1, len(parts) + 1):
@@ -211,7 +212,9 @@ def _declare_namespaces(folder: Path, dataset_id: str) -> None:
                 )
 
 
-def _write(folder: Path, name: str, task: Task, world: World, episodes: Sequence[Demonstration]) -> None:
+def write_dataset(
+    folder: Path, name: str, task: Task, world: World, episodes: Sequence[Demonstration]
+) -> None:
     """Write episodes as a Minari dataset: the executed actions as actions, the expert's among the infos."""
     from minari.data_collector import EpisodeBuffer
     from minari.dataset.minari_storage import MinariStorage

@@ -16,16 +16,14 @@ from clbench.base.errors import InputError
 from clbench.base.leftovers import unfinished
 from clbench.base.text import counted
 from clbench.data.access import check_demonstrations
-
-# private names: under public ones every dataset and the policy that ships would have to be made again
 from clbench.data.demonstrations import (
     Demonstration,
-    _declare_namespaces,
-    _inputs,
-    _write,
     dataset_folder,
     dataset_id,
+    dataset_inputs,
+    declare_namespaces,
     read_dataset,
+    write_dataset,
 )
 from clbench.evaluation.definition import recording_of
 from clbench.exchange.recorded import expert_of, recording_hash
@@ -163,13 +161,13 @@ def import_demonstrations(
         )
     name = dataset_id(chosen, loaded.budget)
     folder = get_dataset_path(name)
-    _declare_namespaces(folder, name)
+    declare_namespaces(folder, name)
 
     def make(partial: Path) -> None:
         with closing(resolve(chosen.world)()) as world:
-            _write(partial / "data", name, chosen, world, episodes)
+            write_dataset(partial / "data", name, chosen, world, episodes)
 
-    cached(folder, _inputs(chosen, loaded.budget), make)
+    cached(folder, dataset_inputs(chosen, loaded.budget), make)
     return name
 
 

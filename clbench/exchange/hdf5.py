@@ -199,7 +199,7 @@ class _File:
         parts = words if isinstance(words, list) else [words]
         if not all(isinstance(part, str) for part in parts):
             raise self._error(
-                f"language_instruction in problem_info must be a text, not {quoted(str(words))}"
+                f"language_instruction in problem_info must be a string, not {quoted(str(words))}"
             )
         words = "".join(parts)  # LIBERO joins it, too
         # LIBERO's files name the task, and have words of their own ("open the middle layer of the drawer")

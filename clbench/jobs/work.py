@@ -91,8 +91,9 @@ def do_run(
 
     record = execute(spec, records, progress, checkpoints=checkpoints, tensorboard=tensorboard)
     if record.error is not None:
-        reason = f"failed in {record.error['where']}: {record.error['type']}: {record.error['message']}"
-        raise JobError(shortened(reason, spec.path(records).relative_to(records).as_posix()))
+        raise JobError(
+            shortened(f"failed in {record.failure}", spec.path(records).relative_to(records).as_posix())
+        )
     scores = Scores.from_record(record)
     names = ["adaptation", "retention", "question_retention"]
     names[2:2] = ["perturbed_retention"] if spec.perturb else []

@@ -156,7 +156,7 @@ def _held(name: str, value: Any, hint: Any) -> Any:
     return value
 
 
-WORDS = {int: "a whole number", float: "a number", bool: "true or false", str: "a text", NoneType: "none"}
+WORDS = {int: "a whole number", float: "a number", bool: "true or false", str: "a string", NoneType: "none"}
 
 
 def _words(kinds: Iterable[Any]) -> str:

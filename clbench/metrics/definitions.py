@@ -16,7 +16,7 @@ FAMILIES = {
 
 @dataclass(frozen=True)
 class Definition:
-    """What is to know about a definition beside its formula."""
+    """What to know about a definition besides its formula."""
 
     family: str
     """The family that it belongs to."""

@@ -13,7 +13,7 @@ from clbench.base.errors import InputError
 from clbench.base.text import quoted
 
 _WORDS: dict[Any, str] = {
-    str: "a text",
+    str: "a string",
     int: "a whole number",
     float: "a number",
     bool: "true or false",

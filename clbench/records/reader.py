@@ -160,7 +160,7 @@ def _check_error(record: Record) -> None:
         raise RecordError(f"error must have the entries {', '.join(ERROR_FIELDS)}.")
     for name, text in record.error.items():
         if not isinstance(text, str):
-            raise RecordError(f"error: {name} must be a text.")
+            raise RecordError(f"error: {name} must be a string.")
 
 
 def _check_budget(budget: dict[str, Any]) -> None:
@@ -202,5 +202,5 @@ def _check_columns(name: str, table: dict[str, Any], columns: Iterable[str]) -> 
 def _check_names(kind: str, names: Iterable[Any]) -> None:
     for name in names:
         if not isinstance(name, str):
-            raise RecordError(f"the name of a {kind} must be a text, not {name!r}.")
+            raise RecordError(f"the name of a {kind} must be a string, not {name!r}.")
         check_plain(kind, name)

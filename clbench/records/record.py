@@ -133,6 +133,19 @@ class Relearning:
     """Whether the criterion was met."""
 
 
+ONLINE_USES: dict[str, Any] = {
+    "demonstrations": "never",
+    "questions": "never",
+    "reference": False,
+    "online": True,
+}
+"""`RunInfo.uses` of an agent: it uses no prior data of clbench, and another program trains it."""
+
+EXTERNAL_USES: dict[str, Any] = {"external": True}
+"""`RunInfo.uses` of a policy that was trained elsewhere. Nothing is known of its data: it may even have
+learned from the demonstrations of clbench, which can be exported."""
+
+
 @dataclass
 class RunInfo:
     """The run. Two runs with equal `RunInfo` and `ScenarioInfo` are the same run."""
@@ -285,6 +298,13 @@ class Record:
     def episode_rows(self) -> list[EpisodeRow]:
         """Return the rows of `episodes`."""
         return [EpisodeRow(*values) for values in zip(*self.episodes.values(), strict=True)]
+
+    @property
+    def failure(self) -> str | None:
+        """Where the run failed and of what, as "stage 1 (push): ValueError: no"; None if it did not."""
+        if self.error is None:
+            return None
+        return ": ".join(self.error[name] for name in ("where", "type", "message"))
 
     def retained_at_start(self) -> float | None:
         """Return the success on the retained skills before the first target; None without any."""

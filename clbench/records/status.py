@@ -73,8 +73,7 @@ def run_state(
     if seconds is not None and not isinstance(seconds, int | float):
         return RunState(path, "damaged", reason=f"timing: seconds must be a number, not {seconds!r}")
     if record.error is not None:
-        reason = f"{record.error['where']}: {record.error['type']}: {record.error['message']}"
-        return RunState(path, "failed", seconds=seconds, reason=reason)
+        return RunState(path, "failed", seconds=seconds, reason=record.failure)
     return RunState(path, "done", seconds=seconds)
 
 

@@ -34,7 +34,7 @@ from clbench.evaluation.players import Agent, TrainingEnv, acts_on_batches, play
 from clbench.records.paths import RECORDS, record_path
 from clbench.records.pinned import other_parts
 from clbench.records.reader import read_record
-from clbench.records.record import AnswerRow, Record, RunInfo
+from clbench.records.record import ONLINE_USES, AnswerRow, Record, RunInfo
 from clbench.records.writer import write_record
 from clbench.runs.fingerprint import fingerprint
 from clbench.runs.spec import describe_scenario
@@ -45,9 +45,6 @@ from clbench.spec.scenario import Scenario
 from clbench.worlds.schedule import is_whole
 
 LOG = logging.getLogger("clbench")
-
-USES = {"demonstrations": "never", "questions": "never", "reference": False, "online": True}
-"""`RunInfo.uses` of an agent: it uses no prior data of clbench, and another program trains it."""
 
 UNFINISHED = ".unfinished"
 """Ending of the name of a record, after .json, until its last stage: it is no record yet."""
@@ -117,10 +114,10 @@ def evaluate_agent(
         )
     if steps is not None and (not is_whole(steps) or steps < 0):
         raise InputError(f"steps must be a whole number from 0, not {steps!r}.")
-    run = StagedRun(scenario, method, seed, Path(records), USES)
+    run = StagedRun(scenario, method, seed, Path(records), ONLINE_USES)
     begin = time.perf_counter()
     trained = begin - training.begun_at if steps is None and training.begun_at is not None else None
-    record = run.begin(stage, _plain(settings or {}), agent, again=stage == 0)
+    record = run.begin(stage, _checked_settings(settings or {}), agent, again=stage == 0)
     if batched is None:
         batched = acts_on_batches(agent, training.instruction)
     with seeded("online evaluation", seed, stage):
@@ -147,7 +144,7 @@ def next_stage(scenario: str, *, method: str, seed: int = 0, records: Path | str
     Raises:
         InputError: The record is of a served policy, or its scenario or simulator is another version.
     """
-    run = StagedRun(load_scenario(scenario), method, seed, Path(records), USES)
+    run = StagedRun(load_scenario(scenario), method, seed, Path(records), ONLINE_USES)
     return run.next_after(run.kept())
 
 
@@ -436,7 +433,7 @@ def _describe(agent: Any) -> dict[str, Any]:
     }
 
 
-def _plain(settings: Mapping[str, Any]) -> dict[str, Any]:
+def _checked_settings(settings: Mapping[str, Any]) -> dict[str, Any]:
     """Return settings in the form of a record.
 
     Raises:

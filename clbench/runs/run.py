@@ -177,8 +177,20 @@ class _Run:
         record = _new_record(run, trainer, folder)
         examiner = Examiner(scenario, run.protocol, data, pretrained, spec.seed, progress)
         checker = Checker(scenario, run.protocol, spec.seed)
-        parts = (run, trainer, examiner, checker, record, Log(), progress, checkpoints, lease)
-        return cls(*parts, kept, tensorboard, _inputs(run))
+        return cls(
+            run=run,
+            trainer=trainer,
+            examiner=examiner,
+            checker=checker,
+            record=record,
+            log=Log(),
+            progress=progress,
+            checkpoints=checkpoints,
+            lease=lease,
+            kept=kept,
+            tensorboard=tensorboard,
+            inputs=_inputs(run),
+        )
 
     def go(self) -> Record:
         """Go through all stages without a checkpoint, and return the record."""

@@ -60,7 +60,7 @@ class RunSpec:
         for name, hint in (("scenario", "its id"), ("method", "its name or 'module:Class'")):
             value = getattr(self, name)
             if not isinstance(value, str):
-                raise WrongTypeError(f"{name} of a run must be a text, {hint}, not {value!r}.")
+                raise WrongTypeError(f"{name} of a run must be a string, {hint}, not {value!r}.")
         check_whole(self, 0, "seed", "order", most=LARGEST_SEED)
         if self.targets is not None:
             check_whole(self, 1, "targets")
@@ -144,7 +144,7 @@ class ResolvedRun:
         """`Record.run`. Two runs with equal `info` and `scenario_info` are the same run."""
         spec, method = self.spec, self.new_method()
         values = dataclasses.asdict(method)
-        settings = {name: _plain(value) for name, value in values.items()}
+        settings = {name: _as_json(value) for name, value in values.items()}
         return RunInfo(
             scenario=self.scenario.id,
             method=spec.method,
@@ -183,7 +183,7 @@ def describe_scenario(scenario: Scenario) -> ScenarioInfo:
     return ScenarioInfo(scenario.id, retained, target, held_out, steps, budget, scenario.balanced)
 
 
-def _plain(value: Any) -> Any:
+def _as_json(value: Any) -> Any:
     """Return a value in JSON's types; a value that JSON cannot hold becomes text."""
     try:
         return json.loads(json.dumps(value, allow_nan=False))

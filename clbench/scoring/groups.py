@@ -16,6 +16,7 @@ from clbench.scoring.intervals import MANY, Runs, studentised_range_quantile
 from clbench.scoring.layout import Array
 from clbench.scoring.metric import Metric
 from clbench.scoring.metrics import METRICS, load_metric, measure
+from clbench.scoring.rates import check_same
 from clbench.scoring.scores import rates_of
 
 UNKNOWN_DEVIATION = 0.2
@@ -81,8 +82,9 @@ def _check(metric: Metric, rows: Iterable[Runs]) -> None:
             f"{metric.name} compares a row with {' and '.join(metric.references)}, so that rows are not "
             "compared by it. Take a metric that needs no reference, such as final_average."
         )
-    if len({run.layout for runs in rows for run in runs.values()}) > 1:
-        raise InputError("Only runs of the same tasks, episodes, evaluation points and questions compare.")
+    layouts = [run.layout for runs in rows for run in runs.values()]
+    if layouts:
+        check_same(layouts)
 
 
 # ---- groups ------------------------------------------------------------------------------------------------

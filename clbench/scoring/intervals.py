@@ -40,7 +40,7 @@ from clbench.base.errors import InputError
 from clbench.scoring.layout import Array
 from clbench.scoring.metric import Metric
 from clbench.scoring.metrics import load_metric
-from clbench.scoring.rates import Rates, combine
+from clbench.scoring.rates import Rates, check_same, combine
 from clbench.scoring.scores import Scores, rates_of
 
 Runs = Mapping[int, Scores]
@@ -352,10 +352,7 @@ class _Samples:
             raise InputError(
                 "Every method needs a run of each seed, in the same order, and there must be one."
             )
-        if len({run.layout for runs in every for run in runs}) != 1:
-            raise InputError(
-                "Only runs of the same tasks, episodes, evaluation points and questions compare."
-            )
+        check_same(run.layout for runs in every for run in runs)
 
     def estimate(self, quantity: _Quantity, span: Span, *, ratio: bool = False) -> Estimate:
         """Return a quantity with its interval; `ratio` is that of `interval`."""

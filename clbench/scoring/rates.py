@@ -41,7 +41,7 @@ class Measured:
 
 
 def _arrays(cls: type[Measured]) -> tuple[str, ...]:
-    return tuple(entry.name for entry in fields(cls) if entry.type == "Array")
+    return tuple(entry.name for entry in fields(cls) if entry.name not in ("layout", "references"))
 
 
 MEASURED = _arrays(Measured)

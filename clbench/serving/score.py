@@ -22,15 +22,11 @@ from clbench.base.text import printable
 from clbench.evaluation.players import ChunkPlay, ChunkPolicy, play_chunks
 from clbench.records.paths import RECORDS
 from clbench.records.reader import RecordError, read_record
-from clbench.records.record import Record
+from clbench.records.record import EXTERNAL_USES, Record
 from clbench.runs.agents import UNFINISHED, StagedRun
 from clbench.spec.registry import load_scenario
 
 LOG = logging.getLogger("clbench")
-
-USES = {"external": True}
-"""`RunInfo.uses` of a policy that was trained elsewhere. Nothing is known of its data: it may even have
-learned from the demonstrations of clbench, which can be exported."""
 
 MOST_METADATA = 20
 """Entries of a server's metadata that a record keeps."""
@@ -57,7 +53,7 @@ def is_scored(
         InputError: An earlier stage comes first, there is no such stage, the stage was scored with other
             `executed`, `data` or `steps`, or `score` would refuse it for another reason.
     """
-    run = StagedRun(load_scenario(scenario), method, seed, Path(records), USES)
+    run = StagedRun(load_scenario(scenario), method, seed, Path(records), EXTERNAL_USES)
     if restart:
         run.check_unfinished()
     record = run.plan(stage, restart)
@@ -120,10 +116,10 @@ def score(
             earlier stages had another version of the scenario or its simulator, the actions have the wrong
             shape, or the name, the seed or the stage is invalid.
     """
-    run = StagedRun(load_scenario(scenario), method, seed, Path(records), USES)
+    run = StagedRun(load_scenario(scenario), method, seed, Path(records), EXTERNAL_USES)
     begin = time.perf_counter()
     record = run.begin(stage, None if executed is None else {"executed": executed}, policy, restart)
-    server = _plain(getattr(policy, "metadata", {}))
+    server = _kept_metadata(getattr(policy, "metadata", {}))
     if server and server == record.diagnostics.get(str(stage - 1), {}).get("server"):
         LOG.warning(
             "The server says the same about itself as in stage %d (%s): does it have the new checkpoint?",
@@ -197,7 +193,7 @@ def described(server: Mapping[str, Any]) -> str:
     return ", ".join(f"{name} {value}" for name, value in server.items())
 
 
-def _plain(metadata: object) -> dict[str, Any]:
+def _kept_metadata(metadata: object) -> dict[str, Any]:
     """Return what a record keeps of metadata: texts and finite numbers, without control characters."""
     plain: dict[str, Any] = {}
     for name, value in metadata.items() if isinstance(metadata, Mapping) else ():

@@ -263,9 +263,9 @@ def unpack(message: bytes) -> Any:
 def _encode(value: Any) -> Any:
     if isinstance(value, np.ndarray):
         shape, data = value.shape, value.tobytes()
-        return {b"__ndarray__": True, b"data": data, b"dtype": _plain(value.dtype).str, b"shape": shape}
+        return {b"__ndarray__": True, b"data": data, b"dtype": _plain_dtype(value.dtype).str, b"shape": shape}
     if isinstance(value, np.generic):
-        return {b"__npgeneric__": True, b"data": value.item(), b"dtype": _plain(value.dtype).str}
+        return {b"__npgeneric__": True, b"data": value.item(), b"dtype": _plain_dtype(value.dtype).str}
     raise TypeError(f"A message cannot hold a {type(value).__name__}.")
 
 
@@ -285,10 +285,10 @@ def _dtype(name: Any) -> np.dtype[Any]:
     """Return the type of a name such as "<f4"."""
     if not (isinstance(name, str) and _DTYPE.fullmatch(name)):
         raise ValueError("A message must name types as NumPy does, such as <f4.")
-    return _plain(np.dtype(name))
+    return _plain_dtype(np.dtype(name))
 
 
-def _plain(dtype: np.dtype[Any]) -> np.dtype[Any]:
+def _plain_dtype(dtype: np.dtype[Any]) -> np.dtype[Any]:
     """Return a type, unless its values are objects, structures or complex numbers, as openpi does."""
     if dtype.kind in "OVc":
         raise ValueError(f"A message cannot hold values of the type {dtype}.")

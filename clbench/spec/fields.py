@@ -53,7 +53,7 @@ def check_entry_point(part: object, *fields: str) -> None:
         if not isinstance(value, str):
             own = f"{getattr(value, '__module__', 'module')}:{getattr(value, '__qualname__', 'name')}"
             raise WrongTypeError(
-                f"{_place(part, name)} must be a text 'module:name' such as {own!r}, not {value!r}: "
+                f"{_place(part, name)} must be a string 'module:name' such as {own!r}, not {value!r}: "
                 "other processes import it by its name."
             )
         if not is_entry_point(value):

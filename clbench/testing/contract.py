@@ -298,7 +298,7 @@ def _check_type(cls: type[Method], name: str, default: Any) -> None:
     except InputError as error:
         raise _misbuilt("a default of the annotated type", str(error)) from error
     if isinstance(default, str) and read != default:
-        raise _misbuilt("a default of the annotated type", f"{name}={default!r} is a text, not {read!r}")
+        raise _misbuilt("a default of the annotated type", f"{name}={default!r} is a string, not {read!r}")
 
 
 def _misbuilt(expected: str, found: str) -> ContractError:

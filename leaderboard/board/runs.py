@@ -15,7 +15,7 @@ from clbench.base.text import printable
 from clbench.records.paths import label_of, table_name
 from clbench.records.pinned import LATER, other_parts, pinned
 from clbench.records.reader import RecordError, home_of, read_record
-from clbench.records.record import Record, RunInfo, ScenarioInfo
+from clbench.records.record import EXTERNAL_USES, ONLINE_USES, Record, RunInfo, ScenarioInfo
 from clbench.runs.tuning import tuned_settings
 from clbench.scoring.layout import Layout
 from clbench.scoring.scores import Scores
@@ -122,8 +122,7 @@ def read_run(folder: Path, path: Path, changed: bool | None = False) -> Run:
     """
     record = read_record(path)
     if record.error is not None:
-        what = ": ".join(record.error[key] for key in ("where", "type", "message"))
-        raise RecordError(f"the run failed ({what}).")
+        raise RecordError(f"the run failed ({record.failure}).")
     run, name = record.run, path.relative_to(folder).as_posix()
     _check_kind(run, changed)
     label = label_of(run.method, run.changes)
@@ -214,11 +213,11 @@ def division_of(uses: dict[str, Any]) -> str:
     """
     kinds = ("demonstrations", "questions")
     if "external" in uses:
-        if uses != {"external": True}:
+        if uses != EXTERNAL_USES:
             raise RecordError("run: uses of a policy that was fine-tuned elsewhere must say nothing else.")
         return "external"
     if "online" in uses:
-        if uses != {**dict.fromkeys(kinds, "never"), "reference": False, "online": True}:
+        if uses != ONLINE_USES:
             raise RecordError("run: uses of an agent that learned online must be of nothing else.")
         return "online"
     if set(uses) != {*kinds, "reference"} or any(uses[kind] not in ACCESS for kind in kinds):

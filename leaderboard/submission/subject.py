@@ -53,7 +53,7 @@ class Request:
     pretrain: bool = False
     """Whether the tier "retrained" repeats the pretraining, too, and reads no policy from the cache."""
     by: str | None = None
-    """Name of the verifier, if he gives one."""
+    """Name of the verifier, if given."""
     policy: str | None = None
     """module:Class of a policy that is not built in; the name in a record alone is never imported."""
 

@@ -197,6 +197,66 @@ def test_what_is_installed_beside_an_installed_module_does_not_count_with_it(
     assert source_hash("plug.mine") != before
 
 
+PLAIN = """import math
+WIDTH = 3.0
+TEXT = '''one
+
+# two
+'''
+class Arm:
+    reach = (1, "a")
+    def move(self, by):
+        if by:
+            return f"{math.pi * by}" "m"
+        return "still"
+"""
+"""A module with statements of all kinds, and a text that looks like a comment inside."""
+
+SAME = {
+    "comments": PLAIN.replace("3.0", "3.0  # metres").replace("    def", "    # how far\n    def"),
+    "docstrings": '"About arms."\n' + PLAIN.replace("by):", "by):\n        r'''Move.\n\n        Far.'''"),
+    "what follows a value": PLAIN.replace("3.0", "3.0\n'''Width of\n\nan arm.'''"),
+    "blank lines": PLAIN.replace("WIDTH", "\n\nWIDTH").replace("        if", "\n        if"),
+}
+"""The same code, told otherwise."""
+
+OTHER = {
+    "a number": PLAIN.replace("3.0", "3.1"),
+    "an operator": PLAIN.replace("*", "/"),
+    "a text": PLAIN.replace('"still"', '"rests"'),
+    "a part of a text": PLAIN.replace('"m"', '"cm"'),
+    "a line of a text that looks like a comment": PLAIN.replace("# two", "# three"),
+    "a blank line of a text": PLAIN.replace("one\n\n", "one\n"),
+    "the depth of a line": PLAIN.replace('        return "still"', '            return "still"'),
+    "a text that a statement begins with": PLAIN.replace("WIDTH", "'WIDTH'.lower()\nWIDTH"),
+    "a name": PLAIN.replace("reach", "grasp"),
+}
+"""Other code."""
+
+
+@pytest.mark.parametrize("change", SAME)
+def test_comments_docstrings_and_blank_lines_do_not_change_a_hash(
+    change: str, lay_out: Callable[[dict[str, str]], None]
+) -> None:
+    lay_out({"mine.py": PLAIN})
+    before = source_hash("mine")
+    assert SAME[change] != PLAIN
+    lay_out({"mine.py": SAME[change]})
+    assert source_hash("mine") == before
+
+
+@pytest.mark.parametrize("change", OTHER)
+def test_any_change_of_the_code_changes_its_hash(
+    change: str, lay_out: Callable[[dict[str, str]], None]
+) -> None:
+    lay_out({"mine.py": PLAIN})
+    before = source_hash("mine")
+    compile(OTHER[change], "mine.py", "exec")
+    assert OTHER[change] != PLAIN
+    lay_out({"mine.py": OTHER[change]})
+    assert source_hash("mine") != before
+
+
 def test_a_file_that_python_cannot_read_counts_with_its_bytes(
     lay_out: Callable[[dict[str, str]], None],
 ) -> None:

@@ -51,7 +51,7 @@ def test_json_within_the_limits_is_read(value: Any, tmp_path: Path) -> None:
         (json.dumps([number * (2**61 - 1) for number in range(100_000)]), "a whole number of 7. bits"),
         (f'{{"a": {json.dumps(nested(DEEPEST))}}}', "a: nested more than 16 deep"),
         (f'{{"{"x" * (LONGEST_NAME + 1)}": 1}}', "a name of 201 characters"),
-        (f'["{"x" * (LONGEST_TEXT + 1)}"]', "a text of 100,001 characters"),
+        (f'["{"x" * (LONGEST_TEXT + 1)}"]', "a string of 100,001 characters"),
         ("\ufeff{}", "cannot be read as JSON"),
         ("{} {}", "cannot be read as JSON"),
     ],

@@ -109,7 +109,7 @@ def test_a_path_may_begin_with_the_home_folder(
             ["run", "clbench/Fetch-v1", "sft", "--records", "/proc/x", "--dry-run"],
             "/proc/x cannot be written",
         ),
-        (["status", "--seeds", "99"], "Such options choose among the runs of a scenario: name it."),
+        (["status", "--seeds", "99"], "--seeds chooses among the runs of a scenario: name the scenario"),
         (["list", "foo"], "list does not take 'foo': see clbench list --help."),
         (["claims", "--records", "nowhere"], "There is no folder of records at nowhere."),
         (["findings", "--records", "nowhere"], "There is no folder of records at nowhere."),

@@ -224,7 +224,7 @@ def test_the_next_steps_name_another_folder(
         ("../mine", "Did you mean 'mine'?"),
         ("mine.py", "Did you mean 'mine_py'?"),
         ("m" * 51, "at most 50 small letters"),
-        ("lambda", "'lambda' is a word of Python"),
+        ("lambda", "'lambda' is a Python keyword"),
         ("sft", "'sft' is a built-in method. Did you mean 'my_sft'?"),
         ("s_f_t", "would take for 'sft'"),
         ("nul", "the name of a device on Windows"),

@@ -268,7 +268,7 @@ def _last(value: float) -> Callable[[h5py.Group], None]:
         (_claimed("demo_1/states", (4, 10**8)), "states has 400,000,000 numbers; 10,000,000 are the most"),
         (
             _attribute("problem_info", '{"language_instruction": [1, 2]}'),
-            r"language_instruction in problem_info must be a text, not '\[1, 2\]'",
+            r"language_instruction in problem_info must be a string, not '\[1, 2\]'",
         ),
         (
             _attribute("problem_info", '{"language_instruction": "go down"}'),

@@ -181,7 +181,7 @@ def test_a_run_of_another_command_that_kept_no_policies_is_told(
         ({"scenario": "clbench/Fetsh-v1"}, "Did you mean 'clbench/Fetch-v1'"),
         ({"method": "stf"}, "Did you mean 'sft'"),
         ({"method": 3}, "A method must be a class or its name, not 3"),
-        ({"scenario": None}, "scenario of a run must be a text, its id, not None"),
+        ({"scenario": None}, "scenario of a run must be a string, its id, not None"),
         ({"device": "mps"}, "The device 'mps' cannot be used"),
     ],
 )

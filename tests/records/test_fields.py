@@ -60,7 +60,7 @@ def test_nested_dataclasses_lists_and_unions_are_loaded() -> None:
         ({"part": {}}, "part: size, names are missing."),
         ({"part": {"size": True, "names": []}}, "part: size must be a number, not true."),
         ({"part": {"size": 1, "names": "a"}}, 'part: names must be a list, not "a".'),
-        ({"part": {"size": 1, "names": ["a", 1]}}, "an entry of part: names must be a text, not 1."),
+        ({"part": {"size": 1, "names": ["a", 1]}}, "an entry of part: names must be a string, not 1."),
         ({"parts": [{"size": 1}]}, "an entry of parts: names is missing."),
         ({"fre": 1}, "No field of a whole is called 'fre'. Did you mean 'free'?"),
     ],

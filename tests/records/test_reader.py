@@ -95,7 +95,7 @@ def test_a_path_that_is_no_file_is_refused(tmp_path: Path) -> None:
         ({"status": "failed", "error": {"where": "loss"}}, "error must have the entries where, type, mess"),
         (
             {"status": "failed", "error": dict.fromkeys(("where", "type", "message", "traceback"), 1)},
-            "error: where must be a text",
+            "error: where must be a string",
         ),
     ],
 )
@@ -125,7 +125,7 @@ def test_relearning_is_read_as_it_was_written(make_record: Callable[..., Record]
         ({"order": 2**63}, "run: order must be from 0 to 99"),
         ({"perturb": 1}, "run: perturb must be true or false, not 1"),
         ({"seed": False}, "run: seed must be a whole number, not false"),
-        ({"method": ["sft"]}, "run: method must be a text"),
+        ({"method": ["sft"]}, "run: method must be a string"),
         ({"oder": 1}, "No field of run is called 'oder'. Did you mean 'order'?"),
     ],
 )
@@ -189,7 +189,7 @@ def test_columns_that_do_not_fit_together_are_refused_by_name(
 @pytest.mark.parametrize(
     ("field", "words"),
     [
-        ({"retained": [1]}, "an entry of scenario: retained must be a text, not 1"),
+        ({"retained": [1]}, "an entry of scenario: retained must be a string, not 1"),
         ({"evaluation_steps": [True]}, "an entry of scenario: evaluation_steps must be a whole number"),
         ({"budget": []}, "scenario: budget must be an object with named entries"),
     ],

@@ -98,7 +98,7 @@ def test_the_middle_of_a_long_error_is_left_out(record: Record, tmp_path: Path) 
 @pytest.mark.parametrize(
     ("diagnostics", "words"),
     [
-        ({"1": {"text": "x" * (LONGEST_TEXT + 1)}}, "a text of 100,001 characters"),
+        ({"1": {"text": "x" * (LONGEST_TEXT + 1)}}, "a string of 100,001 characters"),
         ({"1": {"x" * 201: 1}}, "a name of 201 characters"),
         ({"1": {"number": float("inf")}}, "diagnostics cannot be written as JSON"),
         ({"1": {"policy": object()}}, "diagnostics cannot be written as JSON"),

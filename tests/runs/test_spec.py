@@ -62,8 +62,8 @@ def test_a_wrong_name_or_value_is_refused_before_any_work(
 @pytest.mark.parametrize(
     ("fields", "message"),
     [
-        ({"scenario": 1}, "scenario of a run must be a text, its id, not 1"),
-        ({"method": int}, "method of a run must be a text, its name or 'module:Class', not <class 'int'>"),
+        ({"scenario": 1}, "scenario of a run must be a string, its id, not 1"),
+        ({"method": int}, "method of a run must be a string, its name or 'module:Class', not <class 'int'>"),
         ({"seed": 0.5}, "seed must be a whole number, not 0.5"),
         ({"order": -1}, "order must be at least 0, not -1"),
         ({"targets": 0}, "targets must be at least 1, not 0"),

@@ -242,7 +242,7 @@ def test_a_metric_without_a_direction_orders_nothing() -> None:
 
 
 def test_rows_of_other_tasks_are_not_compared() -> None:
-    with pytest.raises(ValueError, match="same tasks"):
+    with pytest.raises(ValueError, match="different tasks"):
         groups("final_average", {"one": row(5, 6), "two": {0: equal_run(5, episodes=20)}})
 
 
@@ -344,7 +344,7 @@ def test_metrics_that_compare_with_a_reference_do_not_order_rows() -> None:
 
 def test_rows_of_other_tasks_have_no_deviation() -> None:
     others = {0: equal_run(5, tasks=2), 1: equal_run(6, tasks=2)}
-    with pytest.raises(InputError, match="same tasks"):
+    with pytest.raises(InputError, match="different tasks"):
         deviation_of_differences("final_average", [row(5, 6), others])
 
 

@@ -413,7 +413,7 @@ def test_only_seeds_that_both_have_are_compared() -> None:
 
 def test_methods_that_met_different_episodes_are_not_compared() -> None:
     runs, others = {0: scores(np.ones((2, 5)))}, {0: scores(np.ones((2, 6)))}
-    with pytest.raises(ValueError, match="same tasks, episodes"):
+    with pytest.raises(ValueError, match="different tasks, episodes"):
         paired_difference("retention", runs, others, np.random.default_rng(0))
 
 

@@ -111,7 +111,11 @@ def _lambda(state: object) -> object:
         ({"horizon": 0}, ValueError, "horizon of right must be at least 1, not 0"),
         ({"horizon": 2.5}, TypeError, "horizon of right must be a whole number, not 2.5"),
         ({"action_noise": 2}, ValueError, "action_noise of right must be from 0 to 1, not 2"),
-        ({"expert": _lambda}, TypeError, "expert of right must be a text 'module:name' such as '.*:_lambda'"),
+        (
+            {"expert": _lambda},
+            TypeError,
+            "expert of right must be a string 'module:name' such as '.*:_lambda'",
+        ),
         ({"world": "toy"}, ValueError, "world of right must have the form 'module:name', not 'toy'"),
         ({"instructions": ()}, ValueError, "task right needs an instruction"),
         ({"instructions": ("go right", " ")}, ValueError, "none of them may be empty"),
@@ -130,7 +134,7 @@ def test_a_scenario_that_has_nothing_to_ask_about_is_refused_where_it_is_built()
     with pytest.raises(ValueError, match=r"without retained tasks it needs scenes, .* scenes=target"):
         dataclasses.replace(TOY, retained=())
     assert dataclasses.replace(TOY, retained=(), scenes=TOY.target).scene_tasks == TOY.target
-    with pytest.raises(TypeError, match="questions of clbench/Toy-v0 must be a text 'module:name'"):
+    with pytest.raises(TypeError, match="questions of clbench/Toy-v0 must be a string 'module:name'"):
         dataclasses.replace(TOY, questions=None)  # type: ignore[arg-type]
 
 

@@ -356,7 +356,7 @@ FAULTS: list[tuple[type[Method], str, str, str]] = [
     (Mixed, "declaration", "Did you mean 'end_task()'?", "end_tsk() is never called"),
     (Fixed, "declaration", "with an annotation, `strength: float = 1.0`", "`strength = 1.0`"),
     (Overridden, "declaration", "no run could change step_factor", "`step_factor = 0.5`"),
-    (Texts, "constructor", "a default of the annotated type", "strength='0.5' is a text, not 0.5"),
+    (Texts, "constructor", "a default of the annotated type", "strength='0.5' is a string, not 0.5"),
     (Fractions, "constructor", "a default of the annotated type", "count must be a whole number, not 0.5"),
     (TunesNothing, "declaration", "the name of a field and two values of it", "strenth"),
     (TunesFlat, "declaration", "(name, (a, b))", "('strength', 0.1, 10.0)"),

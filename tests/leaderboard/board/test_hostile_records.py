@@ -144,7 +144,7 @@ FIELDS = [
     ("scenario.budget", 5, "scenario: budget must be an object"),
     ("scenario.evaluation_steps", list(range(1, 102)), "101 evaluation_steps; 100 are the most"),
     ("diagnostics.deep", nested(17), "diagnostics: nested more than 16 deep"),
-    ("diagnostics.text", "x" * 100_001, "diagnostics: a text of 100,001 characters"),
+    ("diagnostics.text", "x" * 100_001, "diagnostics: a string of 100,001 characters"),
     ("diagnostics", {"x" * 201: 1}, "a name of 201 characters"),
     ("diagnostics.number", 2**64, "diagnostics: a whole number of 65 bits"),
     ("fingerprint", None, "fingerprint must be an object"),

@@ -82,7 +82,7 @@ def lose_validation_episode(record: Record) -> None:
         (set_in("run", "method", "[red]x[/red] | `y` | <b>"), "cannot be the name of a method"),
         (set_in("run", "method", "x\n| best | 1.00 |"), "cannot be the name of a method"),
         (set_in("run", "method", "\x1b[31mred\u202e\ud800"), "cannot be the name of a method"),
-        (set_in("run", "method", None), "run: method must be a text, not null."),
+        (set_in("run", "method", None), "run: method must be a string, not null."),
         (set_in("run", "scenario", "../Toy\n"), "cannot be the id of a scenario"),
         (set_in("run", "scenario", "clbench/Toy-v9"), "was run"),
         (set_in("run", "seed", "0"), 'run: seed must be a whole number, not "0".'),
