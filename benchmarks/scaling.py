@@ -26,6 +26,7 @@ from result_files import write_results
 
 from clbench.base.seeding import torch_generator
 from clbench.data.demonstrations import Demonstrations, load_demonstrations
+from clbench.evaluation.episodes import Trial
 from clbench.evaluation.rollouts import Evaluator
 from clbench.learning.optimise import deterministic, optimise
 from clbench.learning.pretraining import policy_config
@@ -62,7 +63,9 @@ def evaluation_of_episodes() -> Callable[[int], float]:
     def seconds(count: int) -> float:
         begin = time.perf_counter()
         with deterministic():
-            evaluator.play(policy, [(scenario.retained[-1], "validation", number) for number in range(count)])
+            evaluator.play(
+                policy, [Trial(scenario.retained[-1], "validation", number) for number in range(count)]
+            )
         return time.perf_counter() - begin
 
     return seconds

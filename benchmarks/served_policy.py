@@ -38,8 +38,10 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=9)
     arguments = parser.parse_args()
     scenario = load_scenario(arguments.scenario)
-    trials: list[Trial] = [
-        (task, "validation", number) for task in scenario.retained for number in range(arguments.episodes)
+    trials = [
+        Trial(task, "validation", number)
+        for task in scenario.retained
+        for number in range(arguments.episodes)
     ]
     here = policy_of(arguments.scenario)
     spawn = multiprocessing.get_context("spawn")

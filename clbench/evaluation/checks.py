@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from clbench.evaluation.episodes import Episode
+from clbench.evaluation.episodes import Episode, Trial
 from clbench.evaluation.rollouts import Evaluator
 from clbench.policy.policy import Policy
 from clbench.records.record import CheckRow
@@ -46,7 +46,7 @@ class Checker:
             return successes >= goal or failures > count - goal
 
         episodes = self._evaluator.play(
-            policy, [(task, "validation", number) for number in range(count)], enough=certain
+            policy, [Trial(task, "validation", number) for number in range(count)], enough=certain
         )
         return CheckRow(*point, len(episodes), successes)
 

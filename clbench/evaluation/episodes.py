@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,12 +15,25 @@ from numpy.typing import NDArray
 from clbench.base.progress import ProgressCallback, no_progress
 from clbench.base.seeding import SPLIT_LABELS, derive_seed
 from clbench.data.access import check_episodes
-from clbench.spec.protocol import Split
+from clbench.spec.protocol import EpisodeKey, Split
 from clbench.spec.task import Task
 from clbench.worlds.lanes import Lanes
 
-Trial = tuple[Task, Split, int]
-"""One episode to run: its task, its split and its number."""
+
+class Trial(NamedTuple):
+    """One episode to run."""
+
+    task: Task
+    split: Split
+    """Split of the episode."""
+    number: int
+    """Number of the initial state within its task and split, from 0."""
+
+    @property
+    def key(self) -> EpisodeKey:
+        """The identity of the episode, which its outcome has, too."""
+        return EpisodeKey(self.task.name, self.split, self.number)
+
 
 Watch = Callable[[Trial, NDArray[np.float32]], None]
 """Called with a trial and each action (A,) taken in it."""
@@ -47,6 +60,11 @@ class Episode:
     length: int
     """Number of steps."""
 
+    @property
+    def key(self) -> EpisodeKey:
+        """The identity of the episode."""
+        return EpisodeKey(self.task, self.split, self.number)
+
 
 @dataclass
 class Live:
@@ -71,7 +89,7 @@ class Live:
     @property
     def ended(self) -> bool:
         """Whether the episode is over."""
-        return self.success or self.length == self.trial[0].horizon
+        return self.success or self.length == self.trial.task.horizon
 
     @property
     def episode(self) -> Episode:
@@ -115,7 +133,7 @@ def play_in_lanes(
     check_episodes((task.name, split) for task, split, _ in trials)
     queue, idle = list(reversed(trials)), list(range(count))
     live: list[Live] = []
-    ended: dict[tuple[str, Split, int], Episode] = {}
+    ended: dict[EpisodeKey, Episode] = {}
     certain = False
     while (queue or live) and not certain:
         starting = [(idle.pop(), queue.pop()) for _ in range(min(len(idle), len(queue)))]
@@ -123,15 +141,14 @@ def play_in_lanes(
         _execute(lanes, live, act(live), watch)
         for one in [one for one in live if one.ended]:
             episode = one.episode
-            ended[episode.task, episode.split, episode.number] = episode
+            ended[episode.key] = episode
             live.remove(one)
             idle.append(one.lane)
             progress(1)
             certain = enough(episode)
             if certain:
                 break
-    keys = [(task.name, split, number) for task, split, number in trials]
-    return [ended[key] for key in keys if key in ended]
+    return [ended[trial.key] for trial in trials if trial.key in ended]
 
 
 def _start(

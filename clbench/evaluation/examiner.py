@@ -78,7 +78,9 @@ class Examiner:
                 share are measured; None elsewhere.
         """
         keys = self._protocol.episodes(point)
-        episodes = self._play(policy, [(self._scenario.task(key.task), *key[1:]) for key in keys])
+        episodes = self._play(
+            policy, [Trial(self._scenario.task(key.task), key.split, key.number) for key in keys]
+        )
         for episode in episodes:
             record.add_episode(episode_row(point, episode))
         for kind, asked, correct in answer(policy, self._data.questions.kinds, *self._asked):
@@ -97,7 +99,7 @@ class Examiner:
     def successes(self, policy: Policy) -> dict[str, int]:
         """Return the successes of `policy` in the validation episodes of each retained skill, in order."""
         skills, numbers = self._scenario.retained, range(self._protocol.validation_episodes)
-        trials: list[Trial] = [(skill, "validation", number) for skill in skills for number in numbers]
+        trials = [Trial(skill, "validation", number) for skill in skills for number in numbers]
         found = dict.fromkeys((skill.name for skill in skills), 0)
         for episode in self._play(policy, trials):
             found[episode.task] += episode.success
@@ -137,7 +139,7 @@ class Examiner:
         ]
         numbers = range(self._protocol.captured_episodes)
         split = self._protocol.split
-        episodes = self._play(policy, [(told[number % len(told)], split, number) for number in numbers])
+        episodes = self._play(policy, [Trial(told[number % len(told)], split, number) for number in numbers])
         return sum(episode.success for episode in episodes) / len(episodes)
 
     def _batch(self, stage: int) -> Batch:

@@ -25,7 +25,7 @@ from clbench.base.errors import InputError, WrongTypeError
 from clbench.base.progress import ProgressCallback, no_progress
 from clbench.base.seeding import derive_seed
 from clbench.evaluation.episodes import LANES, Episode, Live, Trial, play_in_lanes
-from clbench.spec.protocol import Split
+from clbench.spec.protocol import EpisodeKey
 from clbench.spec.scenario import Scenario
 from clbench.worlds.lanes import Lanes
 from clbench.worlds.scenario_env import Observation, ScenarioEnv
@@ -250,11 +250,11 @@ def _play(
 
 def _observations(lanes: Lanes, live: Sequence[Live]) -> Iterator[Observation]:
     """Yield what the agent observes in each running episode."""
-    tasks = [one.trial[0] for one in live]
+    tasks = [one.trial.task for one in live]
     states = np.stack([one.state for one in live])
     numbers, images = lanes.observe([one.lane for one in live], tasks, states)
     for row, one in enumerate(live):
-        picture = {} if one.trial[0].camera is None else {"image": images[row]}
+        picture = {} if one.trial.task.camera is None else {"image": images[row]}
         yield {"state": numbers[row], **picture, "instruction": copy(one.shown)}  # agents may change theirs
 
 
@@ -292,7 +292,7 @@ class _ChunkPlayer:
     policy: ChunkPolicy
     executed: int | None
     whole: bool
-    faults: dict[tuple[str, Split, int], list[NDArray[np.bool_]]] = field(default_factory=dict)
+    faults: dict[EpisodeKey, list[NDArray[np.bool_]]] = field(default_factory=dict)
     """For each episode, chunk after chunk, whether an action was not finite or was clipped, (H, 2)."""
 
     def act(self, lanes: Lanes, live: Sequence[Live]) -> NDArray[np.float32]:
@@ -312,8 +312,7 @@ class _ChunkPlayer:
         finite = np.isfinite(actions).all(axis=-1)
         outside = finite & ((actions < space.low) | (actions > space.high)).any(axis=-1)
         for one, found in zip(live, np.stack([~finite, outside], axis=-1), strict=True):
-            task, split, number = one.trial
-            self.faults.setdefault((task.name, split, number), []).append(found)
+            self.faults.setdefault(one.trial.key, []).append(found)
         return _within(actions, space)
 
     def _length(self, chunks: Any) -> int:
@@ -336,9 +335,7 @@ class _ChunkPlayer:
 
     def shares(self, episodes: Sequence[Episode]) -> tuple[float, float]:
         """Return the shares of the steps of all episodes whose actions were not finite, and were clipped."""
-        found = [
-            np.concatenate(self.faults[one.task, one.split, one.number])[: one.length] for one in episodes
-        ]
+        found = [np.concatenate(self.faults[one.key])[: one.length] for one in episodes]
         not_finite, clipped = np.concatenate(found).mean(axis=0)
         return float(not_finite), float(clipped)
 
@@ -365,7 +362,7 @@ def _checked(action: Any, lanes: Lanes, live: Sequence[Live], rows: tuple[int, .
 
 def _space(lanes: Lanes, live: Sequence[Live]) -> spaces.Box:
     """Return the action space of the first lane; all tasks of a scenario share it."""
-    space: spaces.Box = lanes.world(live[0].trial[0]).single_action_space
+    space: spaces.Box = lanes.world(live[0].trial.task).single_action_space
     return space
 
 

@@ -65,7 +65,9 @@ class Evaluator:
             LeakError: A hook asks for other episodes than validation episodes of tasks that it knows.
         """
         numbers = range(self.scenario.budget.episodes(split))
-        return self.play(policy, [(task, split, number) for task in tasks for number in numbers], progress)
+        return self.play(
+            policy, [Trial(task, split, number) for task in tasks for number in numbers], progress
+        )
 
     def play(
         self,
@@ -114,7 +116,7 @@ class Evaluator:
             noise[row] = one.memory[one.length // config.executed]
         shown = self._lanes.observe(
             [one.lane for one in live],
-            [one.trial[0] for one in live],
+            [one.trial.task for one in live],
             np.stack([one.state for one in live]),
         )
         state[: len(live)], image[: len(live)] = map(torch.from_numpy, shown)
@@ -144,6 +146,6 @@ def _begin(policy: Policy, one: Live) -> None:
     """Give an episode the tokens of its instruction, and noise for all its forward passes, (passes, H, A)."""
     config = policy.config
     one.shown = encode([one.instruction], config.text_length)[0]
-    passes = -(-one.trial[0].horizon // config.executed)
+    passes = -(-one.trial.task.horizon // config.executed)
     shape = (passes, config.chunk, config.action_size)
     one.memory = torch.randn(shape, generator=torch_generator("noise", one.seed))

@@ -262,7 +262,7 @@ def load_stage(folder: Path, method: Method, device: torch.device | str, policy:
     return load_policy(folder, lambda made: method.load_state(made, state), policy).to(device)
 
 
-def sources(scenario: Scenario, seed: int, *modules: str) -> dict[str, Any]:
+def training_inputs(scenario: Scenario, seed: int, *modules: str) -> dict[str, Any]:
     """Return the code, with `modules`, and the data that any result of a run depends on, as JSON."""
     suites = {*packages_of(scenario.tasks, "world", "expert", "camera"), *policy_packages(scenario.policy)}
     return {

@@ -368,7 +368,7 @@ class StagedRun:
         """Return the episodes that every run plays at the end of a stage."""
         protocol = Protocol.of(self.scenario)
         keys = protocol.episodes(protocol.end(stage))
-        return [(self.scenario.task(key.task), key.split, key.number) for key in keys]
+        return [Trial(self.scenario.task(key.task), key.split, key.number) for key in keys]
 
     def report(self, record: Record, stage: int, episodes: Iterable[Episode]) -> None:
         """Add the outcomes of the trials of a stage, and answers to no questions."""

@@ -25,7 +25,7 @@ from clbench.learning.adaptation import Step
 from clbench.learning.hooks import place_of
 from clbench.learning.optimise import MethodError, deterministic
 from clbench.learning.registry import method_packages
-from clbench.learning.trainer import STAGE_FILES, Trainer, load_stage, sources
+from clbench.learning.trainer import STAGE_FILES, Trainer, load_stage, training_inputs
 from clbench.policy.checkpoint import CheckpointError
 from clbench.policy.policy import Policy
 from clbench.records.paths import stage_folder
@@ -218,7 +218,7 @@ def _kept(run: ResolvedRun, checkpoints: Path) -> Path:
 
 def _made(run: ResolvedRun) -> Path:
     """Return the folder in the cache for policies that this version of the code made again."""
-    code = sources(run.scenario, run.spec.seed, *method_packages(run.method))
+    code = training_inputs(run.scenario, run.spec.seed, *method_packages(run.method))
     return cache_folder() / "stages" / hash_of({**_identity(run, 0), **code})
 
 

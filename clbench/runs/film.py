@@ -102,7 +102,7 @@ def shoot(
             with deterministic():
                 episodes, actions = _act(evaluator, policy, trials)
             for column, trial, episode in zip(takes, trials, episodes, strict=True):
-                task = trial[0]
+                task = trial.task
                 pictures, success = _repeat(world(task), trial, seed, actions[trial], width)
                 if success != episode.success:
                     raise RuntimeError(f"{task.world} does not repeat an episode of {task.name!r}.")
@@ -124,7 +124,7 @@ def _repeat(
     world: World, trial: Trial, seed: int, actions: Sequence[NDArray[np.float32]], width: int
 ) -> tuple[list[Image.Image], bool]:
     """Return the pictures of an episode with the given actions, and whether it is a success."""
-    task = trial[0]
+    task = trial.task
     world.reset(seed=start_of(trial, seed)[0], options={"task": task.name})
     pictures, success = [picture(world, width)], False
     for action in actions:
@@ -291,7 +291,7 @@ def film_runs(
         progress: Called with the number of takes made since its last call.
     """
     scenario, seed = runs[0].scenario, runs[0].spec.seed
-    trials: list[Trial] = [(task, "validation", number) for task in tasks]
+    trials = [Trial(task, "validation", number) for task in tasks]
     rows = [
         f"{task.name} ({scenario.group(task.name).replace('_', ' ')}): {start_of(trial, seed)[1]}"
         for task, trial in zip(tasks, trials, strict=True)

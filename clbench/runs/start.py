@@ -13,7 +13,7 @@ from clbench.data.training_data import TrainingData
 from clbench.evaluation.examiner import Examiner
 from clbench.learning.optimise import deterministic
 from clbench.learning.pretraining import pretrained_policy
-from clbench.learning.trainer import sources
+from clbench.learning.trainer import training_inputs
 from clbench.policy.policy import Policy
 from clbench.records.record import Record
 from clbench.runs.length import point_length
@@ -88,6 +88,6 @@ def _kept(run: ResolvedRun, policy: Policy) -> tuple[Path, dict[str, Any]]:
         "policy": hash_of_tensors(policy.state_dict()),
         "scenario": dataclasses.asdict(run.scenario_info),
         "spec": [spec.seed, spec.device, spec.split, spec.perturb],
-        **sources(run.scenario, spec.seed),
+        **training_inputs(run.scenario, spec.seed),
     }
     return cache_folder() / "reports" / hash_of(inputs), inputs

@@ -7,12 +7,12 @@ from collections.abc import Iterable, Sequence
 
 from clbench.records.reader import RecordError
 from clbench.records.record import Record
-from clbench.scoring.reading import Row
+from clbench.scoring.reading import ScoredEpisode
 from clbench.spec.policies import is_built_in
 from clbench.spec.protocol import EpisodeKey, Point, Protocol
 
 
-def check_complete(record: Record, rows: Iterable[Row], protocol: Protocol) -> None:
+def check_complete(record: Record, rows: Iterable[ScoredEpisode], protocol: Protocol) -> None:
     """Refuse a record that is not what its budget demands: results that are left out change the scores.
 
     A method of whole stages, and a policy that was trained elsewhere, is evaluated at the ends of stages
@@ -54,7 +54,7 @@ def _check_answers(record: Record, points: Sequence[Point], demanded: int) -> No
         raise RecordError(f"answers: {total:,} questions were asked, not {demanded:,}.")
 
 
-def _check_episodes(rows: Iterable[Row], protocol: Protocol) -> Sequence[Point]:
+def _check_episodes(rows: Iterable[ScoredEpisode], protocol: Protocol) -> Sequence[Point]:
     """Check the episodes, and return the points at which the policy was evaluated, in their order."""
     played: dict[Point, set[EpisodeKey]] = defaultdict(set)
     for row in rows:

@@ -27,7 +27,7 @@ _HIGHEST = {"update_sparsity": 1.0, "activation_drift": FARTHEST, "shift": FARTH
 """Greatest possible value of each change of the policy, in the order of the columns."""
 
 
-class Row(NamedTuple):
+class ScoredEpisode(NamedTuple):
     """An evaluation episode."""
 
     point: Point
@@ -189,7 +189,7 @@ class _Points:
         return point
 
 
-def read_episodes(record: Record, protocol: Protocol) -> list[Row]:
+def read_episodes(record: Record, protocol: Protocol) -> list[ScoredEpisode]:
     """Return all episodes of a record, each checked.
 
     Raises:
@@ -213,7 +213,7 @@ def read_episodes(record: Record, protocol: Protocol) -> list[Row]:
             raise RecordError(f"{where} has an impossible return.")
         if type(length) is not int or not 0 <= length <= MOST:
             raise RecordError(f"{where} has an impossible length.")
-        rows.append(Row(point, task, split, episode, float(success)))
+        rows.append(ScoredEpisode(point, task, split, episode, float(success)))
     if len({row[:4] for row in rows}) != len(rows):
         raise RecordError("episodes: an episode is there twice.")
     _check_kinds(protocol, rows)
@@ -221,7 +221,7 @@ def read_episodes(record: Record, protocol: Protocol) -> list[Row]:
     return rows
 
 
-def _check_kinds(protocol: Protocol, rows: Iterable[Row]) -> None:
+def _check_kinds(protocol: Protocol, rows: Iterable[ScoredEpisode]) -> None:
     """Refuse a record without scored episodes, or with episodes that its kind of run does not have."""
     splits = {row.split for row in rows}
     if protocol.split not in splits:
@@ -232,7 +232,9 @@ def _check_kinds(protocol: Protocol, rows: Iterable[Row]) -> None:
         raise RecordError("episodes: there are perturbed ones, but its run does not say perturb.")
 
 
-def read_perturbed(protocol: Protocol, rows: Iterable[Row], episodes: Iterable[int]) -> list[Row]:
+def read_perturbed(
+    protocol: Protocol, rows: Iterable[ScoredEpisode], episodes: Iterable[int]
+) -> list[ScoredEpisode]:
     """Return the perturbed episodes among `rows`: all that the protocol demands, and no other.
 
     Args:
@@ -260,7 +262,7 @@ def read_perturbed(protocol: Protocol, rows: Iterable[Row], episodes: Iterable[i
     return found
 
 
-def numbers(rows: Iterable[Row]) -> tuple[int, ...]:
+def numbers(rows: Iterable[ScoredEpisode]) -> tuple[int, ...]:
     """Return the numbers of the episodes among `rows`, rising."""
     return tuple(sorted({row.episode for row in rows}))
 

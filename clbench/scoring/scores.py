@@ -14,7 +14,7 @@ from clbench.scoring.completeness import check_complete
 from clbench.scoring.layout import Array, Layout
 from clbench.scoring.rates import MEASURED, Measured, Rates, check_same, combine
 from clbench.scoring.reading import (
-    Row,
+    ScoredEpisode,
     numbers,
     place,
     read_answers,
@@ -148,7 +148,7 @@ class Scores(Measured):
         )
 
 
-def _chosen_on(rows: Sequence[Row], protocol: Protocol) -> list[Row]:
+def _chosen_on(rows: Sequence[ScoredEpisode], protocol: Protocol) -> list[ScoredEpisode]:
     """Return the validation episodes of each stage's target, which choices may look at."""
     own = [row for row in rows if row.split == "validation" and row.point.stage > 0]
     return [row for row in own if row.task == protocol.target[row.point.stage - 1]]
@@ -176,7 +176,7 @@ def _places(names: Sequence[Any]) -> dict[Any, int]:
     return {name: place for place, name in enumerate(names)}
 
 
-def _success(protocol: Protocol, rows: Sequence[Row], layout: Layout) -> Array:
+def _success(protocol: Protocol, rows: Sequence[ScoredEpisode], layout: Layout) -> Array:
     """Return the success in scored episodes, (stages + 1, points, tasks, episodes)."""
     shape = len(protocol.stages), len(protocol.steps), len(layout.tasks), len(layout.episodes)
     found = np.full(shape, np.nan)
@@ -187,7 +187,7 @@ def _success(protocol: Protocol, rows: Sequence[Row], layout: Layout) -> Array:
     return found
 
 
-def _perturbed(rows: Sequence[Row], layout: Layout) -> Array:
+def _perturbed(rows: Sequence[ScoredEpisode], layout: Layout) -> Array:
     """Return the success in perturbed episodes, (stages + 1, tasks, episodes)."""
     found = np.full((len(layout.target) + 1, len(layout.tasks), len(layout.episodes)), np.nan)
     of_task, of_episode = _places(layout.tasks), _places(layout.episodes)

@@ -24,7 +24,7 @@ from clbench.spec.protocol import FIRST_TUNING_SEED
 from clbench.spec.scenario import balanced_order, target_order
 
 from .summary import NotShown
-from .tiers import findings_of, tier_of
+from .tiers import tier_of, verification_notes
 
 ACCESS = ("never", "prepare", "throughout")
 """Values of `Record.run.uses`: when a method may use prior data."""
@@ -54,7 +54,7 @@ class Run:
     tier: str
     """One of `TIERS`."""
     findings: tuple[tuple[str, str], ...]
-    """What its verification found, as names with texts; see `findings_of`."""
+    """What its verification found, as names with texts; see `verification_notes`."""
     order: int
     """Order in which the targets were learned; 0 is the published one."""
     published: ScenarioInfo
@@ -143,7 +143,7 @@ def read_run(folder: Path, path: Path, changed: bool | None = False) -> Run:
         run.seed,
         division,
         tier_of(path),
-        tuple(findings_of(path)),
+        tuple(verification_notes(path)),
         run.order,
         published,
     )

@@ -36,7 +36,7 @@ def checks_of(record: Path) -> list[Any]:
     return [*_verification(record).get("checks", ())]
 
 
-def findings_of(record: Path) -> list[tuple[str, str]]:
+def verification_notes(record: Path) -> list[tuple[str, str]]:
     """Return who verified the record at `record`, when, and what each check found, as names with texts."""
     values = _verification(record)
     about = [(name, values.get(name)) for name in ("tier", "by", "time")]

@@ -108,8 +108,8 @@ def _replay_episodes(subject: Subject, policies: Sequence[Policy]) -> Check:
     again: list[EpisodeRow] = []
     with closing(Evaluator(scenario, subject.spec.seed)) as evaluator:
         for stage, policy in enumerate(policies):
-            trials: list[Trial] = [
-                (scenario.task(row.task), row.split, row.episode) for row in rows if row.stage == stage
+            trials = [
+                Trial(scenario.task(row.task), row.split, row.episode) for row in rows if row.stage == stage
             ]
             policy.eval()
             again += [episode_row(protocol.end(stage), episode) for episode in evaluator.play(policy, trials)]

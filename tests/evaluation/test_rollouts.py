@@ -85,9 +85,7 @@ def test_an_outcome_equals_the_outcome_in_the_plain_world_bit_for_bit(fetch_poli
     trained, _ = pretrained_policy(TOY, 0)
     cases = [(FETCH, fetch_policy, ["push", "press"]), (TOY, trained, ["left", "right", "up_left"])]
     for scenario, policy, names in cases:
-        trials: list[Trial] = [
-            (scenario.task(name), "validation", number) for name in names for number in (0, 3)
-        ]
+        trials = [Trial(scenario.task(name), "validation", number) for name in names for number in (0, 3)]
         with deterministic():
             alone = [_played_alone(policy, task, number, seed=4) for task, _, number in trials]
             for threads in (1, 2):
@@ -124,7 +122,7 @@ def test_validation_and_test_episodes_and_seeds_have_different_initial_states(fe
 def test_a_perturbed_episode_begins_with_the_seed_and_the_words_of_the_test_episode() -> None:
     task = FETCH.task("push")
     for number in range(3):
-        assert start_of((task, "perturbed", number), 5) == start_of((task, "test", number), 5)
+        assert start_of(Trial(task, "perturbed", number), 5) == start_of(Trial(task, "test", number), 5)
     assert FETCH.budget.episodes("perturbed") == FETCH.budget.test_episodes
 
 
@@ -132,8 +130,8 @@ def test_perturbed_outcomes_neither_depend_on_other_episodes_nor_change_them(
     fetch_policy: Policy,
 ) -> None:
     tasks = [FETCH.task("push"), FETCH.task("reach")]
-    plain: list[Trial] = [(task, "test", number) for task in tasks for number in range(3)]
-    perturbed: list[Trial] = [(task, "perturbed", number) for task, _, number in plain]
+    plain = [Trial(task, "test", number) for task in tasks for number in range(3)]
+    perturbed = [Trial(task, "perturbed", number) for task, _, number in plain]
     with deterministic():
         alone = (
             Evaluator(FETCH, 0).play(fetch_policy, plain),

@@ -176,7 +176,7 @@ def test_a_film_ends_like_the_recorded_episodes(recorded: tuple[Record, Path]) -
 
 def test_all_columns_of_a_row_begin_with_the_same_picture(recorded: tuple[Record, Path]) -> None:
     policies = stage_policies(SPEC.resolve(), recorded[1])
-    trials: list[Trial] = [(SCENARIO.task("left"), "validation", 1), (SCENARIO.task("down"), "validation", 1)]
+    trials = [Trial(SCENARIO.task(name), "validation", 1) for name in ("left", "down")]
     takes = shoot(SCENARIO, 0, policies, trials, 32)
     starts = [[np.asarray(take.pictures[0]) for take in row] for row in takes]
     assert all(np.array_equal(row[0], other) for row in starts for other in row)
@@ -208,7 +208,7 @@ def test_a_world_that_does_not_repeat_an_episode_is_refused_and_all_worlds_are_c
     task = dataclasses.replace(SCENARIO.task("left"), world="stranger:Unsteady")
     policies = stage_policies(SPEC.resolve(), recorded[1])[:1]
     with pytest.raises(RuntimeError, match="stranger:Unsteady does not repeat an episode of 'left'"):
-        shoot(SCENARIO, 0, policies, [(task, "validation", 0)], 32)
+        shoot(SCENARIO, 0, policies, [Trial(task, "validation", 0)], 32)
     assert Unsteady.still_open == 0
 
 

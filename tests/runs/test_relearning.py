@@ -12,6 +12,7 @@ from eager import EAGER
 
 from clbench.base.seeding import torch_generator
 from clbench.data.training_data import TrainingData
+from clbench.evaluation.episodes import Trial
 from clbench.evaluation.rollouts import Evaluator
 from clbench.learning.method import Method
 from clbench.policy.batch import Batch
@@ -76,7 +77,8 @@ def test_an_instruction_is_captured_where_the_target_is_done_though_a_skill_is_a
         for number in range(EAGER.budget.test_episodes):
             skill = skills[number % len(skills)]
             wordings = {name: getattr(skill, name) for name in ("instructions", "test_instructions")}
-            (episode,) = evaluator.play(policy, [(dataclasses.replace(target, **wordings), "test", number)])
+            trial = Trial(dataclasses.replace(target, **wordings), "test", number)
+            (episode,) = evaluator.play(policy, [trial])
             done.append(episode.success)
         shares.append(sum(done) / len(done))
     assert record.policy["captured"] == [None, *shares]

@@ -57,7 +57,7 @@ class MetricView:
 
 
 @dataclass(frozen=True)
-class Stage:
+class MatrixLine:
     """A row of the success matrix, mean over seeds."""
 
     name: str
@@ -84,7 +84,7 @@ class RowView:
     """Cells of the table's `columns`."""
     metrics: tuple[MetricView, ...]
     """Metrics in the section of the row."""
-    stages: tuple[Stage, ...]
+    stages: tuple[MatrixLine, ...]
     data: Mapping[str, Any]
     """Data that the page draws when the section opens."""
     description: Description | None
@@ -287,7 +287,7 @@ def _of_seeds(row: Row, rows: Sequence[Row]) -> dict[str, list[float | None]]:
     return found
 
 
-def _stages(row: Row) -> list[Stage]:
+def _stages(row: Row) -> list[MatrixLine]:
     """Return the success matrix."""
     layout, names = row.runs[0].scores.layout, places(row)
     begin = "after the old skills" if row.division == "online" else "pretrained"
@@ -296,7 +296,7 @@ def _stages(row: Row) -> list[Stage]:
     for stage, line in enumerate(success):
         values = [finite(value) for value in line]
         stages.append(
-            Stage(
+            MatrixLine(
                 printable(f"after {names[stage - 1]}") if stage else begin,
                 tuple(number_text(value, ".2f", MISSING) for value in values),
                 tuple(None if value is None else round(round(value, 9) * SHADES) for value in values),
