@@ -40,9 +40,9 @@ from .records.reader import read_record as read_record
 from .records.record import Record as Record
 from .runs.agents import evaluate_agent as evaluate_agent
 from .runs.agents import next_stage as next_stage
-from .runs.checkpoints import MachineError as MachineError
 from .runs.run import execute as execute
 from .runs.spec import RunSpec as RunSpec
+from .runs.stages import MachineError as MachineError
 from .spec.budget import Budget as Budget
 from .spec.identifiers import scenario_ids as scenario_ids
 from .spec.registry import load_scenario as load_scenario

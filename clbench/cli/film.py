@@ -131,8 +131,8 @@ def _policies(
     runs: Sequence[ResolvedRun], numbers: Sequence[int], checkpoints: Path | None, console: Console
 ) -> dict[str, Policy]:
     """Return the policies by the captions of their columns; methods share the one before any target."""
-    from clbench.runs.checkpoints import load_stages
     from clbench.runs.film import column_of
+    from clbench.runs.stages import load_stages
 
     columns: dict[str, Policy] = {}
     for run, folder in zip(runs, _stages_folders(runs, checkpoints, console), strict=True):
@@ -157,7 +157,7 @@ def _stages_folders(runs: Sequence[ResolvedRun], checkpoints: Path | None, conso
     from clbench.jobs.plan import Plan
     from clbench.jobs.processes import Processes
     from clbench.jobs.scheduler import run_with_bars
-    from clbench.runs.checkpoints import find_stages, make_stages
+    from clbench.runs.stages import find_stages, make_stages
 
     found = [find_stages(run, checkpoints) for run in runs]
     plan = Plan()

@@ -67,7 +67,7 @@ class Missing(NamedTuple):
 
 def missing(runs: Sequence[ResolvedRun], records: Path, checkpoints: Path | None) -> Missing:
     """Return what has to be done until all runs have a record and, with `checkpoints`, policies there."""
-    from clbench.runs.checkpoints import has_stages
+    from clbench.runs.stages import has_stages
 
     without, stages = [], []
     for run in runs:

@@ -110,7 +110,7 @@ def make_policies(spec: RunSpec, checkpoints: Path | None, progress: ProgressCal
     Raises:
         MethodError: The method fails.
     """
-    from clbench.runs.checkpoints import keep_stages, make_stages
+    from clbench.runs.stages import keep_stages, make_stages
 
     run = spec.resolve()
     if checkpoints is None:

@@ -30,11 +30,11 @@ from clbench.records.paths import stage_folder
 from clbench.records.reader import read_record
 from clbench.records.record import Costs, Record
 from clbench.records.writer import check_diagnostics, write_record, write_result
-from clbench.runs.checkpoints import NOT_THE_METHOD, drop_stages, has_stages, keep_stage, machine_needed
 from clbench.runs.fingerprint import fingerprint
 from clbench.runs.length import relearning_length, relearns, run_length
 from clbench.runs.relearning import relearn
 from clbench.runs.spec import ResolvedRun, RunSpec
+from clbench.runs.stages import NOT_THE_METHOD, drop_stages, has_stages, keep_stage, machine_needed
 from clbench.runs.start import evaluate_start
 from clbench.runs.step_time import step_ratio
 from clbench.runs.tensorboard import Log, require_tensorboard
@@ -75,7 +75,7 @@ def execute(
     resolved = run.resolve() if isinstance(run, RunSpec) else run
     # a method may change the working directory
     path = resolved.path(Path(records).absolute())
-    folder = _checkpoints(resolved, Path(records))
+    folder = _resume_folder(resolved, Path(records))
     kept, log = (None if one is None else Path(one).absolute() for one in (checkpoints, tensorboard))
     for other in (kept, log):
         if other is not None:
@@ -91,8 +91,8 @@ def execute(
     return record
 
 
-def _checkpoints(run: ResolvedRun, records: Path) -> Path:
-    """Return the folder of the checkpoints of a run in the cache."""
+def _resume_folder(run: ResolvedRun, records: Path) -> Path:
+    """Return the folder in the cache from which an interrupted run goes on."""
     # two commands may do the same run for different folders at once
     return cache_folder() / "runs" / hash_of({**_inputs(run), "records": str(records.resolve())})
 
@@ -145,15 +145,15 @@ class _Run:
     record: Record
     log: Log
     progress: ProgressCallback
-    checkpoints: Path
-    """Folder of the checkpoints in the cache."""
+    resume_folder: Path
+    """Folder in the cache with the state after each stage, from which an interrupted run goes on."""
     lease: Lease
-    """The right to write the checkpoints."""
+    """The right to write into this folder."""
     kept: Path | None
     """Folder below which the policies of all stages are kept."""
     tensorboard: Path | None
     inputs: dict[str, Any]
-    """Everything that the checkpoints depend on. Code that changes while a run goes on is not the run's."""
+    """Everything that these states depend on. Code that changes while a run goes on is not the run's."""
     begin: float = dataclasses.field(default_factory=time.perf_counter)
     seconds_before: float = 0.0
     """Seconds that the run took before it was interrupted."""
@@ -162,7 +162,7 @@ class _Run:
     def start(
         cls,
         run: ResolvedRun,
-        checkpoints: Path,
+        resume_folder: Path,
         lease: Lease,
         progress: ProgressCallback,
         kept: Path | None,
@@ -185,7 +185,7 @@ class _Run:
             record=record,
             log=Log(),
             progress=progress,
-            checkpoints=checkpoints,
+            resume_folder=resume_folder,
             lease=lease,
             kept=kept,
             tensorboard=tensorboard,
@@ -216,8 +216,8 @@ class _Run:
         return self.record
 
     def forget(self) -> None:
-        """Remove the checkpoints, once the record is written."""
-        shutil.rmtree(self.checkpoints, ignore_errors=True)
+        """Remove what an interrupted run goes on from, once the record is written."""
+        shutil.rmtree(self.resume_folder, ignore_errors=True)
 
     def _go_through(self) -> None:
         done = self._resume()
@@ -353,7 +353,7 @@ class _Run:
         self.trainer.load(self._checkpoint(number), number)
 
     def _checkpoint(self, number: int) -> Path:
-        return stage_folder(self.checkpoints, number)
+        return stage_folder(self.resume_folder, number)
 
     def _resume(self) -> int | None:
         """Load the record of the latest checkpoint and return its stage, or None if there is no checkpoint.

@@ -25,9 +25,9 @@ from clbench.learning.trainer import Trainer
 from clbench.policy.policy import Policy
 from clbench.records.paths import stage_folder
 from clbench.records.record import EpisodeRow
-from clbench.runs.checkpoints import kept_stages, load_stages, stage_policies
 from clbench.runs.run import pretrained_hash
 from clbench.runs.spec import check_device
+from clbench.runs.stages import kept_stages, load_stages, stage_policies
 from clbench.spec.protocol import Point
 
 from .subject import Check, Subject, some

@@ -18,9 +18,9 @@ from clbench.base.progress import ProgressCallback
 from clbench.jobs.grid import run_missing
 from clbench.jobs.job import Job
 from clbench.jobs.processes import Here
-from clbench.runs.checkpoints import has_stages
 from clbench.runs.run import execute
 from clbench.runs.spec import RunSpec
+from clbench.runs.stages import has_stages
 
 TOY = "clbench.testing:clbench/Toy-v0"
 

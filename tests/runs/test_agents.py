@@ -44,10 +44,11 @@ def evaluate(tmp_path: Path, empty_caches: Path) -> Callable[..., Any]:
     return evaluate
 
 
-def test_an_agent_observes_exactly_what_the_environment_returns(evaluate: Callable[..., Any]) -> None:
+def test_an_agent_observes_what_the_space_of_its_environment_declares(evaluate: Callable[..., Any]) -> None:
     env = gymnasium.make("clbench.testing.seen_toy:clbench/SeenToy-v0", stage=0)
     agent = Looking()
     evaluate(agent, env)
+    assert agent.shown
     assert all(env.observation_space.contains(shown) for shown in agent.shown)
     assert any(shown["image"].any() for shown in agent.shown)
 
@@ -113,6 +114,7 @@ def test_a_function_is_an_agent_and_observes_what_its_env_returns(evaluate: Call
         return [-1, 0]
 
     record = evaluate(act, env)
+    assert seen
     assert all(seen)
     scores = Scores.from_record(record, partial=True)  # its stages are still to come
     rates = scores.success[0].mean(axis=-1)
@@ -131,6 +133,7 @@ def test_an_agent_that_overwrites_its_observation_changes_no_later_one(
         return np.zeros(2)
 
     evaluate(act, stage_env(0, instruction="tokens"))
+    assert seen
     assert all(seen)
 
 

@@ -21,10 +21,10 @@ from clbench.policy.transformer import TransformerPolicy
 from clbench.records.reader import read_record
 from clbench.records.record import Record
 from clbench.records.writer import write_record
-from clbench.runs.checkpoints import keep_stage, stage_policies
 from clbench.runs.length import run_length
 from clbench.runs.run import execute
 from clbench.runs.spec import RunSpec
+from clbench.runs.stages import keep_stage, stage_policies
 from clbench.scoring.metrics import measure
 from clbench.scoring.scores import Scores
 from clbench.spec.protocol import Point, check_steps

@@ -16,7 +16,6 @@ from PIL import Image, ImageDraw
 from clbench.cli.film import film
 from clbench.evaluation.episodes import Episode, Trial
 from clbench.records.record import Record
-from clbench.runs.checkpoints import stage_policies
 from clbench.runs.film import (
     FAILURE,
     FASTEST,
@@ -30,6 +29,7 @@ from clbench.runs.film import (
 )
 from clbench.runs.run import execute
 from clbench.runs.spec import RunSpec
+from clbench.runs.stages import stage_policies
 from clbench.spec.registry import load_scenario
 from clbench.testing import ToyWorld
 from clbench.worlds.gl_backend import RenderingError, choose_back_end

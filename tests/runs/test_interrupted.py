@@ -10,9 +10,9 @@ from torch import Tensor
 
 from clbench.learning.method import Method
 from clbench.policy.policy import Policy
-from clbench.runs.checkpoints import make_stages
 from clbench.runs.run import execute
 from clbench.runs.spec import RunSpec
+from clbench.runs.stages import make_stages
 
 TOY = "clbench.testing:clbench/Toy-v0"
 

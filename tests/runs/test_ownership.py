@@ -27,9 +27,9 @@ from clbench.policy.policy import Policy
 from clbench.records.reader import UnreadableRecordError, read_record
 from clbench.records.record import SCHEMA
 from clbench.records.writer import write_record, write_result
-from clbench.runs.checkpoints import MachineError, make_stages
 from clbench.runs.run import execute
 from clbench.runs.spec import RunSpec
+from clbench.runs.stages import MachineError, make_stages
 from clbench.scoring.scores import Scores
 
 TOY = "clbench.testing:clbench/Toy-v0"

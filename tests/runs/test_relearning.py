@@ -19,10 +19,10 @@ from clbench.policy.batch import Batch
 from clbench.policy.policy import Policy
 from clbench.policy.transformer import TransformerPolicy
 from clbench.records.record import Record, Relearning
-from clbench.runs.checkpoints import stage_policies
 from clbench.runs.length import run_length
 from clbench.runs.run import execute
 from clbench.runs.spec import RunSpec
+from clbench.runs.stages import stage_policies
 from clbench.scoring.metrics import measure
 from clbench.scoring.scores import Scores
 from clbench.spec.protocol import check_steps

@@ -22,9 +22,9 @@ from clbench.learning.method import Method, MethodState, Stage
 from clbench.learning.optimise import MethodError
 from clbench.policy.checkpoint import CheckpointError
 from clbench.policy.policy import Policy
-from clbench.runs.checkpoints import find_stages, has_stages, keep_stages, load_stages, stage_policies
 from clbench.runs.run import execute
 from clbench.runs.spec import RunSpec
+from clbench.runs.stages import find_stages, has_stages, keep_stages, load_stages, stage_policies
 
 SPEC = RunSpec(TINY.id, "lora", seed=0)
 
