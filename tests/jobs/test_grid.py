@@ -72,7 +72,7 @@ def test_a_class_of_a_module_runs_in_processes_and_its_change_is_noticed(
     (record,) = clbench.run(TOY, module.Slow, seeds=1, records=tmp_path / "records")
     assert (record.run.method, record.run.seed) == ("slow:Slow", 0)
     assert clbench.run(TOY, module.Slow, seeds=1, records=tmp_path / "records") == [record]
-    (tmp_path / "slow.py").write_text(f"{METHOD}    # a remark\n", encoding="utf-8")
+    (tmp_path / "slow.py").write_text(f"{METHOD}    _speed = 1\n", encoding="utf-8")
     capsys.readouterr()
     (again,) = clbench.run(TOY, importlib.reload(module).Slow, seeds=1, records=tmp_path / "records")
     assert "the code of slow:Slow has changed since" in capsys.readouterr().err

@@ -1,7 +1,6 @@
 """Processes of jobs: what a job does to its process and begins beside it ends with the job."""
 
 import importlib
-import io
 import os
 import signal
 import subprocess
@@ -13,6 +12,7 @@ from typing import Any
 
 import psutil
 import pytest
+from helpers import printed
 
 from clbench.base.cache import cache_folder
 from clbench.jobs.bars import Bars
@@ -85,11 +85,6 @@ def _is_gone(process: int) -> bool:
     return False
 
 
-def _printed(bars: Bars) -> str:
-    assert isinstance(bars.console.file, io.StringIO)
-    return bars.console.file.getvalue()
-
-
 def test_the_children_of_a_job_end_with_it(tmp_path: Path, bars: Bars) -> None:
     path = tmp_path / "child"
     assert run_jobs([_job("leaves_a_child", path=str(path))], Processes(1), bars) == {}
@@ -118,7 +113,7 @@ def test_closing_ends_a_job_that_ignores_it_and_its_children(
 
 def test_a_job_may_start_processes_of_its_own(bars: Bars) -> None:
     assert run_jobs([_job("has_a_helper")], Processes(1), bars) == {}
-    assert "its helper ended with 0" in _printed(bars)
+    assert "its helper ended with 0" in printed(bars)
 
 
 @pytest.mark.parametrize("workers", [Processes, Here])
@@ -138,7 +133,7 @@ def test_a_job_that_moves_finds_the_folders_of_data_where_they_were(
     monkeypatch.setenv("MINARI_DATASETS_PATH", "data")
     assert (cache_folder(), minari_folder()) == (tmp_path / "caches/clbench", tmp_path / "data")
     assert run_jobs([_job("moves", folder=os.sep)], Processes(1), bars) == {}
-    assert f"{tmp_path}/caches/clbench and {tmp_path}/data" in _printed(bars)
+    assert f"{tmp_path}/caches/clbench and {tmp_path}/data" in printed(bars)
 
 
 def test_leases_are_given_back_if_closing_is_interrupted(tmp_path: Path, bars: Bars) -> None:

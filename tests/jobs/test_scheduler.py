@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from helpers import printed
 from rich.console import Console
 
 from clbench.base.errors import InputError
@@ -89,17 +90,12 @@ def _plan(records: Path, *specs: RunSpec) -> list[Job]:
     return plan.jobs
 
 
-def _printed(bars: Bars) -> str:
-    assert isinstance(bars.console.file, io.StringIO)
-    return bars.console.file.getvalue()
-
-
 def test_a_job_starts_after_the_jobs_that_it_needs(tmp_path: Path, bars: Bars) -> None:
     first = _job("first", "good", path=str(tmp_path / "1"))
     second = _job("second", "good", first, path=str(tmp_path / "2"))
     assert run_jobs([second, first], Processes(2), bars) == {}
     assert (tmp_path / "1").stat().st_mtime_ns < (tmp_path / "2").stat().st_mtime_ns
-    assert "first: went well" in _printed(bars)
+    assert "first: went well" in printed(bars)
 
 
 def test_a_job_that_fails_or_is_killed_does_not_stop_the_others(bars: Bars) -> None:
@@ -111,7 +107,7 @@ def test_a_job_that_fails_or_is_killed_does_not_stop_the_others(bars: Bars) -> N
     assert "ValueError: went wrong" in failed["wrong"]
     assert "exit code -9" in failed["dead"]
     assert failed["hopeless"] == "left out, because dead failed"
-    assert "fine: went well" in _printed(bars)
+    assert "fine: went well" in printed(bars)
 
 
 def _damaged() -> bool:
@@ -163,18 +159,18 @@ def test_a_job_that_another_command_does_waits_for_it(
         jobs = [_claimed("claimed", made), _claimed("other", tmp_path / "other")]
         assert run_jobs(jobs, Processes(1), bars) == {}
     assert made.read_text() == text
-    printed = _printed(bars)
-    assert printed.index("other: went well") < printed.index("claimed: ")
-    assert f"Another command does the last job; waiting for process {other.pid} on " in printed
-    assert ("claimed: done by another command" in printed) == (end == "finish")
+    text = printed(bars)
+    assert text.index("other: went well") < text.index("claimed: ")
+    assert f"Another command does the last job; waiting for process {other.pid} on " in text
+    assert ("claimed: done by another command" in text) == (end == "finish")
     assert {path.name for path in tmp_path.iterdir()} <= {"made", "other", "some_jobs.py", "__pycache__"}
 
 
 def test_a_job_whose_work_another_process_took_over_is_done_later(tmp_path: Path, bars: Bars) -> None:
     taken = _job("taken", "loses_its_lease", path=str(tmp_path / "x"))
     assert run_jobs([taken], Processes(1), bars) == {}
-    assert "taken: lost to another process" in _printed(bars)
-    assert "taken: went well" in _printed(bars)
+    assert "taken: lost to another process" in printed(bars)
+    assert "taken: went well" in printed(bars)
 
 
 def test_a_job_that_leaves_a_thread_behind_ends_with_its_result(
@@ -184,7 +180,7 @@ def test_a_job_that_leaves_a_thread_behind_ends_with_its_result(
     begin = time.monotonic()
     assert run_jobs([_job("loose", "leaves_a_thread"), _job("next", "good")], Processes(1), bars) == {}
     assert time.monotonic() - begin < 500
-    assert "next: went well" in _printed(bars)
+    assert "next: went well" in printed(bars)
 
 
 def test_a_job_of_this_process_that_leaves_it_fails_with_its_words(bars: Bars) -> None:
@@ -199,8 +195,8 @@ def test_a_variable_that_is_unset_is_unset_in_the_next_worker(
     assert run_jobs([_job("before", "reads", name="CLBENCH_SOME_PLACE")], Processes(1), bars) == {}
     monkeypatch.delenv("CLBENCH_SOME_PLACE")
     assert run_jobs([_job("after", "reads", name="CLBENCH_SOME_PLACE")], Processes(1), bars) == {}
-    assert "before: somewhere" in _printed(bars)
-    assert "after: unset" in _printed(bars)
+    assert "before: somewhere" in printed(bars)
+    assert "after: unset" in printed(bars)
 
 
 def test_stopping_the_scheduler_ends_its_processes(
@@ -252,7 +248,7 @@ def test_jobs_on_the_longest_chain_start_first(bars: Bars) -> None:
         Job("run that goes fast", good, {}, 8.0, pace=0.5),
     ]
     assert run_jobs(jobs, Processes(1), bars) == {}
-    ended = [line.partition(":")[0] for line in _printed(bars).splitlines()]
+    ended = [line.partition(":")[0] for line in printed(bars).splitlines()]
     assert ended == [
         "pretraining of the long run",
         "long run",

@@ -16,15 +16,6 @@ from clbench.records.writer import write_record
 RELEARNING: dict[str, Any] = {"skill": "left", "successes": 3, "steps": 14, "met": True}
 
 
-@pytest.fixture
-def record(make_record: Callable[..., Record]) -> Record:
-    return make_record(
-        [[1.0, 0.0, 0.0], [0.5, 1.0, 0.0]],
-        answers={(0, "left"): (10, 9), (1, "left"): (10, 8)},
-        sparsity=[[0.9, 0.8, 0.7, 0.6]],
-    )
-
-
 def change(path: Path, **fields: Any) -> None:
     """Set fields of the record at `path`, and its hash."""
     values = json.loads(path.read_text(encoding="utf-8"))

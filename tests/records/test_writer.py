@@ -16,15 +16,6 @@ from clbench.records.record import Record
 from clbench.records.writer import MOST_DIAGNOSTICS, check_diagnostics, write_record
 
 
-@pytest.fixture
-def record(make_record: Callable[..., Record]) -> Record:
-    return make_record(
-        [[1.0, 0.0, 0.0], [0.5, 1.0, 0.0]],
-        answers={(0, "left"): (10, 9), (1, "left"): (10, 8)},
-        sparsity=[[0.9, 0.8, 0.7, 0.6]],
-    )
-
-
 def test_a_record_that_was_written_is_read_as_it_was(record: Record, tmp_path: Path) -> None:
     record.run.settings = {"strength": 0.1, "layers": [1, 2], "name": "naïve | \n"}
     record.diagnostics = {"shed": [0.1, 1e-9]}

@@ -18,20 +18,8 @@ from clbench.evaluation.definition import definition
 from clbench.records.reader import read_record
 from clbench.records.record import Costs
 from clbench.records.status import found_runs
-from clbench.runs.agents import evaluate_agent, next_stage
+from clbench.runs.agents import next_stage
 from clbench.runs.spec import describe_scenario
-
-
-@pytest.fixture
-def evaluate(tmp_path: Path, empty_caches: Path) -> Callable[..., Any]:
-    """Return `evaluate_agent` for the method me/knows, with separate records and caches for the test."""
-
-    def evaluate(agent: Any, env: Any, **options: Any) -> Any:
-        return evaluate_agent(
-            agent, env, **{"method": "me/knows", "records": tmp_path / "records", **options}
-        )
-
-    return evaluate
 
 
 def test_stages_are_evaluated_once_and_in_order(evaluate: Callable[..., Any]) -> None:

@@ -14,7 +14,6 @@ from agents import ID, LEARNED, TOY, Knowing, stage_env, trained
 from clbench.policy.transformer import TransformerPolicy
 from clbench.records.reader import read_record
 from clbench.records.record import Costs
-from clbench.runs.agents import evaluate_agent
 from clbench.scoring.metrics import measure
 from clbench.scoring.scores import Scores
 from clbench.worlds.scenario_env import Observation, ScenarioEnv
@@ -30,18 +29,6 @@ class Looking:
     def predict(self, observation: Observation, *, deterministic: bool) -> tuple[Any, Any]:
         self.shown.append(observation)
         return np.zeros(2), None
-
-
-@pytest.fixture
-def evaluate(tmp_path: Path, empty_caches: Path) -> Callable[..., Any]:
-    """Return `evaluate_agent` for the method me/knows, with separate records and caches for the test."""
-
-    def evaluate(agent: Any, env: Any, **options: Any) -> Any:
-        return evaluate_agent(
-            agent, env, **{"method": "me/knows", "records": tmp_path / "records", **options}
-        )
-
-    return evaluate
 
 
 def test_an_agent_observes_what_the_space_of_its_environment_declares(evaluate: Callable[..., Any]) -> None:

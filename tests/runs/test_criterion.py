@@ -35,12 +35,6 @@ subject = importlib.import_module("clbench.leaderboard.submission.subject")
 tiers = importlib.import_module("clbench.leaderboard.board.tiers")
 
 
-@pytest.fixture(scope="module")
-def record(tmp_path_factory: pytest.TempPathFactory) -> Record:
-    """A run of plain fine-tuning."""
-    return execute(RunSpec(EAGER.id, "sft", seed=0), tmp_path_factory.mktemp("records"))
-
-
 def test_a_stage_ends_at_the_first_check_that_meets_the_criterion(record: Record) -> None:
     assert record.status == "success", record.error
     planned = check_steps(200)

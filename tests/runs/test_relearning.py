@@ -29,12 +29,6 @@ from clbench.spec.protocol import check_steps
 
 
 @pytest.fixture(scope="module")
-def record(tmp_path_factory: pytest.TempPathFactory) -> Record:
-    """A run of plain fine-tuning."""
-    return execute(RunSpec(EAGER.id, "sft", seed=0), tmp_path_factory.mktemp("records"))
-
-
-@pytest.fixture(scope="module")
 def policies(record: Record) -> list[Policy]:
     """The policies of its stages, made again."""
     return stage_policies(RunSpec(EAGER.id, "sft", seed=0).resolve())

@@ -3,6 +3,7 @@
 import base64
 import dataclasses
 import gzip
+import io
 import json
 import re
 from collections.abc import Callable, Mapping, Sequence
@@ -15,6 +16,7 @@ from torch import Tensor
 
 from clbench.base.entry_points import resolve
 from clbench.data.demonstrations import Demonstration
+from clbench.jobs.bars import Bars
 from clbench.learning.method import Method
 from clbench.learning.registry import load_method, new_method, read_changes
 from clbench.policy.policy import Policy
@@ -139,3 +141,9 @@ def write_two_records(folder: Path, make_record: Callable[..., Record]) -> Path:
         write_record(record, record_path(folder, "clbench/Toy-v0", name, seed))
     (folder / "notes.json").write_text("{}")
     return folder
+
+
+def printed(bars: Bars) -> str:
+    """Return what bars that draw into a text have printed."""
+    assert isinstance(bars.console.file, io.StringIO)
+    return bars.console.file.getvalue()
