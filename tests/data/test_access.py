@@ -15,6 +15,7 @@ METHODS = '''
 import dataclasses
 
 from clbench.data.demonstrations import dataset_folder, load_demonstrations, read_dataset
+from clbench.evaluation.episodes import Trial
 from clbench.evaluation.players import play
 from clbench.evaluation.rollouts import Evaluator
 from clbench.learning.method import Method
@@ -72,7 +73,7 @@ class Chooser(Method):
     def end_task(self, policy, stage):
         evaluator = Evaluator(TOY, 0)
         try:
-            evaluator.play(policy, [(TOY.target[self.task], self.split, 0)])
+            evaluator.play(policy, [Trial(TOY.target[self.task], self.split, 0)])
         finally:
             evaluator.close()
 
@@ -104,7 +105,7 @@ class Player(Method):
     """It chooses on test episodes that a function for agents plays."""
 
     def end_task(self, policy, stage):
-        play(lambda observation: TOY.target[0], TOY, [(TOY.target[0], "test", 0)], 0, "text", False)
+        play(lambda observation: TOY.target[0], TOY, [Trial(TOY.target[0], "test", 0)], 0, "text", False)
 
 
 @dataclasses.dataclass

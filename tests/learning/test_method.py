@@ -209,7 +209,7 @@ def test_a_method_is_described_with_the_hash_of_its_code(
     text = "import dataclasses, clbench\n@dataclasses.dataclass\nclass Mine(clbench.Method): ...\n"
     monkeypatch.syspath_prepend(tmp_path)
     hashes = []
-    for ending in ("", "# changed\n"):
+    for ending in ("", "CHANGED = True\n"):
         (tmp_path / "described.py").write_text(text + ending)
         found = describe_method(load_method("described:Mine"))
         assert {**found, "source": ""} == {**vars(Metadata()), "source": ""}
@@ -252,7 +252,7 @@ def test_the_source_of_a_method_covers(changed: str, write_module: Callable[[str
     )
     before = describe_method(load_method("derived_with_helpers:Mine"))["source"]
     path = Path(sys.modules[changed].__file__ or "")
-    path.write_text(path.read_text() + "# changed\n")
+    path.write_text(path.read_text() + "CHANGED = True\n")
     assert describe_method(load_method("derived_with_helpers:Mine"))["source"] != before
     for name in ("derived_with_helpers", *BEHIND.values()):
         del sys.modules[name]

@@ -300,7 +300,7 @@ from clbench.spec.registry import load_scenario
 
 scenario = load_scenario("clbench/Fetch-v1")
 policy = TransformerPolicy(policy_config(scenario), seed=3)
-((take,),) = shoot(scenario, 0, [policy], [(scenario.task("push"), "validation", 0)], 96)
+((take,),) = shoot(scenario, 0, [policy], [Trial(scenario.task("push"), "validation", 0)], 96)
 print(take.episode.length, len({picture.tobytes() for picture in take.pictures}), *take.pictures[0].size)
 """
 
