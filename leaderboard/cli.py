@@ -26,11 +26,13 @@ from clbench.cli.arguments import (
     add_cwd_to_path,
     check_names,
     checked_input,
+    error_line,
     print_json,
     whole_number,
 )
 from clbench.jobs.folders import check_folders
 from clbench.records.paths import RECORDS, record_path
+from clbench.records.reader import RecordError, home_of, read_record
 from clbench.spec.identifiers import scenario_ids, without_module
 from clbench.spec.protocol import DEFAULT_SEEDS
 
@@ -79,7 +81,9 @@ def show(
             sort = load_metric(sort).name
     messages = Console(stderr=True, soft_wrap=True)
     if published:
-        messages.print(Text(f"{counted(add_published(records), 'published record')} added to {records}."))
+        with checked_input():
+            added = add_published(records)
+        messages.print(Text(f"{counted(added, 'published record')} added to {records}."))
     if not any(records.rglob("*.json")):
         message = f"There are no records in {records}. Make some first: clbench run {SCENARIO} sft\n"
         message += "Or look at the published ones: clbench leaderboard --published"
@@ -90,6 +94,11 @@ def show(
     computed = None
     if board is None:
         board = computed = _computed(records)
+    if not board.rows:
+        for entry in board.not_shown:
+            messages.print(Text(printable(f"Not shown: {entry.path}: {entry.reason}")))
+        messages.print(error_line(f"No record in {records} makes a row, and no board was written."))
+        raise SystemExit(2)
     with checked_input():
         shown = _chosen(board, scenario, records)
     if as_json:
@@ -289,10 +298,8 @@ def _placed(found: list[Path], records: Path) -> tuple[list[Path], Path]:
     """Return the records and their folder in one form, as typed or absolute.
 
     Raises:
-        InputError: A record is not below the folder.
+        InputError: A record is not below the folder, or has its place below another one.
     """
-    if all(path.is_relative_to(records) for path in found):
-        return found, records
     folder = Path(os.path.abspath(records))
     absolute = [Path(os.path.abspath(path)) for path in found]
     for path in absolute:
@@ -301,4 +308,17 @@ def _placed(found: list[Path], records: Path) -> tuple[list[Path], Path]:
                 f"{path} is not below {folder}: name its folder of records, in which it is "
                 "SCENARIO/METHOD/seed-N.json, with --records."
             )
-    return absolute, folder
+        home = _home_of(path)
+        if home is not None and home != folder:
+            raise InputError(f"{path} has its place below {home}: add --records {home}.")
+    typed = all(path.is_relative_to(records) for path in found)
+    return (found, records) if typed else (absolute, folder)
+
+
+def _home_of(path: Path) -> Path | None:
+    """Return the folder of records in which a record has its place; None if it has none, or is no record."""
+    try:
+        parts = home_of(read_record(path).run).parts
+    except RecordError:
+        return None
+    return path.parents[len(parts) - 1] if path.parts[-len(parts) :] == parts else None

@@ -41,9 +41,9 @@ def whole_number(least: int, most: int | None = None) -> Parameter:
 
 
 def _whole_number(_: object, tokens: Sequence[Token]) -> int:
-    """Return the number that a token spells; cyclopts would round 1.5."""
+    """Return the number that a token spells; cyclopts would round 1.5, and Python reads 1_0 as 10."""
     try:
-        return int(tokens[0].value)
+        return int(tokens[0].value.replace("_", "-"))
     except ValueError:
         raise ValueError(f"it must be a whole number, not {tokens[0].value!r}") from None
 
@@ -144,10 +144,15 @@ def error_line(message: object) -> Text:
     return Text(f"error: {printable(' '.join(str(message).split()))}", style="bold red")
 
 
-def expand_home(_: App, __: Sequence[str], arguments: ArgumentCollection) -> None:
-    """Replace ~ at the beginning of each path: no shell does so inside quotes, or in --records=~/x."""
+def read_paths(_: App, __: Sequence[str], arguments: ArgumentCollection) -> None:
+    """Refuse empty paths, and replace ~ at the beginning of each: no shell does so in --records=~/x.
+
+    An empty path, for example of a variable that is not set, would stand for the working directory.
+    """
     for argument in arguments:
         if Path in (argument.hint, *get_args(argument.hint)):
+            if any(not token.value for token in argument.tokens):
+                raise CycloptsError(f"{argument.name} must not be empty.")
             argument.tokens[:] = [
                 token.evolve(value=os.path.expanduser(token.value)) for token in argument.tokens
             ]
@@ -188,4 +193,8 @@ def checked_input() -> Iterator[None]:
 
 def add_cwd_to_path() -> None:
     """Let module:Class name a module in the working directory: a console script does not look there."""
-    sys.path.insert(0, os.getcwd())
+    with checked_input():
+        try:
+            sys.path.insert(0, os.getcwd())
+        except FileNotFoundError:
+            raise InputError("The working directory no longer exists: change to another one.") from None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import logging
 import os
 import re
 import shutil
@@ -27,6 +28,8 @@ from clbench.base.leftovers import finished_name, is_left_behind, is_unfinished,
 from clbench.cli.arguments import checked_input, whole_number
 from clbench.jobs.folders import minari_folder
 from clbench.records.reader import RecordError, read_record
+
+LOG = logging.getLogger("clbench")
 
 DEMONSTRATIONS = "demonstrations"
 """Kind of the Minari datasets that clbench collected."""
@@ -205,7 +208,7 @@ def entries() -> Iterator[Entry]:
         folder = cache_folder() / kind
         if kind == DEMONSTRATIONS or not _is_folder(folder):
             continue
-        for path in sorted(folder.iterdir()):
+        for path in _inside(folder):
             if _NAME.fullmatch(path.name) and _is_made_here(kind, path):
                 yield Entry(kind, path)
         yield from _leftovers(kind, folder)
@@ -214,6 +217,15 @@ def entries() -> Iterator[Entry]:
         manifests = sorted(path for path in _walk(datasets) if path.name == MANIFEST)
         yield from (Entry(DEMONSTRATIONS, path.parent) for path in manifests if _is_dataset(path.parent))
         yield from _leftovers(DEMONSTRATIONS, datasets)
+
+
+def _inside(folder: Path) -> list[Path]:
+    """Return what is in a folder, nothing if this user may not read it: the log says so."""
+    try:
+        return sorted(folder.iterdir())
+    except PermissionError as error:
+        LOG.warning("%s cannot be read: %s.", folder, error.strerror)
+        return []
 
 
 def _is_folder(path: Path) -> bool:
@@ -228,7 +240,7 @@ def _is_made_here(kind: str, path: Path) -> bool:
         return False
     if kind == "ray":  # records on their way; a worker that was killed leaves them
         return any(map(_is_record, _walk(path)))
-    inside = (one for one in path.iterdir() if _is_folder(one))
+    inside = (one for one in _inside(path) if _is_folder(one))
     return any(_read_manifest(one / MANIFEST) is not None for one in (path, *inside))
 
 
@@ -285,7 +297,7 @@ def _bytes(stats: Mapping[Path, os.stat_result]) -> int:
 def _stats_below(path: Path) -> dict[Path, os.stat_result]:
     stats = {}
     for one in (path, *_walk(path)):
-        with contextlib.suppress(FileNotFoundError):  # a run has just removed it
+        with contextlib.suppress(FileNotFoundError, PermissionError):  # a run has just removed it
             stats[one] = one.lstat()
     return stats
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import io
 import os
 import signal
@@ -26,6 +27,8 @@ def main() -> None:
     is nothing to clean up: the process ends at once.
     """
     _end_at_once_when_stopped()
+    if sys.stdout is None:  # it was closed: >&-
+        sys.stdout = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115 -- until the process ends
     for stream in (sys.stdout, sys.stderr):  # a terminal may lack a sign, such as that of plus and minus
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")
@@ -42,6 +45,14 @@ def main() -> None:
             with contextlib.suppress(OSError, ValueError):  # a closed pipe
                 sys.stdout.flush()
             _end_at_once_when_stopped()
+    except OSError as error:
+        if error.errno not in (errno.EPIPE, errno.ENOSPC) or error.filename is not None:
+            raise
+        # nobody reads the output any more, or its disk is full
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        if error.errno == errno.ENOSPC:
+            print(f"error: the output cannot be written: {error.strerror}.", file=sys.stderr)  # noqa: T201
+        sys.exit(1)
     except BaseException:
         # an import can turn the KeyboardInterrupt into an ImportError, a command into an error of its own
         if not _interrupted():

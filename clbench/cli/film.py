@@ -95,6 +95,8 @@ def film(
         (episode,) = _numbers("--episode", str(episode), loaded.budget.validation_episodes - 1)
         path = output or _path(runs, names, None if stages is None else numbers, episode)
         check_format(path)
+        if path.is_dir():
+            raise InputError(f"--output {path} is a folder: name a file.")
         check_folders({"--output": path.parent})
         choose_back_end(task.world for task in shown)
     console = Console(stderr=True)

@@ -13,7 +13,7 @@ from rich.logging import RichHandler
 
 import clbench
 from clbench.base.text import printable_lines
-from clbench.cli.arguments import expand_home, parsing_error
+from clbench.cli.arguments import parsing_error, read_paths
 from clbench.cli.data import demonstrations as collect
 
 if TYPE_CHECKING:
@@ -134,7 +134,7 @@ def _app(name: str, text: str | None, commands: dict[Group, dict[str, str]]) -> 
         group_commands=Group("Options"),
         error_console=Console(stderr=True, soft_wrap=True),
         error_formatter=parsing_error,
-        config=expand_home,
+        config=read_paths,
         suppress_keyboard_interrupt=False,  # `clbench.cli.entry` reports it
     )
     for group, members in commands.items():

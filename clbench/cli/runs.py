@@ -118,6 +118,9 @@ def run(
         chosen = _part(shard, runs)
         check_folders({"--records": records, "--checkpoints": checkpoints, "--tensorboard": tensorboard})
     console = Console(stderr=True, quiet=quiet)
+    if not chosen:
+        console.print(f"Part {shard} has no runs: there are only {len(runs)}.", highlight=False)
+        return
     for scenario in {run.spec.scenario: run.scenario for run in runs}.values():
         console.print(expected_precision(scenario, seeds), highlight=False)
     if dry_run:

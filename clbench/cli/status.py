@@ -49,7 +49,7 @@ NOT_GIVEN: Mapping[str, object] = {
 }
 """Values of the options that choose among the runs of a scenario, where nobody gave them."""
 
-STATES: tuple[State, ...] = ("done", "running", "failed", "damaged", "to do")
+STATES: tuple[State, ...] = ("done", "running", "failed", "damaged", "unreadable", "to do")
 
 
 def status(
@@ -160,7 +160,9 @@ def _line(state: RunState, records: Path) -> str | None:
         spent = minutes(state.progress.seconds)
         return f"{name}: {state.progress.share:.0%} after {spent}{rest}, {state.owner}"
     if state.reason is not None:
-        reason = shortened(state.reason.partition("\n")[0], f"{name}.json")
+        path = str(state.path)  # a folder may have a line break in its name
+        text = state.reason.replace(path, printable(path)).partition("\n")[0]
+        reason = shortened(text, f"{name}.json")
         return f"{name}: {state.state}, {printable(reason)}"
     return None
 

@@ -115,7 +115,7 @@ def tune(
         check_folders({"--records": records, "--write": write and write.parent})
         classes = {name: load_method(name) for name in names}
         if write is not None:
-            check_tuned(write, numbers, names)
+            check_tuned(write, without_module(scenario), numbers, names)
         ladder = {name: rungs(cls, fixed) for name, cls in classes.items()}
         combinations = _combinations(values or {})
     if values:
@@ -127,7 +127,8 @@ def tune(
         _table(scenario, {name: (one.settings, one.tried) for name, one in chosen.items()}, seeds)
     )
     if write is not None:
-        write_tuned(write, without_module(scenario), numbers, chosen)
+        with checked_input():
+            write_tuned(write, without_module(scenario), numbers, chosen)
 
 
 def _choose(

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import csv
 import difflib
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -47,7 +48,7 @@ class _Line:
 
 def is_table(name: str) -> bool:
     """Return whether a name is meant as a table: it ends in .csv, or a file has it."""
-    return name.lower().endswith(".csv") or Path(name).is_file()
+    return name.lower().endswith(".csv") or os.path.isfile(name)  # False for a name that is too long
 
 
 def find(name: Path | str) -> Path:
@@ -57,13 +58,16 @@ def find(name: Path | str) -> Path:
         InputError: There is neither; the message names the nearest file.
     """
     path = Path(name)
-    if path.is_file():
+    if os.path.isfile(path):
         return path
-    if path.name == str(path) and (EXAMPLES / path).is_file():
+    if os.path.isdir(path):
+        raise InputError(f"{quoted(str(path))} is a folder, not a file.")
+    if path.name == str(path) and os.path.isfile(EXAMPLES / path):
         return EXAMPLES / path
     examples = sorted(one.name for one in EXAMPLES.glob("*.csv"))
     folder = path.parent
-    near = sorted(one.name for one in folder.glob("*.csv")) if folder.is_dir() else []
+    beside = folder.glob("*.csv") if os.path.isdir(folder) else ()
+    near = sorted(one.name for one in beside if os.path.isfile(one))
     guess = difflib.get_close_matches(path.name, near, n=1)
     hint = f" Did you mean {str(folder / guess[0])!r}?" if guess else did_you_mean(str(path), examples)
     raise InputError(f"There is no file {quoted(str(path))}.{hint}")
@@ -108,6 +112,8 @@ def _text(path: Path) -> str:
         return path.read_text(encoding="utf-8-sig")
     except UnicodeDecodeError:
         raise InputError(f"{path.name}: expected a text file in UTF-8.") from None
+    except OSError as error:
+        raise InputError(f"{path} cannot be read: {error.strerror}.") from None
 
 
 def _read(path: Path) -> tuple[dict[Cell, float], list[str]]:
@@ -193,7 +199,7 @@ def _rate(text: str, where: str) -> float:
     if text.lower() in MISSING:
         return float("nan")
     try:
-        return float(text)
+        return float(text.replace("_", "-"))  # Python reads 1_0 as 10
     except ValueError:
         raise InputError(
             f"{where}: expected a success rate such as 0.8 or 80, or an empty cell; found {quoted(text)}."

@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import Literal, NamedTuple
 
 from clbench.base.lease import Lease, Owner, Report, lease_path
-from clbench.records.reader import RecordError, home_of, read_record
+from clbench.records.reader import RecordError, UnreadableRecordError, home_of, read_record
 from clbench.records.record import Record
 
-State = Literal["done", "running", "failed", "damaged", "to do"]
+State = Literal["done", "running", "failed", "damaged", "unreadable", "to do"]
 
 
 OTHER_SETTINGS = "the record there has other settings, budget or code: `clbench run` replaces it"
@@ -23,7 +23,8 @@ class RunState(NamedTuple):
     path: Path
     """Path of its record."""
     state: State
-    """A run is damaged if its record cannot be read or contradicts itself; `clbench run` does it again."""
+    """A run is damaged if its record is torn or contradicts itself; `clbench run` does it again. It is
+    unreadable if its record may be sound: it is of a newer clbench, or the file system refuses it."""
     owner: Owner | None = None
     """Process that does the run."""
     progress: Report | None = None
@@ -67,6 +68,8 @@ def run_state(
             check(record)
             if not is_wanted(record):
                 return RunState(path, "to do", reason=OTHER_SETTINGS)
+    except UnreadableRecordError as error:
+        return RunState(path, "unreadable", reason=str(error))
     except RecordError as error:
         return RunState(path, "damaged", reason=str(error))
     seconds = record.timing.get("seconds")

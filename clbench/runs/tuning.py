@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING, Any
 from clbench.base.errors import InputError
 from clbench.base.lease import Lease
 from clbench.base.leftovers import replacing
-from clbench.base.strict_json import read_json
+from clbench.base.strict_json import StrictJSONError, read_json
 from clbench.spec.identifiers import folder_name, scenario_ids
 
 if TYPE_CHECKING:
@@ -117,20 +117,42 @@ def tuned_file(scenario: str) -> Path:
     return Path(methods.origin).parent / "tuned" / f"{folder_name(scenario)}.json"
 
 
-def check_tuned(path: Path, seeds: Sequence[int], methods: Iterable[str]) -> None:
+def check_tuned(path: Path, scenario: str, seeds: Sequence[int], methods: Iterable[str]) -> None:
     """Refuse to write the settings of `methods`, tuned on `seeds`, to `path` beside others.
 
     Raises:
-        InputError: The others were tuned on other seeds.
+        InputError: The others are of another scenario or were tuned on other seeds, or the file has no
+            settings.
     """
-    if not path.is_file():
+    if not path.exists():
         return
-    content = read_json(path)
+    content = _settings_in(path)
+    if content["scenario"] != scenario:
+        raise InputError(
+            f"{path} has the settings of {content['scenario']}, not of {scenario}: write to another file."
+        )
     if content["methods"].keys() - set(methods) and content["seeds"] != list(seeds):
         raise InputError(
             f"{path}: its other methods were tuned on seeds {content['seeds']}, not {list(seeds)}; "
             "write to another file, or tune all methods again."
         )
+
+
+def _settings_in(path: Path) -> dict[str, Any]:
+    """Return the content of a file that `write_tuned` wrote.
+
+    Raises:
+        InputError: It is another file, or a folder.
+    """
+    kinds = {"scenario": str, "seeds": list, "methods": dict}
+    try:
+        content: dict[str, Any] = read_json(path)
+    except (OSError, StrictJSONError) as error:
+        raise InputError(f"{path} is no file of settings that clbench tune wrote: {error}") from error
+    whole = isinstance(content, dict) and all(isinstance(content.get(key), kinds[key]) for key in kinds)
+    if not whole:
+        raise InputError(f"{path} has no settings that clbench tune wrote: write to another file.")
+    return content
 
 
 def write_tuned(path: Path, scenario: str, seeds: Sequence[int], methods: Mapping[str, Tuned]) -> None:
@@ -141,10 +163,10 @@ def write_tuned(path: Path, scenario: str, seeds: Sequence[int], methods: Mappin
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     with Lease(path).held():  # another command may add a method at the same time
-        check_tuned(path, seeds, methods)
+        check_tuned(path, scenario, seeds, methods)
         known = {name: asdict(one) for name, one in methods.items()}
         if path.is_file():
-            known = {**read_json(path)["methods"], **known}
+            known = {**_settings_in(path)["methods"], **known}
         content = {"scenario": scenario, "seeds": list(seeds), "methods": dict(sorted(known.items()))}
         with replacing(path) as partial:  # a full disk leaves the settings of the others
             partial.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")

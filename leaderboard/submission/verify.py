@@ -28,7 +28,7 @@ from clbench.jobs.scheduler import run_with_bars
 from clbench.learning.pretraining import pretrain
 from clbench.policy.checkpoint import save_policy
 from clbench.records.pinned import LATER, other_parts
-from clbench.records.reader import RecordError
+from clbench.records.reader import RecordError, UnreadableRecordError
 from clbench.records.record import Record, RunInfo, ScenarioInfo
 from clbench.runs.length import run_length
 from clbench.runs.run import execute, pretrained_hash
@@ -84,6 +84,8 @@ def verify(
     digest = _digest(path)  # before it is read: the tier holds for these bytes alone
     try:
         run = read_run(records, path, changed=None)
+    except UnreadableRecordError as error:  # it may be sound
+        return [Check("record", str(error), None)]
     except RecordError as error:
         verification_path(path).unlink(missing_ok=True)
         return [Check("record", str(error), False)]

@@ -122,6 +122,33 @@ def test_a_bug_shows_its_traceback() -> None:
     assert err.rstrip().endswith("KeyError: 'key'")
 
 
+@pytest.mark.parametrize(
+    ("output", "code", "error"),
+    [
+        ("/dev/full", 1, "error: the output cannot be written: No space left on device.\n"),
+        ("&-", 0, ""),
+    ],
+)
+def test_output_that_goes_nowhere_shows_no_traceback(output: str, code: int, error: str) -> None:
+    program = f"import clbench.cli.main as m, sys; m.main = lambda: print('x' * 10**6); {RUN}"
+    command = ["sh", "-c", f'exec "$0" -c "$1" >{output}', sys.executable, program]
+    found = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert (found.returncode, found.stderr) == (code, error)
+
+
+def test_a_reader_that_leaves_ends_the_command_without_a_traceback() -> None:
+    program = f"import clbench.cli.main as m, sys; m.main = lambda: print('x' * 10**6); {RUN}"
+    process = subprocess.Popen(
+        [sys.executable, "-c", program], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    assert process.stdout is not None
+    process.stdout.close()
+    assert process.stderr is not None
+    assert process.stderr.read() == ""
+    process.stderr.close()
+    assert process.wait() == 1
+
+
 def test_no_text_in_the_log_controls_the_terminal() -> None:
     log = "logging.getLogger('clbench').warning('%s', '[red]x\\x1b[2J')"
     program = f"import clbench.cli.main as m, logging; m.app = lambda: {log}; m.main()"

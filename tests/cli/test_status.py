@@ -36,6 +36,17 @@ def records(done: Record, tmp_path: Path) -> Path:
     return tmp_path
 
 
+def test_a_record_of_a_newer_clbench_is_unreadable_and_not_damaged(
+    records: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    newer = RunSpec(TOY, "sft", seed=0).path(records)
+    newer.write_text('{"schema": 99}', encoding="utf-8")
+    resolve("clbench.cli.status:status")(records=records)
+    shown = capsys.readouterr().out
+    assert "Toy-v0/sft/seed-0: unreadable, " in shown
+    assert "2 runs: 1 done, 1 unreadable." in shown
+
+
 def test_it_counts_the_runs_of_a_request_by_their_states(
     records: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

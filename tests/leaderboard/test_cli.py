@@ -155,11 +155,18 @@ def test_what_a_killed_command_left_beside_the_board_is_removed(
     assert not list(site.glob(".*"))
 
 
-def test_a_folder_without_rows_lists_why(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_folder_without_rows_lists_why_and_replaces_no_board(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     (tmp_path / "records").mkdir()
     (tmp_path / "records" / "torn.json").write_text("{", encoding="utf-8")
-    resolve("clbench.leaderboard.cli:show")(records=tmp_path / "records")
-    assert "torn.json: cannot be read as JSON" in capsys.readouterr().out
+    with pytest.raises(SystemExit) as stopped:
+        resolve("clbench.leaderboard.cli:show")(records=tmp_path / "records")
+    assert stopped.value.code == 2
+    shown = capsys.readouterr().err
+    assert "torn.json: cannot be read as JSON" in shown
+    assert "makes a row, and no board was written" in shown
+    assert [path.name for path in tmp_path.iterdir()] == ["records"]
     assert load(tmp_path / "records").empty
     assert "retention_low" in load(tmp_path / "records")
 

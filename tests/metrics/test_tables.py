@@ -74,6 +74,31 @@ def test_a_file_of_ones_own_comes_before_an_example_of_its_name(
     assert from_csv("robocasa365.csv")["final_average"].value == 0.25
 
 
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("folder.csv", "'folder.csv' is a folder"),
+        ("loop.csv", "no file 'loop.csv'"),
+        ("x" * 300, "no file 'xxx"),
+    ],
+)
+def test_what_is_no_file_is_refused_in_words(
+    name: str, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("folder.csv").mkdir()
+    Path("loop.csv").symlink_to("loop.csv")
+    with pytest.raises(InputError, match=message) as caught:
+        from_csv(name)
+    assert "Did you mean" not in str(caught.value)
+
+
+def test_a_number_with_an_underscore_is_no_rate(table: Path) -> None:
+    table.write_text("stage,reach\n1,1_0\n", encoding="utf-8")
+    with pytest.raises(InputError, match="found '1_0'"):
+        from_csv(table)
+
+
 def test_the_notes_of_a_table_are_its_lines_that_begin_with_a_hash(table: Path) -> None:
     table.write_text(WIDE, encoding="utf-8")
     assert notes(table) == ["where it comes from"]

@@ -142,6 +142,32 @@ def test_a_control_has_the_settings_of_its_method_and_differs_in_nothing_else(
     assert (found.changes, found.uses) == ({}, method.uses)
 
 
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (
+            '{"scenario": "me/Other-v0", "seeds": [100], "methods": {}}',
+            "of me/Other-v0, not of clbench/Toy-v0",
+        ),
+        ("{}", "no settings that clbench tune wrote"),
+        ("[]", "no settings that clbench tune wrote"),
+        ("task,success", "cannot be read as JSON"),
+        (None, "no file of settings"),
+    ],
+)
+def test_settings_are_written_beside_none_but_those_of_the_same_scenario(
+    content: str | None, message: str, tmp_path: Path
+) -> None:
+    path, one = tmp_path / "Toy-v0.json", Tuned({"step_factor": 0.1}, (_tried(0.6, 0.9, 0.1),))
+    if content is None:
+        path.mkdir()
+    else:
+        path.write_text(content, encoding="utf-8")
+    with pytest.raises(InputError, match=message):
+        write_tuned(path, "clbench/Toy-v0", [100], {"lwf": one})
+    assert path.is_dir() if content is None else path.read_text(encoding="utf-8") == content
+
+
 def test_a_full_disk_leaves_the_tuned_settings_of_other_methods(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

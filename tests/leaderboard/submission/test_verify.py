@@ -14,6 +14,7 @@ from helpers import sealed
 from verification import TOY, edit, failures, flip, verify
 
 import clbench
+from clbench.cli.main import app
 from clbench.evaluation.rollouts import Evaluator
 from clbench.learning.pretraining import pretrained_policy
 from clbench.records.paths import record_path
@@ -259,6 +260,30 @@ def test_a_wrong_name_of_the_verifier_takes_no_tier_back(
     stored = tiers.verification_path(mine).read_bytes()
     checks = verify(mine, "replayed", honest, **typo)
     assert not any(check.passed is False for check in checks)
+    assert tiers.verification_path(mine).read_bytes() == stored
+
+
+@pytest.mark.parametrize("levels", [-1, 1])
+def test_a_wrong_folder_of_records_takes_no_tier_back(
+    levels: int, mine: Path, honest: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    verify(mine, "recomputed", honest)
+    stored = tiers.verification_path(mine).read_bytes()
+    records = mine.parents[2]
+    wrong = records.parent if levels < 0 else mine.parents[1]
+    with pytest.raises(SystemExit) as stopped:
+        app(["verify", str(mine), "--records", str(wrong)])
+    assert stopped.value.code == 2
+    assert f"add --records {records}." in " ".join(capsys.readouterr().err.split())
+    assert tiers.verification_path(mine).read_bytes() == stored
+
+
+def test_a_record_that_cannot_be_read_here_keeps_its_tier(mine: Path, honest: Path) -> None:
+    verify(mine, "recomputed", honest)
+    stored = tiers.verification_path(mine).read_bytes()
+    edit(mine, lambda values: values.update(schema=99))
+    (check,) = verify(mine, "recomputed", honest)
+    assert check.passed is None
     assert tiers.verification_path(mine).read_bytes() == stored
 
 
