@@ -4,7 +4,7 @@ A key names packages, each with every package below it, and not single modules: 
 package stays covered, and code that cannot change a result (the film maker, the command line) is not in the
 key. The code of users has no such order, so that what their modules import from beside them counts, too.
 
-Comments, docstrings and blank lines of Python files do not count: a better sentence costs nobody their results.
+Comments, docstrings and blank lines of Python files do not count: a better sentence makes nothing again.
 """
 
 from __future__ import annotations

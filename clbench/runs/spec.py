@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from clbench.base.errors import InputError, WrongTypeError
-from clbench.base.text import did_you_mean
+from clbench.base.text import counted, did_you_mean
 from clbench.records.paths import label_of, record_path
 from clbench.records.record import RunInfo, ScenarioInfo
 from clbench.runs.tuning import tuned_settings
@@ -96,9 +96,12 @@ class RunSpec:
 
         Raises:
             UnknownNameError: There is no such scenario or policy.
-            InputError: There is no such order, or nothing can be perturbed.
+            InputError: There is no such order, there are fewer targets, or nothing can be perturbed.
         """
         published = load_scenario(self.scenario).with_policy(self.policy)
+        if self.targets is not None and self.targets > len(published.target):
+            there = counted(len(published.target), "target")
+            raise InputError(f"{published.id} has {there}, not {self.targets}.")
         scenario = published.in_order(self.order).for_seed(self.seed)
         if self.perturb:
             check_perturbable(scenario.retained + scenario.target)

@@ -62,6 +62,8 @@ def check_known(scenarios: Iterable[str] = (), methods: Iterable[str] = ()) -> N
     """
     for name in scenarios:
         if ":" not in name and name not in scenario_ids():
+            if name in built_in_methods() or name in installed_methods():
+                raise UnknownNameError(f"{name!r} is a method: the scenario comes first, then its methods.")
             raise unknown("scenario", name, scenario_ids())
     for name in methods:
         if ":" not in name and name not in built_in_methods() and name not in installed_methods():
@@ -73,7 +75,9 @@ def unknown_method(name: str) -> UnknownNameError:
     installed = sorted(installed_methods())
     module, _, attribute = name.rpartition(".")
     hint = did_you_mean(name, installed)
-    if module and not hint:
+    if attribute == "py":
+        hint = f" Did you mean a class of this file, as {f'{module}:Class'!r}?"
+    elif module and not hint:
         hint = f" Did you mean {f'{module}:{attribute}'!r}?"
     names = ", ".join(installed) or "none; run `pip install -e .` in the checkout"
     return UnknownNameError(f"No method is called {name!r}.{hint} Installed: {names}. Or give module:Class.")

@@ -69,6 +69,11 @@ def test_a_path_may_begin_with_the_home_folder(
         (["run", "clbench/Fetch-v1", "sft", "--seeds", "1_0"], "it must be a whole number, not '1_0'"),
         (["run", "clbench/Fetch-v1", "sft", "--records", ""], "--records must not be empty."),
         (["leaderboard", "--records="], "--records must not be empty."),
+        (
+            ["run", "sft", "clbench/Fetch-v1"],
+            "'sft' is a method: the scenario comes first",
+        ),
+        (["run", "clbench/Fetch-v1", "my_method.py"], "a class of this file, as 'my_method:Class'?"),
         (["demonstrations", "clbench/Fetch"], "Did you mean 'clbench/Fetch-v"),
         (["demonstrations", "clbench/Fetch-v1", "--workers", "0"], "Must be >= 1."),
         (["pretrain", "clbench/Fetch"], "Did you mean 'clbench/Fetch-v"),

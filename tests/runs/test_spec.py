@@ -13,6 +13,11 @@ from clbench.runs.spec import RunSpec
 TOY = "clbench.testing:clbench/Toy-v0"
 
 
+def test_a_run_learns_no_more_targets_than_there_are() -> None:
+    with pytest.raises(InputError, match=r"clbench/Toy-v0 has 2 targets, not 99\."):
+        RunSpec(TOY, "sft", 0, targets=99).resolve()
+
+
 def test_a_run_looks_up_one_scenario_and_one_method(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     counts = {"_scenario_at": 0, "load_method": 0}
 
