@@ -45,10 +45,10 @@ def evaluation_of_tasks() -> Callable[[int], float]:
     evaluator = Evaluator(scenario, seed=0)
 
     def seconds(count: int) -> float:
-        trials = [(task, "validation", number) for task in tasks[:count] for number in range(4)]
+        trials = [Trial(task, "validation", number) for task in tasks[:count] for number in range(4)]
         begin = time.perf_counter()
         with deterministic():
-            evaluator.play(policy, trials)  # type: ignore[arg-type]
+            evaluator.play(policy, trials)
         return time.perf_counter() - begin
 
     return seconds
