@@ -308,8 +308,9 @@ def _placed(found: list[Path], records: Path) -> tuple[list[Path], Path]:
                 f"{path} is not below {folder}: name its folder of records, in which it is "
                 "SCENARIO/METHOD/seed-N.json, with --records."
             )
-        home = _home_of(path)
-        if home is not None and home != folder:
+        in_place = len(path.relative_to(folder).parts) == 3  # then the verification reads it, and not this
+        home = None if in_place else _home_of(path)
+        if home is not None:
             raise InputError(f"{path} has its place below {home}: add --records {home}.")
     typed = all(path.is_relative_to(records) for path in found)
     return (found, records) if typed else (absolute, folder)
