@@ -43,6 +43,11 @@ def counted(count: int, noun: str, nouns: str = "") -> str:
     return f"{count} {noun if count == 1 else nouns or f'{noun}s'}"
 
 
+def megabytes(count: int) -> str:
+    """Return a number of bytes as megabytes, such as "4.2 MB"."""
+    return f"{count / 1e6:.1f} MB"
+
+
 def listed(parts: Iterable[str]) -> str:
     """Return the parts of a sentence in a row: "a", "a and b", "a, b and c"."""
     *first, last = list(parts) or [""]

@@ -191,6 +191,15 @@ def checked_input() -> Iterator[None]:
         sys.exit(2)
 
 
+@contextmanager
+def checked_writing(path: Path) -> Iterator[None]:
+    """Refuse a path with an `InputError` if the file system does, for example because the disk is full."""
+    try:
+        yield
+    except OSError as error:
+        raise InputError(f"{path} cannot be written: {error.strerror or error}.") from error
+
+
 def add_cwd_to_path() -> None:
     """Let module:Class name a module in the working directory: a console script does not look there."""
     with checked_input():

@@ -25,6 +25,7 @@ from clbench.base.cache import MANIFEST, cache_folder, hash_of
 from clbench.base.errors import InputError
 from clbench.base.lease import Lease
 from clbench.base.leftovers import finished_name, is_left_behind, is_unfinished, unfinished
+from clbench.base.text import counted, megabytes
 from clbench.cli.arguments import checked_input, whole_number
 from clbench.jobs.folders import minari_folder
 from clbench.records.reader import RecordError, read_record
@@ -95,10 +96,10 @@ def cache(
         if entry.foreign
     ]
     if prune or dry_run:
-        lines += [f"{_size(entry.size):>9}  {entry.path}: {reason}" for entry, reason in stale.items()]
+        lines += [f"{megabytes(entry.size):>9}  {entry.path}: {reason}" for entry, reason in stale.items()]
     console.print("\n".join(lines), markup=False, soft_wrap=True)
-    count = f"{len(stale)} stale {'entry' if len(stale) == 1 else 'entries'}"
-    size = _size(sum(entry.size for entry in stale))
+    count = counted(len(stale), "stale entry", "stale entries")
+    size = megabytes(sum(entry.size for entry in stale))
     if prune and not dry_run:
         faults = []
         for entry in stale:
@@ -376,9 +377,9 @@ def _table(found: Sequence[Entry], stale: Mapping[Entry, str], now: float, is_wi
         table.add_row(
             kind,
             str(len(ours)),
-            _size(sum(entry.size for entry in ours)),
+            megabytes(sum(entry.size for entry in ours)),
             _days(max(now - entry.made for entry in ours)),
-            f"{len(unused)} ({_size(sum(unused))})" if unused else "-",
+            f"{len(unused)} ({megabytes(sum(unused))})" if unused else "-",
             *([KINDS[kind]] if is_wide else []),
         )
     return table
@@ -386,13 +387,8 @@ def _table(found: Sequence[Entry], stale: Mapping[Entry, str], now: float, is_wi
 
 def _some(names: Sequence[str]) -> str:
     more = len(names) - 1
-    return names[0] + (f" and {more} more {'file' if more == 1 else 'files'}" if more else "")
-
-
-def _size(count: int) -> str:
-    return f"{count / 1e6:.1f} MB"
+    return names[0] + (f" and {counted(more, 'more file')}" if more else "")
 
 
 def _days(seconds: float) -> str:
-    days = int(max(0.0, seconds) // _DAY)
-    return f"{days} day" if days == 1 else f"{days} days"
+    return counted(int(max(0.0, seconds) // _DAY), "day")

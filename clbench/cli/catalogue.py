@@ -19,8 +19,8 @@ from rich.text import Text
 from clbench import __version__
 from clbench.base.errors import InputError
 from clbench.base.leftovers import replacing
-from clbench.base.text import printable
-from clbench.cli.arguments import AsJson, checked_input, print_json
+from clbench.base.text import megabytes, printable
+from clbench.cli.arguments import AsJson, checked_input, checked_writing, print_json
 from clbench.records.tables import GROUPS
 
 if TYPE_CHECKING:
@@ -172,12 +172,10 @@ def _write_page(path: Path, text: str) -> None:
     Raises:
         InputError: The file system refuses.
     """
-    try:
+    with checked_writing(path):
         path.parent.mkdir(parents=True, exist_ok=True)
         with replacing(path) as partial:
             partial.write_text(text, encoding="utf-8", newline="\n")
-    except OSError as error:
-        raise InputError(f"{path} cannot be written: {error.strerror}.") from error
 
 
 def doctor(*, as_json: AsJson = False) -> None:
@@ -322,4 +320,4 @@ def _films(faults: dict[str, str | None]) -> str:
 def _folder(path: Path, variable: str) -> str:
     from clbench.cli.cache import size_of
 
-    return f"{path} ({size_of(path) / 1e6:.1f} MB; {variable} moves it)"
+    return f"{path} ({megabytes(size_of(path))}; {variable} moves it)"

@@ -12,6 +12,7 @@ from rich.console import Console
 
 from clbench.base.cache import hash_of
 from clbench.base.errors import InputError
+from clbench.base.text import megabytes
 from clbench.cli.arguments import (
     MethodName,
     ScenarioId,
@@ -19,6 +20,7 @@ from clbench.cli.arguments import (
     add_cwd_to_path,
     check_names,
     checked_input,
+    checked_writing,
     items_of,
     whole_number,
 )
@@ -105,9 +107,10 @@ def film(
     with Bars(len(shown) * len(policies), console) as bars:
         bars.start("film", len(shown) * len(policies))
         made = film_runs(runs, policies, shown, episode, size, lambda takes: bars.advance("film", takes))
-        made.save(path, fps or frames_per_second(shown[0]))
+        with checked_input(), checked_writing(path):
+            made.save(path, fps or frames_per_second(shown[0]))
         width, height = made.size
-        bars.finish("film", f"{path} ({width} x {height} pixels, {path.stat().st_size / 1e6:.1f} MB)")
+        bars.finish("film", f"{path} ({width} x {height} pixels, {megabytes(path.stat().st_size)})")
 
 
 def _path(

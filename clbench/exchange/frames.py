@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from clbench.base.text import printable
 from clbench.records.paths import RECORDS, check_folder
-from clbench.records.reader import RecordError, home_of, read_record
+from clbench.records.reader import RecordError, check_home, read_record
 from clbench.records.record import Record
 from clbench.records.tables import TYPES, frame, typed
 from clbench.scoring.scores import Scores
@@ -67,9 +67,7 @@ def _read(path: Path) -> tuple[Record, Path]:
     try:
         if record.status != "success":
             raise RecordError("the run failed.")
-        home = home_of(record.run)
-        if home.parts != Path(os.path.realpath(path)).parts[-len(home.parts) :]:
-            raise RecordError(f"it is the record of {home.as_posix()}, and must be there.")
+        home = check_home(record.run, Path(os.path.realpath(path)))
         Scores.from_record(record, partial=True)
         return record, home
     except RecordError as error:

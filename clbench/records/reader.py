@@ -88,6 +88,23 @@ def home_of(run: RunInfo) -> Path:
         raise RecordError(f"run: {error}") from error
 
 
+def check_home(run: RunInfo, path: Path, records: Path | None = None) -> Path:
+    """Return `home_of` a run, if its record has that place.
+
+    Args:
+        run: The run.
+        path: Path of its record.
+        records: Folder of the records; if None, `path` only has to end with the place.
+
+    Raises:
+        RecordError: The record is at another place, or a name, the seed or the order is impossible.
+    """
+    home = home_of(run)
+    if home.parts != (path.relative_to(records).parts if records else path.parts[-len(home.parts) :]):
+        raise RecordError(f"it is the record of {home.as_posix()}, and must be there.")
+    return home
+
+
 def _record(values: Any) -> Record:
     """Return the record in `values`, which `json` read from its file."""
     schema = values.get("schema") if isinstance(values, dict) else None

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Literal, NamedTuple
 
 from clbench.base.lease import Lease, Owner, Report, lease_path
-from clbench.records.reader import RecordError, UnreadableRecordError, home_of, read_record
+from clbench.records.reader import RecordError, UnreadableRecordError, check_home, read_record
 from clbench.records.record import Record
 
 State = Literal["done", "running", "failed", "damaged", "unreadable", "to do"]
@@ -61,9 +61,7 @@ def run_state(
         return RunState(path, "to do")
     try:
         record = read_record(path)
-        home = home_of(record.run)
-        if home.parts != path.parts[-len(home.parts) :]:
-            raise RecordError(f"{path}: it is the record of {home}, and must be there.")
+        check_home(record.run, path)
         if record.error is None:
             check(record)
             if not is_wanted(record):

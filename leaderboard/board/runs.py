@@ -14,7 +14,7 @@ from typing import Any
 from clbench.base.text import printable
 from clbench.records.paths import label_of, table_name
 from clbench.records.pinned import LATER, other_parts, pinned
-from clbench.records.reader import RecordError, home_of, read_record
+from clbench.records.reader import RecordError, check_home, home_of, read_record
 from clbench.records.record import EXTERNAL_USES, ONLINE_USES, Record, RunInfo, ScenarioInfo
 from clbench.runs.tuning import tuned_settings
 from clbench.scoring.layout import Layout
@@ -123,16 +123,15 @@ def read_run(folder: Path, path: Path, changed: bool | None = False) -> Run:
     record = read_record(path)
     if record.error is not None:
         raise RecordError(f"the run failed ({record.failure}).")
-    run, name = record.run, path.relative_to(folder).as_posix()
+    run = record.run
     _check_kind(run, changed)
     label = label_of(run.method, run.changes)
-    home = home_of(run).as_posix()
+    name = home_of(run).as_posix()
     if record.scenario.id != run.scenario:
         raise RecordError(f"scenario: its id is {record.scenario.id!r}, but {run.scenario!r} was run.")
     _check_settings(run)
     division = division_of(run.uses)
-    if name != home:
-        raise RecordError(f"it is the record of {home}, and must be there.")
+    check_home(run, path, folder)
     scores, published = Scores.from_record(record), _published(record)
     return Run(
         name,

@@ -4,8 +4,18 @@ from pathlib import Path
 
 import pytest
 
-from clbench.cli.arguments import checked_input
+from clbench.base.errors import InputError
+from clbench.cli.arguments import checked_input, checked_writing
 from clbench.cli.main import app
+
+
+def test_a_file_that_does_not_fit_on_the_disk_is_named() -> None:
+    full = Path("/dev/full")
+    with (
+        pytest.raises(InputError, match=r"^/dev/full cannot be written: No space left on device\.$"),
+        checked_writing(full),
+    ):
+        full.write_text("a film")
 
 
 @pytest.mark.parametrize("words", [["--records=~/somewhere"], ["--records", "~/somewhere"]])
