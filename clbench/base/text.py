@@ -7,7 +7,10 @@ import html
 import inspect
 import textwrap
 from collections.abc import Iterable
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
+
+if TYPE_CHECKING:
+    from rich.console import Console
 
 T = TypeVar("T")
 
@@ -46,6 +49,11 @@ def counted(count: int, noun: str, nouns: str = "") -> str:
 def megabytes(count: int) -> str:
     """Return a number of bytes as megabytes, such as "4.2 MB"."""
     return f"{count / 1e6:.1f} MB"
+
+
+def print_plain(console: Console, text: str, style: str | None = None) -> None:
+    """Print text as it is: `rich` changes no bracket, colours no word and breaks no line of it."""
+    console.print(text, style=style, highlight=False, markup=False, soft_wrap=True)
 
 
 def listed(parts: Iterable[str]) -> str:

@@ -25,7 +25,7 @@ from clbench.base.cache import MANIFEST, cache_folder, hash_of
 from clbench.base.errors import InputError
 from clbench.base.lease import Lease
 from clbench.base.leftovers import finished_name, is_left_behind, is_unfinished, unfinished
-from clbench.base.text import counted, megabytes
+from clbench.base.text import counted, megabytes, print_plain
 from clbench.cli.arguments import checked_input, whole_number
 from clbench.jobs.folders import minari_folder
 from clbench.records.reader import RecordError, read_record
@@ -97,7 +97,7 @@ def cache(
     ]
     if prune or dry_run:
         lines += [f"{megabytes(entry.size):>9}  {entry.path}: {reason}" for entry, reason in stale.items()]
-    console.print("\n".join(lines), markup=False, soft_wrap=True)
+    print_plain(console, "\n".join(lines))
     count = counted(len(stale), "stale entry", "stale entries")
     size = megabytes(sum(entry.size for entry in stale))
     if prune and not dry_run:

@@ -16,7 +16,7 @@ from rich.text import Text
 
 from clbench.base.entry_points import unknown
 from clbench.base.errors import InputError
-from clbench.base.text import counted
+from clbench.base.text import counted, print_plain
 from clbench.cli.arguments import (
     PolicyName,
     PolicySize,
@@ -81,7 +81,7 @@ def demonstrations(
             f"mean length {sum(len(episode.executed) for episode in episodes) / count:.1f}",
         )
         console.print(Text.assemble((task.name, "bold"), f": {', '.join(facts)}"))
-        console.print(f"    {dataset_id(task, loaded.budget)}", highlight=False, markup=False, soft_wrap=True)
+        print_plain(console, f"    {dataset_id(task, loaded.budget)}")
 
 
 def export(
@@ -116,7 +116,7 @@ def export(
     with checked_input():
         folder = export_demonstrations(loaded, output, format=format, tasks=[task.name for task in chosen])
     text = f"{counted(len(chosen), 'task')} of {loaded.id} in {folder}"
-    Console().print(text, highlight=False, markup=False, soft_wrap=True)
+    print_plain(Console(), text)
 
 
 def import_(
@@ -147,7 +147,7 @@ def import_(
     with checked_input():
         check_folders({})
         name = import_demonstrations(scenario, task, path, state=state)
-    Console().print(name, highlight=False, markup=False, soft_wrap=True)
+    print_plain(Console(), name)
 
 
 def _collect(name: str, scenario: Scenario, tasks: Sequence[Task], workers: int | None) -> None:
@@ -234,7 +234,7 @@ def measure(scenario: ScenarioId, /, *tasks: str, episodes: Annotated[int, whole
     found = [expert_rates.complaint(task, row) for task, row in zip(chosen, rows, strict=True)]
     complaints = [text for text in found if text is not None]
     for text in complaints:
-        Console(stderr=True).print(text, style="bold red", highlight=False, markup=False, soft_wrap=True)
+        print_plain(Console(stderr=True), text, "bold red")
     if complaints:
         sys.exit(1)
 

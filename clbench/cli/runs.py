@@ -14,7 +14,7 @@ from rich.console import Console
 
 from clbench.base.dependencies import require
 from clbench.base.errors import InputError
-from clbench.base.text import counted, printable_lines
+from clbench.base.text import counted, print_plain, printable_lines
 from clbench.cli.arguments import (
     MethodName,
     PolicyName,
@@ -128,7 +128,7 @@ def run(
         return
     went_well = do_runs(chosen, records, lambda: _workers(workers, ray), checkpoints, tensorboard, quiet)
     if not changes:  # the board shows no run with changed settings
-        console.print(_next(records), highlight=False, markup=False, soft_wrap=True)
+        print_plain(console, _next(records))
     if not went_well:
         sys.exit(1)
 
@@ -193,7 +193,7 @@ def score(
     }
     with checked_input():
         if is_scored(scenario, **options):
-            console.print(f"Stage {stage} of {method}, seed {seed}, is done.", highlight=False, markup=False)
+            print_plain(console, f"Stage {stage} of {method}, seed {seed}, is done.")
             return
         served = ServedPolicy(policy, timeout)
         with Bars(1.0, console) as bars:
@@ -210,7 +210,7 @@ def score(
         )
     else:
         then = f"Record: {path}\n{_next(records)}"
-    console.print(then, highlight=False, markup=False, soft_wrap=True)
+    print_plain(console, then)
 
 
 def _rates(record: Record) -> str:
@@ -290,7 +290,7 @@ def _print_forecast(
         plan = to_do.plan(records, checkpoints)
     lines = [f"{len(runs) - len(to_do.runs)} of {counted(len(runs), 'run')} done already."]
     lines += forecast(plan, [*to_do.runs, *to_do.stages], workers, checkpoints) if plan.jobs else []
-    Console(soft_wrap=True).print("\n".join(lines), highlight=False, markup=False)
+    print_plain(Console(), "\n".join(lines))
 
 
 def do_runs(
@@ -308,10 +308,9 @@ def do_runs(
     with checked_input():
         failed = grid.run_missing(runs, records, workers, console, checkpoints, tensorboard)
     if failed and quiet:
-        alarm = Console(stderr=True, soft_wrap=True)
         for job, reason in failed.items():
-            alarm.print(printable_lines(f"{job}: {reason}"), highlight=False, markup=False)
+            print_plain(Console(stderr=True), printable_lines(f"{job}: {reason}"))
     if failed:
         names = ", ".join(map(str, failed))
-        console.print(f"{len(failed)} failed: {names}.", style="bold red", highlight=False, markup=False)
+        print_plain(console, f"{len(failed)} failed: {names}.", "bold red")
     return not failed

@@ -11,7 +11,7 @@ from pathlib import Path
 from rich.console import Console
 
 from clbench.base.errors import InputError
-from clbench.base.text import quoted
+from clbench.base.text import print_plain, quoted
 from clbench.cli.arguments import checked_input
 from clbench.spec.identifiers import built_in_methods, check_method_name
 from clbench.spec.policies import POLICIES
@@ -69,7 +69,7 @@ def _print_next(kind: str, files: tuple[Path, Path], folder: Path, command: str)
     lines = [f"Wrote {module} and {test}. Make the {kind} yours, then:"]
     lines += [f"  cd {shlex.quote(str(folder))}"] if folder != Path() else []
     lines += [f"  python -m pytest {test.name}  # pip install pytest", f"  {command}"]
-    Console().print("\n".join(lines), highlight=False, markup=False, soft_wrap=True)
+    print_plain(Console(), "\n".join(lines))
 
 
 def write_method(name: str, folder: Path) -> tuple[Path, Path]:

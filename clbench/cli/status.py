@@ -14,7 +14,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from clbench.base.errors import InputError
-from clbench.base.text import counted, listed, minutes, printable, shortened
+from clbench.base.text import counted, listed, minutes, print_plain, printable, shortened
 from clbench.cli.arguments import (
     AsJson,
     MethodName,
@@ -118,7 +118,7 @@ def status(
     for state in states:
         line = _line(state, records)
         if line:
-            console.print(line, markup=False, highlight=False, soft_wrap=True)
+            print_plain(console, line)
     console.print(_summary(states), highlight=False)
 
 

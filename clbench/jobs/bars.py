@@ -13,7 +13,7 @@ from rich.markup import escape
 from rich.progress import BarColumn, Progress, TaskID, TaskProgressColumn, TextColumn, TimeElapsedColumn
 from rich.progress import TimeRemainingColumn as TimeLeftColumn
 
-from clbench.base.text import minutes, printable, printable_lines
+from clbench.base.text import minutes, print_plain, printable, printable_lines
 
 LINE_SECONDS = 30.0
 """Seconds between two lines without a terminal."""
@@ -107,7 +107,7 @@ class Bars:
 
     def say(self, line: str) -> None:
         """Print a text without markup, wrapping or characters that control the terminal."""
-        self.console.print(printable_lines(line), highlight=False, markup=False, soft_wrap=True)
+        print_plain(self.console, printable_lines(line))
 
 
 def lines_console() -> Console:

@@ -13,7 +13,7 @@ from rich.console import Console
 from clbench.base.cache import cache_folder
 from clbench.base.errors import ClbenchError, InputError, WrongTypeError
 from clbench.base.leftovers import sweep
-from clbench.base.text import counted, printable
+from clbench.base.text import counted, print_plain, printable
 from clbench.jobs.bars import lines_console
 from clbench.jobs.folders import check_folders, minari_folder
 from clbench.jobs.job import Job, Workers
@@ -163,7 +163,7 @@ def _without_record(jobs: Sequence[Job], failed: Mapping[Job, str], records: Pat
 
 def _print(console: Console, line: str) -> None:
     """Print one line without markup, wrapping or characters that control the terminal."""
-    console.print(printable(line), highlight=False, markup=False, soft_wrap=True)
+    print_plain(console, printable(line))
 
 
 def run(

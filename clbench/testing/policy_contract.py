@@ -17,13 +17,14 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import cached_property
 from pathlib import Path
+from typing import TypeVar
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
 from clbench.learning.optimise import deterministic, optimise
-from clbench.policy.batch import Batch
+from clbench.policy.batch import Batch, QuestionBatch
 from clbench.policy.checkpoint import load_policy, save_policy
 from clbench.policy.kinds import new_policy, policy_class
 from clbench.policy.policy import ABILITIES, Policy, PolicyConfig
@@ -34,6 +35,8 @@ from clbench.testing.small import SMALL, toy_questions, toy_source
 SAMPLES = 6
 """Samples in a batch that the checks look at."""
 
+Rows = TypeVar("Rows", Batch, QuestionBatch)
+
 LEARNING_STEPS = 80
 """Optimiser steps within which the loss on the toy's demonstrations must fall by `LEAST_FALL`."""
 
@@ -43,11 +46,13 @@ LEAST_FALL = 0.25
 PAGE = "docs/guide/your_policy.md"
 
 
-def check_policy(kind: str) -> None:
+def check_policy(kind: str, image_size: int = 0) -> None:
     """Check on the toy's data that a policy keeps the protocol of `clbench.Policy`.
 
     Args:
         kind: Kind of the policy: a built-in name, or "module:Class".
+        image_size: Width and height of the pictures that it sees, such as 64 for `clbench/FetchPixels-v0`; 0
+            without pictures. The toy's pictures show its state as stripes.
 
     Raises:
         UnknownNameError: There is no such kind.
@@ -55,13 +60,13 @@ def check_policy(kind: str) -> None:
         ContractError: The policy breaks a clause; the message shows the expected and the actual behaviour,
             and the place to look at.
     """
-    for check in policy_checks(kind):
+    for check in policy_checks(kind, image_size):
         check()
 
 
-def policy_checks(kind: str) -> list[Check]:
+def policy_checks(kind: str, image_size: int = 0) -> list[Check]:
     """Return a check for each clause of the contract, for `pytest.mark.parametrize(..., ids=str)`."""
-    subject = Subject(kind)
+    subject = Subject(kind, image_size)
     return [Check(deterministic()(_named(clause)), subject) for clause in CLAUSES]
 
 
@@ -90,11 +95,12 @@ class Subject:
 
     Args:
         kind: Kind of the policy.
+        image_size: Width and height of the pictures that it sees; 0 without pictures.
     """
 
-    def __init__(self, kind: str) -> None:
+    def __init__(self, kind: str, image_size: int = 0) -> None:
         self.cls = policy_class(kind)
-        self.config: PolicyConfig = dataclasses.replace(SMALL, kind=kind)
+        self.config: PolicyConfig = dataclasses.replace(SMALL, kind=kind, image_size=image_size)
 
     def build(self, seed: int = 0) -> Policy:
         """Return a new policy, normalised like the toy's demonstrations."""
@@ -111,10 +117,15 @@ class Subject:
     @cached_property
     def batch(self) -> Batch:
         """Some samples; in the first one, the last actions do not count."""
-        drawn = toy_source("left", "up").sample(SAMPLES)
+        drawn = self.seen(toy_source("left", "up").sample(SAMPLES))
         valid = drawn.valid.clone()
         valid[0, self.config.chunk // 2 :] = 0
         return dataclasses.replace(drawn, valid=valid)
+
+    def seen(self, batch: Rows) -> Rows:
+        """Return a batch with the pictures that the policy sees, if it sees any."""
+        size = self.config.image_size
+        return dataclasses.replace(batch, image=_stripes(batch.state, size)) if size else batch
 
 
 # ---- the clauses -------------------------------------------------------------------------------------------
@@ -202,16 +213,16 @@ def actions(subject: Subject) -> None:
 
 
 def learning(subject: Subject) -> None:
-    """The policy learns the toy's demonstrations, and then reads the state and the words."""
+    """The policy learns the toy's demonstrations, reads all that it sees, and acts in the world's units."""
     policy, source = subject.build(), toy_source("left", "up", seed=1)
-    batch = toy_source("left", "up", seed=2).sample(200)
+    batch = subject.seen(toy_source("left", "up", seed=2).sample(200))
     before = float(policy.action_loss(batch).detach().mean())
     policy.train()
     optimise(
         policy.parameters(),
         2e-3,
         LEARNING_STEPS,
-        lambda _: policy.action_loss(source.sample(source.batch_size)).mean(),
+        lambda _: policy.action_loss(subject.seen(source.sample(source.batch_size))).mean(),
     )
     policy.eval()
     after = float(policy.action_loss(batch).detach().mean())
@@ -224,9 +235,18 @@ def learning(subject: Subject) -> None:
     if not (left[0] < up[0] and left[1] < up[1]):
         found = f"mean actions {left.tolist()} for `go left` and {up.tolist()} for `go up`"
         raise _breach(learning, "actions that follow the instruction", found, "act()")
-    elsewhere = dataclasses.replace(seen, state=seen.state.flip(0))
-    if _act(policy, elsewhere).equal(_act(policy, seen)):
+    chunk = _act(policy, batch)
+    normalised = (batch.action - policy.action_mean) / policy.action_std
+    if (chunk - normalised).abs().mean() < (chunk - batch.action).abs().mean():
+        expected = "actions in the units of the world: action_mean + action_std * the normalised ones"
+        raise _breach(learning, expected, "actions nearer to the normalised ones", "act()")
+    chunk = _act(policy, seen)
+    if _act(policy, dataclasses.replace(seen, state=seen.state.flip(0))).equal(chunk):
         raise _breach(learning, "actions that depend on the state", "the same ones in other states", "act()")
+    sees = subject.config.image_size > 0
+    if sees and _act(policy, dataclasses.replace(seen, image=seen.image.flip(0))).equal(chunk):
+        found = "the same ones for other pictures"
+        raise _breach(learning, "actions that depend on the picture", found, "act()")
 
 
 def checkpoints(subject: Subject) -> None:
@@ -254,7 +274,7 @@ def abilities(subject: Subject) -> None:
     if "hidden_states" in subject.cls.abilities:
         _check_hidden_states(policy, batch)
     if "answers" in subject.cls.abilities:
-        _check_answers(policy)
+        _check_answers(policy, subject)
 
 
 def _check_hidden_states(policy: Policy, batch: Batch) -> None:
@@ -277,9 +297,9 @@ def _check_hidden_states(policy: Policy, batch: Batch) -> None:
         raise _breach(abilities, "a gradient in the head alone", found, "action_loss(batch, hidden)")
 
 
-def _check_answers(policy: Policy) -> None:
+def _check_answers(policy: Policy, subject: Subject) -> None:
     """The policy answers questions with a word of its vocabulary."""
-    questions = toy_questions().sample(SAMPLES)
+    questions = subject.seen(toy_questions().sample(SAMPLES))
     logits = policy.answer_logits(questions.state, questions.words, questions.image)
     _check_shape(abilities, logits, (SAMPLES, policy.config.vocabulary_size), "answer_logits()")
     loss = policy.answer_loss(questions)
@@ -294,6 +314,13 @@ CLAUSES = (initial_weights, losses, gradients, actions, learning, checkpoints, a
 def _breach(clause: Callable[[Subject], None], expected: str, found: str, look: str) -> ContractError:
     name = clause.__name__.replace("_", " ")
     return ContractError(name, expected, found, look, subject="policy", page=PAGE)
+
+
+def _stripes(state: Tensor, size: int) -> Tensor:
+    """Return pictures (B, N, N, 3) with a stripe for each number of the states (B, S), as bright as it."""
+    stripe = torch.arange(size) * state.shape[1] // size
+    grey = (255 * torch.sigmoid(state)).to(torch.uint8)[:, stripe]
+    return grey[:, None, :, None].repeat(1, size, 1, 3)
 
 
 def _act(policy: Policy, batch: Batch) -> Tensor:

@@ -8,7 +8,7 @@ from pathlib import Path
 from rich.console import Console
 
 from clbench.base.progress import ProgressCallback
-from clbench.base.text import counted
+from clbench.base.text import counted, print_plain
 from clbench.jobs.grid import run_missing
 from clbench.jobs.job import Job, JobError
 from clbench.jobs.processes import Processes
@@ -46,7 +46,7 @@ def run_submission(
     check = Job("check", check_job, {"method": name}, CHECK_STEPS, limits=runs[0].scenario.limits)
     failed = run_missing(runs, records, lambda: Processes(workers), console, checkpoints, check=check)
     if check in failed:
-        console.print(f"No run was started: {name} breaks the contract.", highlight=False, markup=False)
+        print_plain(console, f"No run was started: {name} breaks the contract.")
         return None
     return not failed
 

@@ -25,6 +25,11 @@ def test_the_built_in_policies_keep_the_contract(kind: str) -> None:
     check_policy(kind)
 
 
+@pytest.mark.parametrize("kind", POLICIES)
+def test_the_built_in_policies_keep_the_contract_with_pictures(kind: str) -> None:
+    check_policy(kind, image_size=32)
+
+
 class Base(TransformerPolicy):
     """A policy that keeps the contract; those below break one clause each."""
 
@@ -209,6 +214,14 @@ class Forgetful(Base):
         return self.scale * super().act(state, words, noise, image)
 
 
+class Unscaled(Base):
+    """Returns normalised actions."""
+
+    @torch.inference_mode()
+    def act(self, state: Tensor, words: Tensor, noise: Tensor, image: Tensor | None = None) -> Tensor:
+        return (super().act(state, words, noise, image) - self.action_mean) / self.action_std
+
+
 class Boastful(Plain):
     """Declares an ability that there is not."""
 
@@ -280,6 +293,7 @@ BROKEN: list[tuple[type[Policy], str, str]] = [
     (Stateless, "learning", "actions that depend on the state"),
     (Deaf, "learning", "for `go left`"),
     (Stubborn, "learning", "a loss of at most"),
+    (Unscaled, "learning", "actions in the units of the world"),
     (Forgetful, "checkpoints", "a loaded policy acts otherwise"),
     (Boastful, "abilities", "telepathy"),
     (Listing, "abilities", r"a set of texts, such as abilities = frozenset\(\{"),
@@ -300,6 +314,12 @@ def test_a_broken_policy_is_caught_by_its_clause(cls: type[Policy], clause: str,
         check()
     assert (caught.value.clause, caught.value.subject) == (clause, "policy")
     assert "docs/guide/your_policy.md#" in str(caught.value)
+
+
+def test_a_policy_that_does_not_look_at_the_pictures_breaks_the_contract() -> None:
+    (check,) = [check for check in policy_checks(f"{__name__}:Plain", 32) if str(check) == "learning"]
+    with pytest.raises(ContractError, match="actions that depend on the picture"):
+        check()
 
 
 @pytest.mark.parametrize(
