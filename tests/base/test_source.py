@@ -203,6 +203,11 @@ TEXT = '''one
 
 # two
 '''
+PARTS = [
+    "hand",
+]
+NAME = \\
+    "left"
 class Arm:
     reach = (1, "a")
     def move(self, by):
@@ -229,6 +234,8 @@ OTHER = {
     "a blank line of a text": PLAIN.replace("one\n\n", "one\n"),
     "the depth of a line": PLAIN.replace('        return "still"', '            return "still"'),
     "a text that a statement begins with": PLAIN.replace("WIDTH", "'WIDTH'.lower()\nWIDTH"),
+    "a text alone in its line, inside of brackets": PLAIN.replace("hand", "foot"),
+    "a text alone in its line, which goes on": PLAIN.replace("left", "right"),
     "a name": PLAIN.replace("reach", "grasp"),
 }
 """Other code."""
@@ -254,6 +261,14 @@ def test_any_change_of_the_code_changes_its_hash(
     compile(OTHER[change], "mine.py", "exec")
     assert OTHER[change] != PLAIN
     lay_out({"mine.py": OTHER[change]})
+    assert source_hash("mine") != before
+
+
+def test_a_text_inside_of_a_formatted_one_counts(lay_out: Callable[[dict[str, str]], None]) -> None:
+    """Python 3.12 allows the quotation marks of the outer text inside, where a part looks like a comment."""
+    lay_out({"mine.py": 'print(f"{names["#1"]}")\n'})
+    before = source_hash("mine")
+    lay_out({"mine.py": 'print(f"{names["#2"]}")\n'})
     assert source_hash("mine") != before
 
 
