@@ -1,7 +1,7 @@
 """The frontier: what methods learn and keep at each learning rate of the ladder.
 
-The ladder also has plain fine-tuning at settings that tuning rated as high as the chosen one. A gain over the
-chosen one alone may come from the order in which tuning tried them.
+The ladder also has plain fine-tuning at settings that tuning rated as highly as the chosen one. A gain over
+the chosen one alone may come from the order in which tuning tried them.
 """
 
 from __future__ import annotations
@@ -140,7 +140,7 @@ def _rung(factor: float, runs: Sequence[Run]) -> Rung:
 
 @dataclass(frozen=True)
 class TiedGain:
-    """Gain of a method over plain fine-tuning at a setting that tuning rated as high as the chosen one."""
+    """Gain of a method over plain fine-tuning at a setting that tuning rated as highly as the chosen one."""
 
     factor: float
     """Step factor of plain fine-tuning."""
@@ -156,7 +156,7 @@ class TiedGain:
 
 
 def is_certain_over(tied: Iterable[TiedGain]) -> bool:
-    """Return whether a gain is certain over every setting that tuning rated as high as the chosen one."""
+    """Return whether a gain is certain over every setting that tuning rated as highly as the chosen one."""
     return all(one.is_certain for one in tied)
 
 

@@ -67,7 +67,7 @@ class Board(Summary):
     frontiers: Mapping[str, tuple[Curve, ...]] = field(default_factory=dict)
     """Methods at the learning rates of the ladder, by scenario; those with records only."""
     tied: Mapping[str, Mapping[str, tuple[TiedGain, ...]]] = field(default_factory=dict)
-    """Gains over plain fine-tuning at settings that tuning rated as high as the chosen one, by scenario and
+    """Gains over plain fine-tuning at settings that tuning rated as highly as the chosen one, by scenario and
     method; of a scenario without such a setting, none."""
 
 
@@ -101,8 +101,8 @@ def compute_board(records: Path, only: Container[str] | None = None) -> Board:
 
 
 def _rivals(rows: Iterable[Row]) -> dict[str, Runs]:
-    """Return the scores of the rows that compete with plain fine-tuning, by method."""
-    return {row.method: row.scores for row in rows if row.division in METHODS and row.method != BASELINE}
+    """Return the scores of the rows that compete, plain fine-tuning at the chosen setting among them."""
+    return {row.method: row.scores for row in rows if row.division in METHODS}
 
 
 def _beside_rows(runs: list[Run]) -> Sifted:

@@ -61,7 +61,7 @@ def action_loss_erodes_answers(evidence: Evidence) -> Finding:
     curve = answer_curve(evidence, "sft")
     steps, _ = learning_curve(evidence, "sft")
     half = [one for step, one in zip(steps, curve, strict=True) if step <= steps[-1] / 2]
-    sentences = _how_rapid(evidence, curve)
+    sentences = _when_lost(evidence, "sft")
     if evidence.difference("question_retention", "stop_gradient", "sft").low > 0:
         sentences.append("Without that gradient in the backbone less is lost: the gradient is the cause.")
     verdict = decided(
@@ -78,16 +78,17 @@ def action_loss_erodes_answers(evidence: Evidence) -> Finding:
     )
 
 
-def _how_rapid(evidence: Evidence, losses: list[Figure]) -> list[str]:
-    """Return what the stage is long compared with: the step at which the target is learned."""
-    steps, success = learning_curve(evidence, "sft")
+def _when_lost(evidence: Evidence, method: str) -> list[str]:
+    """Return when a method has lost answers, and when it had learned the target: the stage goes on."""
+    steps, success = learning_curve(evidence, method)
     learned = next((step for step, value in zip(steps, success, strict=True) if value >= 0.9), None)
-    lost = next((step for step, one in zip(steps, losses, strict=True) if one.low > 0.01), None)
+    curve = zip(steps, answer_curve(evidence, method), strict=True)
+    lost = next((step for step, one in curve if one.low > 0.01), None)
     if learned is None or lost is None:
         return []
     return [
-        f"sft does the target in 0.9 of the episodes after {learned} steps; it has certainly lost 0.01 of "
-        f"the answers after {lost} of {steps[-1]} steps."
+        f"{method} does the target in 0.9 of the episodes after {learned} steps; it has certainly lost 0.01 "
+        f"of the answers after {lost} of {steps[-1]} steps."
     ]
 
 
@@ -150,8 +151,12 @@ def lora_still_overwrites(evidence: Evidence) -> Finding:
             and all(figure.low > -0.05 for figure in skills),
         ),
         (answers[1], answers[0], answers[2], *skills),
-        (of_sft, evidence.difference("retention", "sft", "frozen")),
-        (f"{', '.join(less)}: fewer answers are lost than with sft.",) if less else (),
+        (of_sft, evidence.difference("retention", "sft", "frozen"), *answer_curve(evidence, "lora")),
+        (
+            *([f"{', '.join(less)}: fewer answers are lost than with sft."] if less else ()),
+            "The direction of the update was not measured.",
+            *_when_lost(evidence, "lora"),
+        ),
         what_would_change(max(answers, key=lambda one: one.high) if all(lost) else answers[1], -0.01),
     )
 
@@ -182,8 +187,9 @@ def keeps_answers(evidence: Evidence) -> Finding:
     return Finding(
         decided(holds=aegis.low >= -0.01, fails=aegis.high < -0.01),
         (aegis,),
-        (sft, *gains),
+        (sft, *gains, *answer_curve(evidence, "aegis")),
         (
+            *_when_lost(evidence, "aegis"),
             not_told_apart(
                 gains[0],
                 explains="the projection need not keep any answer",

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from .claim import Finding, best_first
+from .claim import Finding, Verdict, best_first
 from .evidence import Evidence, Figure
 from .figures import share_afterwards, share_between
 
@@ -53,14 +53,38 @@ def _afterwards(evidence: Evidence, arm: str) -> str:
     )
 
 
-def without_an_arm(evidence: Evidence, figures: Sequence[Figure], controls: Sequence[Figure] = ()) -> Finding:
-    """Return the finding on a board on which no arm counts."""
+def if_all_counted(arms: Sequence[str], verdict: Verdict, of_all: Verdict) -> tuple[str, ...]:
+    """Return what the verdict would be if the arms that do not count did; empty if all count.
+
+    Args:
+        arms: Arms that count.
+        verdict: Verdict of the rule.
+        of_all: Verdict of the rule on all arms.
+    """
+    others = " and ".join(arm for arm in ARMS if arm not in arms)
+    if not others:
+        return ()
+    if of_all == verdict:
+        return (f"If {others} counted, the verdict would be the same.",)
+    return (f'If {others} counted: "{of_all}".',)
+
+
+def without_an_arm(
+    evidence: Evidence,
+    figures: Sequence[Figure],
+    controls: Sequence[Figure] = (),
+    of_all: Verdict | None = None,
+) -> Finding:
+    """Return the finding on a board on which no arm counts; `of_all` is the verdict if all did."""
     shares = tuple(one(evidence, arm) for arm in ARMS for one in (share_between, share_afterwards))
     return Finding(
         "cannot be shown here",
         best_first(figures),
         (*controls, *shares),
-        inactive_sentences(evidence),
+        (
+            *inactive_sentences(evidence),
+            *(if_all_counted((), "cannot be shown here", of_all) if of_all is not None else ()),
+        ),
         NEEDS_WEIGHTS,
         about=ARMS,
     )

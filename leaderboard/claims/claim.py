@@ -95,6 +95,8 @@ class Claim:
     """Gymnasium ids of the scenarios on which it is judged."""
     judge: Callable[[Evidence], Finding]
     """Function that applies the rule."""
+    ours: bool = False
+    """Whether it is our reading of the paper, which does not state it in so many words."""
 
 
 def claim(
@@ -106,13 +108,14 @@ def claim(
     settled: str,
     margin: str,
     scenarios: tuple[str, ...] = BOARDS,
+    ours: bool = False,
 ) -> Callable[[Callable[[Evidence], Finding]], Claim]:
     """Return a decorator that makes a claim of the function that judges it; its docstring is the claim."""
 
     def enter(judge: Callable[[Evidence], Finding]) -> Claim:
         words = " ".join((judge.__doc__ or "").split())
         since = datetime.fromisoformat(settled)
-        return Claim(identifier, paper, words, reported, rule, since, margin, scenarios, judge)
+        return Claim(identifier, paper, words, reported, rule, since, margin, scenarios, judge, ours)
 
     return enter
 
@@ -195,14 +198,14 @@ def _seeds_for(reach: float, half: float, seeds: int) -> int | None:
 
 def not_told_apart(control: Figure, name: str = "", *, explains: str, does_not: str) -> str:
     """Return what a control says: the figure is the method's gain over the control, higher is better."""
-    name = name or control.methods[1]
+    method, name = control.methods[0], name or control.methods[1]
     if math.isnan(control.low):
-        return f"The records cannot show what {name} says about it."
+        return f"The records cannot show what {name} says about {method}."
     if control.low > 0:
-        return f"{name} does not reach it: {does_not}."
+        return f"{name} does not reach {method}: {does_not}."
     if control.high < 0:
-        return f"{name} is even better than it: {explains}."
-    return f"{name} is not told apart from it: {explains}."
+        return f"{name} is even better than {method}: {explains}."
+    return f"{name} is not told apart from {method}: {explains}."
 
 
 def best_first(figures: Sequence[Figure]) -> tuple[Figure, ...]:

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from typing import Any
 
-from .arms import ARMS, NEEDS_WEIGHTS, arms_that_count, inactive_sentences, without_an_arm
+from ..board.runs import is_number
+from .arms import ARMS, NEEDS_WEIGHTS, arms_that_count, if_all_counted, inactive_sentences, without_an_arm
 from .claim import (
     ANYWHERE,
     Finding,
@@ -17,6 +19,14 @@ from .claim import (
     deciding,
     not_told_apart,
     what_would_change,
+)
+from .consft_controls import (
+    CONTROLS,
+    controls_at_the_full_rate,
+    controls_of,
+    sft_at_the_rate_of,
+    what_controls_say,
+    what_the_full_rate_says,
 )
 from .evidence import Evidence, Figure, rung
 from .figures import (
@@ -96,94 +106,51 @@ def keeps_20_points_more(evidence: Evidence) -> Finding:
     published = [figure for figure in at_one if figure.methods[0] in {rung(arm, PUBLISHED) for arm in arms}]
     best = best_first(counting or at_best)[0]
     figures = (best, *(one for one in (*at_best, *at_one) if one is not best))
-    controls = _controls_of(evidence, best.methods[0])
-    controls_at_one = _controls_at_the_full_rate(evidence)
+    controls = controls_of(evidence, best.methods[0])
+    controls_at_one = controls_at_the_full_rate(evidence)
     arm = best.methods[0]
-    alike = [kept(evidence, arm, label) for label in _sft_at_the_rate_of(evidence, arm)]
+    alike = [kept(evidence, arm, label) for label in sft_at_the_rate_of(evidence, arm)]
     shares = tuple(one(evidence, arm) for arm in ARMS for one in (share_between, share_afterwards))
     shown = (*sft, *alike, *controls, *controls_at_one, *shares)
-    at_one_says = _what_the_full_rate_says(best_first(at_one)[0], controls_at_one)
+    at_one_says = what_the_full_rate_says(best_first(at_one)[0], controls_at_one)
     if not arms or all(one.low > 0.80 for one in sft):
         reason = ("sft keeps too much for a gain of 0.20.",) if arms else ()
         return Finding(
             "cannot be shown here",
             figures,
             shown,
-            (*inactive_sentences(evidence), *reason, *at_one_says),
+            (
+                *inactive_sentences(evidence),
+                *reason,
+                *(() if arms else if_all_counted(arms, "cannot be shown here", _keeps_more(at_best, at_one))),
+                *at_one_says,
+            ),
             "A setting in which sft keeps less than 0.80." if arms else NEEDS_WEIGHTS,
         )
-    verdict = decided(
-        holds=any(one.low >= 0.20 for one in counting),
-        in_part=any(one.low >= 0.20 for one in published),
-        fails=all(one.high < 0.20 for one in (*counting, *published)),
-    )
+    verdict = _keeps_more(counting, published)
     judged = {"holds": counting, "holds in part": published}.get(verdict, [*counting, *published])
     return Finding(
         verdict,
         figures,
         shown,
-        (*inactive_sentences(evidence), *_what_controls_say(controls, arms), *at_one_says),
+        (
+            *inactive_sentences(evidence),
+            *if_all_counted(arms, verdict, _keeps_more(at_best, at_one)),
+            *what_controls_say(best, controls, arms),
+            *at_one_says,
+        ),
         what_would_change(deciding(verdict, judged, 0.20), 0.20),
         about=ARMS,
     )
 
 
-CONTROLS = {
-    "constant_weight": (
-        "weighing single samples need not be what keeps skills",
-        "the weights of single samples may matter",
-    ),
-    "shuffled_weights": (
-        "it need not matter which samples get small weights",
-        "it may matter which samples get small weights",
-    ),
-    "finch": (
-        "a learning rate that follows the loss may suffice",
-        "a learning rate that follows the loss does not suffice",
-    ),
-}
-"""Controls of ConSFT: what one says that is not told apart from it, and one that is worse."""
-
-
-def _controls_of(evidence: Evidence, arm: str) -> tuple[Figure, ...]:
-    """Return the gains in retained success over the controls: two of consft_calibrated, and one of `arm`."""
-    first = [kept(evidence, "consft_calibrated", name) for name in ("constant_weight", "shuffled_weights")]
-    return (*first, kept(evidence, arm, "finch"))
-
-
-def _sft_at_the_rate_of(evidence: Evidence, arm: str) -> tuple[str, ...]:
-    """Return the label of sft at the arm's learning rate, if tuning chose another for sft and it ran."""
-    runs = [next(iter(evidence.runs.get(label, {}).values()), None) for label in (arm, "sft")]
-    factors = [run.record.run.settings.get("step_factor", PUBLISHED) for run in runs if run is not None]
-    if len(factors) < len(runs) or factors[0] == factors[1]:
-        return ()
-    label = rung("sft", factors[0])
-    return (label,) if label in evidence.runs else ()
-
-
-def _controls_at_the_full_rate(evidence: Evidence) -> tuple[Figure, ...]:
-    """Return the gains of consft_calibrated over two controls at the scenario's rate, if they ran."""
-    labels = [f"{name}+step_factor={PUBLISHED}" for name in ("constant_weight", "shuffled_weights")]
-    arm = rung("consft_calibrated", PUBLISHED)
-    return tuple(kept(evidence, arm, label) for label in labels if label in evidence.runs)
-
-
-def _what_the_full_rate_says(gain: Figure, controls: Sequence[Figure]) -> list[str]:
-    """Return in a sentence what an arm gains at the scenario's learning rate, and what the controls say."""
-    if not gain.low > 0:
-        return []
-    said = f"At the scenario's learning rate, {gain.methods[0]} keeps {gain.value:.2f} more than sft"
-    for one in controls:
-        name = one.methods[1].partition("+")[0]
-        explains, does_not = CONTROLS[name]
-        said += f"; {not_told_apart(one, name, explains=explains, does_not=does_not).rstrip('.')}"
-    return [f"{said}."]
-
-
-def _what_controls_say(figures: tuple[Figure, ...], arms: Sequence[str]) -> list[str]:
-    """Return what the controls of the arms that count say."""
-    says = [(one, *CONTROLS[one.methods[1]]) for one in figures if one.methods[0] in arms]
-    return [not_told_apart(figure, explains=yes, does_not=no) for figure, yes, no in says]
+def _keeps_more(at_best: Sequence[Figure], at_one: Sequence[Figure]) -> Verdict:
+    """Return the verdict on the gains of some arms, at their best settings and at the scenario's rate."""
+    return decided(
+        holds=any(one.low >= 0.20 for one in at_best),
+        in_part=any(one.low >= 0.20 for one in at_one),
+        fails=all(one.high < 0.20 for one in (*at_best, *at_one)),
+    )
 
 
 @claim(
@@ -201,24 +168,45 @@ def _what_controls_say(figures: tuple[Figure, ...], arms: Sequence[str]) -> list
 def as_good_as_replay(evidence: Evidence) -> Finding:
     """As good as experience replay, without prior data."""
     replays = ("experience_replay", "buffered_replay")
-    arms = [[kept(evidence, arm, replay) for replay in replays] for arm in arms_that_count(evidence)]
+    every = {arm: [kept(evidence, arm, replay) for replay in replays] for arm in ARMS}
+    of_all, counting = _reaches(every.values()), arms_that_count(evidence)
+    arms = [every[arm] for arm in counting]
     if not arms:
-        return without_an_arm(evidence, [kept(evidence, arm, replays[0]) for arm in ARMS])
+        return without_an_arm(evidence, [of_arm[0] for of_arm in every.values()], (), of_all)
+    verdict = _reaches(arms)
     holding = [arm[0].methods[0] for arm in arms if all(figure.low >= -0.05 for figure in arm)]
-    fails = all(any(figure.high < -0.05 for figure in arm) for arm in arms)
     figures = best_first([arm[0] for arm in arms])
     sentences = [f"It holds for {' and '.join(holding)}."] if holding else []
-    if fails:
+    if verdict == "does not hold":
         names = " and ".join(arm[0].methods[0] for arm in arms)
-        sentences = [f"Replay certainly keeps more skills than {names}."]
+        sentences = [f"Replay{_share_of_replay(evidence)} certainly keeps more skills than {names}."]
     return Finding(
-        decided(holds=bool(holding), fails=fails),
+        verdict,
         figures,
         tuple(arm[1] for arm in arms),
-        (*inactive_sentences(evidence), *sentences),
+        (*inactive_sentences(evidence), *if_all_counted(counting, verdict, of_all), *sentences),
         what_would_change(figures[0], -0.05),
         about=ARMS,
     )
+
+
+def _reaches(arms: Iterable[Sequence[Figure]]) -> Verdict:
+    """Return the verdict on the differences of some arms to both kinds of replay."""
+    found = list(arms)
+    return decided(
+        holds=any(all(figure.low >= -0.05 for figure in arm) for arm in found),
+        fails=all(any(figure.high < -0.05 for figure in arm) for arm in found),
+    )
+
+
+def _share_of_replay(evidence: Evidence) -> str:
+    """Return which share of a batch experience replay draws from prior demonstrations, in words."""
+    run = next(iter(evidence.runs.get("experience_replay", {}).values()), None)
+    share: Any = run.record.run.settings.get("replay") if run else None
+    if not is_number(share):
+        return ""
+    beyond = ", more than the paper's 1:1," if share > 0.5 else ""
+    return f" with a share of {share:g} of each batch{beyond}"
 
 
 @claim(
@@ -234,10 +222,11 @@ def as_good_as_replay(evidence: Evidence) -> Finding:
 )
 def stays_sparse(evidence: Evidence) -> Finding:
     """Updates stay sparse."""
-    arms = [sparsity(evidence, arm, "sft") for arm in arms_that_count(evidence)]
-    response = sparsity(evidence, "l2_sp", "sft")
+    every = {arm: sparsity(evidence, arm, "sft") for arm in ARMS}
+    counting = arms_that_count(evidence)
+    arms, response = [every[arm] for arm in counting], sparsity(evidence, "l2_sp", "sft")
     if not arms:
-        return without_an_arm(evidence, [sparsity(evidence, arm, "sft") for arm in ARMS], (response,))
+        return without_an_arm(evidence, list(every.values()), (response,))
     figures = best_first(arms)
     if response.high < 0.05:
         return Finding(
@@ -253,9 +242,12 @@ def stays_sparse(evidence: Evidence) -> Finding:
             about=ARMS,
         )
     responds = response.high >= 0.05  # not known without l2_sp
-    verdict = decided(
-        holds=responds and any(one.low > 0.05 for one in arms),
-        fails=responds and all(one.high < 0.05 for one in arms),
+    verdict, of_all = (
+        decided(
+            holds=responds and any(one.low > 0.05 for one in some),
+            fails=responds and all(one.high < 0.05 for one in some),
+        )
+        for some in (arms, list(every.values()))
     )
     more = (
         f"A penalty on moved weights keeps {response.value:.3f} more of them in place; weighing samples does "
@@ -265,7 +257,11 @@ def stays_sparse(evidence: Evidence) -> Finding:
         verdict,
         figures,
         (response,),
-        (*inactive_sentences(evidence), *([more] if verdict == "does not hold" else [])),
+        (
+            *inactive_sentences(evidence),
+            *if_all_counted(counting, verdict, of_all),
+            *([more] if verdict == "does not hold" else []),
+        ),
         what_would_change(deciding(verdict, figures, 0.05) if responds else response, 0.05),
         about=ARMS,
     )
@@ -341,6 +337,7 @@ def costs_nothing(evidence: Evidence) -> Finding:
     "count; does not hold if all their upper ends are below -0.10. Cannot be shown here if no arm counts.",
     settled="2026-11-26T04:12Z",
     margin="0.10 of the success on earlier targets",
+    ours=True,
 )
 def keeps_earlier_targets(evidence: Evidence) -> Finding:
     """Learns several targets in sequence and keeps the earlier ones."""
@@ -348,7 +345,8 @@ def keeps_earlier_targets(evidence: Evidence) -> Finding:
     references = tuple(evidence.metric("backward_transfer", name) for name in ("sft", "experience_replay"))
     arms = [own[arm] for arm in arms_that_count(evidence)]
     if not arms:
-        return without_an_arm(evidence, tuple(own.values()), references)
+        of_all = _keeps_targets(list(own.values()))
+        return without_an_arm(evidence, tuple(own.values()), references, of_all)
     figures = best_first(arms)
     over_sft, *over_controls = _gains_in_transfer(evidence, figures[0].methods[0])
     others = [arm for arm in ARMS if own[arm] not in arms]
@@ -364,7 +362,7 @@ def keeps_earlier_targets(evidence: Evidence) -> Finding:
         (over_sft, *over_controls, *not_counted, *references),
         (
             *inactive_sentences(evidence),
-            *([f'If {" and ".join(others)} counted: "{of_all}".'] if of_all != verdict else ()),
+            *if_all_counted([arm for arm in ARMS if arm not in others], verdict, of_all),
             _what_keeps_targets(over_sft, over_controls),
         ),
         what_would_change(deciding(verdict, figures, -0.10), -0.10),
@@ -380,7 +378,7 @@ def _keeps_targets(arms: Sequence[Figure]) -> Verdict:
 def _gains_in_transfer(evidence: Evidence, arm: str) -> Iterator[Figure]:
     """Yield the gain of an arm over sft, over sft at the arm's step factor, and over its controls."""
     controls = (label for label in CONTROLS if label in evidence.runs)
-    for other in ("sft", *_sft_at_the_rate_of(evidence, arm), *controls):
+    for other in ("sft", *sft_at_the_rate_of(evidence, arm), *controls):
         yield evidence.difference("backward_transfer", arm, other)
 
 

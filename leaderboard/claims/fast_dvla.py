@@ -32,6 +32,11 @@ KNOWN = (
     "The auxiliary objective, to answer questions, is a part of the pretraining, and sft does not certainly "
     "lose 0.01 of the answers: whether the objective could add anything here is open."
 )
+KNOWN_NO_HELP = (
+    "The auxiliary objective, to answer questions, is a part of the pretraining, and sft does not certainly "
+    "lose 0.01 of the answers. Here the objective certainly saves less than 5 % of the steps; whether it "
+    "would help a policy that lacks it is open."
+)
 A_CAPABILITY = "An auxiliary objective that speeds up learning, or a policy that lacks it."
 
 
@@ -47,6 +52,11 @@ def _no_capability(evidence: Evidence) -> bool:
     return share_of_steps(evidence, CO_TRAINING, SFT).low > 0.95
 
 
+def _why_known(evidence: Evidence) -> str:
+    """Return why a board says nothing of an objective that the policy knows, and whether it helps there."""
+    return KNOWN_NO_HELP if _no_capability(evidence) else KNOWN
+
+
 def _not_shown(evidence: Evidence, figure: Figure, *controls: Figure) -> Finding | None:
     """Return the finding on a board that could not show what a vector saves, else None."""
     stage = median_stage(evidence, SFT)
@@ -54,7 +64,8 @@ def _not_shown(evidence: Evidence, figure: Figure, *controls: Figure) -> Finding
         return Finding("cannot be shown here", (figure,), (*controls, stage), (TOO_SHORT,), LONGER)
     answers = question_drop(evidence, SFT)
     if loses_no_answers(answers):
-        return Finding("cannot be shown here", (figure,), (*controls, answers), (KNOWN,), A_CAPABILITY)
+        shown = (*controls, answers)
+        return Finding("cannot be shown here", (figure,), shown, (_why_known(evidence),), A_CAPABILITY)
     if _no_capability(evidence):
         return Finding("cannot be shown here", (figure,), controls, (NO_CAPABILITY,), A_CAPABILITY)
     return None
@@ -81,7 +92,8 @@ def auxiliary_objective_helps(evidence: Evidence) -> Finding:
     if stage.value < FEWEST_STEPS:
         return Finding("cannot be shown here", (steps, time), (stage,), (TOO_SHORT,), LONGER)
     if loses_no_answers(answers):
-        return Finding("cannot be shown here", (steps, time), (stage, answers), (KNOWN,), A_CAPABILITY)
+        shown = (stage, answers)
+        return Finding("cannot be shown here", (steps, time), shown, (_why_known(evidence),), A_CAPABILITY)
     whether = "It helps." if helps else "It does not help." if no_help else "Whether it helps is open."
     more = ["The steps to the criterion certainly cost more time in all."] if time.low * steps.low > 1 else []
     return Finding(

@@ -34,7 +34,7 @@ def agreement_sentences(board: Board, boards: Mapping[str, list[Row]]) -> Iterat
     for name, found in board.agreements.items():
         if found is not None and name in boards:
             yield f"On {name}, {_seeds_order(found)}."
-            without = _without_demonstrations(boards[name])
+            without = without_demonstrations(boards[name])
             alone = agreement(without)
             if alone is not None:  # replay is far above the others
                 yield f"On {name}, without methods that read prior demonstrations, {_seeds_order(alone)}."
@@ -44,7 +44,7 @@ def agreement_sentences(board: Board, boards: Mapping[str, list[Row]]) -> Iterat
         across = _between(rows, others)
         if across is not None:
             pairs.append((f"{one} and {other}", across, counted(across.rows, "method")))
-        rest = _between(*(_without_demonstrations(them) for them in (rows, others)))
+        rest = _between(*(without_demonstrations(them) for them in (rows, others)))
         if across is not None and rest is not None:
             methods = f"{counted(rest.rows, 'method')} without prior demonstrations"
             pairs.append((f"{one} and {other}", rest, methods))
@@ -105,7 +105,8 @@ def _taus(rows: Sequence[Row]) -> dict[str, float]:
     return found
 
 
-def _without_demonstrations(rows: Iterable[Row]) -> list[Row]:
+def without_demonstrations(rows: Iterable[Row]) -> list[Row]:
+    """Return the rows of methods that read no prior demonstrations, plain fine-tuning among them."""
     return [row for row in rows if row.division in WITHOUT_DEMONSTRATIONS]
 
 

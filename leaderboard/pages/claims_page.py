@@ -32,7 +32,11 @@ INTRODUCTION = (
     "ratios are paired by seed and episode. Each verdict takes its intervals alone, without correction for "
     "the number of verdicts and controls: where a true value lies at the bar of a rule, one interval in 40 "
     'is wrongly beyond it. A rule that asks for an interval needs {seeds} seeds. "Cannot be shown here" '
-    "means that the setting could not have shown the claim, whether it is true or not. A control is the "
+    "means that a condition of the rule is missing, so that no figure speaks for or against the claim; a "
+    "sentence says which. `consft` is the published loss with a tuned first temperature, as its authors tune "
+    "it. `consft_calibrated` has the published constants, and multiplies the loss inside the weight by a "
+    "tuned factor, because the published constants leave nearly all weights of this small policy at their "
+    "floor. A verdict on ConSFT is about the arms that count on its board. A control is the "
     "method without the one ingredient that is supposed to explain its success. `{missing}` marks a value "
     "that could not be computed."
 )

@@ -6,33 +6,31 @@ the last section says what the records cannot tell.
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
 from typing import TypeVar
 
-from clbench.base.text import counted, listed
+from clbench.base.text import counted, listed, megabytes
 from clbench.records.paths import table_parts
-from clbench.scoring.groups import differences_needed
 from clbench.scoring.intervals import Estimate
 from clbench.spec.policies import DEFAULT_POLICY
 from clbench.spec.references import BASELINE, FROZEN
 
-from ..board.frontier import TiedGain, is_certain_over
 from ..board.predictors import predictions
-from ..board.rows import Board, Row, apart_from_baseline
-from ..board.summary import METHODS, RANKED_BY, WITHOUT_DEMONSTRATIONS, tables_of
-from ..claims.claim import PREDICATES, Claim, Verdict, tally
+from ..board.rows import Board, Row
+from ..board.summary import WITHOUT_DEMONSTRATIONS, tables_of
+from ..claims.claim import KNOWLEDGE, PREDICATES, Claim, Verdict, tally
 from ..claims.evidence import Evidence
 from ..claims.judges import Judged
 from ..policies.compared import by_table
-from ..views.format import MISSING, format_interval, over_tied, tau_text
+from ..views.format import MISSING, format_interval, tau_text
 from ..views.markdown import templates
 from ..views.page.charts.picture import themed
-from .agreements import after_correction, agreement_sentences
+from .agreements import after_correction, agreement_sentences, without_demonstrations
 from .findings_chart import gains_chart
+from .gains import Tied, competing, gain_sentences, gain_table
 from .learning_rates import rate_lines, rate_sentences
 from .lost_skills import relearning_sentences
 
@@ -113,101 +111,14 @@ def _usual(board: Board) -> dict[str, list[Row]]:
     }
 
 
-def competing(rows: Iterable[Row]) -> list[Row]:
-    """Return the rows of methods other than plain fine-tuning, by falling gain."""
-    found = [row for row in rows if row.division in METHODS and row.method != BASELINE]
-    known = [row for row in found if row.estimates["gain"].value is not None]
-    return sorted(known, key=lambda row: -(row.estimates["gain"].value or 0.0))
-
-
-def _gains(boards: dict[str, list[Row]], tied: Mapping[str, Mapping[str, Sequence[TiedGain]]]) -> Section:
+def _gains(boards: dict[str, list[Row]], tied: Tied) -> Section:
     """Does any method beat tuned fine-tuning without prior demonstrations?"""
-    answers: list[str] = []
-    lines = []
-    for name, rows in boards.items():
-        others = competing(rows)
-        answers += _gain_sentences(name, rows, tied.get(name, {}))
-        lines += [
-            (
-                name,
-                row.method,
-                format_interval(row.estimates["gain"], ".3f"),
-                *(format_interval(row.estimates[one]) for one in ("adaptation", "kept")),
-                str(len(row.seeds)),
-            )
-            for row in others
-        ]
-    return Section(
-        "Does a method without prior demonstrations beat tuned fine-tuning?",
-        tuple(answers),
-        ("scenario", "method", "gain", "learned", "kept", "seeds"),
-        tuple(lines),
-        "gains" if lines else "",
+    answers = tuple(
+        one for name, rows in boards.items() for one in gain_sentences(name, rows, tied.get(name, {}))
     )
-
-
-def _gain_sentences(name: str, rows: Sequence[Row], tied: Mapping[str, Sequence[TiedGain]]) -> Iterator[str]:
-    """Yield what Tukey's test of all rows without prior demonstrations says of each gain."""
-    others = [row for row in competing(rows) if row.division in WITHOUT_DEMONSTRATIONS]
-    if not others or BASELINE not in {row.method for row in rows}:
-        return
-    gains = {row.method: row.estimates["gain"] for row in others}
-    apart = apart_from_baseline(rows)
-    better = {method: gains[method] for method in gains if method in apart and (gains[method].value or 0) > 0}
-    certain = {
-        method: gain
-        for method, gain in better.items()
-        if gain.is_above(0) and is_certain_over(tied.get(method, ()))
-    }
-    if certain:
-        yield f"On {name}, yes: {_listed(certain)}."
-    for method in better:
-        yield from over_tied(name, f"`{method}`", gains[method], tied.get(method, ()))
-    if not better:
-        best = next(iter(gains))
-        which = f"the gain of `{best}`"
-        if len(gains) > 1:
-            which = f"the largest gain of {len(gains)} methods, that of `{best}`,"
-        yield (
-            f"On {name}, none is told apart from plain fine-tuning as better: {which} is "
-            f"{format_interval(gains[best], '.3f')}. {_power(rows, gains)}"
-        )
-    alone = "by its own interval alone"
-    if len(gains) > 1:
-        alone += f", without correction for {len(gains)} comparisons"
-    higher = {method: gain for method, gain in gains.items() if gain.is_above(0) and method not in better}
-    over_both = {method: gain for method, gain in higher.items() if is_certain_over(tied.get(method, ()))}
-    if over_both:
-        yield f"Higher {alone}: {_listed(over_both)}."
-    if len(over_both) < len(higher):
-        rest = {method: gain for method, gain in higher.items() if method not in over_both}
-        yield f"Higher {alone}, and over the chosen setting of plain fine-tuning alone: {_listed(rest)}."
-    lower = {
-        method: Estimate(-gain.value, -gain.high, -gain.low)
-        for method, gain in gains.items()
-        if gain.value is not None and gain.low is not None and gain.high is not None and gain.is_below(0)
-    }
-    worse = {method: loss for method, loss in lower.items() if method in apart}
-    if worse:
-        yield f"Told apart from plain fine-tuning as worse: {_listed(worse)}."
-    if len(worse) < len(lower):
-        rest = {method: loss for method, loss in lower.items() if method not in worse}
-        yield f"Lower {alone}: {_listed(rest)}."
-
-
-def _power(rows: Iterable[Row], methods: Collection[str]) -> str:
-    """Return the sentence on the differences that the test of these methods cannot show."""
-    family = {row.method: row.scores for row in rows if row.method in methods or row.method == BASELINE}
-    needed = differences_needed(RANKED_BY, family, BASELINE)
-    if not needed or not math.isfinite(max(needed.values())):
-        return ""
-    ends = [f"{end:.3f}" for end in (min(needed.values()), max(needed.values()))]
-    between = ends[0] if ends[0] == ends[1] else f"{ends[0]} to {ends[1]}, depending on the method"
-    return f"To be told apart, a gain must exceed {between}."
-
-
-def _listed(estimates: dict[str, Estimate]) -> str:
-    return ", ".join(f"`{name}` by {format_interval(one, '.3f')}" for name, one in estimates.items())
+    head, lines = gain_table(boards, tied)
+    question = "Does a method without prior demonstrations beat tuned fine-tuning?"
+    return Section(question, answers, head, lines, "gains" if lines else "")
 
 
 def _replay(boards: dict[str, list[Row]]) -> Section:
@@ -219,15 +130,24 @@ def _replay(boards: dict[str, list[Row]]) -> Section:
             kept = row.costs.get("bytes_kept")
             if row.division in WITHOUT_DEMONSTRATIONS or not kept:
                 continue
+            gain = row.estimates["gain"]
+            moves = "gains" if gain.is_above(0) else "changes the final average by"
+            doubt = "" if gain.is_above(0) or gain.is_below(0) else ", which is not certain"
             answers.append(
-                f"On {name}, `{row.method}` gains {format_interval(row.estimates['gain'])}, keeps "
-                f"{kept / 1e6:.1f} MB between stages, and takes {format_interval(_steps(row), '.0f')} steps "
-                f"to learn a target (plain fine-tuning: {usual}){_never_learned(row)}."
+                f"On {name}, `{row.method}` {moves} {format_interval(gain)}{doubt}, keeps "
+                f"{megabytes(int(kept))} between stages, and takes "
+                f"{format_interval(_steps(row), '.0f')} steps to learn a target (plain fine-tuning: {usual})"
+                f"{_never_learned(row)}."
             )
     if answers:
-        answers.append(OWN_RATES)
+        answers += [WHAT_IS_KEPT, OWN_RATES]
     return Section("What do prior demonstrations buy?", tuple(answers))
 
+
+WHAT_IS_KEPT = (
+    "Replay and `a_gem` keep demonstrations between stages; `ewc` and `fast_dvla` keep vectors as large as "
+    "the policy, which they make from demonstrations before the first stage."
+)
 
 OWN_RATES = (
     "Each method has the learning rate that tuning chose for it, and a smaller one takes more steps: a "
@@ -251,7 +171,7 @@ def _steps(row: Row) -> Estimate:
 
 def _learning_rates(board: Board, evidence: Callable[[str], Evidence]) -> Section:
     """How much a smaller learning rate does alone."""
-    head = ("scenario", "method", "factor", "learned", "kept")
+    head = ("scenario", "method", "factor", "learned", "kept", "seeds")
     answers = tuple(rate_sentences(board.frontiers, _usual(board), evidence))
     lines = tuple(rate_lines(board.frontiers))
     return Section("How much does a smaller learning rate do alone?", answers, head, lines)
@@ -263,7 +183,9 @@ def _claims(judged: Sequence[Judged]) -> Section:
     by_paper = groupby(judged, key=lambda one: one.claim.paper.name)
     for paper, members in by_paper:
         every = list(members)
-        answers.append(f"{paper}: {tally(one.finding.verdict for one in every)}.{_those_that_hold(every)}")
+        answers.append(
+            f"{paper}: {tally(one.finding.verdict for one in every)}.{_those_that_hold(every)}{_ours(every)}"
+        )
     boards = tuple(dict.fromkeys(one.evidence.scenario for one in judged))
     found = _grouped((one.claim, one) for one in judged)
     lines = tuple(_claim_line(claim, members, boards) for claim, members in found.items())
@@ -327,15 +249,26 @@ def _grouped(pairs: Iterable[tuple[Key, Value]]) -> dict[Key, list[Value]]:
     return found
 
 
+MADE_FOR_IT = "the one scenario that was made to show it, by training far past learning"
+
+
 def _those_that_hold(judged: Sequence[Judged]) -> str:
     """Return in a sentence which claims hold: some are about plain fine-tuning, costs, or algebra."""
     boards = _grouped((one.claim, one.finding.verdict in ("holds", "holds in part")) for one in judged)
     words = [
-        f"{claim.id}, {claim.words.rstrip('.')} (on {sum(held)} of {counted(len(held), 'board')})"
+        f"{claim.id}, {claim.words.rstrip('.')} (on "
+        + (MADE_FOR_IT if claim.scenarios == KNOWLEDGE else f"{sum(held)} of {counted(len(held), 'board')}")
+        + ")"
         for claim, held in boards.items()
         if any(held)
     ]
     return f" What holds: {'; '.join(words)}." if words else ""
+
+
+def _ours(judged: Sequence[Judged]) -> str:
+    """Return in a sentence which claims are our reading of a paper; empty without one."""
+    ours = dict.fromkeys(one.claim.id for one in judged if one.claim.ours)
+    return f" {listed(ours)} {'is' if len(ours) == 1 else 'are'} our reading of the paper." if ours else ""
 
 
 def _predictors(boards: dict[str, list[Row]]) -> Section:
@@ -346,9 +279,14 @@ def _predictors(boards: dict[str, list[Row]]) -> Section:
         0: "shows no certain agreement with forgetting on the order of the methods",
         -1: "orders the methods against their forgetting",
     }
-    found = [(name, one) for name, rows in boards.items() for one in predictions(rows)]
-    for name, one in found:
-        tau = f"Kendall's tau {tau_text(one)}, {counted(one.rows, 'method')}"
+    found = [
+        (name, which, one)
+        for name, rows in boards.items()
+        for which, members in (("", rows), (" without prior demonstrations", without_demonstrations(rows)))
+        for one in predictions(members)
+    ]
+    for name, which, one in found:
+        tau = f"Kendall's tau {tau_text(one)}, {counted(one.rows, 'method')}{which}"
         answers.append(f"On {name}, {one.predictor} {words[one.direction]} ({tau}).")
     if answers:
         answers.insert(
@@ -356,7 +294,10 @@ def _predictors(boards: dict[str, list[Row]]) -> Section:
             "Forgetting is here 1 minus the kept share. Methods differ in more than one way, such as their "
             "learning rate: an order that agrees does not say what causes forgetting.",
         )
-        answers += after_correction([one.chance for _, one in found])
+        answers += after_correction([one.chance for _, _, one in found])
+        answers.append(
+            "`stop_gradient` leaves the backbone as it is, so that few of its weights change by construction."
+        )
     return Section("What predicts how much a method forgets?", tuple(answers))
 
 
@@ -370,17 +311,20 @@ def _knowledge(boards: dict[str, list[Row]]) -> Section:
         after, before = (by_method[method].estimates for method in (BASELINE, FROZEN))
         if after["question_retention"].value is None:
             continue
+        stages = "end at the criterion" if by_method[BASELINE].to_criterion else "have a fixed length"
         skills = ""
         if after["retention"].value is not None:
             skills = (
-                f"keeps {format_interval(after['retention'])} of the skills "
-                f"({format_interval(before['retention'])} before), and "
+                f"success on the skills falls from {format_interval(before['retention'])} to "
+                f"{format_interval(after['retention'])}, and "
             )
         answers.append(
-            f"On {name}, plain fine-tuning {skills}answers "
-            f"{format_interval(after['question_retention'])} of the questions "
-            f"({format_interval(before['question_retention'])} before)."
+            f"On {name}, where stages {stages}, {skills}the share of right answers goes from "
+            f"{format_interval(before['question_retention'])} to "
+            f"{format_interval(after['question_retention'])}."
         )
+    if answers:
+        answers.insert(0, "Plain fine-tuning, before the first target and after the last one:")
     return Section("Are skills and knowledge lost together?", tuple(answers))
 
 
@@ -391,8 +335,11 @@ def _policies(board: Board) -> Section:
         scenario, policy = table_parts(name)
         comparisons = [one for one in every if one.method != FROZEN]  # a policy that is not trained keeps all
         for one in comparisons:
-            three = map(format_interval, one.estimates[FORGOTTEN_BY])
-            lines.append((scenario, one.method, policy, *three, str(one.seeds)))
+            cells = [
+                format_interval(estimate if one.seeds > 1 else Estimate(estimate.value, None, None))
+                for estimate in (*one.estimates[FORGOTTEN_BY], *one.estimates["adaptation"][:2])
+            ]
+            lines.append((scenario, one.method, policy, *cells, str(one.seeds)))
         apart = [one.estimates[FORGOTTEN_BY][2] for one in comparisons if one.seeds > 1]
         if apart:
             lower = sum(one.is_below(0) for one in apart)
@@ -400,12 +347,20 @@ def _policies(board: Board) -> Section:
             answers.append(
                 f"On {scenario} with {policy}, the kept share of {lower} of "
                 f"{counted(len(apart), 'method')} is lower than with the flow policy, and that of {higher} "
-                "higher, by intervals of their own. Its methods have the settings that were tuned for the "
-                "flow policy, and its stages take other numbers of steps: tuning may explain a difference."
+                "higher, by intervals of their own, without correction for "
+                f"{counted(len(apart), 'comparison')}. Its methods have the settings that were tuned for the "
+                "flow policy, and its stages take other numbers of steps: tuning may explain a difference. "
+                "So may learning: what was never learned cannot be forgotten."
             )
         elif comparisons:
-            answers.append(f"On {scenario} with {policy} there is one seed, which tells nothing for certain.")
-    head = ("scenario", "method", "other policy", "kept share, flow", "the other", "difference", "seeds")
+            answers.append(
+                f"On {scenario} with {policy} there is one seed, which tells nothing for certain: the table "
+                "has no interval of it."
+            )
+    head = (
+        *("scenario", "method", "other policy", "kept share, flow", "kept share, the other", "difference"),
+        *("learned, flow", "learned, the other", "seeds"),
+    )
     return Section("Does forgetting depend on the policy?", tuple(answers), head, tuple(lines))
 
 
@@ -414,7 +369,7 @@ def _undecided(judged: Sequence[Judged]) -> Section:
     answers = []
     reasons: tuple[tuple[Verdict, str], ...] = (
         ("undecided", "runs are missing, or the intervals are too wide"),
-        ("cannot be shown here", "the setting could not have shown the effect"),
+        ("cannot be shown here", "a condition of the rule is missing, and the page of the claims says which"),
     )
     for verdict, why in reasons:
         found = [one for one in judged if one.finding.verdict == verdict]

@@ -10,7 +10,7 @@ from ..board.frontier import Curve, Rung
 from ..board.rows import Row
 from ..board.summary import WITHOUT_DEMONSTRATIONS
 from ..claims.evidence import Evidence, rung
-from ..views.format import format_interval
+from ..views.format import format_interval, rate_text
 
 Curves = Mapping[str, Sequence[Curve]]
 
@@ -29,30 +29,31 @@ def rate_sentences(
         for curve in curves:
             if curve.is_baseline:
                 yield _of_the_baseline(name, curve, evidence)
-                yield from _at_the_first_rung(name, curve, curves)
-        yield from _of_frozen(name, boards.get(name, []))
+                yield from _at_the_first_rung(name, curve, curves, evidence)
+                yield from _of_frozen(name, curve, boards.get(name, []), evidence)
 
 
 def rate_lines(frontiers: Curves) -> Iterator[tuple[str, ...]]:
-    """Yield the cells of the table: scenario, method, factor, learned and kept."""
+    """Yield the cells of the table: scenario, method, factor, learned, kept and the number of seeds."""
     for name, curves in frontiers.items():
         for curve in curves:
             for one in curve.rungs:
                 learned, kept = format_interval(one.learned), format_interval(one.kept)
-                yield name, curve.method, f"{one.factor:g}", learned, kept
+                yield name, curve.method, f"{one.factor:g}", learned, kept, str(len(one.seeds))
 
 
 def _of_the_baseline(name: str, curve: Curve, evidence: Callable[[str], Evidence]) -> str:
     """Return what plain fine-tuning keeps at the first rung, and at the one where it keeps most."""
-    first, best = curve.rungs[0], max(curve.rungs, key=lambda rung: rung.kept.value or 0.0)
+    first, best = curve.rungs[0], _best(curve)
     more = ""
     if best is not first:
         more = (
-            f", and {format_interval(best.kept)} at {_rate(best.factor)}, where it learns "
+            f", and {format_interval(best.kept)} at {rate_text(best.factor)}, where it learns "
             f"{format_interval(best.learned)}"
         )
         more += f". {_gain_of_a_rate(first, best, len(curve.rungs), evidence(name))}"
-    return f"On {name}, plain fine-tuning keeps {format_interval(first.kept)} at {_rate(first.factor)}{more}."
+    kept = format_interval(first.kept)
+    return f"On {name}, plain fine-tuning keeps {kept} at {rate_text(first.factor)}{more}."
 
 
 def _gain_of_a_rate(first: Rung, best: Rung, rates: int, evidence: Evidence) -> str:
@@ -65,12 +66,13 @@ def _gain_of_a_rate(first: Rung, best: Rung, rates: int, evidence: Evidence) -> 
     )
 
 
-def _rate(factor: float) -> str:
-    return "the scenario's learning rate" if factor == 1 else f"{factor:g} times the scenario's learning rate"
+def _at_the_first_rung(
+    name: str, baseline: Curve, curves: Sequence[Curve], evidence: Callable[[str], Evidence]
+) -> Iterator[str]:
+    """Yield what the methods without prior demonstrations keep at the learning rate of the first rung.
 
-
-def _at_the_first_rung(name: str, baseline: Curve, curves: Sequence[Curve]) -> Iterator[str]:
-    """Yield what the methods without prior demonstrations keep at the learning rate of the first rung."""
+    The one that keeps most is compared with plain fine-tuning there, and at its best rate.
+    """
     factor = baseline.rungs[0].factor
     kept = {
         curve.method: curve.rungs[0].kept
@@ -82,15 +84,38 @@ def _at_the_first_rung(name: str, baseline: Curve, curves: Sequence[Curve]) -> I
     if kept:
         falling = sorted(kept, key=lambda method: -(kept[method].value or 0.0))
         listed = ", ".join(f"`{method}` {format_interval(kept[method])}" for method in falling)
-        yield f"On {name}, methods without prior demonstrations keep at factor {factor:g}: {listed}."
+        best = _best(baseline)
+        over = [
+            f"{_kept_more(evidence(name), rung(falling[0], factor), rung(BASELINE, other))} more than plain "
+            f"fine-tuning at {rate_text(other)}"
+            for other in dict.fromkeys((factor, best.factor))
+        ]
+        yield (
+            f"On {name}, methods without prior demonstrations keep at {rate_text(factor)}: {listed}. The "
+            f"first of them, `{falling[0]}`, keeps {' and '.join(over)}."
+        )
 
 
-def _of_frozen(name: str, rows: Sequence[Row]) -> Iterator[str]:
-    """Yield what a policy that learns nothing keeps by this measure."""
+def _best(curve: Curve) -> Rung:
+    """Return the rung at which a method keeps most."""
+    return max(curve.rungs, key=lambda one: one.kept.value or 0.0)
+
+
+def _kept_more(evidence: Evidence, method: str, other: str) -> str:
+    """Return how much more a method keeps than another, seed by seed."""
+    return format_interval(evidence.difference("kept", method, other).estimate)
+
+
+def _of_frozen(
+    name: str, baseline: Curve, rows: Sequence[Row], evidence: Callable[[str], Evidence]
+) -> Iterator[str]:
+    """Yield what a policy that learns nothing keeps by this measure, and whether fine-tuning keeps more."""
     for row in rows:
         if row.method == FROZEN:
+            best = _best(baseline)
             yield (
                 f"On {name}, `{FROZEN}`, which learns nothing, keeps "
                 f"{format_interval(row.estimates['kept'])} by this measure: a target that was never learned "
-                "counts as not kept."
+                f"counts as not kept. Plain fine-tuning at {rate_text(best.factor)} keeps "
+                f"{_kept_more(evidence(name), rung(BASELINE, best.factor), FROZEN)} more, seed by seed."
             )

@@ -18,7 +18,8 @@ LOST = 0.5
 """Share of its validation episodes below which a skill counts as lost."""
 
 LOST_MEANS = (
-    "A skill is lost here if it succeeds in less than half of its validation episodes after the last target."
+    "A skill is lost here if the policy does it in fewer than half of its validation episodes after the last "
+    "target. Each run measures the skill that is lost most."
 )
 
 
@@ -36,8 +37,9 @@ def relearning_sentences(boards: Mapping[str, Sequence[Row]]) -> list[str]:
             answers.append(f"On {name}, plain fine-tuning loses a skill in {len(lost)} of {seeds}.")
             continue
         answers.append(
-            f"On {name}, plain fine-tuning loses a skill in {len(lost)} of {seeds} ({_skills(lost)}). It is "
-            f"back at the criterion after {_steps(lost)} steps of its demonstrations."
+            f"On {name}, plain fine-tuning loses a skill in {len(lost)} of {seeds} (most of all "
+            f"{_skills(lost)}). It meets the criterion again after {_steps(lost)} steps on its "
+            "demonstrations."
             f"{_without_pretraining(by_method.get(FROM_SCRATCH), lost)}"
         )
     if answers:
@@ -56,14 +58,15 @@ def _measured(row: Row | None) -> list[tuple[Relearning, float]]:
 
 
 def _without_pretraining(row: Row | None, lost: Sequence[Relearning]) -> str:
-    """Return what a policy without pretraining needs: of the same skill, where a run has it."""
+    """Return what a policy without pretraining needs for the same skill; empty if no run measured that."""
     found = [one for one, _ in _measured(row)]
     same = [one for one in found if one.skill in {entry.skill for entry in lost}]
-    told = same or found
-    if len(told) < 2:
+    if len(same) < 2:
         return ""
-    other = "" if same else f", another skill{'' if len({one.skill for one in told}) == 1 else ' or two'}"
-    return f" A policy without pretraining takes {_steps(told)} ({_skills(told)}){other}."
+    return (
+        f" A policy without pretraining, which has learned the targets, takes {_steps(same)} "
+        f"({_skills(same)})."
+    )
 
 
 def _skills(found: Sequence[Relearning]) -> str:

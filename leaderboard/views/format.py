@@ -250,7 +250,7 @@ def scaled(count: float) -> tuple[str, str]:
 
 
 def over_tied(name: str, words: str, gain: Estimate, tied: Sequence[TiedGain]) -> Iterator[str]:
-    """Yield how a certain gain fares against settings of plain fine-tuning that tuning rated as high.
+    """Yield how a certain gain fares against settings of plain fine-tuning that tuning rated as highly.
 
     `words` name the method, with the markup of the page.
     """
@@ -259,6 +259,11 @@ def over_tied(name: str, words: str, gain: Estimate, tied: Sequence[TiedGain]) -
         chosen, other = format_interval(gain, ".3f"), format_interval(one.gain, ".3f")
         yield (
             f"On {name}, {'for' if sure else 'not for'} certain: {words} gains {chosen} over plain "
-            f"fine-tuning at the setting that tuning chose, {'and' if sure else 'but'} {other} at factor "
-            f"{one.factor:g}, which tuning rated as high ({counted(one.seeds, 'seed')})."
+            f"fine-tuning at the setting that tuning chose, {'and' if sure else 'but'} {other} at "
+            f"{rate_text(one.factor)}, which tuning rated as highly ({counted(one.seeds, 'seed')})."
         )
+
+
+def rate_text(factor: float) -> str:
+    """Return a learning rate in words: "0.1 times the scenario's learning rate"."""
+    return "the scenario's learning rate" if factor == 1 else f"{factor:g} times the scenario's learning rate"

@@ -79,7 +79,7 @@ def markdown(board: Board, comparisons: Comparisons) -> str:
 
 
 def _tied_text(name: str, rows: Sequence[Row], tied: Mapping[str, Sequence[TiedGain]]) -> str:
-    """Return which rows are told apart above plain fine-tuning, but not from its settings rated as high."""
+    """Return which rows are told apart above plain fine-tuning, but not from its settings rated as highly."""
     apart = apart_from_baseline(rows)
     unsure = [row for row in rows if row.method in apart and not is_certain_over(tied.get(row.method, ()))]
     found = [

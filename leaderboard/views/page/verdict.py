@@ -64,8 +64,8 @@ def headline(rows: Sequence[Row], tied: Mapping[str, Sequence[TiedGain]] | None 
 
     Args:
         rows: The rows.
-        tied: Gains over plain fine-tuning at settings that tuning rated as high as the chosen one, by method:
-            a gain is certain if they are, too.
+        tied: Gains over plain fine-tuning at settings that tuning rated as highly as the chosen one, by
+            method: a gain is certain if they are, too.
     """
     competing = [row for row in rows if row.division in METHODS]
     baseline = next((row for row in competing if row.method == BASELINE), None)
@@ -186,7 +186,7 @@ def _doubt(leader: Row, rows: Sequence[Row], apart: Container[str], tied: Sequen
     if not unsure:
         return ""
     return (
-        f"Tuning rated sft at {number_text(unsure[0].factor, 'g')} times the learning rate as high; over "
+        f"Tuning rated sft as highly at {number_text(unsure[0].factor, 'g')} times the learning rate; over "
         f"that setting, the gain is {format_interval(unsure[0].gain)} and not certain."
     )
 

@@ -48,7 +48,7 @@ class ScenarioView:
     frontier: tuple[Curve, ...]
     """Methods along the ladder of learning rates."""
     tied: Mapping[str, Sequence[TiedGain]]
-    """Gains over plain fine-tuning at settings that tuning rated as high as the chosen one, by method."""
+    """Gains over plain fine-tuning at settings that tuning rated as highly as the chosen one, by method."""
     start: str
     """Sentence on what the pretrained policy can do, empty if there is none."""
     agreement: str

@@ -147,9 +147,12 @@ def test_a_control_says_whether_it_explains_what_is_kept(bench: Bench) -> None:
     for method in ("consft_calibrated", "constant_weight"):
         bench.add(method, kept=0.9)
     entry = section(bench.page(), "C2")
-    assert "constant_weight is not told apart from it" in entry
-    assert "finch does not reach it: a learning rate that follows the loss does not suffice." in entry
-    assert "The records cannot show what shuffled_weights says about it." in entry
+    assert "constant_weight is not told apart from consft_calibrated" in entry
+    assert (
+        "finch does not reach consft_calibrated: a learning rate that follows the loss does not suffice."
+        in entry
+    )
+    assert "The records cannot show what shuffled_weights says about consft_calibrated." in entry
 
 
 def test_what_keeps_skills_at_the_scenarios_learning_rate_is_asked_of_controls_there(bench: Bench) -> None:
@@ -161,8 +164,8 @@ def test_what_keeps_skills_at_the_scenarios_learning_rate_is_asked_of_controls_t
     entry = section(bench.page(), "C2")
     assert (
         "At the scenario's learning rate, consft_calibrated@1 keeps 0.70 more than sft; constant_weight is "
-        "not told apart from it: weighing single samples need not be what keeps skills; shuffled_weights "
-        "does not reach it: it may matter which samples get small weights."
+        "not told apart from consft_calibrated@1: weighing single samples need not be what keeps skills; "
+        "shuffled_weights does not reach consft_calibrated@1: it may matter which samples get small weights."
     ) in entry
 
 

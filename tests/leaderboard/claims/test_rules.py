@@ -258,6 +258,8 @@ def test_an_arm_that_does_not_count_is_shown_with_the_verdict_that_it_would_give
     finding = bench.judge("C7")
     assert finding.verdict == "does not hold"
     assert 'If consft counted: "holds".' in finding.sentences
+    (same,) = [one for one in bench.judge("C2").sentences if one.startswith("If consft counted")]
+    assert same == "If consft counted, the verdict would be the same."
     assert {one.methods for one in finding.controls} >= {("consft",), ("consft", "sft")}
 
 
@@ -290,10 +292,10 @@ def test_the_seeds_in_which_aegis_sheds_little_are_counted(bench: Bench) -> None
 @pytest.mark.parametrize(
     ("low", "high", "says"),
     [
-        (0.01, 0.20, "finch does not reach it: it takes weights."),
-        (-0.10, 0.10, "finch is not told apart from it: a learning rate suffices."),
-        (-0.20, -0.01, "finch is even better than it: a learning rate suffices."),
-        (math.nan, math.nan, "The records cannot show what finch says about it."),
+        (0.01, 0.20, "finch does not reach consft: it takes weights."),
+        (-0.10, 0.10, "finch is not told apart from consft: a learning rate suffices."),
+        (-0.20, -0.01, "finch is even better than consft: a learning rate suffices."),
+        (math.nan, math.nan, "The records cannot show what finch says about consft."),
     ],
 )
 def test_what_a_control_says_follows_from_the_interval_of_the_gain(

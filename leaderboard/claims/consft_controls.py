@@ -1,0 +1,69 @@
+"""The controls of ConSFT: the method without its ingredient, and what each says of a gain."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from .claim import not_told_apart
+from .evidence import Evidence, Figure, rung
+from .figures import PUBLISHED, kept
+
+CONTROLS = {
+    "constant_weight": (
+        "weighing single samples need not be what keeps skills",
+        "the weights of single samples may matter",
+    ),
+    "shuffled_weights": (
+        "it need not matter which samples get small weights",
+        "it may matter which samples get small weights",
+    ),
+    "finch": (
+        "a learning rate that follows the loss may suffice",
+        "a learning rate that follows the loss does not suffice",
+    ),
+}
+"""Controls of ConSFT: what one says that is not told apart from it, and one that is worse."""
+
+
+def controls_of(evidence: Evidence, arm: str) -> tuple[Figure, ...]:
+    """Return the gains in retained success over the controls: two of consft_calibrated, and one of `arm`."""
+    first = [kept(evidence, "consft_calibrated", name) for name in ("constant_weight", "shuffled_weights")]
+    return (*first, kept(evidence, arm, "finch"))
+
+
+def sft_at_the_rate_of(evidence: Evidence, arm: str) -> tuple[str, ...]:
+    """Return the label of sft at the arm's learning rate, if tuning chose another for sft and it ran."""
+    runs = [next(iter(evidence.runs.get(label, {}).values()), None) for label in (arm, "sft")]
+    factors = [run.record.run.settings.get("step_factor", PUBLISHED) for run in runs if run is not None]
+    if len(factors) < len(runs) or factors[0] == factors[1]:
+        return ()
+    label = rung("sft", factors[0])
+    return (label,) if label in evidence.runs else ()
+
+
+def controls_at_the_full_rate(evidence: Evidence) -> tuple[Figure, ...]:
+    """Return the gains of consft_calibrated over two controls at the scenario's rate, if they ran."""
+    labels = [f"{name}+step_factor={PUBLISHED}" for name in ("constant_weight", "shuffled_weights")]
+    arm = rung("consft_calibrated", PUBLISHED)
+    return tuple(kept(evidence, arm, label) for label in labels if label in evidence.runs)
+
+
+def what_the_full_rate_says(gain: Figure, controls: Sequence[Figure]) -> list[str]:
+    """Return in a sentence what an arm gains at the scenario's learning rate, and what the controls say."""
+    if not gain.low > 0:
+        return []
+    said = f"At the scenario's learning rate, {gain.methods[0]} keeps {gain.value:.2f} more than sft"
+    for one in controls:
+        name = one.methods[1].partition("+")[0]
+        explains, does_not = CONTROLS[name]
+        said += f"; {not_told_apart(one, name, explains=explains, does_not=does_not).rstrip('.')}"
+    return [f"{said}."]
+
+
+def what_controls_say(gain: Figure, figures: Sequence[Figure], arms: Sequence[str]) -> list[str]:
+    """Return what the controls of the arms that count say of a gain over sft, if there is one."""
+    if gain.low <= 0:
+        method, other = gain.methods[:2]
+        return [f"{method} does not certainly keep more than {other}: no gain is there to be explained."]
+    says = [(one, *CONTROLS[one.methods[1]]) for one in figures if one.methods[0] in arms]
+    return [not_told_apart(figure, explains=yes, does_not=no) for figure, yes, no in says]
