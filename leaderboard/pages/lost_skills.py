@@ -37,7 +37,7 @@ def relearning_sentences(boards: Mapping[str, Sequence[Row]]) -> list[str]:
             answers.append(f"On {name}, plain fine-tuning loses a skill in {len(lost)} of {seeds}.")
             continue
         answers.append(
-            f"On {name}, plain fine-tuning loses a skill in {len(lost)} of {seeds} (most of all "
+            f"On {name}, plain fine-tuning loses a skill in {len(lost)} of {seeds} (most lost: "
             f"{_skills(lost)}). It meets the criterion again after {_steps(lost)} steps on its "
             "demonstrations."
             f"{_without_pretraining(by_method.get(FROM_SCRATCH), lost)}"
@@ -71,7 +71,7 @@ def _without_pretraining(row: Row | None, lost: Sequence[Relearning]) -> str:
 
 def _skills(found: Sequence[Relearning]) -> str:
     counts = Counter(one.skill for one in found)
-    return ", ".join(f"`{skill}` {count}" for skill, count in counts.most_common())
+    return ", ".join(f"`{skill}` in {count}" for skill, count in counts.most_common())
 
 
 def _steps(found: Sequence[Relearning]) -> str:

@@ -203,9 +203,9 @@ def test_how_fast_lost_skills_come_back_is_told_with_their_names(
             )
             write_record(record, record_path(tmp_path / "records", "clbench/Even-v1", method, seed))
     text = page()
-    assert "plain fine-tuning loses a skill in 2 of 2 seeds (most of all `skill_1` 2)." in text
+    assert "plain fine-tuning loses a skill in 2 of 2 seeds (most lost: `skill_1` in 2)." in text
     assert "It meets the criterion again after 10 [" in text
-    told = "A policy without pretraining, which has learned the targets, takes 20 (`skill_1` 2)." in text
+    told = "A policy without pretraining, which has learned the targets, takes 20 (`skill_1` in 2)." in text
     assert told == (other == "skill_1"), "another skill says nothing of this one"
 
 
