@@ -18,6 +18,9 @@ from clbench.base.text import minutes, print_plain, printable, printable_lines
 LINE_SECONDS = 30.0
 """Seconds between two lines without a terminal."""
 
+AT_ONCE = 1.0
+"""Seconds in which a piece ends that was done before, for example because its result is cached."""
+
 
 class Bars:
     """One bar for all work and one for each running piece.
@@ -38,6 +41,7 @@ class Bars:
         self._bars: dict[Hashable, TaskID] = {}
         self._left: dict[Hashable, float] = {}
         self._length: dict[Hashable, float] = {}
+        self._begun: dict[Hashable, float] = {}
         self._text: dict[Hashable, str] = {}
         self._progress = Progress(
             TextColumn("{task.description}"),
@@ -68,6 +72,7 @@ class Bars:
         """Show a new piece of work under its text, `str(piece)`."""
         self._bars[piece] = self._progress.add_task(escape(printable(str(piece))), total=length)
         self._left[piece] = self._length[piece] = length
+        self._begun[piece] = self._clock()
         self._text[piece] = str(piece)
 
     def place(self, piece: Hashable, place: str) -> None:
@@ -94,14 +99,22 @@ class Bars:
             self.say(f"{share:4.0%}{left}: {'; '.join(self._text.values())}")
 
     def skip(self, piece: Hashable, length: float, text: str) -> None:
-        """Count a piece of work that need not be done, and print why."""
+        """Leave out a piece of work that need not be done, and print why."""
         self.start(piece, length)
         self.finish(piece, text)
 
     def finish(self, piece: Hashable, text: str) -> None:
-        """Complete and remove the bar of a piece, and print the outcome."""
-        self.advance(piece, self._left[piece])
-        del self._left[piece], self._length[piece], self._text[piece]
+        """Complete and remove the bar of a piece, and print the outcome.
+
+        What took no time does not count: it says nothing of how long the rest will take.
+        """
+        if self._clock() - self._begun[piece] < AT_ONCE:
+            self._total = max(self._total - self._left[piece], self._done, 1e-9)
+            # a bar of which nothing is left to do is full
+            self._progress.update(self._all, total=self._total, completed=min(self._done + 1e-9, self._total))
+        else:
+            self.advance(piece, self._left[piece])
+        del self._left[piece], self._length[piece], self._text[piece], self._begun[piece]
         self._progress.remove_task(self._bars.pop(piece))
         self.say(f"{piece}: {text}")
 

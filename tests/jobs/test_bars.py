@@ -23,6 +23,20 @@ def test_without_a_terminal_a_line_is_printed_now_and_then() -> None:
     assert lines[5] == "pretraining [seed 0]: done"
 
 
+def test_what_takes_no_time_does_not_shorten_the_time_left() -> None:
+    now = 0.0
+    file = io.StringIO()
+    with Bars(200, Console(file=file, width=100), clock=lambda: now) as bars:
+        bars.start("demonstrations", 60)
+        bars.finish("demonstrations", "from the cache")
+        bars.skip("sft seed 0", 40, "done")
+        bars.start("sft seed 1", 100)
+        now += LINE_SECONDS
+        bars.advance("sft seed 1", 10)
+    # a tenth of the rest in 30 s; with the others it would be half of all, and 30 s left
+    assert file.getvalue().splitlines()[-1] == " 10%, about 4:30 left: sft seed 1"
+
+
 def test_no_time_left_is_shown_before_any_work_is_done() -> None:
     now = 0.0
     file = io.StringIO()
@@ -42,6 +56,14 @@ def test_a_terminal_shows_bars_with_the_time_left() -> None:
     assert "sft seed 0" in text
     assert "40%" in text
     assert "left" in text
+
+
+def test_a_bar_of_work_that_was_done_before_is_full() -> None:
+    file = io.StringIO()
+    with Bars(100, Console(file=file, width=100, force_terminal=True)) as bars:
+        bars.skip("sft seed 0", 60, "done")
+        bars.skip("sft seed 1", 40, "done")
+    assert "100%" in file.getvalue()
 
 
 def test_one_bar_counts_all_work_and_each_piece_its_own() -> None:
