@@ -4,11 +4,12 @@ BIN := .venv/bin
 SCENARIO := clbench/Fetch-v1
 QUICK := build/quick
 
-.PHONY: help leaderboard tuning records ladder controls docs site benchmark test test-slow libero-test check wheel-test clean
+.PHONY: help leaderboard tuning records ladder controls docs site benchmark test test-long test-slow libero-test check wheel-test clean
 
 define HELP
 make leaderboard  from nothing to a table in minutes: install, run two methods with one seed
-make test         the tests
+make test         most of the tests, in minutes
+make test-long    the tests that take seconds each, many of them whole runs
 make test-slow    the tests that take minutes each
 make check        format, lint, types, committed pages and definitions, the page in a browser, the benchmarks
 make libero-test  install LIBERO (340 MB), and compare our world with it
@@ -138,6 +139,10 @@ benchmark: .venv/installed-dev
 
 test: .venv/installed-dev
 	$(BIN)/pytest
+
+# What takes two seconds or more of one core: whole runs, every method's contract, films, killed commands.
+test-long: .venv/installed-dev
+	$(BIN)/pytest -m "long and not slow"
 
 # What takes minutes: random input for longer, a Ray cluster, and all that a stranger types from nothing to a row.
 test-slow: .venv/installed-dev

@@ -6,6 +6,8 @@ import re
 import subprocess
 import sys
 
+import pytest
+
 import clbench
 from clbench.base.entry_points import resolve
 
@@ -46,6 +48,7 @@ def test_the_help_of_run_and_the_driver_of_ray_jobs_do_not_wait_for_pytorch() ->
     assert _run(f"{code} print('torch' in sys.modules)") == "False"
 
 
+@pytest.mark.long
 def test_nothing_leaks_to_the_top_level() -> None:
     code = "import clbench.cli.main, clbench.methods.sft, clbench.envs.fetch, clbench.leaderboard, sys;"
     code += "print({'envs', 'methods', 'leaderboard'} & set(sys.modules))"

@@ -43,6 +43,7 @@ def installed(copy: Path) -> Path:
     return target
 
 
+@pytest.mark.long
 def test_an_installed_submission_is_listed_as_package_and_name(installed: Path, tmp_path: Path) -> None:
     output = _python("clbench", "list", folder=tmp_path, path=installed)
     assert INSTALLED in output

@@ -42,6 +42,7 @@ def der(blocks: list[str]) -> Any:
     return importlib.import_module("der").DER(kept=8)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("block", [1, 3])
 def test_its_methods_keep_the_contract(block: int, blocks: list[str]) -> None:
     exec(blocks[block], {})

@@ -35,12 +35,14 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.long
 def test_its_scenario_is_an_environment_and_passes_the_check(folder: Path) -> None:
     _, environments, check = blocks_of(PAGE, "python")
     shown = "\nprint(env.unwrapped.scenario.id, envs.reset(seed=0)[0]['state'].shape)"
     assert _python(folder, "-c", environments + check + shown) == "me/Mine-v0 (4, 4)\n"
 
 
+@pytest.mark.long
 def test_its_world_is_perturbed_as_the_page_shows(tmp_path: Path) -> None:
     """Insert the lines of the page into the world, each before or after a line that occurs once."""
     imported, declared, made, drawn, displaced = _fragments()

@@ -22,6 +22,7 @@ def _restored_path(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(".")  # and take back what the command puts there
 
 
+@pytest.mark.long
 def test_a_policy_is_pretrained_unless_it_is_in_the_cache(capsys: pytest.CaptureFixture[str]) -> None:
     _clbench("pretrain", TOY)
     folder = pretraining.pretrained_folder(load_scenario(TOY), 0)
@@ -69,6 +70,7 @@ def test_a_policy_ships_from_a_checkout_alone(
     }
 
 
+@pytest.mark.long
 def test_a_scenario_of_the_working_folder_is_found(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

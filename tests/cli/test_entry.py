@@ -74,6 +74,7 @@ def _exit_code(process: subprocess.Popen[str]) -> tuple[int, str, str]:
     return (128 - code if code < 0 else code), out, err
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "number", [pytest.param(number, marks=[pytest.mark.slow] if number > 1 else []) for number in range(10)]
 )

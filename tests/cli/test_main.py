@@ -265,6 +265,7 @@ def test_a_dry_run_counts_recorded_runs_whose_policies_would_be_made_again(
     assert " 0 kB of records, " in disk
 
 
+@pytest.mark.long
 def test_a_quiet_run_prints_failures_alone(
     tmp_path: Path, write_module: Callable[[str, str], None], capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -83,6 +83,7 @@ def test_a_fresh_policy_is_linted_and_formatted_by_ruffs_own_settings(
     assert result.returncode == 0, result.stdout + result.stderr
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "method",
     [
@@ -105,6 +106,7 @@ def test_methods_fine_tune_a_fresh_policy(method: str, fresh_policy: str, tmp_pa
     assert learned > 0.5
 
 
+@pytest.mark.long
 def test_a_record_of_a_fresh_policy_is_replayed_only_if_the_verifier_names_it(
     fresh_policy: str, tmp_path: Path
 ) -> None:
@@ -186,6 +188,7 @@ def test_the_command_prints_the_next_steps(
     ]
 
 
+@pytest.mark.long
 def test_pytest_finds_the_fresh_tests(tmp_path: Path) -> None:
     write_method("freshly_written", tmp_path)
     write_policy("diffusion", tmp_path)

@@ -20,6 +20,7 @@ def _tune(folder: Path, *arguments: str, method: str = "l2_sp") -> subprocess.Co
     return done
 
 
+@pytest.mark.long
 def test_equal_settings_run_once_and_plain_fine_tuning_is_run_unchanged_too(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -199,6 +199,7 @@ def test_a_hook_that_restores_a_state_may_read_no_more() -> None:
         check_method(load_method("leaky:Late"), hook="load_state")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("method", ["FairChooser", "Declared"])
 def test_a_stage_may_use_everything_that_it_may_know(method: str, tmp_path: Path) -> None:
     assert execute(RunSpec(TOY, f"leaky:{method}", 0, targets=1), tmp_path).status == "success"

@@ -54,6 +54,7 @@ def test_an_answer_that_no_state_gives_is_named() -> None:
         Questions((kind,), torch.zeros(5, 4))
 
 
+@pytest.mark.long
 def test_fetch_questions_have_balanced_answers_for_training_and_test() -> None:
     few = dataclasses.replace(FETCH, budget=dataclasses.replace(FETCH.budget, question_episodes=96))
     for questions in load_questions(few):

@@ -235,6 +235,7 @@ def test_questions_describe_a_scene_correctly() -> None:
     assert said == {"body": "cart", "pole_up": "up", "pole_side": "right", "cart_side": "left"}
 
 
+@pytest.mark.long
 def test_the_world_is_drawn_with_the_target_of_its_task() -> None:
     if not _draws():
         pytest.skip("nothing renders here: clbench doctor shows the missing parts")

@@ -68,6 +68,7 @@ def test_a_longer_training_continues_a_shorter_one_and_not_the_other_way_round(e
         training.train(tiny(steps=400), empty_caches)
 
 
+@pytest.mark.long
 def test_the_json_records_the_command_and_the_results_of_the_weights(empty_caches: Path) -> None:
     said = training.train(tiny(steps=200), empty_caches)
     assert said == json.loads((empty_caches / "point_mass_easy.json").read_text(encoding="utf-8"))

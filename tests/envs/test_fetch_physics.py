@@ -94,6 +94,7 @@ def compare(task: str, steps: int, threads: int, lanes: int = 8) -> tuple[int, i
     return followed, successes
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("task", ["pick_and_place", "push_right"])
 def test_it_is_the_plain_world_and_gymnasium_robotics_bit_for_bit(task: str) -> None:
     followed, successes = compare(task, steps=400, threads=2)

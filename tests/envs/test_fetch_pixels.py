@@ -137,6 +137,7 @@ def test_a_picture_follows_the_block_and_the_target(observer: Observer) -> None:
     assert columns[1] - columns[0] > 1.5
 
 
+@pytest.mark.long
 def test_a_picture_depends_on_its_state_alone(observer: Observer) -> None:
     starts = np.stack([_start(seed) for seed in range(4)])
     together, backwards = observer.observe(starts)[1], observer.observe(starts[::-1])[1]

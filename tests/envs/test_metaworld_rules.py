@@ -101,6 +101,7 @@ def test_lanes_of_all_tasks_do_so_in_any_order_on_two_threads_with_and_without_r
     compare([*TASKS, *TASKS[::3], "stick_push", "dial_turn"], steps=40, threads=2)
 
 
+@pytest.mark.long
 def test_perturbed_lanes_of_all_tasks_do_so() -> None:
     compare([*TASKS, *TASKS[::3]], steps=20, perturbed=True)
 

@@ -274,6 +274,7 @@ def test_questions_have_balanced_answers_for_training_and_test() -> None:
                 assert share == pytest.approx(1 / len(entry.answers), abs=0.2)
 
 
+@pytest.mark.long
 def test_pictures_show_the_maze_of_the_task_and_leave_the_episode_alone() -> None:
     """Draw in another process, which a broken rendering back end may kill."""
     code = """

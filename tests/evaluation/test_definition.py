@@ -36,6 +36,7 @@ CHECKED = ("clbench/FetchKnowledge-v1", "clbench/FetchPixels-v0", "clbench/MetaW
 """They take 14 s in suites that others stand for here: `make check` defines them."""
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "scenario",
     [pytest.param(name, marks=pytest.mark.slow if name in CHECKED else []) for name in sorted(pinned())],

@@ -47,6 +47,7 @@ def _with_episodes(**numbers: int) -> Scenario:
     )
 
 
+@pytest.mark.long
 def test_an_outcome_does_not_depend_on_other_episodes(fetch_policy: Policy) -> None:
     scenario = _with_episodes(validation_episodes=5)
     evaluator = Evaluator(scenario, seed=0)
@@ -81,6 +82,7 @@ def _played_alone(policy: Policy, task: Task, number: int, seed: int) -> Episode
     return Episode(task.name, "validation", number, success, total_reward, step + 1)
 
 
+@pytest.mark.long
 def test_an_outcome_equals_the_outcome_in_the_plain_world_bit_for_bit(fetch_policy: Policy) -> None:
     trained, _ = pretrained_policy(TOY, 0)
     cases = [(FETCH, fetch_policy, ["push", "press"]), (TOY, trained, ["left", "right", "up_left"])]
@@ -107,6 +109,7 @@ def test_a_row_of_a_forward_pass_does_not_depend_on_its_place_or_its_neighbours(
         assert fetch_policy.act(state, words, noise)[:7].equal(straight[:7])
 
 
+@pytest.mark.long
 def test_validation_and_test_episodes_and_seeds_have_different_initial_states(fetch_policy: Policy) -> None:
     task = FETCH.task("reach")
     scenario = _with_episodes(validation_episodes=2, test_episodes=3, curve_episodes=1)
@@ -126,6 +129,7 @@ def test_a_perturbed_episode_begins_with_the_seed_and_the_words_of_the_test_epis
     assert FETCH.budget.episodes("perturbed") == FETCH.budget.test_episodes
 
 
+@pytest.mark.long
 def test_perturbed_outcomes_neither_depend_on_other_episodes_nor_change_them(
     fetch_policy: Policy,
 ) -> None:

@@ -92,6 +92,7 @@ def test_a_file_has_the_layout_that_robomimic_reads(exported: Path) -> None:
         assert list(demo["dones"]) == [0] * (steps - 1) + [1]
 
 
+@pytest.mark.long
 def test_a_file_of_a_task_with_a_camera_has_what_a_policy_sees(tmp_path: Path) -> None:
     seen = dataclasses.replace(TASK, camera=CAMERA)
     scenario = dataclasses.replace(TOY, retained=(), scenes=(seen,), target=(seen,), held_out=())
@@ -337,6 +338,7 @@ def test_a_path_without_a_file_that_can_be_read_is_named(tmp_path: Path) -> None
             read_hdf5(path, TASK)
 
 
+@pytest.mark.long
 def test_a_damaged_file_is_named_wherever_the_damage_is(exported: Path) -> None:
     whole = exported.read_bytes()
     generator = np.random.default_rng(0)

@@ -106,6 +106,7 @@ def test_other_demonstrations_are_another_dataset_another_policy_and_another_def
     assert [name for name in defined[0] if name.startswith("demonstrations")] == []
 
 
+@pytest.mark.long
 def test_a_record_says_which_demonstrations_it_learned_from(
     path: Path, tmp_path: Path, write_module: Callable[[str, str], None]
 ) -> None:

@@ -137,6 +137,7 @@ def test_a_run_with_a_damaged_file_gives_the_same_record(
         _check_run(runs, folder, finished, lasting_records)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", [kind for kind in (*CACHED, *HALF_WAY) if not kind.startswith("names")])
 @pytest.mark.parametrize("count", [20, pytest.param(500, marks=pytest.mark.slow)])
 def test_a_damaged_file_of_a_cached_result_is_found(
@@ -171,6 +172,7 @@ def test_a_damaged_file_of_a_cached_result_is_found(
 # ---- records -----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("count", [60, pytest.param(1000, marks=pytest.mark.slow)])
 def test_a_damaged_record_is_refused_by_all_commands_or_shows_the_same_numbers(
     count: int, tmp_path: Path, record_property: Callable[[str, object], None]
@@ -231,6 +233,7 @@ def _told(board: Path) -> tuple[Any, Any]:
     return kept and kept.to_json(), tiers.verification_notes(record) or None
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", BESIDE)
 @pytest.mark.parametrize("count", [20, pytest.param(500, marks=pytest.mark.slow)])
 def test_a_damaged_file_beside_the_records_changes_no_number_of_the_board(

@@ -51,6 +51,7 @@ def _die(
         _check_next_start(runs, folder, whole, lasting_records)
 
 
+@pytest.mark.long
 def test_a_run_that_dies_at_some_operation_is_completed_by_the_next_start(
     runs: Runs,
     whole: tuple[Path, int],

@@ -62,6 +62,7 @@ def test_a_class_of_the_script_itself_runs_and_its_change_is_noticed(tmp_path: P
     assert kept == ["seed-0.json", "seed-0.json.old"]
 
 
+@pytest.mark.long
 def test_a_class_of_a_module_runs_in_processes_and_its_change_is_noticed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -80,6 +81,7 @@ def test_a_class_of_a_module_runs_in_processes_and_its_change_is_noticed(
     assert again.episodes == record.episodes
 
 
+@pytest.mark.long
 def test_an_installed_method_is_named_by_its_class(tmp_path: Path) -> None:
     settings = {"step_factor": 0.5}
     records = clbench.run(
@@ -100,6 +102,7 @@ def test_a_failed_run_raises_with_its_reason(
         clbench.run(TOY, "lossless:Slow", seeds=1, records=tmp_path / "records")
 
 
+@pytest.mark.long
 def test_a_method_that_changes_the_folder_leaves_its_record_where_it_was_asked_for(
     tmp_path: Path, write_module: Callable[[str, str], None], monkeypatch: pytest.MonkeyPatch
 ) -> None:

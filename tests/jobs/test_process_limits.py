@@ -73,6 +73,7 @@ def test_a_job_that_takes_too_long_is_stopped_and_the_others_are_not(
     assert failed == {"long": "stopped, because it took longer than 1 s"}
 
 
+@pytest.mark.long
 def test_a_job_that_takes_too_much_memory_is_stopped(done: Done) -> None:
     (message,) = done(("large", Limits(memory=600_000_000))).values()
     assert message.startswith("stopped, because it took ")

@@ -311,6 +311,7 @@ def test_runs_of_two_scenarios_have_separate_jobs_and_one_pretraining_for_each_s
     ]
 
 
+@pytest.mark.long
 def test_a_run_waits_for_the_data_that_it_needs_and_no_other_data_is_made(
     tmp_path: Path, empty_caches: Path
 ) -> None:
@@ -347,6 +348,7 @@ def test_a_run_waits_for_the_data_that_it_needs_and_no_other_data_is_made(
     assert after - demonstrated == {f"{task.name}-v0" for task in scenario.target}
 
 
+@pytest.mark.long
 def test_one_worker_and_two_make_equal_records_and_a_stopped_benchmark_continues(
     tmp_path: Path, bars: Bars, lasting_records: Callable[[Path], dict[str, Any]]
 ) -> None:

@@ -67,6 +67,7 @@ def test_the_files_do_not_depend_on_where_the_records_lie(
     assert str(tmp_path) not in here
 
 
+@pytest.mark.long
 def test_unchanged_records_show_the_same_board_without_being_read(
     four_methods: Path, shown: Callable[[], tuple[str, str]], monkeypatch: pytest.MonkeyPatch
 ) -> None:

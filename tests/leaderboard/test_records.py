@@ -71,6 +71,7 @@ def board() -> Any:
     return table[table["scenario"] == "clbench/Fetch-v1"].set_index("method")
 
 
+@pytest.mark.long
 def test_the_records_are_those_of_make_records_and_runs_of_a_seed_share_their_pretrained_policy() -> None:
     every = {path: read_record(path) for path in RECORDS.rglob("*.json")}
     trained = {path: record for path, record in every.items() if "online" not in record.run.uses}
@@ -101,6 +102,7 @@ def test_the_pretrained_policy_has_its_skills_and_answers() -> None:
     assert np.mean(retained) >= 0.95
 
 
+@pytest.mark.long
 def test_plain_fine_tuning_learns_and_forgets(board: Any) -> None:
     assert board.loc["sft", "adaptation"] >= 0.85
     assert board.loc["sft", "kept"] <= 0.80

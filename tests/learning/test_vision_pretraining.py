@@ -55,6 +55,7 @@ def _error(vision: Vision, train: Questions, test: Questions) -> float:
     return float(np.abs(predicted - test.scenes[:, :4].numpy()).mean())
 
 
+@pytest.mark.long
 def test_the_vision_learns_to_locate_the_objects_in_a_picture(questions: tuple[Questions, Questions]) -> None:
     train, test = questions
     assert _error(_pretrained(train, 150), train, test) < 0.6 * _error(_new_vision(), train, test)
@@ -97,6 +98,7 @@ def test_a_question_without_an_answer_in_any_picture_of_a_step_does_no_harm(
     assert all(torch.isfinite(parameter).all() for parameter in vision.parameters())
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("empty_caches")
 def test_progress_includes_the_steps_of_the_vision() -> None:
     scenario = dataclasses.replace(

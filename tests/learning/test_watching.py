@@ -77,6 +77,7 @@ class Undeclared(Careful):
     uses = clbench.Uses()
 
 
+@pytest.mark.long
 def test_a_method_sees_every_step_and_pays_for_it(
     tmp_path: Path, empty_caches: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

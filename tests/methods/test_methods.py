@@ -48,6 +48,7 @@ def _value(scores: dict[str, Scores], method: str, metric: str) -> float:
     return value
 
 
+@pytest.mark.long
 def test_sft_learns_the_targets_and_forgets_the_skills(scores: dict[str, Scores]) -> None:
     assert _value(scores, "sft", "adaptation") >= 0.9
     assert _value(scores, "sft", "retention") <= 0.2
@@ -87,6 +88,7 @@ OF_THE_KIND = ("aegis", "lora", "lwf", "stop_gradient")
 """Methods that use what differs between kinds of policy: hidden states, modules, outputs and gradients."""
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("name", "policy"),
     [

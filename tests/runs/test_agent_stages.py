@@ -159,6 +159,7 @@ for stage in range(3):
 """
 
 
+@pytest.mark.long
 def test_two_programs_do_not_mix_their_stages(evaluate: Callable[..., Any], empty_caches: Path) -> None:
     command = [sys.executable, "-c", OTHER.format(id=ID)]
     pipes: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}

@@ -45,6 +45,7 @@ def _small_blocks() -> tuple[str, str]:
     return small, flat
 
 
+@pytest.mark.long
 def test_the_agent_of_the_page_repeats_itself(monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("stable_baselines3")
 

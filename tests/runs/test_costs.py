@@ -101,6 +101,7 @@ class Hoarding(Method):
 SOURCES: list[Any] = []
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("method", "more"), [(Consolidating, 2 * 7), (Preparing, 5)])
 def test_steps_outside_of_the_loop_are_counted(
     method: type[Method], more: int, stranger: Callable[[type[Method]], str], tmp_path: Path
@@ -109,6 +110,7 @@ def test_steps_outside_of_the_loop_are_counted(
     assert record.costs.optimiser_steps == 2 * STEPS + more
 
 
+@pytest.mark.long
 def test_a_buffer_that_the_method_added_is_kept_data(
     stranger: Callable[[type[Method]], str], tmp_path: Path
 ) -> None:

@@ -35,6 +35,7 @@ subject = importlib.import_module("clbench.leaderboard.submission.subject")
 tiers = importlib.import_module("clbench.leaderboard.board.tiers")
 
 
+@pytest.mark.long
 def test_a_stage_ends_at_the_first_check_that_meets_the_criterion(record: Record) -> None:
     assert record.status == "success", record.error
     planned = check_steps(200)
@@ -71,6 +72,7 @@ def test_checks_play_validation_episodes_until_their_outcome_is_certain(
     evaluator.close()
 
 
+@pytest.mark.long
 def test_a_check_plays_the_policy_that_a_method_of_whole_stages_would_leave(tmp_path: Path) -> None:
     run = RunSpec(EAGER.id, "weight_interpolation", 0, {"coefficient": 0.7}, targets=1).resolve()
     record = execute(run.spec, tmp_path / "records", checkpoints=tmp_path / "kept")
@@ -105,6 +107,7 @@ def test_asking_for_the_policy_that_a_stage_would_leave_changes_nothing(
         assert all(torch.equal(one[name], other[name]) for name in one)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("share", "stage"), [(0.6, 1), (0.8, 2)])
 def test_an_interrupted_run_continues_to_the_same_record(
     share: float, stage: int, record: Record, execute_and_kill: Callable[..., None], tmp_path: Path
@@ -157,6 +160,7 @@ def test_a_method_that_trains_nothing_is_checked_once(tmp_path: Path) -> None:
     assert measure("criterion_met", scores) == 0
 
 
+@pytest.mark.long
 def test_a_stage_that_never_meets_the_criterion_takes_all_its_steps(tmp_path: Path) -> None:
     spec = RunSpec(EAGER.id, "sft", seed=0, changes={"step_factor": 1e-6}, targets=1)
     record = execute(spec, tmp_path)
@@ -204,6 +208,7 @@ def test_the_scenario_says_which_order_a_seed_has(record: Record) -> None:
     assert load_scenario(EAGER.id).for_seed(1).target[0].name == "down"
 
 
+@pytest.mark.long
 def test_a_record_with_a_criterion_reaches_every_tier(record: Record, tmp_path: Path) -> None:
     records = tmp_path / "records"
     spec = RunSpec(EAGER.id, "sft", seed=0)

@@ -143,6 +143,7 @@ def test_an_mp4_has_every_step_and_holds_its_last_frame(drawn: Film, tmp_path: P
     frames.close()
 
 
+@pytest.mark.long
 def test_a_film_ends_like_the_recorded_episodes(recorded: tuple[Record, Path]) -> None:
     record, folder = recorded
     policies = stage_policies(SPEC.resolve(), folder)
@@ -212,6 +213,7 @@ def test_a_world_that_does_not_repeat_an_episode_is_refused_and_all_worlds_are_c
     assert Unsteady.still_open == 0
 
 
+@pytest.mark.long
 def test_the_command_writes_the_requested_film(recorded: tuple[Record, Path], tmp_path: Path) -> None:
     path = tmp_path / "toy.gif"
     film(
@@ -257,6 +259,7 @@ def test_bad_input_ends_with_exit_code_2_before_any_work(
     assert message in capsys.readouterr().err
 
 
+@pytest.mark.long
 def test_films_of_other_tasks_stages_or_episodes_have_other_names(
     recorded: tuple[Record, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -82,6 +82,7 @@ def test_a_commit_is_dirty_if_code_was_changed_and_not_by_records(
     assert fingerprint(TOY)["commit"] == {"id": head, "dirty": True}
 
 
+@pytest.mark.long
 def test_a_fingerprint_names_only_the_simulator_of_its_suite() -> None:
     assert fingerprint(FETCH)["versions"]["gymnasium-robotics"] == version("gymnasium-robotics")
     assert "gymnasium-robotics" not in fingerprint(TOY)["versions"]

@@ -132,6 +132,7 @@ def test_retention_is_missing_and_forgetting_covers_earlier_targets(record: Reco
     assert measure("adaptation", scores) == pytest.approx(0.8)
 
 
+@pytest.mark.long
 def test_table_and_page_are_drawn_without_retention(record: Record, tmp_path: Path) -> None:
     for method in ("sft", "joint"):
         uses = dataclasses.asdict(load_method(method).uses)

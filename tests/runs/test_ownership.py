@@ -243,6 +243,7 @@ def test_a_run_that_fails_leaves_a_good_record_of_another_configuration_alone(
     assert "stays: it is of a run that succeeded" in caplog.text
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("damage", ["torn", "incomplete"])
 def test_a_damaged_record_is_named_set_aside_and_made_again(
     tmp_path: Path, damage: str, capsys: pytest.CaptureFixture[str]

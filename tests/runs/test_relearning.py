@@ -44,6 +44,7 @@ def velocity(policy: Policy, batch: Batch) -> torch.Tensor:
         return policy.predict(batch)
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("one_thread")
 def test_the_shift_is_the_mean_squared_change_of_velocity_on_the_new_targets_data(
     record: Record, policies: list[Policy], data: TrainingData
@@ -115,6 +116,7 @@ def test_a_skill_that_is_still_known_takes_no_steps_and_the_first_is_chosen_on_a
     assert record.policy["shift"] == [None, 0.0, 0.0]
 
 
+@pytest.mark.long
 def test_relearning_costs_the_run_nothing_but_seconds(record: Record, tmp_path: Path) -> None:
     ends = {row.stage: row.step for row in record.check_rows()}
     assert record.costs.optimiser_steps == sum(ends.values())
@@ -126,6 +128,7 @@ def test_relearning_costs_the_run_nothing_but_seconds(record: Record, tmp_path: 
     assert sum(amounts) == pytest.approx(run_length(run.scenario, run.protocol))
 
 
+@pytest.mark.long
 def test_adapters_are_relearned_with_all_that_they_adapt(tmp_path: Path) -> None:
     spec = RunSpec(EAGER.id, "lora", seed=0)
     record = execute(spec, tmp_path, checkpoints=tmp_path / "kept")
@@ -186,6 +189,7 @@ class Breaking(Method):
         policy.__class__ = Broken
 
 
+@pytest.mark.long
 def test_a_policy_that_cannot_be_fine_tuned_is_not_relearned(
     tmp_path: Path, stranger: Callable[[type[Method]], str]
 ) -> None:
@@ -199,6 +203,7 @@ def test_a_tuning_run_relearns_nothing(tmp_path: Path) -> None:
     assert (record.status, record.relearning) == ("success", None)
 
 
+@pytest.mark.long
 def test_a_scenario_of_equal_stages_has_a_shift_at_their_ends_and_no_relearning(tmp_path: Path) -> None:
     record = execute(RunSpec("clbench.testing:clbench/Toy-v0", "sft", seed=0), tmp_path)
     assert record.relearning is None

@@ -18,6 +18,7 @@ def test_a_run_learns_no_more_targets_than_there_are() -> None:
         RunSpec(TOY, "sft", 0, targets=99).resolve()
 
 
+@pytest.mark.long
 def test_a_run_looks_up_one_scenario_and_one_method(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     counts = {"_scenario_at": 0, "load_method": 0}
 

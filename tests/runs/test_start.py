@@ -33,6 +33,7 @@ def test_progress_adds_up_to_the_length_of_the_run(perturb: bool, tmp_path: Path
         assert sum(amounts) == pytest.approx(run_length(run.scenario, run.protocol))
 
 
+@pytest.mark.long
 def test_the_pretrained_policy_is_evaluated_once(tmp_path: Path, reports: Path) -> None:
     first = execute(RunSpec(TINY.id, "sft", seed=0), tmp_path)
     (folder,) = reports.iterdir()

@@ -37,6 +37,7 @@ def logged(tmp_path_factory: pytest.TempPathFactory) -> tuple[Any, Path]:
     return record, folder / "logs" / "Toy-v0" / "aegis" / "seed-0"
 
 
+@pytest.mark.long
 def test_a_log_changes_no_bit_of_the_record(logged: tuple[Any, Path], tmp_path: Path) -> None:
     record, _ = logged
     assert record.status == "success"
@@ -92,6 +93,7 @@ def test_a_log_shows_the_success_in_perturbed_episodes(tmp_path: Path) -> None:
     assert [step for step, _ in points["success_perturbed/right"]] == [60]
 
 
+@pytest.mark.long
 def test_a_resumed_run_logs_no_point_twice(
     logged: tuple[Any, Path], tmp_path: Path, execute_and_kill: Callable[..., None]
 ) -> None:

@@ -95,6 +95,7 @@ def test_less_forgetting_is_better() -> None:
     assert list(groups("forgetting", rows)) == ["keeps", "forgets"]
 
 
+@pytest.mark.long
 def test_with_complete_boards_rows_are_told_apart_as_by_tukeys_test() -> None:
     # Rows vary enough for the pooled error to be the largest, so that SciPy's test must agree.
     generator = np.random.default_rng(0)

@@ -205,6 +205,7 @@ def test_forward_transfer_weighs_uneven_steps_by_their_length(scores: Callable[.
     assert measure("forward_transfer", run, {"from_scratch": scratch}) == pytest.approx(expected)
 
 
+@pytest.mark.long
 def test_metrics_agree_with_plain_loops_on_random_matrices(scores: Callable[..., Scores]) -> None:
     generator = np.random.default_rng(0)
     for _ in range(200):

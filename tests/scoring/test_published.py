@@ -61,6 +61,7 @@ def test_every_published_definition_is_worked_out_by_hand() -> None:
     assert {name for name, metric in METRICS.items() if metric.function.__module__ == MODULE} == set(BY_HAND)
 
 
+@pytest.mark.long
 def test_published_definitions_agree_with_plain_loops_on_random_matrices_also_in_a_batch(
     scores: Callable[..., Scores],
 ) -> None:

@@ -187,6 +187,7 @@ def test_a_reply_that_is_no_reply_is_an_error(handle: Callable[..., None], messa
         served.close()
 
 
+@pytest.mark.long
 def test_a_server_that_does_not_read_a_large_request_is_an_error() -> None:
     pictures = {**OBSERVATIONS, "image": np.zeros((40, 512, 512, 3), np.uint8)}  # 31 MB fill every buffer
     with socket.create_server(("localhost", 0)) as listening:

@@ -149,6 +149,7 @@ def test_a_killed_program_loses_only_the_stage_that_was_running(
     assert [path.name for path in (tmp_path / "records").rglob("*") if path.is_file()] == ["seed-0.json"]
 
 
+@pytest.mark.long
 def test_chunks_are_executed_to_their_end_or_to_the_number_asked_for(
     run: Callable[..., Record], tmp_path: Path
 ) -> None:

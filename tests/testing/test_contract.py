@@ -274,6 +274,7 @@ FAULTS: list[tuple[Any, str, str, str]] = [
 ]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("cls", "clause", "expected", "found"), FAULTS)
 def test_a_planted_fault_is_found_with_its_own_message(
     cls: Any, clause: str, expected: str, found: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -291,6 +292,7 @@ def test_no_two_faults_have_the_same_message() -> None:
     assert len({(expected, found) for _, _, expected, found in FAULTS}) == len(FAULTS)
 
 
+@pytest.mark.long
 def test_changes_that_a_faulty_method_leaves_behind_are_undone(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -400,6 +402,7 @@ class Generous(Method):
         stage.target.sample(2 * len(stage.target))
 
 
+@pytest.mark.long
 def test_only_the_draws_of_the_target_in_a_step_are_limited() -> None:
     check_method(Generous)
 

@@ -117,6 +117,7 @@ class Merges(Method):
         self.mean = sum(self.losses) / max(len(self.losses), 1)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("cls", [Groups, Single, Named, Slots, Structured, Caches, Merges])
 def test_a_right_method_passes(cls: type[Method]) -> None:
     check_method(cls)
@@ -397,6 +398,7 @@ FAULTS: list[tuple[type[Method], str, str, str]] = [
 ]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("cls", "clause", "expected", "found"), FAULTS)
 def test_a_subtle_fault_is_found(cls: type[Method], clause: str, expected: str, found: str) -> None:
     with pytest.raises(ContractError) as caught:
@@ -407,6 +409,7 @@ def test_a_subtle_fault_is_found(cls: type[Method], clause: str, expected: str, 
     assert found in f"found:    {error.found}"
 
 
+@pytest.mark.long
 def test_what_a_class_and_its_module_hold_is_back_after_a_check() -> None:
     held, memory = ClassMemory.memory, _memory
     for cls in (ClassMemory, ModuleMemory):

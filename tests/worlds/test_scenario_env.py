@@ -159,6 +159,7 @@ def test_stable_baselines_checks_and_trains_on_numeric_instructions() -> None:
     assert env.action_space.contains(action)
 
 
+@pytest.mark.long
 def test_the_scene_renders_without_changing_the_episode() -> None:
     """In a process of its own: a rendering back end that does not work may kill it."""
     code = """
@@ -218,6 +219,7 @@ env.close()
 """
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("scenario", ["clbench/PointMaze-v1"])
 def test_without_a_display_or_a_variable_environments_draw_and_are_recorded(
     scenario: str, tmp_path: Path

@@ -282,6 +282,7 @@ def check_board(board: Path, examples: int) -> Counter[str]:
     return came
 
 
+@pytest.mark.long
 def test_damaged_records_are_refused_or_counted_rightly(board: Path) -> None:
     came = check_board(board, 200)
     assert min(came.values()) >= 5

@@ -61,6 +61,7 @@ def test_without_one_the_page_says_so_and_names_the_largest_gain(
     )
 
 
+@pytest.mark.long
 def test_a_difference_that_is_certain_only_without_counting_the_comparisons_is_said_to_be_so(
     even_board: Callable[..., Path], page: Callable[[], str]
 ) -> None:
@@ -76,6 +77,7 @@ def test_a_difference_that_is_certain_only_without_counting_the_comparisons_is_s
     assert f"Lower {alone}: `lora` by 0.0" in text
 
 
+@pytest.mark.long
 def test_the_ladder_tells_what_a_smaller_learning_rate_does(
     even_board: Callable[..., Path], page: Callable[[], str]
 ) -> None:

@@ -242,6 +242,7 @@ def test_where_nothing_draws_the_card_says_so_and_keeps_the_pictures_that_are_th
     assert "No pictures are drawn; existing ones are kept." in " ".join(capsys.readouterr().err.split())
 
 
+@pytest.mark.long
 def test_a_card_that_is_made_again_has_the_same_bytes_and_nothing_is_measured_twice(
     bench: Bench, capsys: pytest.CaptureFixture[str]
 ) -> None:

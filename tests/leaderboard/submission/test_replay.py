@@ -32,6 +32,7 @@ def elsewhere(honest: Path, tmp_path: Path) -> Path:
     return tmp_path / "elsewhere"
 
 
+@pytest.mark.long
 def test_policies_that_follow_from_another_start_than_pretraining_gives_are_refused(
     mine: Path, elsewhere: Path
 ) -> None:

@@ -57,6 +57,7 @@ def submit(method: str, scenario: str = "clbench.testing:clbench/Toy-v0", **rest
     command(method, scenario=scenario, **{"seeds": 1, "workers": 1, "records": Path("board/records"), **rest})
 
 
+@pytest.mark.long
 def test_a_sound_class_gets_a_row_and_a_place(
     make_record: Callable[..., Record], capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -108,6 +108,7 @@ def test_settings_tried_are_counted(records: Path, monkeypatch: pytest.MonkeyPat
     assert "| - | - |" in next(line for line in text.splitlines() if "| lora | prior" in line)
 
 
+@pytest.mark.long
 def test_seeds_that_order_the_methods_alike_are_said_to_do_so(
     records: Path, even_board: Callable[..., Path]
 ) -> None:
@@ -126,6 +127,7 @@ def test_targets_of_balanced_seeds_are_numbered_in_the_section_of_a_row(records:
     assert "after target 2" in unpacked(page(compute_board(records), {}))
 
 
+@pytest.mark.long
 def test_the_frontier_has_each_method_at_each_learning_rate(records: Path) -> None:
     curves = compute_board(records).frontiers[SCENARIO]
     assert [curve.method for curve in curves] == ["sft", "finch"]

@@ -34,6 +34,7 @@ def test_the_markdown_has_values_with_intervals_and_explains_them(
     assert len({line.count("|") for line in page.splitlines() if line.startswith("|")}) == 1
 
 
+@pytest.mark.long
 def test_perturbed_retention_follows_retention_where_a_row_has_it(
     four_methods: Path, add_full: Callable[..., Path], shown: Callable[[], tuple[str, str]]
 ) -> None:

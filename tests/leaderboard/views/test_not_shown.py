@@ -73,6 +73,7 @@ def lose_validation_episode(record: Record) -> None:
     lose(record, lambda stage, step, task, split, episode, *_: split == "validation" and episode == 9)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("edit", "reason"),
     [
@@ -188,6 +189,7 @@ def test_a_file_name_with_control_characters_is_shown_without_them(
         assert "\n## y" not in text
 
 
+@pytest.mark.long
 def test_a_record_in_another_place_is_refused_though_its_run_has_no_other(
     four_methods: Path, add_full: Callable[..., Path], shown: Callable[[], tuple[str, str]]
 ) -> None:
@@ -200,6 +202,7 @@ def test_a_record_in_another_place_is_refused_though_its_run_has_no_other(
         assert "a/more.json: it is the record of Toy-v0/sft/seed-2.json, and must be there." in flat(text)
 
 
+@pytest.mark.long
 def test_any_damage_to_a_record_ends_in_a_row_or_a_reason(
     make_record: Callable[..., Record], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

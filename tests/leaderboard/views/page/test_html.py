@@ -327,6 +327,7 @@ def test_the_pictures_show_every_method_in_both_themes(records: Path) -> None:
     assert drawn["pareto.svg"] != drawn["pareto-dark.svg"]
 
 
+@pytest.mark.long
 def test_15_methods_with_5_seeds_on_4_scenarios_are_less_than_3_megabytes(
     make_record: Callable[..., Record], tmp_path: Path
 ) -> None:
