@@ -9,7 +9,7 @@ QUICK := build/quick
 define HELP
 make leaderboard  from nothing to a table in minutes: install, run two methods with one seed
 make test         most of the tests, in minutes
-make test-long    the tests that take seconds each, many of them whole runs
+make test-long    the tests that take a second and more, many of them whole runs
 make test-slow    the tests that take minutes each
 make check        format, lint, types, committed pages and definitions, the page in a browser, the benchmarks
 make libero-test  install LIBERO (340 MB), and compare our world with it
@@ -140,7 +140,7 @@ benchmark: .venv/installed-dev
 test: .venv/installed-dev
 	$(BIN)/pytest
 
-# What takes two seconds or more of one core: whole runs, every method's contract, films, killed commands.
+# What takes a second or more of one core: whole runs, every method's contract, films, killed commands.
 test-long: .venv/installed-dev
 	$(BIN)/pytest -m "long and not slow"
 

@@ -171,6 +171,7 @@ def test_every_package_of_the_core_has_a_floor() -> None:
     assert packages == {package for floor in FLOORS for package in floor}
 
 
+@pytest.mark.long
 def test_packages_of_the_core_import_only_what_is_below_them() -> None:
     wrong = []
     for module in _modules().values():

@@ -48,6 +48,7 @@ def test_its_methods_keep_the_contract(block: int, blocks: list[str]) -> None:
     exec(blocks[block], {})
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("module", "name"), [("prompt", "Prompt"), ("teacher", "Teacher")])
 @pytest.mark.usefixtures("blocks")
 def test_its_shorter_methods_keep_the_contract_too(module: str, name: str) -> None:

@@ -26,6 +26,7 @@ def _run(folder: Path, *arguments: str) -> str:
     return done.stdout
 
 
+@pytest.mark.long
 def test_its_command_prints_what_the_page_shows(tmp_path: Path) -> None:
     (tmp_path / "table.csv").write_text(_block("csv"), encoding="utf-8")
     printed = _run(tmp_path, "-m", *_block("console").split()).splitlines()

@@ -144,6 +144,7 @@ def test_the_first_line_of_a_commands_help_names_its_arguments(capsys: pytest.Ca
     assert first == "Usage: clbench run [OPTIONS] SCENARIOS [METHODS...]"
 
 
+@pytest.mark.long
 def test_help_of_a_command_shows_its_limits_and_does_not_wait_for_pytorch() -> None:
     commands = [name for name, place in PLACES.items() if place.startswith("clbench.cli.")]
     code = f"""
@@ -180,6 +181,7 @@ def test_tab_completes_scenarios_and_methods(
     assert expected in capsys.readouterr().out.splitlines()
 
 
+@pytest.mark.long
 def test_lists_metrics_and_the_machine_come_as_json_too(capsys: pytest.CaptureFixture[str]) -> None:
     def printed(*words: str) -> Any:
         app([*words, "--json"], result_action="return_value")
@@ -251,6 +253,7 @@ def test_a_hyper_parameter_set_in_the_usual_way_is_told_the_right_one(
     assert "error: The name belongs to the option: write --set.step_factor" in capsys.readouterr().err
 
 
+@pytest.mark.long
 def test_a_dry_run_counts_recorded_runs_whose_policies_would_be_made_again(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

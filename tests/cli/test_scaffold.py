@@ -46,6 +46,7 @@ def fresh(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
     sys.modules.pop(name, None)
 
 
+@pytest.mark.long
 def test_a_fresh_template_keeps_the_contract(fresh: str) -> None:
     cls = load_method(f"{fresh}:FreshlyWritten")
     check_method(cls)
@@ -197,6 +198,7 @@ def test_pytest_finds_the_fresh_tests(tmp_path: Path) -> None:
     assert "test_freshly_written_keeps_the_contract" in found
 
 
+@pytest.mark.long
 def test_a_fresh_template_runs(fresh: str, tmp_path: Path) -> None:
     spec = RunSpec("clbench.testing:clbench/Toy-v0", f"{fresh}:FreshlyWritten", 0)
     record = execute(spec, tmp_path / "records")

@@ -95,6 +95,7 @@ def test_a_symmetric_task_is_trained_as_the_one_that_it_mirrors(empty_caches: Pa
     )
 
 
+@pytest.mark.long
 def test_a_torn_checkpoint_is_refused_by_name_with_the_way_out(empty_caches: Path) -> None:
     training.train(tiny(steps=200), empty_caches)
     path = training.checkpoint_path(tiny())

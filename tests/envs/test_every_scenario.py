@@ -116,6 +116,7 @@ def test_the_data_of_all_scenarios_load_no_simulator() -> None:
     )
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "scenario",
     [

@@ -93,6 +93,7 @@ def test_things_are_apart_in_two_colours_and_follow_from_the_seed() -> None:
     assert set(things[:, :, 2].ravel()) == {0, 1, 2, 3}
 
 
+@pytest.mark.long
 def test_a_picture_shows_the_target_and_both_things_and_no_other_colour(observer: Observer) -> None:
     starts = np.stack([_start(seed) for seed in range(12)])
     numbers, images = observer.observe(starts)
@@ -162,6 +163,7 @@ def test_a_perturbed_view_moves_the_target_by_pixels_and_changes_the_light(obser
     assert np.array_equal(observer.observe(states)[1], plain)
 
 
+@pytest.mark.long
 def test_an_agent_of_the_scenario_sees_the_picture(observer: Observer) -> None:
     env = ScenarioEnv(SCENARIO)
     observation, _ = env.reset(seed=1, options={"task": "lift"})

@@ -97,6 +97,7 @@ def test_lanes_of_a_task_equal_meta_worlds_own_steps(task: str) -> None:
     compare([task] * 3, steps=60)
 
 
+@pytest.mark.long
 def test_lanes_of_all_tasks_do_so_in_any_order_on_two_threads_with_and_without_rules() -> None:
     compare([*TASKS, *TASKS[::3], "stick_push", "dial_turn"], steps=40, threads=2)
 

@@ -200,6 +200,7 @@ def test_a_definition_of_another_form_differs_as_a_whole() -> None:
         assert other_parts(strange, known) == ["the tasks themselves"]
 
 
+@pytest.mark.long
 def test_a_record_of_another_definition_is_refused_by_run_and_not_shown_on_the_board(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -163,6 +163,7 @@ def test_its_statistics_are_those_of_its_frames(folder: Path) -> None:
     assert facts[0]["stats/observation.state/count"] == [len(first)]
 
 
+@pytest.mark.long
 def test_pictures_are_kept_without_loss(tmp_path: Path) -> None:
     import io
 
@@ -195,6 +196,7 @@ def test_pictures_are_kept_without_loss(tmp_path: Path) -> None:
         assert np.allclose(np.array(stats[name])[:, 0, 0], value), name
 
 
+@pytest.mark.long
 @pytest.mark.skipif(find_spec("lerobot_doctor") is None, reason="lerobot-doctor is not installed")
 @pytest.mark.parametrize("scenario", [TOY, _seen()], ids=["numbers", "pictures"])
 def test_lerobot_doctor_finds_no_fault(scenario: Scenario, tmp_path: Path) -> None:

@@ -97,6 +97,7 @@ def test_a_run_that_is_killed_at_a_random_moment_is_completed_by_the_next_start(
     record_property("counts", dict(came))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("share", [0.5, pytest.param(None, marks=pytest.mark.slow)])
 def test_a_full_disk_ends_a_run_without_a_record_and_the_next_start_completes_it(
     runs: Runs,

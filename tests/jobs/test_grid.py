@@ -90,6 +90,7 @@ def test_an_installed_method_is_named_by_its_class(tmp_path: Path) -> None:
     assert [(one.run.method, one.run.seed, one.run.changes) for one in records] == [("frozen", 3, settings)]
 
 
+@pytest.mark.long
 def test_a_failed_run_raises_with_its_reason(
     tmp_path: Path, write_module: Callable[[str, str], None]
 ) -> None:

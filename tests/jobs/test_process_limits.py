@@ -66,6 +66,7 @@ def done(bars: Bars) -> Done:
     return done
 
 
+@pytest.mark.long
 def test_a_job_that_takes_too_long_is_stopped_and_the_others_are_not(
     done: Done,
 ) -> None:
@@ -80,6 +81,7 @@ def test_a_job_that_takes_too_much_memory_is_stopped(done: Done) -> None:
     assert message.endswith("GB of memory, more than 0.6 GB")
 
 
+@pytest.mark.long
 def test_a_job_that_writes_too_much_is_stopped(tmp_path: Path, done: Done) -> None:
     limits = Limits(written=20_000_000)
     (message,) = done(("writer", limits), path=os.fspath(tmp_path / "file")).values()
@@ -87,6 +89,7 @@ def test_a_job_that_writes_too_much_is_stopped(tmp_path: Path, done: Done) -> No
     assert message.endswith("GB, more than 0.0 GB")
 
 
+@pytest.mark.long
 def test_the_children_of_a_stopped_job_are_stopped_too(tmp_path: Path, done: Done) -> None:
     path = tmp_path / "child"
     done(("parent", Limits(written=20_000_000)), path=os.fspath(path))

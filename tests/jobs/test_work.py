@@ -33,6 +33,7 @@ class Wordy(clbench.Method):
 SPEC = RunSpec("clbench.testing:clbench/Toy-v0", "frozen", 0)
 
 
+@pytest.mark.long
 def test_a_policy_that_can_do_little_is_called_weak_before_and_after_a_run(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -49,6 +50,7 @@ def test_a_policy_that_can_do_little_is_called_weak_before_and_after_a_run(
         assert ("That is little" in evaluate_policy(SPEC, nothing)) == weak
 
 
+@pytest.mark.long
 def test_a_policy_is_evaluated_where_stages_end_when_the_target_is_learned() -> None:
     nothing: Any = lambda _: None  # noqa: E731
     assert evaluate_policy(RunSpec(EAGER.id, "sft", 0), nothing) == "success 1.00 on the retained skills"

@@ -52,6 +52,7 @@ def test_the_published_rows_stand_beside_ones_own(
     assert "0 published records added" in capsys.readouterr().err
 
 
+@pytest.mark.long
 def test_the_files_do_not_depend_on_where_the_records_lie(
     four_methods: Path, shown: Callable[[], tuple[str, str]], tmp_path: Path
 ) -> None:
@@ -88,6 +89,7 @@ def test_unchanged_records_show_the_same_board_without_being_read(
     assert clbench.plot.plane(four_methods).spec == plane
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("what", ["record", "verification", "table", "numbers", "one value", "code"])
 def test_a_board_is_computed_again_when_something_changed_that_it_was_made_from(
     what: str, four_methods: Path, shown: Callable[[], tuple[str, str]], monkeypatch: pytest.MonkeyPatch

@@ -28,6 +28,7 @@ def test_methods_are_compared_over_the_seeds_that_were_asked_for(
     assert table.loc["frozen", "retention"] > table.loc["sft", "retention"]
 
 
+@pytest.mark.long
 def test_a_method_whose_record_makes_no_row_is_named_with_the_reason(tmp_path: Path) -> None:
     sft, frozen = (RunSpec(TINY.id, method, seed=0) for method in ("sft", "frozen"))
     execute(sft, tmp_path)

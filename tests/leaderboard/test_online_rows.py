@@ -54,6 +54,7 @@ class Other(Knowing):
     """Another agent, of which a name says nothing."""
 
 
+@pytest.mark.long
 def test_two_agents_of_one_name_make_no_row_together(tmp_path: Path) -> None:
     for seed, kind in enumerate((Knowing, Knowing, Other)):
         for stage, known in enumerate(LEARNED):

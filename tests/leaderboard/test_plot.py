@@ -94,6 +94,7 @@ def test_runs_that_do_not_belong_together_are_refused(
         plot.curves(tmp_path / "gone.json")
 
 
+@pytest.mark.long
 def test_a_plane_shows_every_method_in_the_colours_of_the_theme(four_methods: Path) -> None:
     light, dark = (
         plot.plane(four_methods, "clbench/Toy-v0", dark=dark)._repr_svg_() for dark in (False, True)

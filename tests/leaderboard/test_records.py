@@ -137,6 +137,7 @@ def test_stop_gradient_keeps_every_answer(board: Any) -> None:
     assert abs(board.loc["stop_gradient", "question_retention"] - before) <= 0.01
 
 
+@pytest.mark.long
 def test_a_row_may_touch_the_data_that_its_class_declares() -> None:
     paths = [*(RECORDS / "Fetch-v1").rglob("*.json")]
     assert paths

@@ -61,12 +61,14 @@ def test_a_row_has_every_metric_with_its_interval_and_the_costs(four_methods: Pa
         assert row[f"{name}_low"] <= row[name] <= row[f"{name}_high"]
 
 
+@pytest.mark.long
 def test_without_from_scratch_forward_transfer_is_missing(four_methods: Path) -> None:
     assert load(four_methods).set_index("method").forward_transfer.notna().sum() == 3
     record_path(four_methods, "clbench/Toy-v0", "from_scratch", 1).unlink()
     assert load(four_methods).forward_transfer.isna().all()
 
 
+@pytest.mark.long
 def test_a_row_does_not_depend_on_the_other_rows(four_methods: Path, add_full: Callable[..., Path]) -> None:
     before = load(four_methods)
     add_full("another", 0)
@@ -77,6 +79,7 @@ def test_a_row_does_not_depend_on_the_other_rows(four_methods: Path, add_full: C
     pandas.testing.assert_frame_equal(kept, before.drop(columns="letters"))
 
 
+@pytest.mark.long
 def test_the_relative_cost_counts_all_steps_with_the_time_of_one(
     four_methods: Path, add_full: Callable[..., Path]
 ) -> None:

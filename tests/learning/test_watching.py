@@ -105,6 +105,7 @@ def test_a_method_that_only_looks_keeps_the_contract() -> None:
     check_method(Careful)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("method", "message", "look"),
     [

@@ -287,6 +287,7 @@ def test_the_anchor_survives_its_state() -> None:
     assert all(np.array_equal(found[0][name], found[1][name]) for name in found[0])
 
 
+@pytest.mark.long
 def test_the_diagnostics_have_the_distance_at_eleven_steps_from_the_first_to_the_last() -> None:
     method, policy = build_method("aegis", {"samples": 50}), TransformerPolicy(CONFIG)
     method.prepare(policy, Prior({"questions": toy_questions(3)}))

@@ -55,6 +55,7 @@ def _adapted(variant: str, **changes: Any) -> tuple[Any, Policy]:
     return method, policy
 
 
+@pytest.mark.long
 @VARIANTS
 def test_adapters_begin_as_no_change_and_sit_on_every_linear_map_of_the_layers(variant: str) -> None:
     policy, batch = TransformerPolicy(SMALL), toy_source("right", seed=1).sample(8)
@@ -130,6 +131,7 @@ def _map(policy: Policy) -> NDArray[np.float64]:
     return np.asarray(units.T.double().numpy())
 
 
+@pytest.mark.long
 @VARIANTS
 def test_an_adapted_policy_survives_saving_and_goes_on_as_it_would_have(variant: str, tmp_path: Path) -> None:
     method, policy = _adapted(variant)

@@ -17,6 +17,7 @@ from clbench.scoring.scores import Scores
 TOY = "clbench.testing:clbench/Toy-v0"
 
 
+@pytest.mark.long
 def test_every_state_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     spec = RunSpec(TOY, "frozen", seed=0)
     record = execute(spec, tmp_path)
@@ -43,6 +44,7 @@ def test_every_state_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     assert [path.name for path in paths[3].parent.glob(".*")] == []
 
 
+@pytest.mark.long
 def test_a_copy_of_a_record_under_another_name_is_not_another_run(tmp_path: Path) -> None:
     path = RunSpec(TOY, "frozen", seed=0).path(tmp_path)
     execute(RunSpec(TOY, "frozen", seed=0), tmp_path)

@@ -158,6 +158,7 @@ def outcomes(record: Any) -> dict[str, list[Any]]:
     return {name: list(values) for name, values in record.episodes.items()}
 
 
+@pytest.mark.long
 def test_an_agent_that_acts_on_batches_has_the_same_outcomes_in_fewer_calls(
     evaluate: Callable[..., Any], tmp_path: Path
 ) -> None:

@@ -108,6 +108,7 @@ def test_an_agent_that_learned_from_words_is_refused_where_instructions_are_text
         evaluate(ppo(WORDS()), stage_env(0))
 
 
+@pytest.mark.long
 def test_an_agent_that_undoes_its_wrapper_is_evaluated(evaluate: Callable[..., Any]) -> None:
     envs = side_by_side(VecNormalize, norm_obs_keys=["state"])
     agent = ppo(envs)
@@ -135,6 +136,7 @@ class State(BaseFeaturesExtractor):
         return observations["state"]
 
 
+@pytest.mark.long
 def test_pictures_whose_colours_the_library_puts_first_are_no_wrapper(evaluate: Callable[..., Any]) -> None:
     env = gymnasium.make("clbench.testing.seen_toy:clbench/SeenToy-v0", instruction="tokens", stage=0)
     agent = ppo(env, policy_kwargs={"features_extractor_class": State})

@@ -58,6 +58,7 @@ def test_every_task_is_evaluated_at_the_end_of_each_stage_and_nowhere_else(recor
     assert {row.split for row in record.episode_rows()} == {"test"}
 
 
+@pytest.mark.long
 def test_checks_play_validation_episodes_until_their_outcome_is_certain(
     record: Record, tmp_path: Path
 ) -> None:
@@ -85,6 +86,7 @@ def test_a_check_plays_the_policy_that_a_method_of_whole_stages_would_leave(tmp_
     evaluator.close()
 
 
+@pytest.mark.long
 def test_asking_for_the_policy_that_a_stage_would_leave_changes_nothing(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -126,6 +128,7 @@ def test_an_interrupted_run_continues_to_the_same_record(
         assert getattr(again, part) == getattr(record, part)
 
 
+@pytest.mark.long
 def test_the_time_of_a_stage_is_that_of_its_training_its_checks_and_its_evaluation(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -152,6 +155,7 @@ def test_the_time_of_a_stage_is_that_of_its_training_its_checks_and_its_evaluati
     assert record.timing["stages"] == [steps]
 
 
+@pytest.mark.long
 def test_a_method_that_trains_nothing_is_checked_once(tmp_path: Path) -> None:
     record = execute(RunSpec(EAGER.id, "frozen", seed=0), tmp_path)
     assert [(row.stage, row.step) for row in record.check_rows()] == [(1, 0), (2, 0)]

@@ -128,6 +128,7 @@ def test_a_gif_has_every_step_and_holds_its_last_frame(drawn: Film, tmp_path: Pa
     assert durations == [50, 50, 50, 50, 2000]
 
 
+@pytest.mark.long
 @pytest.mark.skipif(find_spec("imageio_ffmpeg") is None, reason="the extra film is not installed")
 def test_an_mp4_has_every_step_and_holds_its_last_frame(drawn: Film, tmp_path: Path) -> None:
     from imageio_ffmpeg import count_frames_and_secs, read_frames

@@ -16,6 +16,7 @@ TOY = load_scenario("clbench.testing:clbench/Toy-v0")
 FETCH = load_scenario("clbench/Fetch-v1")
 
 
+@pytest.mark.long
 def test_a_rollout_hash_is_the_same_in_another_process_and_differs_between_tasks() -> None:
     world = FETCH.task("press").world
     code = f"from clbench.runs.fingerprint import rollout_hash; print(rollout_hash({world!r}, 'press'))"

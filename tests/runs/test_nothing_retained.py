@@ -98,6 +98,7 @@ def test_questions_ask_about_the_scenes_of_other_tasks() -> None:
 
 
 # one method for each use of prior demonstrations; without demonstrations each is plain fine-tuning
+@pytest.mark.long
 @pytest.mark.parametrize("method", ["experience_replay", "joint", "a_gem", "buffered_replay", "ewc"])
 def test_a_method_that_replays_begins_with_the_first_target(method: str, tmp_path: Path) -> None:
     record = run(method, tmp_path, **({"samples": 4} if method == "ewc" else {}))

@@ -82,6 +82,7 @@ def test_commands_that_start_together_do_each_run_once(tmp_path: Path) -> None:
     assert len(list((tmp_path / "records").rglob(".*"))) == 0
 
 
+@pytest.mark.long
 def test_a_full_disk_is_no_failure_of_the_method(tmp_path: Path) -> None:
     spec = RunSpec(TINY.id, "sft", seed=0)
     execute(dataclasses.replace(spec, method="frozen"), tmp_path)  # the policy and the data are in the cache
@@ -111,6 +112,7 @@ class _Waits(Method):
         time.sleep(1.0)
 
 
+@pytest.mark.long
 def test_a_run_that_another_process_took_over_writes_nothing_more(
     tmp_path: Path,
     empty_caches: Path,
@@ -141,6 +143,7 @@ class _Interrupts(Method):
         raise KeyboardInterrupt
 
 
+@pytest.mark.long
 def test_an_interrupt_is_the_methods_where_ctrl_c_is_ignored_and_the_users_elsewhere(
     tmp_path: Path, stranger: Callable[[type[Method]], str]
 ) -> None:
@@ -203,6 +206,7 @@ def test_a_method_that_exits_is_named_with_its_hook(
     assert record.error["message"] == "The hook raised SystemExit(3)."
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("death", "end"),
     [
@@ -226,6 +230,7 @@ def test_a_method_that_kills_its_process_is_named_with_its_hook(
     assert not list(tmp_path.glob("records/*/*/*.json"))
 
 
+@pytest.mark.long
 def test_a_run_that_fails_leaves_a_good_record_of_another_configuration_alone(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -110,6 +110,7 @@ def test_relearning_repeats_itself_in_a_loop_written_out(
     assert measure("relearning_steps", Scores.from_record(record)) == steps
 
 
+@pytest.mark.long
 def test_a_skill_that_is_still_known_takes_no_steps_and_the_first_is_chosen_on_a_tie(tmp_path: Path) -> None:
     record = execute(RunSpec(EAGER.id, "frozen", seed=0), tmp_path)
     assert record.relearning == Relearning("left", 4, 0, True)
@@ -198,6 +199,7 @@ def test_a_policy_that_cannot_be_fine_tuned_is_not_relearned(
     assert measure("relearning_steps", Scores.from_record(record)) is None
 
 
+@pytest.mark.long
 def test_a_tuning_run_relearns_nothing(tmp_path: Path) -> None:
     record = execute(RunSpec(EAGER.id, "sft", seed=0, split="validation"), tmp_path)
     assert (record.status, record.relearning) == ("success", None)

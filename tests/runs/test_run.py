@@ -27,6 +27,8 @@ from clbench.scoring.scores import Scores
 from clbench.spec.registry import load_scenario
 from clbench.testing import ToyWorld
 
+pytestmark = pytest.mark.long
+
 TOY = "clbench.testing:clbench/Toy-v0"
 
 
@@ -83,7 +85,6 @@ class Adapting(Method):
         return policy.action_loss(batch).mean() * (1 + noise) + (scale * torch.rand(3)).sum()
 
 
-@pytest.mark.long
 @pytest.mark.parametrize(
     "method",
     [
@@ -100,7 +101,6 @@ def test_the_same_run_twice_gives_equal_records(tmp_path: Path, method: str) -> 
     assert _lasting(paths[0]) == _lasting(paths[1])
 
 
-@pytest.mark.long
 def test_a_record_holds_every_episode_and_answer_once(tmp_path: Path) -> None:
     record = execute(RunSpec(TOY, "sft", seed=0), tmp_path)
     budget = record.scenario.budget
@@ -135,7 +135,6 @@ def test_all_methods_have_the_same_initial_states_and_the_same_pretrained_policy
     assert records[0].fingerprint == records[1].fingerprint
 
 
-@pytest.mark.long
 def test_a_run_in_another_order_begins_with_the_same_policy_states_and_simulator(tmp_path: Path) -> None:
     specs = [RunSpec(TOY, "frozen", seed=0, order=order) for order in range(2)]
     published, other = (execute(spec, tmp_path) for spec in specs)
@@ -151,7 +150,6 @@ def test_a_run_in_another_order_begins_with_the_same_policy_states_and_simulator
     assert starts == others
 
 
-@pytest.mark.long
 def test_a_run_with_perturbed_episodes_has_everything_that_a_plain_run_has(tmp_path: Path) -> None:
     plain, perturbed = (
         execute(RunSpec(TOY, "sft", 0, perturb=perturb), tmp_path) for perturb in (False, True)
@@ -222,7 +220,6 @@ def test_frozen_forgets_nothing_and_costs_nothing(tmp_path: Path) -> None:
     assert (record.costs.optimiser_steps, record.costs.bytes_kept) == (0, 0)
 
 
-@pytest.mark.long
 @pytest.mark.parametrize(
     ("cls", "perturb", "shares"),
     [
@@ -258,7 +255,6 @@ def _unfinished() -> set[str]:
     return {path.name for path in folder.iterdir()} if folder.exists() else set()
 
 
-@pytest.mark.long
 def test_the_state_of_a_method_is_counted_in_bytes(
     tmp_path: Path, stranger: Callable[[type[Method]], str]
 ) -> None:
@@ -282,7 +278,6 @@ class Merging(Method):
         return 0.0
 
 
-@pytest.mark.long
 def test_a_method_of_whole_stages_is_evaluated_only_at_their_ends(
     tmp_path: Path, stranger: Callable[[type[Method]], str]
 ) -> None:

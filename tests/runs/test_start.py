@@ -49,6 +49,7 @@ def test_the_pretrained_policy_is_evaluated_once(tmp_path: Path, reports: Path) 
     assert len(list(reports.iterdir())) == 2  # a perturbed evaluation has more episodes
 
 
+@pytest.mark.long
 def test_an_evaluation_that_another_run_makes_at_the_same_time_is_used(
     tmp_path: Path, reports: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -60,6 +60,7 @@ def _a_second_for_each_loss(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("clbench.runs.step_time.time", clock)
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("_a_second_for_each_loss")
 def test_a_slow_method_of_a_stranger_has_its_ratio_in_the_record(
     tmp_path: Path, stranger: Callable[[type[Method]], str]
@@ -67,6 +68,7 @@ def test_a_slow_method_of_a_stranger_has_its_ratio_in_the_record(
     assert _timing(stranger(Slow), tmp_path)["step_ratio"] == 5
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("_a_second_for_each_loss")
 def test_a_method_that_trains_nothing_has_no_time_of_a_step_and_plain_fine_tuning_is_the_unit(
     tmp_path: Path,
@@ -88,6 +90,7 @@ def test_a_method_that_cannot_be_measured_keeps_its_record(
     assert "The time of a step could not be measured: RuntimeError: twice" in caplog.text
 
 
+@pytest.mark.long
 def test_the_measurement_changes_nothing_else(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, lasting_records: Callable[[Path], dict[str, Any]]
 ) -> None:

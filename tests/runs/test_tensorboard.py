@@ -83,6 +83,7 @@ def test_a_log_shows_the_contents_of_the_record(logged: tuple[Any, Path]) -> Non
     assert "diagnostics/anchor_distance" not in points  # a list, no number
 
 
+@pytest.mark.long
 def test_a_log_shows_the_success_in_perturbed_episodes(tmp_path: Path) -> None:
     spec = dataclasses.replace(SPEC, method="frozen", perturb=True)
     rates = Scores.from_record(execute(spec, tmp_path, tensorboard=tmp_path / "logs")).rates()

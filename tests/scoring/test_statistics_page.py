@@ -84,6 +84,7 @@ def test_the_examples_of_the_page_give_its_results() -> None:
         assert (f"{got:.2f}" if isinstance(got, float) else str(got)) == result
 
 
+@pytest.mark.long
 def test_the_command_line_shows_the_width_to_expect_of_intervals_before_a_run(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -54,6 +54,7 @@ def test_a_served_policy_acts_like_the_same_policy_here(tmp_path: Path) -> None:
         served.close()
 
 
+@pytest.mark.long
 def test_a_server_that_is_killed_and_started_again_is_found_again(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -98,6 +99,7 @@ def test_nobody_at_the_address_is_an_error_that_says_what_to_do() -> None:
         ServedPolicy(f"ws://localhost:{port}", patience=0.3)
 
 
+@pytest.mark.long
 def test_a_server_that_is_still_loading_is_waited_for_with_a_message_now_and_then(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:

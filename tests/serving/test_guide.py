@@ -156,6 +156,7 @@ def create_trained_policy(train_config, checkpoint_dir):
 """The parts of LeRobot and openpi that the page uses, with the signatures that they have there."""
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("program", [LEROBOT, OPENPI], ids=["lerobot", "openpi"])
 def test_the_programs_for_other_libraries_serve_their_policies(program: str, tmp_path: Path) -> None:
     for name, source in LIBRARIES.items():

@@ -61,6 +61,7 @@ def outcomes(record: Record) -> dict[str, list[Any]]:
     return dict(record.episodes)
 
 
+@pytest.mark.long
 def test_a_served_policy_has_exactly_the_outcomes_of_the_same_policy_in_this_process(
     run: Callable[..., Record], tmp_path: Path
 ) -> None:
@@ -75,6 +76,7 @@ def test_a_served_policy_has_exactly_the_outcomes_of_the_same_policy_in_this_pro
     assert 0 < np.mean(there.episodes["success"]) < 1
 
 
+@pytest.mark.long
 def test_a_server_that_is_killed_during_a_stage_changes_no_outcome(
     run: Callable[..., Record], tmp_path: Path
 ) -> None:
@@ -270,6 +272,7 @@ def test_a_scenario_that_retains_nothing_is_refused_with_the_reason(tmp_path: Pa
         is_scored("clbench/MetaWorldCW-v0", stage=0, method="me/elsewhere", records=tmp_path)
 
 
+@pytest.mark.long
 def test_a_stage_that_was_scored_wrongly_is_scored_again(run: Callable[..., Record], tmp_path: Path) -> None:
     expected = [run(knowing(stage), stage, records=tmp_path / "other") for stage in STAGES][-1]
     for stage, policy in ((0, knowing(0)), (1, knowing(0)), (1, knowing(1)), (2, knowing(2))):
@@ -282,6 +285,7 @@ def test_a_stage_that_was_scored_wrongly_is_scored_again(run: Callable[..., Reco
         run(knowing(2), 2, restart=True)
 
 
+@pytest.mark.long
 def test_a_restart_at_stage_0_drops_all_stages(run: Callable[..., Record], tmp_path: Path) -> None:
     for stage in (0, 1):
         run(knowing(stage, 4), stage)
@@ -384,6 +388,7 @@ def test_a_policy_that_repeats_all_episodes_of_the_stage_before_is_suspected(
     assert message.endswith("ended as in stage 0, in equal steps: does the policy have the new checkpoint?")
 
 
+@pytest.mark.long
 def test_a_checkpoint_that_was_scored_with_another_seed_is_no_second_training(
     run: Callable[..., Record], caplog: pytest.LogCaptureFixture
 ) -> None:

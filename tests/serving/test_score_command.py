@@ -12,6 +12,7 @@ from clbench.base.entry_points import resolve
 STAGES = range(3)
 
 
+@pytest.mark.long
 def test_the_command_scores_stage_after_stage_and_skips_what_is_done(
     tmp_path: Path, empty_caches: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -40,6 +41,7 @@ def test_the_command_scores_stage_after_stage_and_skips_what_is_done(
     assert "has a record already" in capsys.readouterr().err
 
 
+@pytest.mark.long
 def test_the_command_refuses_what_contradicts_a_done_stage_and_scores_it_again_if_asked(
     tmp_path: Path, empty_caches: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -381,6 +381,7 @@ class Seldom(Method):
         return loss if questions is None else loss + policy.answer_loss(questions).mean()
 
 
+@pytest.mark.long
 def test_prior_data_may_be_drawn_at_few_steps() -> None:
     check_method(Seldom)
 
@@ -419,6 +420,7 @@ def test_the_checks_have_names() -> None:
     assert [str(check) for check in CHECKS][:3] == ["declaration", "constructor", "sound_hooks"]
 
 
+@pytest.mark.long
 def test_settings_can_shorten_a_preparation() -> None:
     ewc = load_method("ewc")
     (check,) = (check for check in method_checks(ewc, samples=1) if str(check) == "sound_hooks")

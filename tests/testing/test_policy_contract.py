@@ -19,6 +19,7 @@ from clbench.testing import ContractError, check_method, check_policy, policy_ch
 from clbench.testing.policy_contract import CLAUSES
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", POLICIES)
 def test_the_built_in_policies_keep_the_contract(kind: str) -> None:
     assert [str(check) for check in policy_checks(kind)] == [clause.__name__ for clause in CLAUSES]
@@ -336,6 +337,7 @@ def test_what_is_no_policy_is_refused_by_name(kind: str, error: type[Exception],
         check_policy(kind)
 
 
+@pytest.mark.long
 def test_every_broken_policy_is_one_by_its_clause_alone() -> None:
     """The class that they derive from keeps the contract: what the checks find is the change."""
     check_policy(f"{__name__}:Base")

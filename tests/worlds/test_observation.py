@@ -200,6 +200,7 @@ def test_an_agent_of_the_scenario_sees_the_picture_and_no_more() -> None:
     env.close()
 
 
+@pytest.mark.long
 def test_a_policy_learns_facts_that_only_the_picture_shows() -> None:
     policy = TransformerPolicy(policy_config(SEEN_TOY), seed=0)
     assert (policy.config.state_size, policy.config.image_size) == (1, 16)
@@ -212,6 +213,7 @@ def test_a_policy_learns_facts_that_only_the_picture_shows() -> None:
     assert policy.answer_loss(blind).mean() > 0.5
 
 
+@pytest.mark.long
 def test_an_outcome_does_not_depend_on_what_else_is_seen() -> None:
     policy, _ = pretrained_policy(SHORT, 0)
     evaluator = Evaluator(SHORT, seed=0)

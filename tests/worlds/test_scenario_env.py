@@ -144,6 +144,7 @@ def test_vector_environments_give_text_too() -> None:
     env.close()
 
 
+@pytest.mark.long
 def test_stable_baselines_checks_and_trains_on_numeric_instructions() -> None:
     from stable_baselines3 import SAC
     from stable_baselines3.common.env_checker import check_env as check_env_of_stable_baselines

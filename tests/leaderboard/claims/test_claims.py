@@ -47,6 +47,7 @@ ACTIVE = {"1": {"omega_counts": [[5, 5, 0, 0, 0], [0, 5, 3, 1, 1]]}}
 SAME = {"1": {"omega_counts": [[98, 2, 0, 0, 0], [60, 0, 0, 0, 40]]}}
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("identifier", "method", "limit"),
     [("C6", "consft", 1.05), ("A7", "aegis", 1.6), ("F4", "fast_dvla", 1.05)],
@@ -140,6 +141,7 @@ def test_an_arm_whose_samples_weigh_the_same_does_not_count_and_the_page_says_so
     assert "weights of consft_calibrated lie" not in entry
 
 
+@pytest.mark.long
 def test_a_control_says_whether_it_explains_what_is_kept(bench: Bench) -> None:
     for label in ("sft", "sft@1", "finch"):
         bench.add(label)
@@ -155,6 +157,7 @@ def test_a_control_says_whether_it_explains_what_is_kept(bench: Bench) -> None:
     assert "The records cannot show what shuffled_weights says about consft_calibrated." in entry
 
 
+@pytest.mark.long
 def test_what_keeps_skills_at_the_scenarios_learning_rate_is_asked_of_controls_there(bench: Bench) -> None:
     for label in ("sft", "sft@1", "consft", "consft@1", "consft_calibrated"):
         bench.add(label)
@@ -169,6 +172,7 @@ def test_what_keeps_skills_at_the_scenarios_learning_rate_is_asked_of_controls_t
     ) in entry
 
 
+@pytest.mark.long
 def test_a_gain_that_a_control_shares_is_not_put_down_to_the_weights(bench: Bench) -> None:
     bench.add("sft", earlier=0.2)
     for label in ("consft", "consft_calibrated", "constant_weight", "shuffled_weights"):

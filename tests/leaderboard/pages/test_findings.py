@@ -35,6 +35,7 @@ def fill(even_board: Callable[..., Path], **kept: float) -> None:
             even_board(method, seed, share)
 
 
+@pytest.mark.long
 def test_a_method_that_is_certainly_better_is_named_with_its_gain(
     even_board: Callable[..., Path], page: Callable[[], str]
 ) -> None:
@@ -211,6 +212,7 @@ def test_how_fast_lost_skills_come_back_is_told_with_their_names(
     assert told == (other == "skill_1"), "another skill says nothing of this one"
 
 
+@pytest.mark.long
 def test_definitions_that_order_the_methods_alike_have_a_tau_of_one(
     even_board: Callable[..., Path], page: Callable[[], str]
 ) -> None:
@@ -242,6 +244,7 @@ def test_boards_with_a_fixed_number_of_steps_also_tell_what_is_lost_of_skills_an
     assert re.search(r"and the share of right answers goes from 0\.\d\d .* to 0\.50", section)  # 25 of 50
 
 
+@pytest.mark.long
 def test_a_second_call_changes_no_byte(
     even_board: Callable[..., Path], page: Callable[[], str], tmp_path: Path
 ) -> None:

@@ -262,6 +262,7 @@ def test_words_of_strangers_in_records_are_no_markup(bench: Bench) -> None:
     assert len(re.findall("^```", page, re.MULTILINE)) == 2
 
 
+@pytest.mark.long
 def test_the_same_content_gives_the_same_bytes_and_no_place_or_date(bench: Bench) -> None:
     for method in ("sft", "consft", "aegis"):
         bench.add(method)

@@ -266,6 +266,7 @@ def test_a_card_that_is_made_again_has_the_same_bytes_and_nothing_is_measured_tw
     assert {*bench.output.glob("Toy-v0/*")} == {path for path in files if path.parent.name == "Toy-v0"}
 
 
+@pytest.mark.long
 def test_the_card_reports_records_of_another_version_of_the_scenario(bench: Bench) -> None:
     bench.add_all()
     assert "another version" not in bench.card()
@@ -324,6 +325,7 @@ def test_a_wrong_word_is_named(
     assert not bench.output.exists()
 
 
+@pytest.mark.long
 def test_a_scenario_with_a_criterion_has_bars_and_orders_of_its_own(
     make_record: Callable[..., Record], tmp_path: Path
 ) -> None:

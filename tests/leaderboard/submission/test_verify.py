@@ -24,10 +24,11 @@ from clbench.runs.spec import RunSpec
 from clbench.testing import TOY as TOY_SCENARIO
 from clbench.testing import ToyWorld
 
+pytestmark = pytest.mark.long
+
 tiers = importlib.import_module("clbench.leaderboard.board.tiers")
 
 
-@pytest.mark.long
 @pytest.mark.parametrize("tier", ["recomputed", "replayed", "retrained"])
 def test_an_honest_record_earns_every_tier_and_is_not_touched(tier: str, mine: Path, honest: Path) -> None:
     before = mine.read_bytes()
@@ -41,7 +42,6 @@ def test_an_honest_record_earns_every_tier_and_is_not_touched(tier: str, mine: P
     assert [check["name"] for check in stored["checks"]] == [check.name for check in checks]
 
 
-@pytest.mark.long
 def test_a_run_in_another_order_of_the_targets_is_verified_in_that_order(tmp_path: Path) -> None:
     spec = RunSpec(TOY, "frozen", 0, order=1)
     execute(spec, tmp_path / "records")
@@ -54,7 +54,6 @@ def test_a_run_in_another_order_of_the_targets_is_verified_in_that_order(tmp_pat
     assert "is missing at stage 1" in failures(verify(path, "recomputed"))
 
 
-@pytest.mark.long
 def test_perturbed_episodes_are_replayed_like_test_episodes(tmp_path: Path) -> None:
     spec = RunSpec(TOY, "frozen", 0, perturb=True)
     execute(spec, tmp_path / "records")
@@ -128,7 +127,6 @@ def test_the_pretraining_is_repeated_on_request_and_its_policy_compared(mine: Pa
     assert pretraining.found == f"repeated, it gives the same policy {pretrained}"
 
 
-@pytest.mark.long
 def test_a_policy_that_pretraining_does_not_give_is_found_before_the_run_is_repeated(
     mine: Path, honest: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -356,7 +354,6 @@ def test_a_run_on_a_device_that_is_missing_here_is_recomputed_and_no_more(mine: 
     assert tiers.tier_of(mine) == "recomputed"
 
 
-@pytest.mark.long
 def test_the_command_lists_its_checks(mine: Path, honest: Path, capsys: pytest.CaptureFixture[str]) -> None:
     command = importlib.import_module("clbench.leaderboard.cli").verify
     records = next(folder for folder in mine.parents if folder.name == "records")
@@ -397,7 +394,6 @@ def test_a_record_elsewhere_is_refused_with_the_option_that_finds_it(
     assert f"{beside}: recomputed" in capsys.readouterr().out
 
 
-@pytest.mark.long
 def test_the_command_prints_json_of_good_and_bad_records(
     mine: Path, honest: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

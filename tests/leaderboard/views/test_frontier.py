@@ -59,6 +59,7 @@ def test_the_curves_have_the_seeds_that_all_rungs_have(
     ]
 
 
+@pytest.mark.long
 def test_scenarios_with_a_criterion_come_first(records: Path, make_record: Callable[..., Record]) -> None:
     fixed = "clbench/Alphabetic-v0"
     path = record_path(records, fixed, "sft", 0)
@@ -74,6 +75,7 @@ def test_scenarios_with_a_criterion_come_first(records: Path, make_record: Calla
     assert f"Means over {SCENARIO}, {fixed}, for methods" in markdown(compute_board(records), {})
 
 
+@pytest.mark.long
 def test_a_scenario_with_a_criterion_has_its_own_columns(records: Path) -> None:
     head = next(
         line for line in markdown(compute_board(records), {}).splitlines() if line.startswith("| letters")
@@ -87,6 +89,7 @@ def test_a_scenario_with_a_criterion_has_its_own_columns(records: Path) -> None:
     assert "retention" not in heads
 
 
+@pytest.mark.long
 def test_the_terminal_shows_gain_and_kept(
     records: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -122,6 +125,7 @@ def test_seeds_that_order_the_methods_alike_are_said_to_do_so(
     assert sentence in markdown(compute_board(records), {}).replace("\\", "")
 
 
+@pytest.mark.long
 def test_targets_of_balanced_seeds_are_numbered_in_the_section_of_a_row(records: Path) -> None:
     assert "new tasks, each seed in its own order target_ 0 target_ 1" in words(section_of(records))
     assert "after target 2" in unpacked(page(compute_board(records), {}))

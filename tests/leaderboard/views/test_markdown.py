@@ -61,6 +61,7 @@ def test_perturbed_retention_follows_retention_where_a_row_has_it(
     assert after.set_index("method").perturbed_retention["sft"] == pytest.approx(0.3)
 
 
+@pytest.mark.long
 def test_a_missing_value_is_a_dash_in_markdown_and_empty_in_csv(
     four_methods: Path, shown: Callable[[], tuple[str, str]]
 ) -> None:
@@ -75,6 +76,7 @@ def test_a_missing_value_is_a_dash_in_markdown_and_empty_in_csv(
     }
 
 
+@pytest.mark.long
 def test_rows_in_every_scenario_are_averaged_over_them(
     four_methods: Path, add_full: Callable[..., Path], shown: Callable[[], tuple[str, str]]
 ) -> None:

@@ -39,6 +39,7 @@ def flat(text: str) -> str:
     return " ".join(text.replace("\\", "").split())
 
 
+@pytest.mark.long
 def test_a_record_that_is_not_of_its_schema_is_listed_and_hides_no_other(
     four_methods: Path, add_full: Callable[..., Path], shown: Callable[[], tuple[str, str]]
 ) -> None:

@@ -65,6 +65,7 @@ def test_the_best_of_a_division_is_bold_and_a_lone_row_is_not(
     assert better.count("\x1b[1m") > sft.count("\x1b[1m")
 
 
+@pytest.mark.long
 def test_one_scenario_is_shown_in_the_order_of_a_metric(
     four_methods: Path, add_full: Callable[..., Path], matrix: Any, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -134,6 +135,7 @@ def test_a_weak_pretrained_policy_is_named_on_every_form_of_the_board(
         assert sentence in " ".join(text.split())
 
 
+@pytest.mark.long
 def test_bytes_have_three_digits_and_go_on_to_the_next_unit(
     four_methods: Path,
     add_full: Callable[..., Path],

@@ -149,6 +149,7 @@ def test_a_tier_says_how_many_runs_reached_a_higher_one(records: Path) -> None:
     assert "At least one run was checked by its submitter alone." in words(section)
 
 
+@pytest.mark.long
 def test_a_missing_value_is_a_dash_that_says_why(add: Callable[..., Path], records: Path) -> None:
     section = by_id(parsed(page(compute_board(records), {})), "clbench/Toy-v0")
     assert "forward transfer" not in [words(one) for one in section.iterfind(".//table/thead/tr/th")]
@@ -250,6 +251,7 @@ def test_files_that_make_no_row_are_listed_with_their_reason(records: Path) -> N
     assert "What to do" in text
 
 
+@pytest.mark.long
 def test_definitions_that_rank_in_opposite_orders_are_named(add: Callable[..., Path], records: Path) -> None:
     # one forgets the skills alone, one the targets alone: the metrics distinguish them
     for seed in range(2):

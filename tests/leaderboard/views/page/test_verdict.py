@@ -81,6 +81,7 @@ def test_without_a_method_that_surely_ends_higher_none_is_named(board: Callable[
     )
 
 
+@pytest.mark.long
 def test_a_gain_that_is_certain_only_without_counting_the_comparisons_names_no_method(
     board: Callable[..., Any],
 ) -> None:
@@ -220,6 +221,7 @@ def test_a_gain_that_is_not_certain_over_a_tied_setting_is_not_in_the_headline(
     assert headline(rows, tied) == headline(rows)
 
 
+@pytest.mark.long
 def test_a_card_says_why_the_gain_of_its_leader_is_not_certain(board: Callable[..., Any]) -> None:
     rows = board(sft=matrix(0.2), lora=matrix(0.6), finch=matrix(0.2))
     assert verdicts(rows)[0].doubt == ""
