@@ -53,10 +53,14 @@ def rollout_hash(world: str, task: str) -> str:
     return digest.hexdigest()[:16]
 
 
-def fingerprint(scenario: Scenario) -> dict[str, Any]:
+def fingerprint(scenario: Scenario, device: str = "cpu") -> dict[str, Any]:
     """Return versions, commit, hardware, the rollout hash of every world of the scenario, and its definition.
 
     For a world with a camera, the hash of a picture is added under the name of the camera.
+
+    Args:
+        scenario: The scenario.
+        device: Device on which the policy is computed, in PyTorch's words.
     """
     from clbench.evaluation.definition import definition  # imports torch, see `_hardware`
 
@@ -70,7 +74,7 @@ def fingerprint(scenario: Scenario) -> dict[str, Any]:
         "versions": versions(packages),
         "python": platform.python_version(),
         "commit": _commit(),
-        "hardware": _hardware(),
+        "hardware": _hardware(device),
         "rollouts": {**rollouts, **frames},
         "definition": definition(scenario),
     }
@@ -94,11 +98,13 @@ def _commit() -> dict[str, Any] | None:
     return {"id": head.stdout.strip(), "dirty": bool(changed.stdout.strip())}
 
 
-def _hardware() -> dict[str, str]:
+def _hardware(device: str) -> dict[str, str]:
     """Return what affects rounding: processors of the same name may have different instructions."""
     import torch  # takes seconds, for which environments that only step need not wait
 
+    gpu = {"gpu": torch.cuda.get_device_name(device)} if torch.device(device).type == "cuda" else {}
     return {
+        **gpu,
         "machine": platform.machine(),
         "system": platform.system(),
         "processor": _processor(),

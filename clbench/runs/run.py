@@ -112,7 +112,7 @@ def _new_record(run: ResolvedRun, trainer: Trainer, pretrained_folder: Path) -> 
         costs=Costs(optimiser_steps=0, parameters=_parameters(trainer)),
         fingerprint={
             # the first task of each world starts its rollout: the order of the targets must not change it
-            **fingerprint(run.published),
+            **fingerprint(run.published, run.spec.device),
             "method": describe_method(run.method),
             "pretrained": pretrained_hash(pretrained_folder),
         },

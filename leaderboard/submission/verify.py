@@ -61,7 +61,7 @@ _ACTORS = {"online": "an agent that learned online", "external": "a policy serve
 
 ORIGIN = {
     "versions": (),
-    "hardware": ("machine", "system", "instructions"),
+    "hardware": ("machine", "system", "instructions", "gpu"),
     "method": ("authors", "link", "licence", "version"),
 }
 """Entries of a fingerprint that a repetition confirms on the same kind of machine; () stands for all."""

@@ -89,6 +89,11 @@ def test_a_fingerprint_names_only_the_simulator_of_its_suite() -> None:
     assert "gymnasium-robotics" not in fingerprint(TOY)["versions"]
 
 
+def test_a_run_on_a_gpu_names_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("torch.cuda.get_device_name", {"cuda:1": "H100"}.__getitem__)
+    assert fingerprint(TOY, "cuda:1")["hardware"]["gpu"] == "H100"
+
+
 def test_a_fingerprint_names_versions_hardware_and_every_world() -> None:
     found = fingerprint(TOY)
     assert found["versions"]["mujoco"] == version("mujoco")
