@@ -83,7 +83,7 @@ records: .venv/installed-dev
 
 # The frontier: what a smaller learning rate does, for plain fine-tuning and for the methods that compete with it. The
 # claims need consft_calibrated at the scenario's own learning rate only. On Fetch-v1, tuning rated plain fine-tuning at
-# 0.1 as high as at 0.3, the first: a gain is certain only if it is over both.
+# 0.1 as highly as at 0.3, the first: a gain is certain only if it is over both.
 LADDER = $(BIN)/clbench run $(BOTH) $(filter-out consft_calibrated,$(METHODS)) --seeds 4 --records leaderboard/ladder
 ladder: .venv/installed-dev
 	$(LADDER) --set.step_factor 1
