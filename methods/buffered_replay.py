@@ -1,7 +1,8 @@
 """Buffered replay: experience replay from a buffer of 2 % of the prior demonstrations.
 
-The buffer sizes come from arXiv 2603.03818, where a few per cent of the data nearly stop forgetting in
-vision-language-action models.
+The size of the buffer comes from arXiv 2603.03818. There, 2 % of the data leave a negative backward transfer
+of 0.1 to 0.2 in vision-language-action models, where small networks have 0.4 to 0.5; 20 % nearly stop
+forgetting.
 
 Details:
 1. Before the first target, single time steps are drawn at random into the buffer, with replacement; all

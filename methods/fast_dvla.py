@@ -11,7 +11,7 @@ Details:
 1. The auxiliary objective is to answer questions. The paper's Spatial Forcing aligns hidden states with those
    of a vision model instead: both give the backbone a second task besides acting. But the paper's second task
    is new to the policy, while questions are a part of the pretraining here. The vector is therefore largely
-   what 150 steps without questions cost: on Fetch-v1, seed 0, the two fine-tunings differ by 0.81 in norm,
+   what 150 steps without questions cost: on Fetch-v1, seed 0, the two fine-tunings differ by 0.78 in norm,
    and move from the pretrained policy by 1.04 in directions with a cosine of 0.73. A scenario whose policy
    has not been pretrained on questions would test the paper's premise more directly.
 2. Both fine-tunings see the same demonstrations of all retained skills, in the same order with the same
@@ -20,7 +20,7 @@ Details:
 4. theta_meta is the merged policy for all targets of the sequence; the paper fine-tunes on one target.
 5. The regulariser's gradient is added in closed form, lambda |g| sign(theta - theta_meta), with sign(0) = 0.
 6. No LoRA: the full matrices are regularised. lambda = 1e-4 was chosen for 7 billion parameters;
-   docs/reference/methods/fast_dvla.md shows other values here.
+   tuning tried 0.01 and 1 here.
 7. The regulariser's gradient is clipped together with the loss's, to a norm of 1, and goes through Adam.
 8. The vector is cached. The steps that made it count in every row.
 9. Where nothing is retained, there is no skill to make a vector from: the run fails and says so.

@@ -7,8 +7,9 @@ the start of a target.
 Details:
 1. The cap is the benchmark's own schedule instead of the paper's constant 5e-5, so that no method takes
    larger steps than plain fine-tuning. kappa is therefore a factor of that schedule.
-2. The default of kappa comes from validation episodes of the first Fetch board (docs/history.md). On Fetch-v1
-   and MetaWorld-v1, `clbench tune` chose again. The average restarts with the first loss of each target.
+2. The default of kappa comes from validation episodes of the first Fetch board (docs/history.md).
+   Where methods are tuned, `clbench tune` chose again.
+3. The average restarts with the first loss of each target.
 """
 
 import math

@@ -1,4 +1,4 @@
-"""Frozen: the pretrained policy, without training. A reference row: it forgets and learns nothing."""
+"""Frozen: the pretrained policy, without training. A reference row: it learns and forgets nothing."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass

@@ -1,9 +1,13 @@
 """Joint: training on the demonstrations of all skills and targets so far, and on the questions.
 
 A reference row: it keeps these demonstrations, so it does not solve forgetting. Like every other method, it
-never sees those of the background, the tasks of pretraining that no score counts. It is no upper bound where
-stages end at a criterion: it is not tuned, its stages end after few steps, and replay ends above it. Its
-success right after a target is a* in intransigence (Chaudhry 2018).
+never sees those of the background, the tasks of pretraining that no score counts. It is no upper bound: it is
+not tuned, and where stages end at a criterion, they end after few steps. Replay ends above it there, and on
+FetchPixels-v0 as well. Its success right after a target is a* in intransigence (Chaudhry 2018).
+
+Details:
+1. A step reads a batch of the target, as many prior samples if there are any, and half as many questions: 2.5
+   times the samples of a step of `sft`.
 """
 
 from dataclasses import dataclass

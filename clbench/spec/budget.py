@@ -27,13 +27,14 @@ class Budget:
     test_questions: int = 1000
     """Test questions asked at the end of each stage."""
     pretraining_steps: int = 3000
-    """Optimiser steps on the retained tasks and the training questions."""
+    """Optimiser steps of pretraining: on the retained skills, the background and the training questions."""
     pretraining_learning_rate: float = 1.5e-3
     """Peak learning rate of pretraining."""
     adaptation_steps: int = 300
     """Optimiser steps on each target task; with a criterion the most."""
     criterion: float | None = None
-    """Success rate on the target's validation episodes that ends a stage. None: stages are equally long."""
+    """Success rate on the target's validation episodes that ends a stage; without it, stages are equally
+    long."""
     learning_rate: float = 3e-4
     """Peak learning rate of adaptation, which each method multiplies by its `step_factor`."""
     batch_size: int = 64

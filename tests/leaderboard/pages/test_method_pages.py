@@ -158,8 +158,8 @@ def test_the_stored_data_come_from_the_declaration_and_the_records(bench: Bench)
     assert "It reads prior demonstrations only before the first target." in stored
     assert "It never uses prior questions." in stored
     assert "Division: prior demonstrations." in stored
-    assert "Bytes kept: 8,000." in stored
-    assert "Parameters added: 12." in stored
+    assert "Bytes kept on clbench/Toy-v0: 8,000." in stored
+    assert "Parameters added on clbench/Toy-v0: 12." in stored
 
 
 def test_the_row_of_the_board_is_next_to_three_others(bench: Bench) -> None:

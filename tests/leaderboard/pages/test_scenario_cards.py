@@ -196,7 +196,7 @@ def test_without_any_record_the_card_says_so_and_invents_nothing(bench: Bench) -
     assert f"`{command}` makes them." in card
     assert {tuple(cells[1:]) for cells in bars(card).values()} == {("-", "-")}
     assert part(card, "How small a difference it resolves").startswith(
-        "Unknown: this takes two seeds of two methods"
+        "Unknown: it takes records of at least two methods of one division"
     )
     assert part(card, "Order of the targets").startswith("The records have the published order only.")
 
@@ -359,5 +359,8 @@ def test_a_scenario_with_a_criterion_has_bars_and_orders_of_its_own(
     }
     assert "Latin square" in part(card.page(), "Order of the targets")
     assert "<br>in test episodes:<br>a wording of the test |" in part(card.page(), "Tasks")
-    assert "Pretrained with the retained skills, and not scored: practised." in part(card.page(), "Tasks")
+    assert (
+        "Pretraining also has these tasks, which no score counts and no method trains on again: practised."
+        in part(card.page(), "Tasks")
+    )
     assert "The policy is evaluated at the end of each stage." in part(card.page(), "Budget")
