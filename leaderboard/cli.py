@@ -32,7 +32,7 @@ from clbench.cli.arguments import (
 )
 from clbench.jobs.folders import check_folders
 from clbench.records.paths import RECORDS, record_path
-from clbench.records.reader import RecordError, home_of, read_record
+from clbench.records.reader import RecordError, check_home, read_record
 from clbench.spec.identifiers import scenario_ids, without_module
 from clbench.spec.protocol import DEFAULT_SEEDS
 
@@ -319,7 +319,7 @@ def _placed(found: list[Path], records: Path) -> tuple[list[Path], Path]:
 def _home_of(path: Path) -> Path | None:
     """Return the folder of records in which a record has its place; None if it has none, or is no record."""
     try:
-        parts = home_of(read_record(path).run).parts
+        home = check_home(read_record(path).run, path)
     except RecordError:
         return None
-    return path.parents[len(parts) - 1] if path.parts[-len(parts) :] == parts else None
+    return path.parents[len(home.parts) - 1]

@@ -343,26 +343,26 @@ def keeps_earlier_targets(evidence: Evidence) -> Finding:
     """Learns several targets in sequence and keeps the earlier ones."""
     own = {arm: evidence.metric("backward_transfer", arm) for arm in ARMS}
     references = tuple(evidence.metric("backward_transfer", name) for name in ("sft", "experience_replay"))
-    arms = [own[arm] for arm in arms_that_count(evidence)]
+    counting, of_all = arms_that_count(evidence), _keeps_targets(list(own.values()))
+    arms = [own[arm] for arm in counting]
     if not arms:
-        of_all = _keeps_targets(list(own.values()))
         return without_an_arm(evidence, tuple(own.values()), references, of_all)
     figures = best_first(arms)
     over_sft, *over_controls = _gains_in_transfer(evidence, figures[0].methods[0])
-    others = [arm for arm in ARMS if own[arm] not in arms]
     not_counted = [
         figure
-        for arm in others
+        for arm in ARMS
+        if arm not in counting
         for figure in (own[arm], evidence.difference("backward_transfer", arm, "sft"))
     ]
-    verdict, of_all = _keeps_targets(arms), _keeps_targets(list(own.values()))
+    verdict = _keeps_targets(arms)
     return Finding(
         verdict,
         figures,
         (over_sft, *over_controls, *not_counted, *references),
         (
             *inactive_sentences(evidence),
-            *if_all_counted([arm for arm in ARMS if arm not in others], verdict, of_all),
+            *if_all_counted(counting, verdict, of_all),
             _what_keeps_targets(over_sft, over_controls),
         ),
         what_would_change(deciding(verdict, figures, -0.10), -0.10),

@@ -30,12 +30,7 @@ NO_CAPABILITY = (
 )
 KNOWN = (
     "The auxiliary objective, to answer questions, is a part of the pretraining, and sft does not certainly "
-    "lose 0.01 of the answers: whether the objective could add anything here is open."
-)
-KNOWN_NO_HELP = (
-    "The auxiliary objective, to answer questions, is a part of the pretraining, and sft does not certainly "
-    "lose 0.01 of the answers. Here the objective certainly saves less than 5 % of the steps; whether it "
-    "would help a policy that lacks it is open."
+    "lose 0.01 of the answers"
 )
 A_CAPABILITY = "An auxiliary objective that speeds up learning, or a policy that lacks it."
 
@@ -54,7 +49,12 @@ def _no_capability(evidence: Evidence) -> bool:
 
 def _why_known(evidence: Evidence) -> str:
     """Return why a board says nothing of an objective that the policy knows, and whether it helps there."""
-    return KNOWN_NO_HELP if _no_capability(evidence) else KNOWN
+    if not _no_capability(evidence):
+        return f"{KNOWN}: whether the objective could add anything here is open."
+    return (
+        f"{KNOWN}. Here the objective certainly saves less than 5 % of the steps; whether it would help a "
+        "policy that lacks it is open."
+    )
 
 
 def _not_shown(evidence: Evidence, figure: Figure, *controls: Figure) -> Finding | None:

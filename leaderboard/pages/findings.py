@@ -295,9 +295,11 @@ def _predictors(boards: dict[str, list[Row]]) -> Section:
             "learning rate: an order that agrees does not say what causes forgetting.",
         )
         answers += after_correction([one.chance for _, _, one in found])
-        answers.append(
-            "`stop_gradient` leaves the backbone as it is, so that few of its weights change by construction."
-        )
+        if any(row.method == "stop_gradient" for rows in boards.values() for row in rows):
+            answers.append(
+                "`stop_gradient` leaves the backbone as it is, so that few of its weights change by "
+                "construction."
+            )
     return Section("What predicts how much a method forgets?", tuple(answers))
 
 

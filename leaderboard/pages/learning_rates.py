@@ -26,11 +26,12 @@ def rate_sentences(
         evidence: Returns the runs of the scenario with a Gymnasium id, those of the ladder included.
     """
     for name, curves in frontiers.items():
+        found = evidence(name)
         for curve in curves:
             if curve.is_baseline:
-                yield _of_the_baseline(name, curve, evidence)
-                yield from _at_the_first_rung(name, curve, curves, evidence)
-                yield from _of_frozen(name, curve, boards.get(name, []), evidence)
+                yield _of_the_baseline(name, curve, found)
+                yield from _at_the_first_rung(name, curve, curves, found)
+                yield from _of_frozen(name, curve, boards.get(name, []), found)
 
 
 def rate_lines(frontiers: Curves) -> Iterator[tuple[str, ...]]:
@@ -42,7 +43,7 @@ def rate_lines(frontiers: Curves) -> Iterator[tuple[str, ...]]:
                 yield name, curve.method, f"{one.factor:g}", learned, kept, str(len(one.seeds))
 
 
-def _of_the_baseline(name: str, curve: Curve, evidence: Callable[[str], Evidence]) -> str:
+def _of_the_baseline(name: str, curve: Curve, evidence: Evidence) -> str:
     """Return what plain fine-tuning keeps at the first rung, and at the one where it keeps most."""
     first, best = curve.rungs[0], _best(curve)
     more = ""
@@ -51,7 +52,7 @@ def _of_the_baseline(name: str, curve: Curve, evidence: Callable[[str], Evidence
             f", and {format_interval(best.kept)} at {rate_text(best.factor)}, where it learns "
             f"{format_interval(best.learned)}"
         )
-        more += f". {_gain_of_a_rate(first, best, len(curve.rungs), evidence(name))}"
+        more += f". {_gain_of_a_rate(first, best, len(curve.rungs), evidence)}"
     kept = format_interval(first.kept)
     return f"On {name}, plain fine-tuning keeps {kept} at {rate_text(first.factor)}{more}."
 
@@ -67,7 +68,7 @@ def _gain_of_a_rate(first: Rung, best: Rung, rates: int, evidence: Evidence) -> 
 
 
 def _at_the_first_rung(
-    name: str, baseline: Curve, curves: Sequence[Curve], evidence: Callable[[str], Evidence]
+    name: str, baseline: Curve, curves: Sequence[Curve], evidence: Evidence
 ) -> Iterator[str]:
     """Yield what the methods without prior demonstrations keep at the learning rate of the first rung.
 
@@ -86,7 +87,7 @@ def _at_the_first_rung(
         listed = ", ".join(f"`{method}` {format_interval(kept[method])}" for method in falling)
         best = _best(baseline)
         over = [
-            f"{_kept_more(evidence(name), rung(falling[0], factor), rung(BASELINE, other))} more than plain "
+            f"{_kept_more(evidence, rung(falling[0], factor), rung(BASELINE, other))} more than plain "
             f"fine-tuning at {rate_text(other)}"
             for other in dict.fromkeys((factor, best.factor))
         ]
@@ -106,9 +107,7 @@ def _kept_more(evidence: Evidence, method: str, other: str) -> str:
     return format_interval(evidence.difference("kept", method, other).estimate)
 
 
-def _of_frozen(
-    name: str, baseline: Curve, rows: Sequence[Row], evidence: Callable[[str], Evidence]
-) -> Iterator[str]:
+def _of_frozen(name: str, baseline: Curve, rows: Sequence[Row], evidence: Evidence) -> Iterator[str]:
     """Yield what a policy that learns nothing keeps by this measure, and whether fine-tuning keeps more."""
     for row in rows:
         if row.method == FROZEN:
@@ -117,5 +116,5 @@ def _of_frozen(
                 f"On {name}, `{FROZEN}`, which learns nothing, keeps "
                 f"{format_interval(row.estimates['kept'])} by this measure: a target that was never learned "
                 f"counts as not kept. Plain fine-tuning at {rate_text(best.factor)} keeps "
-                f"{_kept_more(evidence(name), rung(BASELINE, best.factor), FROZEN)} more, seed by seed."
+                f"{_kept_more(evidence, rung(BASELINE, best.factor), FROZEN)} more, seed by seed."
             )
