@@ -62,9 +62,11 @@ def listed(parts: Iterable[str]) -> str:
     return " and ".join([*filter(None, [", ".join(first)]), last])
 
 
-def minutes(seconds: float) -> str:
-    """Return a time as minutes and seconds, such as "2:05"."""
-    return f"{int(seconds) // 60}:{int(seconds) % 60:02d}"
+def clock_time(seconds: float) -> str:
+    """Return a duration as minutes and seconds, "2:05", from an hour on with hours: "1:02:05"."""
+    minutes, seconds = divmod(int(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02d}:{seconds:02d}" if hours else f"{minutes}:{seconds:02d}"
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:

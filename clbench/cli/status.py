@@ -14,7 +14,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from clbench.base.errors import InputError
-from clbench.base.text import counted, listed, minutes, print_plain, printable, shortened
+from clbench.base.text import clock_time, counted, listed, print_plain, printable, shortened
 from clbench.cli.arguments import (
     AsJson,
     MethodName,
@@ -156,8 +156,8 @@ def _line(state: RunState, records: Path) -> str | None:
         if state.progress is None:
             return f"{name}: begun by {state.owner}"
         left = state.seconds_left
-        rest = "" if left is None else f", about {minutes(left)} left"
-        spent = minutes(state.progress.seconds)
+        rest = "" if left is None else f", about {clock_time(left)} left"
+        spent = clock_time(state.progress.seconds)
         return f"{name}: {state.progress.share:.0%} after {spent}{rest}, {state.owner}"
     if state.reason is not None:
         path = str(state.path)  # a folder may have a line break in its name
@@ -172,7 +172,7 @@ def _summary(states: Sequence[RunState]) -> str:
     parts = [f"{counts[name]} {name}" for name in STATES if counts[name]]
     text = f"{counted(len(states), 'run')}: {', '.join(parts)}."
     left = seconds_left(states)
-    return text if left is None else f"{text} About {minutes(left)} left with {counts['running']} at once."
+    return text if left is None else f"{text} About {clock_time(left)} left with {counts['running']} at once."
 
 
 def _values(state: RunState, records: Path) -> dict[str, Any]:

@@ -13,10 +13,13 @@ from rich.markup import escape
 from rich.progress import BarColumn, Progress, TaskID, TaskProgressColumn, TextColumn, TimeElapsedColumn
 from rich.progress import TimeRemainingColumn as TimeLeftColumn
 
-from clbench.base.text import minutes, print_plain, printable, printable_lines
+from clbench.base.text import clock_time, print_plain, printable, printable_lines
 
 LINE_SECONDS = 30.0
 """Seconds between two lines without a terminal."""
+
+KNOWN = 0.01
+"""Share of all work from which the time left is told: after 30 s of a work of hours it told two weeks."""
 
 AT_ONCE = 1.0
 """Seconds in which a piece ends that was done before, for example because its result is cached."""
@@ -94,8 +97,8 @@ class Bars:
         if self._progress.disable and now - self._last_line >= LINE_SECONDS:
             self._last_line = now
             share = min(1.0, self._done / self._total)
-            # the time left is unknown before any work is done
-            left = f", about {minutes((now - self._started) * (1 - share) / share)} left" if share else ""
+            seconds = (now - self._started) * (1 - share) / share if share >= KNOWN else None
+            left = "" if seconds is None else f", about {clock_time(seconds)} left"
             self.say(f"{share:4.0%}{left}: {'; '.join(self._text.values())}")
 
     def skip(self, piece: Hashable, length: float, text: str) -> None:

@@ -35,9 +35,11 @@ class _Lane:
 class DMControlVectorWorld:
     """Bodies of dm_control with the tasks of `RULES`; the module `state` documents the layout of states.
 
-    It is a `clbench.worlds.world.VectorWorld`. An action (2,) in [-1, 1] sets the motors for one step of 0.04
-    s, or 0.16 s for the point mass; a body with one motor ignores the second number. An episode succeeds at
-    its last step, the 100th, if its return is at least 0.8 of the mean return of the expert's episodes.
+    An action (2,) in [-1, 1] sets the motors for one step of 0.04 s, or 0.16 s for the point mass; a body
+    with one motor ignores the second number. An episode succeeds at its last step, the 100th, if its return
+    is at least 0.8 of the mean return of the expert's episodes.
+
+    It is a `clbench.worlds.world.VectorWorld`.
 
     Args:
         lanes: Number of lanes. A lane allocates its memory when it first has a body.

@@ -2,8 +2,7 @@
 
 The first 8 are the observation of the body's dm_control environment, in its order and units, padded with
 zeros. The next 8 mark observed numbers with 1 and padding with 0. The last 3 are a one-hot code of the body,
-in the order of `BODIES`. Actions have 2 numbers: a body with one motor ignores the second. Lengths are in
-metres, angles in radians, speeds per second.
+in the order of `BODIES`. Lengths are in metres, angles in radians, speeds per second.
 """
 
 from __future__ import annotations
@@ -27,6 +26,7 @@ ACTION_SIZE = 2
 OBSERVATION_SIZE = 8
 SIZE = 2 * OBSERVATION_SIZE + len(BODIES)
 BODY = slice(2 * OBSERVATION_SIZE, SIZE)
+"""One-hot code of the body, in the order of `BODIES`."""
 
 
 def padded(body: str, observation: Observation) -> State:

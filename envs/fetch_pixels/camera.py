@@ -62,6 +62,9 @@ ARM = (0.75, 0.75, 0.75, 1.0)
 class FetchCamera:
     """Draws states of the pixel scenario; a picture does not depend on earlier ones.
 
+    A policy gets the picture and ten measurements of the robot: the position of the gripper, the opening of
+    each finger, the velocity of the gripper and that of each finger, in metres and metres per step.
+
     Args:
         size: Width and height of a picture in pixels.
         scale: Number of drawn pixels per pixel of the picture along each side; averaging smooths edges.

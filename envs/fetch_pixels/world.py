@@ -42,6 +42,8 @@ Vectors = NDArray[np.float64]
 class FetchPixelsVectorWorld(FetchVectorWorld):
     """The episodes of `FetchVectorWorld`, with all targets on the table and two things in each episode.
 
+    Actions and rewards are those of `clbench/Fetch-v1`.
+
     States (N, 56) contain everything that the experts, the questions and the camera need. A policy gets only
     pictures and the numbers that `FetchCamera.proprioception` returns.
 

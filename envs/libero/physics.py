@@ -24,10 +24,11 @@ from .state import SIZE, State
 class LiberoVectorWorld:
     """LIBERO's tasks with their own physics and success conditions, bit for bit.
 
-    It is a `clbench.worlds.world.VectorWorld`. An action (7,) in [-1, 1] displaces the goal of the hand from
-    its place by up to 5 cm along x, y and z and by up to 0.5 rad around them, and closes (+1) or opens (-1)
-    the fingers; a step takes 0.05 s. The reward is 1 with success, and 0 otherwise. Only success ends an
-    episode; the caller counts its steps.
+    An action (7,) in [-1, 1] displaces the goal of the hand from its place by up to 5 cm along x, y and z and
+    by up to 0.5 rad around them, and closes (+1) or opens (-1) the fingers; a step takes 0.05 s. The reward
+    is 1 with success, and 0 otherwise.
+
+    It is a `clbench.worlds.world.VectorWorld`. Only success ends an episode; the caller counts its steps.
 
     From the same places of fixtures and the same initial state, all trajectories and successes are LIBERO's.
     The differences:

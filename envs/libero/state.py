@@ -1,8 +1,8 @@
 """Layout of the state of the LIBERO world: 213 numbers, lengths in metres.
 
-x grows away from the robot, y to its left, z up. Quaternions begin with their scalar. The numbers of each of
-`THINGS` have the same place in the states of all scenes. A scene has seven things; the numbers of the others
-are 0, and so are joints of fixtures that it lacks.
+x grows away from the robot, y to its left, z up. Quaternions begin with their scalar. Each thing has its
+place in the states of all scenes, in the order of `THINGS`. A scene has seven of the 20 things; the numbers
+of the others are 0, and so are joints of fixtures that it lacks.
 
 Positions of things are from the hand, and once more at a finer scale. A policy kept .81 of the skills of
 libero_goal with places in the room, .88 with positions from the hand, and .95 with the finer scale as well
@@ -50,6 +50,7 @@ SIZE = 9 + 10 * len(THINGS) + PARTS
 HAND = slice(0, 3)
 """Position of the point between the finger tips."""
 HAND_QUATERNION = slice(3, 7)
+"""Orientation of the hand."""
 FINGERS = slice(7, 9)
 """Positions of the fingers: (0.04, -0.04) open, (0, 0) closed."""
 PLACES = slice(9, 9 + 7 * len(THINGS))
@@ -57,7 +58,7 @@ PLACES = slice(9, 9 + 7 * len(THINGS))
 JOINTS = slice(PLACES.stop, PLACES.stop + PARTS)
 """Positions of the joints of fixtures: drawers, then the knob of the stove."""
 CLOSE_BY = slice(JOINTS.stop, SIZE)
-"""Positions from the hand once more, cut at `REACH` along each axis: three numbers for each thing."""
+"""Positions from the hand once more, cut at 5 cm (`REACH`) along each axis: three numbers for each."""
 REACH = 0.05
 """Metres. A policy scales each number by its spread, which is smaller for numbers that are cut."""
 

@@ -63,10 +63,10 @@ class _Order:
 class MetaWorldVectorWorld:
     """Meta-World's tasks with their own physics, observations, rewards and success conditions, bit for bit.
 
-    It is a `clbench.worlds.world.VectorWorld`. An action (4,) in [-1, 1] moves the hand by up to 1 cm along
-    x, y and z, and closes (+1) or opens (-1) the fingers; a step takes 0.0125 s. The state is Meta-World's
-    observation including the goal, and the reward is Meta-World's own, from 0 to 10. Only success ends an
-    episode; the caller counts its steps.
+    An action (4,) in [-1, 1] moves the hand by up to 1 cm along x, y and z, and closes (+1) or opens (-1) the
+    fingers; a step takes 0.0125 s. The reward is Meta-World's own, from 0 to 10.
+
+    It is a `clbench.worlds.world.VectorWorld`. Only success ends an episode; the caller counts its steps.
 
     Args:
         lanes: Number of lanes. The first reset to a task compiles its scene.

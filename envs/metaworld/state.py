@@ -1,7 +1,8 @@
 """Layout of the state of the Meta-World world: Meta-World's observation, 39 numbers, lengths in metres.
 
 The robot is at the origin and faces along y: x grows to its right, y away from it, z up. The first 18 numbers
-describe the current step, the next 18 the previous step, and the last 3 the goal.
+describe the current step, the next 18 the previous step, and the last 3 the goal. Number 3 is the opening of
+the fingers.
 """
 
 from __future__ import annotations
@@ -24,5 +25,6 @@ OBJECT = slice(4, 7)
 HAND_BEFORE = slice(18, 21)
 """Position of the hand in the previous step."""
 OBJECT_BEFORE = slice(22, 25)
+"""Position of the object in the previous step."""
 GOAL = slice(36, 39)
 """Goal position of the object, or of the hand in a reach."""

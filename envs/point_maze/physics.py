@@ -67,10 +67,11 @@ class _Lane:
 class PointMazeVectorWorld:
     """The ball, the physics and the observation of PointMaze in three mazes, with the tasks of `GOALS`.
 
-    It is a `clbench.worlds.world.VectorWorld`. An action (2,) in [-1, 1] pushes the ball to the right and
-    upwards for 0.1 s, by up to 24 m/s^2. The reward is minus the length of the way to the goal in metres,
-    through the centres of the cells, plus `SUCCESS_BONUS` on success. Only success ends an episode; the
-    caller counts its steps.
+    An action (2,) in [-1, 1] pushes the ball to the right and upwards for 0.1 s, by up to 24 m/s^2. The
+    reward is minus the length of the way to the goal in metres, through the centres of the cells, plus 1 on
+    success.
+
+    It is a `clbench.worlds.world.VectorWorld`. Only success ends an episode; the caller counts its steps.
 
     Args:
         lanes: Number of lanes. A lane allocates its memory when it first enters a maze.

@@ -1,4 +1,4 @@
-"""A card for each scenario: its tasks, its budget, and whether it tells methods apart.
+"""A card for each scenario: its tasks, spaces and budget, and whether it tells methods apart.
 
 The same code, records, measurements and pictures give the same bytes.
 """
@@ -40,6 +40,7 @@ from ..board.runs import differences
 from ..board.summary import METHODS, RANKED_BY
 from ..views.format import MISSING
 from ..views.markdown import templates
+from .scenario_spaces import spaces_of
 from .scenario_tasks import Experts, picture_path
 
 GROUPS = {
@@ -146,6 +147,7 @@ class Card:
                 if task.name in self.pictures
             },
             without_picture=[task.name for task in self.scenario.tasks if task.name not in self.pictures],
+            spaces=spaces_of(self.scenario),
             budget=[(name, meanings[name], value) for name, value in values.items()],
             questions=resolve(self.scenario.questions),
             references=[*self._pretrained(), *references],

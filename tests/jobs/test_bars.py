@@ -47,6 +47,17 @@ def test_no_time_left_is_shown_before_any_work_is_done() -> None:
     assert file.getvalue() == "  0%: a\n"
 
 
+def test_the_time_left_is_told_from_one_per_cent_on_and_has_hours() -> None:
+    now = 0.0
+    file = io.StringIO()
+    with Bars(1000, Console(file=file, width=100), clock=lambda: now) as bars:
+        bars.start("a", 1000)
+        for amount in (9, 1):
+            now += 2 * LINE_SECONDS
+            bars.advance("a", amount)
+    assert file.getvalue() == "  1%: a\n  1%, about 3:18:00 left: a\n"
+
+
 def test_a_terminal_shows_bars_with_the_time_left() -> None:
     file = io.StringIO()
     with Bars(100, Console(file=file, width=100, force_terminal=True)) as bars:

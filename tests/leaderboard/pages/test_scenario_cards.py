@@ -4,7 +4,7 @@ import dataclasses
 import json
 import re
 from collections.abc import Callable, Iterable
-from itertools import chain
+from itertools import chain, pairwise
 from pathlib import Path
 from typing import Any
 
@@ -18,10 +18,13 @@ from clbench.base.entry_points import resolve
 from clbench.records.record import Record
 from clbench.records.writer import write_record
 from clbench.runs.spec import RunSpec
+from clbench.spec.registry import load_scenario
 from clbench.testing import TOY
 
 scenario_card = resolve("clbench.leaderboard.pages.cli:scenario_card")
+spaces_of = resolve("clbench.leaderboard.pages.scenario_spaces:spaces_of")
 
+GUIDES = Path(__file__).parents[3] / "docs" / "guide"
 GROUPS = ("retained", "target", "held_out")
 ONLINE = {"demonstrations": "never", "questions": "never", "reference": False, "online": True}
 NAMES = [task.name for task in TOY.tasks]
@@ -116,6 +119,45 @@ def test_every_task_has_its_group_picture_instructions_and_measured_expert(bench
     assert {picture.shape for picture in pictures} == {(240, 240, 3)}
     assert all(picture.max() > 200 for picture in pictures)  # the white point
     assert sum(path.stat().st_size for path in (bench.output / "Toy-v0").iterdir()) < 500_000
+
+
+def test_a_card_has_the_shapes_and_the_words_of_the_world(bench: Bench) -> None:
+    text = part(bench.card(), "States, actions and rewards")
+    assert '| `observation["state"]` | (4,) |' in text
+    assert "| `action` | (2,) | -1 to 1 |" in text
+    assert "image" not in text
+    assert "A task succeeds when the point has moved by 1 in the direction of the task" in text
+    assert "About this world" not in text  # it is in no suite with a guide
+
+
+@pytest.mark.parametrize(
+    ("name", "size", "words"),
+    [
+        ("Fetch-v1", 28, "| 25 to 27 | Position of the target marker. |"),
+        ("MetaWorld-v1", 39, "| 36 to 38 | Goal position of the object, or of the hand in a reach. |"),
+        ("PointMaze-v1", 11, "| 2 to 3 | Velocity of the ball. |"),
+        ("DMControl-v0", 19, "| 16 to 18 | One-hot code of the body, in the order of `BODIES`. |"),
+    ],
+)
+def test_a_card_says_what_each_number_of_a_state_is(name: str, size: int, words: str, bench: Bench) -> None:
+    scenario = load_scenario(f"clbench/{name}")
+    spaces = spaces_of(scenario)
+    places = [tuple(map(int, place.split(" to "))) for place, _ in spaces.parts]
+    assert spaces.state_size == size
+    assert all(first <= last < size for first, last in places)
+    assert all(before[1] < after[0] for before, after in pairwise(places))  # in order, and none twice
+    assert words in [f"| {place} | {meaning} |" for place, meaning in spaces.parts]
+    assert any(re.search(r"action \(\d,\) in \[-1, 1\]", paragraph) for paragraph in spaces.words)
+    assert spaces.guide is not None
+    page, _, heading = spaces.guide.partition("#")
+    titles = re.findall(r"^## (.*)$", (GUIDES / page).read_text(encoding="utf-8"), re.MULTILINE)
+    assert not heading or heading in [title.lower() for title in titles]
+
+
+def test_a_policy_with_a_camera_gets_the_numbers_that_the_camera_passes_on() -> None:
+    spaces = spaces_of(load_scenario("clbench/FetchPixels-v0"))
+    assert (spaces.image_size, spaces.state_size, spaces.parts) == (64, 10, ())
+    assert "ten measurements of the robot" in spaces.words[-1]
 
 
 def test_budget_and_questions_come_from_the_code(bench: Bench) -> None:
