@@ -54,7 +54,7 @@ MAZE := aegis $(SCHEDULED) experience_replay fast_dvla finch l2_sp lora sft stop
 CLAIMED := $(BOTH),clbench/PointMaze-v1
 
 # The settings of every method, from validation episodes of seeds that no board has. Run it before `make records`.
-tuning: .venv/installed-dev
+tuning: .venv/installed-libero
 	for id in $(BOARDS); do $(BIN)/clbench tune $$id $(METHODS) --write methods/tuned/$${id#clbench/}.json || exit; done
 	$(BIN)/clbench tune clbench/Fetch-v1 $(RIVALS) --write methods/tuned/Fetch-v1.json
 	$(BIN)/clbench tune clbench/PointMaze-v1 $(filter-out $(SCHEDULED),$(MAZE)) --write methods/tuned/PointMaze-v1.json
@@ -66,7 +66,7 @@ FIXED := clbench/DMControl-v0,clbench/FetchPixels-v0
 
 # The committed boards. Runs that have a record are skipped: a stopped command goes on. Seeds in fours are whole Latin
 # squares of orders. The policy of size base has one seed: 4.9 million parameters take up to 20 minutes a run.
-records: .venv/installed-dev
+records: .venv/installed-libero
 	$(BIN)/clbench run clbench/Fetch-v1 sft consft consft_calibrated --seeds 12 --perturb
 	$(BIN)/clbench run clbench/Fetch-v1 $(REFERENCES) $(METHODS) $(CONSFT_CONTROLS) $(RIVALS) --seeds 12
 	$(BIN)/clbench run clbench/MetaWorld-v1 $(REFERENCES) $(METHODS) $(CONSFT_CONTROLS) --seeds 8
@@ -149,8 +149,7 @@ test-slow: .venv/installed-dev
 	$(BIN)/pytest -m slow
 
 # LIBERO's scenario, and its world beside LIBERO's own, which the extra brings: 340 MB. Elsewhere its tests are skipped.
-libero-test: .venv/installed-dev
-	$(BIN)/pip install -q -c constraints.txt -e ".[dev,libero]"
+libero-test: .venv/installed-libero
 	$(BIN)/pytest tests/envs/test_libero.py tests/envs/test_libero_physics.py tests/envs/test_libero_scenario.py
 	$(BIN)/pytest tests/envs/test_every_scenario.py -k Libero
 
@@ -196,6 +195,10 @@ clean:
 
 .venv/installed-dev: .venv/installed
 	$(BIN)/pip install -q -c constraints.txt -e ".[dev]"
+	@touch $@
+
+.venv/installed-libero: .venv/installed-dev
+	$(BIN)/pip install -q -c constraints.txt -e ".[dev,libero]"
 	@touch $@
 
 .venv/installed-docs: .venv/installed

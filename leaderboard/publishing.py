@@ -22,7 +22,7 @@ from clbench.records.pinned import pinned_file
 from clbench.spec.identifiers import installed_methods
 
 from .board.frontier import ladder_of
-from .board.paths import CARDS, FILM
+from .board.paths import CARDS, FILM, beside
 from .board.summary import Summary
 from .policies.decoders import RESULTS
 from .views.csv import csv_text
@@ -47,7 +47,7 @@ _CODE = (
 
 def site_of(records: Path) -> Path:
     """Return the folder of the board for a folder of records."""
-    return Path(os.path.normpath(records / "../site"))
+    return beside(records, "site")
 
 
 def add_published(records: Path) -> int:
@@ -141,7 +141,20 @@ def write_site(board: Board, records: Path, inputs: dict[str, str]) -> list[Path
     texts[NUMBERS] = json.dumps({**kept, "content": content_hash(kept)}, indent=1) + "\n"
     site = site_of(records)
     sweep(site)
-    return write_all({site / name: text for name, text in texts.items()})
+    former = _files_of(site)
+    written = write_all({site / name: text for name, text in texts.items()})
+    for name in former - texts.keys():  # such as the picture of a frontier that is no more
+        (site / name).unlink(missing_ok=True)
+    return written
+
+
+def _files_of(site: Path) -> set[str]:
+    """Return the names of the files that the board of a folder was written to; none if that is unknown."""
+    try:
+        names = json.loads(read_regular(site / NUMBERS))["files"]
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+        return set()
+    return {name for name in names if isinstance(name, str) and Path(name).name == name}
 
 
 def _text_hash(content: bytes) -> str:

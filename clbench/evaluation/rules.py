@@ -57,6 +57,7 @@ class _Reached:
     def __init__(self, modules: set[str]) -> None:
         self.modules, self.texts = modules, dict[str, str]()
         self._objects: list[object] = []
+        self._first = dict[str, object]()
 
     def add(self, name: str, value: Any) -> None:
         """Add a value, found under a name, with all that it reaches."""
@@ -88,15 +89,16 @@ class _Reached:
             self.add(f"{name}.{key}", one)
 
     def _add_class(self, value: type) -> None:
-        if value.__module__ not in self.modules or value.__qualname__ in self.texts:
+        name = self._own_name(value.__qualname__, value.__module__, value)
+        if value.__module__ not in self.modules or name in self.texts:
             return
-        self.texts[value.__qualname__] = ", ".join(base.__qualname__ for base in value.__bases__)
+        self.texts[name] = ", ".join(base.__qualname__ for base in value.__bases__)
         for base in value.__bases__:
             self._add_class(base)
-        for name, one in vars(value).items():
+        for member, one in vars(value).items():
             function = getattr(one, "__func__", getattr(one, "fget", one))
-            if isinstance(function, FunctionType) or not name.startswith("__"):
-                self.add(f"{value.__qualname__}.{name}", function)
+            if isinstance(function, FunctionType) or not member.startswith("__"):
+                self.add(f"{name}.{member}", function)
 
     def _add_function(self, name: str, value: FunctionType) -> None:
         """Add the code of a function, and what it takes from its module and from the function around it."""
@@ -108,7 +110,12 @@ class _Reached:
         self.texts[name] = text
         self._add_all(name, inspect.getclosurevars(value).nonlocals)
         for other in sorted(names_in(value.__code__) & value.__globals__.keys()):
-            self.add(other, value.__globals__[other])
+            found = value.__globals__[other]
+            self.add(self._own_name(other, value.__module__, found), found)
+
+    def _own_name(self, name: str, module: str, value: object) -> str:
+        """Return a name of a module that no other value has: another value's gets its module before it."""
+        return name if self._first.setdefault(name, value) is value else f"{module}.{name}"
 
 
 def _is_wrapper(function: FunctionType) -> bool:

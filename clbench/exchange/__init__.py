@@ -1,1 +1,1 @@
-"""Demonstrations in and out: LeRobot and HDF5 files of others, and tasks that learn from such a file."""
+"""Data in and out: demonstrations as LeRobotDataset and HDF5, recorded ones from HDF5, records as tables."""

@@ -53,7 +53,7 @@ def export_demonstrations(
         tasks: Names of tasks, or one name; the retained skills and the targets if there are none.
 
     Raises:
-        InputError: The folder exists, or a world does not give its steps per second.
+        InputError: The folder exists or cannot be made, or a world does not give its steps per second.
         UnknownNameError: The format or a name is unknown.
         MissingPackageError: A package is not installed.
         LeakError: The running hooks of a method must not read them.
@@ -116,10 +116,16 @@ _WRITERS = {"lerobot": _write_dataset, "hdf5": _write_files}
 
 
 def _in_one_step(folder: Path, fill: Callable[[Path], None]) -> Path:
-    """Return a folder that appears when it is complete."""
-    folder.absolute().parent.mkdir(parents=True, exist_ok=True)
+    """Return a folder that appears when it is complete.
+
+    Raises:
+        InputError: The folder cannot be made.
+    """
     partial = unfinished(folder)
-    partial.mkdir()
+    try:
+        partial.absolute().mkdir(parents=True)
+    except OSError as error:
+        raise InputError(f"{folder} cannot be made: {error.strerror}.") from error
     try:
         fill(partial)
         return partial.rename(folder)

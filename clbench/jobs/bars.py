@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Hashable
+from dataclasses import dataclass
 from importlib.util import find_spec
 from types import TracebackType
 from typing import Self
@@ -22,7 +23,23 @@ KNOWN = 0.01
 """Share of all work from which the time left is told: after 30 s of a work of hours it told two weeks."""
 
 AT_ONCE = 1.0
-"""Seconds in which a piece ends that was done before, for example because its result is cached."""
+"""A piece that ends within so many seconds was done before: its result is cached, for example."""
+
+
+@dataclass
+class _Piece:
+    """A piece of work that is shown."""
+
+    bar: TaskID
+    """Its bar."""
+    length: float
+    """Its length."""
+    left: float
+    """Length that is left to do."""
+    begun: float
+    """Time of its start."""
+    text: str
+    """What is shown of it."""
 
 
 class Bars:
@@ -41,11 +58,7 @@ class Bars:
         self._clock = clock
         self._total, self._done = max(total, 1e-9), 0.0
         self._started = self._last_line = clock()
-        self._bars: dict[Hashable, TaskID] = {}
-        self._left: dict[Hashable, float] = {}
-        self._length: dict[Hashable, float] = {}
-        self._begun: dict[Hashable, float] = {}
-        self._text: dict[Hashable, str] = {}
+        self._pieces: dict[Hashable, _Piece] = {}
         self._progress = Progress(
             TextColumn("{task.description}"),
             BarColumn(),
@@ -73,24 +86,25 @@ class Bars:
 
     def start(self, piece: Hashable, length: float) -> None:
         """Show a new piece of work under its text, `str(piece)`."""
-        self._bars[piece] = self._progress.add_task(escape(printable(str(piece))), total=length)
-        self._left[piece] = self._length[piece] = length
-        self._begun[piece] = self._clock()
-        self._text[piece] = str(piece)
+        bar = self._progress.add_task(escape(printable(str(piece))), total=length)
+        self._pieces[piece] = _Piece(bar, length, length, self._clock(), str(piece))
 
     def place(self, piece: Hashable, place: str) -> None:
         """Show where a piece of work is, such as the stage of a run and its last success."""
-        self._text[piece] = f"{piece}, {place}"
-        self._progress.update(self._bars[piece], description=escape(printable(self._text[piece])))
+        shown = self._pieces[piece]
+        shown.text = f"{piece}, {place}"
+        self._progress.update(shown.bar, description=escape(printable(shown.text)))
 
     def share(self, piece: Hashable) -> float:
         """Return the share of a piece that is done."""
-        return 1.0 - self._left[piece] / max(self._length[piece], 1e-9)
+        shown = self._pieces[piece]
+        return 1.0 - shown.left / max(shown.length, 1e-9)
 
     def advance(self, piece: Hashable, amount: float) -> None:
         """Show that `amount` of a piece was done."""
-        self._left[piece] -= amount
-        self._progress.advance(self._bars[piece], amount)
+        shown = self._pieces[piece]
+        shown.left -= amount
+        self._progress.advance(shown.bar, amount)
         self._progress.advance(self._all, amount)
         self._done += amount
         now = self._clock()
@@ -99,7 +113,7 @@ class Bars:
             share = min(1.0, self._done / self._total)
             seconds = (now - self._started) * (1 - share) / share if share >= KNOWN else None
             left = "" if seconds is None else f", about {clock_time(seconds)} left"
-            self.say(f"{share:4.0%}{left}: {'; '.join(self._text.values())}")
+            self.say(f"{share:4.0%}{left}: {'; '.join(one.text for one in self._pieces.values())}")
 
     def skip(self, piece: Hashable, length: float, text: str) -> None:
         """Leave out a piece of work that need not be done, and print why."""
@@ -111,14 +125,15 @@ class Bars:
 
         What took no time does not count: it says nothing of how long the rest will take.
         """
-        if self._clock() - self._begun[piece] < AT_ONCE:
-            self._total = max(self._total - self._left[piece], self._done, 1e-9)
+        shown = self._pieces[piece]
+        if self._clock() - shown.begun < AT_ONCE:
+            self._total = max(self._total - shown.left, self._done, 1e-9)
             # a bar of which nothing is left to do is full
             self._progress.update(self._all, total=self._total, completed=min(self._done + 1e-9, self._total))
         else:
-            self.advance(piece, self._left[piece])
-        del self._left[piece], self._length[piece], self._text[piece], self._begun[piece]
-        self._progress.remove_task(self._bars.pop(piece))
+            self.advance(piece, shown.left)
+        del self._pieces[piece]
+        self._progress.remove_task(shown.bar)
         self.say(f"{piece}: {text}")
 
     def say(self, line: str) -> None:

@@ -13,7 +13,7 @@ import torch
 
 from clbench.base.text import counted
 from clbench.jobs import work
-from clbench.jobs.job import Job
+from clbench.jobs.job import Job, chain_times
 from clbench.jobs.plan import Plan
 from clbench.learning.optimise import optimise
 from clbench.learning.pretraining import policy_config
@@ -64,7 +64,10 @@ def forecast(
 
 def _time(jobs: Sequence[Job], scenarios: Sequence[Scenario], at_once: int) -> str:
     slowest = max(map(step_seconds, scenarios))
-    seconds = slowest * sum(job.duration for job in jobs) / min(at_once, len(jobs))
+    at_once = min(at_once, len(jobs))
+    # a run waits for its policy, and the policy for demonstrations, however many workers there are
+    longest = max(chain_times(jobs).values())
+    seconds = slowest * max(sum(job.duration for job in jobs) / at_once, longest)
     early = any(scenario.budget.criterion for scenario in scenarios)
     return (
         f"Time: about {_duration(seconds)} with {at_once} at once, at "

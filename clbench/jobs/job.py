@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, Protocol
 
@@ -37,8 +38,8 @@ class Job:
     pace: float = 1.0
     """Expected time of a unit of length, relative to an optimiser step."""
     makes: Path | None = None
-    """File that the job makes, which one command at a time may do: others wait, and do other jobs
-    meanwhile. None lets several do the job."""
+    """File that the job makes. One command at a time may do such a job; others wait, and do other jobs
+    meanwhile. If None, several commands may do it at once."""
     is_done: Callable[[], bool] | None = None
     """Returns whether another command has made the file."""
     has_failed: Callable[[], bool] | None = None
@@ -63,6 +64,25 @@ class Job:
     def new_lease(self) -> Lease | None:
         """Return the lease that a command needs to do the job, None if it needs none."""
         return None if self.makes is None else Lease(self.makes)
+
+
+def chain_times(jobs: Iterable[Job]) -> dict[Job, float]:
+    """Return the expected time of the longest chain that begins with each job, relative to an optimiser step.
+
+    Args:
+        jobs: Jobs, with all jobs that they need.
+    """
+    jobs = list(jobs)
+    dependents: dict[Job, list[Job]] = {job: [] for job in jobs}
+    for job in jobs:
+        for needed in job.needs:
+            dependents[needed].append(job)
+
+    @cache
+    def time_of_chain(job: Job) -> float:
+        return max(map(time_of_chain, dependents[job]), default=0.0) + job.duration
+
+    return {job: time_of_chain(job) for job in jobs}
 
 
 class Event(NamedTuple):

@@ -292,7 +292,10 @@ def _exit(code: int | None) -> str:
     """Return an exit code in words, with the name of the signal if one ended the process."""
     if code is None or code >= 0:
         return f"exit code {code}"
-    return f"exit code {code}, {signal.Signals(-code).name}"
+    try:
+        return f"exit code {code}, {signal.Signals(-code).name}"
+    except ValueError:  # the real-time signals between the first and the last have no name
+        return f"exit code {code}, signal {-code}"
 
 
 def _work(

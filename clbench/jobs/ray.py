@@ -5,17 +5,19 @@ from __future__ import annotations
 import logging
 import os
 import shutil
+import site
 import socket
 import sys
-import time
+import sysconfig
 from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import replace
+from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 from clbench.base.cache import cache_folder, hash_of
 from clbench.base.dependencies import require
-from clbench.base.errors import InputError, UnknownNameError
+from clbench.base.errors import ClbenchError, InputError, UnknownNameError
 from clbench.jobs.folders import absolute_places
 from clbench.jobs.job import Event, Job
 from clbench.jobs.processes import Processes
@@ -84,6 +86,8 @@ class RayWorkers:
             raise InputError(f"--ray must be auto, local or host:port, not {address!r}.") from error
         except (ConnectionError, RuntimeError) as error:
             raise _no_cluster(address) from error
+        except Exception as error:  # Ray has no class for "The current node timed out during startup"
+            raise ClbenchError(f"Ray did not start at {address!r}: {error}") from error
         self._progress_actor: Any = ray.remote(num_cpus=0)(_ProgressActor).remote()
         self._running: dict[Any, Job] = {}
         self._shown: defaultdict[Job, float] = defaultdict(float)
@@ -102,9 +106,6 @@ class RayWorkers:
 
     def events(self) -> Iterator[Event]:
         """Yield the events since the last call; wait at most a second for one."""
-        if not self._running:  # the cluster has no cores yet
-            time.sleep(1.0)
-            return
         ended, _ = self._ray.wait(list(self._running), num_returns=1, timeout=1.0)
         done = self._amounts()
         for job in self._running.values():
@@ -143,8 +144,11 @@ class RayWorkers:
         except self._ray.exceptions.RayError as error:
             first = str(error).strip().partition("\n")[0]
             return "failed", f"{lost}{type(error).__name__}: {first}"
-        for path, record in result.records.items():
-            write_result(record, job.arguments["records"] / path)
+        try:
+            for path, record in result.records.items():
+                write_result(record, job.arguments["records"] / path)
+        except (ClbenchError, OSError) as error:  # the other jobs go on
+            return "failed", f"its record cannot be written: {error}"
         return result.kind, result.value
 
 
@@ -237,7 +241,9 @@ def _do_apart(actor: Any, job: Job) -> tuple[Outcome, str]:
 
 def _environment() -> dict[str, str]:
     """Return the environment in which workers find the same modules and caches as this process."""
-    installed = (sys.prefix, sys.base_prefix)
-    paths = [path for path in sys.path if path and not path.startswith(installed)]
+    own = [*map(sysconfig.get_path, ("stdlib", "platstdlib")), *site.getsitepackages()]
+    paths = [
+        path for path in sys.path if os.path.isdir(path) and not any(map(Path(path).is_relative_to, own))
+    ]
     passed_on = {name: os.environ[name] for name in _PASSED_ON if name in os.environ}
     return {"PYTHONPATH": os.pathsep.join(paths), **passed_on, **absolute_places()}

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterable, Sequence
-from functools import cache
 
 from rich.console import Console
 
 from clbench.base import interrupts
 from clbench.base.errors import ClbenchError
 from clbench.jobs.bars import Bars
-from clbench.jobs.job import Job, Workers
+from clbench.jobs.job import Job, Workers, chain_times
 
 DONE, FAILED = "done by another command", "failed in another command"
 
@@ -54,7 +53,7 @@ def run_jobs(jobs: Sequence[Job], workers: Workers, bars: Bars) -> dict[Job, str
                 started[job] = time.monotonic()
                 bars.start(job, job.duration)
             if not started and waiting:
-                leases.wait(waiting, bars)
+                leases.wait(waiting, workers.free() > 0, bars)
             for job, kind, value in workers.events() if started else ():
                 if kind == "progress":
                     bars.advance(job, value * job.pace)
@@ -94,7 +93,7 @@ class _Leases:
 
     def __init__(self, jobs: Sequence[Job]) -> None:
         self._all = {job: lease for job in jobs if (lease := job.new_lease()) is not None}
-        self._told = False
+        self._told = set[bool]()
 
     def take(self, ready: Iterable[Job], most: int) -> dict[Job, str | None]:
         """Take the leases of as many of the jobs as can be had, in their order, and return these jobs.
@@ -112,14 +111,18 @@ class _Leases:
                 taken[job] = f"its lease cannot be written: {error}"
         return taken
 
-    def wait(self, waiting: Sequence[Job], bars: Bars) -> None:
-        """Wait a moment, as other commands do all that is left, and say so the first time."""
-        if not self._told:
-            self._told = True
+    def wait(self, waiting: Sequence[Job], has_worker: bool, bars: Bars) -> None:
+        """Wait a moment, as other commands do what is left or no worker is free; say so the first time."""
+        if has_worker not in self._told:
+            self._told.add(has_worker)
+            left = "job" if len(waiting) == 1 else f"{len(waiting)} jobs"
             owners = {lease.owner for job in waiting if (lease := self._all.get(job)) is not None}
             names = ", ".join(sorted(str(owner) for owner in owners if owner is not None))
-            left = "job" if len(waiting) == 1 else f"{len(waiting)} jobs"
-            bars.say(f"Another command does the last {left}; waiting for {names or 'it'}.")
+            bars.say(
+                f"Another command does the last {left}; waiting for {names or 'it'}."
+                if has_worker
+                else f"No worker is free for the last {left}; waiting for one."
+            )
         time.sleep(WAIT_SECONDS)
 
     def report(self, job: Job, share: float) -> None:
@@ -149,16 +152,8 @@ def _by_urgency(jobs: Sequence[Job]) -> list[Job]:
 
     The longest run starts first, so that no worker is left alone with it at the end.
     """
-    dependents: dict[Job, list[Job]] = {job: [] for job in jobs}
-    for job in jobs:
-        for needed in job.needs:
-            dependents[needed].append(job)
-
-    @cache
-    def time_of_chain(job: Job) -> float:
-        return max(map(time_of_chain, dependents[job]), default=0.0) + job.duration
-
-    return sorted(jobs, key=lambda job: -time_of_chain(job))
+    times = chain_times(jobs)
+    return sorted(jobs, key=lambda job: -times[job])
 
 
 def _drop_hopeless(waiting: list[Job], failed: dict[Job, str]) -> list[Job]:

@@ -41,7 +41,7 @@ it is told to do a retained skill. Only the ends of stages have the last two. Ea
 """
 
 FARTHEST = 1e18
-"""A greater activation drift or shift than any policy has whose outputs are numbers of any use."""
+"""An activation drift or shift above this comes from a policy that diverged, and is recorded as None."""
 
 CHECK_COLUMNS = ("stage", "step", "episodes", "successes")
 """One row for each check of a stage's criterion. A check plays the target's validation episodes until its

@@ -18,7 +18,7 @@ from clbench.runs.tuning import rated_best, tuned
 from clbench.scoring.intervals import Estimate, Runs, estimate, row_generator
 from clbench.spec.references import BASELINE
 
-from .paths import LADDER
+from .paths import LADDER, beside
 from .runs import ALIKE, Run, Sifted, is_number, no_row, read_run, read_runs
 from .summary import DIVISIONS, GAIN
 
@@ -61,8 +61,8 @@ class Curve:
 
 
 def ladder_of(records: Path) -> Path:
-    """Return the folder of the ladder's records for a folder of records, from any working directory."""
-    return records.resolve().parent / LADDER.name
+    """Return the folder of the ladder's records for a folder of records."""
+    return beside(records, LADDER.name)
 
 
 def read_ladder(folder: Path) -> Sifted:

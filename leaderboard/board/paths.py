@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 SCENARIO = "clbench/Fetch-v1"
@@ -18,3 +19,8 @@ CARDS = Path(__file__).parents[2] / "docs/reference/scenarios"
 
 FILM = "film.gif"
 """File with a film of a scenario, in the folder of its card; `clbench film --output` makes it."""
+
+
+def beside(records: Path, name: str) -> Path:
+    """Return the path of a folder beside a folder of records; a link counts where it lies."""
+    return Path(os.path.normpath(records.absolute() / ".." / name))

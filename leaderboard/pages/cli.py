@@ -89,13 +89,13 @@ def method_pages(
         output: Folder of the pages.
     """
     from ..claims.judges import judge_all
-    from ..views.descriptions import built_in_methods
+    from ..views.descriptions import built_in_descriptions
     from ..views.files import write_all
     from .method_pages import Sources, pages
 
     evidence = _evidence(scenario, records, controls, optional=True)
     sources = Sources(evidence(without_module(scenario)), judge_all(evidence), _board(records).rows)
-    texts = pages(built_in_methods(), sources)
+    texts = pages(built_in_descriptions(), sources)
     with checked_input():
         write_all({output / name: text for name, text in texts.items()})
     Console().print(Text(f"Written: {len(texts)} pages in {output}"), soft_wrap=True)

@@ -104,7 +104,8 @@ def _replay_episodes(subject: Subject, policies: Sequence[Policy]) -> Check:
     at_ends = [row for row in every if protocol.is_end(row.point)]
     generator = np.random.default_rng(request.seed)
     chosen = generator.permutation(len(at_ends))[: request.episodes]
-    rows = [at_ends[index] for index in sorted(chosen)]
+    # a record may hold its episodes in any order; they are played again stage by stage
+    rows = sorted((at_ends[index] for index in sorted(chosen)), key=lambda row: row.stage)
     again: list[EpisodeRow] = []
     with closing(Evaluator(scenario, subject.spec.seed)) as evaluator:
         for stage, policy in enumerate(policies):
@@ -125,7 +126,7 @@ def _replay_episodes(subject: Subject, policies: Sequence[Policy]) -> Check:
     found = [
         f"{len(rows)} of {len(at_ends)} replayed, all ended as recorded",
         *([f"{unseen} before the ends of stages have no policy to replay"] if unseen else []),
-        f"{least_found(len(at_ends), len(rows))} made-up ones would have been found with 95 %",
+        f"{least_found(len(at_ends), len(rows))} made-up ones would be found with a probability of 95 %",
     ]
     return Check("episodes", "; ".join(found), True)
 

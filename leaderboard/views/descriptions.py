@@ -97,7 +97,7 @@ class Description:
         return paragraphs((text[:1].upper() + text[1:]).splitlines())
 
 
-def built_in_methods() -> list[Description]:
+def built_in_descriptions() -> list[Description]:
     """Return the descriptions of the methods that come with clbench, by name."""
     return [describe(name, load_method(name)) for name in method_names() if "/" not in name]
 

@@ -59,7 +59,7 @@ FITTING = ("final_average", "gain", "adaptation", "retention", "kept")
 """Metrics of `TO_CRITERION` in a terminal of 108 columns."""
 
 NOT_FITTING = ("perturbed_retention", "zero_shot")
-"""Metrics of `FIXED` that it has no room for."""
+"""Metrics of `FIXED` for which a terminal of 108 columns has no room."""
 
 MISSING = "-"
 """Text for a value that could not be computed."""

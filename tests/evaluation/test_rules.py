@@ -143,6 +143,24 @@ def test_of_the_rules_of_a_suite_the_entry_of_the_task_counts_alone(
     assert (codes[0] != codes[1]) == changed
 
 
+@pytest.mark.parametrize(("changed", "name"), [("world", "LIMIT"), ("rules", "LIMIT"), ("rules", "size")])
+def test_values_of_one_name_in_two_modules_both_count(
+    changed: str, name: str, module: Callable[[str, str], str]
+) -> None:
+    sources = {
+        "rules": "LIMIT = 0.5\nclass Near:\n    size = 3\ndef far(x): return Near.size * x < LIMIT\n",
+        "world": "from .rules import far\nLIMIT = 0.05\nclass Near:\n    size = 4\n"
+        "class World:\n    def step(self, x): return far(x) and Near.size * x < LIMIT\n",
+    }
+    codes = []
+    for package, after in (("one_suite", ""), ("other_suite", "1")):
+        texts = sources | {changed: sources[changed].replace(f"{name} = ", f"{name} = {after}")}
+        for part in ("__init__", "rules", "world"):
+            module(f"{package}.{part}", texts.get(part, ""))
+        codes.append(rule_code(dataclasses.replace(TOY.retained[0], world=f"{package}.world:World")))
+    assert codes[0].replace("one_suite", "other_suite") != codes[1]
+
+
 def test_objects_that_name_each_other_end(module: Callable[[str, str], str]) -> None:
     source = (
         NEAR

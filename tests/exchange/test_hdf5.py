@@ -375,3 +375,9 @@ def test_attributes_that_say_nothing_are_no_fault(exported: Path) -> None:
         file["data"].attrs["env_args"] = "[1]"
     task: Task = dataclasses.replace(TASK, instructions=("another",))
     assert len(read_hdf5(exported, task)) == 10
+
+
+def test_a_place_in_which_no_folder_can_be_made_is_named(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("", encoding="utf-8")
+    with pytest.raises(InputError, match="cannot be made: Not a directory"):
+        export_demonstrations(TOY, tmp_path / "file" / "out", format="hdf5")

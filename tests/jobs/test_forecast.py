@@ -34,7 +34,7 @@ RUNS = [RunSpec(TINY.id, "sft", seed).resolve() for seed in range(2)]
     [
         (18_000, 1, "about 54 minutes with 1 at once"),  # 3 jobs, one at half of the pace: 2.5 x 18,000 steps
         (18_000, 2, "about 27 minutes with 2 at once"),
-        (18_000, 8, "about 18 minutes with 8 at once"),  # there are no more than three jobs
+        (18_000, 8, "about 22 minutes with 3 at once"),  # there are three jobs, and the longest takes 22
         (29_000, 1, "about 87 minutes with 1 at once"),
         (31_000, 1, "about 1.6 hours with 1 at once"),
     ],
@@ -46,6 +46,15 @@ def test_the_time_is_that_of_all_jobs_shared_by_the_workers(
     jobs = [_job(work.do_run, length), _job(work.pretrain, length), _job(work.do_run, length, 0.5)]
     _, time, _ = forecast(_plan(*jobs), RUNS, workers, None)
     assert time == f"Time: {words}, at 72 ms for an optimiser step here."
+
+
+def test_more_workers_do_not_shorten_the_longest_chain(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "step_seconds", lambda _: 0.06)
+    pretraining = _job(work.pretrain, 3000)
+    runs = [Job("a run", work.do_run, {}, 1000 * (1 + number), (pretraining,)) for number in range(4)]
+    _, time, _ = forecast(_plan(pretraining, *runs), RUNS, 16, None)
+    # 3,000 and then 4,000 steps of 60 ms; all 13,000 on the five workers that have a job take 2.6 minutes
+    assert time == "Time: about 7 minutes with 5 at once, at 60 ms for an optimiser step here."
 
 
 def test_the_disk_is_that_of_policies_demonstrations_and_records(monkeypatch: pytest.MonkeyPatch) -> None:

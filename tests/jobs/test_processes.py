@@ -53,6 +53,10 @@ def has_a_helper(progress):
     helper.join()
     return f"its helper ended with {helper.exitcode}"
 
+def ends_by(progress, number):
+    os.kill(os.getpid(), number)
+    time.sleep(600)
+
 def interrupts(progress):
     raise KeyboardInterrupt("of its own")
 
@@ -97,6 +101,12 @@ def test_a_job_whose_forked_child_lives_on_is_lost_at_once(tmp_path: Path, bars:
     assert reason == "its process ended without a result (exit code -9, SIGKILL)"
     assert time.monotonic() - begin < 300
     assert _is_gone(int(path.read_text()))
+
+
+@pytest.mark.parametrize(("number", "name"), [(9, "SIGKILL"), (40, "signal 40")])
+def test_a_job_that_a_signal_ends_is_lost_with_its_name_or_number(number: int, name: str, bars: Bars) -> None:
+    (reason,) = run_jobs([_job("ends_by", number=number)], Processes(1), bars).values()
+    assert reason == f"its process ended without a result (exit code -{number}, {name})"
 
 
 def test_closing_ends_a_job_that_ignores_it_and_its_children(

@@ -279,6 +279,27 @@ class _Two:
         pass
 
 
+def test_without_a_free_worker_the_scheduler_waits_for_one_and_says_so_once(
+    bars: Bars, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("clbench.jobs.scheduler.WAIT_SECONDS", 0.0)
+
+    class Late(_Two):
+        """Workers of a cluster that has no core at first."""
+
+        looks = 0
+
+        def free(self) -> int:
+            self.looks += 1
+            return 0 if self.looks < 9 else 2
+
+    good = _function("good")
+    assert run_jobs([Job("one", good, {}, 1.0), Job("other", good, {}, 1.0)], Late(), bars) == {}
+    first, *rest = printed(bars).splitlines()
+    assert first == "No worker is free for the last 2 jobs; waiting for one."
+    assert [line.partition(":")[0] for line in rest] == ["one", "other"]
+
+
 def test_progress_is_counted_in_the_expected_time_of_each_job(monkeypatch: pytest.MonkeyPatch) -> None:
     totals, advanced = [], []
 

@@ -2,6 +2,7 @@
 
 import errno
 import io
+import json
 import os
 import subprocess
 import sys
@@ -143,6 +144,22 @@ def test_a_board_whose_reader_leaves_is_written_whole(
     site = four_methods.parent / "site"
     assert sorted(os.listdir(site)) == ["LEADERBOARD.md", "board.json", "index.html", "leaderboard.csv"]
     assert "replay" in (site / "leaderboard.csv").read_text(encoding="utf-8")
+
+
+def test_a_picture_of_a_former_board_is_removed_and_no_other_file(
+    four_methods: Path, shown: Callable[[], tuple[str, str]]
+) -> None:
+    shown()
+    site = four_methods.parent / "site"
+    kept = json.loads((site / "board.json").read_text(encoding="utf-8"))
+    kept["files"] |= {"frontier-Toy-v0.svg": "hash", "../records": "hash", "gone.svg": "hash"}
+    (site / "board.json").write_text(json.dumps(kept), encoding="utf-8")
+    for name in ("frontier-Toy-v0.svg", "mine.svg"):
+        (site / name).write_text("<svg/>", encoding="utf-8")
+    shown()
+    assert (site / "mine.svg").exists()
+    assert not (site / "frontier-Toy-v0.svg").exists()
+    assert four_methods.is_dir()
 
 
 def test_what_a_killed_command_left_beside_the_board_is_removed(

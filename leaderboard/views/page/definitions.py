@@ -51,9 +51,8 @@ def families(rows: Sequence[Row]) -> list[Family]:
     for family, title in FAMILIES.items():
         members = {metric for metric, one in DEFINITIONS.items() if one.family == family}
         members |= set(OF_CURVES.get(family, ()))
-        metrics = [
-            one for name, one in METRICS.items() if name in members and name != GAIN
-        ]  # a difference of a member
+        # the gain is a difference of final averages, and no definition of its own
+        metrics = [one for name, one in METRICS.items() if name in members and name != GAIN]
         metrics = [one for one in metrics if one.higher_is_better is not None]
         metrics = [one for one in metrics if any(row.estimates[one.name].value is not None for row in rows)]
         if len(metrics) < 2 or len(rows) < 2:

@@ -29,6 +29,17 @@ def _tuned(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(f"{MODULE}.tuned", lambda name: found if name == SCENARIO else {})
 
 
+def test_the_ladder_lies_beside_the_records_as_they_are_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "board").mkdir()
+    (tmp_path / "data").mkdir()
+    (tmp_path / "board" / "records").symlink_to(tmp_path / "data")
+    assert ladder_of(tmp_path / "board" / "records") == tmp_path / "board" / "ladder"
+    monkeypatch.chdir(tmp_path / "board" / "records")
+    assert ladder_of(Path("../board/records")) == tmp_path / "board" / "ladder"
+
+
 @pytest.mark.usefixtures("_tuned")
 def test_a_gain_over_a_tied_setting_is_that_over_plain_fine_tuning_there_on_common_seeds(
     even_board: Callable[..., Path],

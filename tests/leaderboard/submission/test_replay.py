@@ -4,6 +4,7 @@ import importlib
 import json
 import shutil
 from pathlib import Path
+from typing import Any
 
 import pytest
 from safetensors.torch import load_file, save_file
@@ -41,6 +42,15 @@ def test_policies_that_follow_from_another_start_than_pretraining_gives_are_refu
     assert found["from stage to stage"] is True
     assert found["start"] is False
     assert tiers.tier_of(mine) == "recomputed"
+
+
+def test_a_record_may_hold_its_episodes_in_any_order(mine: Path, honest: Path) -> None:
+    def turn_round(values: dict[str, Any]) -> None:
+        values["episodes"] = {name: column[::-1] for name, column in values["episodes"].items()}
+
+    edit(mine, turn_round)
+    assert all(check.passed for check in verify(mine, "replayed", honest))
+    assert tiers.tier_of(mine) == "replayed"
 
 
 def test_the_record_of_a_machine_that_pretrains_otherwise_cannot_be_replayed_here(

@@ -17,7 +17,7 @@ from ....board.summary import DIVISIONS, WITH_DEMONSTRATIONS
 from ...format import format_interval, number_text
 from .vega import SYSTEM_FONT, Size, Spec, axis, colour, heading, layer, rounded, specification
 
-SHAPES = ("circle", "square", "triangle-up", "diamond", "cross", "triangle-down")
+RATE_SHAPES = ("circle", "square", "triangle-up", "diamond", "cross", "triangle-down")
 """Shapes of the learning rates, the largest first."""
 
 BESIDE = "sft, in every panel"
@@ -132,7 +132,7 @@ def _look(points: Points, size: Size) -> Spec:
     grey = {"symbolFillColor": colour("muted"), "symbolStrokeColor": colour("muted")}
     rate: Spec = {"title": "learning rate", "titleColor": colour("ink"), "titleFontWeight": "normal"}
     rate |= {"titleFontSize": 12, "columns": len(factors), **grey}
-    shapes = [SHAPES[number % len(SHAPES)] for number in range(len(factors))]
+    shapes = [RATE_SHAPES[number % len(RATE_SHAPES)] for number in range(len(factors))]
     return {
         "color": {"field": "line", "type": "nominal", "legend": legend}
         | {"scale": {"domain": lines, "range": hues}},
