@@ -1,5 +1,7 @@
+import collections
 import contextlib
 import dataclasses
+import itertools
 import logging
 import re
 from pathlib import Path
@@ -80,12 +82,13 @@ def test_a_dataset_recovers_the_environment_that_made_it(empty_caches: Path) -> 
 def test_two_budgets_or_versions_never_share_a_folder(empty_caches: Path) -> None:
     others = (
         (TASK, dataclasses.replace(BUDGET, demonstrations=3)),
+        (TASK, dataclasses.replace(BUDGET, noisy_demonstrations=0.9)),
         (dataclasses.replace(TASK, horizon=TASK.horizon - 1), BUDGET),
     )
     first = dataset_folder(TASK, BUDGET)
     written = (first / "data" / "main_data.hdf5").stat().st_mtime_ns
-    assert len({first, *(dataset_folder(task, budget) for task, budget in others)}) == 3
-    assert [len(read_dataset(dataset_folder(*one))) for one in ((TASK, BUDGET), *others)] == [5, 3, 5]
+    assert len({first, *(dataset_folder(task, budget) for task, budget in others)}) == 4
+    assert [len(read_dataset(dataset_folder(*one))) for one in ((TASK, BUDGET), *others)] == [5, 3, 5, 5]
     assert (first / "data" / "main_data.hdf5").stat().st_mtime_ns == written
     assert not list((empty_caches / "minari").rglob("*.partial"))
 
@@ -114,6 +117,23 @@ def test_the_recorded_actions_replay_to_the_recorded_states_bit_for_bit() -> Non
     state, _ = world.reset(seed=7, options={"task": task.name})
     states = [state] + [world.step(action)[0] for action in episode.executed]
     assert np.array_equal(np.array(states), episode.state)
+
+
+def test_three_to_six_random_actions_in_a_row_replace_the_experts(monkeypatch: pytest.MonkeyPatch) -> None:
+    stay = np.zeros(2, np.float32)
+    monkeypatch.setattr("clbench.testing.lazy_expert", lambda _: lambda state: stay, raising=False)
+    task = dataclasses.replace(TASK, expert="clbench.testing:lazy_expert", horizon=40, action_noise=0.02)
+    lengths = []
+    for seed in range(200):
+        episode = demonstrate(ToyWorld(), task, seed, noisy=True)
+        random = (episode.executed != 0).any(axis=1)
+        assert np.array_equal(random, episode.noisy[:-1])
+        runs = [(is_random, len(list(run))) for is_random, run in itertools.groupby(random)]
+        lengths += [length for is_random, length in runs[:-1] if is_random]  # the last may be cut short
+    counts = collections.Counter(lengths)
+    assert min(counts) == 3
+    assert all(counts[length] > 0.1 * len(lengths) for length in (3, 4, 5, 6))
+    assert sum(counts[length] for length in counts if length > 6) < 0.1 * len(lengths)  # two in succession
 
 
 class OneArray(gymnasium.Wrapper[State, State, State, State]):

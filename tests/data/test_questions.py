@@ -1,10 +1,21 @@
 import dataclasses
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from safetensors.torch import load_file
 
-from clbench.data.questions import QuestionKind, Questions, load_questions, scored_questions, sign, which
+from clbench.data.questions import (
+    QuestionKind,
+    Questions,
+    load_questions,
+    scenes_folder,
+    scored_questions,
+    sign,
+    which,
+)
 from clbench.spec.language import word_id
 from clbench.spec.registry import load_scenario
 
@@ -37,6 +48,31 @@ def test_test_questions_are_about_other_episodes_than_training() -> None:
     assert len(markers[0]) == 40
     assert len(markers[1]) == 10
     assert not markers[0] & markers[1]
+
+
+def test_two_numbers_of_question_episodes_never_share_scenes(empty_caches: Path) -> None:
+    half = dataclasses.replace(TOY, budget=dataclasses.replace(TOY.budget, question_episodes=20))
+    folders = [scenes_folder(one) for one in (TOY, half)]
+    whole, part = (load_file(folder / "scenes.safetensors")["train"] for folder in folders)
+    assert len(whole) > len(part)
+    assert whole[: len(part)].equal(part)
+
+
+def test_the_answers_of_a_kind_are_as_frequent_whatever_the_number_of_answers_of_the_others() -> None:
+    def third(states: Any) -> Any:
+        return np.arange(len(states)) % 3
+
+    def half(states: Any) -> Any:
+        return np.arange(len(states)) % 2
+
+    kinds = (
+        QuestionKind("side", ("which side",), ("left", "right"), half),
+        QuestionKind("place", ("where is it",), ("above", "below", "left"), third),
+    )
+    questions = Questions(kinds, torch.zeros(60, 4))
+    batch = questions.ask(torch.ones(3000, dtype=torch.int64), torch.Generator().manual_seed(0))
+    counts = [int((batch.answer == word_id(answer)).sum()) for answer in kinds[1].answers]
+    assert all(900 < count < 1100 for count in counts), counts
 
 
 def test_every_evaluation_asks_the_same_questions_as_many_of_each_kind() -> None:

@@ -6,12 +6,19 @@ from pathlib import Path
 import pytest
 import torch
 
+from clbench.data.questions import Questions, scored_questions
+from clbench.data.training_data import TrainingData
+from clbench.evaluation.examiner import Examiner
 from clbench.learning.method import Method, Stage
+from clbench.learning.pretraining import policy_config
 from clbench.policy.policy import Policy
+from clbench.policy.transformer import TransformerPolicy
 from clbench.records.reader import read_record
+from clbench.records.record import Record
 from clbench.runs.run import execute
 from clbench.runs.spec import RunSpec
 from clbench.scoring.scores import Scores
+from clbench.spec.protocol import ScoredSplit
 
 
 @dataclasses.dataclass
@@ -38,3 +45,48 @@ def test_a_policy_whose_hidden_states_overflow_has_no_drift_and_a_record_that_ca
     assert record.policy["activation_drift"][:-1].count(None) == 0
     assert record.policy["activation_drift"][-1] is None
     Scores.from_record(record)
+
+
+def _moments(policy: Policy, questions: Questions, count: int) -> list[tuple[torch.Tensor, torch.Tensor]]:
+    """Return the mean and the deviation of each layer's hidden states on the questions that are scored."""
+    _, asked = scored_questions(questions, count)
+    with torch.no_grad():
+        hidden = policy.eval().hidden_states(asked.state, asked.words, asked.image)
+    read = policy.token_mask(asked.words)[:, 0, 0]
+    rows = [states[read].double() for states in hidden]
+    return [(one.mean(dim=0), (one.var(dim=0, correction=0) + 1e-6).sqrt()) for one in rows]
+
+
+@pytest.mark.parametrize("split", ["test", "validation"])
+def test_a_tuning_run_looks_at_training_questions_alone_and_the_drift_is_a_mean_over_layers(
+    split: ScoredSplit,
+) -> None:
+    run = RunSpec("tiny:me/Tiny-v0", "sft", 0, split=split).resolve()
+    config = dataclasses.replace(policy_config(run.scenario), layers=3)
+    pretrained, policy = (TransformerPolicy(config, seed=1) for _ in range(2))
+    generator, still, total = torch.Generator().manual_seed(0), 0, 0
+    with torch.no_grad():
+        for weight in policy.parameters():
+            moves = torch.rand(weight.shape, generator=generator) < 0.5
+            weight += 0.1 * (weight.abs() + 1) * moves
+            still += int((~moves).sum())
+            total += weight.numel()
+    data = TrainingData.open(run.scenario, config)
+    record = Record("success", run.info, run.scenario_info)
+    examiner = Examiner(run.scenario, run.protocol, data, pretrained, seed=0)
+    examiner.examine(policy, run.protocol.end(0), record)
+    examiner.close()
+    questions = data.questions if split == "validation" else data.test_questions
+    count = run.scenario.budget.test_questions
+    before, now = (_moments(one, questions, count) for one in (pretrained, policy))
+    away = [
+        sum(float((one - other).square().sum()) for one, other in zip(new, old, strict=True))
+        for new, old in zip(now, before, strict=True)
+    ]
+    assert record.policy["activation_drift"] == pytest.approx([sum(away) / 3], rel=1e-4)
+    assert record.policy["update_sparsity"] == [still / total]
+    kind, asked = scored_questions(questions, count)
+    with torch.no_grad():
+        right = policy.answer_logits(asked.state, asked.words, asked.image).argmax(dim=1) == asked.answer
+    assert record.answers["asked"] == torch.bincount(kind).tolist()
+    assert record.answers["correct"] == torch.bincount(kind, right.double()).int().tolist()

@@ -339,6 +339,16 @@ def test_a_metric_without_value_has_no_interval() -> None:
     assert estimate(["retention"], {}, np.random.default_rng(0)) == {"retention": NO_ESTIMATE}
 
 
+def test_a_reference_meets_the_draws_of_the_method_that_is_compared_with_it() -> None:
+    generator = np.random.default_rng(5)
+    runs, others = ({0: scores(generator.integers(0, 2, size=(2, 20)))} for _ in range(2))
+    same = estimate(["gain"], runs, np.random.default_rng(0), references={"sft": runs})["gain"]
+    assert same == of_episodes(0.0, 0.0, 0.0)
+    found = estimate(["gain"], runs, np.random.default_rng(0), references={"sft": others})["gain"]
+    paired = paired_difference("final_average", runs, others, np.random.default_rng(0))
+    assert (found.low, found.high) == pytest.approx((paired.low, paired.high))
+
+
 def test_a_reference_that_lacks_a_seed_is_missing() -> None:
     runs = {seed: scores([[1, 0]]) for seed in range(2)}
     short = {"from_scratch": {0: runs[0]}}

@@ -121,6 +121,14 @@ def test_the_share_of_right_answers_is_missing_where_a_kind_was_not_asked(make_r
     np.testing.assert_array_equal(run.correct, [[10, 10], [0, 7], [0, 0]])
 
 
+def test_the_curve_of_answers_counts_the_questions_of_all_kinds_together(make_record: MakeRecord) -> None:
+    record = make_record(MATRIX, answers={(0, "left"): (30, 30), (0, "above"): (10, 10)})
+    append(record.answers, 1, 100, "left", 30, 15)
+    append(record.answers, 1, 100, "above", 10, 9)
+    run = Scores.from_record(record, partial=True)
+    assert run.answer_curves[0, 0] == (15 + 9) / (30 + 10)
+
+
 def test_the_episodes_on_the_way_weigh_as_often_as_they_were_drawn(scores: Callable[..., Scores]) -> None:
     outcomes = np.array([[[[1, 0]], [[0, 1]]]])  # one stage, two points on the way, one skill, two episodes
     run = scores(np.ones((2, 3, 4)), retained_curves=outcomes, steps=(1, 2, 4))

@@ -118,6 +118,11 @@ CASES: list[tuple[str, str, Given]] = [
     ("C2", "does not hold", {**_shares(0.1, 0.099), **SFT, **_kept(LESS, (0.2, 0.3)), **AT_ONE}),
     ("C2", "holds", {**_shares(0.1, 0.099), **SFT, **_kept((0.2, 0.3), LESS), **AT_ONE}),
     ("C2", "cannot be shown here", {**_shares(0.099, 0.099), **SFT, **_kept((0.2, 0.3), LESS), **AT_ONE}),
+    (
+        "C2",
+        "does not hold",
+        {**_shares(0.1, 0.099), **SFT, **_kept(LESS, LESS), **_kept(LESS, (0.2, 0.3), rung="@1")},
+    ),
     # plain fine-tuning keeps too much at both settings
     *[
         (
@@ -389,6 +394,16 @@ def test_a_saving_of_steps_counts_from_a_twentieth_on(
     stage = Figure("median", ("sft@1",), Estimate(median, None, None))
     monkeypatch.setattr(f"{MODULE}.fast_dvla.median_stage", lambda *_: stage)
     assert judged(identifier, given).verdict == verdict
+
+
+@pytest.mark.parametrize(("time", "says"), [((1.06, 1.2), True), ((1.04, 1.2), False)])
+def test_steps_are_said_to_cost_more_time_in_all_only_where_both_lower_ends_do(
+    time: Ends, says: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stage = Figure("median", ("sft@1",), Estimate(20, None, None))
+    monkeypatch.setattr(f"{MODULE}.fast_dvla.median_stage", lambda *_: stage)
+    finding = judged("F1", {SFT_STEPS.format(CO_TRAINING): SLOW, f"time of {CO_TRAINING}": time})
+    assert ("The steps to the criterion certainly cost more time in all." in finding.sentences) is says
 
 
 # ---- claims of a curve of answers --------------------------------------------------------------------------

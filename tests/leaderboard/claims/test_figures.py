@@ -19,6 +19,7 @@ from clbench.testing import TOY
 figures = {
     name: resolve(f"clbench.leaderboard.claims.figures:{name}")
     for name in (
+        "drift_ratio",
         "early_success",
         "kept",
         "learning_curve",
@@ -28,6 +29,7 @@ figures = {
         "share_afterwards",
         "share_between",
         "share_of_steps",
+        "sparsity",
     )
 }
 Figure = resolve("clbench.leaderboard.claims.evidence:Figure")
@@ -100,6 +102,20 @@ def test_the_loss_by_perturbation_is_that_from_what_was_learned(
     assert figures["perturbation_loss"](evidence, "sft").value == pytest.approx(1.0 - 0.65)
     gain = figures["perturbation_gain"](evidence, "consft", "sft")
     assert gain.value == pytest.approx((1.0 - 0.65) - (0.8 - 0.65))
+
+
+def test_sparsity_and_drift_are_those_after_the_last_target(bench: Bench, add: Callable[..., None]) -> None:
+    success = [[1, 1, 0, 0, 0], [1, 1, 1, 0, 0], [1, 1, 1, 1, 0]]
+    moved = {
+        "sft": {"sparsity": [[0.8, 0.7], [0.6, 0.5]], "drift": [[1.0, 2.0], [3.0, 4.0]]},
+        "consft": {"sparsity": [[0.9, 0.9], [0.9, 0.8]], "drift": [[1.0, 1.0], [1.0, 0.5]]},
+    }
+    for seed in range(2):
+        for method, values in moved.items():
+            add(method, seed, success, steps=(50, 100), **values)
+    evidence = bench.evidence()
+    assert figures["sparsity"](evidence, "consft", "sft").value == pytest.approx(0.8 - 0.5)
+    assert figures["drift_ratio"](evidence, "consft").value == pytest.approx(0.5 / 4.0)
 
 
 def test_a_target_that_no_policy_can_do_when_perturbed_costs_no_method_anything(
