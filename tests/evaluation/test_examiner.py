@@ -68,7 +68,7 @@ def test_a_tuning_run_looks_at_training_questions_alone_and_the_drift_is_a_mean_
     with torch.no_grad():
         for weight in policy.parameters():
             moves = torch.rand(weight.shape, generator=generator) < 0.5
-            weight += 0.1 * (weight.abs() + 1) * moves
+            weight.add_(0.1 * (weight.abs() + 1) * moves)
             still += int((~moves).sum())
             total += weight.numel()
     data = TrainingData.open(run.scenario, config)
