@@ -124,7 +124,8 @@ def run(
     for scenario in {run.spec.scenario: run.scenario for run in runs}.values():
         console.print(expected_precision(scenario, seeds), highlight=False)
     if dry_run:
-        _print_forecast(chosen, records, workers, checkpoints)
+        # nothing asks a cluster for its cores before there is work for it
+        _print_forecast(chosen, records, workers or (1 if ray else None), checkpoints)
         return
     went_well = do_runs(chosen, records, lambda: _workers(workers, ray), checkpoints, tensorboard, quiet)
     if not changes:  # the board shows no run with changed settings

@@ -244,6 +244,16 @@ def test_a_dry_run_says_what_would_be_done_and_does_nothing(
     assert not any(path.is_file() for path in empty_caches.rglob("*"))
 
 
+def test_a_dry_run_on_a_cluster_tells_the_time_of_one_core_and_starts_nothing(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = ["run", TOY, "sft", "--records", str(tmp_path / "records"), "--ray", "auto", "--dry-run"]
+    app(command, result_action="return_value")
+    assert "with 1 at once, at " in capsys.readouterr().out
+    app([*command, "--workers", "2"], result_action="return_value")
+    assert "with 2 at once, at " in capsys.readouterr().out
+
+
 @pytest.mark.parametrize("words", [["step_factor=0.3"], ["step_factor", "0.3"]])
 def test_a_hyper_parameter_set_in_the_usual_way_is_told_the_right_one(
     words: list[str], capsys: pytest.CaptureFixture[str]
