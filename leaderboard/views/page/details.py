@@ -139,7 +139,7 @@ def diagnostics(runs: Sequence[Run]) -> Diagnostics:
 
 
 def _mean(values: Sequence[Any]) -> tuple[str, str]:
-    """Return the mean over seeds as text and as a line; for other values than numbers, the first one."""
+    """Return the mean over seeds as text and as a line; of values that are no numbers, what all have."""
     if all(map(is_number, values)):
         return text_of(float(np.mean(values))), ""
     lengths = {
@@ -148,7 +148,10 @@ def _mean(values: Sequence[Any]) -> tuple[str, str]:
     if len(lengths) == 1 and min(lengths) > 1:
         points = np.mean(values, axis=0)
         return f"{text_of(float(points[0]))} → {text_of(float(points[-1]))}", _line(points)
-    return text_of(next((value for value in values if value is not None), None)), ""
+    if any(isinstance(value, list | dict) for value in values):
+        return "in the records", ""
+    texts = set(map(text_of, values))
+    return texts.pop() if len(texts) == 1 else "not the same in all seeds", ""
 
 
 def _line(points: np.ndarray[Any, Any]) -> str:

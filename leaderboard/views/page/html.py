@@ -82,7 +82,9 @@ def page(board: Board, comparisons: Comparisons) -> str:
     """
     tables = sorted_tables(board)
     views = scenarios(tables, board, comparisons)
-    scripts = [_source("page.js"), _library()]  # the page waits for the library only to draw
+    # the page waits for the library only to draw
+    scripts = [_source("choices.js"), _source("page.js"), _library()]
+    maps = heat_maps(tables)
     style = _source("style.css") + _colours()
     return (
         _templates()
@@ -93,7 +95,8 @@ def page(board: Board, comparisons: Comparisons) -> str:
             scripts=[Markup(script) for script in scripts],
             data=_packed(_data(views)),
             scenarios=views,
-            heat_maps=heat_maps(tables),
+            heat_maps=maps,
+            shown_divisions={row.division for one in maps for row in one.rows},
             not_shown=board.not_shown,
         )
     )

@@ -10,7 +10,7 @@
 
   /* The part or row that the address names. */
   function place() {
-    try { return decodeURIComponent(location.hash.slice(1)); } catch { return ""; /* "%" alone is no text */ }
+    try { return decodeURIComponent(location.hash.slice(1).split("?")[0]); } catch { return ""; /* "%" alone is no text */ }
   }
 
   /* Make the elements of a part from its text, in which the templates escaped what strangers wrote. */
@@ -102,18 +102,20 @@
     else hideTip();
   }, { capture: true, passive: true });
 
+  const NOTED = ":is(td, .turned)[data-note]";
+
   /* One number of a table is a stop of the Tab key; the arrow keys lead to the others. */
   function roam(table) {
-    const cells = () => [...table.tBodies].flatMap((body) => [...body.rows])
+    const cells = () => [...table.rows]
       .filter((row) => row.checkVisibility())
-      .map((row) => [...row.querySelectorAll("td[data-note]")].filter((cell) => cell.checkVisibility()))
+      .map((row) => [...row.querySelectorAll(NOTED)].filter((cell) => cell.checkVisibility()))
       .filter((row) => row.length);
-    for (const cell of table.querySelectorAll("td[data-note]")) cell.tabIndex = -1;
+    for (const cell of table.querySelectorAll(NOTED)) cell.tabIndex = -1;
     const first = cells()[0]?.[0];
     if (first) first.tabIndex = 0;
     table.addEventListener("keydown", (event) => {
       const step = { ArrowLeft: [0, -1], ArrowRight: [0, 1], ArrowUp: [-1, 0], ArrowDown: [1, 0] }[event.key];
-      const here = event.target.closest("td[data-note]");
+      const here = event.target.closest(NOTED);
       if (!step || !here) return;
       const all = cells(), row = all.findIndex((row) => row.includes(here));
       const line = all[row + step[0]], at = all[row].indexOf(here) + step[1];
@@ -134,8 +136,11 @@
     const rows = bodies.flatMap((body) => [...body.rows].slice(1).map((row) => ({ row, body })));
     const form = part.querySelector(".filters");
     const [all, grouped] = part.querySelectorAll(".choices input");
-    const sorted = heads.find((head) => head.ariaSort !== "none");
-    let column = heads.indexOf(sorted), direction = sorted.ariaSort;
+    const usual = heads.find((head) => head.ariaSort !== "none"), first = usual.ariaSort;
+    const [wanted, order] = choices.read(part, heads);
+    let column = heads.indexOf(wanted ?? usual);
+    let direction = wanted && ["ascending", "descending"].includes(order) ? order : heads[column].ariaSort;
+    if (direction === "none") direction = wanted.querySelector("button").dataset.first;
 
     function compare(a, b) {
       const [x, y] = [a, b].map(({ row }) => row.cells[column].dataset.order);
@@ -168,6 +173,10 @@
     }
 
     part.picture = () => drawPlane(part, form.elements.across.value, form.elements.up.value, filter());
+    part.keep = () => {
+      const isUsual = heads[column] === usual && direction === first;
+      choices.keep(part, isUsual ? null : heads[column], direction);
+    };
     table.tHead.addEventListener("click", (event) => {
       const button = event.target.closest("button");
       if (!button) return;
@@ -176,12 +185,17 @@
       direction = chosen === column ? other[direction] : button.dataset.first;
       column = chosen;
       arrange();
+      part.keep();
     });
-    part.querySelector(".choices").addEventListener("input", arrange);
-    form.addEventListener("input", part.picture);
-    form.reset();
-    all.checked = false;
-    grouped.checked = true;
+    part.querySelector(".choices").addEventListener("input", () => { arrange(); part.keep(); });
+    let waiting;
+    form.addEventListener("input", () => {
+      filter();
+      part.keep();
+      clearTimeout(waiting);
+      waiting = setTimeout(part.picture, 150); // a drawing for each letter would hold up the next one
+    });
+    arrange();
     roam(table);
   }
 
@@ -414,6 +428,7 @@
     const tab = tabs.querySelector("[aria-current]")?.textContent;
     document.title = [isRow && name.slice(part.id.length + 1), tab, title].filter(Boolean).join(" · ");
     if (part) show(part);
+    if (part && name === part.id) part.keep?.();
     if (isRow) return openRow(name);
     if (dialog.open) { stay(); dialog.close(); }
   }

@@ -37,6 +37,12 @@ from .curves import estimated, retained_curve, target_curves
 from .details import Diagnostics, Entry, commands, diagnostics, flat, same_or_each
 from .numbers import MISSING, Number, cost, number, size, tried
 
+STEPS = {
+    "steps": "optimiser steps, in all stages",
+    "environment_steps": "environment steps, in all stages",
+}
+"""Titles of costs that say what is counted; all costs are means over seeds."""
+
 NAMED = 3
 """Number of methods not told apart from a row that are named; further ones are only counted."""
 
@@ -128,10 +134,12 @@ class RowView:
 
     @property
     def costs(self) -> list[Entry]:
-        """Every cost by its name."""
+        """Every cost that was measured, by its name, as the table shows it."""
+        shown = {"relative_cost": cost(self.row).text, "bytes_kept": size(self.row).text}
         return [
-            Entry(title_of(name), number_text(value, ",.2f" if name == "relative_cost" else ",.0f", MISSING))
+            Entry(STEPS.get(name, title_of(name)), shown.get(name) or number_text(value, ",.0f"))
             for name, value in self.row.costs.items()
+            if value is not None
         ]
 
     @property

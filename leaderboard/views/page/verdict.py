@@ -178,9 +178,10 @@ def _doubt(leader: Row, rows: Sequence[Row], apart: Container[str], tied: Sequen
             kind for kind in (WITHOUT_DEMONSTRATIONS, WITH_DEMONSTRATIONS) if leader.division in kind
         )
         count = sum(row.division in family and row.method != BASELINE for row in rows)
+        kind = "without" if family is WITHOUT_DEMONSTRATIONS else "with"
         return (
             "Its gain is above 0 by its own interval alone, but not told apart from 0 when all "
-            f"{count} such methods are compared with sft."
+            f"{count} methods {kind} prior demonstrations are compared with sft."
         )
     unsure = [one for one in tied if not one.is_certain]
     if not unsure:
@@ -206,9 +207,11 @@ def _keeping(members: Sequence[Row], baseline: Row | None) -> str:
     slower = "" if leader in equal else f"{_other_learning(leader, baseline)} "
     keeper = max(equal, key=lambda row: mean_difference("kept", row.scores, baseline.scores) or 0.0)
     name = "it" if keeper is leader else printable(keeper.method)
+    whose = "Its" if keeper is leader else f"{name}'s"
     if len(equal) == 1 and keeper.method != BASELINE:
-        which = "It" if keeper is leader else f"Of the others, {name}"
-        return f"{slower}{which} {_beside(keeper, baseline)} {_training(keeper)}"
+        other = f"The other, {name}," if len(members) == 2 else f"Of the others, {name}"
+        which = "It" if keeper is leader else other
+        return f"{slower}{which} {_beside(keeper, baseline)} {_training(keeper, whose)}"
     kept, like = _value("kept", keeper), "Of the methods that learn about as much as sft"
     if keeper.method == BASELINE:
         return f"{slower}{like}, none keeps more than sft itself ({kept})."
@@ -216,7 +219,7 @@ def _keeping(members: Sequence[Row], baseline: Row | None) -> str:
     sure = f"; in this, {_alike_text(len(peers) - 1)}" if len(peers) > 1 else ""
     if BASELINE in peers:
         sure = f", but is not told apart from sft ({_value('kept', baseline)}) in this"
-    return f"{slower}{like}, {name} keeps the most ({kept}){sure}. {_training(keeper)}"
+    return f"{slower}{like}, {name} keeps the most ({kept}){sure}. {_training(keeper, whose)}"
 
 
 def _beside(row: Row, baseline: Row) -> str:
@@ -231,19 +234,19 @@ def _beside(row: Row, baseline: Row) -> str:
     return f"learns {learned} and keeps {kept}; {sure} told apart."
 
 
-def _training(row: Row) -> str:
+def _training(row: Row, whose: str = "Its") -> str:
     """Return the sentence on the training time of a row."""
     relative = row.costs["relative_cost"]
     if relative is None:
-        return "Its training time was not measured."
+        return f"{whose} training time was not measured."
     if relative == 0:
-        return "It takes no training."
+        return f"{whose} training takes no time."
     step = mean_step_ratio(row.runs)
     parts = ""
     if step:
-        steps, step_text = (number_text(one, ".1f") for one in (relative / step, step))
+        steps, step_text = (number_text(one, ".2f") for one in (relative / step, step))
         parts = f": {steps} times the steps, each {step_text} times as long"
-    return f"Its training takes {number_text(relative, '.1f')} times as long as sft's{parts}."
+    return f"{whose} training takes {number_text(relative, '.2f')} times as long as sft's{parts}."
 
 
 def _value(metric: str, row: Row) -> str:

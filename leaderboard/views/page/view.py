@@ -96,7 +96,7 @@ class ScenarioView:
         sentences = [
             f"{policy} is fine-tuned on {counted(targets, 'new task')}{turns}.",
             f"The final average is its success on {_all(skills, targets)} at the end.",
-            f"{numbers}, with 95 % confidence intervals.",
+            f"{numbers}, with 95\N{NO-BREAK SPACE}% confidence intervals.",
         ]
         sentences += _other_policy(table_parts(self.id)[1])
         if any(row.method == BASELINE for row in self.table):

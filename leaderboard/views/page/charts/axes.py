@@ -44,7 +44,8 @@ class Quantity:
         if not self.is_cost or one.value is None:
             return format_interval(one)
         if self.source == "bytes_kept":
-            return "".join(scaled(one.value)) + "B"
+            digits, unit = scaled(one.value)
+            return f"{digits} {unit}B" if one.value else "0"
         return number_text(one.value, ".2f") + "\N{MULTIPLICATION SIGN}"
 
 
@@ -129,7 +130,9 @@ class Axis:
     def marks(self) -> Spec:
         """Its ticks and labels in Vega-Lite."""
         if self.quantity.source == "bytes_kept":
-            return {"values": [0, 1e3, 1e6, 1e9], "format": "~s"}
+            # the format "~s" gives all ticks one prefix: 1 kB would read "0M"
+            label = "datum.value ? replace(format(datum.value, '~s'), /([kMG])/, ' $1') + 'B' : '0'"
+            return {"values": [0, 1e3, 1e6, 1e9], "labelExpr": label}
         if self.quantity.is_cost:
             return {"values": [0.5, 1, 2, 5, 10, 20, 50, 100, 1000], "format": "~r"}
         return {"format": ".2~f", "tickCount": 5}

@@ -191,7 +191,7 @@ def test_texts_of_strangers_stay_text(add: Callable[..., Path], records: Path) -
     text = page(compute_board(records), {})
     document = parsed(text)
     assert not list(document.iter("img"))
-    assert len(list(document.iter("script"))) == 3
+    assert len(list(document.iter("script"))) == 4
     assert not [name for one in document.iter() for name in one.attrib if name.startswith("on")]
     section = row_of(text, "clbench/Hostile-v0/hostile")
     assert not list(section.iter("img"))

@@ -24,8 +24,8 @@ pytestmark = [
 
 @pytest.fixture
 def address(even_board: Callable[..., Path]) -> str:
-    """The address of a page with three methods, and with a file that is not shown."""
-    for method in ("sft", "finch", "lora"):
+    """The address of a page with four methods, which it ranks, and with a file that is not shown."""
+    for method in ("sft", "finch", "lora", "l2_sp"):
         records = even_board(method, 0, 0.2)
     (records / "torn.json").write_text("{", encoding="utf-8")
     path = records.parent / "index.html"
@@ -161,3 +161,63 @@ def test_escape_hides_a_tip_first_and_then_closes_the_row(open_page: Callable[[s
     expect(row(page)).to_have_count(1)
     page.keyboard.press("Escape")
     expect(row(page)).to_have_count(0)
+
+
+def chosen(page: Page) -> dict[str, str]:
+    """Return what the reader has chosen: the quantities, the filter, and the column that sorts the table."""
+    part = page.locator(".part:not([hidden])")
+    head = part.locator(".board thead th:not([aria-sort=none])")
+    title = head.locator("button").inner_text().partition(" lower")[0].strip()
+    return {
+        "across": part.get_by_label("Quantity from left to right").input_value(),
+        "text": part.get_by_label("Method", exact=True).input_value(),
+        "all": str(part.get_by_label("all columns").is_checked()),
+        "sorted": f"{title} {head.get_attribute('aria-sort')}",
+        "first": part.locator(".board tbody tr:not(.division-head):visible .name").first.inner_text(),
+    }
+
+
+def test_choices_survive_a_reload_and_the_way_back_and_a_link_hands_them_on(
+    open_page: Callable[[str], Page], browser: Browser
+) -> None:
+    page = open_page("")
+    part = page.locator(".part:not([hidden])")
+    usual = chosen(page)
+    part.get_by_label("Quantity from left to right").select_option("bytes kept")
+    part.get_by_label("Method", exact=True).fill("f")
+    part.get_by_label("all columns").check()
+    part.locator(".board thead button", has_text="learned").click()
+    part.locator(".board thead button", has_text="learned").click()
+    mine = chosen(page)
+    assert mine["sorted"] == "learned ascending"
+    assert mine != usual
+    page.reload()
+    page.locator("html[data-ready]").wait_for()
+    assert chosen(page) == mine
+    page.goto("about:blank")
+    page.go_back()
+    page.locator("html[data-ready]").wait_for()
+    assert chosen(page) == mine
+    part.locator(".board .name a").first.click()
+    row(page).get_by_text("Close").click()
+    assert chosen(page) == mine
+    address = page.url
+    other = browser.new_page()
+    other.goto(address)
+    other.locator("html[data-ready]").wait_for()
+    assert chosen(other) == mine
+    other.close()
+
+
+def test_choices_that_the_page_does_not_know_are_ignored(open_page: Callable[[str], Page]) -> None:
+    usual = chosen(open_page(""))
+    assert chosen(open_page(f"#{EVEN}?across=nothing&sort=nothing&order=sideways&all=perhaps&text=")) == usual
+
+
+def test_the_meaning_of_a_definition_is_reached_by_keyboard(open_page: Callable[[str], Page]) -> None:
+    page = open_page(f"#{EVEN}")
+    heads = page.locator(".part:not([hidden]) .definitions .turned[data-note]")
+    heads.first.focus()
+    expect(page.locator("#tip")).to_be_visible()
+    page.keyboard.press("ArrowRight")
+    expect(page.locator("#tip")).to_have_text(heads.nth(1).get_attribute("data-note") or "")
