@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from clbench.learning.optimise import MethodError, deterministic, learning_rate_factor, optimise
+from clbench.learning.optimise import MethodError, deterministic, learning_rate_factor, optimise, warm_up
 
 
 def test_the_learning_rate_warms_up_and_then_follows_a_cosine_down_to_a_tenth() -> None:
@@ -24,6 +24,33 @@ def test_the_first_step_of_adamw_moves_every_weight_by_the_learning_rate() -> No
     assert steps == 1
     # Adam's first step is the sign of the gradient; one step is all warm-up, so the factor is 1
     assert weight.tolist() == pytest.approx([0.9, -1.9])
+
+
+def test_steps_are_those_of_adamw_by_its_equations_under_one_norm_for_all_groups() -> None:
+    """Loshchilov, Hutter 2019, Algorithm 2, with betas .9 and .95 and a weight decay of 1e-10."""
+    start = np.array([1.0, -2.0, 3.0, 0.5])
+    weights = [
+        nn.Parameter(torch.tensor(start[part], dtype=torch.float64)) for part in (slice(2), slice(2, 4))
+    ]
+    steps = 12
+
+    def loss_at(step: int) -> Tensor:
+        return ((step + 1) * torch.cat([*weights]).square() + torch.cat([*weights])).sum()
+
+    optimise([{"params": [one]} for one in weights], 0.1, steps, loss_at)
+    value, mean, square = start, np.zeros(4), np.zeros(4)
+    for step in range(steps):
+        gradient = 2 * (step + 1) * value + 1
+        gradient = gradient / max(1.0, float(np.linalg.norm(gradient)))
+        rate = 0.1 * (0.1 + 0.45 * (1 + math.cos(math.pi * max(0, step - 1) / (steps - 1))))
+        mean, square = 0.9 * mean + 0.1 * gradient, 0.95 * square + 0.05 * gradient**2
+        move = (mean / (1 - 0.9 ** (step + 1))) / (np.sqrt(square / (1 - 0.95 ** (step + 1))) + 1e-8)
+        value = value * (1 - rate * 1e-10) - rate * move
+    np.testing.assert_allclose(torch.cat([*weights]).detach(), value, rtol=1e-5)
+
+
+def test_stages_to_a_criterion_warm_up_in_fifteen_steps_and_then_keep_their_rate() -> None:
+    assert [warm_up(step) for step in range(20)] == pytest.approx([*np.arange(1, 16) / 15, *[1.0] * 5])
 
 
 def test_gradients_are_clipped_after_the_method_has_set_them() -> None:

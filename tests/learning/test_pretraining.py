@@ -1,6 +1,7 @@
 import dataclasses
 import json
 import logging
+import math
 import shutil
 from pathlib import Path
 from typing import Any
@@ -10,15 +11,20 @@ import torch
 
 from clbench import load_scenario
 from clbench.base.cache import MANIFEST, cache_folder, hash_of
+from clbench.base.seeding import derive_seed, torch_generator
+from clbench.data.demonstrations import Demonstrations, load_demonstrations
+from clbench.data.questions import load_questions
 from clbench.learning.pretraining import (
     SHIPPED,
     is_pretrained,
+    policy_config,
     pretrain,
     pretrained_folder,
     pretrained_policy,
     pretraining_inputs,
     shipped_folder,
 )
+from clbench.policy.kinds import new_policy
 from clbench.policy.policy import Policy
 
 FETCH = load_scenario("clbench/Fetch-v1")
@@ -91,3 +97,35 @@ def test_the_data_are_normalised_with_one_thread(monkeypatch: pytest.MonkeyPatch
     finally:
         torch.set_num_threads(before)
     assert threads == [1]
+
+
+@pytest.mark.usefixtures("one_thread")
+def test_pretraining_repeats_itself_in_a_loop_written_out() -> None:
+    toy = load_scenario("clbench.testing:clbench/Toy-v0")
+    steps = 6
+    brief = dataclasses.replace(
+        toy,
+        background=(dataclasses.replace(toy.held_out[0], name="down", instructions=("go down there",)),),
+        target=toy.target[:1],
+        budget=dataclasses.replace(toy.budget, pretraining_steps=steps),
+    )
+    config = policy_config(brief)
+    known = [load_demonstrations(task, brief, config) for task in (*brief.retained, *brief.background)]
+    demonstrations, (questions, _) = Demonstrations.cat(known), load_questions(brief)
+    policy = new_policy(config, seed=derive_seed("weights", 5))
+    policy.normalise_like(demonstrations.state, demonstrations.action[:, 0])
+    optimiser = torch.optim.AdamW(policy.parameters(), betas=(0.9, 0.95), weight_decay=1e-10, fused=True)
+    generator, size = torch_generator("pretraining", 5), brief.budget.batch_size
+    for step in range(steps):
+        # one step of warm-up, then a cosine down to a tenth
+        share = 0.1 + 0.45 * (1 + math.cos(math.pi * max(0, step - 1) / (steps - 1)))
+        optimiser.param_groups[0]["lr"] = brief.budget.pretraining_learning_rate * share
+        loss = policy.action_loss(demonstrations.sample(size, generator)).mean()
+        loss = loss + policy.answer_loss(questions.sample(size // 2, generator)).mean()
+        optimiser.zero_grad()
+        loss.backward()  # type: ignore[no-untyped-call]
+        torch.nn.utils.clip_grad_norm_(policy.parameters(), 1.0)
+        optimiser.step()
+    made = pretrain(brief, 5).state_dict()
+    for name, value in policy.state_dict().items():
+        torch.testing.assert_close(made[name], value, rtol=0, atol=1e-7)

@@ -1,6 +1,7 @@
 """Vision that learns to describe pictures, before a policy learns to act."""
 
 import dataclasses
+import math
 
 import numpy as np
 import pytest
@@ -96,6 +97,45 @@ def test_a_question_without_an_answer_in_any_picture_of_a_step_does_no_harm(
     vision = _new_vision()
     pretrain_vision(vision, [silent], questions[0].kinds, 3, torch_generator("vision", 0))
     assert all(torch.isfinite(parameter).all() for parameter in vision.parameters())
+
+
+def test_each_step_sums_the_loss_of_the_numbers_three_times_and_the_mean_over_kinds_of_questions(
+    questions: tuple[Questions, Questions],
+) -> None:
+    steps, kinds = 4, questions[0].kinds
+    (pictures,) = _pictures(questions[0])
+    pictures.answers[::3] = -1  # too close to call
+    made, vision = _new_vision(), _new_vision()
+    pretrain_vision(made, [pictures], kinds, steps, torch_generator("vision", 0))
+    generator = torch_generator("vision", 0)
+    outputs = 4 + sum(len(kind.answers) for kind in kinds)
+    weight = torch.zeros(outputs, vision.tokens * vision.width).normal_(std=0.02, generator=generator)
+    trained = [
+        *vision.parameters(),
+        weight.requires_grad_(),
+        bias := torch.zeros(outputs, requires_grad=True),
+    ]
+    optimiser = torch.optim.AdamW(trained, betas=(0.9, 0.95), weight_decay=1e-10, fused=True)
+    for step in range(steps):
+        # one step of warm-up, then a cosine down to a tenth
+        share = 0.1 + 0.45 * (1 + math.cos(math.pi * max(0, step - 1) / (steps - 1)))
+        optimiser.param_groups[0]["lr"] = 3e-3 * share
+        rows = torch.randint(len(pictures.image), (64,), generator=generator)
+        predicted = vision(pictures.image[rows]).flatten(1) @ weight.T + bias
+        away = (predicted[:, :4] - pictures.numbers[rows]).abs()
+        losses, first = [], 4
+        for column, kind in enumerate(kinds):
+            logits = predicted[:, first : (first := first + len(kind.answers))].log_softmax(dim=1)
+            answers = pictures.answers[rows, column]
+            known = answers >= 0
+            losses.append(-logits[known].gather(1, answers[known, None]).mean())
+        loss = 3 * torch.where(away < 0.1, away**2 / 0.2, away - 0.05).mean() + sum(losses) / len(losses)
+        optimiser.zero_grad()
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(trained, 1.0)
+        optimiser.step()
+    for one, other in zip(made.parameters(), vision.parameters(), strict=True):
+        torch.testing.assert_close(one, other, rtol=0, atol=1e-5)
 
 
 @pytest.mark.long

@@ -76,6 +76,15 @@ def test_the_pipeline_decodes_as_algorithm_1_says(block: int) -> None:
         assert len(work.spans) == forwards
 
 
+@pytest.mark.parametrize("block", [2, 4])
+def test_a_block_must_exceed_the_share_that_activates_the_next_one(block: int) -> None:
+    told = Thresholds(confidence=0.9, add=0.25, activate=0.5)  # blocks are often decoded to one half
+    for seed in range(12):
+        made, (hidden, mask) = head(block, seed=seed), observation(1, seed)
+        expected, _ = algorithm_1(made, hidden, mask, told)
+        assert pipelined(made, hidden, mask, told)[0].tolist() == expected
+
+
 @EVERY_BLOCK
 def test_kept_keys_change_no_logit(block: int) -> None:
     made, (hidden, mask) = head(block), observation(1)

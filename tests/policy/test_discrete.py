@@ -85,6 +85,20 @@ def test_the_loss_is_the_mean_cross_entropy_of_the_masked_tokens_that_count() ->
         np.testing.assert_allclose(losses[row], -np.log(right[counts]).mean(), rtol=1e-5)
 
 
+def test_the_prediction_is_the_mean_action_over_the_bins_at_the_masked_chunk() -> None:
+    policy, batch = TransformerPolicy(CONFIG, seed=1), batch_of(6)
+    policy.normalise_like(batch.state, batch.action[:, 0] * torch.tensor([0.2, 1.0, 3.0]) + 0.5)
+    head, hidden = head_of(policy), policy.hidden_states(batch.state, batch.words)
+    truth = head.tokens((batch.action - policy.action_mean) / policy.action_std)
+    shown = torch.where(head.masked(batch.valid, batch.draw, batch.noise), 256, truth)
+    logits = head.logits(shown, hidden, policy.token_mask(batch.words)).detach().double().numpy()
+    chances = np.exp(logits) / np.exp(logits).sum(axis=2, keepdims=True)
+    centres = head.centres().double().numpy()
+    expected = np.stack([chances[:, token] @ centres[token % 3] for token in range(LENGTH)], axis=1)
+    found = policy.predict(batch).detach().numpy()
+    np.testing.assert_allclose(found, expected.reshape(6, CONFIG.chunk, 3), rtol=1e-4, atol=1e-5)
+
+
 def test_the_loss_does_not_see_tokens_that_are_masked_or_do_not_count() -> None:
     policy, batch = TransformerPolicy(CONFIG), batch_of(4)
     other = batch.action.clone()

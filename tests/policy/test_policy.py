@@ -18,6 +18,7 @@ from clbench.policy.checkpoint import CheckpointError, load_policy, save_policy
 from clbench.policy.flow import FlowHead
 from clbench.policy.policy import PolicyConfig, evaluating
 from clbench.policy.transformer import TransformerPolicy
+from clbench.policy.vision import Vision
 
 CONFIG = PolicyConfig(state_size=5, action_size=3, width=32, layers=2)
 
@@ -114,6 +115,134 @@ def test_normalisation_follows_the_data_it_is_given() -> None:
     np.testing.assert_allclose(policy.state_mean, state.numpy().mean(axis=0), rtol=1e-5)
     np.testing.assert_allclose(policy.state_std[:4], state.numpy().std(axis=0)[:4], rtol=1e-5)
     assert policy.state_std[4] == pytest.approx(0.01)  # constant channels are not blown up
+
+
+def _in_the_units_of_a_world(batch: Batch) -> tuple[Batch, Batch]:
+    """Return a batch of other units, and the same with numbers of mean 0 and deviation 1."""
+    scaled = dataclasses.replace(
+        batch,
+        state=batch.state * torch.tensor([0.1, 5.0, 1.0, 2.0, 0.5]) + 3,
+        action=batch.action * torch.tensor([0.2, 4.0, 1.0]) - 2,
+    )
+    state, first = scaled.state.double(), scaled.action[:, 0].double()
+    plain = dataclasses.replace(
+        batch,
+        state=((state - state.mean(0)) / state.std(0, correction=0)).float(),
+        action=((scaled.action.double() - first.mean(0)) / first.std(0, correction=0)).float(),
+    )
+    return scaled, plain
+
+
+def test_losses_predictions_and_actions_do_not_depend_on_the_units_of_the_world() -> None:
+    policy, other = TransformerPolicy(CONFIG), TransformerPolicy(CONFIG)
+    scaled, plain = _in_the_units_of_a_world(_batch(50))
+    policy.normalise_like(scaled.state, scaled.action[:, 0])
+    torch.testing.assert_close(policy.action_loss(scaled), other.action_loss(plain), rtol=1e-3, atol=1e-4)
+    torch.testing.assert_close(policy.predict(scaled), other.predict(plain), rtol=1e-3, atol=1e-4)
+    first = scaled.action[:, 0].double().numpy()
+    expected = other.act(plain.state, plain.words, plain.noise).double().numpy()
+    expected = expected * first.std(axis=0) + first.mean(axis=0)
+    found = policy.act(scaled.state, scaled.words, scaled.noise)
+    np.testing.assert_allclose(found, expected, rtol=1e-3, atol=1e-3)
+
+
+class _ByHand:
+    """The equations of the policy in NumPy, with its weights."""
+
+    def __init__(self, policy: TransformerPolicy) -> None:
+        self.weights = {name: value.double().numpy() for name, value in policy.state_dict().items()}
+
+    def linear(self, values: Any, name: str) -> Any:
+        return values @ self.weights[f"{name}.weight"].T + self.weights[f"{name}.bias"]
+
+    def norm(self, values: Any, name: str) -> Any:
+        away = values - values.mean(axis=-1, keepdims=True)
+        scaled = away / np.sqrt((away**2).mean(axis=-1, keepdims=True) + 1e-5)
+        return scaled * self.weights[f"{name}.weight"] + self.weights[f"{name}.bias"]
+
+    def attention(self, own: Any, memory: Any, read: Any, name: str) -> Any:
+        width, size = own.shape[-1], own.shape[-1] // CONFIG.heads
+        query, both = self.linear(own, f"{name}.query"), self.linear(memory, f"{name}.key_value")
+        mixed = np.zeros_like(own)
+        for first in range(0, width, size):
+            part, other = slice(first, first + size), slice(width + first, width + first + size)
+            scores = query[..., part] @ both[..., part].swapaxes(1, 2) / np.sqrt(size)
+            shares = np.exp(scores) * read[:, None]
+            mixed[..., part] = shares / shares.sum(axis=-1, keepdims=True) @ both[..., other]
+        return self.linear(mixed, f"{name}.out")
+
+    def layer(self, tokens: Any, read: Any, name: str, prefix: Any = None) -> Any:
+        own = self.norm(tokens, f"{name}.attention_norm")
+        known = [] if prefix is None else [self.norm(prefix, f"{name}.attention_norm")]
+        tokens = tokens + self.attention(
+            own, np.concatenate([*known, own], axis=1), read, f"{name}.attention"
+        )
+        inner = self.linear(self.norm(tokens, f"{name}.feed_forward.0"), f"{name}.feed_forward.1")
+        return tokens + self.linear(np.maximum(inner, 0), f"{name}.feed_forward.3")
+
+    def hidden(self, state: Any, words: Any) -> tuple[list[Any], Any]:
+        """Return the hidden states of the layers, and which of their tokens are read."""
+        count, width = len(state), CONFIG.width
+        seen = self.linear(state, "backbone.observation").reshape(count, 4, width)
+        readout = np.repeat(self.weights["backbone.readout"], count, axis=0)
+        tokens = np.concatenate([seen, readout, self.weights["backbone.words.weight"][words]], axis=1)
+        tokens = tokens + self.weights["backbone.position"]
+        read = np.concatenate([np.ones((count, 5)), words != 0], axis=1)
+        layers = []
+        for number in range(CONFIG.layers):
+            tokens = self.layer(tokens, read, f"backbone.layers.{number}")
+            layers.append(tokens)
+        return layers, read
+
+    def velocity(self, noisy: Any, time: Any, hidden: list[Any], read: Any) -> Any:
+        angle = time[:, None] * np.geomspace(1, 1000, 16)
+        clock = self.linear(np.concatenate([np.sin(angle), np.cos(angle)], axis=1), "head.time.0")
+        clock = self.linear(clock / (1 + np.exp(-clock)), "head.time.2")
+        tokens = self.linear(noisy, "head.embed") + self.weights["head.position"] + clock[:, None]
+        read = np.concatenate([read, np.ones((len(noisy), CONFIG.chunk))], axis=1)
+        for number, prefix in enumerate(hidden):
+            tokens = self.layer(tokens, read, f"head.layers.{number}", prefix)
+        return self.linear(self.norm(tokens, "head.velocity_out.0"), "head.velocity_out.1")
+
+
+def test_hidden_states_answers_and_velocities_follow_from_the_equations_of_the_policy() -> None:
+    policy, batch = TransformerPolicy(CONFIG), _batch(4)
+    assert isinstance(policy.head, FlowHead)
+    by_hand, words = _ByHand(policy), batch.words.numpy()
+    layers, read = by_hand.hidden(batch.state.double().numpy(), words)
+    hidden = policy.hidden_states(batch.state, batch.words)
+    for found, expected in zip(hidden, layers, strict=True):
+        np.testing.assert_allclose(found.detach(), expected, rtol=1e-3, atol=1e-4)
+    answers = by_hand.linear(by_hand.norm(layers[-1][:, 4], "backbone.answer.0"), "backbone.answer.1")
+    found = policy.answer_logits(batch.state, batch.words).detach()
+    np.testing.assert_allclose(found, answers, rtol=1e-3, atol=1e-4)
+    velocity = by_hand.velocity(batch.noise.double().numpy(), batch.draw.double().numpy(), layers, read)
+    found = policy.head.velocity(batch.noise, batch.draw, hidden, policy.token_mask(batch.words)).detach()
+    np.testing.assert_allclose(found, velocity, rtol=1e-3, atol=1e-4)
+
+
+@pytest.mark.parametrize("side", [-1, 1])
+def test_a_number_of_a_state_counts_up_to_ten_deviations_on_each_side(side: int) -> None:
+    policy, batch = TransformerPolicy(CONFIG), _batch(2)
+    policy.normalise_like(torch.randn(100, 5) * 3 + 7)
+
+    def at(deviations: float) -> Tensor:
+        state = batch.state.clone()
+        state[:, 1] = policy.state_mean[1] + side * deviations * policy.state_std[1]
+        return policy.hidden_states(state, batch.words)[-1]
+
+    torch.testing.assert_close(at(40.0), at(10.0), rtol=1e-4, atol=1e-5)
+    assert (at(9.0) - at(10.0)).abs().max() > 1e-3
+
+
+def test_an_action_is_where_five_steps_along_the_velocity_lead_from_the_noise() -> None:
+    policy, batch = TransformerPolicy(CONFIG), _batch(4)
+    assert isinstance(policy.head, FlowHead)
+    hidden, mask = policy.hidden_states(batch.state, batch.words), policy.token_mask(batch.words)
+    chunk = batch.noise
+    for time in (1.0, 0.8, 0.6, 0.4, 0.2):  # from noise at 1 to the action at 0
+        chunk = chunk - 0.2 * policy.head.velocity(chunk, torch.full((4,), time), hidden, mask)
+    torch.testing.assert_close(policy.act(batch.state, batch.words, batch.noise), chunk.detach())
 
 
 def test_a_policy_survives_saving(tmp_path: Path) -> None:
@@ -244,6 +373,14 @@ def test_a_policy_reads_an_image_in_four_tokens() -> None:
     eyes = [weight for name, weight in policy.named_parameters() if "vision" in name]
     gradients = torch.autograd.grad(policy.action_loss(batch).mean(), eyes)
     assert all(gradient.abs().sum() > 0 for gradient in gradients)
+
+
+@pytest.mark.parametrize(("pixel", "number"), [(0, -1.0), (255, 1.0)])
+def test_pixels_are_numbers_from_minus_one_to_one(pixel: int, number: float) -> None:
+    vision = Vision(16, 24)
+    shown = vision(torch.full((1, 16, 16, 3), pixel, dtype=torch.uint8))
+    expected = vision.out(vision.convolutions(torch.full((1, 3, 16, 16), number)).flatten(1))
+    torch.testing.assert_close(shown, expected.view(1, 4, 24))
 
 
 def test_a_policy_with_eyes_refuses_to_act_without_an_image() -> None:

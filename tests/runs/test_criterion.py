@@ -237,6 +237,23 @@ def test_a_record_whose_last_check_does_not_repeat_itself_stays_recomputed(
     assert [check.name for check in found if not check.passed] == ["ends of stages"]
 
 
+@pytest.mark.long
+def test_a_made_up_check_on_the_way_and_made_up_relearning_are_found_by_the_whole_run(
+    record: Record, tmp_path: Path
+) -> None:
+    spec = RunSpec(EAGER.id, "sft", seed=0)
+    checks = {name: list(column) for name, column in record.checks.items()}
+    checks["successes"][0] = 1 - checks["successes"][0]  # too few to end the stage, as before
+    assert record.relearning is not None
+    relearning = replace(record.relearning, successes=record.relearning.successes + 1)
+    write_record(replace(record, checks=checks, relearning=relearning), spec.path(tmp_path))
+    request = subject.Request("retrained", 20, 7, None, None, None)
+    found = verification.verify(spec.path(tmp_path), tmp_path, request)
+    assert [check.found for check in found if not check.passed] == [
+        "repeated, checks (successes), relearning (successes) differ"
+    ]
+
+
 @pytest.mark.slow
 def test_kept_policies_of_other_settings_under_this_name_are_found_by_going_on_from_them(
     tmp_path: Path,

@@ -1,25 +1,31 @@
 """Measurements around the stages of a run: the shift of the policy in each, and relearning after the last."""
 
+import copy
 import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 import torch
 from eager import EAGER
 
+from clbench.base.progress import no_progress
 from clbench.base.seeding import torch_generator
 from clbench.data.training_data import TrainingData
 from clbench.evaluation.episodes import Trial
 from clbench.evaluation.rollouts import Evaluator
 from clbench.learning.method import Method
+from clbench.learning.registry import load_method
+from clbench.learning.trainer import Trainer
 from clbench.policy.batch import Batch
 from clbench.policy.policy import Policy
 from clbench.policy.transformer import TransformerPolicy
 from clbench.records.record import Record, Relearning
 from clbench.runs.length import run_length
+from clbench.runs.relearning import relearn
 from clbench.runs.run import execute
 from clbench.runs.spec import RunSpec
 from clbench.runs.stages import stage_policies
@@ -108,6 +114,50 @@ def test_relearning_repeats_itself_in_a_loop_written_out(
     assert record.relearning == Relearning(lost.name, successes[lost.name], steps, True)
     assert steps > 0
     assert measure("relearning_steps", Scores.from_record(record)) == steps
+
+
+@pytest.mark.parametrize(("left", "up", "lost"), [(3, 1, "up"), (1, 3, "left"), (2, 2, "left")])
+def test_the_skill_that_is_relearned_is_the_one_with_the_fewest_successes(
+    left: int, up: int, lost: str
+) -> None:
+    trainer = Trainer.open(EAGER, load_method("sft"), 0, "cpu")
+    examiner: Any = SimpleNamespace(successes=lambda policy: {"left": left, "up": up})
+    checked: list[str] = []
+    checker: Any = SimpleNamespace(
+        is_due=lambda point: True,
+        check=lambda policy, skill, point: checked.append(skill.name),
+        is_learned=lambda row: True,
+    )
+    assert relearn(trainer, examiner, checker, no_progress) == Relearning(lost, min(left, up), 0, True)
+    assert checked == [lost]
+
+
+@pytest.mark.usefixtures("one_thread")
+def test_a_skill_is_relearned_by_plain_steps_of_the_scenarios_size_on_draws_of_the_runs_seed() -> None:
+    trainer = Trainer.open(EAGER, lambda: load_method("sft")(step_factor=0.1), 1, "cpu")
+    examiner: Any = SimpleNamespace(successes=lambda policy: {"left": 3, "up": 1})
+    seen: list[Policy] = []
+    checker: Any = SimpleNamespace(
+        is_due=lambda point: point.step % 4 == 0,
+        check=lambda policy, skill, point: seen.append(copy.deepcopy(policy)),
+        is_learned=lambda row: len(seen) == 3,
+    )
+    assert relearn(trainer, examiner, checker, no_progress) == Relearning("up", 1, 8, True)
+    policy = trainer.policy
+    demonstrations, generator = (
+        trainer.data.demonstrations(EAGER.task("up")),
+        torch_generator("relearning", 1),
+    )
+    optimiser = torch.optim.AdamW(policy.parameters(), betas=(0.9, 0.95), weight_decay=1e-10, fused=True)
+    for step in range(8):
+        optimiser.param_groups[0]["lr"] = 1e-3 * (step + 1) / 15
+        loss = policy.action_loss(demonstrations.sample(16, generator)).mean()
+        optimiser.zero_grad()
+        loss.backward()  # type: ignore[no-untyped-call]
+        torch.nn.utils.clip_grad_norm_(policy.parameters(), 1.0)
+        optimiser.step()
+    for one, other in zip(policy.parameters(), seen[-1].parameters(), strict=True):
+        torch.testing.assert_close(one, other, rtol=0, atol=1e-7)
 
 
 @pytest.mark.long

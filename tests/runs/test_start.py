@@ -14,6 +14,7 @@ from clbench.base.lease import Lease
 from clbench.runs.length import run_length
 from clbench.runs.run import execute
 from clbench.runs.spec import RunSpec
+from clbench.spec.protocol import ScoredSplit
 
 
 @pytest.fixture
@@ -31,6 +32,19 @@ def test_progress_adds_up_to_the_length_of_the_run(perturb: bool, tmp_path: Path
         run = RunSpec(TINY.id, "sft", seed=0, perturb=perturb, targets=1).resolve()
         execute(run, tmp_path, amounts.append)
         assert sum(amounts) == pytest.approx(run_length(run.scenario, run.protocol))
+
+
+@pytest.mark.parametrize("splits", [("test", "validation"), ("validation", "test")])
+def test_a_tuning_run_and_a_test_run_share_no_evaluation(
+    splits: tuple[ScoredSplit, ScoredSplit], tmp_path: Path, reports: Path
+) -> None:
+    for split in splits:
+        record = execute(RunSpec(TINY.id, "frozen", seed=0, split=split), tmp_path / split)
+        rows = zip(record.episodes["stage"], record.episodes["split"], strict=True)
+        assert record.status == "success"
+        assert split in {kind for stage, kind in rows if stage == 0}
+        assert ("test" in record.episodes["split"]) == (split == "test")
+    assert len(list(reports.iterdir())) == 2
 
 
 @pytest.mark.long

@@ -69,6 +69,27 @@ def test_a_slow_method_of_a_stranger_has_its_ratio_in_the_record(
 
 
 @pytest.mark.long
+def test_neither_the_warm_up_nor_one_disturbed_block_changes_the_ratio(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    losses, begun, usual = list[int](), list[int](), TransformerPolicy.action_loss
+
+    def action_loss(policy: TransformerPolicy, *arguments: Any, **named: Any) -> torch.Tensor:
+        losses.append(1)
+        return usual(policy, *arguments, **named)
+
+    def clock() -> float:
+        """A loss takes a second, but for the four timed ones of the method's first and third block."""
+        begun.append(len(losses))
+        taken = range(1, len(losses) - begun[0] + 1)
+        return float(sum({0: 100, 20: 50}.get((loss - 1) // 5 * 5, 1) for loss in taken))
+
+    monkeypatch.setattr(TransformerPolicy, "action_loss", action_loss)
+    monkeypatch.setattr("clbench.runs.step_time.time", types.SimpleNamespace(perf_counter=clock))
+    assert _timing("l2_sp", tmp_path)["step_ratio"] == 1
+
+
+@pytest.mark.long
 @pytest.mark.usefixtures("_a_second_for_each_loss")
 def test_a_method_that_trains_nothing_has_no_time_of_a_step_and_plain_fine_tuning_is_the_unit(
     tmp_path: Path,

@@ -22,6 +22,7 @@ from clbench.runs.tuning import (
     Tuned,
     best_of,
     fixed_settings,
+    rated_best,
     refinements,
     rungs,
     tuned,
@@ -102,6 +103,12 @@ def toy_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 def test_the_first_of_equal_settings_wins() -> None:
     first, second = _tried(0.6, 0.9, 1.0), _tried(0.6, 0.9, 0.3)
     assert best_of([first, second]) is first
+
+
+def test_a_setting_that_learns_too_little_is_no_equal_of_the_best() -> None:
+    lazy, best, equal = _tried(0.6, 0.79, 1.0), _tried(0.6, 0.9, 0.3), _tried(0.6, 0.8, 0.1)
+    assert best_of([lazy, best, equal]) is best
+    assert rated_best([lazy, best, equal]) == [best, equal]
 
 
 def test_if_no_setting_learns_enough_the_one_that_learns_most_wins() -> None:

@@ -6,6 +6,9 @@ from pathlib import Path
 import pytest
 
 from clbench.base.entry_points import resolve
+from clbench.records.paths import label_of, record_path
+from clbench.records.record import Record
+from clbench.records.writer import write_record
 from clbench.runs.tuning import Tried, Tuned
 from clbench.scoring.intervals import Estimate
 
@@ -13,8 +16,8 @@ SCENARIO = "clbench/Even-v1"
 MODULE = "clbench.leaderboard.board.frontier"
 TiedGain = resolve(f"{MODULE}:TiedGain")
 is_certain_over = resolve(f"{MODULE}:is_certain_over")
-ladder_of, read_ladder, tied_gains = (
-    resolve(f"{MODULE}:{name}") for name in ("ladder_of", "read_ladder", "tied_gains")
+frontiers_of, ladder_of, read_ladder, tied_gains = (
+    resolve(f"{MODULE}:{name}") for name in ("frontiers_of", "ladder_of", "read_ladder", "tied_gains")
 )
 compute_board = resolve("clbench.leaderboard.board.rows:compute_board")
 read_run = resolve("clbench.leaderboard.board.runs:read_run")
@@ -96,3 +99,16 @@ def test_one_learning_rate_is_no_ladder(even_board: Callable[..., Path]) -> None
     even_board("finch", 0, 0.2, "ladder", step_factor=0.3)
     even_board("sft", 0, 0.2, "ladder", step_factor=0.3)
     assert not compute_board(even_board("sft", 0, 0.1)).frontiers
+
+
+def test_a_rung_has_what_was_learned_in_each_stage_and_what_is_kept_of_skills_and_earlier_targets(
+    make_record: Callable[..., Record], tmp_path: Path
+) -> None:
+    for factor, kept in ((0.3, 0.2), (0.1, 0.8)):
+        success = [[1, 1, 0, 0, 0], [0.5, 0.5, 0.9, 0, 0], [0.6, 0.4, kept, 0.8, 0]]
+        changes = {"step_factor": factor}
+        record = make_record(success, settings=changes, changes=changes)
+        write_record(record, record_path(tmp_path / "ladder", "clbench/Toy-v0", label_of("sft", changes), 0))
+    (curve,) = frontiers_of(read_ladder(tmp_path / "ladder")[0])["clbench/Toy-v0"]
+    found = [(rung.factor, rung.learned.value, rung.kept.value) for rung in curve.rungs]
+    assert found == [pytest.approx((0.3, 0.85, 1.2 / 3)), pytest.approx((0.1, 0.85, 1.8 / 3))]

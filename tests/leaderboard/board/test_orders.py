@@ -18,6 +18,7 @@ from clbench.records.record import Record
 from clbench.records.writer import write_record
 from clbench.spec.scenario import target_order
 
+compute_board = resolve("clbench.leaderboard.board.rows:compute_board")
 Order, Orders = (resolve(f"clbench.leaderboard.board.orders:{name}") for name in ("Order", "Orders"))
 
 SCENARIO = "clbench/Toy-v0"
@@ -84,6 +85,16 @@ def test_without_a_seed_that_all_orders_have_there_is_no_order_sensitivity(
     for order in range(3):
         add(0.5, order=order, seed=order)
     assert math.isnan(load(records).order_sensitivity[0])
+
+
+def test_every_order_of_three_targets_counts_also_one_that_is_no_swap(
+    add: Callable[..., Path], records: Path
+) -> None:
+    for order in range(6):
+        add(0.5, order=order)
+    board = compute_board(records)
+    assert board.not_shown == ()
+    assert [one.number for one in board.rows[0].orders.orders] == list(range(6))
 
 
 def test_an_order_without_a_final_average_leaves_no_order_sensitivity() -> None:

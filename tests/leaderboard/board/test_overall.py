@@ -88,3 +88,10 @@ def test_a_method_without_a_rival_in_a_scenario_has_no_letter_there() -> None:
     one, two = "clbench/One-v0", "clbench/Two-v0"
     (row,) = overall([_row(one, "sft", 0.5), _row(two, "sft", 0.5), _row(two, "lora", 0.4)])
     assert row.letters == (None, "a")
+
+
+def test_a_method_of_two_divisions_has_no_mean_over_both() -> None:
+    one, two = "clbench/One-v0", "clbench/Two-v0"
+    rows = [_row(name, "sft", 0.5) for name in (one, two)]
+    rows += [_row(one, "mine", 0.6), _row(two, "mine", 0.6, division="prior demonstrations")]
+    assert [row.method for row in overall(rows)] == ["sft"]

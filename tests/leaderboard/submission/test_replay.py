@@ -11,6 +11,7 @@ from safetensors.torch import load_file, save_file
 from verification import edit, verify
 
 from clbench.base.cache import MANIFEST, cached
+from clbench.evaluation.rollouts import Evaluator
 
 tiers = importlib.import_module("clbench.leaderboard.board.tiers")
 
@@ -63,3 +64,29 @@ def test_the_record_of_a_machine_that_pretrains_otherwise_cannot_be_replayed_her
     (check,) = (check for check in verify(mine, "replayed", honest) if check.passed is None)
     assert "(instructions of its processor: NEON, here: " in check.found
     assert tiers.tier_of(mine) == "recomputed"
+
+
+def test_the_replayed_episodes_are_drawn_at_random_from_the_ends_of_all_stages(
+    mine: Path, honest: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    looks: list[list[Any]] = []
+
+    class Listing(Evaluator):
+        """Notes the episodes that are asked for, and ends the verification after them."""
+
+        def play(self, policy: Any, trials: Any, *arguments: Any, **options: Any) -> Any:
+            looks[-1].append([(one.task.name, one.split, one.number) for one in trials])
+            return []
+
+        def close(self) -> None:
+            super().close()
+            raise RuntimeError("enough was seen")
+
+    monkeypatch.setattr("clbench.leaderboard.submission.replay.Evaluator", Listing)
+    for seed in range(6):
+        looks.append([])
+        with pytest.raises(RuntimeError, match="enough was seen"):
+            verify(mine, "replayed", honest, episodes=10, seed=seed)
+    assert [sum(map(len, stages)) for stages in looks] == [10] * 6
+    assert all(sum(len(stages[number]) for stages in looks) > 6 for number in range(3))
+    assert len({str(stages) for stages in looks}) == 6

@@ -1,0 +1,105 @@
+"""The trainer: what a stage trains on, step by step, and which prior data a method gets."""
+
+import copy
+import dataclasses
+import math
+from typing import Any
+
+import pytest
+import torch
+from helpers import build_method
+from tiny import TINY
+
+from clbench.base.seeding import torch_generator
+from clbench.data.demonstrations import Demonstrations
+from clbench.learning.adaptation import Step
+from clbench.learning.method import Method, Progress
+from clbench.learning.trainer import Trainer
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+SEED = 3
+STEPS = TINY.budget.adaptation_steps
+
+
+def _trainer(method: str) -> Trainer:
+    trainer = Trainer.open(TINY, lambda: build_method(method, {}), SEED, "cpu")
+    trainer.prepare()
+    return trainer
+
+
+def _go_on(step: Step) -> None:
+    pass
+
+
+def test_each_stage_repeats_itself_in_a_loop_written_out() -> None:
+    trainer = _trainer("sft")
+    for number, task in enumerate(TINY.target, 1):
+        policy = copy.deepcopy(trainer.policy)
+        assert trainer.learn(number, _go_on) == STEPS
+        demonstrations, generator = trainer.data.demonstrations(task), torch_generator("target", SEED, number)
+        optimiser = torch.optim.AdamW(policy.parameters(), betas=(0.9, 0.95), weight_decay=1e-10, fused=True)
+        for step in range(STEPS):
+            # one step of warm-up, then a cosine down to a tenth
+            fallen = max(0, step - 1) / (STEPS - 1)
+            share = 0.1 + 0.45 * (1 + math.cos(math.pi * fallen))
+            optimiser.param_groups[0]["lr"] = TINY.budget.learning_rate * share
+            loss = policy.action_loss(demonstrations.sample(TINY.budget.batch_size, generator)).mean()
+            optimiser.zero_grad()
+            loss.backward()  # type: ignore[no-untyped-call]
+            torch.nn.utils.clip_grad_norm_(policy.parameters(), 1.0)
+            optimiser.step()
+        learned = dict(trainer.policy.named_parameters())
+        for name, weight in policy.named_parameters():
+            torch.testing.assert_close(weight, learned[name], rtol=0, atol=1e-7)
+
+
+def _columns(rows: Any) -> list[torch.Tensor]:
+    return [getattr(rows, field.name) for field in dataclasses.fields(rows)]
+
+
+@pytest.mark.parametrize("number", [1, 2])
+def test_prior_data_are_those_of_skills_and_earlier_targets_with_draws_of_their_own_in_each_stage(
+    number: int,
+) -> None:
+    trainer = _trainer("joint")
+    before = TINY.retained + TINY.target[: number - 1]
+    demonstrations = Demonstrations.cat([trainer.data.demonstrations(task) for task in before])
+    prior = trainer.prior(number, ("throughout",))
+    for source, data, name in (
+        (prior.demonstrations, demonstrations, "prior demonstrations"),
+        (prior.questions, trainer.data.questions, "prior questions"),
+    ):
+        expected = data.sample(40, torch_generator(name, SEED, number))
+        drawn = source.sample(40)
+        assert len(source) == len(data)
+        assert all(one.equal(other) for one, other in zip(_columns(drawn), _columns(expected), strict=True))
+
+
+def test_the_hooks_of_each_stage_have_a_seed_of_their_own() -> None:
+    seeds = []
+    for seed in (SEED, SEED + 1):
+        trainer = Trainer.open(TINY, lambda: build_method("from_scratch", {}), seed, "cpu")
+        for number in (1, 2):
+            trainer.learn(number, lambda step: True)
+            seeds.append(trainer.policy.state_dict()["head.embed.weight"].flatten().tolist()[0])
+    assert len(set(seeds)) == 4
+
+
+@dataclasses.dataclass
+class Fixed(Method):
+    """Takes steps of one size, whatever is scheduled."""
+
+    scheduled: list[float] = dataclasses.field(default_factory=list)
+
+    def learning_rate(self, scheduled: float, progress: Progress) -> float:
+        self.scheduled.append(scheduled)
+        return 2e-4
+
+
+def test_the_step_factor_changes_the_scheduled_rate_and_not_the_one_that_a_method_returns() -> None:
+    trainer, rates = _trainer("sft"), list[float | None]()
+    trainer.method = method = Fixed(step_factor=0.5)
+    trainer.learn(1, lambda step: rates.append(step.learning_rate))
+    assert rates == [2e-4] * STEPS
+    assert max(method.scheduled) == pytest.approx(0.5 * TINY.budget.learning_rate)
