@@ -127,7 +127,7 @@ def run_missing(
     for job, reason in lost.items():
         _print(console, f"{job}: {reason}")
     failed |= lost
-    lost_runs = sum(job.is_done is not None for job in failed)
+    lost_runs = sum(job.product is not None for job in failed)
     done = f"{_part(lost_runs, len(to_do.runs))}{counted(len(to_do.runs), 'run')}"
     if to_do.stages:
         from clbench.jobs.work import make_policies
@@ -154,9 +154,9 @@ def _without_record(jobs: Sequence[Job], failed: Mapping[Job, str], records: Pat
     """Return the reason of each run that went well by its own words and has no record that counts."""
     lost = {}
     for job in jobs:
-        if job.makes is None or job.is_done is None or job in failed or job.is_done():
+        if job.product is None or job in failed or job.product.exists():
             continue
-        path = records / job.makes.relative_to(records.absolute())
+        path = records / job.product.path.relative_to(records.absolute())
         lost[job] = f"it ended without a record of this run at {path}."
     return lost
 

@@ -18,6 +18,18 @@ class JobError(ClbenchError):
 
 
 @dataclass(frozen=True, eq=False)
+class Product:
+    """A file that a job makes. One command at a time makes it; others wait, and do other jobs meanwhile."""
+
+    path: Path
+    """Place of the file."""
+    exists: Callable[[], bool]
+    """Returns whether a command has made the file."""
+    has_failed: Callable[[], bool] = bool
+    """Returns whether another command tried to make the file since this one began, and failed."""
+
+
+@dataclass(frozen=True, eq=False)
 class Job:
     """A piece of work for one process. Two jobs are the same only if they are the same object."""
 
@@ -37,13 +49,8 @@ class Job:
     """Device on which the job computes."""
     pace: float = 1.0
     """Expected time of a unit of length, relative to an optimiser step."""
-    makes: Path | None = None
-    """File that the job makes. One command at a time may do such a job; others wait, and do other jobs
-    meanwhile. If None, several commands may do it at once."""
-    is_done: Callable[[], bool] | None = None
-    """Returns whether another command has made the file."""
-    has_failed: Callable[[], bool] | None = None
-    """Returns whether another command did the job since this one began, and it failed."""
+    product: Product | None = None
+    """File that the job makes. If None, several commands may do the job at once."""
 
     def __str__(self) -> str:
         return self.title
@@ -56,14 +63,14 @@ class Job:
     def bare(self) -> Job:
         """Return the job with what a worker needs alone.
 
-        The command has the lease, and looks whether the file is made. The functions that look know the whole
-        run: they would travel with it, and make the worker import its method before it begins.
+        The command has the lease, and looks for the product. The functions that look know the whole run: they
+        would travel with it, and make the worker import its method before it begins.
         """
-        return replace(self, needs=(), makes=None, is_done=None, has_failed=None)
+        return replace(self, needs=(), product=None)
 
     def new_lease(self) -> Lease | None:
         """Return the lease that a command needs to do the job, None if it needs none."""
-        return None if self.makes is None else Lease(self.makes)
+        return None if self.product is None else Lease(self.product.path)
 
 
 def chain_times(jobs: Iterable[Job]) -> dict[Job, float]:

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from clbench.jobs import work
-from clbench.jobs.job import Job
+from clbench.jobs.job import Job, Product
 from clbench.jobs.recorded import has_failed, has_record
 from clbench.learning.pretraining import is_pretrained, vision_steps
 from clbench.records.paths import table_name
@@ -132,16 +131,8 @@ class Plan:
         records: Path | None = None,
     ) -> Job:
         title = _title(_place(run), title)
-        job = Job(title, function, {**arguments}, length, needs, limits, run.spec.device, _pace(run))
-        if records is not None:
-            path = run.path(records)
-            before = _version(path)
-            job = replace(
-                job,
-                makes=path,
-                is_done=lambda: has_record(run, records),
-                has_failed=lambda: _version(path) != before and has_failed(run, records),
-            )
+        product = None if records is None else _record_of(run, records)
+        job = Job(title, function, {**arguments}, length, needs, limits, run.spec.device, _pace(run), product)
         self._runs.append(job)
         return job
 
@@ -215,6 +206,17 @@ class Plan:
             length = scenario.budget.demonstrations
             jobs[key] = Job(title, work.collect_demonstrations, arguments, length, self._first)
         return jobs[key]
+
+
+def _record_of(run: ResolvedRun, records: Path) -> Product:
+    """Return the record that a run makes."""
+    path = run.path(records)
+    before = _version(path)
+    return Product(
+        path,
+        exists=lambda: has_record(run, records),
+        has_failed=lambda: _version(path) != before and has_failed(run, records),
+    )
 
 
 def _version(path: Path) -> tuple[int, int] | None:

@@ -80,10 +80,12 @@ def run_jobs(jobs: Sequence[Job], workers: Workers, bars: Bars) -> dict[Job, str
 
 def _ending(job: Job) -> str | None:
     """Return how a job ended elsewhere, or why that cannot be told; None if it is to be done."""
+    if job.product is None:
+        return None
     try:
-        if job.is_done is not None and job.is_done():
+        if job.product.exists():
             return DONE
-        return FAILED if job.has_failed is not None and job.has_failed() else None
+        return FAILED if job.product.has_failed() else None
     except ClbenchError as error:
         return str(error)
 

@@ -128,7 +128,7 @@ def test_runs_that_failed_are_not_counted_and_neither_are_the_jobs_that_they_sha
     def fail(jobs: Sequence[Job], *_: Any) -> dict[Job, str]:
         """Let the pretraining and one run fail; the other one ends without a record."""
         pretraining = next(job for job in jobs if "pretraining" in job.title)
-        return {pretraining: "no room", next(job for job in jobs if job.is_done): "no room"}
+        return {pretraining: "no room", next(job for job in jobs if job.product): "no room"}
 
     monkeypatch.setattr("clbench.jobs.grid.run_with_bars", fail)
     console = Console(file=io.StringIO(), width=200)

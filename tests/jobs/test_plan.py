@@ -95,15 +95,15 @@ def test_a_run_that_failed_counts_as_failed_only_if_another_command_did_it_since
     spec = RunSpec(TINY.id, "failing_method:Failing", 0)
     assert execute(spec, tmp_path).status == "failed"
     job = Plan().add_run(spec.resolve(), tmp_path)
-    assert job.has_failed is not None
-    assert not job.has_failed()
+    assert job.product is not None
+    assert not job.product.has_failed()
     record = read_record(spec.path(tmp_path))
     write_record(record, spec.path(tmp_path))
-    assert job.has_failed()
+    assert job.product.has_failed()
     write_record(
         dataclasses.replace(record, run=dataclasses.replace(record.run, device="cuda")), spec.path(tmp_path)
     )
-    assert not job.has_failed()
+    assert not job.product.has_failed()
 
 
 def test_runs_share_the_evaluation_of_a_start_only_if_it_is_the_same(

@@ -17,7 +17,7 @@ from helpers import printed
 from clbench.base.cache import cache_folder
 from clbench.jobs.bars import Bars
 from clbench.jobs.folders import minari_folder
-from clbench.jobs.job import Job
+from clbench.jobs.job import Job, Product
 from clbench.jobs.processes import Here, Processes
 from clbench.jobs.scheduler import run_jobs
 
@@ -156,7 +156,7 @@ def test_leases_are_given_back_if_closing_is_interrupted(tmp_path: Path, bars: B
             raise SystemExit
 
     job = _job("has_a_helper")
-    claimed = Job(job.title, job.function, {}, 1, makes=tmp_path / "made", is_done=lambda: False)
+    claimed = Job(job.title, job.function, {}, 1, product=Product(tmp_path / "made", lambda: False))
     with pytest.raises(SystemExit):
         run_jobs([claimed], Interrupted(1), bars)
     assert not list(tmp_path.glob(".made.*"))

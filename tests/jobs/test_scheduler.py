@@ -19,7 +19,7 @@ from rich.console import Console
 
 from clbench.base.errors import InputError
 from clbench.jobs.bars import Bars
-from clbench.jobs.job import Event, Job
+from clbench.jobs.job import Event, Job, Product
 from clbench.jobs.plan import Plan
 from clbench.jobs.processes import Here, Processes
 from clbench.jobs.recorded import has_record
@@ -120,8 +120,10 @@ def test_a_job_that_failed_elsewhere_or_cannot_be_judged_does_not_start_and_stop
     (tmp_path / "file").touch()
     places = {"failed": "a", "unreadable": "b", "locked out": "file/c", "fine": "d"}
     jobs = {name: _claimed(name, tmp_path / place) for name, place in places.items()}
-    jobs["failed"] = dataclasses.replace(jobs["failed"], has_failed=lambda: True)
-    jobs["unreadable"] = dataclasses.replace(jobs["unreadable"], is_done=_damaged)
+    failed = Product(tmp_path / "a", exists=lambda: False, has_failed=lambda: True)
+    jobs["failed"] = dataclasses.replace(jobs["failed"], product=failed)
+    unreadable = Product(tmp_path / "b", exists=_damaged)
+    jobs["unreadable"] = dataclasses.replace(jobs["unreadable"], product=unreadable)
     found = {job.title: reason for job, reason in run_jobs([*jobs.values()], Processes(1), bars).items()}
     assert found.pop("locked out").startswith("its lease cannot be written: ")
     assert found == {"failed": "failed in another command", "unreadable": "the record cannot be read"}
@@ -130,7 +132,7 @@ def test_a_job_that_failed_elsewhere_or_cannot_be_judged_does_not_start_and_stop
 
 def _claimed(title: str, makes: Path) -> Job:
     job = _job(title, "good", path=str(makes))
-    return dataclasses.replace(job, makes=makes, is_done=makes.exists)
+    return dataclasses.replace(job, product=Product(makes, makes.exists))
 
 
 HOLD = """
