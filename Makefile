@@ -165,7 +165,7 @@ libero-test: .venv/installed-libero
 # is what its definition says, and the slow tests of what few change: the page in a browser, and the benchmarks.
 CHECKED := tests/leaderboard/test_records.py tests/evaluation/test_definition.py tests/test_benchmarks.py \
 	tests/scoring/test_statistics_page.py tests/base/test_source.py \
-	$(addprefix tests/leaderboard/views/page/,test_in_browser.py test_on_a_phone.py test_ways.py)
+	$(addprefix tests/leaderboard/views/page/test_,in_browser.py on_a_phone.py published_page.py ways.py)
 check: .venv/installed-dev
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .

@@ -30,8 +30,8 @@ class HeatRow:
     """A method in all scenarios."""
 
     method: str
-    division: int
-    """Number of its division."""
+    division_number: int
+    """Place of its division in `DIVISIONS`."""
     cells: tuple[tuple[Number, float | None], ...]
     """Number and value of each metric in each scenario."""
 

@@ -96,7 +96,7 @@ def page(board: Board, comparisons: Comparisons) -> str:
             data=_packed(_data(views)),
             scenarios=views,
             heat_maps=maps,
-            shown_divisions={row.division for one in maps for row in one.rows},
+            shown_divisions={row.division_number for one in maps for row in one.rows},
             not_shown=board.not_shown,
         )
     )

@@ -195,7 +195,7 @@
       clearTimeout(waiting);
       waiting = setTimeout(part.picture, 150); // a drawing for each letter would hold up the next one
     });
-    arrange();
+    if (location.hash.includes("?")) arrange(); // the rows come in the usual order
     roam(table);
   }
 

@@ -102,8 +102,8 @@ class RowView:
         return f"{self.row.scenario}/{self.row.method}"
 
     @property
-    def division(self) -> int:
-        """Number of its division."""
+    def division_number(self) -> int:
+        """Place of its division in `DIVISIONS`."""
         return DIVISIONS.index(self.row.division)
 
     @property

@@ -43,8 +43,8 @@ class Fact:
 class Verdict:
     """What a scenario says of one division."""
 
-    division: int
-    """Number of the division."""
+    division_number: int
+    """Place of the division in `DIVISIONS`."""
     name: str
     rule: str
     leader: Row

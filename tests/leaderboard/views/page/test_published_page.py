@@ -66,7 +66,7 @@ def test_the_first_screen_says_which_method_keeps_most_without_prior_data_and_it
     kept, cost = best["estimates"]["kept"][0], best["costs"]["relative_cost"]
     assert in_first_viewport(opened, best["method"])
     assert in_first_viewport(opened, f"it keeps the most ({kept:.2f})")
-    assert in_first_viewport(opened, f"Its training takes {cost:.1f} times as long as sft's")
+    assert in_first_viewport(opened, f"Its training takes {cost:.2f} times as long as sft's")
 
 
 def test_the_first_screen_says_what_beats_plain_fine_tuning(opened: Page) -> None:
